@@ -1,0 +1,1 @@
+"""Sources of scans and odometry: rosbag2, CARMEN, MRPT rawlog."""

@@ -1,0 +1,1 @@
+"""The five processes and the simulated robot as rclpy nodes."""

@@ -1,0 +1,1 @@
+"""The five processes in lock-step in one process, and the output folder."""

@@ -1,0 +1,1 @@
+"""The five processes of HMT-SLAM and the messages between them."""

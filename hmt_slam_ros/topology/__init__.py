@@ -1,0 +1,1 @@
+"""Areas and arcs, normalized cut, transition model, area matching, hypotheses, globally consistent map."""
