@@ -1,0 +1,75 @@
+"""Gaussian beliefs over SE(2): compose, invert, fuse, gate.
+
+A covariance lives in the right tangent space of its mean: T = mean * exp(xi), xi ~ N(0, covariance), in the order
+(v_x, v_y, omega), m and rad. Propagation is first order.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hmt_slam_ros.geometry import se2
+
+
+@dataclass(frozen=True, eq=False)
+class PoseGaussian:
+    """N(mean, covariance) over the poses ``a_T_b``.
+
+    :ivar mean: shape (3,), (x, y, theta), m and rad.
+    :ivar covariance: shape (3, 3), right tangent frame.
+    """
+
+    mean: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+
+    def inverse(self) -> PoseGaussian:
+        """The belief over ``b_T_a``."""
+        ad = se2.adjoint(self.mean)
+        return PoseGaussian(se2.inverse(self.mean), ad @ self.covariance @ ad.T)
+
+    def compose(self, other: PoseGaussian) -> PoseGaussian:
+        """The belief over ``a_T_c``, from independent beliefs over ``a_T_b`` and ``b_T_c``."""
+        ad = se2.adjoint(se2.inverse(other.mean))
+        return PoseGaussian(
+            se2.compose(self.mean, other.mean),
+            ad @ self.covariance @ ad.T + other.covariance,
+        )
+
+    def mahalanobis2(self, other: PoseGaussian) -> float:
+        """Squared Mahalanobis distance between two independent beliefs over the same pose; chi-square with 3 dof.
+
+        The difference is taken on the manifold, so the value does not depend on the frame.
+        """
+        xi = se2.log(se2.between(self.mean, other.mean))
+        ad = se2.adjoint(se2.between(other.mean, self.mean))
+        spread = self.covariance_at(other.mean, ad) + other.covariance
+        return float(xi @ np.linalg.solve(spread, xi))
+
+    def covariance_at(self, mean: NDArray[np.float64], ad: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
+        """This belief's covariance, shape (3, 3), carried into the tangent space of the nearby pose ``mean``."""
+        ad = se2.adjoint(se2.between(mean, self.mean)) if ad is None else ad
+        return ad @ self.covariance @ ad.T
+
+
+def fuse(beliefs: list[PoseGaussian], iterations: int = 10) -> PoseGaussian:
+    """The normalised product of independent Gaussians over the same pose, Eq. (10).
+
+    Gauss-Newton on the manifold, started at the first mean.
+    """
+    mean = beliefs[0].mean
+    covariance = beliefs[0].covariance
+    for _ in range(iterations):
+        information, vector = np.zeros((3, 3)), np.zeros(3)
+        for belief in beliefs:
+            weight = np.linalg.inv(belief.covariance_at(mean))
+            information += weight
+            vector += weight @ se2.log(se2.between(mean, belief.mean))
+        covariance = np.linalg.inv(information).astype(np.float64, copy=False)
+        step = covariance @ vector
+        mean = se2.compose(mean, se2.exp(step))
+        if np.abs(step).max() < 1e-12:
+            break
+    return PoseGaussian(mean, covariance)

@@ -1,0 +1,93 @@
+"""Rigid motions of the plane as arrays (..., 3) of (x, y, theta), metres and radians.
+
+``a_T_b`` is the pose of frame b in frame a: ``compose(a_T_b, b_T_c)`` is ``a_T_c``. All functions broadcast over
+leading dimensions and return theta in [-pi, pi).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Pose = NDArray[np.float64]
+
+_SMALL_ANGLE = 1e-5
+
+
+def wrap(angle: ArrayLike) -> NDArray[np.float64]:
+    """``angle`` brought into [-pi, pi)."""
+    angle = np.asarray(angle, dtype=np.float64)
+    inside = (angle >= -np.pi) & (angle < np.pi)
+    # An angle inside the interval keeps its bits: 2 pi is not a double, so the modulus is not exact.
+    return np.where(inside, angle, (angle + np.pi) % (2.0 * np.pi) - np.pi)
+
+
+def compose(a_T_b: ArrayLike, b_T_c: ArrayLike) -> Pose:
+    """``a_T_c``: the second motion carried out in the frame that the first leads to."""
+    a, b = np.asarray(a_T_b, dtype=np.float64), np.asarray(b_T_c, dtype=np.float64)
+    cos, sin = np.cos(a[..., 2]), np.sin(a[..., 2])
+    x = a[..., 0] + cos * b[..., 0] - sin * b[..., 1]
+    y = a[..., 1] + sin * b[..., 0] + cos * b[..., 1]
+    return np.stack((x, y, wrap(a[..., 2] + b[..., 2])), axis=-1)
+
+
+def inverse(a_T_b: ArrayLike) -> Pose:
+    """``b_T_a``."""
+    a = np.asarray(a_T_b, dtype=np.float64)
+    cos, sin = np.cos(a[..., 2]), np.sin(a[..., 2])
+    x = -cos * a[..., 0] - sin * a[..., 1]
+    y = sin * a[..., 0] - cos * a[..., 1]
+    return np.stack((x, y, wrap(-a[..., 2])), axis=-1)
+
+
+def between(c_T_a: ArrayLike, c_T_b: ArrayLike) -> Pose:
+    """``a_T_b``, from the poses of a and b in a common frame."""
+    return compose(inverse(c_T_a), c_T_b)
+
+
+def transform(a_T_b: ArrayLike, points: ArrayLike) -> NDArray[np.float64]:
+    """Points (n, 2) of frame b in frame a, for one pose (3,)."""
+    a, p = np.asarray(a_T_b, dtype=np.float64), np.asarray(points, dtype=np.float64)
+    cos, sin = np.cos(a[2]), np.sin(a[2])
+    return np.stack((a[0] + cos * p[..., 0] - sin * p[..., 1], a[1] + sin * p[..., 0] + cos * p[..., 1]), axis=-1)
+
+
+def exp(xi: ArrayLike) -> Pose:
+    """The motion of the twist (..., 3) of (v_x, v_y, omega) over unit time."""
+    xi = np.asarray(xi, dtype=np.float64)
+    omega = xi[..., 2]
+    small = np.abs(omega) < _SMALL_ANGLE
+    safe = np.where(small, 1.0, omega)
+    a = np.where(small, 1.0 - omega**2 / 6.0, np.sin(safe) / safe)
+    b = np.where(small, omega / 2.0, (1.0 - np.cos(safe)) / safe)
+    x = a * xi[..., 0] - b * xi[..., 1]
+    y = b * xi[..., 0] + a * xi[..., 1]
+    return np.stack((x, y, wrap(omega)), axis=-1)
+
+
+def log(pose: ArrayLike) -> NDArray[np.float64]:
+    """The twist (..., 3) with ``exp(twist) == pose`` and |omega| <= pi."""
+    pose = np.asarray(pose, dtype=np.float64)
+    omega = wrap(pose[..., 2])
+    small = np.abs(omega) < _SMALL_ANGLE
+    safe = np.where(small, 1.0, omega)
+    half_cot = np.where(small, 1.0 - omega**2 / 12.0, 0.5 * safe / np.tan(0.5 * safe))
+    x = half_cot * pose[..., 0] + 0.5 * omega * pose[..., 1]
+    y = -0.5 * omega * pose[..., 0] + half_cot * pose[..., 1]
+    return np.stack((x, y, omega), axis=-1)
+
+
+def adjoint(pose: ArrayLike) -> NDArray[np.float64]:
+    """Ad_T, shape (..., 3, 3), with ``T exp(xi) = exp(Ad_T xi) T``."""
+    pose = np.asarray(pose, dtype=np.float64)
+    cos, sin = np.cos(pose[..., 2]), np.sin(pose[..., 2])
+    ad = np.zeros((*pose.shape[:-1], 3, 3))
+    ad[..., 0, 0], ad[..., 0, 1], ad[..., 0, 2] = cos, -sin, pose[..., 1]
+    ad[..., 1, 0], ad[..., 1, 1], ad[..., 1, 2] = sin, cos, -pose[..., 0]
+    ad[..., 2, 2] = 1.0
+    return ad
+
+
+def interpolate(start: ArrayLike, end: ArrayLike, fraction: ArrayLike) -> Pose:
+    """The pose at ``fraction`` of the way from ``start`` to ``end`` along a constant twist."""
+    return compose(start, exp(np.asarray(fraction)[..., None] * log(between(start, end))))

@@ -1,0 +1,257 @@
+"""What the five processes say to each other, as immutable values.
+
+Scans and odometry enter as :class:`~hmt_slam_ros.sensing.Scan` and :class:`~hmt_slam_ros.sensing.Odometry`. One
+*keyframe event* k sets off the chain Keyframe(k) -> AreaEvents(k) -> Hypotheses(k) -> Accepted(k), after which metric
+SLAM takes up the scans that waited.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.sensing import Odometry, Scan
+
+Pose = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class LeafEstimate:
+    """What metric SLAM says of one live hypothesis at a keyframe event.
+
+    :ivar hypothesis: id of the live hypothesis.
+    :ivar area: the robot's area, gamma_t.
+    :ivar pose: belief over ``area_T_base`` at the keyframe. Its covariance is the drift since the area's origin, or
+        the uncertainty of localisation where the robot moves over ground that is already mapped.
+    :ivar stored: whether the keyframe enters this hypothesis's map; False where it would add nothing new.
+    :ivar log_evidence: tempered log-likelihood of the keyframe's scan, given this hypothesis's map, relative to
+        unknown space; nats, not accumulated over keyframes.
+    :ivar effective_samples: ESS of the hypothesis's particles, in [1, number of particles].
+    """
+
+    hypothesis: int
+    area: int
+    pose: PoseGaussian
+    stored: bool
+    log_evidence: float
+    effective_samples: float
+
+
+@dataclass(frozen=True, eq=False)
+class Keyframe:
+    """A keyframe event: slam -> aam, tsbi, tlca, recorder.
+
+    :ivar sequence: 0, 1, 2, ... without gaps; it also names the keyframe.
+    :ivar scan: the keyframe's scan.
+    :ivar travelled: path length since the start, m.
+    :ivar leaves: one estimate for every live hypothesis, ordered by hypothesis id.
+    """
+
+    sequence: int
+    scan: Scan
+    travelled: float
+    leaves: tuple[LeafEstimate, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class AreaEvent:
+    """The AAM's finding for one hypothesis.
+
+    :ivar hypothesis: id of the live hypothesis.
+    :ivar kind: "cut" where the newest keyframes separate from the current area, "moved" where the robot went over a
+        known arc into a known area.
+    :ivar keyframes: for "cut": the stored keyframes that leave, ascending, the newest among them; else empty.
+    :ivar area: for "moved": the known area in which the robot is now; for "cut": the area that was left.
+    :ivar score: for "cut": the normalised cut; for "moved": the overlap with the new area.
+    """
+
+    hypothesis: int
+    kind: Literal["cut", "moved"]
+    keyframes: tuple[int, ...]
+    area: int
+    score: float
+
+
+@dataclass(frozen=True, eq=False)
+class AreaEvents:
+    """aam -> tsbi, one for every keyframe event, mostly without events."""
+
+    sequence: int
+    events: tuple[AreaEvent, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Arc:
+    """A directed arc of the topological graph.
+
+    :ivar source: area a.
+    :ivar target: area b.
+    :ivar pose: belief over ``a_T_b``, Eq. (9).
+    :ivar closure: whether the arc closed a loop, that is, led into an area that was already known.
+    """
+
+    source: int
+    target: int
+    pose: PoseGaussian
+    closure: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Relabelled:
+    """Keyframe ``keyframe`` of area ``source`` now belongs to ``area``, at ``pose`` = ``area_T_base``, shape (3,)."""
+
+    keyframe: int
+    source: int
+    area: int
+    pose: Pose
+
+
+@dataclass(frozen=True, eq=False)
+class LocalArea:
+    """An area that the local map must hold: ``pose`` = ``current_T_area``, shape (3,)."""
+
+    area: int
+    pose: Pose
+
+
+@dataclass(frozen=True, eq=False)
+class Leaf:
+    """A live hypothesis after keyframe event k, as changes against the leaf ``parent`` before it.
+
+    :ivar hypothesis: its id; equal to ``parent`` where nothing branched; of several children of one parent each has a
+        new id.
+    :ivar parent: the hypothesis it continues.
+    :ivar probability: P(gamma^t | d), Eq. (14).
+    :ivar area: the robot's area now.
+    :ivar rebase: belief over ``area_T_previous``: the frame of the robot's area before the event in that of ``area``;
+        None where the area did not change and the robot's pose stands.
+    :ivar relabelled: keyframes that change area.
+    :ivar arcs: arcs that are new or replaced.
+    :ivar local: the areas of the local map, the current one first; empty where the local map stays as it is.
+    """
+
+    hypothesis: int
+    parent: int
+    probability: float
+    area: int
+    rebase: PoseGaussian | None = None
+    relabelled: tuple[Relabelled, ...] = ()
+    arcs: tuple[Arc, ...] = ()
+    local: tuple[LocalArea, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Hypotheses:
+    """tsbi -> slam, aam, tlca, rtl, recorder; one for every keyframe event.
+
+    :ivar sequence: the keyframe event that it answers.
+    :ivar leaves: every live hypothesis, ordered by id; probabilities sum to 1 less ``unexamined``.
+    :ivar unexamined: probability of topologies that the gate did not examine or the reduction dropped.
+    """
+
+    sequence: int
+    leaves: tuple[Leaf, ...]
+    unexamined: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class AreaPose:
+    """Belief over ``map_T_area`` of the globally consistent map."""
+
+    area: int
+    pose: PoseGaussian
+
+
+@dataclass(frozen=True, eq=False)
+class Accepted:
+    """tlca -> slam, aam, tsbi, rtl, recorder; one for every keyframe event.
+
+    :ivar sequence: the keyframe event that it answers.
+    :ivar hypothesis: the hypothesis whose history is now definite, all others being dropped; None where the question
+        stays open.
+    :ivar arcs: arcs of that hypothesis refined by alignment and fusion, Eq. (10).
+    :ivar relabelled: keyframes of that hypothesis whose pose in their area was refined.
+    :ivar global_poses: ``map_T_area`` of all areas of the most probable hypothesis, ordered by id; empty where
+        unchanged since the last message.
+    """
+
+    sequence: int
+    hypothesis: int | None = None
+    arcs: tuple[Arc, ...] = ()
+    relabelled: tuple[Relabelled, ...] = ()
+    global_poses: tuple[AreaPose, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class LocalEstimate:
+    """slam -> rtl, recorder, and to the robot as the acknowledgement of a scan; one for every scan.
+
+    :ivar stamp: the scan's, ns.
+    :ivar scan_index: 0, 1, 2, ... of the scan since the start, without gaps.
+    :ivar area: area of the most probable hypothesis.
+    :ivar pose: belief over ``area_T_base`` at the scan, the HMT pose s_t = (gamma_t, x_t).
+    :ivar odometry: shape (3,), ``odom_T_base`` at the scan.
+    :ivar dropped: scans dropped since the start.
+    """
+
+    stamp: int
+    scan_index: int
+    area: int
+    pose: PoseGaussian
+    odometry: Pose
+    dropped: int
+
+
+@dataclass(frozen=True, eq=False)
+class Trail:
+    """slam -> tlca, recorder: where the scans since the last trail were taken, under one hypothesis.
+
+    :ivar hypothesis: id of the live hypothesis.
+    :ivar first_scan: ``scan_index`` of the first row.
+    :ivar stamps: shape (n,), int64, ns.
+    :ivar anchors: shape (n,), int64, the stored keyframe to which the scan's pose is relative.
+    :ivar poses: shape (n, 3), ``anchor_T_base``.
+    """
+
+    hypothesis: int
+    first_scan: int
+    stamps: NDArray[np.int64]
+    anchors: NDArray[np.int64]
+    poses: NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class EndOfLog:
+    """robot -> slam: no more scans will come; slam answers with the last trails and ``Finished``."""
+
+
+@dataclass(frozen=True, eq=False)
+class Finished:
+    """slam -> recorder, robot: every scan received has been processed.
+
+    :ivar scans_in: scans received.
+    :ivar processed: scans for which a pose was given.
+    :ivar dropped: scans refused or skipped.
+    """
+
+    scans_in: int
+    processed: int
+    dropped: int
+
+
+Message = (
+    Scan
+    | Odometry
+    | Keyframe
+    | AreaEvents
+    | Hypotheses
+    | Accepted
+    | LocalEstimate
+    | Trail
+    | EndOfLog
+    | Finished
+)

@@ -1,0 +1,72 @@
+"""The maps of all live hypotheses, kept up to date in every process from the messages that it hears."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from hmt_slam_ros.processes.messages import Accepted, Arc, Hypotheses, Keyframe, Leaf, Relabelled
+from hmt_slam_ros.sensing import Scan
+from hmt_slam_ros.topology.hybrid_map import HybridMap
+
+FIRST_HYPOTHESIS = 0
+FIRST_AREA = 0
+
+
+@dataclass
+class Replica:
+    """Scans of the keyframes, and the HMT map and probability of every live hypothesis.
+
+    :ivar scans: {keyframe: scan} of the keyframes stored under at least one hypothesis when they came.
+    :ivar maps: {hypothesis: map}.
+    :ivar probabilities: {hypothesis: P(gamma^t | d)}.
+    :ivar areas: {hypothesis: the robot's area}.
+    """
+
+    scans: dict[int, Scan] = field(default_factory=dict)
+    maps: dict[int, HybridMap] = field(default_factory=lambda: {FIRST_HYPOTHESIS: HybridMap()})
+    probabilities: dict[int, float] = field(default_factory=lambda: {FIRST_HYPOTHESIS: 1.0})
+    areas: dict[int, int] = field(default_factory=lambda: {FIRST_HYPOTHESIS: FIRST_AREA})
+
+    @property
+    def best(self) -> int:
+        """The most probable hypothesis; of equals the oldest."""
+        return min(self.probabilities, key=lambda h: (-self.probabilities[h], h))
+
+    def add(self, keyframe: Keyframe) -> None:
+        """Store a keyframe in the maps of the hypotheses that want it."""
+        for leaf in keyframe.leaves:
+            if leaf.stored and leaf.hypothesis in self.maps:
+                self.maps[leaf.hypothesis].place(keyframe.sequence, leaf.area, leaf.pose.mean)
+                self.scans[keyframe.sequence] = keyframe.scan
+
+    def apply(self, hypotheses: Hypotheses) -> None:
+        """Branch, change and drop hypotheses as TSBI decided."""
+        self.maps = {leaf.hypothesis: self._child(leaf) for leaf in hypotheses.leaves}
+        self.probabilities = {leaf.hypothesis: leaf.probability for leaf in hypotheses.leaves}
+        self.areas = {leaf.hypothesis: leaf.area for leaf in hypotheses.leaves}
+
+    def _child(self, leaf: Leaf) -> HybridMap:
+        parent = self.maps[leaf.parent]
+        child = parent if leaf.hypothesis == leaf.parent else parent.branch()
+        self._change(child, leaf.relabelled, leaf.arcs)
+        return child
+
+    def accept(self, accepted: Accepted) -> None:
+        """Make one hypothesis definite and drop the others."""
+        if accepted.hypothesis is None:
+            return
+        chosen = self.maps[accepted.hypothesis]
+        self._change(chosen, accepted.relabelled, accepted.arcs)
+        chosen.absorb()
+        self.maps = {accepted.hypothesis: chosen}
+        self.probabilities = {accepted.hypothesis: 1.0}
+        self.areas = {accepted.hypothesis: self.areas[accepted.hypothesis]}
+
+    @staticmethod
+    def _change(hybrid_map: HybridMap, relabelled: tuple[Relabelled, ...], arcs: tuple[Arc, ...]) -> None:
+        for r in relabelled:
+            if r.source != r.area:
+                hybrid_map.remove(r.keyframe, r.source)
+            hybrid_map.place(r.keyframe, r.area, r.pose)
+        for arc in arcs:
+            hybrid_map.set_arc(arc.source, arc.target, arc.pose, closure=arc.closure)
