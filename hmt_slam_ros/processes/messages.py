@@ -20,6 +20,16 @@ Pose = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
+class Relabelled:
+    """Keyframe ``keyframe`` of area ``source`` now belongs to ``area``, at ``pose`` = ``area_T_base``, shape (3,)."""
+
+    keyframe: int
+    source: int
+    area: int
+    pose: Pose
+
+
+@dataclass(frozen=True, eq=False)
 class LeafEstimate:
     """What metric SLAM says of one live hypothesis at a keyframe event.
 
@@ -31,6 +41,8 @@ class LeafEstimate:
     :ivar log_evidence: tempered log-likelihood of the keyframe's scan, given this hypothesis's map, relative to
         unknown space; nats, not accumulated over keyframes.
     :ivar effective_samples: ESS of the hypothesis's particles, in [1, number of particles].
+    :ivar revised: earlier keyframes of the area whose pose changed because another particle leads now; ``source`` and
+        ``area`` are equal.
     """
 
     hypothesis: int
@@ -39,6 +51,7 @@ class LeafEstimate:
     stored: bool
     log_evidence: float
     effective_samples: float
+    revised: tuple[Relabelled, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,16 +111,6 @@ class Arc:
     target: int
     pose: PoseGaussian
     closure: bool = False
-
-
-@dataclass(frozen=True, eq=False)
-class Relabelled:
-    """Keyframe ``keyframe`` of area ``source`` now belongs to ``area``, at ``pose`` = ``area_T_base``, shape (3,)."""
-
-    keyframe: int
-    source: int
-    area: int
-    pose: Pose
 
 
 @dataclass(frozen=True, eq=False)

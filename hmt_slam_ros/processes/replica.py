@@ -35,6 +35,8 @@ class Replica:
     def add(self, keyframe: Keyframe) -> None:
         """Store a keyframe in the maps of the hypotheses that want it."""
         for leaf in keyframe.leaves:
+            if leaf.hypothesis in self.maps:
+                self._change(self.maps[leaf.hypothesis], leaf.revised, ())
             if leaf.stored and leaf.hypothesis in self.maps:
                 self.maps[leaf.hypothesis].place(keyframe.sequence, leaf.area, leaf.pose.mean)
                 self.scans[keyframe.sequence] = keyframe.scan
