@@ -57,16 +57,20 @@ class PoseGaussian:
 def fuse(beliefs: list[PoseGaussian], iterations: int = 10) -> PoseGaussian:
     """The normalised product of independent Gaussians over the same pose, Eq. (10).
 
-    Gauss-Newton on the manifold, started at the first mean.
+    Gauss-Newton on the manifold, started at the first mean; neither the order nor the direction of the poses matters.
+
+    :raises numpy.linalg.LinAlgError: where a covariance is singular.
     """
     mean = beliefs[0].mean
     covariance = beliefs[0].covariance
     for _ in range(iterations):
         information, vector = np.zeros((3, 3)), np.zeros(3)
         for belief in beliefs:
-            weight = np.linalg.inv(belief.covariance_at(mean))
-            information += weight
-            vector += weight @ se2.log(se2.between(mean, belief.mean))
+            residual = se2.log(se2.between(belief.mean, mean))
+            jacobian = se2.right_jacobian_inverse(residual)
+            weighted = jacobian.T @ np.linalg.inv(belief.covariance)
+            information += weighted @ jacobian
+            vector -= weighted @ residual
         covariance = np.linalg.inv(information).astype(np.float64, copy=False)
         step = covariance @ vector
         mean = se2.compose(mean, se2.exp(step))

@@ -19,7 +19,9 @@ def wrap(angle: ArrayLike) -> NDArray[np.float64]:
     angle = np.asarray(angle, dtype=np.float64)
     inside = (angle >= -np.pi) & (angle < np.pi)
     # An angle inside the interval keeps its bits: 2 pi is not a double, so the modulus is not exact.
-    return np.where(inside, angle, (angle + np.pi) % (2.0 * np.pi) - np.pi)
+    wrapped = (angle + np.pi) % (2.0 * np.pi) - np.pi
+    # Just below -pi the modulus rounds up to 2 pi itself.
+    return np.where(inside, angle, np.where(wrapped < np.pi, wrapped, -np.pi))
 
 
 def compose(a_T_b: ArrayLike, b_T_c: ArrayLike) -> Pose:
@@ -59,7 +61,8 @@ def exp(xi: ArrayLike) -> Pose:
     small = np.abs(omega) < _SMALL_ANGLE
     safe = np.where(small, 1.0, omega)
     a = np.where(small, 1.0 - omega**2 / 6.0, np.sin(safe) / safe)
-    b = np.where(small, omega / 2.0, (1.0 - np.cos(safe)) / safe)
+    # 1 - cos(omega) would cancel; 2 sin^2(omega / 2) does not.
+    b = np.where(small, omega / 2.0, 2.0 * np.sin(0.5 * safe) ** 2 / safe)
     x = a * xi[..., 0] - b * xi[..., 1]
     y = b * xi[..., 0] + a * xi[..., 1]
     return np.stack((x, y, wrap(omega)), axis=-1)
@@ -86,6 +89,21 @@ def adjoint(pose: ArrayLike) -> NDArray[np.float64]:
     ad[..., 1, 0], ad[..., 1, 1], ad[..., 1, 2] = sin, cos, -pose[..., 0]
     ad[..., 2, 2] = 1.0
     return ad
+
+
+def right_jacobian_inverse(xi: ArrayLike) -> NDArray[np.float64]:
+    """J, shape (..., 3, 3), with ``log(exp(xi) exp(delta)) = xi + J delta`` to first order in delta."""
+    xi = np.asarray(xi, dtype=np.float64)
+    omega = xi[..., 2]
+    ad = np.zeros((*xi.shape[:-1], 3, 3))
+    ad[..., 0, 1], ad[..., 0, 2] = -omega, xi[..., 1]
+    ad[..., 1, 0], ad[..., 1, 2] = omega, -xi[..., 0]
+    small = np.abs(omega) < 1e-2
+    safe = np.where(small, 1.0, omega)
+    series = 1.0 / 12.0 + omega**2 / 720.0 + omega**4 / 30240.0
+    quadratic = np.where(small, series, (1.0 - 0.5 * safe / np.tan(0.5 * safe)) / safe**2)
+    # The Bernoulli series of ad ends after the square, since ad^3 = -omega^2 ad.
+    return np.eye(3) + 0.5 * ad + quadratic[..., None, None] * (ad @ ad)
 
 
 def interpolate(start: ArrayLike, end: ArrayLike, fraction: ArrayLike) -> Pose:
