@@ -1,0 +1,11 @@
+#!/usr/bin/env bash
+# Makes the environment where it is missing, and maps the bundled log with the robot node and the five process nodes.
+# Usage: scripts/demo.sh [arguments of `hmt_slam replay`]
+set -euo pipefail
+cd "$(dirname "${BASH_SOURCE[0]}")/.."
+. scripts/environment.sh
+make_environment
+
+export ROS_AUTOMATIC_DISCOVERY_RANGE="${ROS_AUTOMATIC_DISCOVERY_RANGE:-LOCALHOST}"
+"$venv/bin/hmt_slam" replay data/malaga_one_loop --out output/demo "$@"
+echo "The results are in output/demo; look at output/demo/map.png"

@@ -1,0 +1,243 @@
+"""Make the virtual environment in which the tests and the demonstration run, and keep it up to date.
+
+Where a Jazzy is sourced, its packages are used and only what it lacks is installed. Elsewhere a real rclpy comes from
+PyPI, and tf2_msgs, of which PyPI has no wheel, is compiled from scripts/tf2_msgs. Nothing but the standard library is
+needed to run this file; it prints the path of the environment's Python interpreter on standard output.
+"""
+
+from __future__ import annotations
+
+import argparse
+import fcntl
+import hashlib
+import os
+import re
+import shutil
+import subprocess
+import sys
+import sysconfig
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+TF2_MSGS = ROOT / "scripts" / "tf2_msgs"
+REQUIREMENTS = ROOT / "requirements"
+# What an installed copy of the project is made of, the Python modules apart: those are used where they lie.
+PROJECT = ("setup.py", "setup.cfg", "package.xml", "resource", "launch", "config", "libexec", "data")
+
+
+class EnvironmentSetupError(Exception):
+    """What hinders the environment, in one sentence that names the remedy."""
+
+
+@dataclass
+class Environment:
+    """A virtual environment of the project.
+
+    :ivar path: its folder.
+    :ivar jazzy: whether ROS 2 Jazzy is sourced, so that rclpy and the messages are there already.
+    :ivar constraints: the pip constraints file that fixes the versions.
+    """
+
+    path: Path
+    jazzy: bool
+    constraints: Path
+    started: float = field(default_factory=time.monotonic)
+
+    @property
+    def python(self) -> Path:
+        """The environment's interpreter."""
+        return self.path / "bin" / "python"
+
+    def say(self, text: str) -> None:
+        """Print a line of progress with the seconds since the start."""
+        print(f"[{time.monotonic() - self.started:4.0f} s] {text}", file=sys.stderr, flush=True)
+
+    def run(self, *command: str | Path, problem: str, **variables: str) -> None:
+        """Run a command of the environment, its output going to the environment's setup.log.
+
+        :raises EnvironmentSetupError: if it fails; the sentence starts with `problem`.
+        """
+        log = self.path / "setup.log"
+        path = f"{self.path / 'bin'}{os.pathsep}{os.environ.get('PATH', os.defpath)}"
+        with log.open("ab") as output:
+            result = subprocess.run(
+                [str(word) for word in command],
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=output,
+                env=os.environ | {"PATH": path} | variables,
+                check=False,
+            )
+        if result.returncode != 0:
+            raise EnvironmentSetupError(f"{problem} ({_last_error(log)}); the whole output is in {log}")
+
+    def install(self, *arguments: str | Path, problem: str) -> None:
+        """Install with pip under the environment's constraints."""
+        pip = (self.python, "-m", "pip", "install", "--disable-pip-version-check", "--no-input")
+        self.run(*pip, "--constraint", self.constraints, *arguments, problem=problem)
+
+
+def _last_error(log: Path) -> str:
+    lines = [line.strip() for line in log.read_text(errors="replace").splitlines() if line.strip()]
+    errors = [line for line in lines if re.search(r"error", line, re.IGNORECASE)]
+    return (errors or lines or ["no output"])[-1].removeprefix("ERROR: ")
+
+
+def digest(*paths: Path, also: str = "") -> str:
+    """Return a fingerprint of files and folders, their names and contents, and of the text `also`."""
+    total = hashlib.sha256(also.encode())
+    for path in paths:
+        for file in sorted(path.rglob("*")) if path.is_dir() else [path]:
+            if file.is_file():
+                total.update(str(file.relative_to(ROOT)).encode())
+                total.update(file.read_bytes())
+    return total.hexdigest()
+
+
+def sourced_jazzy() -> bool:
+    """Return whether ROS 2 Jazzy is sourced.
+
+    :raises EnvironmentSetupError: where another distribution is, or one of another Python, which would get in the way.
+    """
+    distribution = os.environ.get("ROS_DISTRO")
+    if distribution is None:
+        return False
+    if distribution != "jazzy":
+        raise EnvironmentSetupError(
+            f"ROS 2 {distribution} is sourced but hmt_slam_ros needs Jazzy; source Jazzy or use a shell without ROS"
+        )
+    if subprocess.run([sys.executable, "-c", "import rclpy"], capture_output=True, check=False).returncode != 0:
+        raise EnvironmentSetupError(
+            f"ROS 2 Jazzy is sourced but {sys.executable} cannot import its rclpy; name the Python that can with "
+            "PYTHON=/usr/bin/python3, or use a shell without ROS"
+        )
+    return True
+
+
+def create(environment: Environment) -> None:
+    """Make the empty virtual environment, unless one of this Python version, place and kind is there.
+
+    :raises EnvironmentSetupError: where the module venv is incomplete.
+    """
+    version = f"{sys.version_info.major}.{sys.version_info.minor}"
+    wanted = (f"= {version}.", f" {environment.path}\n", f"include-system-site-packages = {environment.jazzy}".lower())
+    settings = environment.path / "pyvenv.cfg"
+    if environment.python.exists() and settings.is_file() and all(part in settings.read_text() for part in wanted):
+        return
+    environment.say(f"creating {environment.path.name} with Python {version}")
+    shutil.rmtree(environment.path, ignore_errors=True)
+    environment.path.mkdir()
+    environment.run(
+        sys.executable,
+        *("-m", "venv", str(environment.path)),
+        *(["--system-site-packages"] if environment.jazzy else []),
+        problem=f"no virtual environment could be made; on Debian or Ubuntu install python{version}-venv",
+    )
+
+
+def install_project(environment: Environment) -> None:
+    """Install the project, so that its modules are used where they lie, with all that it and its tests need."""
+    environment.say("installing hmt_slam_ros with numpy, scipy, numba and the tools of the tests")
+    environment.install("--editable", f"{ROOT}[test]", problem="hmt_slam_ros could not be installed")
+
+
+def install_ros(environment: Environment) -> None:
+    """Install rclpy and the message packages, unless Jazzy is sourced."""
+    if environment.jazzy:
+        return
+    environment.say("installing rclpy (ROS 2 Jazzy) from PyPI")
+    environment.install("-r", REQUIREMENTS / "ros.txt", problem="rclpy could not be installed from PyPI")
+    missing = missing_for_compilation()
+    if missing:
+        environment.say(f"tf2_msgs is left out and /tf stays silent: {missing} and run this again")
+    else:
+        environment.say("compiling tf2_msgs, for /tf")
+        build_tf2_msgs(environment)
+
+
+def missing_for_compilation() -> str:
+    """Return what to install before tf2_msgs can be compiled, as an instruction; empty if nothing is missing."""
+    if not (Path(sysconfig.get_paths()["include"]) / "Python.h").is_file():
+        return "install Python's headers (python3-dev on Debian and Ubuntu)"
+    if not shutil.which("c++"):
+        return "install a C++ compiler (g++)"
+    return ""
+
+
+def build_tf2_msgs(environment: Environment) -> None:
+    """Compile tf2_msgs into the environment, with the ROS build tools of PyPI."""
+    environment.install("-r", REQUIREMENTS / "tf2_msgs.txt", problem="the tools for tf2_msgs could not be installed")
+    mend_wheels(environment)
+    build = environment.path / "build_tf2_msgs"
+    options = {
+        "CMAKE_PREFIX_PATH": environment.path,
+        "CMAKE_INSTALL_PREFIX": environment.path,
+        "Python3_EXECUTABLE": environment.python,
+        "BUILD_TESTING": "OFF",
+    }
+    steps: tuple[tuple[str | Path, ...], ...] = (
+        ("-S", TF2_MSGS, "-B", build, "-GNinja", *(f"-D{name}={value}" for name, value in options.items())),
+        ("--build", build),
+        ("--install", build),
+    )
+    shutil.rmtree(build, ignore_errors=True)
+    for step in steps:
+        environment.run(
+            environment.path / "bin" / "cmake",
+            *step,
+            problem="tf2_msgs could not be compiled",
+            AMENT_PREFIX_PATH=str(environment.path),
+        )
+    shutil.rmtree(build)
+
+
+def mend_wheels(environment: Environment) -> None:
+    """Replace the include folders of the machine that built the ROS wheels, which CMake would stumble over."""
+    numpy = (environment.python, "-c", "import numpy; print(numpy.get_include())")
+    numpy_include = subprocess.run(numpy, capture_output=True, text=True, check=True).stdout.strip()
+    for file in environment.path.glob("share/*/cmake/*__rosidl_generator_pyExport.cmake"):
+        text = file.read_text()
+        mended = re.sub(r'/opt/python/[^;">]*/numpy/[^;">]*', numpy_include, text)
+        mended = re.sub(r'/opt/python/[^;">]*', sysconfig.get_paths()["include"], mended)
+        file.write_text(mended)
+
+
+def update(environment: Environment) -> None:
+    """Bring the environment up to date; do nothing where it is."""
+    needs = f"{sys.version} {ROOT} {environment.jazzy} {environment.constraints.name} {missing_for_compilation()}"
+    steps = {
+        "project": (digest(REQUIREMENTS, *(ROOT / name for name in PROJECT), also=needs), install_project),
+        "ros": (digest(REQUIREMENTS, TF2_MSGS, also=needs), install_ros),
+    }
+    for name, (wanted, install) in steps.items():
+        stamp = environment.path / f"{name}.stamp"
+        if not (environment.python.exists() and stamp.is_file() and stamp.read_text() == wanted):
+            create(environment)
+            install(environment)
+            stamp.write_text(wanted)
+            environment.say("done")
+
+
+def main() -> int:
+    """Run the command line; return the exit status."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--floor", action="store_true", help="use the oldest supported versions, in .venv-floor")
+    arguments = parser.parse_args()
+    try:
+        jazzy = sourced_jazzy()
+        constraints = REQUIREMENTS / ("floor.txt" if arguments.floor or jazzy else "tested.txt")
+        environment = Environment(ROOT / (".venv-floor" if arguments.floor else ".venv"), jazzy, constraints)
+        with Path(__file__).open() as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            update(environment)
+    except (EnvironmentSetupError, OSError) as problem:
+        print(f"environment: {problem}", file=sys.stderr)
+        return 2
+    print(environment.python)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

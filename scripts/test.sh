@@ -1,0 +1,30 @@
+#!/usr/bin/env bash
+# Makes the environment where it is missing and passes the tests.
+# Usage: scripts/test.sh [--floor] [pytest arguments]
+#   --floor  with the oldest versions supported (requirements/floor.txt), in .venv-floor, pytest only
+set -uo pipefail
+cd "$(dirname "${BASH_SOURCE[0]}")/.."
+. scripts/environment.sh
+
+status=0
+check() {
+    echo "== $*"
+    "$venv/bin/$@" || status=1
+}
+
+if [ "${1:-}" = --floor ]; then
+    shift
+    make_environment --floor
+    # The caches of two numba versions beside the same sources would drive each other out.
+    export NUMBA_CACHE_DIR="$venv/numba_cache"
+else
+    make_environment
+    check ruff check
+    check mypy
+    [ "$status" = 0 ] || echo "ruff or mypy found faults, see above; the tests run all the same"
+fi
+
+# Misspelled message fields and wrong types fail; nodes of other machines on the network are not seen.
+export ROS_PYTHON_CHECK_FIELDS=1 ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST
+check pytest "$@"
+exit "$status"
