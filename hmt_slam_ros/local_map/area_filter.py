@@ -1,0 +1,310 @@
+"""The Rao-Blackwellized particle filter of one hypothesis in its current area, second step of Eq. (6).
+
+Every particle has a pose, its own map in shared patches, and its own poses of the keyframes taken since the area was
+entered. The map frame is the frame of the current area.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hmt_slam_ros.configuration.tree import Configuration
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.local_map import batch, matching
+from hmt_slam_ros.local_map.patches import FAR, PatchPool
+from hmt_slam_ros.random_streams import Purpose, stream
+from hmt_slam_ros.sensing import Scan
+
+_ODDS_PER_NAT = 20.0
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedKeyframe:
+    """A keyframe of the local map: its id, its area, its scan and ``map_T_base``, shape (3,)."""
+
+    keyframe: int
+    area: int
+    scan: Scan
+    pose: NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class FilterStep:
+    """What a filter step found.
+
+    :ivar covariance: of the leading particle's pose, shape (3, 3), right tangent frame.
+    :ivar log_evidence: log p(z_t | past), tempered, relative to unknown space, nats.
+    :ivar effective_samples: ESS before resampling.
+    :ivar history_changed: whether another particle leads than before, so that keyframe poses differ from those told.
+    """
+
+    covariance: NDArray[np.float64]
+    log_evidence: float
+    effective_samples: float
+    history_changed: bool
+
+
+class LocalMapping:
+    """What all filters of a process share: the pool of patches, the beam model, the settings."""
+
+    def __init__(self, configuration: Configuration) -> None:
+        self.configuration = configuration
+        local_map, match = configuration.local_map, configuration.matching
+        patch = 32 * local_map.cell
+        self.pool = PatchPool(2 * math.ceil(local_map.extent / patch), local_map.cell, local_map.field_radius)
+        self.model = matching.beam_model(
+            local_map.field_radius, match.sigma_hit, match.unknown_range, match.random_returns
+        )
+        self.hit = round(local_map.log_odds_hit * _ODDS_PER_NAT)
+        self.miss = round(-local_map.log_odds_miss * _ODDS_PER_NAT)
+        self.limit = round(local_map.log_odds_limit * _ODDS_PER_NAT)
+        self.near = int(match.matched_distance / local_map.field_radius * FAR)
+
+    def matching_points(self, scan: Scan) -> NDArray[np.float64]:
+        """The points that are matched: within the map's range, evenly thinned; shape (n, 2), base frame, m."""
+        points = self.mapped_points(scan)[0]
+        stride = -(-len(points) // self.configuration.matching.max_points)
+        return np.ascontiguousarray(points[:: max(1, stride)])
+
+    def mapped_points(self, scan: Scan) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """End points within the map's range, and where longer beams leave that range; (n, 2), (k, 2), base frame, m."""
+        limit = self.configuration.local_map.max_range
+        relative = scan.points - scan.laser_pose[:2]
+        distance = np.hypot(relative[:, 0], relative[:, 1])
+        near = distance <= limit
+        beyond = scan.laser_pose[:2] + relative[~near] * (limit / distance[~near, None])
+        return scan.points[near], beyond
+
+    def insert(self, table: NDArray[np.int32], pose: NDArray[np.float64], scan: Scan) -> None:
+        """Enter a scan at ``map_T_base`` into a map."""
+        points, free = self.mapped_points(scan)
+        self.pool.insert(table, pose, scan.laser_pose, points, free, self.hit, self.miss, self.limit)
+
+
+class AreaFilter:
+    """M particles of one hypothesis in one area.
+
+    :ivar hypothesis: id of the hypothesis.
+    :ivar area: the current area; the map frame is its frame.
+    :ivar poses: shape (M, 3), ``map_T_base``.
+    :ivar log_weights: shape (M,), nats, the largest is 0.
+    :ivar keyframes: the local map's keyframes, ids.
+    :ivar keyframe_areas: their areas.
+    :ivar keyframe_poses: shape (M, K, 3), ``map_T_base`` of each under each particle.
+    """
+
+    def __init__(self, mapping: LocalMapping, hypothesis: int, area: int) -> None:
+        self.mapping = mapping
+        self.hypothesis = hypothesis
+        self.area = area
+        count = mapping.configuration.filter.particles
+        self.poses = np.zeros((count, 3))
+        self.log_weights = np.zeros(count)
+        self.keyframes: list[int] = []
+        self.keyframe_areas: list[int] = []
+        self.keyframe_poses = np.zeros((count, 0, 3))
+        self._tables = np.stack([mapping.pool.empty_table()] * count)
+        self._priors = self.poses.copy()
+        self._odometry_covariance = np.zeros((3, 3))
+        self._told_leader = 0
+        self.tracking_covariance = np.zeros((3, 3))
+
+    @property
+    def leader(self) -> int:
+        """The particle of largest weight; of equals the first."""
+        return int(np.argmax(self.log_weights))
+
+    @property
+    def pose(self) -> NDArray[np.float64]:
+        """The leading particle's ``area_T_base``, shape (3,)."""
+        return self.poses[self.leader]
+
+    def leading_keyframe_poses(self) -> NDArray[np.float64]:
+        """``map_T_base`` of the local map's keyframes under the leading particle, shape (K, 3)."""
+        return self.keyframe_poses[self.leader]
+
+    def branch(self, hypothesis: int) -> AreaFilter:
+        """A filter of the same state for a child hypothesis; maps are shared until written to."""
+        child = AreaFilter(self.mapping, hypothesis, self.area)
+        child.poses, child.log_weights = self.poses.copy(), self.log_weights.copy()
+        child.keyframes, child.keyframe_areas = list(self.keyframes), list(self.keyframe_areas)
+        child.keyframe_poses = self.keyframe_poses.copy()
+        child._tables = np.stack([self.mapping.pool.share(table) for table in self._tables])
+        child._priors, child._odometry_covariance = self._priors.copy(), self._odometry_covariance
+        child._told_leader, child.tracking_covariance = self._told_leader, self.tracking_covariance
+        return child
+
+    def release(self) -> None:
+        """Give the maps back."""
+        for table in self._tables:
+            self.mapping.pool.release(table)
+
+    def track(self, scan_points: NDArray[np.float64], increment: NDArray[np.float64], covariance: NDArray[np.float64]) -> None:
+        """Move all particles by the leader's matched increment: a pose for a scan between two keyframes.
+
+        :param scan_points: shape (n, 2), m, base frame.
+        :param increment: odometry increment since the last scan, shape (3,).
+        :param covariance: its covariance (3, 3) in the frame of its end.
+        """
+        self._priors = se2.compose(self._priors, increment)
+        ad = se2.adjoint(se2.inverse(increment))
+        self._odometry_covariance = ad @ self._odometry_covariance @ ad.T + covariance
+        leader = self.leader
+        before = self.poses[leader]
+        predicted = se2.compose(before, increment)
+        matched = self._match(scan_points, predicted, covariance)
+        self.poses = se2.compose(self.poses, se2.between(before, matched))
+
+    def _match(
+        self, points: NDArray[np.float64], predicted: NDArray[np.float64], covariance: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        settings, pool = self.mapping.configuration.matching, self.mapping.pool
+        table = self._tables[self.leader]
+        information = np.linalg.inv(_in_map_frame(covariance, predicted[2]))
+        pose, hessian = self._align(points, predicted, predicted, information)
+        fraction = matching.matched_fraction(points, pose, table, pool.field, pool.cell, self.mapping.near)
+        if fraction < settings.matched_fraction and len(points):
+            wide = self._search(points, predicted, information)
+            retried, retried_hessian = self._align(points, wide, wide, information)
+            again = matching.matched_fraction(points, retried, table, pool.field, pool.cell, self.mapping.near)
+            if again > fraction:
+                pose, hessian = retried, retried_hessian
+        self.tracking_covariance = _in_body_frame(np.linalg.inv(hessian + information), pose[2])
+        return pose
+
+    def _align(
+        self,
+        points: NDArray[np.float64],
+        start: NDArray[np.float64],
+        prior: NDArray[np.float64],
+        information: NDArray[np.float64],
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        settings, pool = self.mapping.configuration.matching, self.mapping.pool
+        return matching.align(  # type: ignore[no-any-return]
+            points, start, prior, information, self._tables[self.leader], pool.field, pool.cell, pool.radius,
+            settings.sigma_hit, settings.robust_scale, settings.iterations,
+        )
+
+    def _search(
+        self, points: NDArray[np.float64], centre: NDArray[np.float64], information: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """The best start in the search window, by correlation with the leader's map."""
+        settings, pool, model = self.mapping.configuration.matching, self.mapping.pool, self.mapping.model
+        step, angle = 2.0 * pool.cell, math.radians(settings.search_step)
+        counts = np.array(
+            [
+                math.ceil(settings.search_distance / step),
+                math.ceil(settings.search_distance / step),
+                math.ceil(math.radians(settings.search_angle) / angle),
+            ]
+        )
+        best, _ = matching.correlative_search(
+            points[:: max(1, len(points) // 90)], centre, 0.1 * information, np.array([step, step, angle]), counts,
+            self._tables[self.leader], pool.odds, pool.field, pool.cell, model.in_unknown, model.in_known, 0.1,
+        )
+        return best  # type: ignore[no-any-return]
+
+    def update(self, points: NDArray[np.float64], step: int) -> FilterStep:
+        """Draw every particle from its optimal proposal, weigh it, resample where ESS fell below its bound.
+
+        :param points: of the keyframe's scan, shape (n, 2), m, base frame.
+        :param step: number of the keyframe event, for the random streams.
+        """
+        settings, pool, model = self.mapping.configuration, self.mapping.pool, self.mapping.model
+        information = np.linalg.inv(_in_map_frame(self._odometry_covariance, self.pose[2]))
+        modes, means, covariances, evidences = batch.propose_all(
+            points, self.poses, self._priors, information, self._tables, pool.odds, pool.field, pool.cell, pool.radius,
+            settings.matching.sigma_hit, settings.matching.robust_scale, settings.matching.iterations,
+            model.in_unknown, model.in_known, settings.matching.sharpness, settings.matching.temper,
+        )
+        weights = _normalised(self.log_weights)
+        log_evidence = _log_mean(evidences, weights)
+        self.log_weights = self.log_weights + evidences
+        self.log_weights -= self.log_weights.max()
+        leader = self.leader
+        random = stream(settings.seed, Purpose.PARTICLES, self.hypothesis, step).standard_normal((len(means), 3))
+        self.poses = means + np.einsum("mij,mj->mi", np.linalg.cholesky(covariances), random)
+        # The leader keeps the mode, so that the published path has no sampling noise.
+        self.poses[leader] = modes[leader]
+        self.poses[:, 2] = se2.wrap(self.poses[:, 2])
+        covariance = _in_body_frame(covariances[leader], self.poses[leader, 2])
+        effective = 1.0 / float(np.sum(_normalised(self.log_weights) ** 2))
+        changed = leader != self._told_leader
+        if effective < settings.filter.ess_fraction * len(self.poses):
+            self._resample(step)
+        self._told_leader = self.leader
+        self._restart_odometry()
+        return FilterStep(covariance, log_evidence, effective, changed)
+
+    def _restart_odometry(self) -> None:
+        self._priors = self.poses.copy()
+        self._odometry_covariance = np.zeros((3, 3))
+
+    def _resample(self, step: int) -> None:
+        """Systematic resampling; the leader stands first, so that it still leads."""
+        weights = _normalised(self.log_weights)
+        offset = stream(self.mapping.configuration.seed, Purpose.RESAMPLING, self.hypothesis, step).random()
+        positions = (np.arange(len(weights)) + offset) / len(weights)
+        ancestors = np.minimum(np.searchsorted(np.cumsum(weights), positions), len(weights) - 1)
+        leader = self.leader
+        ancestors = np.concatenate((ancestors[ancestors == leader], ancestors[ancestors != leader]))
+        tables = np.stack([self.mapping.pool.share(self._tables[a]) for a in ancestors])
+        self.release()
+        self._tables = tables
+        self.poses, self.keyframe_poses = self.poses[ancestors], self.keyframe_poses[ancestors]
+        self.log_weights = np.zeros(len(weights))
+
+    def add_keyframe(self, keyframe: int, scan: Scan) -> None:
+        """Enter the scan into every particle's map at that particle's pose."""
+        for table, pose in zip(self._tables, self.poses, strict=True):
+            self.mapping.insert(table, pose, scan)
+        self.keyframes.append(keyframe)
+        self.keyframe_areas.append(self.area)
+        self.keyframe_poses = np.concatenate((self.keyframe_poses, self.poses[:, None]), axis=1)
+
+    def change_area(self, area: int, area_T_previous: NDArray[np.float64], content: Sequence[PlacedKeyframe]) -> None:
+        """Go over to the frame of another area and load its local map, the same for all particles.
+
+        :param area: the area now.
+        :param area_T_previous: shape (3,).
+        :param content: all keyframes of the local map, in the new frame.
+        """
+        self.area = area
+        self.poses = se2.compose(area_T_previous, self.poses)
+        self._priors = se2.compose(area_T_previous, self._priors)
+        self.release()
+        table = self.mapping.pool.empty_table()
+        for placed in content:
+            self.mapping.insert(table, placed.pose, placed.scan)
+        count = len(self.poses)
+        self._tables = np.stack([table] + [self.mapping.pool.share(table) for _ in range(count - 1)])
+        self.keyframes = [placed.keyframe for placed in content]
+        self.keyframe_areas = [placed.area for placed in content]
+        poses = np.array([placed.pose for placed in content]).reshape(-1, 3)
+        self.keyframe_poses = np.repeat(poses[None], count, axis=0)
+
+
+def _normalised(log_weights: NDArray[np.float64]) -> NDArray[np.float64]:
+    weights = np.exp(log_weights - log_weights.max())
+    return weights / weights.sum()
+
+
+def _log_mean(log_values: NDArray[np.float64], weights: NDArray[np.float64]) -> float:
+    top = log_values.max()
+    return float(top + np.log(np.sum(weights * np.exp(log_values - top))))
+
+
+def _in_map_frame(covariance: NDArray[np.float64], theta: float) -> NDArray[np.float64]:
+    """A covariance in the body's tangent frame as one of (x, y, theta) in the map frame, both (3, 3)."""
+    turn = se2.adjoint(np.array([0.0, 0.0, theta]))
+    return turn @ covariance @ turn.T
+
+
+def _in_body_frame(covariance: NDArray[np.float64], theta: float) -> NDArray[np.float64]:
+    """The inverse of :func:`_in_map_frame`."""
+    return _in_map_frame(covariance, -theta)

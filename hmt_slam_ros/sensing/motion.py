@@ -1,0 +1,64 @@
+"""Odometry increments between any two times, and how far they can be trusted."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hmt_slam_ros.configuration.tree import Motion
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.sensing.odometry import Odometry
+
+
+class OdometryBuffer:
+    """The recent odometry readings, from which the pose at a scan is interpolated."""
+
+    def __init__(self) -> None:
+        self._readings: deque[Odometry] = deque()
+
+    def add(self, reading: Odometry) -> None:
+        """Append a reading; one whose stamp goes back starts a new sequence."""
+        if self._readings and reading.stamp < self._readings[-1].stamp:
+            self._readings.clear()
+        self._readings.append(reading)
+
+    def covers(self, stamp: int) -> bool:
+        """Whether a reading at or after ``stamp`` (ns) has come."""
+        return bool(self._readings) and self._readings[-1].stamp >= stamp
+
+    def at(self, stamp: int) -> NDArray[np.float64] | None:
+        """``odom_T_base`` (3,) at ``stamp`` (ns): interpolated, held at the ends, None without any reading.
+
+        Readings before the one that is needed are forgotten.
+        """
+        while len(self._readings) > 1 and self._readings[1].stamp <= stamp:
+            self._readings.popleft()
+        if not self._readings:
+            return None
+        first = self._readings[0]
+        if first.stamp >= stamp or len(self._readings) == 1:
+            return first.pose
+        second = self._readings[1]
+        fraction = (stamp - first.stamp) / (second.stamp - first.stamp)
+        return se2.interpolate(first.pose, second.pose, fraction)
+
+
+def increment_covariance(increment: NDArray[np.float64], motion: Motion) -> NDArray[np.float64]:
+    """Covariance (3, 3) of an odometry increment in the frame of its end, m and rad.
+
+    Standard deviations grow linearly with the distance and the angle travelled; the lateral deviation equals the
+    longitudinal one.
+    """
+    distance = math.hypot(increment[0], increment[1])
+    angle = abs(float(se2.wrap(increment[2])))
+    translation = (
+        motion.translation_floor
+        + motion.translation_from_translation * distance
+        + motion.translation_from_rotation * math.degrees(angle)
+    )
+    rotation = math.radians(motion.rotation_floor + motion.rotation_from_translation * distance)
+    rotation += motion.rotation_from_rotation * angle
+    return np.diag([translation**2, translation**2, rotation**2])
