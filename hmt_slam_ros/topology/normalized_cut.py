@@ -1,0 +1,131 @@
+"""Normalised cut of a similarity graph, by spectral bisection and a sweep (Shi and Malik, PAMI 2000).
+
+With similarities A, cut(P1, P2) the sum of A over the pairs between the parts, and assoc(P, V) the sum over all pairs
+from P to the whole graph, pairs within P counting in both directions:
+
+    NCut(P1, P2) = cut(P1, P2) / assoc(P1, V) + cut(P1, P2) / assoc(P2, V),    in [0, 2].
+
+It is NCut = 0 where nothing is cut, also of a node without any similarity. A diagonal entry A_ii is what node i holds
+within itself: contracting nodes into one keeps the value of every cut that does not split them.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import eigh
+from scipy.sparse.csgraph import connected_components
+
+# Similarity of neighbours in the order of the nodes, relative to the largest, that joins what is not connected.
+_CHAIN = 1e-6
+
+
+class Cut(NamedTuple):
+    """A bipartition.
+
+    :ivar side: shape (n,), True for the part P2; node 0 is always in P1.
+    :ivar value: NCut(P1, P2).
+    """
+
+    side: NDArray[np.bool_]
+    value: float
+
+
+def ncut(similarity: NDArray[np.float64], side: NDArray[np.bool_]) -> float:
+    """NCut of a given bipartition.
+
+    :param similarity: shape (n, n), symmetric, not negative.
+    :param side: shape (n,), True for one part.
+    """
+    between = float(similarity[np.ix_(side, ~side)].sum())
+    degree = similarity.sum(axis=1)
+    return float(_value(np.array(between), np.array(degree[side].sum()), np.array(degree[~side].sum())))
+
+
+def _value(between: NDArray[np.float64], one: NDArray[np.float64], other: NDArray[np.float64]) -> NDArray[np.float64]:
+    shares = [np.divide(between, part, out=np.zeros_like(between), where=part > 0.0) for part in (one, other)]
+    return shares[0] + shares[1]
+
+
+def normalized_cut(
+    similarity: NDArray[np.float64], min_size: int = 1, sizes: NDArray[np.int64] | None = None
+) -> Cut | None:
+    """The best bipartition found: every prefix of every leading eigenvector's order is tried (a sweep cut).
+
+    :param similarity: shape (n, n), symmetric, not negative. The order of the nodes is that of time: only where the
+        graph falls apart does it decide, then a node without similarities stays with its neighbours in time.
+    :param min_size: smallest part allowed, in units of ``sizes``.
+    :param sizes: shape (n,), what each node counts; None for one each.
+    :returns: None where no bipartition has parts large enough.
+    """
+    n = len(similarity)
+    sizes = np.ones(n, np.int64) if sizes is None else sizes
+    if n < 2:
+        return None
+    best: Cut | None = None
+    for order in _orders(similarity):
+        cut = _sweep(similarity, order, min_size, sizes)
+        if cut is not None and (best is None or cut.value < best.value - 1e-12):
+            best = cut
+    return best
+
+
+def _orders(similarity: NDArray[np.float64]) -> list[NDArray[np.intp]]:
+    """Orders of the nodes along the leading solutions of (D - A) x = lambda D x, shape (n,) each."""
+    n = len(similarity)
+    chain = _CHAIN * max(float(similarity.max()), _CHAIN)
+    joined = similarity + chain * (np.eye(n, k=1) + np.eye(n, k=-1))
+    scale = 1.0 / np.sqrt(joined.sum(axis=1))
+    # x = D^-1/2 y with y an eigenvector of the symmetric I - D^-1/2 A D^-1/2.
+    laplacian = np.eye(n) - scale[:, None] * joined * scale
+    # Each component beyond the first has an eigenvalue near 0; the next solution bisects a component.
+    last = min(n - 1, int(connected_components(similarity, directed=False)[0]) + 1)
+    vectors = eigh(laplacian, subset_by_index=(0, last))[1]
+    return [np.argsort(scale * vector, kind="stable") for vector in vectors.T]
+
+
+def _sweep(
+    similarity: NDArray[np.float64], order: NDArray[np.intp], min_size: int, sizes: NDArray[np.int64]
+) -> Cut | None:
+    """The best of the bipartitions that divide ``order`` in two, or None where each has too small a part."""
+    within = np.diag(np.cumsum(np.cumsum(similarity[np.ix_(order, order)], axis=0), axis=1))[:-1]
+    assoc = np.cumsum(similarity.sum(axis=1)[order])
+    values = _value(np.maximum(assoc[:-1] - within, 0.0), assoc[:-1], assoc[-1] - assoc[:-1])
+    size = np.cumsum(sizes[order])
+    allowed = (size[:-1] >= min_size) & (size[-1] - size[:-1] >= min_size)
+    if not allowed.any():
+        return None
+    prefix = order[: int(np.argmin(np.where(allowed, values, np.inf))) + 1]
+    side = np.zeros(len(order), np.bool_)
+    side[prefix] = True
+    side ^= side[0]
+    return Cut(side, ncut(similarity, side))
+
+
+def recursive_cut(
+    similarity: NDArray[np.float64], threshold: float, min_size: int = 1, sizes: NDArray[np.int64] | None = None
+) -> NDArray[np.int64]:
+    """Partition by cutting each part again, as a graph of its own, while its NCut is at most ``threshold``.
+
+    :param similarity: as for :func:`normalized_cut`.
+    :param threshold: largest NCut at which a part is cut, in [0, 2].
+    :param min_size: smallest part allowed, in units of ``sizes``.
+    :param sizes: shape (n,), what each node counts; None for one each.
+    :returns: shape (n,), the part of each node; parts are numbered in the order of their first nodes.
+    """
+    sizes = np.ones(len(similarity), np.int64) if sizes is None else sizes
+    labels = np.zeros(len(similarity), np.int64)
+    waiting, parts = [np.arange(len(similarity))], 0
+    while waiting:
+        nodes = waiting.pop()
+        cut = normalized_cut(similarity[np.ix_(nodes, nodes)], min_size, sizes[nodes])
+        if cut is not None and cut.value <= threshold:
+            waiting += [nodes[cut.side], nodes[~cut.side]]
+        else:
+            labels[nodes] = parts
+            parts += 1
+    first = np.unique(labels, return_index=True)[1]
+    rank = np.argsort(np.argsort(first))
+    return rank[labels]
