@@ -1,0 +1,35 @@
+"""Who hears what: the same for the lock-step run and for the nodes."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from hmt_slam_ros.processes.messages import (
+    Accepted,
+    AreaEvents,
+    EndOfLog,
+    Finished,
+    Hypotheses,
+    Keyframe,
+    LocalEstimate,
+    Message,
+    Trail,
+)
+from hmt_slam_ros.sensing import Odometry, Scan
+
+
+class Process(Protocol):
+    """A value machine: no thread, clock, file or global random state inside."""
+
+    def handle(self, message: Message) -> list[Message]:
+        """Take in one message and return what there is to say."""
+
+
+HEARD_BY: dict[str, tuple[type, ...]] = {
+    "slam": (Scan, Odometry, Hypotheses, Accepted, EndOfLog),
+    "aam": (Keyframe, Hypotheses, Accepted),
+    "tsbi": (Keyframe, AreaEvents, Accepted),
+    "tlca": (Keyframe, Hypotheses),
+    "rtl": (Odometry, LocalEstimate, Hypotheses, Accepted),
+    "recorder": (Keyframe, Hypotheses, Accepted, Trail, LocalEstimate, Finished),
+}
