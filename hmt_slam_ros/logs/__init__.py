@@ -1,1 +1,7 @@
 """Sources of scans and odometry: rosbag2, CARMEN, MRPT rawlog."""
+
+from hmt_slam_ros.logs.open_log import open_log
+from hmt_slam_ros.logs.records import Log, LogRecord
+from hmt_slam_ros.logs.writer import convert, write_bag
+
+__all__ = ["Log", "LogRecord", "convert", "open_log", "write_bag"]

@@ -13,9 +13,15 @@ from hmt_slam_ros.sensing import Odometry, Scan
 class LogRecord:
     """One measurement of a log, in file order.
 
+    The stamps of the measurements come from one running clock over all records of the log in file order: each is
+    the later of the record's source stamp and the last stamp given. A scan lies strictly after the scan before it
+    and an odometry reading strictly after the odometry reading before it, 1 microsecond where the source does not
+    advance. An odometry reading that belongs to a scan (the odometry fields of a CARMEN scan, the action before a
+    rawlog's observation) has exactly the scan's stamp and comes just before it. A part of a log has the stamps that
+    the same records have in the whole log.
+
     :ivar source_stamp: the log's own time stamp in ns, which may jump back; results are keyed by it.
-    :ivar measurement: the scan or odometry reading; its ``stamp`` is in ns and strictly increasing within its kind
-        over the log: ``source_stamp`` wherever that moves forward, and just after its predecessor where it does not.
+    :ivar measurement: the scan or odometry reading, with its ``stamp`` from the running clock, ns.
     """
 
     source_stamp: int
@@ -31,14 +37,15 @@ class Log(Protocol):
 
     @property
     def scan_count(self) -> int:
-        """Number of scans in the whole log."""
+        """Number of scans that `records` yields."""
 
     @property
     def duration(self) -> float:
-        """Seconds from the first to the last record."""
+        """Seconds from the first to the last record, on the running clock."""
 
     def records(self) -> Iterator[LogRecord]:
         """All measurements in file order, from the start at every call.
 
-        :raises HmtSlamError: where the file is truncated or malformed, when that place is reached.
+        :raises HmtSlamError: where the file is damaged, when that place is reached; everything that can be noticed
+            earlier is refused when the log is opened.
         """

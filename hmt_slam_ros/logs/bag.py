@@ -1,0 +1,187 @@
+"""rosbag2 recordings, mcap or sqlite3, read without a ROS installation."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import pairwise
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hmt_slam_ros.errors import HmtSlamError
+from hmt_slam_ros.logs.bag_messages import (
+    BagMessage,
+    choose_odom_topic,
+    choose_scan_topic,
+    header_of,
+    read_messages,
+    read_topics,
+)
+from hmt_slam_ros.logs.entries import Window, require_scans
+from hmt_slam_ros.logs.mounting import Mounting, heading_of_quaternion, planar_mounting
+from hmt_slam_ros.logs.records import LogRecord
+from hmt_slam_ros.logs.ros_types import LASER_SCAN, ODOMETRY, TRANSFORMS, RosMessage, deserialize
+from hmt_slam_ros.logs.stamps import NANOSECONDS, running_stamps
+from hmt_slam_ros.logs.transforms import FrameTree, frame_name
+from hmt_slam_ros.sensing import Odometry, Scan
+
+_ODOM_FRAME, _BASE_FRAME = "odom", "base_link"
+
+
+class _Measurement(NamedTuple):
+    """A scan or odometry reading that is not yet deserialized.
+
+    :ivar bag_time: ns.
+    :ivar source_stamp: of its header, ns.
+    :ivar scan_frame: frame of a scan, None for odometry.
+    :ivar content: bytes of the message, or the transform that stands for an odometry reading.
+    """
+
+    bag_time: int
+    source_stamp: int
+    scan_frame: str | None
+    content: RosMessage
+
+
+class BagLog:
+    """A rosbag2 whose scans stay on disk until they are asked for.
+
+    All of it is passed over once when the log is opened, so damage shows then. The source stamp of a record is its
+    header's; the order is that of the bag's own times, and at one bag time odometry comes before the scan.
+
+    :param path: a bag folder, or a .mcap or .db3 file.
+    :param window: the part wanted.
+    :param scan_topic: topic of the scans; the only LaserScan topic where the default does not exist.
+    :param odom_topic: topic of the odometry, chosen likewise; without any, the transform odom -> base on /tf.
+    :raises HmtSlamError: where the bag is truncated or damaged, or lacks scans, odometry or the laser's transform.
+    """
+
+    def __init__(self, path: Path, window: Window, scan_topic: str, odom_topic: str) -> None:
+        self._path = path
+        topics = read_topics(path)
+        self._scan_topic = choose_scan_topic(topics, scan_topic, path.name)
+        self._odom_topic = choose_odom_topic(topics, odom_topic, path.name)
+        self._base = self._base_frame()
+        headers = [measurement[:3] for measurement in self._measurements()]
+        is_scan = [frame is not None for _, _, frame in headers]
+        self._stamps = running_stamps([stamp for _, stamp, _ in headers], is_scan, _precedes_its_scan(headers))
+        self._part = window.among(self._stamps)
+        self._scan_count = sum(is_scan[self._part])
+        require_scans(path.name, self._scan_count, sum(is_scan))
+        self._mountings = self._find_mountings(sorted({frame for _, _, frame in headers if frame is not None}))
+
+    @property
+    def name(self) -> str:
+        """Short name for reports."""
+        return self._path.stem if self._path.is_file() else self._path.name
+
+    @property
+    def scan_count(self) -> int:
+        """Number of scans."""
+        return self._scan_count
+
+    @property
+    def duration(self) -> float:
+        """Seconds from the first to the last record."""
+        part = self._stamps[self._part]
+        return float(part[-1] - part[0]) / NANOSECONDS
+
+    def records(self) -> Iterator[LogRecord]:
+        """All measurements in file order."""
+        for k, measurement in enumerate(self._measurements()):
+            if k >= self._part.stop:
+                return
+            if k >= self._part.start:
+                yield self._record(measurement, int(self._stamps[k]))
+
+    def _record(self, measurement: _Measurement, stamp: int) -> LogRecord:
+        if measurement.scan_frame is not None:
+            message = deserialize(measurement.content, LASER_SCAN)
+            return LogRecord(measurement.source_stamp, _scan(message, stamp, self._mountings[measurement.scan_frame]))
+        if self._odom_topic is None:
+            move, turn = measurement.content.translation, measurement.content.rotation
+        else:
+            pose = deserialize(measurement.content, ODOMETRY).pose.pose
+            move, turn = pose.position, pose.orientation
+        heading = heading_of_quaternion((turn.x, turn.y, turn.z, turn.w))
+        return LogRecord(measurement.source_stamp, Odometry(stamp, np.array([move.x, move.y, heading])))
+
+    def _measurements(self) -> Iterator[_Measurement]:
+        for message in read_messages(self._path, {self._scan_topic, self._odom_topic or "/tf"}):
+            if message.kind == TRANSFORMS:
+                yield from self._odometry_transforms(message)
+            else:
+                stamp, frame = header_of(message.content)
+                scan_frame = frame_name(frame) if message.kind == LASER_SCAN else None
+                yield _Measurement(message.bag_time, stamp, scan_frame, message.content)
+
+    def _odometry_transforms(self, message: BagMessage) -> Iterator[_Measurement]:
+        for joint in deserialize(message.content, TRANSFORMS).transforms:
+            if (frame_name(joint.header.frame_id), frame_name(joint.child_frame_id)) == (_ODOM_FRAME, self._base):
+                stamp = joint.header.stamp.sec * NANOSECONDS + joint.header.stamp.nanosec
+                yield _Measurement(message.bag_time, stamp, None, joint.transform)
+
+    def _base_frame(self) -> str:
+        """The robot's frame: the child frame of the odometry."""
+        if self._odom_topic is not None:
+            for message in read_messages(self._path, {self._odom_topic}):
+                return frame_name(deserialize(message.content, ODOMETRY).child_frame_id) or _BASE_FRAME
+            raise HmtSlamError(
+                f"{self._path.name} has no message on {self._odom_topic}: record the wheel odometry in it."
+            )
+        for message in read_messages(self._path, {"/tf"}):
+            for joint in deserialize(message.content, TRANSFORMS).transforms:
+                if frame_name(joint.header.frame_id) == _ODOM_FRAME:
+                    return frame_name(joint.child_frame_id)
+        raise HmtSlamError(
+            f"{self._path.name} has neither a topic of type {ODOMETRY} nor a transform from {_ODOM_FRAME!r} on /tf: "
+            "record the wheel odometry in it."
+        )
+
+    def _find_mountings(self, frames: list[str]) -> dict[str, Mounting]:
+        """Where each scan frame is on the robot; /tf serves where /tf_static says nothing."""
+        mountings: dict[str, Mounting] = {}
+        tree = FrameTree()
+        for topic in ("/tf_static", "/tf"):
+            for message in read_messages(self._path, {topic}):
+                if len(mountings) == len(frames):
+                    return mountings
+                tree.add(deserialize(message.content, TRANSFORMS))
+                if topic == "/tf":
+                    self._look_up(frames, tree, mountings)
+            self._look_up(frames, tree, mountings)
+        for frame in frames:
+            if frame not in mountings:
+                raise HmtSlamError(
+                    f"{self._path.name} has no transform from {self._base!r} to the scans' frame {frame!r}: "
+                    "record /tf_static with it."
+                )
+        return mountings
+
+    def _look_up(self, frames: list[str], tree: FrameTree, mountings: dict[str, Mounting]) -> None:
+        for frame in frames:
+            base_T_laser = tree.pose(self._base, frame)
+            if frame not in mountings and base_T_laser is not None:
+                mountings[frame] = planar_mounting(base_T_laser, f"the laser {frame!r} of {self._path.name}")
+
+
+def _precedes_its_scan(headers: list[tuple[int, int, str | None]]) -> list[bool]:
+    """For each measurement, whether it is odometry with the bag time and stamp of a scan right behind it."""
+    pairs = [a[2] is None and b[2] is not None and a[:2] == b[:2] for a, b in pairwise(headers)]
+    return [*pairs, False][: len(headers)]
+
+
+def _scan(message: RosMessage, stamp: int, mounting: Mounting) -> Scan:
+    ranges: NDArray[np.float32] = message.ranges
+    return Scan(
+        stamp,
+        ranges,
+        mounting.side * message.angle_min,
+        mounting.side * message.angle_increment,
+        message.range_min,
+        message.range_max,
+        mounting.laser_pose,
+        message.time_increment,
+    )

@@ -1,0 +1,221 @@
+"""CARMEN logs: FLASER, ROBOTLASER1 and ODOM lines; all others carry no measurement that is used here."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hmt_slam_ros.errors import HmtSlamError
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.logs.entries import Entry, EntryLog, Window
+from hmt_slam_ros.logs.saturation import smallest_saturated
+from hmt_slam_ros.logs.stamps import stamp_from_seconds
+from hmt_slam_ros.sensing import Odometry, Scan
+
+_KNOWN_LINE = re.compile(rb"^(# message_name|(PARAM|SYNC|ODOM|FLASER|RLASER|ROBOTLASER\d|RAWLASER\d|TRUEPOS) )", re.M)
+_FRONT_LASER_OFFSET = b"robot_frontlaser_offset"
+_TRAILER = 3  # ipc_timestamp ipc_hostname logger_timestamp
+_FEWEST_SCANS_FOR_OFFSET = 10
+_LARGEST_OFFSET = 2.0  # m; farther from its odometry, a pose is a corrected one and not the laser's
+_SAME_OFFSET = 2e-3  # m and rad; the poses are written with six decimals
+
+
+@dataclass(frozen=True, eq=False)
+class _Sweep:
+    """A scan as a line tells it.
+
+    :ivar ranges: shape (n,), float32, metres.
+    :ivar angle_min: rad.
+    :ivar increment: rad.
+    :ivar stated_max: the sensor's maximum where the line states it, metres, else inf.
+    :ivar robot_pose: shape (3,), ``odom_T_base``.
+    :ivar laser_pose: shape (3,), the line's pose of the laser, in the frame of the odometry or a corrected one.
+    :ivar is_front: a FLASER line, which tells less.
+    """
+
+    ranges: NDArray[np.float32]
+    angle_min: float
+    increment: float
+    stated_max: float
+    robot_pose: NDArray[np.float64]
+    laser_pose: NDArray[np.float64]
+    is_front: bool
+
+
+class _Reading(NamedTuple):
+    """An ODOM line's pose (3,), or a scan, with its stamp in ns."""
+
+    stamp: int
+    content: NDArray[np.float64] | _Sweep
+
+
+@dataclass
+class _Content:
+    """What the lines of a file hold."""
+
+    readings: list[_Reading] = field(default_factory=list)
+    front_laser_offset: float = 0.0
+
+
+def looks_like_carmen(content: bytes) -> bool:
+    """Whether one of the first lines is one that CARMEN writes."""
+    return _KNOWN_LINE.search(content[:65536]) is not None
+
+
+def open_carmen(path: Path, content: bytes, window: Window) -> EntryLog:
+    """A CARMEN log, in file order.
+
+    Odometry is taken from the ODOM lines and from the ``odom_*`` fields of FLASER or the robot pose of ROBOTLASER1,
+    which belong to the scan; the stamp is the ``ipc_timestamp``. FLASER does not state angles: the sweep begins at
+    -90 degrees; an odd number of beams includes both ends of the half circle, an even one leaves out the last. Nor
+    does it state the sensor's maximum, which `smallest_saturated` finds from all scans together.
+
+    :param path: for the name.
+    :param content: the file, decompressed.
+    :param window: the part wanted.
+    :raises HmtSlamError: where a line is cut off or malformed, or there is no scan.
+    """
+    parsed = _parse(content, path.name)
+    sweeps = [reading.content for reading in parsed.readings if isinstance(reading.content, _Sweep)]
+    limits = _range_limits(sweeps)
+    mounting = _Mountings(sweeps, parsed.front_laser_offset)
+    return EntryLog(_stem(path), list(_entries(parsed.readings, limits, mounting)), window)
+
+
+def _stem(path: Path) -> str:
+    return Path(path.stem).stem if path.suffix in {".gz", ".xz"} else path.stem
+
+
+def _entries(readings: Iterable[_Reading], limits: dict[float, float], mountings: _Mountings) -> Iterator[Entry]:
+    for stamp, content in readings:
+        if isinstance(content, _Sweep):
+            yield Entry(stamp, Odometry, (content.robot_pose,), precedes_its_scan=True)
+            limit = limits[content.stated_max]
+            geometry = (content.angle_min, content.increment, 0.0, limit, mountings.of(content))
+            yield Entry(stamp, Scan, (content.ranges, *geometry))
+        else:
+            yield Entry(stamp, Odometry, (content,))
+
+
+def _parse(content: bytes, name: str) -> _Content:
+    parsed = _Content()
+    lines = content.split(b"\n")
+    for number, line in enumerate(lines, start=1):
+        tokens = line.split()
+        if not tokens:
+            continue
+        try:
+            if tokens[0] in _MEASUREMENTS:
+                parsed.readings.append(_MEASUREMENTS[tokens[0]](tokens))
+            elif tokens[:2] == [b"PARAM", _FRONT_LASER_OFFSET]:
+                parsed.front_laser_offset = float(tokens[2])
+        except (ValueError, IndexError):
+            end = " (the last one)" if number == len(lines) else ""
+            raise HmtSlamError(
+                f"line {number}{end} of {name} is cut off or malformed: copy the log anew or remove that line."
+            ) from None
+    return parsed
+
+
+def _odom(tokens: list[bytes]) -> _Reading:
+    """``ODOM x y theta tv rv accel`` and the trailer."""
+    return _Reading(_stamp(tokens, 7), np.array(_numbers(tokens, 1, 3)))
+
+
+def _flaser(tokens: list[bytes]) -> _Reading:
+    """``FLASER n r1..rn x y theta odom_x odom_y odom_theta`` and the trailer."""
+    count = int(tokens[1])
+    stamp = _stamp(tokens, 2 + count + 6)
+    poses = np.array(_numbers(tokens, 2 + count, 6))
+    increment = np.pi / max(count - count % 2, 1)
+    ranges = np.array(_numbers(tokens, 2, count), dtype=np.float32)
+    return _Reading(stamp, _Sweep(ranges, -np.pi / 2, increment, np.inf, poses[3:], poses[:3], is_front=True))
+
+
+def _robotlaser(tokens: list[bytes]) -> _Reading:
+    """A laser that tells its geometry.
+
+    ``ROBOTLASER1 type start_angle field_of_view resolution maximum_range accuracy remission_mode n r1..rn
+    m s1..sm laser_x laser_y laser_theta robot_x robot_y robot_theta tv rv`` three safety fields and the trailer.
+    """
+    start, field_of_view, resolution, maximum = _numbers(tokens, 2, 4)
+    count = int(tokens[8])
+    poses_at = 10 + count + int(tokens[9 + count])
+    stamp = _stamp(tokens, poses_at + 6 + 5)
+    poses = np.array(_numbers(tokens, poses_at, 6))
+    increment = resolution if resolution > 0.0 else field_of_view / max(count - 1, 1)
+    ranges = np.array(_numbers(tokens, 9, count), dtype=np.float32)
+    limit = maximum if maximum > 0.0 else np.inf
+    return _Reading(stamp, _Sweep(ranges, start, increment, limit, poses[3:], poses[:3], is_front=False))
+
+
+_MEASUREMENTS: dict[bytes, Callable[[list[bytes]], _Reading]] = {
+    b"ODOM": _odom,
+    b"FLASER": _flaser,
+    b"ROBOTLASER1": _robotlaser,
+}
+
+
+def _stamp(tokens: list[bytes], at: int) -> int:
+    """The stamp at the trailer's begin; the trailer must be there whole, and nothing behind it."""
+    if len(tokens) != at + _TRAILER:
+        raise ValueError("wrong number of fields")
+    return stamp_from_seconds(tokens[at].decode())
+
+
+def _numbers(tokens: list[bytes], begin: int, count: int) -> list[float]:
+    return list(map(float, tokens[begin : begin + count]))
+
+
+def _range_limits(sweeps: Sequence[_Sweep]) -> dict[float, float]:
+    """The smallest range that means "no return", metres, by the maximum that the lines state (inf for none).
+
+    Sensors that state a maximum often report a smaller value for a beam without a return, so that is looked for too.
+    """
+    limits = {}
+    for stated in {sweep.stated_max: None for sweep in sweeps}:
+        ranges = np.concatenate([sweep.ranges for sweep in sweeps if sweep.stated_max == stated])
+        limits[stated] = min(smallest_saturated(ranges), float(np.float32(stated)))
+    return limits
+
+
+class _Mountings:
+    """``base_T_laser`` of each scan.
+
+    ROBOTLASER1 has both poses. In FLASER, the first pose is the laser's as the odometry has it, or a corrected pose
+    of the robot. Only in the first case is it at the same place relative to the odometry in every scan; then that is
+    the mounting. Else the log's robot_frontlaser_offset tells, and without it the laser is at the origin.
+    """
+
+    def __init__(self, sweeps: Sequence[_Sweep], front_laser_offset: float) -> None:
+        self._known: list[NDArray[np.float64]] = []
+        front = _constant_offset([sweep for sweep in sweeps if sweep.is_front])
+        self._front = np.array([front_laser_offset, 0.0, 0.0]) if front is None else front
+
+    def of(self, sweep: _Sweep) -> NDArray[np.float64]:
+        """Shape (3,); poses that differ by rounding only are one."""
+        if sweep.is_front:
+            return self._front
+        offset = se2.between(sweep.robot_pose, sweep.laser_pose)
+        for known in self._known:
+            if np.all(np.abs(se2.between(known, offset)) < _SAME_OFFSET):
+                return known
+        self._known.append(np.round(offset, 4))
+        return self._known[-1]
+
+
+def _constant_offset(sweeps: Sequence[_Sweep]) -> NDArray[np.float64] | None:
+    if len(sweeps) < _FEWEST_SCANS_FOR_OFFSET:
+        return None
+    robot = np.array([sweep.robot_pose for sweep in sweeps])
+    offsets = se2.between(robot, np.array([sweep.laser_pose for sweep in sweeps]))
+    middle = np.round(np.median(offsets, axis=0), 4)
+    constant = bool(np.all(np.abs(se2.between(middle, offsets)) < _SAME_OFFSET))
+    apart = np.abs(middle).max() > _SAME_OFFSET and np.hypot(*middle[:2]) < _LARGEST_OFFSET
+    return middle if constant and apart else None

@@ -1,0 +1,71 @@
+"""The plane of a laser that is mounted anywhere on the robot."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hmt_slam_ros.errors import HmtSlamError
+
+_LARGEST_TILT = np.deg2rad(10.0)  # beyond it, ranges are too far from distances on the floor plan
+
+
+class Mounting(NamedTuple):
+    """Where a laser is in the plane.
+
+    :ivar laser_pose: shape (3,), ``base_T_laser`` as (x, y, theta) in m and rad.
+    :ivar side: 1.0, or -1.0 for a laser mounted upside down: its angles count the other way round.
+    """
+
+    laser_pose: NDArray[np.float64]
+    side: float
+
+
+def planar_mounting(base_T_laser: ArrayLike, laser_name: str) -> Mounting:
+    """The planar pose of a laser whose scan plane is level, upright or upside down.
+
+    :param base_T_laser: shape (4, 4), homogeneous transform, metres.
+    :param laser_name: for the message.
+    :raises HmtSlamError: where the scan plane is tilted by more than 10 degrees.
+    """
+    transform = np.asarray(base_T_laser, dtype=np.float64)
+    upright = float(transform[2, 2])  # cosine between the laser's z axis and the robot's
+    tilt = float(np.arccos(min(abs(upright), 1.0)))
+    if not tilt <= _LARGEST_TILT:
+        raise HmtSlamError(
+            f"{laser_name} is tilted by {np.rad2deg(tilt):.0f} degrees, and only a level laser can be used: "
+            "choose another scan or correct its mounting."
+        )
+    heading = float(np.arctan2(transform[1, 0], transform[0, 0]))
+    return Mounting(np.array([transform[0, 3], transform[1, 3], heading]), 1.0 if upright > 0.0 else -1.0)
+
+
+def transform_from_quaternion(translation: ArrayLike, quaternion: ArrayLike) -> NDArray[np.float64]:
+    """Homogeneous transform (4, 4).
+
+    :param translation: (x, y, z) in metres.
+    :param quaternion: (x, y, z, w), of any length but zero.
+    """
+    x, y, z, w = np.asarray(quaternion, dtype=np.float64) / np.linalg.norm(quaternion)
+    transform = np.eye(4)
+    transform[:3, :3] = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    transform[:3, 3] = translation
+    return transform
+
+
+def heading_of_quaternion(quaternion: ArrayLike) -> float:
+    """Rotation about z, rad; exact to the last bits where the rotation is about z alone.
+
+    :param quaternion: (x, y, z, w), of any length but zero.
+    """
+    x, y, z, w = np.asarray(quaternion, dtype=np.float64).tolist()
+    if x == 0.0 and y == 0.0:
+        heading = 2.0 * np.arctan2(z, w)
+        return float(heading - 2.0 * np.pi * np.round(heading / (2.0 * np.pi)))
+    return float(np.arctan2(2.0 * (w * z + x * y), w * w + x * x - y * y - z * z))

@@ -1,0 +1,60 @@
+"""Time stamps as integer nanoseconds, and the one running clock of a log."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from decimal import Decimal, InvalidOperation
+
+import numpy as np
+from numpy.typing import NDArray
+
+NANOSECONDS = 1_000_000_000
+
+_STEP = 1_000  # ns between two readings of one kind where the source's clock does not advance
+
+
+def stamp_from_seconds(text: str) -> int:
+    """Nanoseconds of a decimal number of seconds, exact: a float64 keeps only 100 ns of a stamp of this century.
+
+    :param text: such as ``976052857.337284`` or ``1.4e3``; digits beyond the ninth decimal are cut off.
+    :raises ValueError: where the text is no finite number.
+    """
+    whole, _, fraction = text.partition(".")
+    if whole.isdecimal() and (fraction.isdecimal() or not fraction):
+        return int(whole) * NANOSECONDS + int(fraction[:9].ljust(9, "0"))
+    try:
+        return int(Decimal(text) * NANOSECONDS)
+    except (InvalidOperation, OverflowError, ValueError):
+        raise ValueError(f"{text!r} is no time in seconds") from None
+
+
+def seconds_from_stamp(stamp: int) -> str:
+    """Decimal seconds with nine decimals, from which `stamp_from_seconds` recovers the stamp exactly."""
+    whole, fraction = divmod(abs(stamp), NANOSECONDS)
+    return f"{'-' if stamp < 0 else ''}{whole}.{fraction:09d}"
+
+
+def running_stamps(
+    sources: Sequence[int], is_scan: Sequence[bool], precedes_its_scan: Sequence[bool]
+) -> NDArray[np.int64]:
+    """Stamps of one running clock over all readings of a log, shape (n,), ns; the rule is in `LogRecord`.
+
+    :param sources: the log's own stamps in file order, ns.
+    :param is_scan: scan (True) or odometry reading (False).
+    :param precedes_its_scan: True for an odometry reading that belongs to the scan right behind it.
+    """
+    stamps = np.empty(len(sources), dtype=np.int64)
+    last_scan = last_odometry = last = min(sources, default=0) - _STEP
+    for k, (source, scan, paired) in enumerate(zip(sources, is_scan, precedes_its_scan, strict=True)):
+        if scan and k and precedes_its_scan[k - 1]:
+            stamp = last
+        else:
+            stamp = max(source, last)
+            if scan or paired:
+                stamp = max(stamp, last_scan + _STEP)
+            if not scan:
+                stamp = max(stamp, last_odometry + _STEP)
+        last_scan = stamp if scan else last_scan
+        last_odometry = last_odometry if scan else stamp
+        stamps[k] = last = stamp
+    return stamps

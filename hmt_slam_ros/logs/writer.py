@@ -1,0 +1,190 @@
+"""Writing any log as a rosbag2, so that every ROS 2 tool can play it."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+
+from hmt_slam_ros.errors import HmtSlamError
+from hmt_slam_ros.logs.open_log import open_log
+from hmt_slam_ros.logs.records import Log, LogRecord
+from hmt_slam_ros.logs.ros_types import LASER_SCAN, ODOMETRY, TRANSFORMS, RosMessage, typestore
+from hmt_slam_ros.logs.stamps import NANOSECONDS
+from hmt_slam_ros.sensing import Odometry, Scan
+
+ODOM_FRAME, BASE_FRAME, LASER_FRAME = "odom", "base_link", "laser"
+
+_STORAGES = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}
+_NEVER = QosTime(9223372036, 854775807)  # "no deadline", as rosbag2 itself writes it
+
+
+def convert(
+    source: Path,
+    destination: Path,
+    *,
+    storage: str = "mcap",
+    scan_topic: str = "/scan",
+    odom_topic: str = "/odom",
+    start: float = 0.0,
+    duration: float | None = None,
+) -> Log:
+    """Write a log of any format, or a part of it, as a rosbag2 folder.
+
+    :param source: the log, as `open_log` takes it, with ``scan_topic`` ... ``duration``.
+    :param destination: folder to be made; it must not exist.
+    :param storage: ``mcap`` or ``sqlite3``.
+    :returns: the log that was read.
+    :raises HmtSlamError: where the log cannot be read or the folder not be made; nothing is left behind.
+    """
+    log = open_log(source, scan_topic=scan_topic, odom_topic=odom_topic, start=start, duration=duration)
+    write_bag(log, destination, storage=storage)
+    return log
+
+
+def write_bag(log: Log, destination: Path, *, storage: str = "mcap") -> None:
+    """Write a log as a rosbag2 folder with /scan, /odom, /tf (odom -> base_link) and /tf_static (base_link -> laser).
+
+    The bag's own times are the running clock's, so they never jump back; each header holds the source stamp, so a
+    reader gets back the log's own stamps, and by the same rule the same running clock. Angles become float32, as the
+    message has them. Where the laser's pose changes within the log, each pose is a frame of its own: laser, laser_1...
+
+    :raises HmtSlamError: where the folder exists or cannot be written; nothing is left behind.
+    """
+    if storage not in _STORAGES:
+        raise HmtSlamError(f"storage {storage!r} is not known: choose one of {', '.join(_STORAGES)}.")
+    if destination.exists():
+        raise HmtSlamError(f"{destination} exists already: choose another name or remove it first.")
+    try:
+        destination.absolute().parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=".partial-", dir=destination.absolute().parent) as folder:
+            finished = Path(folder) / destination.name
+            _write(log, finished, _STORAGES[storage])
+            finished.rename(destination)
+    except OSError as error:
+        raise HmtSlamError(f"{destination} cannot be written ({error.strerror}): choose another folder.") from error
+
+
+def _write(log: Log, folder: Path, storage: StoragePlugin) -> None:
+    frames = _laser_frames(log)
+    writer = Writer(folder, version=9, storage_plugin=storage)
+    if storage == StoragePlugin.MCAP:
+        writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
+    with writer:
+        types = {"/scan": LASER_SCAN, "/odom": ODOMETRY, "/tf": TRANSFORMS, "/tf_static": TRANSFORMS}
+        connections = {
+            topic: writer.add_connection(topic, kind, typestore=typestore(), offered_qos_profiles=[_qos(topic)])
+            for topic, kind in types.items()
+        }
+        for topic, stamp, message in _messages(log.records(), frames):
+            content = typestore().serialize_cdr(message, types[topic])
+            writer.write(connections[topic], stamp, content)
+
+
+def _qos(topic: str) -> Qos:
+    static = topic == "/tf_static"
+    durability = QosDurability.TRANSIENT_LOCAL if static else QosDurability.VOLATILE
+    return Qos(
+        QosHistory.KEEP_LAST,
+        1 if static else 100,
+        QosReliability.RELIABLE,
+        durability,
+        _NEVER,
+        _NEVER,
+        QosLiveliness.AUTOMATIC,
+        _NEVER,
+        avoid_ros_namespace_conventions=False,
+    )
+
+
+def _laser_frames(log: Log) -> dict[bytes, tuple[str, NDArray[np.float64]]]:
+    """Name and pose of every laser frame, by the bytes of the pose, in the order of their first scans."""
+    frames: dict[bytes, tuple[str, NDArray[np.float64]]] = {}
+    for record in log.records():
+        if isinstance(record.measurement, Scan):
+            pose = record.measurement.laser_pose
+            frames.setdefault(pose.tobytes(), (f"{LASER_FRAME}_{len(frames)}" if frames else LASER_FRAME, pose))
+    return frames
+
+
+def _messages(
+    records: Iterable[LogRecord], frames: dict[bytes, tuple[str, NDArray[np.float64]]]
+) -> Iterator[tuple[str, int, RosMessage]]:
+    """Topic, bag time in ns and message, in the order of the bag."""
+    for k, record in enumerate(records):
+        measurement, source = record.measurement, record.source_stamp
+        if k == 0:
+            joints = [_transform(source, BASE_FRAME, frame, pose) for frame, pose in frames.values()]
+            yield "/tf_static", measurement.stamp, _message(TRANSFORMS, transforms=joints)
+        if isinstance(measurement, Odometry):
+            yield "/odom", measurement.stamp, _odometry(source, measurement)
+            joints = [_transform(source, ODOM_FRAME, BASE_FRAME, measurement.pose)]
+            yield "/tf", measurement.stamp, _message(TRANSFORMS, transforms=joints)
+        else:
+            frame, _ = frames[measurement.laser_pose.tobytes()]
+            yield "/scan", measurement.stamp, _laser_scan(source, measurement, frame)
+
+
+def _message(kind: str, **fields: object) -> RosMessage:
+    return typestore().types[kind](**fields)
+
+
+def _header(stamp: int, frame: str) -> RosMessage:
+    seconds, nanoseconds = divmod(stamp, NANOSECONDS)
+    time = _message("builtin_interfaces/msg/Time", sec=seconds, nanosec=nanoseconds)
+    return _message("std_msgs/msg/Header", stamp=time, frame_id=frame)
+
+
+def _vector(kind: str, x: float, y: float, z: float = 0.0) -> RosMessage:
+    return _message(f"geometry_msgs/msg/{kind}", x=x, y=y, z=z)
+
+
+def _rotation(theta: float) -> RosMessage:
+    sin, cos = float(np.sin(0.5 * theta)), float(np.cos(0.5 * theta))
+    return _message("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=sin, w=cos)
+
+
+def _transform(stamp: int, parent: str, child: str, parent_T_child: NDArray[np.float64]) -> RosMessage:
+    """A geometry_msgs/TransformStamped of the rosbags library for a planar pose (3,)."""
+    x, y, theta = parent_T_child.tolist()
+    joint = _message("geometry_msgs/msg/Transform", translation=_vector("Vector3", x, y), rotation=_rotation(theta))
+    return _message(
+        "geometry_msgs/msg/TransformStamped", header=_header(stamp, parent), child_frame_id=child, transform=joint
+    )
+
+
+def _odometry(stamp: int, reading: Odometry) -> RosMessage:
+    x, y, theta = reading.pose.tolist()
+    pose = _message("geometry_msgs/msg/Pose", position=_vector("Point", x, y), orientation=_rotation(theta))
+    still = _message(
+        "geometry_msgs/msg/Twist", linear=_vector("Vector3", 0.0, 0.0), angular=_vector("Vector3", 0.0, 0.0)
+    )
+    return _message(
+        ODOMETRY,
+        header=_header(stamp, ODOM_FRAME),
+        child_frame_id=BASE_FRAME,
+        pose=_message("geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=np.zeros(36)),
+        twist=_message("geometry_msgs/msg/TwistWithCovariance", twist=still, covariance=np.zeros(36)),
+    )
+
+
+def _laser_scan(stamp: int, scan: Scan, frame: str) -> RosMessage:
+    count = scan.ranges.size
+    return _message(
+        LASER_SCAN,
+        header=_header(stamp, frame),
+        angle_min=scan.angle_min,
+        angle_max=scan.angle_min + (count - 1) * scan.angle_increment,
+        angle_increment=scan.angle_increment,
+        time_increment=scan.time_increment,
+        scan_time=0.0,
+        range_min=scan.range_min,
+        range_max=scan.range_max,
+        ranges=scan.ranges,
+        intensities=np.empty(0, dtype=np.float32),
+    )
