@@ -228,6 +228,24 @@ class Trail:
 
 
 @dataclass(frozen=True, eq=False)
+class RealTimePose:
+    """rtl -> the robot's other programs; one for every odometry reading.
+
+    :ivar stamp: of the odometry reading, ns.
+    :ivar area: area gamma of the pose.
+    :ivar local: belief over ``area_T_base``, p(s_t+k | s_t, u), the HMT pose by dead reckoning from the last estimate.
+    :ivar map_pose: belief over ``map_T_base``.
+    :ivar map_T_odom: shape (3,), takes the odometry's pose to the map.
+    """
+
+    stamp: int
+    area: int
+    local: PoseGaussian
+    map_pose: PoseGaussian
+    map_T_odom: Pose  # noqa: N815  named as every transform is
+
+
+@dataclass(frozen=True, eq=False)
 class EndOfLog:
     """robot -> slam: no more scans will come; slam answers with the last trails and ``Finished``."""
 
@@ -255,6 +273,7 @@ Message = (
     | Accepted
     | LocalEstimate
     | Trail
+    | RealTimePose
     | EndOfLog
     | Finished
 )

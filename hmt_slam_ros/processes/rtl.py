@@ -1,0 +1,139 @@
+"""Real-time localisation: the robot's pose at the rate of the odometry, whatever the other processes are doing.
+
+Section V of Blanco et al. 2008: while scans wait in metric SLAM's queue, the prior p(s_t+k | s_t, u) of the HMT pose
+is the last estimate carried on by the odometry since its scan.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections import deque
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hmt_slam_ros.configuration import Configuration
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.processes.messages import Accepted, LocalEstimate, Message, RealTimePose
+from hmt_slam_ros.processes.replica import FIRST_AREA
+from hmt_slam_ros.sensing import Odometry
+from hmt_slam_ros.sensing.motion import increment_covariance
+
+_LOG = logging.getLogger(__name__)
+
+# Beyond the bounds of speed: two readings of one moment may differ by this much without a reset.
+_SLACK_DISTANCE = 0.5  # m
+_SLACK_ANGLE = math.radians(30.0)
+# Readings kept for an estimate that is still to come: half an hour at 50 Hz.
+_READINGS_KEPT = 90_000
+
+
+class _Reading(NamedTuple):
+    """An odometry reading on the path without resets.
+
+    :ivar raw: ``odom_T_base`` as measured, shape (3,).
+    :ivar smooth: the same with the resets taken out, shape (3,).
+    :ivar distance: path length since the start, m.
+    :ivar angle: sum of the turns since the start, both ways positive, rad.
+    """
+
+    stamp: int
+    raw: NDArray[np.float64]
+    smooth: NDArray[np.float64]
+    distance: float
+    angle: float
+
+    def at(self, raw: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The pose without resets of a measured pose near this reading, shape (3,)."""
+        return se2.compose(self.smooth, se2.between(self.raw, raw))
+
+
+class Rtl:
+    """The RTL process. Consumes Odometry, LocalEstimate, Accepted; produces RealTimePose."""
+
+    def __init__(self, configuration: Configuration) -> None:
+        self._motion = configuration.motion
+        self._settings = configuration.rtl
+        self._readings: deque[_Reading] = deque(maxlen=_READINGS_KEPT)
+        self._newest: LocalEstimate | None = None
+        self._estimate: LocalEstimate | None = None
+        # The map's frame is the first area's: known before TLCA has spoken.
+        self._areas = {FIRST_AREA: PoseGaussian(np.zeros(3), np.zeros((3, 3)))}
+
+    def handle(self, message: Message) -> list[Message]:
+        """Take in one message; an odometry reading is answered with the pose at its stamp, once one is known."""
+        if isinstance(message, Odometry):
+            return self._predict() if self._add(message) else []
+        if isinstance(message, LocalEstimate):
+            if self._newest is None or message.stamp > self._newest.stamp:
+                self._newest = message
+                self._correct()
+        elif isinstance(message, Accepted) and message.global_poses:
+            self._areas = {area.area: area.pose for area in message.global_poses}
+            self._correct()
+        return []
+
+    def _add(self, reading: Odometry) -> bool:
+        """Carry the path on to a reading; False for one that is not newer than its predecessor."""
+        if not self._readings:
+            self._readings.append(_Reading(reading.stamp, reading.pose, reading.pose, 0.0, 0.0))
+            return True
+        last = self._readings[-1]
+        if reading.stamp <= last.stamp:
+            return False
+        step = se2.between(last.raw, reading.pose)
+        distance, angle = math.hypot(step[0], step[1]), abs(float(step[2]))
+        if self._is_reset(distance, angle, 1e-9 * (reading.stamp - last.stamp)):
+            _LOG.warning(
+                "the odometry jumped by %.2f m and %.0f degrees at stamp %d: taken for a reset, the robot for standing",
+                distance, math.degrees(angle), reading.stamp,
+            )  # fmt: skip
+            step, distance, angle = np.zeros(3), 0.0, 0.0
+        self._readings.append(
+            _Reading(
+                reading.stamp,
+                reading.pose,
+                se2.compose(last.smooth, step),
+                last.distance + distance,
+                last.angle + angle,
+            )
+        )
+        return True
+
+    def _is_reset(self, distance: float, angle: float, seconds: float) -> bool:
+        return (
+            distance > _SLACK_DISTANCE + self._settings.max_speed * seconds
+            or angle > _SLACK_ANGLE + math.radians(self._settings.max_turn_rate) * seconds
+        )
+
+    def _correct(self) -> None:
+        """Start from the newest estimate, and forget the readings before its scan.
+
+        An area that is new has no place in the map before TLCA's answer is here: until then the former estimate holds.
+        """
+        if self._newest is None or self._newest.area not in self._areas:
+            return
+        self._estimate = self._newest
+        while len(self._readings) > 1 and self._readings[1].stamp <= self._estimate.stamp:
+            self._readings.popleft()
+
+    def _predict(self) -> list[Message]:
+        """The estimate carried on by the odometry since its scan, in the area and in the map."""
+        if self._estimate is None:
+            return []
+        start, now = self._readings[0], self._readings[-1]
+        since = PoseGaussian(
+            se2.between(start.at(self._estimate.odometry), now.smooth),
+            self._spread(now.distance - start.distance, now.angle - start.angle),
+        )
+        local = self._estimate.pose.compose(since)
+        map_pose = self._areas[self._estimate.area].compose(local)
+        map_T_odom = se2.compose(map_pose.mean, se2.inverse(now.raw))
+        return [RealTimePose(now.stamp, self._estimate.area, local, map_pose, map_T_odom)]
+
+    def _spread(self, distance: float, angle: float) -> NDArray[np.float64]:
+        """Covariance (3, 3) of a piece of the path, of which the motion model sees the length and the turns."""
+        return increment_covariance(np.array([distance, 0.0, min(angle, math.pi)]), self._motion)

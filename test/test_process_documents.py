@@ -1,0 +1,142 @@
+"""JSON documents: what is sent comes back bit for bit, and what is malformed is refused by name."""
+
+import json
+import types
+from dataclasses import fields, is_dataclass
+from typing import Literal, Union, get_args, get_origin, get_type_hints
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hmt_slam_ros.errors import HmtSlamError
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.processes.documents import Closing, KeyframeHead, RobotStatus, decode, encode
+from hmt_slam_ros.processes.messages import (
+    Accepted,
+    AreaEvents,
+    Hypotheses,
+    Keyframe,
+    LeafEstimate,
+    LocalEstimate,
+)
+from hmt_slam_ros.sensing import Scan
+
+KINDS = (KeyframeHead, AreaEvents, Hypotheses, Accepted, LocalEstimate, Closing, RobotStatus)
+NUMBERS = st.floats(allow_nan=False, allow_infinity=False)
+
+
+def values(kind, name=""):
+    """Any value that a field of this type may have."""
+    origin, arguments = get_origin(kind), get_args(kind)
+    if origin is np.ndarray:
+        shape = (3, 3) if name == "covariance" else (3,)
+        count = int(np.prod(shape))
+        return st.lists(NUMBERS, min_size=count, max_size=count).map(lambda flat: np.array(flat).reshape(shape))
+    if origin is Literal:
+        return st.sampled_from(arguments)
+    if origin is tuple:
+        return st.lists(values(arguments[0]), max_size=3).map(tuple)
+    if origin in (Union, types.UnionType):
+        return st.none() | values(arguments[0])
+    if is_dataclass(kind):
+        hints = get_type_hints(kind)
+        return st.builds(kind, **{entry.name: values(hints[entry.name], entry.name) for entry in fields(kind)})
+    return {bool: st.booleans(), int: st.integers(-(2**63), 2**63 - 1), float: NUMBERS, str: st.text()}[kind]
+
+
+def assert_same(a, b):
+    assert type(a) is type(b)
+    if is_dataclass(a):
+        for entry in fields(a):
+            assert_same(getattr(a, entry.name), getattr(b, entry.name))
+    elif isinstance(a, tuple):
+        assert len(a) == len(b)
+        for left, right in zip(a, b, strict=True):
+            assert_same(left, right)
+    elif isinstance(a, np.ndarray):
+        assert a.dtype == b.dtype
+        assert a.shape == b.shape
+        assert a.tobytes() == b.tobytes()
+    elif isinstance(a, float):
+        assert np.float64(a).tobytes() == np.float64(b).tobytes()
+    else:
+        assert a == b
+
+
+@pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.__name__)
+def test_every_document_comes_back_bit_for_bit(kind):
+    @settings(max_examples=40, deadline=None)
+    @given(values(kind))
+    def round_trip(message):
+        assert_same(decode(encode(message), kind), message)
+
+    round_trip()
+
+
+def test_numpy_scalars_in_a_message_become_plain_numbers():
+    belief = PoseGaussian(np.zeros(3), np.eye(3))
+    message = LocalEstimate(np.int64(7), np.int64(1), np.int64(0), belief, np.zeros(3), 0)
+    assert decode(encode(message), LocalEstimate).stamp == 7
+
+
+def test_a_keyframe_is_whole_again_with_its_ranges():
+    ranges = np.array([1.0, np.nan, np.inf, 0.1], dtype=np.float32)
+    scan = Scan(5, ranges, -1.1, 0.1, 0.05, 30.0, np.array([0.1, 0.2, 0.3]), 1e-5)
+    leaf = LeafEstimate(3, 4, PoseGaussian(np.array([1.0, 2.0, 0.1]), np.eye(3)), True, -0.3, 11.5)
+    keyframe = Keyframe(2, scan, 1.25, (leaf,))
+    assert_same(decode(encode(KeyframeHead.of(keyframe)), KeyframeHead).with_ranges(ranges), keyframe)
+
+
+STATUS = RobotStatus("playing", "aces", 12, 3, 7374, 3, 1)
+EVENT = '{"hypothesis":1,"kind":"cut","keyframes":[1,2],"area":0,"score":0.5}'
+EVENTS = f'{{"document":"area_events","version":1,"sequence":3,"events":[{EVENT}]}}'
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "sentence"),
+    [
+        ('"version":1', '"version":2', "has version 2, not 1"),
+        ("area_events", "hypotheses", "is no area_events"),
+        ('"sequence":3', '"sequence":"3"', r"area_events\.sequence = 3 is not a whole number"),
+        ('"sequence":3', '"sequence":true', r"area_events\.sequence = True is not a whole number"),
+        ('"sequence":3,', "", r"area_events\.sequence is missing"),
+        ('"sequence":3', '"sequence":3,"colour":1', r"area_events\.colour is unknown"),
+        ('"kind":"cut"', '"kind":"torn"', r"area_events\.events\[0\]\.kind = torn is not cut or moved"),
+        ('"score":0.5', '"score":NaN', r"score = nan is not a finite number"),
+        ('"keyframes":[1,2]', '"keyframes":[1,2.5]', r"keyframes\[1\] = 2.5 is not a whole number"),
+        ('"keyframes":[1,2]', '"keyframes":1', r"keyframes = 1 is not a list"),
+        ("}]}", "}]", "no JSON"),
+    ],
+)
+def test_a_malformed_document_is_refused_by_name(old, new, sentence):
+    assert old in EVENTS
+    with pytest.raises(HmtSlamError, match=sentence):
+        decode(EVENTS.replace(old, new), AreaEvents)
+
+
+@pytest.mark.parametrize("covariance", ["[[1,0],[0,1]]", "[1,2,3]", '"wide"', "[[1,0,0],[0,1,0],[0,0,NaN]]",
+                                        "null", '[["1"]]', '[["1",0,0],[0,1,0],[0,0,1]]'])
+def test_an_array_of_another_shape_or_kind_is_refused(covariance):
+    belief = PoseGaussian(np.zeros(3), np.eye(3))
+    content = json.loads(encode(LocalEstimate(1, 0, 0, belief, np.zeros(3), 0)))
+    content["pose"]["covariance"] = json.loads(covariance)
+    with pytest.raises(HmtSlamError, match=r"local_estimate\.pose\.covariance = .* is not an array"):
+        decode(json.dumps(content), LocalEstimate)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_number_that_is_not_finite_is_not_sent(value):
+    with pytest.raises(HmtSlamError, match="not finite"):
+        encode(LocalEstimate(1, 0, 0, PoseGaussian(np.zeros(3), np.eye(3)), np.full(3, value), 0))
+
+
+@pytest.mark.parametrize("text", ["[]", "3", "null", '"text"', ""])
+def test_json_that_is_no_document_is_refused(text):
+    with pytest.raises(HmtSlamError):
+        decode(text, RobotStatus)
+
+
+def test_a_status_is_readable_by_people():
+    assert json.loads(encode(STATUS))["state"] == "playing"

@@ -1,0 +1,172 @@
+"""Real-time localisation: dead reckoning since the last estimate, in the area and in the map."""
+
+import logging
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hmt_slam_ros.configuration import Configuration
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.processes.messages import Accepted, AreaPose, LocalEstimate
+from hmt_slam_ros.processes.rtl import Rtl
+from hmt_slam_ros.sensing import Odometry
+
+SECOND = 1_000_000_000
+
+
+def odometry(seconds, x, y, theta):
+    return Odometry(round(seconds * SECOND), np.array([x, y, theta], dtype=np.float64))
+
+
+def estimate(seconds, pose, odom, area=0, variance=1e-4):
+    belief = PoseGaussian(np.array(pose, dtype=np.float64), np.eye(3) * variance)
+    return LocalEstimate(round(seconds * SECOND), 0, area, belief, np.array(odom, dtype=np.float64), 0)
+
+
+def accepted(**areas):
+    poses = tuple(
+        AreaPose(int(name[1:]), PoseGaussian(np.array(pose, dtype=np.float64), np.eye(3) * 0.01))
+        for name, pose in areas.items()
+    )
+    return Accepted(0, global_poses=poses)
+
+
+@pytest.fixture
+def rtl():
+    return Rtl(Configuration())
+
+
+def test_nothing_is_said_before_the_first_estimate(rtl):
+    assert rtl.handle(odometry(0.0, 0, 0, 0)) == []
+
+
+def test_each_odometry_reading_is_answered_with_the_estimate_carried_on(rtl):
+    rtl.handle(odometry(0.0, 5, 5, math.pi / 2))
+    assert rtl.handle(estimate(0.0, (1, 2, 0), (5, 5, math.pi / 2))) == []
+    (said,) = rtl.handle(odometry(0.1, 5, 5.3, math.pi / 2))
+    assert said.stamp == SECOND // 10
+    assert said.area == 0
+    assert np.allclose(said.local.mean, (1.3, 2, 0))
+
+
+def test_the_odometry_that_came_while_metric_slam_was_busy_counts(rtl):
+    for k in range(11):
+        rtl.handle(odometry(0.1 * k, 0.1 * k, 0, 0))
+    rtl.handle(estimate(0.2, (7, 0, math.pi / 2), (0.2, 0, 0)))
+    (said,) = rtl.handle(odometry(1.1, 1.1, 0, 0))
+    assert np.allclose(said.local.mean, (7, 0.9, math.pi / 2))
+
+
+def test_an_estimate_between_two_readings_starts_at_its_own_odometry(rtl):
+    rtl.handle(odometry(0.0, 0, 0, 0))
+    rtl.handle(odometry(1.0, 1, 0, 0))
+    rtl.handle(estimate(0.5, (0, 0, 0), (0.5, 0, 0)))
+    (said,) = rtl.handle(odometry(2.0, 2, 0, 0))
+    assert np.allclose(said.local.mean, (1.5, 0, 0))
+
+
+def test_the_map_pose_is_the_areas_pose_and_the_pose_in_the_area(rtl):
+    rtl.handle(accepted(a0=(0, 0, 0), a3=(10, 0, math.pi / 2)))
+    rtl.handle(odometry(0.0, 0, 0, 0))
+    rtl.handle(estimate(0.0, (1, 0, 0), (0, 0, 0), area=3))
+    (said,) = rtl.handle(odometry(0.1, 0.5, 0, 0))
+    assert said.area == 3
+    assert np.allclose(said.map_pose.mean, (10, 1.5, math.pi / 2))
+    assert np.allclose(se2.compose(said.map_T_odom, (0.5, 0, 0)), said.map_pose.mean)
+    assert np.linalg.eigvalsh(said.map_pose.covariance - said.local.covariance).min() > 0
+
+
+def test_a_new_area_waits_for_its_place_in_the_map(rtl):
+    rtl.handle(odometry(0.0, 0, 0, 0))
+    rtl.handle(estimate(0.0, (0, 0, 0), (0, 0, 0)))
+    rtl.handle(estimate(0.1, (0, 0, 0), (0.1, 0, 0), area=1))
+    (before,) = rtl.handle(odometry(0.2, 0.2, 0, 0))
+    assert before.area == 0
+    assert np.allclose(before.map_pose.mean, (0.2, 0, 0))
+    rtl.handle(accepted(a0=(0, 0, 0), a1=(0.1, 0, 0)))
+    (after,) = rtl.handle(odometry(0.3, 0.3, 0, 0))
+    assert after.area == 1
+    assert np.allclose(after.map_pose.mean, (0.3, 0, 0))
+
+
+def test_the_uncertainty_grows_with_the_path_and_shrinks_with_the_next_estimate(rtl):
+    rtl.handle(odometry(0.0, 0, 0, 0))
+    rtl.handle(estimate(0.0, (0, 0, 0), (0, 0, 0)))
+    spread = [np.linalg.det(rtl.handle(odometry(k, k, 0, 0))[0].local.covariance) for k in (1, 2, 3)]
+    assert spread[0] < spread[1] < spread[2]
+    rtl.handle(estimate(3, (3, 0, 0), (3, 0, 0)))
+    assert np.linalg.det(rtl.handle(odometry(4, 4, 0, 0))[0].local.covariance) < spread[1]
+
+
+def test_driving_to_and_fro_does_not_make_the_robot_sure_again(rtl):
+    rtl.handle(odometry(0, 0, 0, 0))
+    rtl.handle(estimate(0, (0, 0, 0), (0, 0, 0)))
+    (there,) = rtl.handle(odometry(1, 3, 0, 0))
+    (back,) = rtl.handle(odometry(2, 0, 0, 0))
+    assert np.allclose(back.local.mean, 0)
+    assert back.local.covariance[0, 0] > there.local.covariance[0, 0]
+
+
+def test_an_odometry_reset_is_told_once_and_the_robot_stays_where_it_was(rtl, caplog):
+    rtl.handle(odometry(0.0, 40, 10, 1.0))
+    rtl.handle(estimate(0.0, (2, 0, 0), (40, 10, 1.0)))
+    rtl.handle(odometry(0.1, 40, 10, 1.0))
+    with caplog.at_level(logging.WARNING):
+        (said,) = rtl.handle(odometry(0.2, 0, 0, 0))
+        (later,) = rtl.handle(odometry(0.3, 0.2, 0, 0))
+    assert np.allclose(said.local.mean, (2, 0, 0))
+    assert np.allclose(later.local.mean, (2.2, 0, 0))
+    assert len(caplog.records) == 1
+    assert "41.23 m" in caplog.text
+
+
+def test_an_estimate_from_before_a_reset_still_serves(rtl):
+    rtl.handle(odometry(0.0, 40, 0, 0))
+    rtl.handle(odometry(0.1, 40.1, 0, 0))
+    rtl.handle(odometry(0.2, 0, 0, 0))
+    rtl.handle(estimate(0.0, (0, 0, 0), (40, 0, 0)))
+    (said,) = rtl.handle(odometry(0.3, 0.1, 0, 0))
+    assert np.allclose(said.local.mean, (0.2, 0, 0))
+
+
+def test_a_reading_that_is_not_newer_is_passed_over(rtl):
+    rtl.handle(odometry(1.0, 0, 0, 0))
+    rtl.handle(estimate(1.0, (0, 0, 0), (0, 0, 0)))
+    assert rtl.handle(odometry(1.0, 3, 0, 0)) == []
+    assert rtl.handle(odometry(0.5, 3, 0, 0)) == []
+    (said,) = rtl.handle(odometry(1.1, 0.1, 0, 0))
+    assert np.allclose(said.local.mean, (0.1, 0, 0))
+
+
+def test_an_older_estimate_does_not_replace_a_newer_one(rtl):
+    rtl.handle(odometry(1.0, 1, 0, 0))
+    rtl.handle(estimate(1.0, (1, 0, 0), (1, 0, 0)))
+    rtl.handle(estimate(0.5, (9, 9, 0), (0.5, 0, 0)))
+    (said,) = rtl.handle(odometry(1.1, 1.1, 0, 0))
+    assert np.allclose(said.local.mean, (1.1, 0, 0))
+
+
+STEPS = st.lists(st.tuples(st.floats(-0.4, 0.4), st.floats(-0.4, 0.4), st.floats(-0.4, 0.4)), min_size=2, max_size=12)
+
+
+@settings(max_examples=60, deadline=None)
+@given(STEPS, st.integers(0, 11))
+def test_when_an_estimate_arrives_does_not_matter_only_which_scan_it_is_of(steps, late):
+    poses = [np.zeros(3)]
+    for step in steps:
+        poses.append(se2.compose(poses[-1], step))
+    late = min(late, len(steps) - 1)
+    at_once, delayed = Rtl(Configuration()), Rtl(Configuration())
+    belief = estimate(0.0, (1, 2, 3), poses[0])
+    at_once.handle(belief)
+    for k, pose in enumerate(poses):
+        said = [rtl.handle(Odometry(k * SECOND, pose)) for rtl in (at_once, delayed)]
+        if k == late:
+            delayed.handle(belief)
+    assert np.allclose(said[0][0].local.mean, said[1][0].local.mean)
+    assert np.allclose(said[0][0].local.covariance, said[1][0].local.covariance)
+    assert np.allclose(said[0][0].local.mean, se2.compose((1, 2, 3), se2.between(poses[0], poses[-1])))
