@@ -11,16 +11,19 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hmt_slam_ros.arrays import Float64, Int32
 from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.local_map import batch, matching
-from hmt_slam_ros.local_map.patches import FAR, PatchPool
+from hmt_slam_ros.local_map.patches import FAR, InverseModel, MapView, PatchPool
 from hmt_slam_ros.random_streams import Purpose, stream
 from hmt_slam_ros.sensing import Scan
 
 _ODDS_PER_NAT = 20.0
+_SEARCH_POINTS = 90
+# The search is called where odometry is in doubt: its prior is trusted less.
+_SEARCH_PRIOR = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +33,7 @@ class PlacedKeyframe:
     keyframe: int
     area: int
     scan: Scan
-    pose: NDArray[np.float64]
+    pose: Float64
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +46,7 @@ class FilterStep:
     :ivar history_changed: whether another particle leads than before, so that keyframe poses differ from those told.
     """
 
-    covariance: NDArray[np.float64]
+    covariance: Float64
     log_evidence: float
     effective_samples: float
     history_changed: bool
@@ -60,18 +63,21 @@ class LocalMapping:
         self.model = matching.beam_model(
             local_map.field_radius, match.sigma_hit, match.unknown_range, match.random_returns
         )
-        self.hit = round(local_map.log_odds_hit * _ODDS_PER_NAT)
-        self.miss = round(-local_map.log_odds_miss * _ODDS_PER_NAT)
-        self.limit = round(local_map.log_odds_limit * _ODDS_PER_NAT)
+        self.alignment = matching.Alignment(match.sigma_hit, match.robust_scale, match.iterations)
+        self._inverse_model = InverseModel(
+            round(local_map.log_odds_hit * _ODDS_PER_NAT),
+            round(-local_map.log_odds_miss * _ODDS_PER_NAT),
+            round(local_map.log_odds_limit * _ODDS_PER_NAT),
+        )
         self.near = int(match.matched_distance / local_map.field_radius * FAR)
 
-    def matching_points(self, scan: Scan) -> NDArray[np.float64]:
+    def matching_points(self, scan: Scan) -> Float64:
         """The points that are matched: within the map's range, evenly thinned; shape (n, 2), base frame, m."""
         points = self.mapped_points(scan)[0]
         stride = -(-len(points) // self.configuration.matching.max_points)
         return np.ascontiguousarray(points[:: max(1, stride)])
 
-    def mapped_points(self, scan: Scan) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def mapped_points(self, scan: Scan) -> tuple[Float64, Float64]:
         """End points within the map's range, and where longer beams leave that range; (n, 2), (k, 2), base frame, m."""
         limit = self.configuration.local_map.max_range
         relative = scan.points - scan.laser_pose[:2]
@@ -80,10 +86,10 @@ class LocalMapping:
         beyond = scan.laser_pose[:2] + relative[~near] * (limit / distance[~near, None])
         return scan.points[near], beyond
 
-    def insert(self, table: NDArray[np.int32], pose: NDArray[np.float64], scan: Scan) -> None:
+    def insert(self, table: Int32, pose: Float64, scan: Scan) -> None:
         """Enter a scan at ``map_T_base`` into a map."""
         points, free = self.mapped_points(scan)
-        self.pool.insert(table, pose, scan.laser_pose, points, free, self.hit, self.miss, self.limit)
+        self.pool.insert(table, pose, scan.laser_pose, points, free, self._inverse_model)
 
 
 class AreaFilter:
@@ -120,11 +126,11 @@ class AreaFilter:
         return int(np.argmax(self.log_weights))
 
     @property
-    def pose(self) -> NDArray[np.float64]:
+    def pose(self) -> Float64:
         """The leading particle's ``area_T_base``, shape (3,)."""
         return self.poses[self.leader]
 
-    def leading_keyframe_poses(self) -> NDArray[np.float64]:
+    def leading_keyframe_poses(self) -> Float64:
         """``map_T_base`` of the local map's keyframes under the leading particle, shape (K, 3)."""
         return self.keyframe_poses[self.leader]
 
@@ -144,83 +150,74 @@ class AreaFilter:
         for table in self._tables:
             self.mapping.pool.release(table)
 
-    def track(self, scan_points: NDArray[np.float64], increment: NDArray[np.float64], covariance: NDArray[np.float64]) -> None:
+    def track(
+        self, points: Float64, increment: Float64, covariance: Float64
+    ) -> None:
         """Move all particles by the leader's matched increment: a pose for a scan between two keyframes.
 
-        :param scan_points: shape (n, 2), m, base frame.
+        :param points: of the scan, shape (n, 2), m, base frame.
         :param increment: odometry increment since the last scan, shape (3,).
         :param covariance: its covariance (3, 3) in the frame of its end.
         """
         self._priors = se2.compose(self._priors, increment)
         ad = se2.adjoint(se2.inverse(increment))
         self._odometry_covariance = ad @ self._odometry_covariance @ ad.T + covariance
-        leader = self.leader
-        before = self.poses[leader]
+        before = self.pose
         predicted = se2.compose(before, increment)
-        matched = self._match(scan_points, predicted, covariance)
+        matched = self._match(points, matching.Prior(predicted, _information(covariance, predicted[2])))
         self.poses = se2.compose(self.poses, se2.between(before, matched))
 
-    def _match(
-        self, points: NDArray[np.float64], predicted: NDArray[np.float64], covariance: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
-        settings, pool = self.mapping.configuration.matching, self.mapping.pool
-        table = self._tables[self.leader]
-        information = np.linalg.inv(_in_map_frame(covariance, predicted[2]))
-        pose, hessian = self._align(points, predicted, predicted, information)
-        fraction = matching.matched_fraction(points, pose, table, pool.field, pool.cell, self.mapping.near)
-        if fraction < settings.matched_fraction and len(points):
-            wide = self._search(points, predicted, information)
-            retried, retried_hessian = self._align(points, wide, wide, information)
-            again = matching.matched_fraction(points, retried, table, pool.field, pool.cell, self.mapping.near)
-            if again > fraction:
-                pose, hessian = retried, retried_hessian
-        self.tracking_covariance = _in_body_frame(np.linalg.inv(hessian + information), pose[2])
+    def _leading_view(self) -> MapView:
+        return self.mapping.pool.view(self._tables[self.leader])
+
+    def _match(self, points: Float64, prior: matching.Prior) -> Float64:
+        """The pose that fits the leader's map best; where the prediction leads to a poor fit, search around it."""
+        view, near, alignment = self._leading_view(), self.mapping.near, self.mapping.alignment
+        pose, hessian = matching.align(points, prior.mean, prior, view, alignment)
+        fraction = matching.matched_fraction(points, pose, view, near)
+        if len(points) and fraction < self.mapping.configuration.matching.matched_fraction:
+            start = self._search(points, prior)
+            around = matching.Prior(start, prior.information)
+            found, found_hessian = matching.align(points, start, around, view, alignment)
+            if matching.matched_fraction(points, found, view, near) > fraction:
+                pose, hessian = found, found_hessian
+        self.tracking_covariance = _in_body_frame(np.linalg.inv(hessian + prior.information), pose[2])
         return pose
 
-    def _align(
-        self,
-        points: NDArray[np.float64],
-        start: NDArray[np.float64],
-        prior: NDArray[np.float64],
-        information: NDArray[np.float64],
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        settings, pool = self.mapping.configuration.matching, self.mapping.pool
-        return matching.align(  # type: ignore[no-any-return]
-            points, start, prior, information, self._tables[self.leader], pool.field, pool.cell, pool.radius,
-            settings.sigma_hit, settings.robust_scale, settings.iterations,
-        )
-
-    def _search(
-        self, points: NDArray[np.float64], centre: NDArray[np.float64], information: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
+    def _search(self, points: Float64, prior: matching.Prior) -> Float64:
         """The best start in the search window, by correlation with the leader's map."""
-        settings, pool, model = self.mapping.configuration.matching, self.mapping.pool, self.mapping.model
-        step, angle = 2.0 * pool.cell, math.radians(settings.search_step)
-        counts = np.array(
-            [
-                math.ceil(settings.search_distance / step),
-                math.ceil(settings.search_distance / step),
-                math.ceil(math.radians(settings.search_angle) / angle),
-            ]
+        settings = self.mapping.configuration.matching
+        distance_step, angle_step = 2.0 * self.mapping.pool.cell, math.radians(settings.search_step)
+        reach = math.ceil(settings.search_distance / distance_step)
+        counts = np.array([reach, reach, math.ceil(math.radians(settings.search_angle) / angle_step)])
+        return matching.correlative_search(
+            points[:: max(1, len(points) // _SEARCH_POINTS)],
+            matching.Prior(prior.mean, _SEARCH_PRIOR * prior.information),
+            np.array([distance_step, distance_step, angle_step]),
+            counts,
+            self._leading_view(),
+            self.mapping.model,
+            settings.temper,
         )
-        best, _ = matching.correlative_search(
-            points[:: max(1, len(points) // 90)], centre, 0.1 * information, np.array([step, step, angle]), counts,
-            self._tables[self.leader], pool.odds, pool.field, pool.cell, model.in_unknown, model.in_known, 0.1,
-        )
-        return best  # type: ignore[no-any-return]
 
-    def update(self, points: NDArray[np.float64], step: int) -> FilterStep:
+    def update(self, points: Float64, step: int) -> FilterStep:
         """Draw every particle from its optimal proposal, weigh it, resample where ESS fell below its bound.
 
         :param points: of the keyframe's scan, shape (n, 2), m, base frame.
         :param step: number of the keyframe event, for the random streams.
         """
-        settings, pool, model = self.mapping.configuration, self.mapping.pool, self.mapping.model
-        information = np.linalg.inv(_in_map_frame(self._odometry_covariance, self.pose[2]))
+        settings = self.mapping.configuration
         modes, means, covariances, evidences = batch.propose_all(
-            points, self.poses, self._priors, information, self._tables, pool.odds, pool.field, pool.cell, pool.radius,
-            settings.matching.sigma_hit, settings.matching.robust_scale, settings.matching.iterations,
-            model.in_unknown, model.in_known, settings.matching.sharpness, settings.matching.temper,
+            points,
+            self.poses,
+            self._priors,
+            _information(self._odometry_covariance, self.pose[2]),
+            self._tables,
+            self._leading_view(),
+            self.mapping.alignment,
+            self.mapping.model,
+            settings.matching.sharpness,
+            settings.matching.temper,
         )
         weights = _normalised(self.log_weights)
         log_evidence = _log_mean(evidences, weights)
@@ -267,7 +264,7 @@ class AreaFilter:
         self.keyframe_areas.append(self.area)
         self.keyframe_poses = np.concatenate((self.keyframe_poses, self.poses[:, None]), axis=1)
 
-    def change_area(self, area: int, area_T_previous: NDArray[np.float64], content: Sequence[PlacedKeyframe]) -> None:
+    def change_area(self, area: int, area_T_previous: Float64, content: Sequence[PlacedKeyframe]) -> None:
         """Go over to the frame of another area and load its local map, the same for all particles.
 
         :param area: the area now.
@@ -289,22 +286,28 @@ class AreaFilter:
         self.keyframe_poses = np.repeat(poses[None], count, axis=0)
 
 
-def _normalised(log_weights: NDArray[np.float64]) -> NDArray[np.float64]:
+def _normalised(log_weights: Float64) -> Float64:
     weights = np.exp(log_weights - log_weights.max())
     return weights / weights.sum()
 
 
-def _log_mean(log_values: NDArray[np.float64], weights: NDArray[np.float64]) -> float:
+def _log_mean(log_values: Float64, weights: Float64) -> float:
     top = log_values.max()
     return float(top + np.log(np.sum(weights * np.exp(log_values - top))))
 
 
-def _in_map_frame(covariance: NDArray[np.float64], theta: float) -> NDArray[np.float64]:
+def _information(covariance: Float64, theta: float) -> Float64:
+    """Inverse, in the map frame, of a covariance in the body's tangent frame, both (3, 3)."""
+    information: Float64 = np.linalg.inv(_in_map_frame(covariance, theta))
+    return information
+
+
+def _in_map_frame(covariance: Float64, theta: float) -> Float64:
     """A covariance in the body's tangent frame as one of (x, y, theta) in the map frame, both (3, 3)."""
     turn = se2.adjoint(np.array([0.0, 0.0, theta]))
     return turn @ covariance @ turn.T
 
 
-def _in_body_frame(covariance: NDArray[np.float64], theta: float) -> NDArray[np.float64]:
+def _in_body_frame(covariance: Float64, theta: float) -> Float64:
     """The inverse of :func:`_in_map_frame`."""
     return _in_map_frame(covariance, -theta)

@@ -5,25 +5,37 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from hmt_slam_ros.local_map.matching import align, log_ratio
+from hmt_slam_ros.arrays import Float64, Int32
+from hmt_slam_ros.local_map.matching import Alignment, BeamModel, Prior, align, log_prior, log_ratio
+from hmt_slam_ros.local_map.patches import MapView
 
 _STEPS = 5
 _GRID = _STEPS**3
 
 
 @njit(cache=True)
-def proposal(  # type: ignore[no-untyped-def]
-    points, mode, hessian, prior, information, table, odds, field, cell, in_unknown, in_known, sharp, tempered
-):
+def proposal(
+    points: Float64,
+    mode: Float64,
+    hessian: Float64,
+    prior: Prior,
+    view: MapView,
+    model: BeamModel,
+    sharpness: float,
+    temper: float,
+) -> tuple[Float64, Float64, float]:
     """The optimal proposal around a mode, from the likelihood volume.
 
     Prior times likelihood is evaluated on 5 x 5 x 5 poses along the principal axes of the Gauss-Newton covariance,
-    two standard deviations to each side; its moments are the proposal (Grisetti 2007). The evidence
-    p(z | x_{t-1}, u) is the Laplace integral of prior times the ``tempered`` likelihood, relative to unknown space.
+    two standard deviations to each side; its moments are the proposal (Grisetti et al. 2007). The evidence
+    p(z | x_{t-1}, u) is the Laplace integral of prior times tempered likelihood, relative to unknown space.
 
-    :returns: mean (3,), covariance (3, 3), map frame, and log-evidence, nats.
+    :param hessian: (3, 3) information of the points at the mode.
+    :param sharpness: exponent on the likelihood in the proposal.
+    :param temper: exponent on the likelihood in the evidence.
+    :returns: mean (3,), covariance (3, 3), map coordinates, and log-evidence, nats.
     """
-    values, vectors = np.linalg.eigh(np.linalg.inv(sharp * hessian + information))
+    values, vectors = np.linalg.eigh(np.linalg.inv(sharpness * hessian + prior.information))
     spread = np.sqrt(values)
     offsets, scores = np.empty((_GRID, 3)), np.empty(_GRID)
     local = np.empty(3)
@@ -33,50 +45,58 @@ def proposal(  # type: ignore[no-untyped-def]
         local[1] = (n // _STEPS % _STEPS - _STEPS // 2) * spread[1]
         local[2] = (n % _STEPS - _STEPS // 2) * spread[2]
         offsets[n] = vectors @ local
-        difference = mode + offsets[n] - prior
-        difference[2] = (difference[2] + np.pi) % (2.0 * np.pi) - np.pi
-        log_prior = -0.5 * np.dot(difference, information @ difference)
-        ratio = log_ratio(
-            points, mode[0] + offsets[n, 0], mode[1] + offsets[n, 1], mode[2] + offsets[n, 2],
-            table, odds, field, cell, in_unknown, in_known,
-        )
-        scores[n] = log_prior + sharp * ratio
-        best = max(best, log_prior + tempered * ratio)
-    weights = np.exp(scores - scores.max())
-    weights /= weights.sum()
-    shift = np.zeros(3)
-    for n in range(_GRID):
-        shift += weights[n] * offsets[n]
-    covariance = np.zeros((3, 3))
-    for n in range(_GRID):
-        centred = offsets[n] - shift
-        for i in range(3):
-            for j in range(3):
-                covariance[i, j] += weights[n] * centred[i] * centred[j]
-    occam = 0.5 * np.log(np.linalg.det(information) / np.linalg.det(information + tempered * hessian))
-    return mode + shift, covariance, best + occam
+        pose = mode + offsets[n]
+        expected = log_prior(pose, prior)
+        ratio = log_ratio(points, pose[0], pose[1], pose[2], view, model)
+        scores[n] = expected + sharpness * ratio
+        best = max(best, expected + temper * ratio)
+    mean, covariance = _moments(offsets, scores)
+    occam = np.linalg.det(prior.information) / np.linalg.det(prior.information + temper * hessian)
+    return mode + mean, covariance, best + 0.5 * np.log(occam)
 
 
 @njit(cache=True)
-def propose_all(  # type: ignore[no-untyped-def]
-    points, starts, priors, information, tables, odds, field, cell, radius, sigma, robust, iterations,
-    in_unknown, in_known, sharp, tempered,
-):
+def _moments(offsets: Float64, scores: Float64) -> tuple[Float64, Float64]:
+    """Mean (3,) and covariance (3, 3) of offsets (n, 3) under the log-weights (n,)."""
+    weights = np.exp(scores - scores.max())
+    weights /= weights.sum()
+    mean, covariance = np.zeros(3), np.zeros((3, 3))
+    for n in range(weights.size):
+        mean += weights[n] * offsets[n]
+    for n in range(weights.size):
+        for i in range(3):
+            for j in range(3):
+                covariance[i, j] += weights[n] * (offsets[n, i] - mean[i]) * (offsets[n, j] - mean[j])
+    return mean, covariance
+
+
+@njit(cache=True)
+def propose_all(
+    points: Float64,
+    starts: Float64,
+    priors: Float64,
+    information: Float64,
+    tables: Int32,
+    view: MapView,
+    settings: Alignment,
+    model: BeamModel,
+    sharpness: float,
+    temper: float,
+) -> tuple[Float64, Float64, Float64, Float64]:
     """The optimal proposal of every particle.
 
     :param starts: (m, 3) poses to start matching from; ``priors``: (m, 3) poses that odometry predicts.
-    :param tables: (m, T, T).
+    :param tables: (m, T, T), the particles' maps; ``view`` is any view of the same pool.
     :returns: modes (m, 3), means (m, 3), covariances (m, 3, 3), log-evidences (m,).
     """
     m = starts.shape[0]
     modes, means = np.empty((m, 3)), np.empty((m, 3))
     covariances, evidences = np.empty((m, 3, 3)), np.empty(m)
     for i in range(m):
-        modes[i], hessian = align(
-            points, starts[i], priors[i], information, tables[i], field, cell, radius, sigma, robust, iterations
-        )
+        own = MapView(tables[i], view.odds, view.field, view.cell, view.radius)
+        prior = Prior(priors[i], information)
+        modes[i], hessian = align(points, starts[i], prior, own, settings)
         means[i], covariances[i], evidences[i] = proposal(
-            points, modes[i], hessian, priors[i], information, tables[i], odds, field, cell, in_unknown, in_known,
-            sharp, tempered,
+            points, modes[i], hessian, prior, own, model, sharpness, temper
         )
     return modes, means, covariances, evidences

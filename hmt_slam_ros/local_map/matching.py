@@ -1,7 +1,7 @@
-"""Scan matching against a map of patches: likelihood, correlative search, Gauss-Newton, likelihood volume.
+"""Scan matching against a map of patches: likelihood, correlative search, Gauss-Newton on the distance field.
 
 Poses are ``map_T_base`` (x, y, theta); points are (n, 2) in m in the base frame. The likelihood of a beam is taken
-relative to unknown space, so that 0 means "nothing known here", and products over maps of different extent compare.
+relative to unknown space, so that 0 means "nothing known here", and maps of different extent compare.
 """
 
 from __future__ import annotations
@@ -10,9 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-from hmt_slam_ros.local_map.patches import FAR, PATCH, field_at, odds_at
+from hmt_slam_ros.arrays import Float64, Int64
+from hmt_slam_ros.local_map.patches import FAR, PATCH, MapView, field_at, odds_at
 
 
 class BeamModel(NamedTuple):
@@ -22,12 +22,36 @@ class BeamModel(NamedTuple):
     :ivar in_known: shape (256,), nats, where it was: far from surfaces the map contradicts the beam.
     """
 
-    in_unknown: NDArray[np.float64]
-    in_known: NDArray[np.float64]
+    in_unknown: Float64
+    in_known: Float64
+
+
+class Prior(NamedTuple):
+    """A Gaussian over poses, in map coordinates (x, y, theta).
+
+    :ivar mean: shape (3,).
+    :ivar information: shape (3, 3), inverse of the covariance.
+    """
+
+    mean: Float64
+    information: Float64
+
+
+class Alignment(NamedTuple):
+    """How Gauss-Newton weighs the beams.
+
+    :ivar sigma: deviation of an end point from its surface, m.
+    :ivar robust: scale of the Cauchy weight, m.
+    :ivar iterations: steps at most.
+    """
+
+    sigma: float
+    robust: float
+    iterations: int
 
 
 def beam_model(radius: float, sigma: float, unknown_range: float, random: float) -> BeamModel:
-    """The table of p(z | map) / p(z | unknown).
+    """The table of log p(z | map) / p(z | unknown).
 
     :param radius: truncation of the distance field, m.
     :param sigma: standard deviation of a return around a surface, sigma_hit, m.
@@ -40,130 +64,131 @@ def beam_model(radius: float, sigma: float, unknown_range: float, random: float)
 
 
 @njit(cache=True)
-def log_ratio(points, x, y, theta, table, odds, field, cell, in_unknown, in_known):  # type: ignore[no-untyped-def]
-    """Sum over the points of the log-likelihood ratio at a pose, nats."""
-    cos, sin = np.cos(theta) / cell, np.sin(theta) / cell
-    half = 0.5 * table.shape[0] * PATCH
-    x, y = x / cell + half, y / cell + half
+def log_ratio(points: Float64, x: float, y: float, theta: float, view: MapView, model: BeamModel) -> float:
+    """Sum over the points of the log-likelihood ratio at the pose (x, y, theta), nats."""
+    cos, sin = np.cos(theta) / view.cell, np.sin(theta) / view.cell
+    half = 0.5 * view.table.shape[0] * PATCH
+    u, v = x / view.cell + half, y / view.cell + half
     total = 0.0
     for i in range(points.shape[0]):
-        column = int(x + cos * points[i, 0] - sin * points[i, 1])
-        row = int(y + sin * points[i, 0] + cos * points[i, 1])
-        distance = field_at(table, field, column, row)
-        if odds_at(table, odds, column, row) == 0:
-            total += in_unknown[distance]
+        column = int(u + cos * points[i, 0] - sin * points[i, 1])
+        row = int(v + sin * points[i, 0] + cos * points[i, 1])
+        distance = field_at(view, column, row)
+        if odds_at(view, column, row) == 0:
+            total += model.in_unknown[distance]
         else:
-            total += in_known[distance]
+            total += model.in_known[distance]
     return total
 
 
 @njit(cache=True)
-def matched_fraction(points, pose, table, field, cell, near):  # type: ignore[no-untyped-def]
+def matched_fraction(points: Float64, pose: Float64, view: MapView, near: int) -> float:
     """Share of the points whose quantised distance to a surface is below ``near``."""
-    cos, sin = np.cos(pose[2]) / cell, np.sin(pose[2]) / cell
-    half = 0.5 * table.shape[0] * PATCH
+    cos, sin = np.cos(pose[2]) / view.cell, np.sin(pose[2]) / view.cell
+    half = 0.5 * view.table.shape[0] * PATCH
     count = 0
     for i in range(points.shape[0]):
-        column = int(pose[0] / cell + half + cos * points[i, 0] - sin * points[i, 1])
-        row = int(pose[1] / cell + half + sin * points[i, 0] + cos * points[i, 1])
-        if field_at(table, field, column, row) < near:
+        column = int(pose[0] / view.cell + half + cos * points[i, 0] - sin * points[i, 1])
+        row = int(pose[1] / view.cell + half + sin * points[i, 0] + cos * points[i, 1])
+        if field_at(view, column, row) < near:
             count += 1
     return count / max(1, points.shape[0])
 
 
 @njit(cache=True)
-def correlative_search(  # type: ignore[no-untyped-def]
-    points, centre, information, steps, counts, table, odds, field, cell, in_unknown, in_known, temper
-):
-    """The best pose on a regular grid of offsets around ``centre``, by tempered likelihood ratio times prior.
-
-    :param information: (3, 3) of the Gaussian prior around ``centre``, map frame.
-    :param steps: (3,) spacing of the grid in m, m, rad, along and across the centre's heading.
-    :param counts: (3,) int, steps to each side.
-    """
-    best_score = -np.inf
-    best = centre.copy()
-    cos, sin = np.cos(centre[2]), np.sin(centre[2])
-    offset = np.empty(3)
-    for k in range(-counts[2], counts[2] + 1):
-        offset[2] = k * steps[2]
-        for i in range(-counts[0], counts[0] + 1):
-            for j in range(-counts[1], counts[1] + 1):
-                along, across = i * steps[0], j * steps[1]
-                offset[0] = cos * along - sin * across
-                offset[1] = sin * along + cos * across
-                prior = -0.5 * offset @ information @ offset
-                score = prior + temper * log_ratio(
-                    points, centre[0] + offset[0], centre[1] + offset[1], centre[2] + offset[2],
-                    table, odds, field, cell, in_unknown, in_known,
-                )
-                if score > best_score:
-                    best_score = score
-                    best[:] = centre + offset
-    return best, best_score
+def log_prior(pose: Float64, prior: Prior) -> float:
+    """-1/2 of the squared Mahalanobis distance, without the normaliser."""
+    difference = pose - prior.mean
+    difference[2] = (difference[2] + np.pi) % (2.0 * np.pi) - np.pi
+    return -0.5 * np.dot(difference, prior.information @ difference)
 
 
 @njit(cache=True)
-def _smooth_distance(table, field, u, v):  # type: ignore[no-untyped-def]
+def correlative_search(
+    points: Float64, prior: Prior, steps: Float64, counts: Int64, view: MapView, model: BeamModel, temper: float
+) -> Float64:
+    """The best pose on a regular grid around the prior's mean, by tempered likelihood ratio times prior (Olson 2009).
+
+    :param steps: (3,) spacing of the grid along and across the mean's heading and in heading, m, m, rad.
+    :param counts: (3,) steps to each side.
+    """
+    best_score = -np.inf
+    best = prior.mean.copy()
+    pose = np.empty(3)
+    cos, sin = np.cos(prior.mean[2]), np.sin(prior.mean[2])
+    for k in range(-counts[2], counts[2] + 1):
+        pose[2] = prior.mean[2] + k * steps[2]
+        for i in range(-counts[0], counts[0] + 1):
+            for j in range(-counts[1], counts[1] + 1):
+                along, across = i * steps[0], j * steps[1]
+                pose[0] = prior.mean[0] + cos * along - sin * across
+                pose[1] = prior.mean[1] + sin * along + cos * across
+                ratio = log_ratio(points, pose[0], pose[1], pose[2], view, model)
+                score = log_prior(pose, prior) + temper * ratio
+                if score > best_score:
+                    best_score = score
+                    best[:] = pose
+    return best
+
+
+@njit(cache=True)
+def _smooth_distance(view: MapView, u: float, v: float) -> tuple[float, float, float]:
     """Bilinear distance and its gradient per cell at the continuous cell coordinates (u, v), in quanta."""
     column, row = int(np.floor(u)), int(np.floor(v))
     fu, fv = u - column, v - row
-    d00 = float(field_at(table, field, column, row))
-    d10 = float(field_at(table, field, column + 1, row))
-    d01 = float(field_at(table, field, column, row + 1))
-    d11 = float(field_at(table, field, column + 1, row + 1))
+    d00 = float(field_at(view, column, row))
+    d10 = float(field_at(view, column + 1, row))
+    d01 = float(field_at(view, column, row + 1))
+    d11 = float(field_at(view, column + 1, row + 1))
     low, high = d00 + fu * (d10 - d00), d01 + fu * (d11 - d01)
     gradient_u = (1.0 - fv) * (d10 - d00) + fv * (d11 - d01)
     return low + fv * (high - low), gradient_u, high - low
 
 
 @njit(cache=True)
-def align(  # type: ignore[no-untyped-def]
-    points, start, prior, information, table, field, cell, radius, sigma, robust, iterations
-):
-    """Gauss-Newton on the distance field with a Gaussian prior: the mode and the information of the likelihood.
+def _linearise(points: Float64, pose: Float64, view: MapView, settings: Alignment) -> tuple[Float64, Float64]:
+    """Normal equations of the points at a pose: J' W J (3, 3) and J' W r (3,)."""
+    hessian, gradient, row = np.zeros((3, 3)), np.zeros(3), np.empty(3)
+    half = 0.5 * view.table.shape[0] * PATCH - 0.5
+    quantum = view.radius / FAR
+    cos, sin = np.cos(pose[2]), np.sin(pose[2])
+    for n in range(points.shape[0]):
+        rx = cos * points[n, 0] - sin * points[n, 1]
+        ry = sin * points[n, 0] + cos * points[n, 1]
+        distance, gu, gv = _smooth_distance(
+            view, (pose[0] + rx) / view.cell + half, (pose[1] + ry) / view.cell + half
+        )
+        if distance >= FAR - 1:
+            continue
+        distance *= quantum
+        row[0], row[1] = gu * quantum / view.cell, gv * quantum / view.cell
+        row[2] = row[1] * rx - row[0] * ry
+        weight = 1.0 / ((1.0 + (distance / settings.robust) ** 2) * settings.sigma**2)
+        for i in range(3):
+            gradient[i] += weight * distance * row[i]
+            for j in range(3):
+                hessian[i, j] += weight * row[i] * row[j]
+    return hessian, gradient
 
-    Minimises sum rho(d(T p)^2) / sigma^2 + (T - prior)' information (T - prior), rho of Cauchy with scale
-    ``robust``.
+
+@njit(cache=True)
+def align(
+    points: Float64, start: Float64, prior: Prior, view: MapView, settings: Alignment
+) -> tuple[Float64, Float64]:
+    """Gauss-Newton on the distance field with a Gaussian prior.
+
+    Minimises sum rho(d(T p)^2) / sigma^2 + (T - prior)' information (T - prior), rho being Cauchy's.
 
     :param start: (3,) pose to start from.
-    :param prior: (3,) mean of the prior; ``information``: (3, 3), map frame.
-    :param radius: truncation of the distance field, m; ``sigma``, ``robust``: m.
-    :returns: the pose (3,), and the information (3, 3) of the points alone, map frame.
+    :returns: the mode (3,), and the information (3, 3) of the points alone, map coordinates.
     """
     pose = start.copy()
-    half = 0.5 * table.shape[0] * PATCH
-    quantum = radius / FAR
     hessian = np.zeros((3, 3))
-    for _ in range(iterations):
-        hessian[:] = 0.0
-        difference = pose - prior
+    for _ in range(settings.iterations):
+        hessian, gradient = _linearise(points, pose, view, settings)
+        difference = pose - prior.mean
         difference[2] = (difference[2] + np.pi) % (2.0 * np.pi) - np.pi
-        gradient = information @ difference
-        cos, sin = np.cos(pose[2]), np.sin(pose[2])
-        for i in range(points.shape[0]):
-            rx = cos * points[i, 0] - sin * points[i, 1]
-            ry = sin * points[i, 0] + cos * points[i, 1]
-            distance, gu, gv = _smooth_distance(
-                table, field, (pose[0] + rx) / cell + half - 0.5, (pose[1] + ry) / cell + half - 0.5
-            )
-            if distance >= FAR - 1:
-                continue
-            distance *= quantum
-            jx, jy = gu * quantum / cell, gv * quantum / cell
-            jt = jy * rx - jx * ry
-            weight = 1.0 / (1.0 + (distance / robust) ** 2) / sigma**2
-            hessian[0, 0] += weight * jx * jx
-            hessian[0, 1] += weight * jx * jy
-            hessian[0, 2] += weight * jx * jt
-            hessian[1, 1] += weight * jy * jy
-            hessian[1, 2] += weight * jy * jt
-            hessian[2, 2] += weight * jt * jt
-            gradient[0] += weight * distance * jx
-            gradient[1] += weight * distance * jy
-            gradient[2] += weight * distance * jt
-        hessian[1, 0], hessian[2, 0], hessian[2, 1] = hessian[0, 1], hessian[0, 2], hessian[1, 2]
-        step = np.linalg.solve(hessian + information, gradient)
+        step = np.linalg.solve(hessian + prior.information, gradient + prior.information @ difference)
         pose -= step
         if abs(step[0]) + abs(step[1]) < 1e-4 and abs(step[2]) < 1e-4:
             break

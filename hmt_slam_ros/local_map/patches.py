@@ -9,9 +9,13 @@ aligned: the origin lies at the corner between the four middle patches. Each pat
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
+
+from hmt_slam_ros.arrays import Float64, Int8, Int32, Int64, UInt8
+from hmt_slam_ros.geometry import se2
 
 PATCH = 32
 SHIFT = 5
@@ -19,9 +23,50 @@ MASK = 31
 NO_PATCH = -1
 FAR = 255
 
-Table = NDArray[np.int32]
+_PASSED = 1
+_HIT = 2
 
 _GROWTH = 1024
+
+
+class MapView(NamedTuple):
+    """One map as the kernels see it.
+
+    :ivar table: shape (T, T), indices into the pool.
+    :ivar odds: shape (capacity, 32, 32), the pool's.
+    :ivar field: shape (capacity, 32, 32), the pool's.
+    :ivar cell: edge of a cell, m.
+    :ivar radius: truncation of the distance field, m.
+    """
+
+    table: Int32
+    odds: Int8
+    field: UInt8
+    cell: float
+    radius: float
+
+
+class _Store(NamedTuple):
+    """The arrays of the pool that change when a map is written to; ``free[:free_count[0]]`` are the free patches."""
+
+    odds: Int8
+    field: UInt8
+    references: Int32
+    free: Int32
+    free_count: Int64
+
+
+class InverseModel(NamedTuple):
+    """The inverse sensor model, in quanta of the odds.
+
+    :ivar hit: added to a cell with an end point.
+    :ivar miss: added to a cell that a beam passes, negative.
+    :ivar limit: bound of the odds' magnitude.
+    """
+
+    hit: int
+    miss: int
+    limit: int
 
 
 class PatchPool:
@@ -50,7 +95,7 @@ class PatchPool:
         self._free_count = np.zeros(1, dtype=np.int64)
         edge = table_size * PATCH
         self._marks = np.zeros((edge, edge), dtype=np.uint8)
-        self._distances = _distance_stamp(self.radius_cells, cell, radius)
+        self._stamp = _distance_stamp(self.radius_cells, cell, radius)
 
     @property
     def used(self) -> int:
@@ -62,22 +107,25 @@ class PatchPool:
         """Bytes held, used or not."""
         return self.odds.nbytes + self.field.nbytes + self._marks.nbytes
 
-    def empty_table(self) -> Table:
+    def empty_table(self) -> Int32:
         """The table of a map in which nothing is known."""
         return np.full((self.table_size, self.table_size), NO_PATCH, dtype=np.int32)
 
-    def share(self, table: Table) -> Table:
+    def share(self, table: Int32) -> Int32:
         """A further map with the same content; patches are copied when either is written to."""
         _reference(table, self.references)
         return table.copy()
 
-    def release(self, table: Table) -> None:
+    def release(self, table: Int32) -> None:
         """Give up a map; patches that no other map names are free again."""
-        self._free_count[0] = _release(table, self.references, self._free, self._free_count[0])
+        _release(table, self._store())
+
+    def view(self, table: Int32) -> MapView:
+        """The map of ``table`` for the kernels; valid until the next insertion."""
+        return MapView(table, self.odds, self.field, self.cell, self.radius)
 
     def insert(
-        self, table: Table, pose: NDArray[np.float64], laser: NDArray[np.float64], points: NDArray[np.float64],
-        free: NDArray[np.float64], hit: int, miss: int, limit: int,
+        self, table: Int32, pose: Float64, laser: Float64, points: Float64, free: Float64, model: InverseModel
     ) -> None:
         """Enter a scan into a map: free space along the beams, surfaces at their ends, the distance field around them.
 
@@ -88,15 +136,16 @@ class PatchPool:
         :param laser: ``base_T_laser``, shape (3,).
         :param points: end points on surfaces, shape (n, 2), m, base frame.
         :param free: end points of beams that only tell free space, shape (k, 2), m, base frame.
-        :param hit: added to the odds of a cell with an end point.
-        :param miss: added to the odds of a cell that a beam passes, negative.
-        :param limit: bound of the odds' magnitude.
+        :param model: the inverse sensor model.
         """
         self._reserve(self.table_size * self.table_size)
-        self._free_count[0] = _insert(
-            table, self.odds, self.field, self.references, self._free, self._free_count[0], self._marks,
-            self._distances, pose, laser, points, free, self.cell, hit, miss, limit,
-        )
+        half = 0.5 * self.table_size * PATCH
+        origin = se2.compose(pose, laser)[:2] / self.cell + half
+        ends = se2.transform(pose, np.concatenate((points, free))) / self.cell + half
+        _insert(table, self._store(), self._marks, self._stamp, origin, ends, len(points), model)
+
+    def _store(self) -> _Store:
+        return _Store(self.odds, self.field, self.references, self._free, self._free_count)
 
     def _reserve(self, count: int) -> None:
         missing = count - int(self._free_count[0])
@@ -116,7 +165,7 @@ class PatchPool:
         self._free_count[0] = grown + kept
 
 
-def _distance_stamp(radius_cells: int, cell: float, radius: float) -> NDArray[np.uint8]:
+def _distance_stamp(radius_cells: int, cell: float, radius: float) -> UInt8:
     """Quantised distances around an occupied cell, shape (2r+1, 2r+1)."""
     offsets = np.arange(-radius_cells, radius_cells + 1) * cell
     distance = np.hypot(offsets[:, None], offsets[None, :])
@@ -124,7 +173,35 @@ def _distance_stamp(radius_cells: int, cell: float, radius: float) -> NDArray[np
 
 
 @njit(cache=True)
-def _reference(table, references):  # type: ignore[no-untyped-def]
+def odds_at(view: MapView, column: int, row: int) -> int:
+    """The odds of a cell, 0 outside the map."""
+    if column < 0 or row < 0:
+        return 0
+    tc, tr = column >> SHIFT, row >> SHIFT
+    if tc >= view.table.shape[1] or tr >= view.table.shape[0]:
+        return 0
+    patch = view.table[tr, tc]
+    if patch < 0:
+        return 0
+    return view.odds[patch, row & MASK, column & MASK]
+
+
+@njit(cache=True)
+def field_at(view: MapView, column: int, row: int) -> int:
+    """The quantised distance at a cell, FAR outside the map."""
+    if column < 0 or row < 0:
+        return FAR
+    tc, tr = column >> SHIFT, row >> SHIFT
+    if tc >= view.table.shape[1] or tr >= view.table.shape[0]:
+        return FAR
+    patch = view.table[tr, tc]
+    if patch < 0:
+        return FAR
+    return view.field[patch, row & MASK, column & MASK]
+
+
+@njit(cache=True)
+def _reference(table: Int32, references: Int32) -> None:
     for row in range(table.shape[0]):
         for column in range(table.shape[1]):
             if table[row, column] >= 0:
@@ -132,95 +209,62 @@ def _reference(table, references):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _release(table, references, free, free_count):  # type: ignore[no-untyped-def]
+def _release(table: Int32, store: _Store) -> None:
     for row in range(table.shape[0]):
         for column in range(table.shape[1]):
             patch = table[row, column]
             if patch >= 0:
-                references[patch] -= 1
-                if references[patch] == 0:
-                    free[free_count] = patch
-                    free_count += 1
+                store.references[patch] -= 1
+                if store.references[patch] == 0:
+                    store.free[store.free_count[0]] = patch
+                    store.free_count[0] += 1
             table[row, column] = NO_PATCH
-    return free_count
 
 
 @njit(cache=True)
-def _writable(table, odds, field, references, free, free_count, row, column):  # type: ignore[no-untyped-def]
-    """The patch at a place of the table, made or unshared where needed, and the new count of free patches."""
-    old = table[row, column]
-    if old >= 0 and references[old] == 1:
-        return old, free_count
-    free_count -= 1
-    new = free[free_count]
-    references[new] = 1
-    table[row, column] = new
+def _writable(table: Int32, store: _Store, column: int, row: int) -> int:
+    """The patch that holds a cell, made or unshared where needed."""
+    old = table[row >> SHIFT, column >> SHIFT]
+    if old >= 0 and store.references[old] == 1:
+        return old
+    store.free_count[0] -= 1
+    new = store.free[store.free_count[0]]
+    store.references[new] = 1
+    table[row >> SHIFT, column >> SHIFT] = new
     if old >= 0:
-        odds[new] = odds[old]
-        field[new] = field[old]
-        references[old] -= 1
+        store.odds[new] = store.odds[old]
+        store.field[new] = store.field[old]
+        store.references[old] -= 1
     else:
-        odds[new] = 0
-        field[new] = FAR
-    return new, free_count
+        store.odds[new] = 0
+        store.field[new] = FAR
+    return new
 
 
 @njit(cache=True)
-def odds_at(table, odds, column, row):  # type: ignore[no-untyped-def]
-    """The odds of a cell, 0 outside the map."""
-    if column < 0 or row < 0:
-        return 0
-    tc, tr = column >> SHIFT, row >> SHIFT
-    if tc >= table.shape[1] or tr >= table.shape[0]:
-        return 0
-    patch = table[tr, tc]
-    if patch < 0:
-        return 0
-    return odds[patch, row & MASK, column & MASK]
-
-
-@njit(cache=True)
-def field_at(table, field, column, row):  # type: ignore[no-untyped-def]
-    """The quantised distance at a cell, FAR outside the map."""
-    if column < 0 or row < 0:
-        return FAR
-    tc, tr = column >> SHIFT, row >> SHIFT
-    if tc >= table.shape[1] or tr >= table.shape[0]:
-        return FAR
-    patch = table[tr, tc]
-    if patch < 0:
-        return FAR
-    return field[patch, row & MASK, column & MASK]
-
-
-@njit(cache=True)
-def _insert(  # type: ignore[no-untyped-def]
-    table, odds, field, references, free, free_count, marks, stamp, pose, laser, points, open_ends, cell, hit, miss, limit
-):
-    cos, sin = np.cos(pose[2]), np.sin(pose[2])
-    half = 0.5 * table.shape[0] * PATCH
-    x0 = (pose[0] + cos * laser[0] - sin * laser[1]) / cell + half
-    y0 = (pose[1] + sin * laser[0] + cos * laser[1]) / cell + half
-    ends = np.empty((points.shape[0] + open_ends.shape[0], 2))
-    for i in range(ends.shape[0]):
-        p = points[i] if i < points.shape[0] else open_ends[i - points.shape[0]]
-        ends[i, 0] = (pose[0] + cos * p[0] - sin * p[1]) / cell + half
-        ends[i, 1] = (pose[1] + sin * p[0] + cos * p[1]) / cell + half
-    hits = points.shape[0]
-    touched = _mark(marks, ends, hits, x0, y0)
+def _insert(
+    table: Int32,
+    store: _Store,
+    marks: UInt8,
+    stamp: UInt8,
+    origin: Float64,
+    ends: Float64,
+    hits: int,
+    model: InverseModel,
+) -> None:
+    """Enter beams from ``origin`` to ``ends`` (n, 2), in cells, of which the first ``hits`` end on a surface."""
+    touched = _mark(marks, origin, ends, hits)
     added = np.empty((hits, 2), dtype=np.int32)
     removed = np.empty((touched.shape[0], 2), dtype=np.int32)
     n_added, n_removed = 0, 0
     for k in range(touched.shape[0]):
         column, row = touched[k, 0], touched[k, 1]
-        change = hit if marks[row, column] == 2 else miss
+        change = model.hit if marks[row, column] == _HIT else model.miss
         marks[row, column] = 0
-        patch, free_count = _writable(
-            table, odds, field, references, free, free_count, row >> SHIFT, column >> SHIFT
-        )
-        old = odds[patch, row & MASK, column & MASK]
-        new = min(limit, max(-limit, old + change))
-        odds[patch, row & MASK, column & MASK] = new
+        patch = _writable(table, store, column, row)
+        old = store.odds[patch, row & MASK, column & MASK]
+        new = min(model.limit, max(-model.limit, old + change))
+        store.odds[patch, row & MASK, column & MASK] = new
         if old <= 0 < new:
             added[n_added, 0], added[n_added, 1] = column, row
             n_added += 1
@@ -228,51 +272,42 @@ def _insert(  # type: ignore[no-untyped-def]
             removed[n_removed, 0], removed[n_removed, 1] = column, row
             n_removed += 1
     for k in range(n_removed):
-        free_count = _raise_field(
-            table, odds, field, references, free, free_count, stamp, removed[k, 0], removed[k, 1]
-        )
+        _raise_field(table, store, stamp, removed[k, 0], removed[k, 1])
     for k in range(n_added):
-        free_count = _lower_field(
-            table, odds, field, references, free, free_count, stamp, added[k, 0], added[k, 1]
-        )
-    return free_count
+        _lower_field(table, store, stamp, added[k, 0], added[k, 1])
 
 
 @njit(cache=True)
-def _mark(marks, ends, hits, x0, y0):  # type: ignore[no-untyped-def]
-    """Mark the cells that end points (2) and beams (1) touch; each is listed once as (column, row)."""
+def _mark(marks: UInt8, origin: Float64, ends: Float64, hits: int) -> Int32:
+    """Mark the cells in which beams end and which they pass; each is listed once as (column, row)."""
     edge = marks.shape[0]
     length = 0
     for i in range(ends.shape[0]):
-        length += int(abs(ends[i, 0] - x0)) + int(abs(ends[i, 1] - y0)) + 4
+        length += int(abs(ends[i, 0] - origin[0])) + int(abs(ends[i, 1] - origin[1])) + 4
     touched = np.empty((length, 2), dtype=np.int32)
     count = 0
     for i in range(hits):
         column, row = int(np.floor(ends[i, 0])), int(np.floor(ends[i, 1]))
         if 0 <= column < edge and 0 <= row < edge and marks[row, column] == 0:
-            marks[row, column] = 2
+            marks[row, column] = _HIT
             touched[count, 0], touched[count, 1] = column, row
             count += 1
     for i in range(ends.shape[0]):
-        count = _mark_beam(marks, touched, count, x0, y0, ends[i, 0], ends[i, 1])
+        count = _mark_beam(marks, touched, count, origin, ends[i])
     return touched[:count]
 
 
 @njit(cache=True)
-def _mark_beam(marks, touched, count, x0, y0, x1, y1):  # type: ignore[no-untyped-def]
-    """Mark the cells between the laser and an end point, exclusive, by grid traversal (Amanatides and Woo)."""
+def _mark_beam(marks: UInt8, touched: Int32, count: int, origin: Float64, end: Float64) -> int:
+    """Mark the cells from the laser to before the end point, by grid traversal (Amanatides and Woo 1987)."""
     edge = marks.shape[0]
-    column, row = int(np.floor(x0)), int(np.floor(y0))
-    last_column, last_row = int(np.floor(x1)), int(np.floor(y1))
-    dx, dy = x1 - x0, y1 - y0
-    step_x, step_y = (1 if dx > 0 else -1), (1 if dy > 0 else -1)
-    delta_x = abs(1.0 / dx) if dx != 0.0 else np.inf
-    delta_y = abs(1.0 / dy) if dy != 0.0 else np.inf
-    next_x = ((column + 1 - x0) if dx > 0 else (x0 - column)) * delta_x if dx != 0.0 else np.inf
-    next_y = ((row + 1 - y0) if dy > 0 else (y0 - row)) * delta_y if dy != 0.0 else np.inf
-    for _ in range(abs(last_column - column) + abs(last_row - row)):
+    column, row = int(np.floor(origin[0])), int(np.floor(origin[1]))
+    steps = abs(int(np.floor(end[0])) - column) + abs(int(np.floor(end[1])) - row)
+    step_x, delta_x, next_x = _axis_steps(origin[0], end[0])
+    step_y, delta_y, next_y = _axis_steps(origin[1], end[1])
+    for _ in range(steps):
         if 0 <= column < edge and 0 <= row < edge and marks[row, column] == 0:
-            marks[row, column] = 1
+            marks[row, column] = _PASSED
             touched[count, 0], touched[count, 1] = column, row
             count += 1
         if next_x < next_y:
@@ -285,50 +320,53 @@ def _mark_beam(marks, touched, count, x0, y0, x1, y1):  # type: ignore[no-untype
 
 
 @njit(cache=True)
-def _lower_field(table, odds, field, references, free, free_count, stamp, column, row):  # type: ignore[no-untyped-def]
-    """Enter a newly occupied cell into the distance field."""
-    radius = stamp.shape[0] // 2
-    edge = table.shape[0] * PATCH
-    for dr in range(-radius, radius + 1):
-        r = row + dr
-        if r < 0 or r >= edge:
-            continue
-        for dc in range(-radius, radius + 1):
-            c = column + dc
-            value = stamp[dr + radius, dc + radius]
-            if c < 0 or c >= edge or value >= field_at(table, field, c, r):
-                continue
-            patch, free_count = _writable(
-                table, odds, field, references, free, free_count, r >> SHIFT, c >> SHIFT
-            )
-            field[patch, r & MASK, c & MASK] = value
-    return free_count
+def _axis_steps(start: float, end: float) -> tuple[int, float, float]:
+    """Along one axis: the cell step, the beam's length per cell, and its length up to the first boundary."""
+    if end == start:
+        return 0, np.inf, np.inf
+    delta = 1.0 / abs(end - start)
+    if end > start:
+        return 1, delta, (np.floor(start) + 1.0 - start) * delta
+    return -1, delta, (start - np.floor(start)) * delta
 
 
 @njit(cache=True)
-def _raise_field(table, odds, field, references, free, free_count, stamp, column, row):  # type: ignore[no-untyped-def]
-    """Take a cell that is no longer occupied out of the distance field: measure anew around it."""
+def _lower_field(table: Int32, store: _Store, stamp: UInt8, column: int, row: int) -> None:
+    """Enter a newly occupied cell into the distance field."""
     radius = stamp.shape[0] // 2
     edge = table.shape[0] * PATCH
     for r in range(max(0, row - radius), min(edge, row + radius + 1)):
         for c in range(max(0, column - radius), min(edge, column + radius + 1)):
-            if field_at(table, field, c, r) != stamp[r - row + radius, c - column + radius]:
-                continue
-            value = _measured_distance(table, odds, stamp, c, r)
-            patch, free_count = _writable(
-                table, odds, field, references, free, free_count, r >> SHIFT, c >> SHIFT
-            )
-            field[patch, r & MASK, c & MASK] = value
-    return free_count
+            value = stamp[r - row + radius, c - column + radius]
+            patch = table[r >> SHIFT, c >> SHIFT]
+            if value < (FAR if patch < 0 else store.field[patch, r & MASK, c & MASK]):
+                store.field[_writable(table, store, c, r), r & MASK, c & MASK] = value
 
 
 @njit(cache=True)
-def _measured_distance(table, odds, stamp, column, row):  # type: ignore[no-untyped-def]
+def _raise_field(table: Int32, store: _Store, stamp: UInt8, column: int, row: int) -> None:
+    """Take a cell that is no longer occupied out of the distance field: measure anew where it was the nearest."""
     radius = stamp.shape[0] // 2
+    edge = table.shape[0] * PATCH
+    for r in range(max(0, row - radius), min(edge, row + radius + 1)):
+        for c in range(max(0, column - radius), min(edge, column + radius + 1)):
+            patch = table[r >> SHIFT, c >> SHIFT]
+            if patch < 0 or store.field[patch, r & MASK, c & MASK] != stamp[r - row + radius, c - column + radius]:
+                continue
+            value = _measured_distance(table, store.odds, stamp, c, r)
+            store.field[_writable(table, store, c, r), r & MASK, c & MASK] = value
+
+
+@njit(cache=True)
+def _measured_distance(table: Int32, odds: Int8, stamp: UInt8, column: int, row: int) -> int:
+    """The quantised distance from a cell to the nearest occupied one, by search."""
+    radius = stamp.shape[0] // 2
+    edge = table.shape[0] * PATCH
     best = FAR
-    for dr in range(-radius, radius + 1):
-        for dc in range(-radius, radius + 1):
-            value = stamp[dr + radius, dc + radius]
-            if value < best and odds_at(table, odds, column + dc, row + dr) > 0:
+    for r in range(max(0, row - radius), min(edge, row + radius + 1)):
+        for c in range(max(0, column - radius), min(edge, column + radius + 1)):
+            value = stamp[r - row + radius, c - column + radius]
+            patch = table[r >> SHIFT, c >> SHIFT]
+            if value < best and patch >= 0 and odds[patch, r & MASK, c & MASK] > 0:
                 best = value
     return best

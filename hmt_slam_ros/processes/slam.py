@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -143,7 +144,7 @@ class MetricSlam:
         return (
             math.hypot(moved[0], moved[1]) >= settings.keyframe_distance
             or abs(moved[2]) >= math.radians(settings.keyframe_angle)
-        )  # fmt: skip
+        )
 
     def _keyframe_event(self, scan: Scan, points: NDArray[np.float64]) -> list[Message]:
         sequence = self._events
@@ -290,7 +291,7 @@ class MetricSlam:
         drift = _FIRST_COVARIANCE
         poses = dict(zip(live.filter.keyframes, live.filter.leading_keyframe_poses(), strict=True))
         ordered = sorted(live.fresh)
-        for previous, keyframe in zip(ordered, ordered[1:], strict=False):
+        for previous, keyframe in pairwise(ordered):
             ad = se2.adjoint(se2.between(poses[keyframe], poses[previous]))
             drift = ad @ drift @ ad.T + live.fresh[keyframe]
         return drift

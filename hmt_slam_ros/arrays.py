@@ -1,0 +1,10 @@
+"""Names for the array types of the compiled kernels."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float64 = NDArray[np.float64]
+Int64 = NDArray[np.int64]
+Int32 = NDArray[np.int32]
+Int8 = NDArray[np.int8]
+UInt8 = NDArray[np.uint8]
