@@ -1,0 +1,28 @@
+"""How good a trajectory is: files of stamped poses, and errors of relations between them."""
+
+from hmt_slam_ros.evaluation.relations import (
+    ErrorStatistics,
+    RelationErrors,
+    Relations,
+    RelationScore,
+    evaluate_folder,
+    evaluate_relations,
+    format_table,
+    read_relations,
+)
+from hmt_slam_ros.evaluation.trajectory import StampedPoses, odometry_of, read_tum, write_tum
+
+__all__ = [
+    "ErrorStatistics",
+    "RelationErrors",
+    "RelationScore",
+    "Relations",
+    "StampedPoses",
+    "evaluate_folder",
+    "evaluate_relations",
+    "format_table",
+    "odometry_of",
+    "read_relations",
+    "read_tum",
+    "write_tum",
+]

@@ -1,0 +1,196 @@
+"""Errors of a trajectory at relations between two of its poses (Kuemmerle et al. 2009).
+
+A relation is the true pose at one time in the frame of the pose at another. It needs no common frame and does not
+count an early error of heading again and again, as a comparison of absolute poses would.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hmt_slam_ros.errors import HmtSlamError
+from hmt_slam_ros.evaluation.trajectory import StampedPoses, odometry_of, read_tum
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.logs import open_log
+from hmt_slam_ros.logs.stamps import NANOSECONDS, stamp_from_seconds
+
+NEAR = NANOSECONDS // 10
+"""Largest time between a relation's end and the pose taken for it, ns."""
+
+LONG_SPAN = 60 * NANOSECONDS
+"""Relations that span more time than this, in ns, are the ones that a missed loop shows in."""
+
+
+@dataclass(frozen=True, eq=False)
+class Relations:
+    """True relative poses.
+
+    :ivar starts: shape (n,), stamps of the first poses, ns.
+    :ivar ends: shape (n,), stamps of the second poses, ns; they may lie before the first.
+    :ivar poses: shape (n, 3), ``start_T_end`` as (x, y, theta) in m and rad.
+    """
+
+    starts: NDArray[np.int64]
+    ends: NDArray[np.int64]
+    poses: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class ErrorStatistics:
+    """Of absolute errors: mean, sample standard deviation (n - 1), root of the mean square, largest; NaN for none."""
+
+    mean: float
+    std: float
+    rms: float
+    max: float
+
+
+@dataclass(frozen=True)
+class RelationScore:
+    """Errors over a set of relations.
+
+    :ivar count: relations in the set.
+    :ivar matched: relations with a pose at both ends.
+    :ivar missed: all others.
+    :ivar carried: matched relations of which one end or both were reached along the odometry.
+    :ivar translation: norm of the difference of the two translations, metres.
+    :ivar rotation: absolute difference of heading, degrees.
+    """
+
+    count: int
+    matched: int
+    missed: int
+    carried: int
+    translation: ErrorStatistics
+    rotation: ErrorStatistics
+
+
+@dataclass(frozen=True)
+class RelationErrors:
+    """Errors over all relations, and over those alone that span more than 60 s."""
+
+    overall: RelationScore
+    over_60_s: RelationScore
+
+
+def read_relations(path: Path) -> Relations:
+    """Relations from lines ``t1 t2 x y z roll pitch yaw`` (s, m, rad); ``#`` begins a comment.
+
+    :raises HmtSlamError: where the file cannot be read, is empty or has a malformed line.
+    """
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise HmtSlamError(f"{path} cannot be read as relations ({error}): give a file of relations.") from error
+    stamps: list[tuple[int, int]] = []
+    poses: list[tuple[float, float, float]] = []
+    for number, line in enumerate(lines, start=1):
+        fields = line.partition("#")[0].split()
+        if not fields:
+            continue
+        try:
+            x, y, _, _, _, yaw = map(float, fields[2:])
+            stamps.append((stamp_from_seconds(fields[0]), stamp_from_seconds(fields[1])))
+        except ValueError:
+            raise HmtSlamError(
+                f"line {number} of {path} is not 't1 t2 x y z roll pitch yaw': mend that line."
+            ) from None
+        poses.append((x, y, yaw))
+    if not stamps:
+        raise HmtSlamError(f"{path} holds no relation: give a file of relations.")
+    starts, ends = np.array(stamps, dtype=np.int64).T
+    return Relations(starts, ends, np.array(poses))
+
+
+def evaluate_folder(output_dir: Path, relations_file: Path, odometry_log: Path | None = None) -> RelationErrors:
+    """Errors of the trajectory.tum of an output folder.
+
+    :param odometry_log: the log that it was made from, to carry poses along its odometry where there is no pose
+        within 0.1 s.
+    :raises HmtSlamError: where one of the files cannot be read.
+    """
+    trajectory = read_tum(output_dir / "trajectory.tum")
+    odometry = None if odometry_log is None else odometry_of(open_log(odometry_log))
+    return evaluate_relations(trajectory, read_relations(relations_file), odometry)
+
+
+def evaluate_relations(
+    trajectory: StampedPoses, relations: Relations, odometry: StampedPoses | None = None
+) -> RelationErrors:
+    """Errors of a trajectory at each relation.
+
+    The pose at a stamp is the one nearest in time if that is within 0.1 s. Else, with odometry, the nearest pose is
+    moved by the odometry between the two times, each of which must have a reading within 0.1 s. Else the relation is
+    missed.
+
+    :param trajectory: under test, with source stamps.
+    :param relations: the truth.
+    :param odometry: raw wheel odometry with source stamps.
+    """
+    starts, start_found, start_carried = _poses_at(relations.starts, trajectory, odometry)
+    ends, end_found, end_carried = _poses_at(relations.ends, trajectory, odometry)
+    estimates = se2.between(starts, ends)
+    translation = np.hypot(*(estimates[:, :2] - relations.poses[:, :2]).T)
+    rotation = np.rad2deg(np.abs(se2.wrap(estimates[:, 2] - relations.poses[:, 2])))
+    found, carried = start_found & end_found, start_carried | end_carried
+    span = np.abs(relations.ends - relations.starts)
+
+    def score(chosen: NDArray[np.bool_]) -> RelationScore:
+        kept = chosen & found
+        return RelationScore(
+            count=int(chosen.sum()),
+            matched=int(kept.sum()),
+            missed=int((chosen & ~found).sum()),
+            carried=int((kept & carried).sum()),
+            translation=_statistics(translation[kept]),
+            rotation=_statistics(rotation[kept]),
+        )
+
+    return RelationErrors(score(np.ones(span.size, dtype=np.bool_)), score(span > LONG_SPAN))
+
+
+def _poses_at(
+    stamps: NDArray[np.int64], trajectory: StampedPoses, odometry: StampedPoses | None
+) -> tuple[NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_]]:
+    """Pose at each stamp (n, 3), whether there is one, and whether it was carried there along the odometry."""
+    nearest = trajectory.nearest(stamps)
+    poses, times = trajectory.poses[nearest], trajectory.stamps[nearest]
+    near = np.abs(times - stamps) <= NEAR
+    if odometry is None or not odometry.stamps.size:
+        return poses, near, np.zeros_like(near)
+    begin, end = odometry.nearest(times), odometry.nearest(stamps)
+    covered = (np.abs(odometry.stamps[begin] - times) <= NEAR) & (np.abs(odometry.stamps[end] - stamps) <= NEAR)
+    carried = ~near & covered
+    moved = se2.compose(poses, se2.between(odometry.poses[begin], odometry.poses[end]))
+    return np.where(carried[:, None], moved, poses), near | covered, carried
+
+
+def _statistics(errors: NDArray[np.float64]) -> ErrorStatistics:
+    if not errors.size:
+        return ErrorStatistics(np.nan, np.nan, np.nan, np.nan)
+    std = float(np.std(errors, ddof=1)) if errors.size > 1 else 0.0
+    return ErrorStatistics(float(np.mean(errors)), std, float(np.sqrt(np.mean(errors**2))), float(np.max(errors)))
+
+
+def format_table(errors: RelationErrors) -> str:
+    """The errors as a table of fixed-width lines, with the share of relations matched and the policy."""
+    header = (
+        f"{'relations':<10} {'matched':>18} {'carried':>8} "
+        f"{'translation [m]':>18} {'rms':>7} {'max':>7} {'rotation [deg]':>18} {'rms':>7} {'max':>7}"
+    )
+    rows = [_row("all", errors.overall), _row("over 60 s", errors.over_60_s)]
+    policy = "mean +- std; pose nearest in time within 0.1 s, else carried there along the odometry, else missed"
+    return "\n".join([header, *rows, policy])
+
+
+def _row(name: str, score: RelationScore) -> str:
+    share = 100.0 * score.matched / score.count if score.count else 0.0
+    matched = f"{score.matched}/{score.count} ({share:.1f} %)"
+    errors = [
+        f"{f'{e.mean:.3f} +- {e.std:.3f}':>18} {e.rms:>7.3f} {e.max:>7.3f}" for e in (score.translation, score.rotation)
+    ]
+    return f"{name:<10} {matched:>18} {score.carried:>8} {errors[0]} {errors[1]}"
