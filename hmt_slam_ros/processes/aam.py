@@ -1,0 +1,180 @@
+"""Area Abstraction Mechanism: when do the newest keyframes no longer belong to the area, and which known one is this?
+
+A hypothesis is one topological path, so "once for every group of particles with the same path" is once for every leaf.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hmt_slam_ros.configuration import Configuration
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.processes.messages import (
+    Accepted,
+    AreaEvent,
+    AreaEvents,
+    Hypotheses,
+    Keyframe,
+    Leaf,
+    LeafEstimate,
+    Message,
+)
+from hmt_slam_ros.processes.replica import FIRST_AREA, FIRST_HYPOTHESIS, Replica
+from hmt_slam_ros.topology.hybrid_map import HybridMap
+from hmt_slam_ros.topology.overlap import overlaps, sensed_points
+from hmt_slam_ros.topology.overlap_graph import Measure, OverlapGraph, Separation, separation, synchronised
+
+# An area's overlap with a scan is that of the best few keyframes among those taken nearest to it.
+_NEAREST, _BEST = 8, 3
+
+
+@dataclass(frozen=True)
+class _Watch:
+    """What the AAM remembers of one hypothesis; a value, so that the children of a hypothesis inherit it.
+
+    :ivar area: the robot's area.
+    :ivar graphs: {area: overlap graph of its keyframes} of the areas that the robot was in.
+    :ivar own: keyframes stored since the robot entered ``area``, and those that came over with it.
+    :ivar separate: at how many of the latest evaluations in a row the newest keyframes separated.
+    :ivar beyond: the known area that the robot seems to be in, and for how many keyframes in a row.
+    """
+
+    area: int
+    graphs: dict[int, OverlapGraph] = field(default_factory=dict)
+    own: frozenset[int] = frozenset()
+    separate: int = 0
+    beyond: tuple[int, int] | None = None
+
+
+class Aam:
+    """Answers every keyframe event with the areas that were left.
+
+    The overlap of two keyframes is measured once, when the later one joins the area of the earlier one, and inherited
+    by the hypotheses that branch off. It is not measured again when metric SLAM or TLCA corrects poses: a correction
+    within an area is small against the radius of overlap.
+
+    A cut and a move have to be found at ``aam.persistence`` evaluations in a row, so that one poor scan does nothing.
+    """
+
+    def __init__(self, configuration: Configuration) -> None:
+        self._options = configuration.aam
+        self._max_range = configuration.local_map.max_range
+        self._replica = Replica()
+        self._points: dict[int, NDArray[np.float64]] = {}
+        self._watches = {FIRST_HYPOTHESIS: _Watch(FIRST_AREA)}
+
+    def handle(self, message: Message) -> list[Message]:
+        """Answer a ``Keyframe`` with its ``AreaEvents``; learn from ``Hypotheses`` and ``Accepted``."""
+        if isinstance(message, Keyframe):
+            return [self._examine(message)]
+        if isinstance(message, Hypotheses):
+            self._replica.apply(message)
+            self._watches = {leaf.hypothesis: self._follow(leaf) for leaf in message.leaves}
+        elif isinstance(message, Accepted) and message.hypothesis is not None:
+            self._replica.accept(message)
+            self._watches = {message.hypothesis: self._watches[message.hypothesis]}
+        return []
+
+    def _examine(self, keyframe: Keyframe) -> AreaEvents:
+        self._replica.add(keyframe)
+        self._points[keyframe.sequence] = sensed_points(keyframe.scan, self._max_range, self._options.overlap_points)
+        known = [leaf for leaf in keyframe.leaves if leaf.hypothesis in self._watches]
+        events = [self._cut(leaf, keyframe.sequence) or self._moved(leaf, keyframe.sequence) for leaf in known]
+        if not any(leaf.stored for leaf in known):
+            del self._points[keyframe.sequence]
+        return AreaEvents(keyframe.sequence, tuple(event for event in events if event is not None))
+
+    def _cut(self, leaf: LeafEstimate, newest: int) -> AreaEvent | None:
+        """The event that the newest keyframes leave the robot's area, when that has lasted."""
+        if not leaf.stored:
+            return None
+        watch = self._watches[leaf.hypothesis]
+        graph = self._graph(watch, leaf.hypothesis, watch.area)
+        own = watch.own | {newest}
+        found = separation(graph, own, newest, self._options.ncut_threshold, self._options.min_cluster)
+        watch = replace(
+            watch, graphs=watch.graphs | {watch.area: graph}, own=own, separate=watch.separate + 1 if found else 0
+        )
+        self._watches[leaf.hypothesis] = watch
+        return self._cut_event(leaf.hypothesis, watch, found)
+
+    def _cut_event(self, hypothesis: int, watch: _Watch, found: Separation | None) -> AreaEvent | None:
+        if found is None or watch.separate < self._options.persistence:
+            return None
+        return AreaEvent(hypothesis, "cut", found.keyframes, watch.area, found.ncut)
+
+    def _moved(self, leaf: LeafEstimate, newest: int) -> AreaEvent | None:
+        """The event that the robot went into a known area one arc away, when that has lasted.
+
+        The margin by which the other area has to overlap more keeps the robot from going back and forth at a border.
+        Keyframes that the robot stored in the area it leaves stay there.
+        """
+        watch = self._watches[leaf.hypothesis]
+        shares = self._shares(leaf, newest)
+        best = max(shares, key=lambda area: (shares[area], -area))
+        inside = best == watch.area or shares[best] < shares[watch.area] + self._options.move_margin
+        times = 1 if watch.beyond is None or watch.beyond[0] != best else watch.beyond[1] + 1
+        self._watches[leaf.hypothesis] = replace(watch, beyond=None if inside else (best, times))
+        if inside or times < self._options.persistence:
+            return None
+        return AreaEvent(leaf.hypothesis, "moved", (), best, shares[best])
+
+    def _shares(self, leaf: LeafEstimate, newest: int) -> dict[int, float]:
+        """Overlap of the newest scan with the robot's area and with those one arc away."""
+        hybrid_map, here = self._replica.maps[leaf.hypothesis], leaf.area
+        shares = {here: self._share(hybrid_map, here, leaf.pose.mean, newest)}
+        for area in hybrid_map.neighbours(here):
+            arc = hybrid_map.arc(area, here)
+            assert arc is not None
+            shares[area] = self._share(hybrid_map, area, se2.compose(arc.mean, leaf.pose.mean), newest)
+        return shares
+
+    def _share(self, hybrid_map: HybridMap, area: int, pose: NDArray[np.float64], newest: int) -> float:
+        """Overlap of the newest scan, taken at ``pose`` = ``area_T_base``, with an area."""
+        placed = hybrid_map.keyframes(area)
+        others = [keyframe for keyframe in placed if keyframe != newest]
+        if not others:
+            return 0.0
+        poses = np.array([placed[keyframe] for keyframe in others])
+        nearest = np.argsort(np.hypot(*(poses[:, :2] - pose[:2]).T), kind="stable")[:_NEAREST]
+        found = overlaps(
+            self._points[newest],
+            pose,
+            [self._points[others[i]] for i in nearest],
+            poses[nearest],
+            self._options.overlap_radius,
+        )
+        return float(np.sort(found)[-_BEST:].mean())
+
+    def _follow(self, leaf: Leaf) -> _Watch:
+        """The watch over a hypothesis after TSBI's answer."""
+        watch = self._watches[leaf.parent]
+        if leaf.area == watch.area:
+            return watch
+        moved = frozenset(r.keyframe for r in leaf.relabelled if r.area == leaf.area)
+        entered = self._graph(watch, leaf.hypothesis, leaf.area)
+        left = watch.graphs.get(watch.area, OverlapGraph()).only(self._keyframes(leaf.hypothesis, watch.area))
+        return _Watch(leaf.area, watch.graphs | {watch.area: left, leaf.area: entered}, moved)
+
+    def _graph(self, watch: _Watch, hypothesis: int, area: int) -> OverlapGraph:
+        """The overlap graph of an area as it is now, from what the watch knows."""
+        graph = watch.graphs.get(area, OverlapGraph())
+        keyframes = self._keyframes(hypothesis, area)
+        return synchronised(graph, keyframes, self._measure(hypothesis, area), watch.graphs.get(watch.area))
+
+    def _keyframes(self, hypothesis: int, area: int) -> Collection[int]:
+        return self._replica.maps[hypothesis].keyframes(area)
+
+    def _measure(self, hypothesis: int, area: int) -> Measure:
+        placed = self._replica.maps[hypothesis].keyframes(area)
+
+        def measure(keyframe: int, others: tuple[int, ...]) -> NDArray[np.float64]:
+            poses = np.array([placed[other] for other in others]).reshape(-1, 3)
+            points = [self._points[other] for other in others]
+            return overlaps(self._points[keyframe], placed[keyframe], points, poses, self._options.overlap_radius)
+
+        return measure

@@ -1,0 +1,119 @@
+"""The overlap graph of one area's keyframes, and what in it separates from the ground known before."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterable
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hmt_slam_ros.topology.normalized_cut import ncut, normalized_cut, recursive_cut
+
+
+@dataclass(frozen=True, eq=False)
+class OverlapGraph:
+    """Keyframes and the overlaps of their sensed space; a value, so that hypotheses may share one.
+
+    :ivar keyframes: ids, ascending, that is, in order of time.
+    :ivar similarity: shape (n, n), symmetric, in [0, 1], zero diagonal.
+    """
+
+    keyframes: tuple[int, ...] = ()
+    similarity: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0)))
+
+    def only(self, keep: Collection[int]) -> OverlapGraph:
+        """The graph of those of its keyframes that are in ``keep``."""
+        rows = [i for i, keyframe in enumerate(self.keyframes) if keyframe in keep]
+        if len(rows) == len(self.keyframes):
+            return self
+        return OverlapGraph(tuple(self.keyframes[i] for i in rows), self.similarity[np.ix_(rows, rows)])
+
+    def with_keyframe(self, keyframe: int, overlaps: NDArray[np.float64]) -> OverlapGraph:
+        """The graph with one keyframe more, whose overlaps with ``keyframes``, shape (n,), are known."""
+        at = int(np.searchsorted(self.keyframes, keyframe))
+        row = np.insert(overlaps, at, 0.0)
+        similarity = np.insert(np.insert(self.similarity, at, overlaps, axis=0), at, row, axis=1)
+        return OverlapGraph((*self.keyframes[:at], keyframe, *self.keyframes[at:]), similarity)
+
+    def between(self, keyframe: int, others: Iterable[int]) -> NDArray[np.float64]:
+        """Overlaps of a keyframe with others, NaN where either is not in this graph."""
+        if keyframe not in self.keyframes:
+            return np.array([np.nan for _ in others])
+        row = dict(zip(self.keyframes, self.similarity[self.keyframes.index(keyframe)], strict=True))
+        return np.array([row.get(other, np.nan) for other in others])
+
+
+Measure = Callable[[int, tuple[int, ...]], NDArray[np.float64]]
+
+
+def synchronised(
+    graph: OverlapGraph, keyframes: Collection[int], measure: Measure, known: OverlapGraph | None = None
+) -> OverlapGraph:
+    """The graph of exactly ``keyframes``, measuring only overlaps that neither ``graph`` nor ``known`` holds.
+
+    :param graph: what was known of the area.
+    :param keyframes: the area's keyframes now.
+    :param measure: (keyframe, others) -> overlaps, shape (number of others,).
+    :param known: the graph of the area from which keyframes came over.
+    """
+    graph = graph.only(keyframes)
+    for keyframe in sorted(set(keyframes) - set(graph.keyframes)):
+        row = (known or OverlapGraph()).between(keyframe, graph.keyframes)
+        unknown = np.flatnonzero(np.isnan(row))
+        row[unknown] = measure(keyframe, tuple(graph.keyframes[i] for i in unknown))
+        graph = graph.with_keyframe(keyframe, row)
+    return graph
+
+
+class Separation(NamedTuple):
+    """Keyframes that separate from their area, ascending, and the normalised cut that sets them apart."""
+
+    keyframes: tuple[int, ...]
+    ncut: float
+
+
+def separation(
+    graph: OverlapGraph, own: Collection[int], newest: int, threshold: float, min_size: int
+) -> Separation | None:
+    """The part of the robot's own keyframes, the newest among them, that separates from its area.
+
+    Keyframes that are not the robot's own, that is, that the area held before the robot entered it, are contracted
+    into one node: known ground is never split, and the node counts as many as it contracts. The graph is cut
+    recursively, and the part of the newest keyframe leaves; parts between it and the old ground stay with the old
+    ground, since they were passed before and nothing says that they form a place of their own. Where the part so found
+    does not separate well from all the rest, the first bipartition stands.
+
+    :param own: the keyframes stored since the robot entered the area.
+    :param newest: the newest keyframe, one of ``own``.
+    :param threshold: largest NCut at which keyframes separate.
+    :param min_size: keyframes on each side at least.
+    :returns: None where nothing separates, or the newest keyframe is on the side of the old ground.
+    """
+    similarity, sizes, nodes = _contracted(graph, own)
+    at = nodes.index(newest)
+    first = normalized_cut(similarity, min_size, sizes)
+    if first is None or first.value > threshold:
+        return None
+    parts = recursive_cut(similarity, threshold, min_size, sizes)
+    for side in (parts == parts[at], first.side):
+        value = ncut(similarity, side)
+        if side[at] and not side[0] and value <= threshold:
+            return Separation(tuple(int(nodes[i]) for i in np.flatnonzero(side)), value)
+    return None
+
+
+_OLD_GROUND = -1
+
+
+def _contracted(graph: OverlapGraph, own: Collection[int]) -> tuple[NDArray[np.float64], NDArray[np.int64], list[int]]:
+    """Similarities, shape (m, m), and sizes, shape (m,), of the old ground (where there is any) and own keyframes."""
+    nodes = [keyframe for keyframe in graph.keyframes if keyframe in own]
+    if len(nodes) < len(graph.keyframes):
+        nodes.insert(0, _OLD_GROUND)
+    column = {keyframe: i for i, keyframe in enumerate(nodes)}
+    membership = np.zeros((len(graph.keyframes), len(nodes)))
+    for row, keyframe in enumerate(graph.keyframes):
+        membership[row, column[keyframe] if keyframe in own else 0] = 1.0
+    return membership.T @ graph.similarity @ membership, membership.sum(axis=0).astype(np.int64), nodes

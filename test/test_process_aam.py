@@ -1,0 +1,273 @@
+"""The Area Abstraction Mechanism in a world of rooms, answered by a TSBI played by hand."""
+
+import numpy as np
+import pytest
+import rooms
+
+from hmt_slam_ros.configuration import Configuration, with_changes
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.processes import aam as aam_module
+from hmt_slam_ros.processes.aam import Aam
+from hmt_slam_ros.processes.messages import (
+    Accepted,
+    Arc,
+    AreaEvents,
+    Hypotheses,
+    Keyframe,
+    Leaf,
+    LeafEstimate,
+    LocalEstimate,
+    Relabelled,
+)
+
+WORLD = rooms.two_rooms()
+THERE = rooms.drive((1.0, 2.0), (4.0, 3.0), (8.0, 3.0), (10.5, 3.5), (10.5, 5.0), (7.5, 5.0), (7.5, 2.0))
+OPTIONS = {"aam.ncut_threshold": 0.8, "aam.overlap_radius": 0.15, "aam.persistence": 1}
+
+
+def aam(**changes):
+    return Aam(with_changes(Configuration(), OPTIONS | {f"aam.{name}": value for name, value in changes.items()}))
+
+
+def exact(pose):
+    return PoseGaussian(np.asarray(pose, dtype=np.float64), np.eye(3) * 1e-6)
+
+
+def estimate(hypothesis, area, pose, stored=True):
+    return LeafEstimate(hypothesis, area, exact(pose), stored, 0.0, 12.0)
+
+
+def keyframe(k, world_pose, *leaves):
+    return Keyframe(k, rooms.scan_at(WORLD, world_pose), 0.5 * k, leaves)
+
+
+def stay(k, *hypotheses, area=0):
+    return Hypotheses(k, tuple(Leaf(h, h, 1.0 / len(hypotheses), area) for h in hypotheses))
+
+
+def drive_until_cut(process, poses=THERE, origin=None):
+    """Play keyframes with one hypothesis in area 0 until a cut; returns it with the index of its keyframe."""
+    origin = poses[0] if origin is None else origin
+    for k, pose in enumerate(poses):
+        (answer,) = process.handle(keyframe(k, pose, estimate(0, 0, se2.between(origin, pose))))
+        assert isinstance(answer, AreaEvents)
+        assert answer.sequence == k
+        if answer.events:
+            return answer.events[0], k
+        process.handle(stay(k, 0))
+    pytest.fail("no cut on the whole way")
+
+
+def into(area, event, k, hypothesis=0, parent=0, probability=1.0, new_T_old=None):
+    """TSBI's answer that the keyframes of a cut belong to ``area``."""
+    new_T_old = np.zeros(3) if new_T_old is None else new_T_old
+    poses = {i: se2.compose(new_T_old, se2.between(THERE[0], THERE[i])) for i in event.keyframes}
+    return Leaf(
+        hypothesis,
+        parent,
+        probability,
+        area,
+        exact(new_T_old),
+        tuple(Relabelled(i, event.area, area, pose) for i, pose in poses.items()),
+        (Arc(event.area, area, exact(se2.inverse(new_T_old))),),
+    )
+
+
+def test_the_second_room_is_cut_off_from_the_first():
+    event, k = drive_until_cut(aam())
+    assert (event.hypothesis, event.kind, event.area) == (0, "cut", 0)
+    assert event.keyframes[-1] == k
+    assert event.keyframes == tuple(range(event.keyframes[0], k + 1))
+    # All the keyframes that leave lie beyond the door or in it, all that stay before it.
+    assert 5.0 < THERE[event.keyframes[0], 0] < 7.0
+    assert 0.0 < event.score <= 0.8
+
+
+def test_a_robot_that_goes_about_in_one_room_stays_in_its_area():
+    process = aam()
+    for k, pose in enumerate(rooms.drive((1.0, 1.0), (5.0, 1.0), (5.0, 4.0), (2.0, 4.0), (2.0, 2.0))):
+        assert process.handle(keyframe(k, pose, estimate(0, 0, pose)))[0].events == ()
+        process.handle(stay(k, 0))
+
+
+def test_a_cut_has_to_be_found_at_several_keyframes_in_a_row():
+    _, first = drive_until_cut(aam(persistence=1))
+    _, third = drive_until_cut(aam(persistence=3))
+    assert third == first + 2
+
+
+def test_a_smaller_threshold_waits_longer_or_never_cuts():
+    _, early = drive_until_cut(aam(ncut_threshold=0.9))
+    _, late = drive_until_cut(aam(ncut_threshold=0.72))
+    assert late > early
+
+
+def test_both_sides_of_a_cut_hold_the_smallest_number_of_keyframes():
+    event, k = drive_until_cut(aam(min_cluster=10))
+    assert len(event.keyframes) >= 10
+    assert k + 1 - len(event.keyframes) >= 10
+
+
+def test_the_frame_of_the_area_does_not_matter():
+    here, k_here = drive_until_cut(aam())
+    there, k_there = drive_until_cut(aam(), origin=np.array([-40.0, 70.0, 2.0]))
+    assert (here.keyframes, k_here) == (there.keyframes, k_there)
+    assert here.score == pytest.approx(there.score, abs=1e-9)
+
+
+def test_every_keyframe_is_answered_once_and_nothing_else_is():
+    process = aam()
+    assert len(process.handle(keyframe(0, THERE[0], estimate(0, 0, np.zeros(3))))) == 1
+    assert process.handle(stay(0, 0)) == []
+    assert process.handle(Accepted(0)) == []
+    assert process.handle(LocalEstimate(0, 0, 0, exact(np.zeros(3)), np.zeros(3), 0)) == []
+    assert process.handle(rooms.scan_at(WORLD, THERE[0])) == []
+
+
+def test_the_keyframes_that_left_begin_the_new_area():
+    process = aam()
+    event, k = drive_until_cut(process)
+    process.handle(Hypotheses(k, (into(1, event, k),)))
+    (answer,) = process.handle(keyframe(k + 1, THERE[k + 1], estimate(0, 1, se2.between(THERE[0], THERE[k + 1]))))
+    assert answer.events == ()
+
+
+@pytest.fixture
+def measured(monkeypatch):
+    """The numbers of scan pairs that were compared, call by call."""
+    counts = []
+    original = aam_module.overlaps
+
+    def counting(points, pose, others, other_poses, radius):
+        counts.append(len(others))
+        return original(points, pose, others, other_poses, radius)
+
+    monkeypatch.setattr(aam_module, "overlaps", counting)
+    return counts
+
+
+def test_a_new_keyframe_is_compared_with_each_of_its_area_once(measured):
+    process = aam(ncut_threshold=0.0)
+    for k, pose in enumerate(THERE[:12]):
+        measured.clear()
+        process.handle(keyframe(k, pose, estimate(0, 0, pose)))
+        # Once with all for the graph and once with the eight nearest for the question whether the robot moved.
+        assert sum(measured) == k + min(k, 8)
+        process.handle(stay(k, 0))
+
+
+def test_nothing_is_measured_again_when_hypotheses_branch_into_a_new_area(measured):
+    process = aam()
+    event, k = drive_until_cut(process)
+    measured.clear()
+    process.handle(Hypotheses(k, (into(1, event, k, 1, 0, 0.6), into(2, event, k, 2, 0, 0.4))))
+    assert sum(measured) == 0
+
+
+def answered_in_first_room(process):
+    """Rooms 0 and 1 known, the robot in room 1; returns the next keyframe's number."""
+    event, k = drive_until_cut(process)
+    process.handle(Hypotheses(k, (into(1, event, k),)))
+    process.handle(Accepted(k, 0))
+    for later in range(k + 1, len(THERE)):
+        area_pose = se2.between(THERE[0], THERE[later])
+        assert process.handle(keyframe(later, THERE[later], estimate(0, 1, area_pose)))[0].events == ()
+        process.handle(stay(later, 0, area=1))
+    return len(THERE)
+
+
+def drive_back(process):
+    """Drive back into the first room over known ground until something happens; (keyframe, world pose, event)."""
+    back = rooms.drive((7.5, 2.0), (7.5, 3.0), (5.0, 3.0), (1.0, 2.0))
+    for k, pose in enumerate(back, start=answered_in_first_room(process)):
+        leaf = estimate(0, 1, se2.between(THERE[0], pose), stored=False)
+        (answer,) = process.handle(keyframe(k, pose, leaf))
+        if answer.events:
+            return k, pose, answer.events[0]
+        process.handle(stay(k, 0, area=1))
+    pytest.fail("nothing happened on the whole way")
+
+
+def test_a_robot_that_returns_over_an_arc_has_moved_into_the_known_area():
+    _, pose, event = drive_back(aam(persistence=2))
+    assert (event.kind, event.area, event.keyframes) == ("moved", 0, ())
+    assert 3.0 < pose[0] < 6.5
+    assert 0.3 < event.score <= 1.0
+
+
+def moves_about(process, poses):
+    """The areas that the robot is said to move into while it goes to and fro on known ground, at first in area 1."""
+    area, moves = 1, []
+    for k, pose in enumerate(poses, start=answered_in_first_room(process)):
+        leaf = estimate(0, area, se2.between(THERE[0], pose), stored=False)
+        (answer,) = process.handle(keyframe(k, pose, leaf))
+        moves += [event.area for event in answer.events]
+        area = moves[-1] if moves else 1
+        process.handle(stay(k, 0, area=area))
+    return moves
+
+
+def test_the_margin_keeps_a_robot_that_dithers_in_the_door_from_flapping():
+    dither = np.array([[6.1, 3.0, np.pi], [6.3, 3.0, np.pi]] * 6)
+    assert len(moves_about(aam(persistence=1), dither)) <= 1
+    assert len(moves_about(aam(persistence=1, move_margin=0.0), dither)) > 4
+
+
+def test_a_short_look_into_the_other_area_is_no_move():
+    looks = np.array([[7.5, 3.0, np.pi], [5.0, 3.0, np.pi]] * 4)
+    assert moves_about(aam(persistence=2), looks) == []
+    assert len(moves_about(aam(persistence=1), looks)) == 8 - 1
+
+
+def test_the_robots_own_keyframes_stay_where_they_are_and_become_known_ground():
+    process = aam(persistence=1, min_cluster=3)
+    k, _, event = drive_back(process)
+    process.handle(stay(k, 0, area=event.area))
+    # In room 0 again: its keyframes are known ground and cannot leave it, however few of them are asked for.
+    for step, pose in enumerate(rooms.drive((4.0, 4.0), (4.0, 2.0)), start=k + 1):
+        (answer,) = process.handle(keyframe(step, pose, estimate(0, 0, se2.between(THERE[0], pose))))
+        cut = [event for event in answer.events if event.kind == "cut"]
+        assert all(min(event.keyframes) > k for event in cut)
+        process.handle(stay(step, 0, area=0))
+
+
+def test_a_closure_puts_the_keyframes_beside_the_known_ones_and_compares_only_across(measured):
+    process = aam()
+    event, k = drive_until_cut(process)
+    # Played: the second room is taken for a known area, which here is area 0 itself under another name.
+    process.handle(Hypotheses(k, (into(7, event, k, 1, 0, 0.5), into(8, event, k, 2, 0, 0.5))))
+    measured.clear()
+    back = {i: se2.between(THERE[0], THERE[i]) for i in event.keyframes}
+    relabelled = tuple(Relabelled(i, 7, 0, pose) for i, pose in back.items())
+    process.handle(Hypotheses(k + 1, (Leaf(1, 1, 1.0, 0, exact(np.zeros(3)), relabelled),)))
+    known = k + 1 - len(event.keyframes)
+    assert sum(measured) == known * len(event.keyframes)
+
+
+def test_a_hypothesis_that_does_not_store_the_keyframe_is_not_cut():
+    process = aam()
+    for k, pose in enumerate(THERE):
+        stored = k < 12
+        (answer,) = process.handle(keyframe(k, pose, estimate(0, 0, se2.between(THERE[0], pose), stored)))
+        assert answer.events == ()
+        process.handle(stay(k, 0))
+
+
+def test_hypotheses_are_judged_each_by_its_own_map():
+    process = aam()
+    event, k = drive_until_cut(process)
+    process.handle(Hypotheses(k, (into(1, event, k, 1, 0, 0.6), Leaf(2, 0, 0.4, 0))))
+    pose = se2.between(THERE[0], THERE[k + 1])
+    (answer,) = process.handle(keyframe(k + 1, THERE[k + 1], estimate(1, 1, pose), estimate(2, 0, pose)))
+    assert [(event.hypothesis, event.kind) for event in answer.events] == [(2, "cut")]
+
+
+def test_acceptance_drops_the_other_hypotheses():
+    process = aam()
+    event, k = drive_until_cut(process)
+    process.handle(Hypotheses(k, (into(1, event, k, 1, 0, 0.9), Leaf(2, 0, 0.1, 0))))
+    process.handle(Accepted(k, 1))
+    pose = se2.between(THERE[0], THERE[k + 1])
+    (answer,) = process.handle(keyframe(k + 1, THERE[k + 1], estimate(1, 1, pose), estimate(2, 0, pose)))
+    assert answer.events == ()
