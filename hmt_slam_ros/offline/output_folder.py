@@ -1,0 +1,161 @@
+"""The output folder of a run, written complete or not at all."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hmt_slam_ros.configuration import Configuration
+from hmt_slam_ros.errors import HmtSlamError
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.offline import plots
+from hmt_slam_ros.offline.map_image import occupancy_image, write_map
+from hmt_slam_ros.offline.recorder import Recorder, Recording
+from hmt_slam_ros.offline.report import RunFigures, report, write_cost, write_probabilities
+from hmt_slam_ros.offline.saved_map import MANIFEST, write_json, write_saved_map
+from hmt_slam_ros.offline.trajectories import Trajectory
+
+# Everything that ever stands in an output folder; a folder with anything else in it is not ours to replace.
+OWN_NAMES = frozenset(
+    {
+        "trajectory.tum",
+        "trajectory_online.tum",
+        "map.pgm",
+        "map.yaml",
+        "map.png",
+        "hmt_map",
+        "graph.g2o",
+        "report.json",
+        "pmf.csv",
+        "pmf.png",
+        "cost.csv",
+        "cost.png",
+        "evaluation.json",
+    }
+)
+
+
+@contextmanager
+def replacing(directory: Path) -> Iterator[Path]:
+    """A folder to write into that becomes ``directory`` if all goes well, and vanishes if not.
+
+    :raises HmtSlamError: where ``directory`` is something else than an old output folder, or cannot be made.
+    """
+    target = directory.absolute()
+    check_replaceable(target)
+    existing = next(parent for parent in target.parents if parent.exists())
+    try:
+        scratch = Path(tempfile.mkdtemp(prefix=f".{target.name}.partial-", dir=existing))
+    except OSError as fault:
+        raise HmtSlamError(f"{existing} cannot be written to ({fault.strerror}): choose another --out") from fault
+    try:
+        folder = scratch / "new"
+        folder.mkdir()
+        yield folder
+        check_replaceable(target)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        if target.exists():
+            target.rename(scratch / "old")
+        folder.rename(target)
+    except OSError as fault:
+        raise HmtSlamError(f"{directory} cannot be written ({fault.strerror}): choose another --out") from fault
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
+
+
+def check_replaceable(directory: Path) -> None:
+    """Refuse a path that holds something that would be lost.
+
+    :raises HmtSlamError: unless there is nothing, an empty folder or an old output folder.
+    """
+    if directory.is_symlink() or (directory.exists() and not directory.is_dir()):
+        raise HmtSlamError(f"{directory} is not a folder: choose another --out")
+    blocking = next((parent for parent in directory.parents if parent.exists() and not parent.is_dir()), None)
+    if blocking is not None:
+        raise HmtSlamError(f"{directory} cannot be made since {blocking} is not a folder: choose another --out")
+    names = {entry.name for entry in directory.iterdir()} if directory.exists() else set()
+    strange = sorted(names - OWN_NAMES)
+    if strange or (names and not (directory / "hmt_map" / MANIFEST).is_file()):
+        found = strange[0] if strange else min(names)
+        raise HmtSlamError(f"{directory} is not an output folder, it holds {found}: choose another --out or empty it")
+
+
+def write_output(
+    directory: Path,
+    recorder: Recorder,
+    stamps: NDArray[np.int64],
+    source_stamps: NDArray[np.int64],
+    figures: RunFigures,
+) -> Recording:
+    """Write every file of a run.
+
+    :param directory: an empty folder, see :func:`replacing`.
+    :param stamps: shape (n,), stamps of all scans of the log as the processes got them, ns, increasing.
+    :param source_stamps: shape (n,), the log's own stamps of the same scans, ns, in file order.
+    :raises HmtSlamError: where the run gave no map.
+    """
+    recording, configuration = recorder.finish(stamps), recorder.configuration
+    write_tum(directory / "trajectory.tum", source_stamps, recording.trajectory)
+    write_tum(directory / "trajectory_online.tum", source_stamps, recording.online)
+    _write_map(directory, recording, configuration)
+    write_saved_map(directory / "hmt_map", recording, configuration)
+    write_graph(directory / "graph.g2o", recording)
+    write_probabilities(directory / "pmf.csv", recording.probabilities)
+    write_cost(directory / "cost.csv", figures.seconds_per_scan)
+    write_json(directory / "report.json", report(recording, configuration, figures))
+    plots.plot_map(directory)
+    return recording
+
+
+def write_tum(path: Path, stamps: NDArray[np.int64], trajectory: Trajectory) -> None:
+    """``t x y z qx qy qz qw`` a line, t in s with all nine decimals.
+
+    :param stamps: shape (n,), ns.
+    """
+    half = 0.5 * trajectory[:, 2]
+    rows = zip(stamps.tolist(), trajectory.tolist(), np.sin(half).tolist(), np.cos(half).tolist(), strict=True)
+    lines = [f"{seconds(stamp)} {x:.9f} {y:.9f} 0 0 0 {sin:.12f} {cos:.12f}\n" for stamp, (x, y, _), sin, cos in rows]
+    path.write_text("".join(lines), encoding="utf-8")
+
+
+def seconds(stamp: int) -> str:
+    """Nanoseconds as decimal seconds, exactly."""
+    sign = "-" if stamp < 0 else ""
+    return f"{sign}{abs(stamp) // 10**9}.{abs(stamp) % 10**9:09d}"
+
+
+def _write_map(directory: Path, recording: Recording, configuration: Configuration) -> None:
+    hybrid_map, poses = recording.hybrid_map, recording.area_poses
+    placed = {
+        keyframe: se2.compose(poses[area].mean, pose)
+        for area in hybrid_map.area_ids()
+        for keyframe, pose in hybrid_map.keyframes(area).items()
+    }
+    scans = [recording.replica.scans[keyframe] for keyframe in placed]
+    settings = configuration.local_map
+    write_map(directory, occupancy_image(scans, np.array(list(placed.values())), settings.cell, settings.max_range))
+
+
+def write_graph(path: Path, recording: Recording) -> None:
+    """Areas as VERTEX_SE2 and arcs as EDGE_SE2.
+
+    The error that g2o weighs is the vector (x, y, theta) of measurement^-1 * estimate, which to first order is the
+    right tangent xi of our covariances, so the information matrix is their inverse.
+    """
+    lines = [f"VERTEX_SE2 {area} {_numbers(pose.mean)}\n" for area, pose in sorted(recording.area_poses.items())]
+    upper = np.triu_indices(3)
+    for a, b, arc in recording.hybrid_map.all_arcs():
+        information = np.linalg.inv(arc.pose.covariance)
+        lines.append(f"EDGE_SE2 {a} {b} {_numbers(arc.pose.mean)} {_numbers(information[upper])}\n")
+    path.write_text("".join(lines), encoding="utf-8")
+
+
+def _numbers(values: NDArray[Any]) -> str:
+    return " ".join(f"{value:.12g}" for value in values)

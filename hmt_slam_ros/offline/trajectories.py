@@ -1,0 +1,94 @@
+"""A pose for every scan of the log, in the final map and as it was known at the time."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hmt_slam_ros.errors import HmtSlamError
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.processes.messages import Accepted, Keyframe, LocalEstimate, Trail
+from hmt_slam_ros.processes.replica import FIRST_AREA
+from hmt_slam_ros.topology.hybrid_map import HybridMap
+
+Trajectory = NDArray[np.float64]
+"""Shape (scans, 3), ``map_T_base`` as (x, y, theta), m and rad, in the order of the log."""
+
+
+def final_trajectory(
+    stamps: NDArray[np.int64], trails: Sequence[Trail], hybrid_map: HybridMap, area_poses: Mapping[int, PoseGaussian]
+) -> Trajectory:
+    """``map_T_area`` * ``area_T_anchor`` * ``anchor_T_base`` of every scan.
+
+    :param stamps: shape (n,), of all scans, ns, increasing.
+    :param trails: of one hypothesis; where two speak of the same scan the later one counts.
+    :raises HmtSlamError: where no trail holds any scan.
+    """
+    anchors = {
+        keyframe: se2.compose(area_poses[area].mean, pose)
+        for area in hybrid_map.area_ids()
+        for keyframe, pose in hybrid_map.keyframes(area).items()
+    }
+    poses = np.full((stamps.size, 3), np.nan)
+    for trail in trails:
+        if trail.stamps.size:
+            map_T_anchor = np.array([anchors[anchor] for anchor in trail.anchors.tolist()])
+            poses[_rows(stamps, trail.stamps)] = se2.compose(map_T_anchor, trail.poses)
+    return _filled(poses)
+
+
+def online_trajectory(
+    stamps: NDArray[np.int64],
+    estimates: Mapping[int, LocalEstimate],
+    keyframes: Sequence[Keyframe],
+    accepted: Sequence[Accepted],
+) -> Trajectory:
+    """``map_T_base`` of every scan from what was known when it was taken.
+
+    The verdict on a keyframe holds for the scans after it. In an area that no verdict has placed yet, the pose goes on
+    from the one before it along the odometry.
+
+    :param stamps: shape (n,), of all scans, ns, increasing.
+    """
+    poses = np.full((stamps.size, 3), np.nan)
+    rows = _rows(stamps, np.array([estimates[index].stamp for index in sorted(estimates)], dtype=np.int64))
+    areas = {FIRST_AREA: np.zeros(3)}
+    verdicts, previous = 0, None
+    for row, index in zip(rows, sorted(estimates), strict=True):
+        estimate = estimates[index]
+        while verdicts < len(keyframes) and keyframes[verdicts].scan.stamp < estimate.stamp:
+            given = accepted[verdicts].global_poses
+            areas = {entry.area: entry.pose.mean for entry in given} if given else areas
+            verdicts += 1
+        if estimate.area in areas or previous is None:
+            pose = se2.compose(areas.get(estimate.area, np.zeros(3)), estimate.pose.mean)
+        else:
+            pose = se2.compose(previous[0], se2.between(previous[1], estimate.odometry))
+        poses[row] = pose
+        previous = (pose, estimate.odometry)
+    return _filled(poses)
+
+
+def _rows(stamps: NDArray[np.int64], wanted: NDArray[np.int64]) -> NDArray[np.intp]:
+    """The scans that have the given stamps."""
+    rows = np.minimum(np.searchsorted(stamps, wanted), stamps.size - 1)
+    strange = wanted[stamps[rows] != wanted]
+    if strange.size:
+        raise HmtSlamError(f"a scan of stamp {strange[0]} ns is not in the log: stop other sources of /scan")
+    return rows
+
+
+def _filled(poses: Trajectory) -> Trajectory:
+    """Scans without a pose get one between their neighbours in the log, or the nearest one at either end."""
+    known = np.flatnonzero(~np.isnan(poses[:, 0]))
+    if known.size == 0:
+        raise HmtSlamError(f"none of the {len(poses)} scans gave a pose: check the ranges and the odometry of the log")
+    index = np.arange(len(poses), dtype=np.float64)
+    position = np.interp(index, known, np.arange(known.size))
+    before = np.floor(position).astype(np.int64)
+    after = np.minimum(before + 1, known.size - 1)
+    between = se2.interpolate(poses[known[before]], poses[known[after]], position - before)
+    return np.where(np.isnan(poses), between, poses)

@@ -1,0 +1,371 @@
+"""The output folder, from a small run made by hand whose right answer is known."""
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hmt_slam_ros.configuration import Configuration, with_changes
+from hmt_slam_ros.errors import HmtSlamError
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.offline import plots
+from hmt_slam_ros.offline.map_image import read_map
+from hmt_slam_ros.offline.output_folder import replacing, seconds, write_output, write_tum
+from hmt_slam_ros.offline.recorder import Recorder
+from hmt_slam_ros.offline.report import RunFigures, read_table
+from hmt_slam_ros.offline.saved_map import read_saved_map
+from hmt_slam_ros.processes.messages import (
+    Accepted,
+    Arc,
+    AreaPose,
+    Finished,
+    Hypotheses,
+    Keyframe,
+    Leaf,
+    LeafEstimate,
+    LocalArea,
+    LocalEstimate,
+    Relabelled,
+    Trail,
+)
+from hmt_slam_ros.sensing import Scan
+
+SCANS, EVERY, CUT, VERDICT = 24, 4, 3, 4
+STAMPS = 10**9 + 10**8 * np.arange(SCANS, dtype=np.int64)
+SOURCE = STAMPS - 7 * 10**17  # the log's own clock, which differs from the one that the processes see
+COVARIANCE = np.diag([0.04, 0.01, 0.0025])
+MAP_T_AREA_1 = np.array([3.0, 0.5, 0.4])
+TRUTH = np.column_stack([np.linspace(0.0, 6.0, SCANS), 0.1 * np.linspace(0.0, 6.0, SCANS), np.linspace(0, 0.6, SCANS)])
+
+
+def scan(index: int) -> Scan:
+    """A round room of radius 10 m about the map's origin, seen from the true pose."""
+    angles = -np.pi + 2.0 * np.pi / 90.0 * np.arange(90)
+    x, y, theta = TRUTH[index]
+    along = np.cos(angles + theta) * x + np.sin(angles + theta) * y
+    ranges = -along + np.sqrt(along**2 + 100.0 - x**2 - y**2)
+    return Scan(int(STAMPS[index]), ranges.astype(np.float32), -np.pi, 2.0 * np.pi / 90.0, 0.1, 80.0)
+
+
+def belief(mean: np.ndarray) -> PoseGaussian:
+    return PoseGaussian(np.asarray(mean, dtype=float), COVARIANCE)
+
+
+def keyframe(sequence: int, leaves: dict[int, int]) -> Keyframe:
+    """Keyframe event with {hypothesis: area}; poses are exact in each hypothesis."""
+    index = EVERY * sequence
+    estimates = tuple(
+        LeafEstimate(hypothesis, area, belief(se2.between(frame(area), TRUTH[index])), True, 0.0, 12.0)
+        for hypothesis, area in leaves.items()
+    )
+    return Keyframe(sequence, scan(index), 6.0 * index / (SCANS - 1), estimates)
+
+
+def frame(area: int) -> np.ndarray:
+    return MAP_T_AREA_1 if area == 1 else np.zeros(3)
+
+
+def verdict_poses(*areas: int) -> tuple[AreaPose, ...]:
+    return tuple(AreaPose(area, belief(frame(area))) for area in areas)
+
+
+def trails() -> list[Trail]:
+    """Hypothesis 0 up to the cut, 1 and 2 after it; 2 is wrong by a metre and must not be used."""
+    rows = []
+    for first in range(0, SCANS, EVERY):
+        index = np.arange(first, min(first + EVERY, SCANS))
+        anchors = index // EVERY
+        poses = se2.between(TRUTH[EVERY * anchors], TRUTH[index])
+        after = first > EVERY * CUT
+        for hypothesis in ([1] if first > EVERY * VERDICT else [1, 2]) if after else [0]:
+            shift = np.array([1.0, 0.0, 0.0]) * (hypothesis == 2)
+            rows.append(Trail(hypothesis, first, STAMPS[index], anchors, poses + shift))
+    return rows
+
+
+def messages() -> list:
+    said = list(trails())
+    for index in range(SCANS):
+        area = 1 if index > EVERY * CUT else 0
+        pose = belief(se2.between(frame(area), TRUTH[index]))
+        said.append(LocalEstimate(int(STAMPS[index]), index, area, pose, TRUTH[index], 0))
+    for k in range(SCANS // EVERY):
+        said.append(keyframe(k, {0: 0} if k <= CUT else {1: 1, 2: 0} if k <= VERDICT else {1: 1}))
+        said.append(hypotheses(k))
+        said.append(accepted(k))
+    return [*said, Finished(SCANS, SCANS, 0)]
+
+
+def hypotheses(k: int) -> Hypotheses:
+    if k < CUT:
+        return Hypotheses(k, (Leaf(0, 0, 1.0, 0),))
+    if k > VERDICT:
+        return Hypotheses(k, (Leaf(1, 1, 1.0, 1),))
+    if k == VERDICT:
+        return Hypotheses(k, (Leaf(1, 1, 0.95, 1), Leaf(2, 2, 0.04, 0)), unexamined=0.01)
+    to_1 = se2.between(MAP_T_AREA_1, TRUTH[EVERY * k])
+    new = Leaf(
+        1,
+        0,
+        0.7,
+        1,
+        belief(se2.inverse(MAP_T_AREA_1)),
+        (Relabelled(k, 0, 1, to_1),),
+        (Arc(0, 1, belief(MAP_T_AREA_1), closure=True),),
+        (LocalArea(1, np.zeros(3)), LocalArea(0, se2.inverse(MAP_T_AREA_1))),
+    )
+    return Hypotheses(k, (new, Leaf(2, 0, 0.3, 0)))
+
+
+def accepted(k: int) -> Accepted:
+    if k == 0:
+        return Accepted(k, global_poses=verdict_poses(0))
+    if k == CUT:
+        return Accepted(k, global_poses=verdict_poses(0, 1))
+    return Accepted(k, hypothesis=1) if k == VERDICT else Accepted(k)
+
+
+FIGURES = RunFigures(
+    "by hand", "lock-step", {"slam": np.arange(SCANS) * 1e-3, "aam": np.zeros(SCANS)}, {"hmt_slam": 10**8}, 2.0, 1.5
+)
+
+
+def recorded(order: int = 0, without: type | None = None) -> Recorder:
+    said = [message for message in messages() if without is None or not isinstance(message, without)]
+    recorder = Recorder(with_changes(Configuration(), {"seed": 7, "local_map.cell": 0.1}))
+    for index in np.random.default_rng(order).permutation(len(said)) if order else range(len(said)):
+        assert recorder.handle(said[index]) == []
+    return recorder
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    directory = tmp_path_factory.mktemp("output")
+    write_output(directory, recorded(), STAMPS, SOURCE, FIGURES)
+    return directory
+
+
+def contents(directory: Path) -> dict[str, bytes]:
+    return {str(f.relative_to(directory)): f.read_bytes() for f in sorted(directory.rglob("*")) if f.is_file()}
+
+
+def test_every_file_of_the_design_is_there(folder: Path) -> None:
+    wanted = "trajectory.tum trajectory_online.tum map.pgm map.yaml hmt_map graph.g2o report.json pmf.csv map.png"
+    assert set(wanted.split()) <= {entry.name for entry in folder.iterdir()}
+
+
+@pytest.mark.parametrize("name", ["trajectory.tum", "trajectory_online.tum"])
+def test_both_trajectories_are_true_and_carry_the_logs_own_stamps(folder: Path, name: str) -> None:
+    lines = (folder / name).read_text().splitlines()
+    assert [line.split()[0] for line in lines] == [seconds(int(stamp)) for stamp in SOURCE]
+    trajectory = plots.read_tum(folder / name)
+    np.testing.assert_allclose(trajectory[:, 1:], TRUTH, atol=1e-8)
+
+
+def test_the_order_in_which_messages_arrive_does_not_matter(folder: Path, tmp_path: Path) -> None:
+    write_output(tmp_path, recorded(order=3), STAMPS, SOURCE, FIGURES)
+    assert contents(tmp_path) == contents(folder)
+
+
+def test_a_message_that_comes_twice_counts_once(folder: Path, tmp_path: Path) -> None:
+    recorder = recorded()
+    for message in messages():
+        recorder.handle(message)
+    write_output(tmp_path, recorder, STAMPS, SOURCE, FIGURES)
+    assert contents(tmp_path) == contents(folder)
+
+
+def test_the_recorder_is_complete_only_when_everything_has_been_heard() -> None:
+    assert recorded().complete
+    for kind in (Finished, Accepted, Hypotheses, LocalEstimate):
+        assert not recorded(without=kind).complete
+
+
+def test_a_lost_message_is_named() -> None:
+    recorder = recorded()
+    del recorder.hypotheses[2]
+    with pytest.raises(HmtSlamError, match="Hypotheses 2 was lost"):
+        recorder.finish(STAMPS)
+
+
+def test_a_lost_last_message_is_named() -> None:
+    recorder = recorded()
+    del recorder.accepted[SCANS // EVERY - 1]
+    with pytest.raises(HmtSlamError, match="was lost"):
+        recorder.finish(STAMPS)
+
+
+def test_a_run_without_any_pose_is_refused() -> None:
+    with pytest.raises(HmtSlamError, match="none of the 24 scans"):
+        recorded(without=LocalEstimate).finish(STAMPS)
+
+
+def test_a_scan_that_is_not_in_the_log_is_named() -> None:
+    with pytest.raises(HmtSlamError, match="is not in the log"):
+        recorded().finish(STAMPS[:-1])
+
+
+def test_a_scan_without_a_pose_gets_one_between_its_neighbours() -> None:
+    recorder = recorded()
+    trail = recorder.trails.pop((1, 16))
+    keep = np.array([True, False, True, True])
+    recorder.handle(Trail(1, 16, trail.stamps[keep], trail.anchors[keep], trail.poses[keep]))
+    np.testing.assert_allclose(recorder.finish(STAMPS).trajectory, TRUTH, atol=5e-3)
+
+
+def test_an_area_that_no_verdict_placed_is_placed_along_the_arcs() -> None:
+    recorder = recorded()
+    recorder.accepted[CUT] = Accepted(CUT)
+    recording = recorder.finish(STAMPS)
+    np.testing.assert_allclose(recording.area_poses[1].mean, MAP_T_AREA_1)
+    np.testing.assert_allclose(recording.trajectory, TRUTH, atol=1e-9)
+    np.testing.assert_allclose(recording.online, TRUTH, atol=1e-9)
+
+
+def test_the_probabilities_are_those_of_tsbi(folder: Path) -> None:
+    table = read_table(folder / "pmf.csv")
+    at_cut = table["keyframe"] == CUT
+    assert table["probability"][at_cut].tolist() == [0.7, 0.3]
+    assert table["areas"][at_cut].tolist() == [2, 1]
+    assert table["closures"][at_cut].tolist() == [1, 0]
+    assert table["parent"][at_cut].tolist() == [0, 0]
+    assert table["unexamined"][table["keyframe"] == VERDICT].tolist() == [0.01, 0.01]
+    accepted_rows = np.flatnonzero(table["accepted"])
+    assert [(table["keyframe"][r], table["hypothesis"][r]) for r in accepted_rows] == [(VERDICT, 1)]
+
+
+def test_the_graph_has_areas_and_arcs_with_information_in_the_order_of_g2o(folder: Path) -> None:
+    lines = [line.split() for line in (folder / "graph.g2o").read_text().splitlines()]
+    assert [line[:2] for line in lines] == [["VERTEX_SE2", "0"], ["VERTEX_SE2", "1"], ["EDGE_SE2", "0"]]
+    assert np.array(lines[1][2:], dtype=float) == pytest.approx(MAP_T_AREA_1)
+    assert np.array(lines[2][3:6], dtype=float) == pytest.approx(MAP_T_AREA_1)
+    assert np.array(lines[2][6:], dtype=float) == pytest.approx([25.0, 0.0, 0.0, 100.0, 0.0, 400.0])
+
+
+def test_the_report_counts_what_happened(folder: Path) -> None:
+    report = json.loads((folder / "report.json").read_text())
+    assert report["scans"] == {"in": SCANS, "processed": SCANS, "dropped": 0}
+    assert (report["areas"], report["arcs"], report["loop_closures"]) == (2, 1, 1)
+    assert report["keyframes"] == report["keyframe_events"] == SCANS // EVERY
+    assert report["processes"]["slam"]["max_ms_per_scan"] == pytest.approx(23.0)
+    assert report["processes"]["slam"]["mean_ms_per_scan"] == pytest.approx(11.5)
+    assert report["configuration"]["local_map"]["cell"] == 0.1
+    assert (report["seed"], report["peak_rss_bytes"]) == (7, {"hmt_slam": 10**8})
+    assert {"numpy", "numba", "hmt_slam_ros"} <= set(report["versions"])
+
+
+def test_the_map_shows_the_round_room(folder: Path) -> None:
+    image = read_map(folder)
+    rows, columns = np.nonzero(image.pixels == 0)
+    x = image.origin[0] + (columns + 0.5) * image.resolution
+    y = image.origin[1] + (image.pixels.shape[0] - rows - 0.5) * image.resolution
+    assert rows.size > 300
+    assert np.abs(np.hypot(x, y) - 10.0).max() < 0.2
+
+
+def test_the_saved_map_reads_back_complete(folder: Path) -> None:
+    saved = read_saved_map(folder / "hmt_map")
+    recording = recorded().finish(STAMPS)
+    hybrid_map = saved.replica.maps[1]
+    assert saved.replica.best == recording.replica.best == 1
+    assert saved.configuration.seed == 7
+    assert hybrid_map.area_ids() == recording.hybrid_map.area_ids()
+    for area in hybrid_map.area_ids():
+        keyframes = recording.hybrid_map.keyframes(area)
+        assert list(hybrid_map.keyframes(area)) == list(keyframes)
+        for k, pose in keyframes.items():
+            np.testing.assert_array_equal(hybrid_map.keyframes(area)[k], pose)
+            np.testing.assert_array_equal(saved.replica.scans[k].ranges, recording.replica.scans[k].ranges)
+            np.testing.assert_array_equal(saved.replica.scans[k].points, recording.replica.scans[k].points)
+    for (a, b, arc), (c, d, other) in zip(hybrid_map.all_arcs(), recording.hybrid_map.all_arcs(), strict=True):
+        assert (a, b, arc.closure) == (c, d, other.closure)
+        np.testing.assert_array_equal(arc.pose.covariance, other.pose.covariance)
+
+
+def test_the_saved_map_keeps_every_live_hypothesis(tmp_path: Path) -> None:
+    recorder = recorded()
+    for k in range(VERDICT, SCANS // EVERY):
+        recorder.hypotheses[k] = Hypotheses(k, (Leaf(1, 1, 0.6, 1), Leaf(2, 2, 0.4, 0)))
+        recorder.accepted[k] = Accepted(k)
+    write_output(tmp_path, recorder, STAMPS, SOURCE, FIGURES)
+    saved = read_saved_map(tmp_path / "hmt_map")
+    assert saved.replica.probabilities == {1: 0.6, 2: 0.4}
+    assert {h: m.area_ids() for h, m in saved.replica.maps.items()} == {1: [0, 1], 2: [0]}
+    assert saved.replica.areas == {1: 1, 2: 0}
+
+
+@pytest.mark.parametrize("name", ["manifest.json", "common.json", "global.json", "scans/ranges.npy"])
+def test_a_damaged_map_is_refused(folder: Path, tmp_path: Path, name: str) -> None:
+    for path, content in contents(folder / "hmt_map").items():
+        (tmp_path / path).parent.mkdir(exist_ok=True)
+        (tmp_path / path).write_bytes(content[: len(content) // 2] if path == name else content)
+    with pytest.raises(HmtSlamError, match="no complete HMT map"):
+        read_saved_map(tmp_path)
+
+
+def test_all_plots_are_drawn_from_the_files_alone(folder: Path) -> None:
+    for picture in plots.plot_all(folder):
+        assert picture.read_bytes().startswith(b"\x89PNG")
+        assert picture.stat().st_size > 10_000
+
+
+def test_plots_of_something_else_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(HmtSlamError, match="map the log again"):
+        plots.plot_all(tmp_path)
+
+
+def test_tum_lines_hold_the_time_exactly_and_a_unit_quaternion(tmp_path: Path) -> None:
+    write_tum(tmp_path / "t.tum", np.array([1_132_567_890_123_456_789, -5]), np.array([[1, 2, math.pi / 2], [0, 0, 0]]))
+    first, second = (tmp_path / "t.tum").read_text().splitlines()
+    assert first == "1132567890.123456789 1.000000000 2.000000000 0 0 0 0.707106781187 0.707106781187"
+    assert second.startswith("-0.000000005 ")
+
+
+def test_a_failed_run_leaves_nothing_behind(tmp_path: Path) -> None:
+    def run() -> None:
+        with replacing(tmp_path / "deep" / "out") as scratch:
+            (scratch / "map.pgm").write_text("half")
+            raise HmtSlamError("stop")
+
+    with pytest.raises(HmtSlamError, match="stop"):
+        run()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_successful_run_makes_missing_folders_and_leaves_no_scratch(tmp_path: Path) -> None:
+    with replacing(tmp_path / "deep" / "out") as scratch:
+        (scratch / "map.pgm").write_text("whole")
+    assert [entry.name for entry in tmp_path.iterdir()] == ["deep"]
+    assert (tmp_path / "deep" / "out" / "map.pgm").read_text() == "whole"
+
+
+def test_an_old_output_folder_is_replaced_whole(tmp_path: Path) -> None:
+    for content in ("old", "new"):
+        with replacing(tmp_path / "out") as scratch:
+            (scratch / "hmt_map").mkdir()
+            (scratch / "hmt_map" / "manifest.json").write_text(content)
+            if content == "old":
+                (scratch / "pmf.png").write_text(content)
+    assert contents(tmp_path) == {"out/hmt_map/manifest.json": b"new"}
+
+
+@pytest.mark.parametrize("name", ["notes.txt", "trajectory.tum", "hmt_map/manifest.json and notes.txt"])
+def test_a_folder_with_anything_else_is_refused_and_kept(tmp_path: Path, name: str) -> None:
+    for part in name.split(" and "):
+        (tmp_path / "out" / part).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "out" / part).write_text("precious")
+    before = contents(tmp_path)
+    with pytest.raises(HmtSlamError, match="is not an output folder"), replacing(tmp_path / "out"):
+        pass
+    assert contents(tmp_path) == before
+
+
+def test_a_file_in_the_way_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "out").write_text("precious")
+    for path in (tmp_path / "out", tmp_path / "out" / "below"):
+        with pytest.raises(HmtSlamError, match="choose another --out"), replacing(path):
+            pass
+    assert (tmp_path / "out").read_text() == "precious"
