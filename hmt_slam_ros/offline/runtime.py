@@ -56,11 +56,13 @@ class RunResult:
     """What a run leaves.
 
     :ivar recorder: what was said.
+    :ivar stamps: shape (n,), int64, stamp of every scan on the log's running clock, ns, increasing.
     :ivar source_stamps: shape (n,), int64, the log's own stamp of every scan in file order, ns.
     :ivar seconds_per_scan: {process: shape (n,) seconds}.
     """
 
     recorder: Recorder
+    stamps: NDArray[np.int64]
     source_stamps: NDArray[np.int64]
     seconds_per_scan: dict[str, NDArray[np.float64]]
 
@@ -82,12 +84,12 @@ def run_log(log: Log, configuration: Configuration, progress: Callable[[int], No
             "recorder": recorder,
         }
     )
-    stamps: list[int] = []
+    stamps: list[tuple[int, int]] = []
     spent: list[dict[str, float]] = []
     for record in log.records():
         lock_step.feed(record.measurement)
         if isinstance(record.measurement, Scan):
-            stamps.append(record.source_stamp)
+            stamps.append((record.measurement.stamp, record.source_stamp))
             spent.append(lock_step.take_seconds())
             if progress:
                 progress(len(stamps))
@@ -95,4 +97,5 @@ def run_log(log: Log, configuration: Configuration, progress: Callable[[int], No
     seconds = {
         name: np.array([taken.get(name, 0.0) for taken in spent]) for name in lock_step.processes if name != "recorder"
     }
-    return RunResult(recorder, np.array(stamps, dtype=np.int64), seconds)
+    running, source = np.array(stamps, dtype=np.int64).reshape(-1, 2).T
+    return RunResult(recorder, running, source, seconds)
