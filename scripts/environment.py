@@ -23,8 +23,6 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 TF2_MSGS = ROOT / "scripts" / "tf2_msgs"
 REQUIREMENTS = ROOT / "requirements"
-# What an installed copy of the project is made of, the Python modules apart: those are used where they lie.
-PROJECT = ("setup.py", "setup.cfg", "package.xml", "resource", "launch", "config", "libexec", "data")
 
 
 class EnvironmentSetupError(Exception):
@@ -208,7 +206,7 @@ def update(environment: Environment) -> None:
     """Bring the environment up to date; do nothing where it is."""
     needs = f"{sys.version} {ROOT} {environment.jazzy} {environment.constraints.name} {missing_for_compilation()}"
     steps = {
-        "project": (digest(REQUIREMENTS, *(ROOT / name for name in PROJECT), also=needs), install_project),
+        "project": (digest(REQUIREMENTS, ROOT / "setup.py", ROOT / "setup.cfg", also=needs), install_project),
         "ros": (digest(REQUIREMENTS, TF2_MSGS, also=needs), install_ros),
     }
     for name, (wanted, install) in steps.items():

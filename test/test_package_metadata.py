@@ -1,0 +1,188 @@
+"""The package says the same thing about itself everywhere, and contains what it promises."""
+
+import ast
+import configparser
+import os
+import re
+import subprocess
+import sys
+from importlib import import_module, metadata
+from importlib.util import find_spec
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pytest
+import yaml
+
+import hmt_slam_ros
+
+ROOT = Path(__file__).resolve().parent.parent
+NODES = ("slam", "aam", "tsbi", "tlca", "rtl", "robot")
+LAUNCH_FILES = sorted((ROOT / "launch").glob("*.launch.py"))
+
+
+@pytest.fixture(scope="module")
+def setup_arguments():
+    """What setup.py hands to setuptools, read without installing anything."""
+    script = (
+        "import json, setuptools; setuptools.setup = lambda **arguments: print(json.dumps(arguments));"
+        "exec(open('setup.py').read())"
+    )
+    result = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, check=True)
+    return yaml.safe_load(result.stdout)
+
+
+@pytest.fixture(scope="module")
+def console_scripts(setup_arguments):
+    """Command name to "module:function"."""
+    return dict(line.split(" = ") for line in setup_arguments["entry_points"]["console_scripts"])
+
+
+def package_xml():
+    return ElementTree.parse(ROOT / "package.xml").getroot()
+
+
+def test_package_xml_and_setup_py_and_the_module_agree_on_name_version_and_licence(setup_arguments):
+    document = package_xml()
+    assert document.findtext("version") == setup_arguments["version"] == hmt_slam_ros.__version__
+    assert document.findtext("name") == setup_arguments["name"] == hmt_slam_ros.__name__
+    assert document.findtext("license") == setup_arguments["license"] == "BSD-3-Clause"
+
+
+def test_the_changelog_is_about_this_package_and_knows_its_version_or_what_is_to_come():
+    text = (ROOT / "CHANGELOG.rst").read_text()
+    assert "Changelog for package hmt_slam_ros" in text
+    assert re.search(rf"^(Forthcoming|{re.escape(hmt_slam_ros.__version__)}\b.*)\n-+$", text, re.MULTILINE)
+
+
+def test_setup_cfg_sends_colcons_executables_to_where_ros2_run_looks():
+    settings = configparser.ConfigParser()
+    settings.read(ROOT / "setup.cfg")
+    assert settings["install"]["install_scripts"] == settings["develop"]["script_dir"] == "$base/lib/hmt_slam_ros"
+
+
+def test_every_command_on_path_is_prefixed_and_every_node_has_one(console_scripts):
+    assert set(console_scripts) == {"hmt_slam", *(f"hmt_slam_{node}" for node in NODES)}
+
+
+@pytest.mark.parametrize("command", ["hmt_slam", *(f"hmt_slam_{node}" for node in NODES)])
+def test_every_command_leads_to_a_function_that_can_be_called(console_scripts, command):
+    module, function = console_scripts[command].split(":")
+    if ".nodes." in module:
+        pytest.importorskip("rclpy", reason="the nodes need rclpy, which is not installed here")
+    assert callable(getattr(import_module(module), function))
+
+
+@pytest.mark.parametrize("node", NODES)
+def test_ros2_run_finds_an_executable_that_runs_the_node_of_its_name(setup_arguments, node, tmp_path):
+    installed = dict(setup_arguments["data_files"])["lib/hmt_slam_ros"]
+    source = ROOT / next(file for file in installed if Path(file).name == node)
+    assert os.access(source, os.X_OK)
+    package = tmp_path / "hmt_slam_ros" / "nodes"
+    package.mkdir(parents=True)
+    (package / f"{node}_node.py").write_text(f"def main():\n    print('this is {node}')\n")
+    executable = tmp_path / node
+    executable.write_bytes(source.read_bytes())
+    result = subprocess.run(
+        [sys.executable, executable], env=os.environ | {"PYTHONPATH": str(tmp_path)}, capture_output=True, text=True,
+        check=True,
+    )
+    assert result.stdout == f"this is {node}\n"
+
+
+def test_the_installed_files_exist_and_hold_marker_launch_configuration_and_the_bundled_log(setup_arguments):
+    installed = dict(setup_arguments["data_files"])
+    assert all((ROOT / file).is_file() for files in installed.values() for file in files)
+    names = {f"{folder}/{Path(file).name}" for folder, files in installed.items() for file in files}
+    share = "share/hmt_slam_ros"
+    assert names >= {
+        "share/ament_index/resource_index/packages/hmt_slam_ros",
+        f"{share}/package.xml",
+        f"{share}/launch/mapping.launch.py",
+        f"{share}/launch/replay.launch.py",
+        f"{share}/config/hmt_slam.yaml",
+        f"{share}/config/hmt_slam.rviz",
+        f"{share}/data/malaga_one_loop/metadata.yaml",
+        f"{share}/data/malaga_one_loop/README.md",
+    }
+    assert any(name.endswith(".mcap") for name in names)
+
+
+def test_every_package_with_modules_is_installed(setup_arguments):
+    folders = {path.parent for path in (ROOT / "hmt_slam_ros").rglob("*.py")}
+    assert set(setup_arguments["packages"]) == {".".join(folder.relative_to(ROOT).parts) for folder in folders}
+
+
+def imported_names(files):
+    trees = [ast.parse(file.read_text()) for file in files]
+    nodes = [node for tree in trees for node in ast.walk(tree)]
+    absolute = [node.module for node in nodes if isinstance(node, ast.ImportFrom) and node.module and not node.level]
+    plain = [alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names]
+    return {name.split(".")[0] for name in absolute + plain}
+
+
+@pytest.fixture(scope="module")
+def python_packages(setup_arguments):
+    """The modules of the packages that pip is to install."""
+    names = (re.split(r"[<>=]", requirement)[0] for requirement in setup_arguments["install_requires"])
+    return {name.lower().replace("pyyaml", "yaml") for name in names}
+
+
+def test_every_third_party_import_is_a_declared_dependency(python_packages):
+    imported = imported_names((ROOT / "hmt_slam_ros").rglob("*.py"))
+    ros = {element.text for element in package_xml().findall("exec_depend")}
+    # _typeshed exists for type checkers only.
+    assert imported - set(sys.stdlib_module_names) - {"hmt_slam_ros", "_typeshed"} <= ros | python_packages
+
+
+def test_pip_and_rosdep_ask_for_the_same_python_packages_but_for_numba_which_rosdep_cannot_give(python_packages):
+    keys = {str(element.text) for element in package_xml().findall("exec_depend")}
+    rosdep = {key.removeprefix("python3-").removesuffix("-pip") for key in keys if key.startswith("python3-")}
+    assert python_packages == rosdep | {"numba"}
+
+
+@pytest.mark.parametrize("requirement", ["numpy", "scipy", "networkx", "numba", "matplotlib", "rosbags", "PyYAML"])
+def test_the_floor_that_is_tested_is_the_floor_that_setup_py_promises(setup_arguments, requirement):
+    promised = next(line for line in setup_arguments["install_requires"] if line.startswith(requirement))
+    floor = (ROOT / "requirements" / "floor.txt").read_text()
+    tested = re.search(rf"^{requirement}==([\d.]+)", floor, re.MULTILINE)
+    assert tested
+    assert f"{tested[1]}.".startswith(f"{promised.split('>=')[1]}.")
+
+
+def test_the_installed_distribution_is_this_checkout():
+    try:
+        installed = metadata.version("hmt_slam_ros")
+    except metadata.PackageNotFoundError:
+        pytest.skip("hmt_slam_ros is used from the source tree, not installed")
+    assert installed == hmt_slam_ros.__version__
+
+
+@pytest.mark.parametrize("path", LAUNCH_FILES, ids=lambda path: path.name)
+def test_launch_file_compiles_and_starts_executables_that_exist(path):
+    tree = ast.parse(path.read_text(), filename=str(path))
+    assert any(isinstance(node, ast.FunctionDef) and node.name == "generate_launch_description" for node in tree.body)
+    literals = {
+        keyword.value.value
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Call)
+        for keyword in node.keywords
+        if keyword.arg == "executable" and isinstance(keyword.value, ast.Constant)
+    }
+    assert literals <= {*NODES, "rviz2"}
+
+
+@pytest.mark.parametrize("path", LAUNCH_FILES, ids=lambda path: path.name)
+def test_launch_file_describes_its_arguments(path):
+    if find_spec("launch_ros") is None:
+        pytest.skip("launch_ros is not installed: it comes with a ROS installation, PyPI does not have it")
+    namespace = {}
+    exec(compile(path.read_text(), str(path), "exec"), namespace)
+    described = {argument.name for argument in namespace["generate_launch_description"]().get_launch_arguments()}
+    assert {"params_file", "namespace"} <= described
+
+
+def test_rviz_shows_the_topics_the_nodes_publish():
+    displays = yaml.safe_load((ROOT / "config" / "hmt_slam.rviz").read_text())["Visualization Manager"]["Displays"]
+    topics = {display["Topic"]["Value"] for display in displays if "Topic" in display}
+    assert topics == {"/map", "/hmt/graph", "/hmt/particles", "/pose", "/scan"}
