@@ -298,8 +298,7 @@ def _log_mean(log_values: Float64, weights: Float64) -> float:
 
 def _information(covariance: Float64, theta: float) -> Float64:
     """Inverse, in the map frame, of a covariance in the body's tangent frame, both (3, 3)."""
-    information: Float64 = np.linalg.inv(_in_map_frame(covariance, theta))
-    return information
+    return np.asarray(np.linalg.inv(_in_map_frame(covariance, theta)), dtype=np.float64)
 
 
 def _in_map_frame(covariance: Float64, theta: float) -> Float64:

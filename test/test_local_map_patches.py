@@ -1,0 +1,101 @@
+"""The shared patches: what a scan leaves in the map, and that maps never write into each other."""
+
+import numpy as np
+import pytest
+from scipy.ndimage import distance_transform_edt
+from worlds import box, scan_in
+
+from hmt_slam_ros.local_map.patches import FAR, PATCH, InverseModel, PatchPool, field_at, odds_at
+
+CELL, RADIUS = 0.05, 0.5
+MODEL = InverseModel(17, -8, 70)
+
+
+@pytest.fixture
+def pool():
+    return PatchPool(table_size=8, cell=CELL, radius=RADIUS)
+
+
+def insert(pool, table, scan, pose=(0.0, 0.0, 0.0)):
+    pool.insert(table, np.asarray(pose, dtype=float), scan.laser_pose, scan.points, np.empty((0, 2)), MODEL)
+
+
+def dense(pool, table, read):
+    edge = pool.table_size * PATCH
+    view = pool.view(table)
+    return np.array([[read(view, column, row) for column in range(edge)] for row in range(edge)])
+
+
+def test_the_distance_field_equals_the_exact_distance_transform_after_walls_came_and_went(pool):
+    table = pool.empty_table()
+    for k in range(3):
+        insert(pool, table, scan_in(box(-3, -3, 3, 3), (0.1 * k, 0, 0.3 * k), field_of_view=2 * np.pi))
+    for k in range(6):
+        insert(pool, table, scan_in(box(-4, -4, 4, 4), (0.1 * k, 0, 0.3 * k), field_of_view=2 * np.pi))
+    odds, field = dense(pool, table, odds_at), dense(pool, table, field_at)
+    assert (odds > 0).any()
+    exact = np.minimum(np.rint(distance_transform_edt(odds <= 0) * CELL / RADIUS * FAR), FAR)
+    np.testing.assert_array_equal(field, exact)
+
+
+def test_a_wall_is_occupied_the_room_is_free_and_what_lies_behind_is_unknown(pool):
+    table = pool.empty_table()
+    insert(pool, table, scan_in(box(-3.02, -3.02, 3.02, 3.02), (0, 0, 0), beams=721, field_of_view=2 * np.pi))
+    view, half = pool.view(table), 4 * PATCH
+    assert odds_at(view, half + int(3.0 / CELL), half) > 0
+    assert odds_at(view, half + int(2.0 / CELL), half + 3) < 0
+    assert odds_at(view, half + int(3.5 / CELL), half) == 0
+
+
+def test_a_cell_counts_once_per_scan_however_many_beams_pass_it(pool):
+    table = pool.empty_table()
+    insert(pool, table, scan_in(box(-3, -3, 3, 3), (0, 0, 0), beams=721, field_of_view=2 * np.pi))
+    assert odds_at(pool.view(table), 4 * PATCH + 1, 4 * PATCH + 1) == MODEL.miss
+
+
+def test_a_shared_map_keeps_its_content_when_its_twin_is_written_to(pool):
+    table = pool.empty_table()
+    insert(pool, table, scan_in(box(-3, -3, 3, 3), (0, 0, 0)))
+    twin = pool.share(table)
+    used = pool.used
+    before = dense(pool, table, odds_at), dense(pool, table, field_at)
+    insert(pool, twin, scan_in(box(-2, -2, 2, 2), (0, 0, 0)))
+    np.testing.assert_array_equal(dense(pool, table, odds_at), before[0])
+    np.testing.assert_array_equal(dense(pool, table, field_at), before[1])
+    assert (dense(pool, twin, odds_at) != before[0]).any()
+    assert used < pool.used <= 2 * used
+
+
+def test_released_maps_leave_no_patch_behind(pool):
+    table = pool.empty_table()
+    insert(pool, table, scan_in(box(-3, -3, 3, 3), (0, 0, 0)))
+    twin = pool.share(table)
+    insert(pool, twin, scan_in(box(-2, -2, 2, 2), (0, 0, 0)))
+    pool.release(table)
+    assert pool.used > 0
+    pool.release(twin)
+    assert pool.used == 0
+
+
+def test_a_patch_used_again_starts_empty(pool):
+    table = pool.empty_table()
+    insert(pool, table, scan_in(box(-3, -3, 3, 3), (0, 0, 0)))
+    pool.release(table)
+    other = pool.empty_table()
+    insert(pool, other, scan_in(box(-1, -1, 1, 1), (0, 0, 0), field_of_view=2 * np.pi))
+    occupied = np.argwhere(dense(pool, other, odds_at) > 0)
+    assert np.abs(occupied - 4 * PATCH).max() <= int(1.0 / CELL) + 1
+
+
+def test_a_scan_that_leaves_the_map_is_cut_off_there(pool):
+    table = pool.empty_table()
+    insert(pool, table, scan_in(box(-20, -20, 20, 20), (0, 0, 0), field_of_view=2 * np.pi))
+    assert (dense(pool, table, odds_at) > 0).sum() == 0
+    assert (dense(pool, table, odds_at) < 0).sum() > 1000
+
+
+def test_the_laser_stands_where_its_mounting_puts_it(pool):
+    table = pool.empty_table()
+    insert(pool, table, scan_in(box(-3, -3, 3, 3), (0, 0, 0), laser_pose=(0.5, 0.2, 0.4)))
+    occupied = (np.argwhere(dense(pool, table, odds_at) > 0)[:, ::-1] - 4 * PATCH + 0.5) * CELL
+    assert np.abs(np.abs(occupied).max(axis=1) - 3.0).max() <= CELL
