@@ -115,6 +115,8 @@ def _parse(content: bytes, name: str) -> _Content:
                 parsed.readings.append(_MEASUREMENTS[tokens[0]](tokens))
             elif tokens[:2] == [b"PARAM", _FRONT_LASER_OFFSET]:
                 parsed.front_laser_offset = float(tokens[2])
+            elif any(kind.startswith(tokens[0]) for kind in _MEASUREMENTS):
+                raise ValueError("cut off within its first word")
         except (ValueError, IndexError):
             end = " (the last one)" if number == len(lines) else ""
             raise HmtSlamError(

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from decimal import Decimal, InvalidOperation
+from decimal import Decimal
 
 import numpy as np
 from numpy.typing import NDArray
 
 NANOSECONDS = 1_000_000_000
 
+_LARGEST = 2**62  # ns, in the year 2116; beyond it sums no longer fit into 64 bits
 _STEP = 1_000  # ns between two readings of one kind where the source's clock does not advance
 
 
@@ -17,15 +18,19 @@ def stamp_from_seconds(text: str) -> int:
     """Nanoseconds of a decimal number of seconds, exact: a float64 keeps only 100 ns of a stamp of this century.
 
     :param text: such as ``976052857.337284`` or ``1.4e3``; digits beyond the ninth decimal are cut off.
-    :raises ValueError: where the text is no finite number.
+    :raises ValueError: where the text is no number, or too large a one.
     """
     whole, _, fraction = text.partition(".")
-    if whole.isdecimal() and (fraction.isdecimal() or not fraction):
-        return int(whole) * NANOSECONDS + int(fraction[:9].ljust(9, "0"))
     try:
-        return int(Decimal(text) * NANOSECONDS)
-    except (InvalidOperation, OverflowError, ValueError):
+        if whole.isdecimal() and (fraction.isdecimal() or not fraction):
+            stamp = int(whole) * NANOSECONDS + int(fraction[:9].ljust(9, "0"))
+        else:
+            stamp = int(Decimal(text) * NANOSECONDS)
+    except (ArithmeticError, ValueError):
         raise ValueError(f"{text!r} is no time in seconds") from None
+    if abs(stamp) > _LARGEST:
+        raise ValueError(f"{text!r} is no time in seconds")
+    return stamp
 
 
 def seconds_from_stamp(stamp: int) -> str:
@@ -50,10 +55,8 @@ def running_stamps(
             stamp = last
         else:
             stamp = max(source, last)
-            if scan or paired:
-                stamp = max(stamp, last_scan + _STEP)
-            if not scan:
-                stamp = max(stamp, last_odometry + _STEP)
+            if ((scan or paired) and stamp <= last_scan) or (not scan and stamp <= last_odometry):
+                stamp = last + _STEP
         last_scan = stamp if scan else last_scan
         last_odometry = last_odometry if scan else stamp
         stamps[k] = last = stamp
