@@ -1,0 +1,197 @@
+"""Poses that agree best with many uncertain relative poses: Lu and Milios (1997) as a sparse least-squares problem.
+
+    chi2 = sum over edges of e^T C^-1 e,    e = log(z^-1 * (x_i^-1 * x_j))
+
+with z the measured pose of j seen from i and C its covariance in the right tangent space, as in
+:class:`~hmt_slam_ros.geometry.gaussian.PoseGaussian`. Solved by Gauss-Newton steps on the manifold, damped after
+Levenberg and Marquardt where a step does not help. One node is held fixed; the marginal covariances are relative to it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csc_matrix, diags
+from scipy.sparse.csgraph import connected_components
+from scipy.sparse.linalg import SuperLU, splu
+
+from hmt_slam_ros.geometry import se2
+
+_STEPS, _SMALLEST_STEP, _SMALLEST_GAIN = 100, 1e-10, 1e-12
+_FIRST_DAMPING, _LAST_DAMPING = 1e-6, 1e8
+_COLUMNS = 300  # right-hand sides solved at once for the marginals, to bound the memory
+
+
+@dataclass(frozen=True, eq=False)
+class Edges:
+    """Measured relative poses.
+
+    :ivar sources: shape (m,), int64, node i of each edge.
+    :ivar targets: shape (m,), int64, node j.
+    :ivar poses: shape (m, 3), measured ``i_T_j``, m and rad.
+    :ivar covariances: shape (m, 3, 3), right tangent frame, regular.
+    :ivar patience: shape (m,), an edge whose chi2 exceeds this is given less weight (dynamic covariance scaling,
+        Agarwal et al. 2013); inf trusts it whatever happens; None trusts all.
+    """
+
+    sources: NDArray[np.int64]
+    targets: NDArray[np.int64]
+    poses: NDArray[np.float64]
+    covariances: NDArray[np.float64]
+    patience: NDArray[np.float64] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """The most likely poses.
+
+    :ivar poses: shape (n, 3), m and rad.
+    :ivar covariances: shape (n, 3, 3), marginals in the right tangent frame, relative to the fixed node, whose own is
+        zero; None where they were not asked for.
+    :ivar chi2: sum of ``edge_chi2``; 3 (m - n + 1) degrees of freedom.
+    :ivar edge_chi2: shape (m,), before weighting.
+    :ivar weights: shape (m,), in (0, 1], the factor on each edge's information; 1 where nothing was doubted.
+    :ivar steps: steps taken.
+    """
+
+    poses: NDArray[np.float64]
+    covariances: NDArray[np.float64] | None
+    chi2: float
+    edge_chi2: NDArray[np.float64]
+    weights: NDArray[np.float64]
+    steps: int
+
+
+def optimise(initial: NDArray[np.float64], edges: Edges, fixed: int = 0, *, marginals: bool = True) -> Solution:
+    """Solve a pose graph.
+
+    A step costs one sparse factorisation. Marginals cost a solution of the factored system for each of 3 n columns,
+    so their time grows with n times the fill: milliseconds for hundreds of nodes, seconds for a few thousand.
+
+    :param initial: shape (n, 3), poses to start from; that of ``fixed`` stays.
+    :param edges: at least enough to join every node with the fixed one.
+    :param fixed: the node that defines the frame.
+    :param marginals: whether to compute the covariances.
+    :raises ValueError: where a node is not joined with the fixed one, so that its pose is not determined.
+    """
+    system = _System(len(initial), edges, fixed)
+    poses, state = initial.copy(), system.evaluate(initial)
+    damping, steps = 0.0, 0
+    while steps < _STEPS and damping <= _LAST_DAMPING:
+        step = system.step(state, damping)
+        if np.abs(step).max(initial=0.0) < _SMALLEST_STEP:
+            break
+        tried = se2.compose(poses, se2.exp(step))
+        next_state = system.evaluate(tried)
+        if not next_state.cost <= state.cost:
+            damping = max(_FIRST_DAMPING, 10.0 * damping)
+            continue
+        gain = state.cost - next_state.cost
+        poses, state, steps = tried, next_state, steps + 1
+        damping = 0.1 * damping if damping > _FIRST_DAMPING else 0.0
+        if gain <= _SMALLEST_GAIN * state.cost:
+            break
+    covariances = system.marginals(state) if marginals else None
+    return Solution(poses, covariances, float(state.chi2.sum()), state.chi2, state.weights, steps)
+
+
+@dataclass(frozen=True, eq=False)
+class _State:
+    """The problem at given poses: residuals (m, 3), Jacobians (m, 3, 3), chi2 and weights (m,), and the cost."""
+
+    residuals: NDArray[np.float64]
+    of_source: NDArray[np.float64]
+    of_target: NDArray[np.float64]
+    chi2: NDArray[np.float64]
+    weights: NDArray[np.float64]
+    cost: float
+
+
+class _System:
+    """The normal equations of one graph, without the fixed node."""
+
+    def __init__(self, nodes: int, edges: Edges, fixed: int) -> None:
+        self._edges = edges
+        self._information = np.linalg.inv(edges.covariances)
+        self._free = np.delete(np.arange(nodes), fixed)
+        self._nodes = nodes
+        self._require_connected(fixed)
+        row = np.full(nodes, -1)
+        row[self._free] = np.arange(nodes - 1)
+        i, j = row[edges.sources], row[edges.targets]
+        ends = np.stack((np.stack((i, i), 1), np.stack((i, j), 1), np.stack((j, i), 1), np.stack((j, j), 1)))
+        self._kept = (ends >= 0).all(axis=2)
+        blocks = 3 * ends[self._kept]
+        # Rows and columns of the nine entries of each 3 x 3 block.
+        self._rows = (blocks[:, 0, None, None] + np.arange(3)[:, None] + np.zeros(3, np.int64)).ravel()
+        self._columns = (blocks[:, 1, None, None] + np.arange(3) + np.zeros((3, 1), np.int64)).ravel()
+
+    def _require_connected(self, fixed: int) -> None:
+        ones = np.ones(len(self._edges.sources))
+        graph = csc_matrix((ones, (self._edges.sources, self._edges.targets)), shape=(self._nodes, self._nodes))
+        labels = connected_components(graph, directed=False)[1]
+        apart = np.flatnonzero(labels != labels[fixed])
+        if apart.size:
+            raise ValueError(f"no edges join node {apart[0]} with the fixed node {fixed}, so it has no definite pose")
+
+    def evaluate(self, poses: NDArray[np.float64]) -> _State:
+        """Residuals, Jacobians and cost at given poses, shape (n, 3)."""
+        relative = se2.between(poses[self._edges.sources], poses[self._edges.targets])
+        residuals = se2.log(se2.between(self._edges.poses, relative))
+        chi2 = np.einsum("mi,mij,mj->m", residuals, self._information, residuals)
+        of_target = se2.right_jacobian_inverse(residuals)
+        of_source = -of_target @ se2.adjoint(se2.inverse(relative))
+        scale, penalty = self._doubt(chi2)
+        cost = float((scale**2 * chi2 + penalty).sum())
+        return _State(residuals, of_source, of_target, chi2, scale**2, cost)
+
+    def _doubt(self, chi2: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Dynamic covariance scaling: the scale s = min(1, 2 p / (p + chi2)) and the price p (1 - s)^2 of doubting."""
+        if self._edges.patience is None:
+            return np.ones_like(chi2), np.zeros_like(chi2)
+        # 2 / (1 + chi2 / p) holds for infinite patience p too, and there the price is nought.
+        scale = np.minimum(1.0, 2.0 / (1.0 + chi2 / self._edges.patience))
+        finite = np.where(np.isfinite(self._edges.patience), self._edges.patience, 0.0)
+        return scale, finite * (1.0 - scale) ** 2
+
+    def step(self, state: _State, damping: float) -> NDArray[np.float64]:
+        """The change of every pose in its right tangent space, shape (n, 3)."""
+        weighted = state.weights[:, None] * np.einsum("mij,mj->mi", self._information, state.residuals)
+        gradient = np.zeros((self._nodes, 3))
+        np.add.at(gradient, self._edges.sources, np.einsum("mij,mi->mj", state.of_source, weighted))
+        np.add.at(gradient, self._edges.targets, np.einsum("mij,mi->mj", state.of_target, weighted))
+        change = np.zeros((self._nodes, 3))
+        if self._free.size:
+            change[self._free] = -self._factor(state, damping).solve(gradient[self._free].ravel()).reshape(-1, 3)
+        return change
+
+    def _factor(self, state: _State, damping: float) -> SuperLU:
+        information = state.weights[:, None, None] * self._information
+        of_source, of_target = state.of_source, state.of_target
+        left = of_source.transpose(0, 2, 1) @ information, of_target.transpose(0, 2, 1) @ information
+        blocks = np.stack((left[0] @ of_source, left[0] @ of_target, left[1] @ of_source, left[1] @ of_target))
+        size = 3 * self._free.size
+        hessian = csc_matrix((blocks[self._kept].ravel(), (self._rows, self._columns)), shape=(size, size))
+        if damping > 0.0:
+            hessian = (hessian + diags(damping * hessian.diagonal())).tocsc()
+        # Symmetric and positive definite: no pivoting, so that the fill follows the graph.
+        return splu(hessian, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+
+    def marginals(self, state: _State) -> NDArray[np.float64]:
+        """The diagonal blocks of the inverse of the normal matrix, shape (n, 3, 3); zero for the fixed node."""
+        covariances = np.zeros((self._nodes, 3, 3))
+        if not self._free.size:
+            return covariances
+        factor, size = self._factor(state, 0.0), 3 * self._free.size
+        blocks = np.empty((size, 3))
+        for start in range(0, size, _COLUMNS):
+            columns = np.arange(start, min(start + _COLUMNS, size))
+            unit = np.zeros((size, columns.size))
+            unit[columns, columns - start] = 1.0
+            solved = factor.solve(unit)
+            own = columns // 3 * 3 + np.arange(3)[:, None]
+            blocks[columns] = solved[own, columns - start].T
+        covariances[self._free] = blocks.reshape(-1, 3, 3)
+        return 0.5 * (covariances + covariances.transpose(0, 2, 1))
