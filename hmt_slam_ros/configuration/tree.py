@@ -49,25 +49,65 @@ class LocalMap:
     field_radius: float = parameter(
         0.5, "Distance at which the distance field is cut off.", unit="m", low=0.05, high=5.0
     )
+    extent: float = parameter(
+        56.0, "Half side of the local map; what lies farther from the area's origin is not kept.", unit="m",
+        low=5.0, high=500.0,
+    )
+    log_odds_hit: float = parameter(
+        0.85, "Evidence of occupancy where a beam ends.", unit="nat", low=0.05, high=3.0
+    )
+    log_odds_miss: float = parameter(
+        0.4, "Evidence of free space where beams of a scan pass.", unit="nat", low=0.05, high=3.0
+    )
+    log_odds_limit: float = parameter(
+        3.5, "Bound of a cell's evidence, so that a changed world is learnt again.", unit="nat", low=0.5, high=6.0
+    )
 
 
 @dataclass(frozen=True)
 class Matching:
     """Scan matching: correlative search for the start, Gauss-Newton on the distance field for precision."""
 
-    search_distance: float = parameter(
-        0.3, "Half side of the window of the correlative search.", unit="m", low=0.0, high=10.0
-    )
-    search_angle: float = parameter(
-        10.0, "Half width of the angular window of the correlative search.", unit="deg", low=0.0, high=180.0
-    )
+    max_points: int = parameter(200, "Beams of a scan that are matched; evenly thinned.", low=10, high=5000)
+    iterations: int = parameter(20, "Gauss-Newton steps at most.", low=1, high=200)
     sigma_hit: float = parameter(
         0.1, "Deviation sigma_hit of a beam's end point from the nearest wall.", unit="m", low=0.005, high=1.0
     )
-    temper: float = parameter(
-        0.1, "Exponent on a scan's likelihood, since neighbouring beams are correlated.", low=1e-4, high=1.0
+    sigma_match: float = parameter(
+        0.04, "Deviation of a beam's end point from its wall when a pose is refined.", unit="m", low=0.002, high=1.0
     )
-    iterations: int = parameter(20, "Gauss-Newton steps at most.", low=1, high=200)
+    robust_scale: float = parameter(
+        0.15, "Scale of the Cauchy weight on the distance of a beam's end point to the nearest wall.", unit="m",
+        low=0.01, high=5.0,
+    )
+    random_returns: float = parameter(
+        0.1, "Share z_rand of returns that no wall of the map explains.", low=1e-4, high=0.9
+    )
+    unknown_range: float = parameter(
+        10.0, "Distance over which a return is equally likely anywhere in unknown space.", unit="m", low=0.5, high=200.0
+    )
+    sharpness: float = parameter(
+        1.0, "Exponent on a scan's likelihood in the proposal of a particle's pose.", low=1e-3, high=10.0
+    )
+    temper: float = parameter(
+        0.05, "Exponent on a scan's likelihood in the weights, since neighbouring beams are correlated.",
+        low=1e-4, high=1.0,
+    )
+    matched_distance: float = parameter(
+        0.15, "A beam whose end point is this close to a wall counts as matched.", unit="m", low=0.01, high=5.0
+    )
+    matched_fraction: float = parameter(
+        0.6, "Below this share of matched beams the correlative search looks for a better start.", low=0.0, high=1.0
+    )
+    search_distance: float = parameter(
+        0.4, "Half side of the window of the correlative search.", unit="m", low=0.0, high=10.0
+    )
+    search_angle: float = parameter(
+        15.0, "Half width of the angular window of the correlative search.", unit="deg", low=0.0, high=180.0
+    )
+    search_step: float = parameter(
+        1.5, "Angular step of the correlative search.", unit="deg", low=0.1, high=30.0
+    )
 
 
 @dataclass(frozen=True)
@@ -83,6 +123,12 @@ class Filter:
     )
     keyframe_angle: float = parameter(
         20.0, "A keyframe is taken after this angle turned.", unit="deg", low=1.0, high=180.0
+    )
+    covariance_inflation: float = parameter(
+        4.0, "Factor on the covariance of a matched keyframe, since its beams are correlated.", low=0.1, high=100.0
+    )
+    patience: int = parameter(
+        50, "Scans that wait for odometry at most, before the last reading is taken to hold.", low=1, high=100000
     )
 
 
@@ -100,6 +146,16 @@ class AreaAbstraction:
     min_cluster: int = parameter(5, "Keyframes of an area at least.", low=1, high=1000)
     overlap_radius: float = parameter(
         0.2, "Two scan points this close count as the same sensed space.", unit="m", low=0.01, high=2.0
+    )
+    overlap_points: int = parameter(
+        180, "Points of a scan that are compared; evenly thinned.", low=10, high=5000
+    )
+    persistence: int = parameter(
+        2, "Keyframes in a row at which a cut, or a move into a known area, has to be found.", low=1, high=100
+    )
+    move_margin: float = parameter(
+        0.1, "The robot moves into a known area that overlaps this much more with its scan than the present one.",
+        low=0.0, high=1.0,
     )
 
 
@@ -147,18 +203,33 @@ class RealTimeLocalization:
     """RTL: the pose at the rate of the odometry."""
 
     publish_tf: bool = parameter(True, "Publish map -> odom on /tf.")
+    max_speed: float = parameter(
+        10.0, "Odometry that moves faster than this between two readings was reset.", unit="m/s", low=0.1, high=1000.0
+    )
+    max_turn_rate: float = parameter(
+        720.0, "Odometry that turns faster than this between two readings was reset.", unit="deg/s", low=1.0, high=1e5
+    )
 
 
 @dataclass(frozen=True)
 class Robot:
     """The simulated robot that replays a log."""
 
-    rate: float = parameter(1.0, "Speed of the replay relative to real time.", low=0.01, high=1000.0)
+    rate: float = parameter(
+        1.0, "Speed of the replay relative to real time; 0 is as fast as possible.", low=0.0, high=1000.0
+    )
     start: float = parameter(0.0, "Seconds of the log to skip.", unit="s", low=0.0, high=1e6)
     duration: float = parameter(0.0, "Seconds of the log to play; 0 plays all of it.", unit="s", low=0.0, high=1e6)
-    loop: bool = parameter(False, "Start again at the end of the log.")
+    loop: bool = parameter(False, "Start again at the end of the log; the stamps go on increasing.")
     paced: bool = parameter(True, "Wait for the acknowledgement of earlier scans, so that none is lost.")
     window: int = parameter(20, "Scans under way without an acknowledgement, when paced.", low=1, high=10000)
+    scan_listeners: int = parameter(
+        1, "Start when this many subscribers of the scans are there; 0 waits for none.", low=0, high=100
+    )
+    odometry_listeners: int = parameter(
+        1, "Start when this many subscribers of the odometry are there; 0 waits for none.", low=0, high=100
+    )
+    patience: float = parameter(10.0, "Wait this long for the subscribers.", unit="s", low=0.0, high=3600.0)
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,144 @@
+"""The particle filter of one area."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from worlds import box, scan_in
+
+from hmt_slam_ros.configuration.tree import Configuration
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.local_map.area_filter import AreaFilter, LocalMapping, PlacedKeyframe
+
+ROOM = np.concatenate((box(-6.02, -4.03, 6.03, 4.01), box(3.51, 1.02, 4.53, 2.52), box(-4.02, 3.03, -3.52, 4.01)))
+STEP = np.array([0.1, 0.0, 0.05])
+COVARIANCE = np.diag([0.02, 0.02, 0.01]) ** 2
+
+
+def driven(mapping, odometry_error=(0.0, 0.0, 0.0), steps=60, hypothesis=0):
+    """A filter after a drive on a circle, and the true pose."""
+    area_filter = AreaFilter(mapping, hypothesis, area=0)
+    truth = np.zeros(3)
+    area_filter.add_keyframe(0, scan_in(ROOM, truth))
+    events = 0
+    for k in range(1, steps):
+        truth = se2.compose(truth, STEP)
+        scan = scan_in(ROOM, truth, noise=0.01, seed=k)
+        points = mapping.matching_points(scan)
+        area_filter.track(points, STEP + np.asarray(odometry_error), COVARIANCE)
+        if k % 5 == 0:
+            events += 1
+            area_filter.update(points, events)
+            area_filter.add_keyframe(events, scan)
+    return area_filter, truth
+
+
+def test_the_robot_is_found_though_odometry_drifts():
+    area_filter, truth = driven(LocalMapping(Configuration()), odometry_error=(0.02, 0.01, 0.01))
+    dead_reckoned = 59 * np.array([0.02, 0.01, 0.01])
+    error = se2.between(truth, area_filter.pose)
+    assert np.hypot(*error[:2]) < 0.05 < 0.1 * np.hypot(*dead_reckoned[:2])
+    assert abs(error[2]) < np.radians(0.5)
+
+
+def test_one_seed_gives_one_result_bit_for_bit_and_another_seed_another():
+    first, _ = driven(LocalMapping(Configuration(seed=1)))
+    again, _ = driven(LocalMapping(Configuration(seed=1)))
+    other, _ = driven(LocalMapping(Configuration(seed=2)))
+    np.testing.assert_array_equal(first.poses, again.poses)
+    np.testing.assert_array_equal(first.log_weights, again.log_weights)
+    assert (first.poses != other.poses).any()
+
+
+def test_a_branch_goes_its_own_way():
+    mapping = LocalMapping(Configuration())
+    parent, _ = driven(mapping, steps=20)
+    child = parent.branch(1)
+    before = parent.poses.copy(), parent.keyframe_poses.copy()
+    scan = scan_in(ROOM, (1.0, 0.5, 0.3))
+    child.track(mapping.matching_points(scan), STEP, COVARIANCE)
+    child.update(mapping.matching_points(scan), 99)
+    child.add_keyframe(99, scan)
+    np.testing.assert_array_equal(parent.poses, before[0])
+    np.testing.assert_array_equal(parent.keyframe_poses, before[1])
+    assert parent.keyframes[-1] != 99
+    child.release()
+    parent.release()
+    assert mapping.pool.used == 0
+
+
+def test_resampling_keeps_the_leader_and_drops_what_has_no_weight():
+    mapping = LocalMapping(Configuration())
+    area_filter, _ = driven(mapping, steps=8)
+    count = len(area_filter.poses)
+    area_filter.log_weights = np.full(count, -50.0)
+    area_filter.log_weights[count - 1] = 0.0
+    leading = area_filter.keyframe_poses[count - 1].copy()
+    scan = scan_in(ROOM, (0.8, 0.1, 0.35))
+    step = area_filter.update(mapping.matching_points(scan), 50)
+    assert step.effective_samples == pytest.approx(1.0, abs=0.1)
+    assert step.history_changed
+    assert area_filter.leader == 0
+    for poses in area_filter.keyframe_poses:
+        np.testing.assert_array_equal(poses, leading)
+    np.testing.assert_array_equal(area_filter.log_weights, 0.0)
+
+
+def test_effective_samples_equal_the_particles_where_all_weigh_the_same():
+    mapping = LocalMapping(Configuration())
+    area_filter = AreaFilter(mapping, 0, 0)
+    area_filter.track(np.empty((0, 2)), STEP, COVARIANCE)
+    step = area_filter.update(np.empty((0, 2)), 1)
+    assert step.effective_samples == pytest.approx(len(area_filter.poses))
+    assert step.log_evidence == pytest.approx(0.0, abs=1e-9)
+
+
+def test_without_returns_the_particles_spread_as_odometry_says():
+    configuration = Configuration()
+    configuration = replace(configuration, filter=replace(configuration.filter, particles=400))
+    area_filter = AreaFilter(LocalMapping(configuration), 0, 0)
+    area_filter.track(np.empty((0, 2)), np.array([1.0, 0.0, 0.0]), np.diag([0.2, 0.1, 0.05]) ** 2)
+    area_filter.update(np.empty((0, 2)), 1)
+    # Five points to two deviations on each side hold 0.88 of a Gaussian's deviation.
+    spread = area_filter.poses[1:].std(axis=0)
+    np.testing.assert_allclose(spread, 0.88 * np.array([0.2, 0.1, 0.05]), rtol=0.15)
+
+
+def test_a_lost_robot_is_found_by_the_search():
+    mapping = LocalMapping(Configuration())
+    area_filter, truth = driven(mapping, steps=30)
+    scan = scan_in(ROOM, se2.compose(truth, (0.3, 0.2, np.radians(12))))
+    area_filter.track(mapping.matching_points(scan), np.zeros(3), np.diag([0.1, 0.1, 0.1]) ** 2)
+    error = se2.between(se2.compose(truth, (0.3, 0.2, np.radians(12))), area_filter.pose)
+    assert np.hypot(*error[:2]) < 0.05
+    assert abs(error[2]) < np.radians(1.0)
+
+
+def test_a_change_of_area_moves_frame_and_map_together():
+    mapping = LocalMapping(Configuration())
+    area_filter, truth = driven(mapping, steps=30)
+    new_T_old = np.array([3.0, -1.0, 0.8])
+    poses = [np.zeros(3)]
+    for _ in range(3):
+        poses.append(se2.compose(poses[-1], se2.exp(10.0 * STEP)))
+    content = [
+        PlacedKeyframe(k, 7, scan_in(ROOM, pose), se2.compose(new_T_old, pose)) for k, pose in enumerate(poses)
+    ]
+    area_filter.change_area(7, new_T_old, content)
+    truth = se2.compose(truth, STEP)
+    area_filter.track(mapping.matching_points(scan_in(ROOM, truth)), STEP, COVARIANCE)
+    error = se2.between(se2.compose(new_T_old, truth), area_filter.pose)
+    assert np.hypot(*error[:2]) < 0.03
+    assert area_filter.area == 7
+    assert area_filter.keyframes == [0, 1, 2, 3]
+    area_filter.release()
+    assert mapping.pool.used == 0
+
+
+def test_beams_beyond_the_range_tell_free_space_up_to_it():
+    configuration = Configuration()
+    mapping = LocalMapping(replace(configuration, local_map=replace(configuration.local_map, max_range=5.0)))
+    points, free = mapping.mapped_points(scan_in(ROOM, (0, 0, 0), laser_pose=(0.2, 0.1, 0.3)))
+    assert np.hypot(*(points - (0.2, 0.1)).T).max() <= 5.0
+    np.testing.assert_allclose(np.hypot(*(free - (0.2, 0.1)).T), 5.0)
+    assert len(points) + len(free) == 181
