@@ -113,7 +113,7 @@ class ObjectStream:
         if reader is None:
             raise HmtSlamError(
                 f"{self._name} holds an object of class {class_name!r}, which is not known here: "
-                "export its scans and odometry with MRPT's rawlog-edit."
+                "remove such objects with MRPT's rawlog-edit first."
             )
         result = reader(self, self.integer("B"))
         if self.integer("B") != _END_OF_OBJECT:

@@ -18,8 +18,8 @@ def smallest_saturated(ranges: NDArray[np.float32]) -> float:
     spread out as the robot moves, so the maximum stands out as a crowd at the far end. The rule: M is the largest
     reading that occurs three times (a stray larger one is no maximum). The readings at or beyond 0.99 M mean "no
     return" if there are more than ten times as many of them as there are, on average, in each of the five bands of
-    the same width below - and if they are not the whole log. Real returns in the last percent of a saturated
-    sensor's reach are lost with them; ranges beyond its half are rare and poor anyway.
+    the same width below - and if they are not the whole log. Real returns in the last percent of the reach of such
+    a sensor are lost with them.
 
     :param ranges: shape (n,), metres, all readings of the log.
     :returns: the smallest reading of that crowd; where there is none, just beyond the largest reading (inf for no
