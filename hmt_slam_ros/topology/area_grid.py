@@ -1,0 +1,174 @@
+"""What the keyframes of an area say of the space around them: surface, free, or unknown, as log-likelihood ratios."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.sensing import Scan
+
+Points = NDArray[np.float64]
+
+# Neighbouring end points of one scan at most this far apart (m) lie on one surface, which is filled in between them.
+_JOIN = 0.3
+
+
+@dataclass(frozen=True)
+class GridModel:
+    """How likely a surface is measured at a place, relative to a place of which nothing is known.
+
+    A constant p(z | unknown) is no background for a building, where a wall at some distance to the side is what one
+    expects anyway. So ``surface_ratio`` is far below what the sensor's precision would give: it says how much more
+    often a surface is met where the map has one than where the building might have one.
+
+    :ivar cell: edge of a cell, m.
+    :ivar sigma: deviation of an end point from the surface, m.
+    :ivar surface_ratio: p(z | surface at distance 0) / p(z | unknown), above 1.
+    :ivar free_ratio: p(z | known free) / p(z | unknown), below 1.
+    :ivar max_range: end points farther than this from the laser are not used, m.
+    :ivar spacing: edge of the voxels that leave one sample each, m.
+    """
+
+    cell: float = 0.1
+    sigma: float = 0.1
+    surface_ratio: float = 3.0
+    free_ratio: float = 0.1
+    max_range: float = 30.0
+    spacing: float = 0.2
+
+
+@dataclass(frozen=True, eq=False)
+class AreaGrid:
+    """Log-likelihood ratios around an area, and its surface points.
+
+    :ivar origin: shape (2,), the corner of cell (0, 0), m, area frame.
+    :ivar cell: edge of a cell, m.
+    :ivar log_ratio: shape (rows, columns), float32, indexed [y, x]: log p(z | map) / p(z | unknown) of a surface
+        measured in the cell; above 0 near a surface, below 0 in free space, 0 where nothing is known.
+    :ivar fine: shape (2 rows, 2 columns), float32, the same at the centres of cells half as long; smooth enough to be
+        interpolated, and ``log_ratio`` is the mean of four.
+    :ivar free: shape (rows, columns), whether a beam passed through the cell.
+    :ivar points: shape (n, 2), one surface point a voxel, m, area frame: samples far enough apart to count as
+        independent.
+    """
+
+    origin: Points
+    cell: float
+    log_ratio: NDArray[np.float32]
+    fine: NDArray[np.float32]
+    free: NDArray[np.bool_]
+    points: Points
+
+    def moved(self, shift: Points) -> AreaGrid:
+        """The same grid in a frame whose origin lies at ``shift``, shape (2,), of this one and is not turned."""
+        return replace(self, origin=self.origin - shift, points=self.points - shift)
+
+
+def build_area_grid(scans: Sequence[Scan], poses: NDArray[np.float64], model: GridModel) -> AreaGrid:
+    """The grid of the keyframes that were taken at ``poses``.
+
+    :param scans: the keyframes' scans.
+    :param poses: shape (len(scans), 3), ``area_T_base``.
+    """
+    hits, lasers = _end_points(scans, poses, model.max_range)
+    if not hits:
+        return _blank(model.cell)
+    reach = 4.0 * model.sigma
+    everything = np.concatenate((*hits, np.array(lasers)))
+    # The corner is a multiple of the cell, so that grids of one area agree on where cells lie.
+    origin = np.floor((everything.min(axis=0) - reach) / model.cell) * model.cell
+    columns, rows = np.ceil((everything.max(axis=0) + reach - origin) / model.cell).astype(np.int64) + 1
+    free = np.zeros((rows, columns), dtype=np.bool_)
+    for laser, points in zip(lasers, hits, strict=True):
+        _mark_free(free, origin, model.cell, laser, points)
+    distance2 = np.full((2 * rows, 2 * columns), reach * reach)
+    surfaces = np.concatenate([_joined(points, 0.5 * model.cell) for points in hits])
+    _lower_distances(distance2, origin, 0.5 * model.cell, surfaces, reach)
+    fine = _log_ratio(distance2, free.repeat(2, axis=0).repeat(2, axis=1), model)
+    coarse = fine.reshape(rows, 2, columns, 2).mean(axis=(1, 3))
+    return AreaGrid(origin, model.cell, coarse, fine, free, thinned(np.concatenate(hits), model.spacing))
+
+
+def _blank(cell: float) -> AreaGrid:
+    nothing = np.zeros((2, 2), dtype=np.float32)
+    return AreaGrid(np.zeros(2), cell, nothing[:1, :1], nothing, np.zeros((1, 1), np.bool_), np.zeros((0, 2)))
+
+
+def _end_points(
+    scans: Sequence[Scan], poses: NDArray[np.float64], max_range: float
+) -> tuple[list[Points], list[Points]]:
+    """End points and laser position of every scan that has any, area frame."""
+    hits, lasers = [], []
+    for scan, pose in zip(scans, poses, strict=True):
+        beams = scan.points - scan.laser_pose[:2]
+        points = scan.points[np.hypot(beams[:, 0], beams[:, 1]) <= max_range]
+        if points.size:
+            hits.append(se2.transform(pose, points))
+            lasers.append(se2.compose(pose, scan.laser_pose)[:2])
+    return hits, lasers
+
+
+def thinned(points: Points, spacing: float) -> Points:
+    """The mean point of every occupied voxel, shape (n, 2), ordered by voxel."""
+    voxels = np.floor(points / spacing).astype(np.int64)
+    _, inverse, counts = np.unique(voxels, axis=0, return_inverse=True, return_counts=True)
+    inverse = inverse.reshape(-1)
+    sums = np.stack([np.bincount(inverse, weights=points[:, axis]) for axis in (0, 1)], axis=1)
+    return sums / counts[:, None]
+
+
+def _joined(points: Points, step: float) -> Points:
+    """Points of one scan in the order of the beams, with the gaps along surfaces filled."""
+    gaps = np.diff(points, axis=0)
+    lengths = np.hypot(gaps[:, 0], gaps[:, 1])
+    counts = np.where(lengths <= _JOIN, np.ceil(lengths / step), 1.0).astype(np.int64)
+    start = np.repeat(np.arange(counts.size), counts)
+    place = np.arange(start.size) - np.repeat(np.cumsum(counts) - counts, counts)
+    between = points[:-1][start] + gaps[start] * (place / counts[start])[:, None]
+    return np.concatenate((between, points[-1:]))
+
+
+def _log_ratio(distance2: NDArray[np.float64], free: NDArray[np.bool_], model: GridModel) -> NDArray[np.float32]:
+    """Blend from the surface to what lies beside it.
+
+    Free space counts in full only from two or three sigma on: beams that graze a wall see free space right up to it,
+    and unlike flanks would draw a match away from the wall.
+    """
+    spread = -0.5 * distance2 / model.sigma**2
+    away = np.where(free, 1.0 + (model.free_ratio - 1.0) * (1.0 - np.exp(0.25 * spread)), 1.0)
+    near = np.exp(spread)
+    near[near < 1e-3] = 0.0
+    return np.log(away + (model.surface_ratio - away) * near).astype(np.float32)
+
+
+@njit(cache=True)
+def _mark_free(free: NDArray[np.bool_], origin: Points, cell: float, laser: Points, points: Points) -> None:
+    """Mark the cells between the laser and one cell before each end point."""
+    x0, y0 = (laser[0] - origin[0]) / cell, (laser[1] - origin[1]) / cell
+    for k in range(points.shape[0]):
+        dx = (points[k, 0] - origin[0]) / cell - x0
+        dy = (points[k, 1] - origin[1]) / cell - y0
+        steps = int(np.ceil(max(abs(dx), abs(dy))))
+        for s in range(steps - 1):
+            free[int(y0 + dy * s / steps), int(x0 + dx * s / steps)] = True
+
+
+@njit(cache=True)
+def _lower_distances(
+    distance2: NDArray[np.float64], origin: Points, cell: float, points: Points, reach: float
+) -> None:
+    """Lower every cell near a point to the squared distance from its centre to that point, m^2."""
+    span = int(np.ceil(reach / cell))
+    rows, columns = distance2.shape
+    for k in range(points.shape[0]):
+        x, y = (points[k, 0] - origin[0]) / cell - 0.5, (points[k, 1] - origin[1]) / cell - 0.5
+        column, row = round(x), round(y)
+        for r in range(max(0, row - span), min(rows, row + span + 1)):
+            for c in range(max(0, column - span), min(columns, column + span + 1)):
+                d2 = ((c - x) ** 2 + (r - y) ** 2) * cell * cell
+                distance2[r, c] = min(distance2[r, c], d2)

@@ -1,0 +1,211 @@
+"""From the cells that a search kept to modes: clusters, their mass by quadrature, their peak and its curvature."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from hmt_slam_ros.topology.area_search import Array, Cells, Indices, Surface, Window
+
+# Of a search's cells, at most this many are divided for the quadrature; the others count with their centre alone.
+_DIVIDED = 400
+
+
+def clusters(cells: Cells, saddle: float) -> Indices:
+    """The cluster of every cell, shape (n,), numbered from 0 by falling height of the peaks.
+
+    Two peaks stay apart where the lower one rises by more than ``saddle`` nats above the pass between them.
+    """
+    order = np.argsort(-cells.score, kind="stable")
+    at = cells.at - cells.at.min(axis=0) + 1
+    sides = at.max(axis=0) + 2
+    keys = (at[:, 0] * sides[1] + at[:, 1]) * sides[2] + at[:, 2]
+    by_key = np.argsort(keys, kind="stable")
+    peaks = _flood(order, keys, keys[by_key], by_key, sides, cells.score, saddle)
+    _, labels = np.unique(np.argsort(order, kind="stable")[peaks], return_inverse=True)
+    return labels.reshape(-1).astype(np.int64)
+
+
+@njit(cache=True)
+def _flood(
+    order: Indices, keys: Indices, sorted_keys: Indices, by_key: Indices, sides: Indices, score: Array, saddle: float
+) -> Indices:
+    """Flood from the top: the peak (a cell) that every cell belongs to."""
+    above = np.full(order.size, -1)
+    for cell in order:
+        above[cell] = cell
+        for dk in range(-1, 2):
+            for di in range(-1, 2):
+                for dj in range(-1, 2):
+                    key = keys[cell] + (dk * sides[1] + di) * sides[2] + dj
+                    place = np.searchsorted(sorted_keys, key)
+                    if place == keys.size or sorted_keys[place] != key or above[by_key[place]] < 0:
+                        continue
+                    _join(above, cell, by_key[place], score, saddle)
+    for cell in order:
+        above[cell] = _peak(above, cell)
+    return above
+
+
+@njit(cache=True)
+def _peak(above: Indices, cell: int) -> int:
+    while above[cell] != cell:
+        cell = above[cell]
+    return cell
+
+
+@njit(cache=True)
+def _join(above: Indices, cell: int, other: int, score: Array, saddle: float) -> None:
+    """Give the lower of two peaks that meet at ``cell`` to the higher, unless it stands out."""
+    a, b = _peak(above, cell), _peak(above, other)
+    if score[a] < score[b] or (score[a] == score[b] and a > b):
+        a, b = b, a
+    if a != b and score[b] - score[cell] <= saddle:
+        above[b] = a
+
+
+@njit(cache=True)
+def log_ratio_at(surface: Surface, samples: Array, pose: Array) -> float:
+    """Sum over the samples of the bilinearly interpolated log-ratio, nats, untempered.
+
+    :param pose: shape (3,), ``candidate_T_query``.
+    """
+    cos, sin = np.cos(pose[2]), np.sin(pose[2])
+    x0, y0 = pose[0] - surface.origin[0], pose[1] - surface.origin[1]
+    rows, columns = surface.log_ratio.shape
+    total = 0.0
+    for n in range(samples.shape[0]):
+        u = (x0 + cos * samples[n, 0] - sin * samples[n, 1]) / surface.cell - 0.5
+        v = (y0 + sin * samples[n, 0] + cos * samples[n, 1]) / surface.cell - 0.5
+        c, r = int(np.floor(u)), int(np.floor(v))
+        if 0 <= c < columns - 1 and 0 <= r < rows - 1:
+            a, b = u - c, v - r
+            low = (1.0 - a) * surface.log_ratio[r, c] + a * surface.log_ratio[r, c + 1]
+            high = (1.0 - a) * surface.log_ratio[r + 1, c] + a * surface.log_ratio[r + 1, c + 1]
+            total += (1.0 - b) * low + b * high
+    return total
+
+
+@njit(cache=True)
+def _score_at(surface: Surface, samples: Array, window: Window, temper: float, pose: Array) -> float:
+    """Tempered log-ratio plus the prior's exponent, without the reverse check."""
+    dx, dy = pose[0] - window.mean[0], pose[1] - window.mean[1]
+    turn = pose[2] - window.mean[2]
+    cos, sin = np.cos(window.mean[2]), np.sin(window.mean[2])
+    x, y = cos * dx + sin * dy, cos * dy - sin * dx
+    half_cot = 1.0 if abs(turn) < 1e-5 else 0.5 * turn / np.tan(0.5 * turn)
+    twist = np.array((half_cot * x + 0.5 * turn * y, half_cot * y - 0.5 * turn * x, turn))
+    exponent = 0.0
+    for r in range(3):
+        exponent += (window.root[r, 0] * twist[0] + window.root[r, 1] * twist[1] + window.root[r, 2] * twist[2]) ** 2
+    return temper * log_ratio_at(surface, samples, pose) - 0.5 * exponent
+
+
+def quadrature(
+    surface: Surface, samples: Array, window: Window, cells: Cells, temper: float
+) -> tuple[Array, NDArray[np.float64]]:
+    """log of the mean of exp(score) over every cell, shape (n,), and the best pose found in it, shape (n, 3).
+
+    The cells are divided as finely as the narrower of prior and likelihood asks for.
+    """
+    widths = 1.0 / np.linalg.norm(window.root, axis=0)  # conditional deviations of the prior
+    divisions = np.array([_odd(window.cell / widths[:2].min()), _odd(_step(window) / widths[2])])
+    order = np.argsort(-cells.score, kind="stable")
+    means, poses = cells.score.copy(), _centres(window, cells)
+    inside = order[:_DIVIDED]
+    fine = _divide(surface, samples, window, temper, poses[inside], divisions, _step(window))
+    means[inside], poses[inside] = fine[0] + cells.contradiction[inside], fine[1]
+    return means, poses
+
+
+def _step(window: Window) -> float:
+    return float(window.turns[1] - window.turns[0]) if window.turns.size > 1 else 0.0
+
+
+def _odd(ratio: float) -> int:
+    """3, 5 or 7 divisions, so that a step is at most 1.5 of the prior's deviations where that is possible."""
+    return 3 if ratio <= 4.5 else (5 if ratio <= 7.5 else 7)
+
+
+def _centres(window: Window, cells: Cells) -> Array:
+    poses = np.empty((cells.score.size, 3))
+    poses[:, :2] = window.mean[:2] + cells.at[:, 1:] * window.cell
+    poses[:, 2] = window.mean[2] + window.turns[cells.at[:, 0]]
+    return poses
+
+
+@njit(cache=True)
+def _divide(
+    surface: Surface, samples: Array, window: Window, temper: float, centres: Array, divisions: Indices, turn: float
+) -> tuple[Array, Array]:
+    count, turns = divisions
+    means, best = np.empty(centres.shape[0]), centres.copy()
+    scores = np.empty(count * count * turns)
+    pose = np.empty(3)
+    for n in range(centres.shape[0]):
+        top = -np.inf
+        for s in range(scores.size):
+            pose[0] = centres[n, 0] + window.cell * ((s % count + 0.5) / count - 0.5)
+            pose[1] = centres[n, 1] + window.cell * ((s // count % count + 0.5) / count - 0.5)
+            pose[2] = centres[n, 2] + turn * ((s // (count * count) + 0.5) / turns - 0.5)
+            scores[s] = _score_at(surface, samples, window, temper, pose)
+            if scores[s] > top:
+                top = scores[s]
+                best[n] = pose
+        means[n] = top + np.log(np.mean(np.exp(scores - top)))
+    return means, best
+
+
+@njit(cache=True)
+def climb(
+    surface: Surface, samples: Array, window: Window, temper: float, start: Array, step: Array, finest: float
+) -> Array:
+    """The highest pose near ``start``, by a pattern search over the 26 neighbours with halving steps.
+
+    :param step: shape (3,), first steps in m, m and rad.
+    :param finest: smallest share of the first steps.
+    """
+    best, height = start.copy(), _score_at(surface, samples, window, temper, start)
+    share = 1.0
+    while share >= finest:
+        centre = best.copy()
+        moved = False
+        for s in range(27):
+            pose = centre + share * step * np.array((s % 3 - 1.0, s // 3 % 3 - 1.0, s // 9 - 1.0))
+            score = _score_at(surface, samples, window, temper, pose)
+            if score > height:
+                best, height, moved = pose, score, True
+        if not moved:
+            share *= 0.5
+    return best
+
+
+@njit(cache=True)
+def curvature(surface: Surface, samples: Array, pose: Array, step: Array) -> Array:
+    """Minus the Hessian of the untempered log-ratio in the right tangent space of ``pose``, shape (3, 3).
+
+    :param step: shape (3,), finite differences in m, m and rad.
+    """
+    corner = np.empty((3, 3))
+    hessian = np.empty((3, 3))
+    for a in range(3):
+        for b in range(a, 3):
+            for p in range(-1, 2):
+                for q in range(-1, 2):
+                    twist = np.zeros(3)
+                    twist[a] += p * step[a]
+                    twist[b] += q * step[b]
+                    corner[p + 1, q + 1] = log_ratio_at(surface, samples, _beside(pose, twist))
+            mixed = corner[2, 2] - corner[2, 0] - corner[0, 2] + corner[0, 0]
+            hessian[a, b] = -mixed / (4.0 * step[a] * step[b])
+            hessian[b, a] = hessian[a, b]
+    return hessian
+
+
+@njit(cache=True)
+def _beside(pose: Array, twist: Array) -> Array:
+    """``pose * exp(twist)`` for a small twist, to second order."""
+    cos, sin = np.cos(pose[2]), np.sin(pose[2])
+    x, y = twist[0] - 0.5 * twist[2] * twist[1], twist[1] + 0.5 * twist[2] * twist[0]
+    return np.array((pose[0] + cos * x - sin * y, pose[1] + sin * x + cos * y, pose[2] + twist[2]))
