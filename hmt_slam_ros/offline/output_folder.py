@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.errors import HmtSlamError
+from hmt_slam_ros.evaluation import StampedPoses, write_tum
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.offline import plots
 from hmt_slam_ros.offline.map_image import occupancy_image, write_map
 from hmt_slam_ros.offline.recorder import Recorder, Recording
 from hmt_slam_ros.offline.report import RunFigures, report, write_cost, write_probabilities
 from hmt_slam_ros.offline.saved_map import MANIFEST, write_json, write_saved_map
-from hmt_slam_ros.offline.trajectories import Trajectory
 
 # Everything that ever stands in an output folder; a folder with anything else in it is not ours to replace.
 OWN_NAMES = frozenset(
@@ -37,7 +37,6 @@ OWN_NAMES = frozenset(
         "pmf.png",
         "cost.csv",
         "cost.png",
-        "evaluation.json",
     }
 )
 
@@ -102,8 +101,8 @@ def write_output(
     :raises HmtSlamError: where the run gave no map.
     """
     recording, configuration = recorder.finish(stamps), recorder.configuration
-    write_tum(directory / "trajectory.tum", source_stamps, recording.trajectory)
-    write_tum(directory / "trajectory_online.tum", source_stamps, recording.online)
+    write_tum(directory / "trajectory.tum", StampedPoses(source_stamps, recording.trajectory))
+    write_tum(directory / "trajectory_online.tum", StampedPoses(source_stamps, recording.online))
     _write_map(directory, recording, configuration)
     write_saved_map(directory / "hmt_map", recording, configuration)
     write_graph(directory / "graph.g2o", recording)
@@ -112,23 +111,6 @@ def write_output(
     write_json(directory / "report.json", report(recording, configuration, figures))
     plots.plot_map(directory)
     return recording
-
-
-def write_tum(path: Path, stamps: NDArray[np.int64], trajectory: Trajectory) -> None:
-    """``t x y z qx qy qz qw`` a line, t in s with all nine decimals.
-
-    :param stamps: shape (n,), ns.
-    """
-    half = 0.5 * trajectory[:, 2]
-    rows = zip(stamps.tolist(), trajectory.tolist(), np.sin(half).tolist(), np.cos(half).tolist(), strict=True)
-    lines = [f"{seconds(stamp)} {x:.9f} {y:.9f} 0 0 0 {sin:.12f} {cos:.12f}\n" for stamp, (x, y, _), sin, cos in rows]
-    path.write_text("".join(lines), encoding="utf-8")
-
-
-def seconds(stamp: int) -> str:
-    """Nanoseconds as decimal seconds, exactly."""
-    sign = "-" if stamp < 0 else ""
-    return f"{sign}{abs(stamp) // 10**9}.{abs(stamp) % 10**9:09d}"
 
 
 def _write_map(directory: Path, recording: Recording, configuration: Configuration) -> None:

@@ -11,9 +11,11 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from hmt_slam_ros.errors import HmtSlamError
+from hmt_slam_ros.evaluation import read_tum
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.offline.map_image import OccupancyImage, read_map
@@ -41,7 +43,7 @@ def plot_all(directory: Path) -> list[Path]:
 def plot_map(directory: Path) -> Path:
     """map.png: the occupancy grid with path, areas, arcs and the 95 % ellipses of the areas' origins."""
     image, saved = read_map(directory), read_saved_map(directory / "hmt_map")
-    path = read_tum(directory / "trajectory.tum")[:, 1:3]
+    path = read_tum(directory / "trajectory.tum").poses[:, :2]
     height, width = (size * image.resolution for size in image.pixels.shape)
     figure = Figure(figsize=_figure_size(width, height), layout="constrained")
     axes = figure.add_subplot()
@@ -145,7 +147,8 @@ def plot_probabilities(directory: Path) -> Path:
     upper.set_ylabel("P(topology | data)")
     upper.set_ylim(0.0, 1.06)
     upper.legend(loc="lower left", fontsize=7)
-    lower.step(minutes[firsts], np.diff(np.append(firsts, minutes.size)), where="post", color=_ARC)
+    lower.stairs(np.diff(np.append(firsts, minutes.size)), _edges(minutes[firsts]), color=_ARC, baseline=None)
+    lower.yaxis.set_major_locator(MaxNLocator(integer=True))
     lower.set_ylabel("live topologies")
     lower.set_xlabel("time [min]")
     return _save(figure, directory / "pmf.png")
@@ -159,14 +162,18 @@ def _draw_bars(
     tops = np.cumsum(table["probability"])
     tops -= np.repeat(tops[firsts] - table["probability"][firsts], counts)
     bottoms = tops - table["probability"]
-    starts = minutes[firsts]
-    last_width = float(np.median(np.diff(starts))) if starts.size > 1 else 1.0
-    left, right = starts.repeat(counts), np.append(starts[1:], starts[-1] + last_width).repeat(counts)
+    edges = _edges(minutes[firsts])
+    left, right = edges[:-1].repeat(counts), edges[1:].repeat(counts)
     corners = np.stack([(left, bottoms), (right, bottoms), (right, tops), (left, tops)]).transpose(2, 0, 1)
     colours = [_colour(int(hypothesis)) for hypothesis in table["hypothesis"]]
     axes.add_collection(PolyCollection(list(corners), facecolors=colours, edgecolors="none"))
     axes.plot([], [], "s", color="none", markeredgecolor="gray", label="white: not examined or dropped")
-    axes.set_xlim(starts[0], right[-1])
+    axes.set_xlim(edges[0], edges[-1])
+
+
+def _edges(starts: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Starts of all bars and the end of the last one, which is as wide as most are."""
+    return np.append(starts, starts[-1] + (float(np.median(np.diff(starts))) if starts.size > 1 else 1.0))
 
 
 def plot_cost(directory: Path) -> Path:
@@ -186,18 +193,6 @@ def plot_cost(directory: Path) -> Path:
     if table:
         axes.legend(loc="upper left", fontsize=7)
     return _save(figure, directory / "cost.png")
-
-
-def read_tum(path: Path) -> NDArray[np.float64]:
-    """A trajectory, shape (n, 4), (t, x, y, theta) in s, m and rad.
-
-    :raises HmtSlamError: where the file is missing or damaged.
-    """
-    try:
-        rows = np.loadtxt(path, ndmin=2)
-        return np.column_stack([rows[:, :3], 2.0 * np.arctan2(rows[:, 6], rows[:, 7])])
-    except (OSError, ValueError, IndexError) as fault:
-        raise HmtSlamError(f"{path} is no complete trajectory: map the log again") from fault
 
 
 def _table(path: Path) -> dict[str, NDArray[np.float64]]:

@@ -1,0 +1,99 @@
+"""What can be said on the command line."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import NoReturn
+
+from hmt_slam_ros import __version__
+from hmt_slam_ros.configuration import Configuration, load_configuration
+
+_LOG = "rosbag2 folder, .mcap or .db3 file, CARMEN log or MRPT rawlog"
+
+
+class OneSentenceParser(argparse.ArgumentParser):
+    """A parser whose complaint is one line."""
+
+    def error(self, message: str) -> NoReturn:
+        """Leave with exit status 2."""
+        self.exit(2, f"{self.prog}: {message}: see {self.prog} --help\n")
+
+
+def parser() -> argparse.ArgumentParser:
+    """The parser of ``hmt_slam``; the name of the subcommand ends up in ``command``."""
+    top = OneSentenceParser(prog="hmt_slam", description="Hybrid metric-topological SLAM.")
+    top.add_argument("--version", action="version", version=f"hmt_slam_ros {__version__}")
+    commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    _map(commands.add_parser("map", help="map a log, all in one process, the same for one seed"))
+    _replay(commands.add_parser("replay", help="map a log by a simulated robot and the ROS nodes"))
+    _convert(commands.add_parser("convert", help="write a log as a rosbag2"))
+    _evaluate(commands.add_parser("evaluate", help="errors of an output folder against true relations"))
+    _plot(commands.add_parser("plot", help="draw map, probabilities and cost of an output folder"))
+    _parameters(commands.add_parser("parameters", help="print every parameter as a YAML file"))
+    return top
+
+
+def chosen_configuration(options: argparse.Namespace) -> Configuration:
+    """Defaults, then ``--config``, then ``--set``, then the options that have names of their own.
+
+    :raises HmtSlamError: for a file, a name or a value that cannot be.
+    """
+    named = {"start": "robot.start", "duration": "robot.duration", "rate": "robot.rate"}
+    settings = list(options.settings)
+    for option, name in named.items():
+        value = getattr(options, option, None)
+        settings += [] if value is None else [f"{name}={value}"]
+    return load_configuration(options.config, settings, options.seed)
+
+
+def _map(command: argparse.ArgumentParser) -> None:
+    _log_to_folder(command)
+
+
+def _replay(command: argparse.ArgumentParser) -> None:
+    _log_to_folder(command)
+    command.add_argument("--rate", type=float, help="speed relative to real time; also --set robot.rate=F")
+
+
+def _log_to_folder(command: argparse.ArgumentParser) -> None:
+    command.add_argument("log", type=Path, metavar="LOG", help=_LOG)
+    command.add_argument("--out", type=Path, required=True, metavar="DIR", help="output folder; an old one is replaced")
+    _configuration(command)
+    _part(command)
+
+
+def _configuration(command: argparse.ArgumentParser) -> None:
+    command.add_argument("--seed", type=int, metavar="N", help="seed of all random numbers")
+    command.add_argument("--config", type=Path, metavar="FILE", help="YAML file with parameters")
+    command.add_argument(
+        "--set", action="append", default=[], dest="settings", metavar="NAME=VALUE", help="set one parameter"
+    )
+
+
+def _part(command: argparse.ArgumentParser) -> None:
+    command.add_argument("--start", type=float, metavar="S", help="seconds of the log to skip")
+    command.add_argument("--duration", type=float, metavar="S", help="seconds of the log to use; 0 for all")
+
+
+def _convert(command: argparse.ArgumentParser) -> None:
+    command.add_argument("source", type=Path, metavar="SRC", help=_LOG)
+    command.add_argument("destination", type=Path, metavar="DST", help="rosbag2 folder to make")
+    command.add_argument("--storage", choices=("mcap", "sqlite3"), default="mcap", help="format of the bag's file")
+    _part(command)
+
+
+def _evaluate(command: argparse.ArgumentParser) -> None:
+    command.add_argument("directory", type=Path, metavar="DIR", help="output folder")
+    command.add_argument("--relations", type=Path, required=True, metavar="FILE", help="lines t1 t2 x y z r p yaw")
+    command.add_argument(
+        "--odometry", type=Path, metavar="LOG", help="the log, to reach times without a pose within 0.1 s"
+    )
+
+
+def _plot(command: argparse.ArgumentParser) -> None:
+    command.add_argument("directory", type=Path, metavar="DIR", help="output folder, in which the pictures are put")
+
+
+def _parameters(command: argparse.ArgumentParser) -> None:
+    _configuration(command)

@@ -1,0 +1,43 @@
+"""The command ``hmt_slam``: finds the subcommand and turns its faults into one sentence and an exit status."""
+
+from __future__ import annotations
+
+import signal
+import sys
+from collections.abc import Sequence
+from importlib import import_module
+from types import FrameType
+
+from hmt_slam_ros.cli.arguments import parser
+from hmt_slam_ros.errors import HmtSlamError
+
+FAULT, INTERRUPTED, TERMINATED = 2, 130, 143
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a subcommand.
+
+    :param arguments: those of the process where None.
+    :returns: exit status: 0 for a complete result, 2 where the input is at fault, 130 where the user stopped it.
+    """
+    signal.signal(signal.SIGTERM, _terminate)
+    options = parser().parse_args(arguments)
+    try:
+        # Each subcommand loads what it needs itself, so that --help does not wait for numba and matplotlib.
+        import_module(f"hmt_slam_ros.cli.{options.command}_command").run(options)
+    except HmtSlamError as fault:
+        print(f"hmt_slam {options.command}: {fault}", file=sys.stderr)
+        return FAULT
+    except KeyboardInterrupt:
+        print(f"hmt_slam {options.command}: stopped, nothing was written", file=sys.stderr)
+        return INTERRUPTED
+    return 0
+
+
+def _terminate(_signal: int, _frame: FrameType | None) -> None:
+    """Leave by an exception, so that half-written output is removed on the way out."""
+    raise SystemExit(TERMINATED)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,26 @@
+"""``hmt_slam replay``: a log becomes an output folder by way of the robot node and the five process nodes."""
+
+from __future__ import annotations
+
+import argparse
+
+from hmt_slam_ros.cli.arguments import chosen_configuration
+from hmt_slam_ros.cli.progress import Progress
+from hmt_slam_ros.cli.summary import summary
+from hmt_slam_ros.errors import HmtSlamError
+from hmt_slam_ros.logs import open_log
+from hmt_slam_ros.offline.output_folder import check_replaceable
+
+
+def run(options: argparse.Namespace) -> None:
+    """Start the nodes, wait for the end of the log and say what came of it."""
+    configuration = chosen_configuration(options)
+    check_replaceable(options.out.absolute())
+    log = open_log(options.log, start=configuration.robot.start, duration=configuration.robot.duration or None)
+    try:
+        from hmt_slam_ros.nodes.replay import replay  # noqa: PLC0415  the only command that needs ROS
+    except ImportError as fault:
+        raise HmtSlamError(f"replay needs ROS ({fault}): source Jazzy or install its wheels, or use map") from fault
+    with Progress(log.scan_count, log.duration) as progress:
+        replayed = replay(options.log, options.out, configuration, progress)
+    print(summary(options.out, replayed.recording, log.duration, replayed.wall_seconds))

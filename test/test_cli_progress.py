@@ -1,0 +1,66 @@
+"""What a run says while it works, with a clock of its own."""
+
+import io
+
+import pytest
+
+from hmt_slam_ros.cli.progress import Progress
+
+
+class Stream(io.StringIO):
+    def __init__(self, tty: bool) -> None:
+        super().__init__()
+        self.tty = tty
+
+    def isatty(self) -> bool:
+        return self.tty
+
+
+class Clock:
+    def __init__(self) -> None:
+        self.now = 100.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+def run(tty: bool, seconds_per_scan: float, scans: int = 100) -> str:
+    stream, clock = Stream(tty), Clock()
+    with Progress(scans, log_seconds=200.0, stream=stream, clock=clock) as progress:
+        for done in range(1, scans + 1):
+            clock.now += seconds_per_scan
+            progress(done)
+    return stream.getvalue()
+
+
+def test_a_short_run_into_a_file_says_nothing() -> None:
+    assert run(tty=False, seconds_per_scan=0.09) == ""
+
+
+def test_a_long_run_into_a_file_says_a_whole_line_every_ten_seconds() -> None:
+    lines = run(tty=False, seconds_per_scan=0.5).splitlines()
+    assert lines[0] == "20/100 scans, 4.0 x real time, 40 s left"
+    assert [line.split("/")[0] for line in lines] == ["20", "40", "60", "80", "100"]
+
+
+def test_a_terminal_sees_one_moving_line_that_ends_full() -> None:
+    text = run(tty=True, seconds_per_scan=0.5)
+    assert text.count("\n") == 1
+    last = text.rstrip("\n").rsplit("\r", 1)[1]
+    assert "[########################] 100/100 scans" in last
+    assert "0 s left" in last
+
+
+def test_the_moving_line_is_not_drawn_for_every_scan_of_a_fast_run() -> None:
+    assert run(tty=True, seconds_per_scan=0.001, scans=1000).count("\r") <= 12
+
+
+def test_minutes_are_told_apart() -> None:
+    assert run(tty=False, seconds_per_scan=5.0, scans=20).startswith("2/20 scans, 2.0 x real time, 1 min 30 s left")
+
+
+@pytest.mark.parametrize("tty", [False, True])
+def test_a_log_without_scans_or_time_divides_by_nothing(tty: bool) -> None:
+    stream = Stream(tty)
+    with Progress(0, 0.0, stream=stream, clock=Clock()) as progress:
+        progress(0)
