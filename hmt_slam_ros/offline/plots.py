@@ -96,7 +96,7 @@ def _draw_areas(axes: Axes, saved: SavedMap, visible: float) -> None:
     """Origins with their ids and ellipses; ellipses too small to see are drawn larger by a round factor, in metres."""
     axes_of_all = {area: _ellipse(belief) for area, belief in saved.area_poses.items()}
     largest = max(float(lengths[0]) for lengths, _ in axes_of_all.values())
-    factor = 1 if largest <= 0.0 else int(10 ** max(0, np.ceil(np.log10(visible / largest))))
+    factor = 1 if largest <= 0.0 else int(10 ** np.clip(np.ceil(np.log10(visible / largest)), 0, 2))
     for area, (lengths, angle) in axes_of_all.items():
         x, y = saved.area_poses[area].mean[:2].tolist()
         axes.add_patch(
@@ -127,9 +127,7 @@ def _map_title(hybrid_map: HybridMap, path: NDArray[np.float64]) -> str:
     arcs = [arc for _, _, arc in hybrid_map.all_arcs()]
     length = float(np.hypot(*np.diff(path, axis=0).T).sum())
     closures = sum(arc.closure for arc in arcs)
-    return (
-        f"{len(hybrid_map.area_ids())} areas, {len(arcs)} arcs, {closures} of them closed a loop; path {length:.0f} m"
-    )
+    return f"areas: {len(hybrid_map.area_ids())}   arcs: {len(arcs)}   loop closures: {closures}   path: {length:.0f} m"
 
 
 def plot_probabilities(directory: Path) -> Path:
@@ -185,13 +183,14 @@ def plot_cost(directory: Path) -> Path:
         if cost.size:
             spread = f"p95 {np.percentile(cost, 95):.2f}, max {cost.max():.1f} ms"
             label = f"{name.removesuffix('_ms')}: mean {cost.mean():.2f}, {spread}"
-            axes.plot(np.arange(cost.size), np.maximum(cost, 1e-3), ".", markersize=3, color=f"C{k}", label=label)
+            busy = np.flatnonzero(cost)
+            axes.plot(busy, cost[busy], ".", markersize=3, color=f"C{k}", label=label)
     axes.set_yscale("log")
     axes.set_xlabel("scan")
     axes.set_ylabel("computing time [ms]")
     axes.grid(alpha=0.3)
     if table:
-        axes.legend(loc="upper left", fontsize=7)
+        axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=3, fontsize=7)
     return _save(figure, directory / "cost.png")
 
 
