@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # Makes the environment where it is missing, and maps the bundled log with the robot node and the five process nodes.
-# Usage: scripts/demo.sh [arguments of `hmt_slam replay`]
+# Usage: scripts/demo.sh [further arguments of `hmt_slam replay`, such as --seed 1 or --set filter.particles=30]
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 . scripts/environment.sh
