@@ -264,6 +264,18 @@ class Finished:
     dropped: int
 
 
+@dataclass(frozen=True, eq=False)
+class Notice:
+    """Any process -> the log and the report: something a person should know; said once per cause.
+
+    :ivar process: who says it.
+    :ivar text: one sentence that names the value and the remedy.
+    """
+
+    process: str
+    text: str
+
+
 Message = (
     Scan
     | Odometry
@@ -276,4 +288,5 @@ Message = (
     | RealTimePose
     | EndOfLog
     | Finished
+    | Notice
 )

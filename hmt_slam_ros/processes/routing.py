@@ -13,6 +13,7 @@ from hmt_slam_ros.processes.messages import (
     Keyframe,
     LocalEstimate,
     Message,
+    Notice,
     Trail,
 )
 from hmt_slam_ros.sensing import Odometry, Scan
@@ -31,5 +32,5 @@ HEARD_BY: dict[str, tuple[type, ...]] = {
     "tsbi": (Keyframe, AreaEvents, Accepted),
     "tlca": (Keyframe, Hypotheses),
     "rtl": (Odometry, LocalEstimate, Hypotheses, Accepted),
-    "recorder": (Keyframe, Hypotheses, Accepted, Trail, LocalEstimate, Finished),
+    "recorder": (Keyframe, Hypotheses, Accepted, Trail, LocalEstimate, Finished, Notice),
 }

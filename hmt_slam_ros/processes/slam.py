@@ -28,6 +28,7 @@ from hmt_slam_ros.processes.messages import (
     LeafEstimate,
     LocalEstimate,
     Message,
+    Notice,
     Relabelled,
     Trail,
 )
@@ -36,6 +37,8 @@ from hmt_slam_ros.sensing import Odometry, Scan
 from hmt_slam_ros.sensing.motion import OdometryBuffer, increment_covariance
 
 _FIRST_COVARIANCE = np.diag([1e-8, 1e-8, 1e-8])
+# Below 1, since the filter step at a keyframe may move the robot a little back towards the last one.
+_SAME_PLACE = 0.8
 
 
 @dataclass
@@ -74,6 +77,8 @@ class MetricSlam:
         self._replica = Replica()
         self._odometry = OdometryBuffer()
         self._queue: deque[Scan] = deque()
+        self._last_stamp = -1
+        self._noticed: set[str] = set()
         self._live = {FIRST_HYPOTHESIS: _LiveHypothesis(AreaFilter(self._mapping, FIRST_HYPOTHESIS, FIRST_AREA))}
         self._events = 0
         self._waiting = False
@@ -94,7 +99,7 @@ class MetricSlam:
         if isinstance(message, Odometry):
             self._odometry.add(message)
         elif isinstance(message, Scan):
-            self._queue.append(message)
+            return self._receive(message) + self._work()
         elif isinstance(message, Hypotheses):
             self._change_hypotheses(message)
         elif isinstance(message, Accepted):
@@ -111,11 +116,47 @@ class MetricSlam:
             said += self._finish()
         return said
 
+    def _receive(self, scan: Scan) -> list[Message]:
+        """Put a scan into the queue; say, once for each fault, what is wrong with it."""
+        said: list[Message] = []
+        if scan.stamp <= self._last_stamp:
+            said += self._notice(
+                "order",
+                f"A scan is stamped {scan.stamp / 1e9:.6f} s, not after its predecessor "
+                f"({self._last_stamp / 1e9:.6f} s); scans are taken in the order of their arrival: check the clocks or the order of the log.",
+            )
+        if not scan.valid.any():
+            said += self._notice(
+                "empty",
+                f"The scan at {scan.stamp / 1e9:.6f} s has no return between {scan.range_min:g} and {scan.range_max:g} "
+                "m; such scans are placed by odometry alone: check the laser and its range limits.",
+            )
+        self._queue.append(scan)
+        self._last_stamp = scan.stamp
+        if self._out_of_patience():
+            said += self._notice(
+                "odometry",
+                f"{len(self._queue)} scans wait for odometry at {self._queue[0].stamp / 1e9:.6f} s and are now matched "
+                "from the last reading: check the odometry topic and its stamps.",
+            )
+        return said
+
+    def _notice(self, fault: str, text: str) -> list[Message]:
+        if fault in self._noticed:
+            return []
+        self._noticed.add(fault)
+        return [Notice("slam", text)]
+
+    def _out_of_patience(self) -> bool:
+        return len(self._queue) > self._configuration.filter.patience and not self._odometry.covers(
+            self._queue[0].stamp
+        )
+
     def _odometry_known(self) -> bool:
         return (
             self._ended
             or self._odometry.covers(self._queue[0].stamp)
-            or len(self._queue) > self._configuration.filter.patience
+            or self._out_of_patience()
         )
 
     def _process(self, scan: Scan) -> list[Message]:
@@ -193,8 +234,8 @@ class MetricSlam:
             return True
         settings = self._configuration.filter
         relative = se2.between(live.filter.leading_keyframe_poses(), live.filter.pose)
-        near = np.hypot(relative[:, 0], relative[:, 1]) < settings.keyframe_distance
-        alike = np.abs(relative[:, 2]) < math.radians(settings.keyframe_angle)
+        near = np.hypot(relative[:, 0], relative[:, 1]) < _SAME_PLACE * settings.keyframe_distance
+        alike = np.abs(relative[:, 2]) < _SAME_PLACE * math.radians(settings.keyframe_angle)
         return not bool(np.any(near & alike))
 
     @staticmethod

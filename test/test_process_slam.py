@@ -1,0 +1,258 @@
+"""The metric SLAM process, answered by hand in the place of the topological processes."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from worlds import box, scan_in
+
+from hmt_slam_ros.configuration.tree import Configuration
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.processes.messages import (
+    Accepted,
+    Arc,
+    EndOfLog,
+    Finished,
+    Hypotheses,
+    Keyframe,
+    Leaf,
+    LocalArea,
+    LocalEstimate,
+    Notice,
+    Relabelled,
+    Trail,
+)
+from hmt_slam_ros.processes.slam import MetricSlam
+from hmt_slam_ros.sensing import Odometry
+
+WALLS = np.concatenate((box(-3.02, -4.03, 12.03, 4.01), box(4.01, 1.52, 5.03, 2.52), box(7.02, -2.51, 7.52, -1.49)))
+STEP = np.array([0.1, 0.0, 0.0])
+SECOND = 10**9
+
+
+def drive(count, start=0):
+    """(odometry, scan, true pose) of a straight drive, ten scans a second."""
+    for k in range(start, start + count):
+        pose = np.array([0.1 * k, 0.0, 0.0])
+        stamp = SECOND + k * SECOND // 10
+        yield Odometry(stamp, pose), scan_in(WALLS, pose, stamp=stamp, field_of_view=2 * np.pi), pose
+
+
+def agree(keyframe):
+    """The answer that changes nothing."""
+    leaves = tuple(
+        Leaf(leaf.hypothesis, leaf.hypothesis, 1.0 / len(keyframe.leaves), leaf.area) for leaf in keyframe.leaves
+    )
+    return [Hypotheses(keyframe.sequence, leaves), Accepted(keyframe.sequence)]
+
+
+class Dialogue:
+    """A metric SLAM process, and everything that it said."""
+
+    def __init__(self, configuration=None, answer=agree):
+        self.slam = MetricSlam(configuration or Configuration())
+        self.answer = answer
+        self.said = []
+
+    def tell(self, *messages):
+        pending = list(messages)
+        while pending:
+            for message in self.slam.handle(pending.pop(0)):
+                self.said.append(message)
+                if isinstance(message, Keyframe):
+                    pending += self.answer(message)
+        return self
+
+    def of(self, kind):
+        return [message for message in self.said if isinstance(message, kind)]
+
+
+def test_every_scan_gets_a_pose_near_the_truth():
+    dialogue = Dialogue()
+    truths = []
+    for odometry, scan, pose in drive(60):
+        dialogue.tell(odometry, scan)
+        truths.append(pose)
+    estimates = dialogue.of(LocalEstimate)
+    assert [estimate.scan_index for estimate in estimates] == list(range(60))
+    errors = np.array([se2.between(t, e.pose.mean) for t, e in zip(truths, estimates, strict=True)])
+    assert np.hypot(*errors[:, :2].T).max() < 0.05
+
+
+def test_a_keyframe_comes_with_every_half_metre():
+    dialogue = Dialogue()
+    for odometry, scan, _ in drive(61):
+        dialogue.tell(odometry, scan)
+    keyframes = dialogue.of(Keyframe)
+    assert [keyframe.sequence for keyframe in keyframes] == list(range(len(keyframes)))
+    assert len(keyframes) in range(11, 14)
+    assert all(keyframe.leaves[0].stored for keyframe in keyframes)
+
+
+def test_ground_that_is_mapped_already_stores_no_keyframe():
+    dialogue = Dialogue()
+    forward = list(drive(41))
+    for odometry, scan, _ in forward:
+        dialogue.tell(odometry, scan)
+    stored = sum(keyframe.leaves[0].stored for keyframe in dialogue.of(Keyframe))
+    for k, (odometry, scan, _) in enumerate(reversed(forward)):
+        stamp = 10 * SECOND + k * SECOND // 10
+        dialogue.tell(replace(odometry, stamp=stamp), replace(scan, stamp=stamp))
+    keyframes = dialogue.of(Keyframe)
+    assert len(keyframes) > stored + 5
+    assert sum(keyframe.leaves[0].stored for keyframe in keyframes) == stored
+
+
+def test_scans_wait_while_a_keyframe_event_is_open_and_none_is_lost():
+    dialogue = Dialogue(answer=lambda keyframe: [])
+    for odometry, scan, _ in drive(20):
+        dialogue.tell(odometry, scan)
+    assert len(dialogue.of(LocalEstimate)) == 1
+    assert dialogue.slam.waiting_scans == 19
+    dialogue.answer = agree
+    dialogue.tell(*agree(dialogue.of(Keyframe)[0]))
+    assert len(dialogue.of(LocalEstimate)) == 20
+
+
+def test_a_scan_waits_for_its_odometry():
+    dialogue = Dialogue()
+    (odometry, scan, _), (later, _, _) = drive(2)
+    dialogue.tell(scan)
+    assert not dialogue.said
+    dialogue.tell(odometry, later)
+    assert len(dialogue.of(LocalEstimate)) == 1
+
+
+def test_without_odometry_scans_are_matched_after_a_while_and_it_is_said_once():
+    configuration = Configuration()
+    configuration = replace(configuration, filter=replace(configuration.filter, patience=5))
+    dialogue = Dialogue(configuration)
+    for _, scan, _ in drive(30):
+        dialogue.tell(scan)
+    dialogue.tell(EndOfLog())
+    assert len(dialogue.of(LocalEstimate)) == 30
+    (notice,) = dialogue.of(Notice)
+    assert "odometry" in notice.text
+    assert np.abs(dialogue.of(LocalEstimate)[-1].pose.mean - (2.9, 0, 0)).max() < 0.1
+
+
+def test_stamps_that_jump_back_lose_no_scan_and_are_said_once():
+    dialogue = Dialogue()
+    for k, (odometry, scan, _) in enumerate(drive(30)):
+        stamp = scan.stamp - (SECOND // 2 if k in (10, 20) else 0)
+        dialogue.tell(replace(odometry, stamp=stamp), replace(scan, stamp=stamp))
+    dialogue.tell(EndOfLog())
+    assert len(dialogue.of(LocalEstimate)) == 30
+    (notice,) = dialogue.of(Notice)
+    assert "not after its predecessor" in notice.text
+    assert np.abs(dialogue.of(LocalEstimate)[-1].pose.mean - (2.9, 0, 0)).max() < 0.1
+
+
+@pytest.mark.parametrize("spoil", [np.nan, np.inf, 0.0, -1.0])
+def test_faulty_ranges_and_differing_beam_counts_lose_no_scan(spoil):
+    dialogue = Dialogue()
+    for k, (odometry, scan, _) in enumerate(drive(30)):
+        ranges = scan.ranges.copy()
+        ranges[k % 7 :: 7] = spoil
+        dialogue.tell(odometry, replace(scan, ranges=ranges[: len(ranges) - k % 3]))
+    dialogue.tell(EndOfLog())
+    assert dialogue.of(Finished)[0].processed == 30
+    assert np.abs(dialogue.of(LocalEstimate)[-1].pose.mean - (2.9, 0, 0)).max() < 0.05
+
+
+def test_a_scan_without_any_return_is_placed_by_odometry():
+    dialogue = Dialogue()
+    for k, (odometry, scan, _) in enumerate(drive(30)):
+        blind = replace(scan, ranges=np.full_like(scan.ranges, np.nan)) if k % 2 else scan
+        dialogue.tell(odometry, blind)
+    assert len(dialogue.of(LocalEstimate)) == 30
+    assert len(dialogue.of(Notice)) == 1
+    assert np.abs(dialogue.of(LocalEstimate)[-1].pose.mean - (2.9, 0, 0)).max() < 0.05
+
+
+def test_the_trails_hold_every_scan_once_and_lead_to_its_pose():
+    dialogue = Dialogue()
+    truths = []
+    for odometry, scan, pose in drive(60):
+        dialogue.tell(odometry, scan)
+        truths.append(pose)
+    dialogue.tell(EndOfLog())
+    poses = {0: np.zeros(3)}
+    for keyframe in dialogue.of(Keyframe):
+        poses[keyframe.sequence] = keyframe.leaves[0].pose.mean
+        poses |= {r.keyframe: r.pose for r in keyframe.leaves[0].revised}
+    rows = [
+        (trail.first_scan + k, se2.compose(poses[int(anchor)], pose))
+        for trail in dialogue.of(Trail)
+        for k, (anchor, pose) in enumerate(zip(trail.anchors, trail.poses, strict=True))
+    ]
+    assert [scan for scan, _ in rows] == list(range(60))
+    errors = np.array([se2.between(t, p) for t, (_, p) in zip(truths, rows, strict=True)])
+    assert np.hypot(*errors[:, :2].T).max() < 0.05
+    (finished,) = dialogue.of(Finished)
+    assert (finished.scans_in, finished.processed, finished.dropped) == (60, 60, 0)
+
+
+def split_at(event):
+    """TSBI's answer that makes the keyframes 6 and later, at event ``event``, a new area 1, in one hypothesis."""
+
+    def answer(keyframe):
+        if keyframe.sequence != event:
+            return agree(keyframe)
+        (leaf,) = keyframe.leaves
+        reference = PoseGaussian(np.array([3.0, 0.0, 0.0]), np.diag([1e-4, 1e-4, 1e-5]))
+        moved = tuple(
+            Relabelled(k, 0, 1, np.array([0.5 * (k - 6), 0.0, 0.0])) for k in range(6, event + 1)
+        )
+        change = Leaf(
+            1, leaf.hypothesis, 1.0, 1, reference.inverse(), moved, (Arc(0, 1, reference),),
+            (LocalArea(1, np.zeros(3)), LocalArea(0, np.array([-3.0, 0.0, 0.0]))),
+        )  # fmt: skip
+        return [Hypotheses(keyframe.sequence, (change,)), Accepted(keyframe.sequence, 1)]
+
+    return answer
+
+
+def test_after_a_change_of_area_poses_are_in_the_new_frame_and_tracking_goes_on():
+    dialogue = Dialogue(answer=split_at(10))
+    truths = []
+    for odometry, scan, pose in drive(80):
+        dialogue.tell(odometry, scan)
+        truths.append(pose)
+    estimates = dialogue.of(LocalEstimate)
+    assert {estimate.area for estimate in estimates} == {0, 1}
+    for truth, estimate in zip(truths, estimates, strict=True):
+        origin = np.array([3.0 if estimate.area == 1 else 0.0, 0.0, 0.0])
+        assert np.abs(se2.between(truth, se2.compose(origin, estimate.pose.mean))[:2]).max() < 0.06
+    last = dialogue.of(Keyframe)[-1].leaves[0]
+    assert last.hypothesis == 1
+    assert last.area == 1
+
+
+def test_the_drift_grows_from_the_origin_of_the_area():
+    dialogue = Dialogue(answer=split_at(10))
+    for odometry, scan, _ in drive(80):
+        dialogue.tell(odometry, scan)
+    deviations = [np.sqrt(np.trace(k.leaves[0].pose.covariance[:2, :2])) for k in dialogue.of(Keyframe)]
+    assert (np.diff(deviations[:11]) > 0).all()
+    assert deviations[11] < deviations[10]
+
+
+def test_two_hypotheses_are_tracked_side_by_side():
+    def fork(keyframe):
+        if keyframe.sequence != 3:
+            return agree(keyframe)
+        leaves = (Leaf(1, 0, 0.5, 0), Leaf(2, 0, 0.5, 0))
+        return [Hypotheses(3, leaves), Accepted(3)]
+
+    dialogue = Dialogue(answer=fork)
+    for odometry, scan, _ in drive(40):
+        dialogue.tell(odometry, scan)
+    keyframes = dialogue.of(Keyframe)
+    assert [leaf.hypothesis for leaf in keyframes[-1].leaves] == [1, 2]
+    assert sorted({trail.hypothesis for trail in dialogue.of(Trail)}) == [0, 1, 2]
+    dialogue.tell(Accepted(keyframes[-1].sequence, 2))
+    for odometry, scan, _ in drive(10, start=40):
+        dialogue.tell(odometry, scan)
+    assert [leaf.hypothesis for leaf in dialogue.of(Keyframe)[-1].leaves] == [2]
