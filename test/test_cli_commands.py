@@ -159,7 +159,7 @@ def test_map_makes_the_folder_and_replaces_it_and_plot_draws_from_it(tmp_path: P
     for seed in (1, 2):
         result = hmt_slam("map", BAG, "--out", out, "--duration", 4, "--seed", seed)
         assert result.returncode == 0, result.stderr
-        assert result.stdout.startswith(f"{out}: ")
+        assert result.stdout.splitlines()[-1].startswith(f"{out}: ")
         assert ", 0 dropped" in result.stdout
         manifest = yaml.safe_load((out / "hmt_map" / "manifest.json").read_text())
         assert manifest["seed"] == seed

@@ -28,6 +28,7 @@ from hmt_slam_ros.processes.messages import (
     LeafEstimate,
     LocalArea,
     LocalEstimate,
+    Notice,
     Relabelled,
     Trail,
 )
@@ -96,7 +97,7 @@ def messages() -> list:
         said.append(keyframe(k, {0: 0} if k <= CUT else {1: 1, 2: 0} if k <= VERDICT else {1: 1}))
         said.append(hypotheses(k))
         said.append(accepted(k))
-    return [*said, Finished(SCANS, SCANS, 0)]
+    return [*said, Notice("slam", "two scans had no beam: clean the laser"), Finished(SCANS, SCANS, 0)]
 
 
 def hypotheses(k: int) -> Hypotheses:
@@ -253,6 +254,7 @@ def test_the_report_counts_what_happened(folder: Path) -> None:
     assert report["processes"]["slam"]["mean_ms_per_scan"] == pytest.approx(11.5)
     assert report["configuration"]["local_map"]["cell"] == 0.1
     assert (report["seed"], report["peak_rss_bytes"]) == (7, {"hmt_slam": 10**8})
+    assert report["notices"] == [{"process": "slam", "text": "two scans had no beam: clean the laser"}]
     assert {"numpy", "numba", "hmt_slam_ros"} <= set(report["versions"])
 
 

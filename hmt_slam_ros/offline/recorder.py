@@ -24,6 +24,7 @@ from hmt_slam_ros.processes.messages import (
     Leaf,
     LocalEstimate,
     Message,
+    Notice,
     Trail,
 )
 from hmt_slam_ros.processes.replica import Replica
@@ -74,6 +75,7 @@ class Recording:
     :ivar probabilities: of every live topology at every keyframe event, in their order.
     :ivar last: the last estimate of metric SLAM.
     :ivar totals: scans received, processed and dropped.
+    :ivar notices: what the processes had to tell a person.
     """
 
     replica: Replica
@@ -83,6 +85,7 @@ class Recording:
     probabilities: list[TopologyProbability]
     last: LocalEstimate
     totals: Finished
+    notices: tuple[Notice, ...]
 
     @property
     def hybrid_map(self) -> HybridMap:
@@ -98,6 +101,7 @@ class Recorder:
     :ivar keyframes: {keyframe event: message}, likewise ``hypotheses`` and ``accepted``.
     :ivar trails: {(hypothesis, first scan): message}.
     :ivar estimates: {scan index: message}.
+    :ivar notices: {(process, text): message} in the order of arrival.
     :ivar finished: the last word of metric SLAM, None before it.
     """
 
@@ -107,6 +111,7 @@ class Recorder:
     accepted: dict[int, Accepted] = field(default_factory=dict)
     trails: dict[tuple[int, int], Trail] = field(default_factory=dict)
     estimates: dict[int, LocalEstimate] = field(default_factory=dict)
+    notices: dict[tuple[str, str], Notice] = field(default_factory=dict)
     finished: Finished | None = None
 
     def handle(self, message: Message) -> list[Message]:
@@ -122,6 +127,8 @@ class Recorder:
                 self.trails[message.hypothesis, message.first_scan] = message
             case LocalEstimate():
                 self.estimates.setdefault(message.scan_index, message)
+            case Notice():
+                self.notices.setdefault((message.process, message.text), message)
             case Finished():
                 self.finished = message
         return []
@@ -162,6 +169,7 @@ class Recorder:
             probabilities,
             self.estimates[max(self.estimates)],
             self.finished,
+            tuple(self.notices.values()),
         )
 
     def _own_trails(self, hypothesis: int) -> list[Trail]:

@@ -59,6 +59,7 @@ def report(recording: Recording, configuration: Configuration, figures: RunFigur
             "most_probable": replica.best,
             "probability": replica.probabilities[replica.best],
         },
+        "notices": [{"process": notice.process, "text": notice.text} for notice in recording.notices],
         "processes": {name: _cost(seconds) for name, seconds in figures.seconds_per_scan.items()},
         "peak_rss_bytes": dict(figures.peak_rss),
         "wall_s": figures.wall_seconds,
