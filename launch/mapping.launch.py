@@ -31,7 +31,7 @@ def generate_launch_description() -> LaunchDescription:
             executable=process,
             namespace=LaunchConfiguration("namespace"),
             parameters=[LaunchConfiguration("params_file"), {"use_sim_time": use_sim_time}],
-            arguments=["--ros-args", "--log-level", LaunchConfiguration("log_level")],
+            ros_arguments=["--log-level", LaunchConfiguration("log_level")],
             output="screen",
         )
         for process in PROCESSES
