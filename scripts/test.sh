@@ -9,7 +9,7 @@ cd "$(dirname "${BASH_SOURCE[0]}")/.."
 status=0
 check() {
     echo "== $*"
-    "$venv/bin/$@" || status=1
+    "$venv/bin/python" -m "$@" || status=1
 }
 
 if [ "${1:-}" = --floor ]; then
