@@ -1,0 +1,160 @@
+"""Topological Space Bayesian Inference: the probability distribution over topological paths, Eqs. (6) and (14)."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hmt_slam_ros.configuration.tree import Configuration
+from hmt_slam_ros.errors import HmtSlamError
+from hmt_slam_ros.processes.messages import (
+    Accepted,
+    AreaEvent,
+    AreaEvents,
+    Hypotheses,
+    Keyframe,
+    Leaf,
+    LocalArea,
+    Message,
+)
+from hmt_slam_ros.processes.replica import FIRST_HYPOTHESIS, Replica
+from hmt_slam_ros.processes.tsbi_branching import Branches, Branching, Child, Parent
+from hmt_slam_ros.random_streams import Purpose, stream
+from hmt_slam_ros.topology.hypothesis_tree import LeafNotes, Settled, settle
+from hmt_slam_ros.topology.surroundings import agreeing, areas_around
+
+
+class Tsbi:
+    """Answers the area events of every keyframe with the live hypotheses.
+
+    Consumes Keyframe, AreaEvents, Accepted; produces Hypotheses.
+    """
+
+    def __init__(self, configuration: Configuration) -> None:
+        self._options = configuration.tsbi
+        self._seed = configuration.seed
+        self._replica = Replica()
+        self._branching = Branching(configuration, self._replica)
+        self._notes = {FIRST_HYPOTHESIS: LeafNotes()}
+        self._evidence: dict[int, float] = {}
+        self._keyframe = -1
+        self._next_hypothesis = FIRST_HYPOTHESIS + 1
+        self._unexamined = 0.0
+        self._global_poses: dict[int, NDArray[np.float64]] = {}
+
+    def handle(self, message: Message) -> list[Message]:
+        """Learn from ``Keyframe`` and ``Accepted``; answer ``AreaEvents`` with ``Hypotheses``."""
+        if isinstance(message, Keyframe):
+            self._note(message)
+        elif isinstance(message, AreaEvents):
+            return [self._infer(message)]
+        elif isinstance(message, Accepted):
+            self._accept(message)
+        return []
+
+    def _note(self, keyframe: Keyframe) -> None:
+        """Store the keyframe and what its scan says of every hypothesis."""
+        self._replica.add(keyframe)
+        self._keyframe = keyframe.sequence
+        self._evidence = {leaf.hypothesis: leaf.log_evidence for leaf in keyframe.leaves}
+        for leaf in keyframe.leaves:
+            if leaf.stored and leaf.hypothesis in self._notes:
+                notes = self._notes[leaf.hypothesis]
+                self._notes[leaf.hypothesis] = notes.stored(keyframe.sequence, leaf.pose.covariance)
+
+    def _infer(self, events: AreaEvents) -> Hypotheses:
+        """Weight, branch, normalise, reduce."""
+        if events.sequence != self._keyframe:
+            raise HmtSlamError(
+                f"area events {events.sequence} came after keyframe {self._keyframe}: a message was lost, start again"
+            )
+        self._branching.begin_event()
+        by_hypothesis = {event.hypothesis: event for event in events.events}
+        branches = [self._branch(hypothesis, by_hypothesis.get(hypothesis)) for hypothesis in sorted(self._notes)]
+        children = [child for branch in branches for child in branch.children]
+        settled = self._settle(events.sequence, children, branches)
+        chosen = [children[k] for k in settled.kept]
+        changed = self._leaves(children, chosen, settled.probabilities)
+        self._replica.apply(Hypotheses(events.sequence, tuple(changed), settled.unexamined))
+        loaded = [self._loaded(changed[n], child) for n, child in enumerate(chosen)]
+        self._unexamined = settled.unexamined
+        leaves = tuple(sorted(loaded, key=lambda leaf: leaf.hypothesis))
+        return Hypotheses(events.sequence, leaves, settled.unexamined)
+
+    def _branch(self, hypothesis: int, event: AreaEvent | None) -> Branches:
+        """The continuations of one hypothesis, each with its weight."""
+        probability = self._replica.probabilities[hypothesis]
+        log_weight = math.log(max(probability, 1e-300)) + self._evidence.get(hypothesis, 0.0)
+        notes, area = self._notes[hypothesis], self._replica.areas[hypothesis]
+        parent = Parent(hypothesis, area, self._replica.maps[hypothesis], notes, log_weight)
+        if event is not None and event.kind == "cut":
+            return self._branching.cut(parent, event.keyframes)
+        if event is not None:
+            return self._branching.move(parent, event.area)
+        if len(notes.unchecked) >= self._options.recheck_keyframes:
+            return self._branching.recheck(parent)
+        return Branches([Child(hypothesis, log_weight, area, notes)])
+
+    def _settle(self, sequence: int, children: Sequence[Child], branches: Sequence[Branches]) -> Settled:
+        generator = stream(self._seed, Purpose.HYPOTHESES, 0, sequence)
+        # Ground that was not looked at would show again by now, in the keyframes that are looked at.
+        if any(branch.looked for branch in branches):
+            self._unexamined *= 0.5
+        return settle(
+            np.array([child.log_weight for child in children]),
+            float(np.logaddexp.reduce([branch.log_skipped for branch in branches])),
+            self._unexamined,
+            self._options.max_hypotheses,
+            self._options.drop_probability,
+            generator,
+        )
+
+    def _leaves(
+        self, children: Sequence[Child], chosen: Sequence[Child], probabilities: NDArray[np.float64]
+    ) -> list[Leaf]:
+        """The survivors; a hypothesis that did not branch keeps its id, children of one that did get new ones."""
+        siblings = Counter(child.parent for child in children)
+        leaves = [
+            self._leaf(child, siblings[child.parent] > 1, float(probability))
+            for child, probability in zip(chosen, probabilities, strict=True)
+        ]
+        self._notes = {leaf.hypothesis: child.notes for leaf, child in zip(leaves, chosen, strict=True)}
+        return leaves
+
+    def _leaf(self, child: Child, branched: bool, probability: float) -> Leaf:
+        hypothesis = child.parent
+        if branched:
+            hypothesis = self._next_hypothesis
+            self._next_hypothesis += 1
+        return Leaf(
+            hypothesis, child.parent, probability, child.area, child.rebase, child.relabelled, child.arcs
+        )
+
+    def _loaded(self, leaf: Leaf, child: Child) -> Leaf:
+        """The leaf with the areas that its local map must hold, where that is to be loaded anew."""
+        if not child.reload:
+            return leaf
+        around = areas_around(self._replica.maps[leaf.hypothesis], leaf.area, self._branching.nearness)
+        poses = {
+            area: agreeing(belief, leaf.area, area, self._global_poses, self._branching.gate)
+            for area, belief in around.items()
+            if area != leaf.area
+        }
+        self._notes[leaf.hypothesis] = replace(self._notes[leaf.hypothesis], local=poses)
+        loaded = [LocalArea(area, pose) for area, pose in poses.items()]
+        return replace(leaf, local=(LocalArea(leaf.area, np.zeros(3)), *loaded))
+
+    def _accept(self, accepted: Accepted) -> None:
+        """One hypothesis is definite: the others, and what was not examined, are gone."""
+        if accepted.global_poses:
+            self._global_poses = {area.area: area.pose.mean for area in accepted.global_poses}
+        if accepted.hypothesis is None:
+            return
+        self._replica.accept(accepted)
+        self._notes = {accepted.hypothesis: self._notes[accepted.hypothesis]}
+        self._unexamined = 0.0

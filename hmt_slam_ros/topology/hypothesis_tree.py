@@ -1,0 +1,98 @@
+"""Leaves of the tree of topological paths: what is remembered of each, and how their weights become the PMF."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.topology.reduction import reduce_hypotheses
+
+Covariance = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class LeafNotes:
+    """What TSBI remembers of a leaf beside its map; children inherit it.
+
+    :ivar covariances: {keyframe: covariance (3, 3) of ``area_T_base``, right tangent} of the unsettled keyframes: those
+        stored in the robot's area since it was entered, and those that came over with it.
+    :ivar compared: {known area: unsettled keyframes that were compared with it}. A keyframe speaks for or against a
+        known area once.
+    :ivar local: {area: ``current_T_area``} of the areas in the local map besides the robot's own.
+    :ivar unchecked: the unsettled keyframes that no re-check has looked at.
+    """
+
+    covariances: Mapping[int, Covariance] = field(default_factory=dict)
+    compared: Mapping[int, frozenset[int]] = field(default_factory=dict)
+    local: Mapping[int, NDArray[np.float64]] = field(default_factory=dict)
+    unchecked: tuple[int, ...] = ()
+
+    def stored(self, keyframe: int, covariance: Covariance) -> LeafNotes:
+        """After a keyframe entered the robot's area."""
+        return replace(
+            self, covariances={**self.covariances, keyframe: covariance}, unchecked=(*self.unchecked, keyframe)
+        )
+
+    def checked(self, areas: Sequence[int], keyframes: Sequence[int]) -> LeafNotes:
+        """After keyframes were compared with known areas."""
+        added = {area: self.compared.get(area, frozenset()) | set(keyframes) for area in areas}
+        return replace(self, compared={**self.compared, **added}, unchecked=())
+
+    def entered(self, covariances: Mapping[int, Covariance]) -> LeafNotes:
+        """After the robot entered another area together with the keyframes of ``covariances``."""
+        kept = {area: keyframes & covariances.keys() for area, keyframes in self.compared.items()}
+        return LeafNotes(covariances, {area: keyframes for area, keyframes in kept.items() if keyframes})
+
+
+def relative_covariance(
+    whole: Covariance, reference: Covariance, reference_T_base: NDArray[np.float64], floor: Covariance
+) -> Covariance:
+    """Covariance of ``reference_T_base`` where the drift up to the reference is part of that of ``area_T_base``.
+
+    :param whole: of ``area_T_base``, shape (3, 3), right tangent.
+    :param reference: of ``area_T_reference``.
+    :param floor: the least that is returned.
+    """
+    ad = se2.adjoint(se2.inverse(reference_T_base))
+    values, vectors = np.linalg.eigh(whole - ad @ reference @ ad.T)
+    return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T + floor, dtype=np.float64)
+
+
+class Settled(NamedTuple):
+    """The distribution over topological paths after a reduction, Eq. (14).
+
+    :ivar kept: shape (n,), int64, ascending: the hypotheses that stay.
+    :ivar probabilities: shape (n,); they sum to 1 less ``unexamined``.
+    :ivar unexamined: probability of what was not looked at or was dropped for its smallness.
+    """
+
+    kept: NDArray[np.int64]
+    probabilities: NDArray[np.float64]
+    unexamined: float
+
+
+def settle(
+    log_weights: NDArray[np.float64], log_skipped: float, unexamined: float, most: int, least: float,
+    generator: np.random.Generator,
+) -> Settled:
+    """Normalise, drop what is tiny, reduce to N.
+
+    :param log_weights: shape (m,), nats, of all hypotheses.
+    :param log_skipped: log of the weight, on the same scale, of what was not looked at now.
+    :param unexamined: probability of what was not looked at earlier; it keeps its share, as no evidence is computed
+        for it.
+    :param most: N.
+    :param least: probability below which a hypothesis is dropped.
+    """  # fmt: skip
+    scale = np.logaddexp(np.logaddexp.reduce(log_weights), log_skipped)
+    probabilities = (1.0 - unexamined) * np.exp(log_weights - scale)
+    probabilities[(probabilities < least) & (probabilities < probabilities.max())] = 0.0
+    reduction = reduce_hypotheses(probabilities, most, generator)
+    # What the sum lacks is the skipped, the dropped and what was unexamined before.
+    total = float(reduction.weights.sum())
+    return Settled(reduction.kept, reduction.weights, max(0.0, 1.0 - total))

@@ -1,0 +1,114 @@
+"""Which areas lie for certain around one of them, and what their keyframes saw together."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.sensing import Scan
+from hmt_slam_ros.topology.area_grid import AreaGrid, GridModel, build_area_grid
+from hmt_slam_ros.topology.hybrid_map import HybridMap
+from hmt_slam_ros.topology.shortest_path import reachable
+from hmt_slam_ros.topology.transition import Place
+
+Pose = NDArray[np.float64]
+
+# An area has few others around it; this bounds the work where hundreds are joined by tight arcs.
+_MOST_AROUND = 64
+_GRIDS = 48
+
+
+@dataclass(frozen=True)
+class Nearness:
+    """What counts as around an area.
+
+    :ivar sigma: largest deviation of an area's position, m.
+    :ivar reach: largest distance between the nearest keyframes of the two, m.
+    """
+
+    sigma: float
+    reach: float
+
+
+def areas_around(
+    hybrid_map: HybridMap, area: int, nearness: Nearness, without: Collection[int] = ()
+) -> dict[int, PoseGaussian]:
+    """{other area: belief over ``area_T_other``}, the area itself first, then by growing uncertainty."""
+    beliefs = reachable(hybrid_map, area, nearness.sigma**2, _MOST_AROUND)
+    here = _positions(hybrid_map, area, np.zeros(3))
+    found = {}
+    for other, belief in beliefs.items():
+        near = other == area or _gap(here, _positions(hybrid_map, other, belief.mean)) <= nearness.reach
+        if near and other not in without:
+            found[other] = belief
+    return found
+
+
+def _positions(hybrid_map: HybridMap, area: int, pose: Pose) -> NDArray[np.float64]:
+    """Positions of an area's keyframes, shape (n, 2), where the area's frame stands at ``pose``."""
+    poses = np.array(list(hybrid_map.keyframes(area).values())).reshape(-1, 3)
+    return se2.transform(pose, poses[:, :2])
+
+
+def _gap(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
+    between = a[:, None] - b[None]
+    return float(np.hypot(between[..., 0], between[..., 1]).min(initial=np.inf))
+
+
+def agreeing(belief: PoseGaussian, area: int, other: int, global_poses: Mapping[int, Pose], gate: float) -> Pose:
+    """``area_T_other`` as the globally consistent map has it, where that agrees with the belief, else its mean.
+
+    A hypothesis with an arc that the global map does not know places areas elsewhere than that map does.
+    """
+    if area not in global_poses or other not in global_poses:
+        return belief.mean
+    pose = se2.between(global_poses[area], global_poses[other])
+    away = se2.log(se2.between(belief.mean, pose))
+    agrees = float(away @ np.linalg.solve(belief.covariance, away)) <= gate
+    return pose if agrees else belief.mean
+
+
+class Views:
+    """Grids and places, built from the keyframes' scans and kept while they are in use."""
+
+    def __init__(self, scans: Mapping[int, Scan], model: GridModel, nearness: Nearness) -> None:
+        """:param scans: {keyframe: scan}, which may grow."""
+        self._scans = scans
+        self._model = model
+        self._nearness = nearness
+        self._grids: OrderedDict[bytes, AreaGrid] = OrderedDict()
+
+    def grid(self, keyframes: Mapping[int, Pose]) -> AreaGrid:
+        """What the keyframes saw, placed at the given poses."""
+        poses = np.array(list(keyframes.values())).reshape(-1, 3)
+        key = np.array(list(keyframes), dtype=np.int64).tobytes() + poses.tobytes()
+        if key not in self._grids:
+            self._grids[key] = build_area_grid([self._scans[k] for k in keyframes], poses, self._model)
+        self._grids.move_to_end(key)
+        while len(self._grids) > _GRIDS:
+            self._grids.popitem(last=False)
+        return self._grids[key]
+
+    def place(self, hybrid_map: HybridMap, area: int, without: Collection[int]) -> Place:
+        """An area with those around it, so that an overlap is not cut off at the area's edge.
+
+        :param without: areas that are left out.
+        """
+        around = areas_around(hybrid_map, area, self._nearness, without)
+        return self.place_of(hybrid_map, area, {other: belief.mean for other, belief in around.items()})
+
+    def place_of(self, hybrid_map: HybridMap, area: int, poses: Mapping[int, Pose]) -> Place:
+        """The place of ``area`` among the areas that stand at ``poses``, {other area: ``area_T_other``}."""
+        keyframes, owners = {}, []
+        for other, pose in poses.items():
+            for keyframe, at in hybrid_map.keyframes(other).items():
+                keyframes[keyframe] = se2.compose(pose, at)
+                owners.append(other)
+        positions = np.array(list(keyframes.values())).reshape(-1, 3)[:, :2]
+        return Place(area, np.array(owners, dtype=np.int64), positions, self.grid(keyframes))
