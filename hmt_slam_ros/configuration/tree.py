@@ -164,14 +164,61 @@ class TopologicalInference:
     """TSBI: the distribution over topological paths."""
 
     max_hypotheses: int = parameter(16, "Topological hypotheses N kept after a reduction.", low=1, high=1000)
+    drop_probability: float = parameter(
+        1e-6, "Hypotheses below this probability are dropped at once.", low=0.0, high=0.1
+    )
+    max_candidates: int = parameter(16, "Known areas that a hypothesis is compared with at a cut.", low=1, high=1000)
+    max_modes: int = parameter(3, "Ways to fit one known area that become hypotheses of their own.", low=1, high=100)
     gate_probability: float = parameter(
         0.999,
         "Share of true revisits that the chi-square gate on the arc prior (3 degrees of freedom) lets pass.",
         low=0.5,
         high=0.999999,
     )
+    prior_scale: float = parameter(
+        1.5, "Factor on the deviations of the arc prior, as drift is estimated from few particles.", low=0.1, high=10.0
+    )
+    prior_limit: float = parameter(
+        10.0, "Known areas whose position is less certain than this are not looked at.", unit="m", low=0.1, high=1000.0
+    )
+    new_probability: float = parameter(
+        0.05, "Probability of new ground at least, where the arcs point into known areas.", low=0.0, high=1.0
+    )
+    place_radius: float = parameter(
+        2.0, "A robot this close to a keyframe of an area, and in its sight, is in the area's place.", unit="m",
+        low=0.1, high=20.0,
+    )
     temper: float = parameter(
-        0.1, "Exponent on the evidence of a scan in the weight of a hypothesis.", low=1e-4, high=1.0
+        0.1, "Exponent on the likelihood of an area's surface samples in the weight of a hypothesis.",
+        low=1e-4, high=1.0,
+    )
+    sample_spacing: float = parameter(
+        0.2, "Distance between the surface samples that areas are compared by.", unit="m", low=0.02, high=2.0
+    )
+    search_cell: float = parameter(
+        0.1, "Side of a cell of the grids that areas are compared by.", unit="m", low=0.02, high=1.0
+    )
+    surface_sigma: float = parameter(
+        0.1, "Deviation of a surface from where another area's map has it.", unit="m", low=0.01, high=1.0
+    )
+    surface_ratio: float = parameter(
+        3.0, "How much likelier a surface is measured on a known surface than in unknown space.", low=1.01, high=100.0
+    )
+    free_ratio: float = parameter(
+        0.1, "How much likelier a surface is measured in free space than in unknown space.", low=1e-4, high=0.99
+    )
+    appearance_weight: float = parameter(
+        0.5, "Bound of the evidence that the look of a place gives.", unit="nat", low=0.0, high=20.0
+    )
+    recheck_keyframes: int = parameter(
+        5, "Keyframes stored without a cut after which known ground is looked for.", low=1, high=1000
+    )
+    local_sigma: float = parameter(
+        0.3, "An area whose position is at least this certain is part of the local map.", unit="m", low=0.01, high=5.0
+    )
+    local_reach: float = parameter(
+        12.0, "An area with a keyframe this close to the robot's area is part of the local map.", unit="m",
+        low=0.5, high=200.0,
     )
 
 
@@ -196,6 +243,11 @@ class LoopClosureAcceptance:
         0.01, "Smallest deviation of an arc's translation.", unit="m", low=1e-4, high=1.0
     )
     arc_angle_floor: float = parameter(0.2, "Smallest deviation of an arc's angle.", unit="deg", low=1e-3, high=45.0)
+    global_map: str = parameter(
+        "consistent",
+        "Poses of the areas: consistent with all arcs (Lu and Milios), or along the shortest paths only (Dijkstra).",
+        choices=("consistent", "shortest_path"),
+    )
 
 
 @dataclass(frozen=True)
