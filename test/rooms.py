@@ -4,11 +4,9 @@ from itertools import pairwise
 
 import numpy as np
 
-from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.sensing import Scan
 
 BEAMS = 180
-ANGLES = np.linspace(-np.pi, np.pi, BEAMS, endpoint=False)
 
 
 def box(x0, y0, x1, y1):
@@ -24,7 +22,7 @@ def two_rooms():
     return np.concatenate((outer, doorway, box(0.5, 4.5, 1.5, 5.5), box(10.0, 0.5, 11.5, 1.5)))
 
 
-def ranges(walls, pose, angles=ANGLES):
+def ranges(walls, pose, angles):
     """Distance from ``pose`` to the nearest wall along each angle, shape (n,), m."""
     heading = np.stack((np.cos(pose[2] + angles), np.sin(pose[2] + angles)), axis=1)[:, None]
     start, edge = walls[None, :, 0] - pose[:2], walls[None, :, 1] - walls[None, :, 0]
@@ -36,12 +34,13 @@ def ranges(walls, pose, angles=ANGLES):
     return np.where(hit, along, np.inf).min(axis=1)
 
 
-def scan_at(walls, pose, noise=0.0, rng=None):
+def scan_at(walls, pose, noise=0.0, rng=None, beams=BEAMS):
     """The scan of a laser that sees all round, taken at ``pose``, shape (3,)."""
-    measured = ranges(walls, np.asarray(pose, dtype=np.float64))
+    angles = np.linspace(-np.pi, np.pi, beams, endpoint=False)
+    measured = ranges(walls, np.asarray(pose, dtype=np.float64), angles)
     if rng is not None:
         measured = measured + rng.normal(size=measured.size) * noise
-    return Scan(0, measured.astype(np.float32), -np.pi, 2.0 * np.pi / BEAMS, 0.05, 30.0)
+    return Scan(0, measured.astype(np.float32), -np.pi, 2.0 * np.pi / beams, 0.05, 30.0)
 
 
 def drive(*corners, step=0.5):
@@ -53,8 +52,3 @@ def drive(*corners, step=0.5):
         heading = np.arctan2(leg[1], leg[0])
         poses += [[*(start + leg * s / length), heading] for s in np.arange(0.0, length - 1e-9, step)]
     return np.array(poses)
-
-
-def relative(poses, origin):
-    """Poses seen from ``origin``."""
-    return se2.between(origin, poses)

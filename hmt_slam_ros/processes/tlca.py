@@ -1,0 +1,234 @@
+"""Topological Loop Closure Acceptance: which topological path is definite, and where everything lies under it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy.stats import chi2
+
+from hmt_slam_ros.configuration import Configuration
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.processes.messages import (
+    Accepted,
+    Arc,
+    AreaPose,
+    Hypotheses,
+    Keyframe,
+    Leaf,
+    Message,
+    Notice,
+    Relabelled,
+)
+from hmt_slam_ros.processes.replica import FIRST_HYPOTHESIS, Replica
+from hmt_slam_ros.topology.arc_fusion import floored, fused
+from hmt_slam_ros.topology.fine_alignment import FineAlignment
+from hmt_slam_ros.topology.global_map import consistent_map, shortest_path_map
+from hmt_slam_ros.topology.hybrid_map import HybridMap
+
+Pair = tuple[int, int]
+
+
+@dataclass(frozen=True, eq=False)
+class _Observation:
+    """An arc that TSBI set and that is not definite yet.
+
+    :ivar source: area a.
+    :ivar target: area b, the one that the robot entered.
+    :ivar pose: belief over ``a_T_b`` as observed.
+    :ivar closure: whether it closed a loop.
+    :ivar before: the definite arc ``a_T_b`` that it replaced, or None.
+    :ivar keyframes: the keyframes by which it was observed.
+    """
+
+    source: int
+    target: int
+    pose: PoseGaussian
+    closure: bool
+    before: Arc | None
+    keyframes: frozenset[int]
+
+    @property
+    def pair(self) -> Pair:
+        """The arc, whatever its direction."""
+        return min(self.source, self.target), max(self.source, self.target)
+
+
+@dataclass(frozen=True, eq=False)
+class _Path:
+    """What TLCA remembers of one hypothesis; a value, so that children inherit it.
+
+    :ivar version: number of the last change of its areas and arcs, of all hypotheses.
+    :ivar parted: path length at which it parted from others, m.
+    :ivar held: at how many of the latest keyframes in a row it dominated since then.
+    :ivar definite: whether nothing happened since it was accepted.
+    :ivar observations: arcs that wait for acceptance, in order.
+    :ivar witnesses: {arc: the keyframes by which it was observed}, of the definite arcs.
+    """
+
+    version: int = 0
+    parted: float = 0.0
+    held: int = 0
+    definite: bool = False
+    observations: tuple[_Observation, ...] = ()
+    witnesses: dict[Pair, frozenset[int]] = field(default_factory=dict)
+
+
+class Tlca:
+    """Answers every ``Hypotheses`` with an ``Accepted``.
+
+    A path is accepted when it has dominated for some keyframes and metres since it parted from the last other one, and
+    at once when no other is left. Then the others are dropped, the areas that it joined are finely aligned, and arcs
+    that were travelled before are fused with what was known of them.
+    """
+
+    def __init__(self, configuration: Configuration) -> None:
+        self._options = configuration.tlca
+        self._alignment = FineAlignment(configuration)
+        self._replica = Replica()
+        self._paths = {FIRST_HYPOTHESIS: _Path()}
+        self._travelled = 0.0
+        self._changes = 0
+        self._published = -1
+        self._gate = float(chi2.ppf(configuration.tsbi.gate_probability, 3))
+        self._doubted: set[Pair] = set()
+
+    def handle(self, message: Message) -> list[Message]:
+        """Learn from a ``Keyframe``; answer ``Hypotheses``."""
+        if isinstance(message, Keyframe):
+            self._replica.add(message)
+            self._travelled = message.travelled
+        elif isinstance(message, Hypotheses):
+            return self._judge(message)
+        return []
+
+    def shortest_path_poses(self) -> dict[int, PoseGaussian]:
+        """``map_T_area`` of the most probable hypothesis along the least uncertain paths only, Eq. (15)."""
+        return shortest_path_map(self._replica.maps[self._replica.best]).poses
+
+    def _judge(self, hypotheses: Hypotheses) -> list[Message]:
+        paths = {leaf.hypothesis: self._followed(leaf, hypotheses.sequence) for leaf in hypotheses.leaves}
+        self._replica.apply(hypotheses)
+        self._paths = paths
+        chosen = self._dominant()
+        arcs, relabelled = ((), ()) if chosen is None else self._refined(chosen)
+        accepted = Accepted(hypotheses.sequence, chosen, arcs, relabelled)
+        self._replica.accept(accepted)
+        self._paths = {hypothesis: self._paths[hypothesis] for hypothesis in self._replica.maps}
+        poses, notices = self._global_poses()
+        return [*notices, replace(accepted, global_poses=poses)]
+
+    def _followed(self, leaf: Leaf, sequence: int) -> _Path:
+        """The path after TSBI's answer, which is not applied yet: the arcs that it replaces are still there."""
+        path = self._paths[leaf.parent]
+        if leaf.hypothesis != leaf.parent:
+            path = replace(path, parted=self._travelled, held=0)
+        dominates = leaf.probability >= self._options.accept_probability
+        path = replace(path, held=path.held + 1 if dominates else 0)
+        if not (leaf.arcs or leaf.relabelled or leaf.rebase):
+            return path
+        self._changes += 1
+        observations = tuple(self._observed(arc, leaf, sequence) for arc in leaf.arcs)
+        return replace(path, version=self._changes, definite=False, observations=path.observations + observations)
+
+    def _observed(self, arc: Arc, leaf: Leaf, sequence: int) -> _Observation:
+        inwards = arc.target == leaf.area
+        source, target, pose = (
+            (arc.source, arc.target, arc.pose) if inwards else (arc.target, arc.source, arc.pose.inverse())
+        )
+        hybrid_map = self._replica.maps[leaf.parent]
+        value, before = hybrid_map.arc_value(source, target), hybrid_map.arc(source, target)
+        old = None if value is None or before is None else Arc(source, target, before, value.closure)
+        keyframes = frozenset(r.keyframe for r in leaf.relabelled if r.area == target) or frozenset([sequence])
+        return _Observation(source, target, pose, arc.closure, old, keyframes)
+
+    def _dominant(self) -> int | None:
+        """The hypothesis that becomes definite now, if any."""
+        best = self._replica.best
+        path = self._paths[best]
+        if len(self._paths) == 1:
+            return None if path.definite else best
+        held = path.held >= self._options.accept_keyframes
+        return best if held and self._travelled - path.parted >= self._options.accept_distance else None
+
+    def _refined(self, hypothesis: int) -> tuple[tuple[Arc, ...], tuple[Relabelled, ...]]:
+        """Align and fuse what the accepted path observed, changing its map."""
+        path, hybrid_map = self._paths[hypothesis], self._replica.maps[hypothesis]
+        arcs: dict[Pair, Arc] = {}
+        relabelled: list[Relabelled] = []
+        witnesses = dict(path.witnesses)
+        for seen in path.observations:
+            aligned, moved = self._aligned(hybrid_map, seen)
+            relabelled += moved
+            old = arcs.get(seen.pair, seen.before)
+            arcs[seen.pair] = self._fused(aligned, old, witnesses.get(seen.pair, frozenset()))
+            witnesses[seen.pair] = witnesses.get(seen.pair, frozenset()) | seen.keyframes
+        if arcs:
+            self._changes += 1
+        version = self._changes if arcs else path.version
+        self._paths[hypothesis] = replace(path, version=version, definite=True, observations=(), witnesses=witnesses)
+        return tuple(arcs.values()), tuple(relabelled)
+
+    def _aligned(self, hybrid_map: HybridMap, seen: _Observation) -> tuple[_Observation, list[Relabelled]]:
+        """The keyframes that joined a known area, moved to where their scans fit the area's own, and the arc likewise.
+
+        Keyframes that the robot stored in the area since then are on neither side: they were matched against both.
+        """
+        placed = hybrid_map.keyframes(seen.target)
+        joined = sorted(seen.keyframes & placed.keys())
+        known = [keyframe for keyframe in placed if joined and keyframe < joined[0]]
+        if not (seen.closure and known):
+            return seen, []
+        scans = self._replica.scans
+        motion = self._alignment.offset(
+            [(scans[keyframe], placed[keyframe]) for keyframe in known],
+            [(scans[keyframe], placed[keyframe]) for keyframe in joined],
+            seen.pose.covariance,
+        )
+        if motion is None:
+            return seen, []
+        moved = [
+            Relabelled(keyframe, seen.target, seen.target, se2.compose(motion, placed[keyframe])) for keyframe in joined
+        ]
+        for r in moved:
+            hybrid_map.place(r.keyframe, r.area, r.pose)
+        back = PoseGaussian(se2.inverse(motion), np.zeros((3, 3)))
+        return replace(seen, pose=seen.pose.compose(back)), moved
+
+    def _fused(self, seen: _Observation, old: Arc | None, witnesses: frozenset[int]) -> Arc:
+        """The definite arc from an observation and what was known before, which tells whether it closed a loop."""
+        belief, closure = seen.pose, seen.closure
+        if old is not None:
+            shared = len(seen.keyframes & witnesses) / len(seen.keyframes)
+            known = old.pose if old.source == seen.source else old.pose.inverse()
+            belief, closure = fused(known, belief, shared), old.closure
+        belief = floored(belief, self._options.arc_sigma_floor, math.radians(self._options.arc_angle_floor))
+        return Arc(seen.source, seen.target, belief, closure)
+
+    def _global_poses(self) -> tuple[tuple[AreaPose, ...], list[Message]]:
+        """The poses of all areas under the most probable hypothesis, where they changed; arcs that refuse to fit."""
+        best = self._replica.best
+        version = self._paths[best].version
+        if version == self._published:
+            return (), []
+        self._published = version
+        hybrid_map = self._replica.maps[best]
+        consistent = self._options.global_map == "consistent"
+        found = consistent_map(hybrid_map) if consistent else shortest_path_map(hybrid_map)
+        notices = self._misfits(found.arc_chi2) if self._paths[best].definite else []
+        return tuple(AreaPose(area, pose) for area, pose in found.poses.items()), notices
+
+    def _misfits(self, arc_chi2: dict[Pair, float]) -> list[Message]:
+        """A notice of every definite arc that does not fit the others, once: a sign of a closure that was false."""
+        wrong = [pair for pair, value in arc_chi2.items() if value > self._gate and pair not in self._doubted]
+        self._doubted.update(wrong)
+        return [
+            Notice(
+                "tlca",
+                f"The arc between areas {a} and {b} misses the other arcs by a chi-square of {arc_chi2[a, b]:.1f}, "
+                f"above {self._gate:.1f}: a loop may be closed falsely; raise tlca.accept_probability.",
+            )
+            for a, b in wrong
+        ]

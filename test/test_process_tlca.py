@@ -1,0 +1,367 @@
+"""Topological Loop Closure Acceptance, with a TSBI played by hand."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import rooms
+
+from hmt_slam_ros.configuration import Configuration, with_changes
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.geometry.gaussian import PoseGaussian, fuse
+from hmt_slam_ros.processes.messages import (
+    Accepted,
+    Arc,
+    AreaEvents,
+    Hypotheses,
+    Keyframe,
+    Leaf,
+    LeafEstimate,
+    Notice,
+    Relabelled,
+)
+from hmt_slam_ros.processes.tlca import Tlca
+
+WORLD = rooms.two_rooms()
+SPREAD = np.diag([0.1**2, 0.1**2, 0.02**2])
+HOME = np.array([1.0, 2.0, 0.0])  # where the map's frame lies in the world
+
+
+def belief(pose, spread=SPREAD):
+    return PoseGaussian(np.asarray(pose, dtype=np.float64), np.asarray(spread))
+
+
+class Play:
+    """TLCA with slam and TSBI played: keyframes are stored where the leaves say, one after another."""
+
+    def __init__(self, **changes):
+        options = {"accept_keyframes": 3, "accept_distance": 1.0, "accept_probability": 0.9} | changes
+        self.process = Tlca(with_changes(Configuration(), {f"tlca.{name}": value for name, value in options.items()}))
+        self.k = -1
+        self.notices = []
+
+    def step(self, *leaves, places=None, world=HOME, travelled=None):
+        """One keyframe event: ``places`` are (hypothesis, area, area_T_base) before it, ``leaves`` TSBI's answer.
+
+        Without places the keyframe is at the origin of the robot's area, and is the first of an area that is new.
+        """
+        self.k += 1
+        if places is None:
+            replica = self.process._replica
+            places = [(h, area, np.zeros(3)) for h, area in replica.areas.items()]
+            leaves = [self._with_first_keyframe(leaf, replica) for leaf in leaves]
+        estimates = tuple(LeafEstimate(h, area, belief(pose), True, 0.0, 12.0) for h, area, pose in places)
+        travelled = 0.5 * self.k if travelled is None else travelled
+        assert self.process.handle(Keyframe(self.k, rooms.scan_at(WORLD, world), travelled, estimates)) == []
+        said = self.process.handle(Hypotheses(self.k, tuple(leaves) or (Leaf(0, 0, 1.0, 0),)))
+        verdicts = [message for message in said if isinstance(message, Accepted)]
+        self.notices += [message for message in said if isinstance(message, Notice)]
+        assert len(verdicts) == 1
+        assert verdicts[0].sequence == self.k
+        return verdicts[0]
+
+    def _with_first_keyframe(self, leaf, replica):
+        if leaf.relabelled or leaf.area in (0, *replica.maps[leaf.parent].area_ids()):
+            return leaf
+        return replace(leaf, relabelled=(Relabelled(self.k, replica.areas[leaf.parent], leaf.area, np.zeros(3)),))
+
+    def start(self):
+        return self.step(places=[(0, 0, np.zeros(3))])
+
+    def arc(self, a, b, hypothesis=0):
+        return self.process._replica.maps[hypothesis].arc(a, b)
+
+
+def new_area(hypothesis, parent, probability, area, pose, source=0):
+    """A leaf whose newest keyframe leaves ``source`` for the new ``area`` at ``source_T_area``."""
+    arc = Arc(source, area, belief(pose))
+    return Leaf(hypothesis, parent, probability, area, belief(se2.inverse(pose)), (), (arc,))
+
+
+def poses_of(verdict):
+    return {given.area: given.pose for given in verdict.global_poses}
+
+
+def test_the_first_area_lies_at_the_origin_of_the_map_with_hardly_any_uncertainty():
+    verdict = Play().start()
+    assert verdict.hypothesis == 0
+    assert list(poses_of(verdict)) == [0]
+    np.testing.assert_array_equal(poses_of(verdict)[0].mean, np.zeros(3))
+    assert 0.0 < np.trace(poses_of(verdict)[0].covariance) < 1e-6
+
+
+def test_nothing_is_said_where_nothing_changed():
+    play = Play()
+    play.start()
+    verdict = play.step(places=[(0, 0, [0.5, 0.0, 0.0])])
+    assert verdict.hypothesis is None
+    assert verdict.arcs == verdict.relabelled == verdict.global_poses == ()
+
+
+def test_the_one_hypothesis_left_is_accepted_at_once_and_its_new_area_is_placed():
+    play = Play()
+    play.start()
+    verdict = play.step(new_area(0, 0, 1.0, 1, [4.0, 0.0, 0.5]))
+    assert verdict.hypothesis == 0
+    np.testing.assert_allclose(poses_of(verdict)[1].mean, [4.0, 0.0, 0.5], atol=1e-9)
+    np.testing.assert_allclose(poses_of(verdict)[1].covariance, SPREAD, atol=1e-9)
+
+
+def parted(play, dominant=0.95):
+    play.start()
+    return play.step(new_area(1, 0, dominant, 1, [4.0, 0.0, 0.5]), new_area(2, 0, 1.0 - dominant, 1, [4.0, 1.0, 0.5]))
+
+
+def both(dominant=0.95):
+    return Leaf(1, 1, dominant, 1), Leaf(2, 2, 1.0 - dominant, 1)
+
+
+def test_a_dominant_path_is_accepted_after_enough_keyframes_since_the_paths_parted():
+    play = Play(accept_distance=0.0)
+    assert parted(play).hypothesis is None
+    assert [play.step(*both()).hypothesis for _ in range(2)] == [None, 1]
+
+
+def test_a_dominant_path_is_accepted_after_enough_metres_since_the_paths_parted():
+    play = Play(accept_keyframes=1, accept_distance=2.0)
+    assert parted(play).hypothesis is None  # parted at 0.5 m
+    assert [play.step(*both(), travelled=t).hypothesis for t in (1.0, 2.4, 2.5)] == [None, None, 1]
+
+
+def test_keyframes_count_only_in_a_row():
+    play = Play(accept_distance=0.0)
+    parted(play)
+    verdicts = [play.step(*both(p)).hypothesis for p in (0.95, 0.5, 0.95, 0.95, 0.95)]
+    assert verdicts == [None, None, None, None, 1]
+
+
+def test_an_undecided_question_stays_open():
+    play = Play()
+    parted(play, 0.6)
+    assert all(play.step(*both(0.6)).hypothesis is None for _ in range(10))
+
+
+def test_branching_again_starts_the_count_anew():
+    play = Play(accept_distance=0.0)
+    parted(play)
+    play.step(*both())
+    again = (
+        new_area(3, 1, 0.92, 2, [3.0, 0.0, 0.0], source=1),
+        new_area(4, 1, 0.06, 2, [3.0, 1.0, 0.0], source=1),
+        Leaf(2, 2, 0.02, 1),
+    )
+    rest = (Leaf(3, 3, 0.92, 2), Leaf(4, 4, 0.06, 2), Leaf(2, 2, 0.02, 1))
+    assert [play.step(*leaves).hypothesis for leaves in (again, rest, rest)] == [None, None, 3]
+
+
+def test_after_acceptance_only_the_accepted_hypothesis_goes_on():
+    play = Play(accept_distance=0.0)
+    parted(play)
+    while play.step(*both()).hypothesis is None:
+        pass
+    verdict = play.step(Leaf(1, 1, 1.0, 1))
+    assert verdict.hypothesis is None
+    assert list(play.process._replica.maps) == [1]
+
+
+def test_global_poses_follow_the_most_probable_hypothesis():
+    play = Play()
+    verdict = parted(play, 0.6)
+    np.testing.assert_allclose(poses_of(verdict)[1].mean, [4.0, 0.0, 0.5], atol=1e-9)
+    assert play.step(*both(0.6)).global_poses == ()
+    verdict = play.step(*both(0.4))
+    np.testing.assert_allclose(poses_of(verdict)[1].mean, [4.0, 1.0, 0.5], atol=1e-9)
+
+
+def revisit(pose, area=1, source=0, closure=True):
+    """The only hypothesis goes over the arc again and observes it at ``pose``."""
+    return Leaf(0, 0, 1.0, area, belief(se2.inverse(pose)), (), (Arc(source, area, belief(pose), closure),))
+
+
+def test_an_arc_that_is_travelled_again_becomes_the_product_of_both_observations():
+    play = Play()
+    play.start()
+    first, second = [4.0, 0.0, 0.5], [4.1, 0.05, 0.49]
+    play.step(new_area(0, 0, 1.0, 1, first))
+    play.step(Leaf(0, 0, 1.0, 0, belief(first)))
+    verdict = play.step(revisit(second))
+    product = fuse([belief(first), belief(second)])
+    (arc,) = verdict.arcs
+    assert (arc.source, arc.target, arc.closure) == (0, 1, False)
+    np.testing.assert_allclose(arc.pose.mean, product.mean, atol=1e-9)
+    np.testing.assert_allclose(arc.pose.covariance, product.covariance, atol=1e-9)
+    np.testing.assert_allclose(play.arc(0, 1).mean, product.mean, atol=1e-9)
+    np.testing.assert_allclose(poses_of(verdict)[1].mean, product.mean, atol=1e-9)
+
+
+def test_an_arc_travelled_the_other_way_is_the_same_arc():
+    play = Play()
+    play.start()
+    first, second = [4.0, 0.0, 0.5], [4.1, 0.05, 0.49]
+    play.step(new_area(0, 0, 1.0, 1, first))
+    back = belief(second).inverse()
+    play.step(Leaf(0, 0, 1.0, 0, belief(second), (), (Arc(1, 0, back, True),)))
+    product = fuse([belief(first), belief(second)])
+    np.testing.assert_allclose(play.arc(0, 1).mean, product.mean, atol=1e-6)
+    np.testing.assert_allclose(play.arc(0, 1).covariance, product.covariance, atol=1e-6)
+
+
+def test_an_arc_seen_twice_before_acceptance_counts_both_times():
+    play = Play(accept_distance=0.0)
+    first, second = [4.0, 0.0, 0.5], [4.1, 0.05, 0.49]
+    play.start()
+    play.step(new_area(1, 0, 0.95, 1, first), Leaf(2, 0, 0.05, 0))
+    again = Leaf(1, 1, 0.95, 1, None, (), (Arc(0, 1, belief(second)),))
+    play.step(again, Leaf(2, 2, 0.05, 0))
+    verdict = play.step(Leaf(1, 1, 0.95, 1), Leaf(2, 2, 0.05, 0))
+    assert verdict.hypothesis == 1
+    product = fuse([belief(first), belief(second)])
+    np.testing.assert_allclose(play.arc(0, 1, 1).mean, product.mean, atol=1e-9)
+    np.testing.assert_allclose(play.arc(0, 1, 1).covariance, product.covariance, atol=1e-9)
+
+
+def test_an_arc_is_fused_only_on_acceptance():
+    play = Play()
+    play.start()
+    first, second = [4.0, 0.0, 0.5], [4.1, 0.05, 0.49]
+    play.step(new_area(0, 0, 1.0, 1, first))
+    play.step(Leaf(0, 0, 1.0, 0, belief(first)))
+    arcs = (Arc(0, 1, belief(second), True),)
+    verdict = play.step(Leaf(1, 0, 0.6, 1, None, (), arcs), new_area(2, 0, 0.4, 2, [1.0, 5.0, 0.0]))
+    assert verdict.hypothesis is None
+    assert verdict.arcs == ()
+    np.testing.assert_allclose(play.arc(0, 1, 1).mean, second, atol=1e-12)
+    np.testing.assert_allclose(play.arc(0, 1, 2).mean, first, atol=1e-12)
+
+
+def test_the_same_keyframes_do_not_make_an_arc_more_certain_twice():
+    play = Play()
+    play.start()
+    pose = [4.0, 0.0, 0.0]
+    play.step(places=[(0, 0, [4.5, 0.0, 0.0])])
+    there = Relabelled(1, 0, 1, np.array([0.5, 0.0, 0.0]))
+    leaf = Leaf(0, 0, 1.0, 1, belief(se2.inverse(pose)), (there,), (Arc(0, 1, belief(pose)),))
+    play.step(leaf)
+    again = Relabelled(1, 1, 1, np.array([0.5, 0.0, 0.0]))
+    play.step(Leaf(0, 0, 1.0, 1, None, (again,), (Arc(0, 1, belief(pose)),)))
+    np.testing.assert_allclose(play.arc(0, 1).covariance, SPREAD, rtol=1e-6, atol=1e-12)
+
+
+def test_arcs_are_never_more_certain_than_the_floor():
+    play = Play(arc_sigma_floor=0.08, arc_angle_floor=1.0)
+    play.start()
+    pose = [4.0, 0.0, 0.0]
+    for _ in range(4):
+        play.step(revisit(pose, closure=False))
+    sigma = np.sqrt(np.diag(play.arc(0, 1).covariance))
+    assert np.all(sigma[:2] >= 0.08 - 1e-12)
+    assert np.degrees(sigma[2]) >= 1.0 - 1e-9
+
+
+ROOM_A = rooms.drive((1.0, 2.0), (4.5, 3.0), (4.0, 5.0))
+ROOM_B = rooms.drive((7.0, 3.0), (10.0, 4.0))
+
+
+def closing_play(error, spread=SPREAD):
+    """Drive room A (area 0) and room B (area 1), come back into A and close the loop with an error in its frame."""
+    play = Play()
+    for pose in ROOM_A:
+        play.step(places=[(0, 0, se2.between(ROOM_A[0], pose))], world=pose)
+    a_T_b = se2.between(ROOM_A[0], ROOM_B[0])
+    first = play.k + 1
+    for i, pose in enumerate(ROOM_B):
+        area, where = (0, se2.between(ROOM_A[0], pose)) if i == 0 else (1, se2.between(ROOM_B[0], pose))
+        moved = Relabelled(first, 0, 1, np.zeros(3))
+        leaf = (
+            Leaf(0, 0, 1.0, 1, belief(se2.inverse(a_T_b)), (moved,), (Arc(0, 1, belief(a_T_b)),))
+            if i == 0
+            else Leaf(0, 0, 1.0, 1)
+        )
+        play.step(leaf, places=[(0, area, where)], world=pose)
+    back = rooms.drive((3.5, 2.0), (2.0, 3.5))
+    first = play.k + 1
+    for pose in back[:-1]:
+        play.step(Leaf(0, 0, 1.0, 1), places=[(0, 1, se2.between(ROOM_B[0], pose))], world=pose)
+    in_b, in_a = se2.between(ROOM_B[0], back), se2.compose(error, se2.between(ROOM_A[0], back))
+    b_T_a = se2.compose(in_b[0], se2.inverse(in_a[0]))
+    moved = tuple(Relabelled(first + i, 1, 0, pose) for i, pose in enumerate(in_a))
+    leaf = Leaf(0, 0, 1.0, 0, belief(se2.inverse(b_T_a)), moved, (Arc(1, 0, belief(b_T_a, spread), True),))
+    verdict = play.step(leaf, places=[(0, 1, in_b[-1])], world=back[-1])
+    return play, verdict, first, se2.between(ROOM_A[0], back), a_T_b
+
+
+def test_keyframes_that_closed_a_loop_are_finely_aligned_with_the_area_and_the_arc_with_them():
+    error = np.array([0.1, -0.08, 0.02])
+    play, verdict, first, truth, a_T_b = closing_play(error)
+    assert [r.keyframe for r in verdict.relabelled] == list(range(first, first + len(truth)))
+    for r, true in zip(verdict.relabelled, truth, strict=True):
+        assert (r.source, r.area) == (0, 0)
+        assert np.hypot(*(r.pose[:2] - true[:2])) < 0.03
+        np.testing.assert_array_equal(play.process._replica.maps[0].keyframes(0)[r.keyframe], r.pose)
+    off = se2.between(a_T_b, play.arc(0, 1).mean)
+    assert np.hypot(*off[:2]) < 0.04
+    assert abs(np.degrees(off[2])) < 0.3
+    assert play.notices == []
+
+
+def test_a_closure_that_claims_to_be_certain_is_not_moved_beyond_its_gate():
+    error = np.array([0.2, -0.15, 0.0])
+    _, verdict, *_ = closing_play(error, np.diag([0.01**2, 0.01**2, 0.005**2]))
+    assert verdict.relabelled == ()
+
+
+def test_a_loop_is_spread_over_its_arcs_or_left_open_as_asked_for():
+    quarter = np.radians(88.0)
+    step = [2.0, 0.0, quarter]
+
+    def around(**changes):
+        play = Play(**changes)
+        play.start()
+        for area in (1, 2, 3):
+            play.step(new_area(0, 0, 1.0, area, step, source=area - 1))
+        closing = Leaf(0, 0, 1.0, 0, belief(se2.inverse(step)), (), (Arc(3, 0, belief(step), True),))
+        verdict = play.step(closing)
+        poses = np.array([poses_of(verdict)[area].mean for area in (0, 1, 2, 3, 0)])
+        return play, np.degrees(se2.between(poses[:-1], poses[1:])[:, 2])
+
+    play, turns = around()
+    np.testing.assert_allclose(turns, 90.0, atol=1e-6)
+    tree = np.array([play.process.shortest_path_poses()[area].mean for area in (0, 1, 2, 3, 0)])
+    _, turns = around(global_map="shortest_path")
+    np.testing.assert_allclose(turns, np.degrees(se2.between(tree[:-1], tree[1:])[:, 2]), atol=1e-9)
+    assert np.ptp(turns) > 5.0
+
+
+def test_an_arc_that_refuses_to_fit_is_told_once():
+    play = Play()
+    play.start()
+    for area in (1, 2, 3):
+        play.step(new_area(0, 0, 1.0, area, [2.0, 0.0, np.pi / 2], source=area - 1))
+    play.step(Leaf(0, 0, 1.0, 0, belief(np.zeros(3)), (), (Arc(3, 0, belief([9.0, 0.0, 0.0]), True),)))
+    assert len(play.notices) >= 1
+    assert "between areas" in play.notices[0].text
+    told = {notice.text.split(" misses")[0] for notice in play.notices}
+    play.step(new_area(0, 0, 1.0, 4, [2.0, 0.0, 0.0]))
+    assert len(told) == len(play.notices)
+
+
+def test_messages_of_others_are_ignored():
+    play = Play()
+    play.start()
+    assert play.process.handle(AreaEvents(0, ())) == []
+    assert play.process.handle(rooms.scan_at(WORLD, HOME)) == []
+
+
+def test_the_same_messages_give_the_same_verdicts():
+    one, two = (closing_play(np.array([0.1, -0.08, 0.02]))[1] for _ in range(2))
+    for a, b in zip(one.global_poses, two.global_poses, strict=True):
+        np.testing.assert_array_equal(a.pose.mean, b.pose.mean)
+        np.testing.assert_array_equal(a.pose.covariance, b.pose.covariance)
+    assert [tuple(r.pose) for r in one.relabelled] == [tuple(r.pose) for r in two.relabelled]
+
+
+@pytest.mark.parametrize("unexamined", [0.0, 0.4])
+def test_a_single_hypothesis_is_accepted_whatever_was_not_examined(unexamined):
+    play = Play()
+    play.start()
+    assert play.step(new_area(0, 0, 1.0 - unexamined, 1, [4.0, 0.0, 0.0])).hypothesis == 0
