@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from hmt_slam_ros.configuration import Configuration
@@ -40,7 +41,8 @@ class _Observation:
     :ivar pose: belief over ``a_T_b`` as observed.
     :ivar closure: whether it closed a loop.
     :ivar before: the definite arc ``a_T_b`` that it replaced, or None.
-    :ivar keyframes: the keyframes by which it was observed.
+    :ivar joined: the keyframes that moved into area b.
+    :ivar witnesses: the keyframes by which it was observed.
     """
 
     source: int
@@ -48,7 +50,8 @@ class _Observation:
     pose: PoseGaussian
     closure: bool
     before: Arc | None
-    keyframes: frozenset[int]
+    joined: tuple[int, ...]
+    witnesses: frozenset[int]
 
     @property
     def pair(self) -> Pair:
@@ -141,8 +144,8 @@ class Tlca:
         hybrid_map = self._replica.maps[leaf.parent]
         value, before = hybrid_map.arc_value(source, target), hybrid_map.arc(source, target)
         old = None if value is None or before is None else Arc(source, target, before, value.closure)
-        keyframes = frozenset(r.keyframe for r in leaf.relabelled if r.area == target) or frozenset([sequence])
-        return _Observation(source, target, pose, arc.closure, old, keyframes)
+        joined = tuple(sorted(r.keyframe for r in leaf.relabelled if r.area == target))
+        return _Observation(source, target, pose, arc.closure, old, joined, frozenset(joined or [sequence]))
 
     def _dominant(self) -> int | None:
         """The hypothesis that becomes definite now, if any."""
@@ -164,7 +167,7 @@ class Tlca:
             relabelled += moved
             old = arcs.get(seen.pair, seen.before)
             arcs[seen.pair] = self._fused(aligned, old, witnesses.get(seen.pair, frozenset()))
-            witnesses[seen.pair] = witnesses.get(seen.pair, frozenset()) | seen.keyframes
+            witnesses[seen.pair] = witnesses.get(seen.pair, frozenset()) | seen.witnesses
         if arcs:
             self._changes += 1
         version = self._changes if arcs else path.version
@@ -172,15 +175,19 @@ class Tlca:
         return tuple(arcs.values()), tuple(relabelled)
 
     def _aligned(self, hybrid_map: HybridMap, seen: _Observation) -> tuple[_Observation, list[Relabelled]]:
+        """A closure that was found by matching areas, finely aligned."""
+        if not seen.closure:
+            return seen, []
+        return self._joined(hybrid_map, seen) if seen.joined else (self._linked(hybrid_map, seen), [])
+
+    def _joined(self, hybrid_map: HybridMap, seen: _Observation) -> tuple[_Observation, list[Relabelled]]:
         """The keyframes that joined a known area, moved to where their scans fit the area's own, and the arc likewise.
 
         Keyframes that the robot stored in the area since then are on neither side: they were matched against both.
         """
         placed = hybrid_map.keyframes(seen.target)
-        joined = sorted(seen.keyframes & placed.keys())
-        known = [keyframe for keyframe in placed if joined and keyframe < joined[0]]
-        if not (seen.closure and known):
-            return seen, []
+        joined = [keyframe for keyframe in seen.joined if keyframe in placed]
+        known = [keyframe for keyframe in placed if keyframe < seen.joined[0]]
         scans = self._replica.scans
         motion = self._alignment.offset(
             [(scans[keyframe], placed[keyframe]) for keyframe in known],
@@ -194,14 +201,23 @@ class Tlca:
         ]
         for r in moved:
             hybrid_map.place(r.keyframe, r.area, r.pose)
-        back = PoseGaussian(se2.inverse(motion), np.zeros((3, 3)))
-        return replace(seen, pose=seen.pose.compose(back)), moved
+        return replace(seen, pose=seen.pose.compose(_exactly(se2.inverse(motion)))), moved
+
+    def _linked(self, hybrid_map: HybridMap, seen: _Observation) -> _Observation:
+        """An arc between areas that keep their keyframes, moved to where the scans of both fit."""
+        known, others, scans = hybrid_map.keyframes(seen.source), hybrid_map.keyframes(seen.target), self._replica.scans
+        motion = self._alignment.offset(
+            [(scans[keyframe], pose) for keyframe, pose in known.items()],
+            [(scans[keyframe], se2.compose(seen.pose.mean, pose)) for keyframe, pose in others.items()],
+            seen.pose.inverse().covariance,
+        )
+        return seen if motion is None else replace(seen, pose=_exactly(motion).compose(seen.pose))
 
     def _fused(self, seen: _Observation, old: Arc | None, witnesses: frozenset[int]) -> Arc:
         """The definite arc from an observation and what was known before, which tells whether it closed a loop."""
         belief, closure = seen.pose, seen.closure
         if old is not None:
-            shared = len(seen.keyframes & witnesses) / len(seen.keyframes)
+            shared = len(seen.witnesses & witnesses) / len(seen.witnesses)
             known = old.pose if old.source == seen.source else old.pose.inverse()
             belief, closure = fused(known, belief, shared), old.closure
         belief = floored(belief, self._options.arc_sigma_floor, math.radians(self._options.arc_angle_floor))
@@ -232,3 +248,7 @@ class Tlca:
             )
             for a, b in wrong
         ]
+
+
+def _exactly(pose: NDArray[np.float64]) -> PoseGaussian:
+    return PoseGaussian(pose, np.zeros((3, 3)))
