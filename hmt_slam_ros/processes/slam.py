@@ -94,6 +94,12 @@ class MetricSlam:
         """Scans in the queue."""
         return len(self._queue)
 
+    @property
+    def particles(self) -> tuple[int, NDArray[np.float64]]:
+        """Area of the most probable hypothesis and the poses of its particles, ``area_T_base``, shape (M, 3)."""
+        best = self._live[self._replica.best].filter
+        return best.area, best.poses
+
     def handle(self, message: Message) -> list[Message]:
         """Take in one message, work off what can be worked off, return what there is to say."""
         if isinstance(message, Odometry):
@@ -325,6 +331,7 @@ class MetricSlam:
         moved = {relabelled.keyframe for relabelled in leaf.relabelled}
         live.fresh = {keyframe: step for keyframe, step in live.fresh.items() if keyframe in moved}
         live.drift = self._drift_from_reference(live)
+        live.anchor = self._nearest_keyframe(live)
 
     @staticmethod
     def _drift_from_reference(live: _LiveHypothesis) -> NDArray[np.float64]:
