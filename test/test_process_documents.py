@@ -20,10 +20,11 @@ from hmt_slam_ros.processes.messages import (
     Keyframe,
     LeafEstimate,
     LocalEstimate,
+    Notice,
 )
 from hmt_slam_ros.sensing import Scan
 
-KINDS = (KeyframeHead, AreaEvents, Hypotheses, Accepted, LocalEstimate, Closing, RobotStatus)
+KINDS = (KeyframeHead, AreaEvents, Hypotheses, Accepted, LocalEstimate, Notice, Closing, RobotStatus)
 NUMBERS = st.floats(allow_nan=False, allow_infinity=False)
 
 

@@ -1,6 +1,5 @@
 """Real-time localisation: dead reckoning since the last estimate, in the area and in the map."""
 
-import logging
 import math
 
 import numpy as np
@@ -11,7 +10,7 @@ from hypothesis import strategies as st
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.processes.messages import Accepted, AreaPose, LocalEstimate
+from hmt_slam_ros.processes.messages import Accepted, AreaPose, LocalEstimate, Notice
 from hmt_slam_ros.processes.rtl import Rtl
 from hmt_slam_ros.sensing import Odometry
 
@@ -111,17 +110,16 @@ def test_driving_to_and_fro_does_not_make_the_robot_sure_again(rtl):
     assert back.local.covariance[0, 0] > there.local.covariance[0, 0]
 
 
-def test_an_odometry_reset_is_told_once_and_the_robot_stays_where_it_was(rtl, caplog):
+def test_an_odometry_reset_is_told_once_and_the_robot_stays_where_it_was(rtl):
     rtl.handle(odometry(0.0, 40, 10, 1.0))
     rtl.handle(estimate(0.0, (2, 0, 0), (40, 10, 1.0)))
     rtl.handle(odometry(0.1, 40, 10, 1.0))
-    with caplog.at_level(logging.WARNING):
-        (said,) = rtl.handle(odometry(0.2, 0, 0, 0))
-        (later,) = rtl.handle(odometry(0.3, 0.2, 0, 0))
+    notice, said = rtl.handle(odometry(0.2, 0, 0, 0))
+    (later,) = rtl.handle(odometry(0.3, 0.2, 0, 0))
+    assert isinstance(notice, Notice)
+    assert "41.23 m" in notice.text
     assert np.allclose(said.local.mean, (2, 0, 0))
     assert np.allclose(later.local.mean, (2.2, 0, 0))
-    assert len(caplog.records) == 1
-    assert "41.23 m" in caplog.text
 
 
 def test_an_estimate_from_before_a_reset_still_serves(rtl):

@@ -1,1 +1,1 @@
-"""The five processes and the simulated robot as rclpy nodes."""
+"""The five processes and the robot as ROS 2 nodes: thin shells that convert, call the process once, and publish."""

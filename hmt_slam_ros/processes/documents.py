@@ -27,6 +27,7 @@ from hmt_slam_ros.processes.messages import (
     Keyframe,
     LeafEstimate,
     LocalEstimate,
+    Notice,
 )
 from hmt_slam_ros.sensing import Scan
 
@@ -115,6 +116,7 @@ _DOCUMENTS: dict[type, tuple[str, int]] = {
     Hypotheses: ("hypotheses", 1),
     Accepted: ("accepted", 1),
     LocalEstimate: ("local_estimate", 1),
+    Notice: ("notice", 1),
     Closing: ("finished", 1),
     RobotStatus: ("robot_status", 1),
 }

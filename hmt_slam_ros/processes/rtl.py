@@ -6,7 +6,6 @@ is the last estimate carried on by the odometry since its scan.
 
 from __future__ import annotations
 
-import logging
 import math
 from collections import deque
 from typing import NamedTuple
@@ -17,12 +16,10 @@ from numpy.typing import NDArray
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.processes.messages import Accepted, LocalEstimate, Message, RealTimePose
+from hmt_slam_ros.processes.messages import Accepted, LocalEstimate, Message, Notice, RealTimePose
 from hmt_slam_ros.processes.replica import FIRST_AREA
 from hmt_slam_ros.sensing import Odometry
 from hmt_slam_ros.sensing.motion import increment_covariance
-
-_LOG = logging.getLogger(__name__)
 
 # Beyond the bounds of speed: two readings of one moment may differ by this much without a reset.
 _SLACK_DISTANCE = 0.5  # m
@@ -52,7 +49,7 @@ class _Reading(NamedTuple):
 
 
 class Rtl:
-    """The RTL process. Consumes Odometry, LocalEstimate, Accepted; produces RealTimePose."""
+    """The RTL process. Consumes Odometry, LocalEstimate, Accepted; produces RealTimePose, Notice."""
 
     def __init__(self, configuration: Configuration) -> None:
         self._motion = configuration.motion
@@ -66,7 +63,7 @@ class Rtl:
     def handle(self, message: Message) -> list[Message]:
         """Take in one message; an odometry reading is answered with the pose at its stamp, once one is known."""
         if isinstance(message, Odometry):
-            return self._predict() if self._add(message) else []
+            return self._hear_odometry(message)
         if isinstance(message, LocalEstimate):
             if self._newest is None or message.stamp > self._newest.stamp:
                 self._newest = message
@@ -76,32 +73,25 @@ class Rtl:
             self._correct()
         return []
 
-    def _add(self, reading: Odometry) -> bool:
-        """Carry the path on to a reading; False for one that is not newer than its predecessor."""
+    def _hear_odometry(self, reading: Odometry) -> list[Message]:
+        """Carry the path on to a reading; one that is not newer than its predecessor is passed over."""
         if not self._readings:
             self._readings.append(_Reading(reading.stamp, reading.pose, reading.pose, 0.0, 0.0))
-            return True
+            return self._predict()
         last = self._readings[-1]
         if reading.stamp <= last.stamp:
-            return False
+            return []
+        said: list[Message] = []
         step = se2.between(last.raw, reading.pose)
         distance, angle = math.hypot(step[0], step[1]), abs(float(step[2]))
         if self._is_reset(distance, angle, 1e-9 * (reading.stamp - last.stamp)):
-            _LOG.warning(
-                "the odometry jumped by %.2f m and %.0f degrees at stamp %d: taken for a reset, the robot for standing",
-                distance, math.degrees(angle), reading.stamp,
-            )  # fmt: skip
+            said.append(_reset_notice(reading.stamp, distance, angle))
             step, distance, angle = np.zeros(3), 0.0, 0.0
+        smooth = se2.compose(last.smooth, step)
         self._readings.append(
-            _Reading(
-                reading.stamp,
-                reading.pose,
-                se2.compose(last.smooth, step),
-                last.distance + distance,
-                last.angle + angle,
-            )
+            _Reading(reading.stamp, reading.pose, smooth, last.distance + distance, last.angle + angle)
         )
-        return True
+        return said + self._predict()
 
     def _is_reset(self, distance: float, angle: float, seconds: float) -> bool:
         return (
@@ -137,3 +127,11 @@ class Rtl:
     def _spread(self, distance: float, angle: float) -> NDArray[np.float64]:
         """Covariance (3, 3) of a piece of the path, of which the motion model sees the length and the turns."""
         return increment_covariance(np.array([distance, 0.0, min(angle, math.pi)]), self._motion)
+
+
+def _reset_notice(stamp: int, distance: float, angle: float) -> Notice:
+    return Notice(
+        "rtl",
+        f"the odometry jumped by {distance:.2f} m and {math.degrees(angle):.0f} degrees at stamp {stamp} ns: taken for a "
+        "reset, with the robot standing; if it does move so fast, raise rtl.max_speed or rtl.max_turn_rate",
+    )

@@ -1,0 +1,85 @@
+"""From what a process says to what goes out on the topics."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import rclpy
+from nav_msgs.msg import Path
+from rclpy.executors import ExternalShutdownException
+from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.node import Node
+from sensor_msgs.msg import LaserScan
+from std_msgs.msg import String
+
+from hmt_slam_ros.nodes import conversions, qos
+from hmt_slam_ros.nodes.topics import DOCUMENTS, FINISHED, KEYFRAME_SCANS, KEYFRAMES, TRAIL
+from hmt_slam_ros.processes.documents import Closing, KeyframeHead, encode
+from hmt_slam_ros.processes.messages import Finished, Keyframe, Message, Trail
+
+RCLError = rclpy_implementation.RCLError
+
+Writer = Callable[[Any], None]
+
+
+class Outbox:
+    """Publishers for the kinds of messages that a node says."""
+
+    def __init__(self, node: Node, said: Iterable[type]) -> None:
+        self._node = node
+        self._sent = {Keyframe: 0, Trail: 0}
+        self._writers: dict[type, Writer] = {kind: self._writer(kind) for kind in said}
+
+    def add(self, kind: type, writer: Writer) -> None:
+        """Send messages of a kind by a writer of the node's own."""
+        self._writers[kind] = writer
+
+    def send(self, message: Message) -> None:
+        """Publish a message."""
+        kind = type(message)
+        self._writers[kind](message)
+        if kind in self._sent:
+            self._sent[kind] += 1
+
+    def _writer(self, kind: type) -> Writer:
+        if kind is Keyframe:
+            return self._keyframe_writer()
+        if kind is Trail:
+            paths = self._node.create_publisher(Path, TRAIL, qos.CHAIN)
+            return lambda trail: publish_surely(paths, conversions.path_message(trail))
+        if kind is Finished:
+            closings = self._node.create_publisher(String, FINISHED, qos.CHAIN)
+            return lambda totals: publish_surely(closings, String(data=encode(self._closing(totals))))
+        documents = self._node.create_publisher(String, DOCUMENTS[kind], qos.CHAIN)
+        return lambda message: publish_surely(documents, String(data=encode(message)))
+
+    def _keyframe_writer(self) -> Writer:
+        scans = self._node.create_publisher(LaserScan, KEYFRAME_SCANS, qos.CHAIN)
+        heads = self._node.create_publisher(String, KEYFRAMES, qos.CHAIN)
+
+        def write(keyframe: Keyframe) -> None:
+            frame = conversions.keyframe_frame(keyframe.sequence)
+            publish_surely(scans, conversions.laser_scan(keyframe.scan, frame))
+            publish_surely(heads, String(data=encode(KeyframeHead.of(keyframe))))
+
+        return write
+
+    def _closing(self, totals: Finished) -> Closing:
+        return Closing(totals, self._sent[Keyframe], self._sent[Trail])
+
+
+def publish_surely(publisher: Any, message: Any) -> None:  # noqa: ANN401  any ROS message
+    """Publish; where a reader lags behind by a whole history, wait until it has caught up or is gone.
+
+    :raises ExternalShutdownException: where the node is told to end meanwhile.
+    """
+    while True:
+        try:
+            publisher.publish(message)
+        except RCLError:
+            # DDS waits 0.1 s for room by itself.
+            if not rclpy.ok():
+                raise ExternalShutdownException from None
+        else:
+            return

@@ -1,0 +1,40 @@
+"""Every quality-of-service profile in use, in one place."""
+
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+
+# Scans and odometry between the robot node and the processes: nothing is lost, however fast the replay runs.
+# A reader that falls behind makes the writer wait, since the history of a reliable KEEP_ALL topic is bounded (5000).
+SENSOR = QoSProfile(history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.RELIABLE)
+
+# Drivers of live lasers publish best effort, which a reliable reader never hears. The nodes begin with SENSOR and
+# change over to this profile when DDS reports such a writer. The depth bridges a second of a fast laser.
+LIVE_SENSOR = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)
+
+# The chain Keyframe -> AreaEvents -> Hypotheses -> Accepted and what belongs to it: who comes late catches up.
+CHAIN = QoSProfile(
+    history=HistoryPolicy.KEEP_ALL,
+    reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.TRANSIENT_LOCAL,
+)
+
+# A reader of a chain topic that has no use for the past.
+CHAIN_FROM_NOW = QoSProfile(history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.RELIABLE)
+
+# Maps, graphs, statuses: the newest one, also for who comes late.
+LATCHED = QoSProfile(
+    history=HistoryPolicy.KEEP_LAST,
+    depth=1,
+    reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.TRANSIENT_LOCAL,
+)
+
+# /tf_static has one latched message from each of several publishers.
+TF_STATIC = QoSProfile(
+    history=HistoryPolicy.KEEP_LAST,
+    depth=100,
+    reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.TRANSIENT_LOCAL,
+)
+
+# What passes by for people and other programs: /tf, /pose, /clock, /diagnostics.
+STREAM = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=100, reliability=ReliabilityPolicy.RELIABLE)

@@ -1,0 +1,234 @@
+"""A whole run of the robot node and the five process nodes, each an OS process of its own, into an output folder."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+
+from hmt_slam_ros.configuration import Configuration
+from hmt_slam_ros.configuration.documents import ros_yaml, yaml_value
+from hmt_slam_ros.errors import HmtSlamError
+from hmt_slam_ros.logs import Log, open_log
+from hmt_slam_ros.nodes.children import Children, Usage
+from hmt_slam_ros.nodes.domain import own_domain
+from hmt_slam_ros.nodes.recorder_node import RecorderNode
+from hmt_slam_ros.nodes.transforms import TFMessage
+from hmt_slam_ros.offline.output_folder import replacing, write_output
+from hmt_slam_ros.offline.recorder import Recording
+from hmt_slam_ros.offline.report import RunFigures
+from hmt_slam_ros.sensing import Scan
+
+PROCESSES = ("slam", "aam", "tsbi", "tlca", "rtl")
+# On a slow computer the first run compiles for a while before anything is said.
+STALL = 180.0  # s
+_LISTENERS_PATIENCE = 60.0  # s
+_SPIN = 0.05  # s
+_LAST_FIGURES = 3.0  # s
+
+
+@dataclass(frozen=True, eq=False)
+class Replay:
+    """What a replay came to.
+
+    :ivar recording: the map and the trajectories.
+    :ivar wall_seconds: from the start of the nodes to the last answer.
+    """
+
+    recording: Recording
+    wall_seconds: float
+
+
+def replay(
+    log: Path,
+    output: Path,
+    configuration: Configuration,
+    progress: Callable[[int], None] | None = None,
+    stall: float = STALL,
+) -> Replay:
+    """Run a log through the nodes, in a domain of their own, and write the output folder.
+
+    :param log: any log; ``configuration.robot`` says which part, and how fast.
+    :param output: the folder; nothing is left there unless all goes well.
+    :param progress: called with the number of scans that are worked off.
+    :param stall: seconds without any message after which the run is given up.
+    :raises HmtSlamError: for a log that cannot be read, a node that dies, or a run that stands still.
+    """
+    if configuration.robot.loop:
+        raise HmtSlamError("robot.loop = true has no end to wait for: set it to false for a replay into a folder")
+    opened = open_log(log, start=configuration.robot.start, duration=configuration.robot.duration or None)
+    if not opened.scan_count:
+        raise HmtSlamError(f"{log} has no scans in the part asked for: check --start and --duration")
+    contents = _contents(opened)
+    with replacing(output) as folder:
+        run = _Run(configuration, progress or (lambda _: None), stall)
+        run.play(log, _slam_settings(contents.laser_poses))
+        figures = RunFigures(
+            log=opened.name,
+            runtime="nodes",
+            seconds_per_scan=run.node.seconds_per_scan(contents.stamps),
+            peak_rss={name: usage.peak_rss for name, usage in run.usage.items()},
+            wall_seconds=run.wall_seconds,
+            cpu_seconds=sum(usage.cpu_seconds for usage in run.usage.values()),
+        )
+        recording = write_output(folder, run.node.recorder, contents.stamps, contents.source_stamps, figures)
+    return Replay(recording, run.wall_seconds)
+
+
+@dataclass(frozen=True, eq=False)
+class _Contents:
+    """What has to be known of a log beforehand; finding it out also shows whether the log is whole.
+
+    :ivar stamps: shape (n,), of every scan on the log's running clock, ns.
+    :ivar source_stamps: shape (n,), the log's own stamps of them, ns.
+    :ivar laser_poses: the different ``base_T_laser`` (3,).
+    """
+
+    stamps: NDArray[np.int64]
+    source_stamps: NDArray[np.int64]
+    laser_poses: list[list[float]]
+
+
+def _contents(log: Log) -> _Contents:
+    stamps: list[tuple[int, int]] = []
+    lasers: dict[bytes, list[float]] = {}
+    for record in log.records():
+        if isinstance(scan := record.measurement, Scan):
+            stamps.append((scan.stamp, record.source_stamp))
+            lasers.setdefault(scan.laser_pose.tobytes(), scan.laser_pose.tolist())
+    running, source = np.array(stamps, dtype=np.int64).T
+    return _Contents(running, source, list(lasers.values()))
+
+
+def _slam_settings(laser_poses: list[list[float]]) -> list[str]:
+    """Where there is no tf2_msgs to say it on /tf_static, a parameter tells slam where the laser is."""
+    if TFMessage is not None:
+        return []
+    if len(laser_poses) > 1:
+        raise HmtSlamError("the laser moves on the robot in this log, which only /tf_static can tell: install tf2_msgs")
+    return ["-p", f"laser_pose:={laser_poses[0]}"]
+
+
+class _Run:
+    """One run of the nodes, and the recorder that listens.
+
+    :ivar node: the recorder's node.
+    :ivar usage: {node: what it used}.
+    :ivar wall_seconds: from the start of the nodes to the last answer.
+    """
+
+    node: RecorderNode
+    usage: dict[str, Usage]
+    wall_seconds: float
+
+    def __init__(self, configuration: Configuration, progress: Callable[[int], None], stall: float) -> None:
+        self._configuration, self._progress, self._stall = configuration, progress, stall
+
+    def play(self, log: Path, slam_settings: list[str]) -> None:
+        """Start the nodes, listen until the end, stop them.
+
+        :param slam_settings: arguments for the node slam.
+        :raises HmtSlamError: where a node dies or nothing happens any more.
+        """
+        with (
+            tempfile.TemporaryDirectory(prefix="hmt_slam_replay_") as scratch,
+            own_domain() as domain,
+            self._listening(domain) as executor,
+            Children(Path(scratch)) as children,
+        ):
+            begin = time.monotonic()
+            self._start(children, log, slam_settings, domain, Path(scratch))
+            self._listen(executor, children)
+            self.wall_seconds = time.monotonic() - begin
+            self._await_figures(executor)
+            self.usage = children.usage()
+
+    @contextmanager
+    def _listening(self, domain: int) -> Iterator[SingleThreadedExecutor]:
+        """The recorder's node, in a context of its own: the signals stay with whoever called."""
+        with _local_discovery():
+            context = Context()
+            context.init(domain_id=domain)
+        try:
+            self.node = RecorderNode(self._configuration, context)
+            executor = SingleThreadedExecutor(context=context)
+            executor.add_node(self.node)
+            try:
+                yield executor
+            finally:
+                executor.shutdown()
+                self.node.destroy_node()
+        finally:
+            context.try_shutdown()
+
+    def _start(
+        self, children: Children, log: Path, slam_settings: list[str], domain: int, scratch: Path
+    ) -> None:
+        parameters = scratch / "parameters.yaml"
+        parameters.write_text(ros_yaml(self._configuration), encoding="utf-8")
+        environment = {**os.environ, "ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+        shared = ["--params-file", str(parameters)]
+        for name in PROCESSES:
+            children.start(name, shared + (slam_settings if name == "slam" else []), environment)
+        own = {
+            "log": yaml_value(str(log.absolute())),
+            "robot.odometry_listeners": 2,  # slam and rtl
+            "robot.patience": _LISTENERS_PATIENCE,
+        }
+        settings = [word for name, value in own.items() for word in ("-p", f"{name}:={value}")]
+        children.start("robot", [*shared, *settings], environment)
+
+    def _listen(self, executor: SingleThreadedExecutor, children: Children) -> None:
+        heard, last = 0, time.monotonic()
+        checked = last
+        while not self.node.complete:
+            executor.spin_once(timeout_sec=_SPIN)
+            now = time.monotonic()
+            if self.node.messages > heard:
+                heard, last = self.node.messages, now
+            if now - checked > _SPIN:
+                checked = now
+                self._progress(len(self.node.recorder.estimates))
+                self._check(children, now - last)
+        self._progress(len(self.node.recorder.estimates))
+
+    def _check(self, children: Children, silence: float) -> None:
+        children.check()
+        if self.node.fault is not None:
+            raise HmtSlamError(self.node.fault)
+        if silence > self._stall:
+            name = self.node.stage()
+            raise HmtSlamError(
+                f"nothing happened for {self._stall:g} s, the run waits for the node {name}, which last said: "
+                f"{children.last_words(name)}"
+            )
+
+    def _await_figures(self, executor: SingleThreadedExecutor) -> None:
+        """Hear once more from every process what it cost, which each tells every second."""
+        asked, deadline = time.time_ns(), time.monotonic() + _LAST_FIGURES
+        while time.monotonic() < deadline and any(self.node.told.get(name, 0) < asked for name in PROCESSES):
+            executor.spin_once(timeout_sec=_SPIN)
+
+
+@contextmanager
+def _local_discovery() -> Iterator[None]:
+    """Nodes made inside find only those on this computer."""
+    name = "ROS_AUTOMATIC_DISCOVERY_RANGE"
+    before = os.environ.get(name)
+    os.environ[name] = "LOCALHOST"
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ[name]
+        else:
+            os.environ[name] = before

@@ -1,0 +1,44 @@
+"""Real-time localisation as a node: /hmt/pose, /pose and map -> odom at the rate of the odometry."""
+
+from __future__ import annotations
+
+import sys
+
+from geometry_msgs.msg import PoseWithCovarianceStamped
+
+from hmt_slam_ros.nodes import conversions, qos
+from hmt_slam_ros.nodes.parameters import declare_frame
+from hmt_slam_ros.nodes.process_node import ProcessNode
+from hmt_slam_ros.nodes.running import run
+from hmt_slam_ros.nodes.topics import HMT_POSE, POSE
+from hmt_slam_ros.nodes.transforms import transform_publisher
+from hmt_slam_ros.processes.messages import RealTimePose
+from hmt_slam_ros.processes.rtl import Rtl
+
+
+class RtlNode(ProcessNode):
+    """The node ``rtl``."""
+
+    def __init__(self) -> None:
+        super().__init__("rtl", Rtl, (), changeable=("rtl.publish_tf",))
+        self._map, self._odom = declare_frame(self, "map", "map"), declare_frame(self, "odom", "odom")
+        self._hmt_poses = self.create_publisher(PoseWithCovarianceStamped, HMT_POSE, qos.STREAM)
+        self._poses = self.create_publisher(PoseWithCovarianceStamped, POSE, qos.STREAM)
+        self._send_transforms = transform_publisher(self, "tf")
+        self.outbox.add(RealTimePose, self._publish)
+
+    def _publish(self, pose: RealTimePose) -> None:
+        self._hmt_poses.publish(conversions.pose_with_covariance(pose.stamp, f"area_{pose.area}", pose.local))
+        self._poses.publish(conversions.pose_with_covariance(pose.stamp, self._map, pose.map_pose))
+        if self.configuration.rtl.publish_tf:
+            joint = conversions.transform_message(pose.stamp, self._map, self._odom, pose.map_T_odom)
+            self._send_transforms([joint])
+
+
+def main() -> None:
+    """Run the node."""
+    sys.exit(run(RtlNode))
+
+
+if __name__ == "__main__":
+    main()

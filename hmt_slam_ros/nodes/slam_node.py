@@ -1,0 +1,147 @@
+"""Metric SLAM as a node: scans wait for the laser's transform, and the end of the log for the last scan."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections import deque
+from typing import TYPE_CHECKING
+
+import numpy as np
+from geometry_msgs.msg import PoseArray
+from sensor_msgs.msg import LaserScan
+from std_msgs.msg import String
+
+from hmt_slam_ros.configuration import Configuration
+from hmt_slam_ros.errors import HmtSlamError
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.nodes import conversions, qos
+from hmt_slam_ros.nodes.figures import PERIOD
+from hmt_slam_ros.nodes.parameters import declare_frame
+from hmt_slam_ros.nodes.process_node import ProcessNode
+from hmt_slam_ros.nodes.running import run
+from hmt_slam_ros.nodes.sensor_subscription import SensorSubscription
+from hmt_slam_ros.nodes.topics import PARTICLES, ROBOT_STATUS, SCAN
+from hmt_slam_ros.nodes.transforms import LaserMounting
+from hmt_slam_ros.processes.documents import RobotStatus, decode
+from hmt_slam_ros.processes.messages import Accepted, EndOfLog, Finished, Keyframe, LocalEstimate, Message, Trail
+from hmt_slam_ros.processes.replica import FIRST_AREA
+
+if TYPE_CHECKING:
+    from hmt_slam_ros.processes.slam import MetricSlam
+
+# Live, scans beyond this many in the queue are dropped; a replay never drops one.
+_LIVE_QUEUE = 200
+# The last scans of a log are awaited this long, since status and scans are separate topics.
+_END_PATIENCE = 5.0  # s
+
+
+class SlamNode(ProcessNode):
+    """The node ``slam``."""
+
+    process: MetricSlam
+
+    def __init__(self) -> None:
+        super().__init__("slam", _make_process, (Keyframe, Trail, LocalEstimate, Finished))
+        self._map = declare_frame(self, "map", "map")
+        self._mounting = LaserMounting(self, self._work_off)
+        self._pending: deque[LaserScan] = deque()
+        self._pending_since = self._last_scan = time.monotonic()
+        self._scans, self._dropped = 0, 0
+        self._end: RobotStatus | None = None
+        self._areas = {FIRST_AREA: np.zeros(3)}
+        self._laser = SensorSubscription(self, LaserScan, SCAN, self._hear_scan)
+        self._particles = self.create_publisher(PoseArray, PARTICLES, qos.STREAM)
+        self.create_subscription(String, ROBOT_STATUS, self._hear_status, qos.LATCHED)
+        self.create_timer(PERIOD, self._look_around, clock=self.figures.steady_clock)
+
+    def _hear_scan(self, message: LaserScan) -> None:
+        self._scans += 1
+        self._last_scan = time.monotonic()
+        self.figures.received["Scan"] += 1
+        if self._laser.live and self.process.waiting_scans + len(self._pending) >= _LIVE_QUEUE:
+            self._dropped += 1
+            self.figures.state["dropped scans"] = self._dropped
+            self.figures.warn("scans come faster than they can be worked off: some are dropped, lower filter.particles")
+            return
+        if not self._pending:
+            self._pending_since = self._last_scan
+        self._pending.append(message)
+        self._work_off()
+
+    def _work_off(self) -> None:
+        """Deliver the scans whose laser's place is known."""
+        while self._pending:
+            message = self._pending[0]
+            mounting = self._mounting.of(message.header.frame_id)
+            if mounting is None:
+                return
+            self._pending.popleft()
+            self.deliver(conversions.scan_from(message, mounting.laser_pose, mounting.side))
+            self.figures.state["waiting scans"] = self.process.waiting_scans
+        self._end_if_all_came()
+
+    def _hear_status(self, message: String) -> None:
+        try:
+            status = decode(message.data, RobotStatus)
+        except HmtSlamError as error:
+            self.figures.fail(f"{ROBOT_STATUS}: {error}")
+            return
+        if status.state == "ended":
+            self._end = status
+            self._end_if_all_came()
+
+    def deliver(self, message: Message) -> None:
+        """As any process node; the odometry may have been the last thing that was missing."""
+        super().deliver(message)
+        if self._end is not None:
+            self._end_if_all_came()
+
+    def _end_if_all_came(self, *, give_up: bool = False) -> None:
+        end = self._end
+        if end is None or self._pending:
+            return
+        complete = self._scans >= end.scans and self.figures.received["Odometry"] >= end.odometry
+        if complete or give_up:
+            self._end = None
+            self.deliver(EndOfLog())
+
+    def _look_around(self) -> None:
+        """Once a second: tell what is missing, and stop waiting for scans that were lost."""
+        now = time.monotonic()
+        if self._pending and now - self._pending_since > 2 * PERIOD:
+            self.figures.fail(self._mounting.complaint(self._pending[0], len(self._pending)))
+            self._pending_since = now + 10 * PERIOD
+        if self._end is not None and now - self._last_scan > _END_PATIENCE:
+            self.figures.warn(f"the log ended, but only {self._scans} of its {self._end.scans} scans came")
+            self._end_if_all_came(give_up=True)
+
+    def show(self, heard: Message, said: list[Message]) -> None:
+        """Publish the particles of the most probable hypothesis in the map, at keyframes."""
+        if isinstance(heard, Accepted) and heard.global_poses:
+            self._areas = {area.area: area.pose.mean for area in heard.global_poses}
+        for message in said:
+            if isinstance(message, Keyframe):
+                self._publish_particles(message.scan.stamp)
+
+    def _publish_particles(self, stamp: int) -> None:
+        area, poses = self.process.particles
+        if area in self._areas and self._particles.get_subscription_count():
+            placed = se2.compose(self._areas[area], poses)
+            header = conversions.header(stamp, self._map)
+            self._particles.publish(PoseArray(header=header, poses=[conversions.pose_message(pose) for pose in placed]))
+
+
+def _make_process(configuration: Configuration) -> MetricSlam:
+    from hmt_slam_ros.processes.slam import MetricSlam  # noqa: PLC0415  takes time, in which a signal has to be heard
+
+    return MetricSlam(configuration)
+
+
+def main() -> None:
+    """Run the node."""
+    sys.exit(run(SlamNode))
+
+
+if __name__ == "__main__":
+    main()

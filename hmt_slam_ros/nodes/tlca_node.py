@@ -1,0 +1,66 @@
+"""Loop closure acceptance as a node, with the map and the graph for people to see."""
+
+from __future__ import annotations
+
+import sys
+
+from nav_msgs.msg import OccupancyGrid
+from rclpy.publisher import Publisher
+from visualization_msgs.msg import MarkerArray
+
+from hmt_slam_ros.configuration import Configuration
+from hmt_slam_ros.nodes import qos
+from hmt_slam_ros.nodes.map_view import MapView
+from hmt_slam_ros.nodes.parameters import declare_frame
+from hmt_slam_ros.nodes.process_node import ProcessNode
+from hmt_slam_ros.nodes.running import run
+from hmt_slam_ros.nodes.topics import GRAPH, MAP
+from hmt_slam_ros.processes.messages import Accepted, Message
+from hmt_slam_ros.processes.routing import Process
+
+_PERIOD = 3.0  # s between two looks at whether the map has to be drawn anew
+
+
+class TlcaNode(ProcessNode):
+    """The node ``tlca``."""
+
+    def __init__(self) -> None:
+        super().__init__("tlca", _make_process, (Accepted,))
+        self._view = MapView(self.configuration, declare_frame(self, "map", "map"))
+        self._grids = self.create_publisher(OccupancyGrid, MAP, qos.LATCHED)
+        self._graphs = self.create_publisher(MarkerArray, GRAPH, qos.LATCHED)
+        self._drawn = {GRAPH: 0, MAP: 0}
+        self.create_timer(_PERIOD, self._draw, clock=self.figures.steady_clock)
+
+    def show(self, heard: Message, said: list[Message]) -> None:
+        """Follow what is heard and said."""
+        for message in (heard, *said):
+            self._view.hear(message)
+
+    def _draw(self) -> None:
+        """Publish map and graph where something changed and someone looks."""
+        if self._due(GRAPH, self._graphs):
+            self._graphs.publish(self._view.graph())
+        if self._due(MAP, self._grids) and (grid := self._view.grid()) is not None:
+            self._grids.publish(grid)
+
+    def _due(self, topic: str, publisher: Publisher) -> bool:
+        due = self._drawn[topic] != self._view.version and publisher.get_subscription_count() > 0
+        if due:
+            self._drawn[topic] = self._view.version
+        return due
+
+
+def _make_process(configuration: Configuration) -> Process:
+    from hmt_slam_ros.processes.tlca import Tlca  # noqa: PLC0415  takes time, in which a signal has to be heard
+
+    return Tlca(configuration)
+
+
+def main() -> None:
+    """Run the node."""
+    sys.exit(run(TlcaNode))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,21 @@
+"""The names of the topics; all relative, so that a namespace moves them together."""
+
+from hmt_slam_ros.processes.messages import Accepted, AreaEvents, Hypotheses, LocalEstimate, Notice
+
+SCAN, ODOM, CLOCK = "scan", "odom", "clock"
+KEYFRAMES, KEYFRAME_SCANS = "hmt/keyframes", "hmt/keyframe_scans"
+TRAIL = "hmt/trail"
+FINISHED = "hmt/finished"
+ROBOT_STATUS = "hmt/robot_status"
+COST = "hmt/cost"
+HMT_POSE, POSE = "hmt/pose", "pose"
+MAP, GRAPH, PARTICLES, PMF = "map", "hmt/graph", "hmt/particles", "hmt/pmf"
+DIAGNOSTICS = "diagnostics"
+
+DOCUMENTS: dict[type, str] = {
+    AreaEvents: "hmt/area_events",
+    Hypotheses: "hmt/hypotheses",
+    Accepted: "hmt/accepted",
+    LocalEstimate: "hmt/local_pose",
+    Notice: "hmt/notices",
+}

@@ -1,0 +1,75 @@
+"""Where the laser is on the robot, and /tf, which needs a package that PyPI does not have."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from geometry_msgs.msg import TransformStamped
+from rclpy.node import Node
+from sensor_msgs.msg import LaserScan
+
+from hmt_slam_ros.logs.mounting import Mounting, planar_mounting
+from hmt_slam_ros.logs.transforms import FrameTree, frame_name
+from hmt_slam_ros.nodes import qos
+from hmt_slam_ros.nodes.conversions import stamp_of
+from hmt_slam_ros.nodes.parameters import declare_frame, declare_laser_pose
+
+try:
+    from tf2_msgs.msg import TFMessage as TFMessage  # noqa: PLC0414  re-exported
+except ImportError:
+    TFMessage = None
+
+_MISSING = "tf2_msgs is not installed, so %s; scripts/test.sh builds it, and every ROS installation has it"
+
+
+def transform_publisher(node: Node, topic: str) -> Callable[[list[TransformStamped]], None]:
+    """What publishes transforms on ``tf`` or ``tf_static``; nothing where tf2_msgs is missing, which is told once."""
+    if TFMessage is None:
+        node.get_logger().warning(_MISSING % f"nothing is published on {topic}")
+        return lambda _: None
+    publisher = node.create_publisher(TFMessage, topic, qos.LATCHED if topic == "tf_static" else qos.STREAM)
+    return lambda transforms: publisher.publish(TFMessage(transforms=transforms))
+
+
+class LaserMounting:
+    """The poses of the lasers, from the parameter ``laser_pose`` or from /tf_static."""
+
+    def __init__(self, node: Node, changed: Callable[[], None]) -> None:
+        """Listen.
+
+        :param changed: called when transforms have come.
+        """
+        self._base = declare_frame(node, "base", "base_link")
+        self._given = declare_laser_pose(node)
+        self._frames = FrameTree()
+        self._known: dict[str, Mounting] = {}
+        self._changed = changed
+        if self._given is None and TFMessage is not None:
+            node.create_subscription(TFMessage, "tf_static", self._hear, qos.TF_STATIC)
+
+    def _hear(self, message: Any) -> None:  # noqa: ANN401  a TFMessage, where there is one
+        self._frames.add(message)
+        self._changed()
+
+    def of(self, frame: str) -> Mounting | None:
+        """Where the laser of a frame is, None as long as no transform tells.
+
+        :raises HmtSlamError: for a laser that is tilted.
+        """
+        if self._given is not None:
+            return Mounting(self._given, 1.0)
+        if frame not in self._known:
+            transform = self._frames.pose(frame_name(self._base), frame_name(frame))
+            if transform is None:
+                return None
+            self._known[frame] = planar_mounting(transform, f"the laser '{frame}'")
+        return self._known[frame]
+
+    def complaint(self, scan: LaserScan, waiting: int) -> str:
+        """One sentence for a scan whose transform is missing."""
+        cause = "" if TFMessage is not None else " (tf2_msgs is not installed)"
+        return (
+            f"no transform from '{self._base}' to '{scan.header.frame_id}' on /tf_static{cause}, so {waiting} scans "
+            f"wait, the first of stamp {stamp_of(scan.header.stamp)} ns: publish it, or set the parameter laser_pose"
+        )

@@ -1,0 +1,56 @@
+"""Topological inference as a node, with the distribution of Eq. (14) for people to see."""
+
+from __future__ import annotations
+
+import sys
+
+from std_msgs.msg import Float64MultiArray, MultiArrayDimension, MultiArrayLayout
+
+from hmt_slam_ros.configuration import Configuration
+from hmt_slam_ros.nodes import qos
+from hmt_slam_ros.nodes.conversions import rows_message_data
+from hmt_slam_ros.nodes.process_node import ProcessNode
+from hmt_slam_ros.nodes.running import run
+from hmt_slam_ros.nodes.topics import PMF
+from hmt_slam_ros.processes.messages import Hypotheses, Message
+from hmt_slam_ros.processes.routing import Process
+
+
+class TsbiNode(ProcessNode):
+    """The node ``tsbi``."""
+
+    def __init__(self) -> None:
+        super().__init__("tsbi", _make_process, (Hypotheses,))
+        self._pmf = self.create_publisher(Float64MultiArray, PMF, qos.LATCHED)
+
+    def show(self, _heard: Message, said: list[Message]) -> None:
+        """Publish the distribution over the topological paths, Eq. (14)."""
+        for message in said:
+            if isinstance(message, Hypotheses):
+                self._pmf.publish(pmf_message(message))
+
+
+def pmf_message(hypotheses: Hypotheses) -> Float64MultiArray:
+    """Rows of (hypothesis, area, probability), the most probable first; the last is (-1, -1, what was not examined)."""
+    leaves = sorted(hypotheses.leaves, key=lambda leaf: (-leaf.probability, leaf.hypothesis))
+    rows = [(leaf.hypothesis, leaf.area, leaf.probability) for leaf in leaves] + [(-1, -1, hypotheses.unexamined)]
+    layout = [
+        MultiArrayDimension(label="leaf", size=len(rows), stride=3 * len(rows)),
+        MultiArrayDimension(label="hypothesis,area,probability", size=3, stride=3),
+    ]
+    return Float64MultiArray(layout=MultiArrayLayout(dim=layout), data=rows_message_data(rows))
+
+
+def _make_process(configuration: Configuration) -> Process:
+    from hmt_slam_ros.processes.tsbi import Tsbi  # noqa: PLC0415  takes time, in which a signal has to be heard
+
+    return Tsbi(configuration)
+
+
+def main() -> None:
+    """Run the node."""
+    sys.exit(run(TsbiNode))
+
+
+if __name__ == "__main__":
+    main()
