@@ -78,7 +78,7 @@ def build_area_grid(scans: Sequence[Scan], poses: NDArray[np.float64], model: Gr
     hits, lasers = _end_points(scans, poses, model.max_range)
     if not hits:
         return _blank(model.cell)
-    reach = 4.0 * model.sigma
+    reach = 5.0 * model.sigma
     everything = np.concatenate((*hits, np.array(lasers)))
     # The corner is a multiple of the cell, so that grids of one area agree on where cells lie.
     origin = np.floor((everything.min(axis=0) - reach) / model.cell) * model.cell
@@ -86,7 +86,7 @@ def build_area_grid(scans: Sequence[Scan], poses: NDArray[np.float64], model: Gr
     free = np.zeros((rows, columns), dtype=np.bool_)
     for laser, points in zip(lasers, hits, strict=True):
         _mark_free(free, origin, model.cell, laser, points)
-    distance2 = np.full((2 * rows, 2 * columns), reach * reach)
+    distance2 = np.full((2 * rows, 2 * columns), np.inf)
     surfaces = np.concatenate([_joined(points, 0.5 * model.cell) for points in hits])
     _lower_distances(distance2, origin, 0.5 * model.cell, surfaces, reach)
     fine = _log_ratio(distance2, free.repeat(2, axis=0).repeat(2, axis=1), model)

@@ -1,0 +1,78 @@
+"""The grid of log-likelihood ratios around an area."""
+
+import numpy as np
+import pytest
+from worlds import box, scan_in
+
+from hmt_slam_ros.topology.area_grid import GridModel, build_area_grid, thinned
+
+ROOM = box(0.0, 0.0, 6.0, 4.0)
+MODEL = GridModel()
+
+
+def log_ratio_at(grid, x, y):
+    column, row = np.floor((np.array([x, y]) - grid.origin) / (0.5 * grid.cell)).astype(int)
+    return grid.fine[row, column]
+
+
+@pytest.fixture(scope="module")
+def room():
+    poses = np.array([[2.0, 2.0, 0.0], [3.0, 2.0, 3.1]])
+    return build_area_grid([scan_in(ROOM, pose, field_of_view=2 * np.pi, beams=721) for pose in poses], poses, MODEL)
+
+
+def test_a_surface_is_likelier_on_a_wall_than_in_unknown_space(room):
+    assert log_ratio_at(room, 6.0, 2.0) == pytest.approx(np.log(3.0), abs=0.1)
+
+
+def test_a_surface_is_less_likely_in_the_open_than_in_unknown_space(room):
+    assert log_ratio_at(room, 2.5, 2.5) == pytest.approx(np.log(0.1), abs=1e-3)
+
+
+def test_nothing_is_known_behind_a_wall(room):
+    assert log_ratio_at(room, 6.39, 2.0) == pytest.approx(0.0, abs=0.01)
+
+
+def test_the_two_flanks_of_a_wall_are_alike_close_to_it(room):
+    assert log_ratio_at(room, 5.9, 2.0) == pytest.approx(log_ratio_at(room, 6.1, 2.0), abs=0.35)
+
+
+def test_the_coarse_grid_is_the_mean_of_the_fine_one(room):
+    rows, columns = room.log_ratio.shape
+    assert np.allclose(room.log_ratio, room.fine.reshape(rows, 2, columns, 2).mean(axis=(1, 3)))
+
+
+def test_points_beyond_the_range_are_not_used():
+    near = GridModel(max_range=2.5)
+    pose = np.array([2.0, 2.0, 0.0])
+    grid = build_area_grid([scan_in(ROOM, pose, field_of_view=2 * np.pi, beams=721)], pose[None], near)
+    assert np.hypot(*(grid.points - pose[:2]).T).max() <= 2.5
+
+
+def test_poses_place_the_scans():
+    pose = np.array([2.0, 1.0, 0.7])
+    grid = build_area_grid([scan_in(ROOM, pose, field_of_view=2 * np.pi, beams=721)], pose[None], MODEL)
+    distance = np.minimum.reduce(
+        [np.abs(grid.points[:, 0]), np.abs(grid.points[:, 0] - 6.0), np.abs(grid.points[:, 1]),
+         np.abs(grid.points[:, 1] - 4.0)]
+    )  # fmt: skip
+    assert np.quantile(distance, 0.95) < 0.03
+
+
+def test_thinning_leaves_one_point_a_voxel():
+    points = np.random.default_rng(1).uniform(-1.0, 1.0, (5000, 2))
+    few = thinned(points, 0.25)
+    assert len(few) == 64
+    assert len({tuple(voxel) for voxel in np.floor(few / 0.25).astype(int)}) == 64
+
+
+def test_scans_without_a_return_give_a_blank_grid():
+    pose = np.zeros(3)
+    grid = build_area_grid([scan_in(ROOM + 100.0, pose)], pose[None], GridModel(max_range=10.0))
+    assert grid.points.shape == (0, 2)
+    assert not grid.log_ratio.any()
+
+
+def test_a_moved_grid_says_the_same_of_the_same_place(room):
+    moved = room.moved(np.array([1.0, -2.0]))
+    assert log_ratio_at(moved, 5.0, 4.0) == log_ratio_at(room, 6.0, 2.0)

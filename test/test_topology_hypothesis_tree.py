@@ -1,0 +1,92 @@
+"""Weights of the leaves and what is remembered of them."""
+
+import math
+
+import numpy as np
+import pytest
+
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.random_streams import Purpose, stream
+from hmt_slam_ros.topology.hypothesis_tree import LeafNotes, relative_covariance, settle
+
+
+def settled(weights, skipped=0.0, unexamined=0.0, most=16, least=1e-6):
+    with np.errstate(divide="ignore"):
+        logs, log_skipped = np.log(np.array(weights)), float(np.log(skipped))
+    return settle(logs, log_skipped, unexamined, most, least, stream(0, Purpose.HYPOTHESES, 0, 0))
+
+
+def test_weights_are_normalised():
+    assert settled([2.0, 6.0]).probabilities.tolist() == pytest.approx([0.25, 0.75])
+
+
+def test_hopelessly_small_weights_do_not_underflow():
+    found = settle(np.array([-5000.0, -5001.0]), -math.inf, 0.0, 4, 1e-6, stream(0, Purpose.HYPOTHESES, 0, 0))
+    assert found.probabilities.tolist() == pytest.approx([1.0 / (1.0 + math.exp(-1.0)), 1.0 / (1.0 + math.e)])
+
+
+def test_what_was_skipped_keeps_its_mass():
+    found = settled([3.0, 6.0], skipped=1.0)
+    assert found.unexamined == pytest.approx(0.1)
+    assert found.probabilities.sum() == pytest.approx(0.9)
+
+
+def test_what_was_not_examined_earlier_keeps_its_share():
+    found = settled([1.0, 1.0], unexamined=0.2)
+    assert found.probabilities.tolist() == pytest.approx([0.4, 0.4])
+    assert found.unexamined == pytest.approx(0.2)
+
+
+def test_what_is_dropped_is_counted_as_unexamined():
+    found = settled([1.0, 1e-3], least=0.01)
+    assert found.kept.tolist() == [0]
+    assert found.unexamined == pytest.approx(1e-3, rel=0.01)
+
+
+def test_the_best_is_never_dropped():
+    assert settled([1.0, 1.0, 1.0], least=0.5).kept.tolist() == [0, 1, 2]
+
+
+def test_the_reduction_keeps_the_total():
+    found = settled(np.linspace(0.5, 1.5, 40), most=5)
+    assert found.kept.size == 5
+    assert found.probabilities.sum() == pytest.approx(1.0)
+
+
+def test_the_drift_beyond_the_reference_is_what_the_chain_added():
+    reference = PoseGaussian(np.array([3.0, 1.0, 0.4]), np.diag([0.04, 0.02, 0.01]))
+    step = PoseGaussian(np.array([2.0, -0.5, 0.3]), np.diag([0.003, 0.001, 0.0004]))
+    whole = reference.compose(step)
+    found = relative_covariance(whole.covariance, reference.covariance, step.mean, np.zeros((3, 3)))
+    assert np.allclose(found, step.covariance)
+
+
+def test_a_keyframe_that_is_better_known_than_the_reference_leaves_the_floor():
+    floor = np.diag([1e-4, 1e-4, 1e-5])
+    found = relative_covariance(np.eye(3) * 1e-3, np.eye(3) * 1e-2, np.zeros(3), floor)
+    assert np.allclose(found, floor)
+
+
+def test_entering_an_area_keeps_the_notes_of_the_keyframes_that_came_along():
+    notes = LeafNotes().stored(4, np.eye(3)).stored(5, np.eye(3)).checked([9], [4, 5])
+    entered = notes.entered({5: 2.0 * np.eye(3)})
+    assert entered.compared == {9: {5}}
+    assert entered.covariances.keys() == {5}
+    assert entered.unchecked == ()
+
+
+def test_notes_are_values():
+    before = LeafNotes().stored(1, np.eye(3))
+    before.stored(2, np.eye(3))
+    before.checked([3], [1])
+    assert before.unchecked == (1,)
+    assert not before.compared
+
+
+def test_the_pose_of_the_reference_does_not_enter_the_relative_covariance():
+    whole, part = np.diag([0.2, 0.1, 0.05]), np.diag([0.1, 0.05, 0.02])
+    pose = np.array([1.0, 2.0, 0.5])
+    ad = se2.adjoint(se2.inverse(pose))
+    found = relative_covariance(ad @ whole @ ad.T, part, pose, np.zeros((3, 3)))
+    assert np.allclose(found, ad @ (whole - part) @ ad.T)

@@ -1,0 +1,107 @@
+"""The transition model: where the arcs alone say that the robot is."""
+
+import math
+
+import numpy as np
+import pytest
+from worlds import box, scan_in
+
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.topology.area_grid import GridModel, build_area_grid
+from hmt_slam_ros.topology.transition import Place, entry_probability, owner_at, transition
+
+RADIUS = 2.0
+# Two corridors side by side, a wall between them.
+CORRIDORS = np.concatenate((box(-1.0, -1.0, 21.0, 1.0), box(-1.0, 1.0, 21.0, 3.0)))
+
+
+def place(first=0.0, last=8.0, border=5.0):
+    """Keyframes every metre along the lower corridor; those beyond ``border`` belong to area 7, the others to 3."""
+    x = np.arange(first, last + 0.1)
+    poses = np.stack((x, np.zeros_like(x), np.zeros_like(x)), axis=1)
+    scans = [scan_in(CORRIDORS, pose, field_of_view=2 * np.pi, beams=361) for pose in poses]
+    return Place(3, np.where(x > border, 7, 3), poses[:, :2], build_area_grid(scans, poses, GridModel()))
+
+
+def keyframes(x, y=0.0, count=4):
+    """Keyframes half a metre apart that begin at (x, y)."""
+    return np.array([[x + 0.5 * k, y, 0.0] for k in range(count)])
+
+
+def belief(sigma, degrees=0.2, x=0.0, y=0.0):
+    return PoseGaussian(np.array([x, y, 0.0]), np.diag([sigma, sigma, math.radians(degrees)]) ** 2)
+
+
+@pytest.fixture(scope="module")
+def corridor():
+    return place()
+
+
+def test_keyframes_among_those_of_an_area_lie_in_its_place(corridor):
+    assert owner_at(corridor, keyframes(1.0, 0.4), RADIUS) == 3
+
+
+def test_keyframes_nearer_to_the_next_area_lie_in_the_place_of_that(corridor):
+    assert owner_at(corridor, keyframes(6.0), RADIUS) == 7
+
+
+def test_keyframes_far_away_lie_in_no_place(corridor):
+    assert owner_at(corridor, keyframes(12.0), RADIUS) is None
+
+
+def test_a_parallel_corridor_behind_a_wall_is_another_place(corridor):
+    assert owner_at(corridor, keyframes(1.0, 1.6), RADIUS) is None
+
+
+def test_where_most_keyframes_lie_decides(corridor):
+    assert owner_at(corridor, keyframes(9.0, count=5), RADIUS) == 7  # up to 11 m, place up to 10 m
+    assert owner_at(corridor, keyframes(9.6, count=5), RADIUS) is None
+
+
+def test_a_robot_tracked_within_a_place_is_there_for_sure(corridor):
+    assert entry_probability(corridor, belief(0.05), keyframes(1.0), RADIUS) == 1.0
+
+
+def test_without_overlap_the_probability_is_exactly_zero(corridor):
+    assert entry_probability(corridor, belief(0.3), keyframes(14.0), RADIUS) == 0.0
+
+
+def test_a_loose_prior_spreads_over_the_place_and_what_lies_around(corridor):
+    share = entry_probability(corridor, belief(3.0, 10.0), keyframes(1.0), RADIUS)
+    assert 0.02 < share < 0.6
+
+
+def test_the_probability_is_that_of_the_gaussian():
+    """Lengthwise uncertainty alone: in the place up to 2 m beyond its last keyframe, normal cumulative distribution."""
+    prior = PoseGaussian(np.array([9.0, 0.0, 0.0]), np.diag([0.8, 1e-3, 1e-4]) ** 2)
+    share = entry_probability(place(border=50.0), prior, np.zeros((1, 3)), RADIUS)
+    assert share == pytest.approx(0.5 * (1.0 + math.erf((10.0 - 9.0) / 0.8 / math.sqrt(2.0))), abs=0.02)
+
+
+def test_neighbouring_areas_share_the_probability(corridor):
+    other = Place(7, corridor.owners, corridor.positions, corridor.grid)
+    prior = PoseGaussian(np.array([4.0, 0.0, 0.0]), np.diag([0.5, 0.1, 0.003]) ** 2)
+    shares = [entry_probability(p, prior, keyframes(0.5), RADIUS) for p in (corridor, other)]
+    assert min(shares) > 0.1
+    assert sum(shares) <= 1.0
+    assert sum(shares) == pytest.approx(1.0, abs=0.02)
+
+
+def test_known_and_new_sum_to_one():
+    for shares in ({1: 0.2, 4: 0.3}, {1: 0.7, 2: 0.6}, {1: 1.0}, {}):
+        model = transition(shares, 0.05)
+        assert sum(model.known.values()) + model.new == pytest.approx(1.0)
+
+
+def test_new_ground_has_what_the_known_places_leave():
+    model = transition({1: 0.2, 4: 0.3}, 0.05)
+    assert model.new == pytest.approx(0.5)
+    assert model.known == pytest.approx({1: 0.2, 4: 0.3})
+
+
+def test_new_ground_keeps_its_floor():
+    assert transition({1: 0.9, 2: 0.9}, 0.05).new == 0.05
+
+
+def test_without_a_candidate_all_is_new():
+    assert transition({}, 0.05) == ({}, 1.0)
