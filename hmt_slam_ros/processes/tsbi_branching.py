@@ -267,7 +267,7 @@ class Branching:
         """New ground: the reference keyframe becomes the frame of a new area."""
         keyframes = tuple(query.poses)
         if keyframes not in self._named:
-            self._areas += 1
+            self._areas = max(self._areas, *parent.hybrid_map.area_ids()) + 1
             self._named[keyframes] = self._areas
         area = self._named[keyframes]
         origin = PoseGaussian(np.zeros(3), self._floor)
