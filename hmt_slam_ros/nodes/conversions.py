@@ -1,8 +1,7 @@
 """Between the project's values and ROS messages.
 
 Bulk arrays go through ``array.array`` and the buffer protocol: a list, or the assignment of a numpy array, costs ten
-to a thousand times as much. Floats of a LaserScan are float32 in ROS; everything else comes back as it was, but for
-the last bits of an angle that went through a quaternion.
+to a thousand times as much. Floats of a LaserScan are float32 in ROS; everything else comes back as it was.
 """
 
 from __future__ import annotations
@@ -40,6 +39,8 @@ from hmt_slam_ros.sensing import Odometry, Scan
 _SECOND = 1_000_000_000
 # Rows and columns of (x, y, theta) in the 6 x 6 covariance of ROS, which is (x, y, z, roll, pitch, yaw).
 _PLANAR = np.ix_((0, 1, 5), (0, 1, 5))
+# Units in the last place by which a quaternion may be off, the smallest first.
+_NUDGES = ((0, 0), (1, 0), (-1, 0), (0, 1), (0, -1), (2, 0), (-2, 0), (0, 2), (0, -2))
 _TRAIL_FRAME = re.compile(r"hypothesis_(\d+)/scan_(\d+)")
 _KEYFRAME_FRAME = re.compile(r"keyframe_(\d+)")
 
@@ -61,8 +62,17 @@ def header(stamp: int, frame: str) -> Header:
 
 
 def quaternion(theta: float) -> Quaternion:
-    """Rotation by ``theta`` rad about z."""
-    return Quaternion(z=math.sin(0.5 * theta), w=math.cos(0.5 * theta))
+    """Rotation by ``theta`` rad, in [-pi, pi), about z, from which the receiver gets ``theta`` back bit for bit.
+
+    Sine and cosine are rounded, so the angle may come back with another last bit, and a run of the nodes would drift
+    away from the lock-step run. The last bits of the quaternion are chosen such that it does not.
+    """
+    sin, cos = math.sin(0.5 * theta), math.cos(0.5 * theta)
+    for steps_z, steps_w in _NUDGES:
+        z, w = sin + steps_z * math.ulp(sin), cos + steps_w * math.ulp(cos)
+        if heading_of_quaternion((0.0, 0.0, z, w)) == theta:
+            return Quaternion(z=z, w=w)
+    return Quaternion(z=sin, w=cos)
 
 
 def pose_message(pose: NDArray[np.float64]) -> Pose:
