@@ -1,4 +1,4 @@
-"""Counter-based random streams: what is drawn depends on who draws and when, never on the order of execution."""
+"""Counter-based random streams: what is drawn depends on what for and when, never on the order of execution."""
 
 from __future__ import annotations
 
@@ -8,19 +8,21 @@ import numpy as np
 
 
 class Purpose(IntEnum):
-    """Who draws."""
+    """What the numbers are for."""
 
     PARTICLES = 1
     RESAMPLING = 2
     HYPOTHESES = 3
 
 
-def stream(seed: int, purpose: Purpose, hypothesis: int, step: int) -> np.random.Generator:
+def stream(seed: int, purpose: Purpose, step: int) -> np.random.Generator:
     """The generator of one decision.
+
+    All hypotheses draw the same numbers: where two have the same map and the same past they stay the same, and the
+    ratio of their evidence carries no noise of sampling.
 
     :param seed: seed of the run.
     :param purpose: what the numbers are for.
-    :param hypothesis: id of the hypothesis that draws, 0 where it concerns all.
     :param step: keyframe event, from 0.
     """
-    return np.random.Generator(np.random.Philox(key=[seed, int(purpose)], counter=[0, 0, hypothesis, step]))
+    return np.random.Generator(np.random.Philox(key=[seed, int(purpose)], counter=[0, 0, 0, step]))

@@ -224,7 +224,7 @@ class AreaFilter:
         self.log_weights = self.log_weights + evidences
         self.log_weights -= self.log_weights.max()
         leader = self.leader
-        random = stream(settings.seed, Purpose.PARTICLES, self.hypothesis, step).standard_normal((len(means), 3))
+        random = stream(settings.seed, Purpose.PARTICLES, step).standard_normal((len(means), 3))
         self.poses = means + np.einsum("mij,mj->mi", np.linalg.cholesky(covariances), random)
         # The leader keeps the mode, so that the published path has no sampling noise.
         self.poses[leader] = modes[leader]
@@ -245,7 +245,7 @@ class AreaFilter:
     def _resample(self, step: int) -> None:
         """Systematic resampling; the leader stands first, so that it still leads."""
         weights = _normalised(self.log_weights)
-        offset = stream(self.mapping.configuration.seed, Purpose.RESAMPLING, self.hypothesis, step).random()
+        offset = stream(self.mapping.configuration.seed, Purpose.RESAMPLING, step).random()
         positions = (np.arange(len(weights)) + offset) / len(weights)
         ancestors = np.minimum(np.searchsorted(np.cumsum(weights), positions), len(weights) - 1)
         leader = self.leader

@@ -101,7 +101,7 @@ class Tsbi:
         return Branches([Child(hypothesis, log_weight, area, notes)])
 
     def _settle(self, sequence: int, children: Sequence[Child], branches: Sequence[Branches]) -> Settled:
-        generator = stream(self._seed, Purpose.HYPOTHESES, 0, sequence)
+        generator = stream(self._seed, Purpose.HYPOTHESES, sequence)
         # Ground that was not looked at would show again by now, in the keyframes that are looked at.
         if any(branch.looked for branch in branches):
             self._unexamined *= 0.5
