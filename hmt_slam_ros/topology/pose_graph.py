@@ -21,7 +21,8 @@ from hmt_slam_ros.geometry import se2
 
 _STEPS, _SMALLEST_STEP, _SMALLEST_GAIN = 100, 1e-10, 1e-12
 _FIRST_DAMPING, _LAST_DAMPING = 1e-6, 1e8
-_COLUMNS = 300  # right-hand sides solved at once for the marginals, to bound the memory
+# Right-hand sides solved at once for the marginals; with many more, threads of the BLAS wait for each other.
+_COLUMNS = 96
 
 
 @dataclass(frozen=True, eq=False)
