@@ -14,7 +14,7 @@ from hmt_slam_ros.topology.hypothesis_tree import LeafNotes, relative_covariance
 def settled(weights, skipped=0.0, unexamined=0.0, most=16, least=1e-6):
     with np.errstate(divide="ignore"):
         logs, log_skipped = np.log(np.array(weights)), float(np.log(skipped))
-    return settle(logs, log_skipped, unexamined, most, least, stream(0, Purpose.HYPOTHESES, 0, 0))
+    return settle(logs, log_skipped, unexamined, most, least, stream(0, Purpose.HYPOTHESES, 0))
 
 
 def test_weights_are_normalised():
@@ -22,7 +22,7 @@ def test_weights_are_normalised():
 
 
 def test_hopelessly_small_weights_do_not_underflow():
-    found = settle(np.array([-5000.0, -5001.0]), -math.inf, 0.0, 4, 1e-6, stream(0, Purpose.HYPOTHESES, 0, 0))
+    found = settle(np.array([-5000.0, -5001.0]), -math.inf, 0.0, 4, 1e-6, stream(0, Purpose.HYPOTHESES, 0))
     assert found.probabilities.tolist() == pytest.approx([1.0 / (1.0 + math.exp(-1.0)), 1.0 / (1.0 + math.e)])
 
 
