@@ -1,0 +1,113 @@
+"""Fixtures for tests with real nodes over real DDS, each in a domain of its own."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+# Messages check the names and types of their fields, which they do not by default.
+os.environ["ROS_PYTHON_CHECK_FIELDS"] = "1"
+
+WAIT = 40.0  # s, for what normally takes less than one
+
+
+@pytest.fixture
+def domain(monkeypatch):
+    """A ROS domain in which nobody else is; set for this process and its children."""
+    pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
+    from hmt_slam_ros.nodes.domain import own_domain
+
+    with own_domain() as number:
+        monkeypatch.setenv("ROS_DOMAIN_ID", str(number))
+        monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+        yield number
+
+
+class Listener:
+    """A node of the test's own, and what it heard."""
+
+    def __init__(self, domain):
+        from rclpy.context import Context
+        from rclpy.executors import SingleThreadedExecutor
+        from rclpy.node import Node
+
+        self.context = Context()
+        self.context.init(domain_id=domain)
+        self.node = Node("listener", context=self.context)
+        self.executor = SingleThreadedExecutor(context=self.context)
+        self.executor.add_node(self.node)
+
+    def hear(self, kind, topic, profile):
+        """Subscribe; the list that is returned fills up."""
+        heard = []
+        self.node.create_subscription(kind, topic, heard.append, profile)
+        return heard
+
+    def until(self, condition, seconds=WAIT, alive=()):
+        """Spin until a condition holds; fail where it does not, or where one of the processes ends before."""
+        deadline = time.monotonic() + seconds
+        while not condition():
+            assert time.monotonic() < deadline, "waited in vain"
+            for process in alive:
+                assert process.poll() is None, process.communicate()[1]
+            self.executor.spin_once(timeout_sec=0.02)
+
+    def spin(self, seconds):
+        """Listen for a while in which nothing in particular is awaited."""
+        deadline = time.monotonic() + seconds
+        while time.monotonic() < deadline:
+            self.executor.spin_once(timeout_sec=0.02)
+
+    def call(self, kind, name, request):
+        """The answer of a service."""
+        client = self.node.create_client(kind, name)
+        self.until(client.service_is_ready)
+        future = client.call_async(request)
+        self.until(future.done)
+        return future.result()
+
+    def close(self):
+        self.executor.shutdown()
+        self.node.destroy_node()
+        self.context.try_shutdown()
+
+
+@pytest.fixture
+def listener(domain):
+    listener = Listener(domain)
+    yield listener
+    listener.close()
+
+
+@pytest.fixture
+def start(domain):
+    """Starts nodes as OS processes; at the end, each that is left has to end well when told to."""
+    started = []
+
+    def start(name, *arguments, **parameters):
+        words = [word for key, value in parameters.items() for word in ("-p", f"{key.replace('__', '.')}:={value}")]
+        process = subprocess.Popen(
+            [sys.executable, "-m", f"hmt_slam_ros.nodes.{name}_node", "--ros-args", *words, *arguments],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            env=dict(os.environ),
+        )
+        started.append(process)
+        return process
+
+    yield start
+    left = [process for process in started if process.poll() is None]
+    for process in left:
+        process.send_signal(signal.SIGINT)
+    try:
+        for process in left:
+            error = process.communicate(timeout=WAIT)[1]
+            assert process.returncode == 0, error
+            assert "Traceback" not in error, error
+    finally:
+        for process in left:
+            process.kill()

@@ -1,0 +1,45 @@
+"""A small log for the robot node: a drive along a corridor, with odometry faster than the scans."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from worlds import box, scan_in
+
+from hmt_slam_ros.logs import LogRecord, write_bag
+from hmt_slam_ros.sensing import Odometry
+
+SECOND = 1_000_000_000
+START = 1_700_000_000 * SECOND
+LASER = np.array([0.1, 0.0, 0.05])
+WALLS = np.concatenate([box(-3, -3, 12, 3), box(4, 1, 5, 3)])
+
+
+@dataclass
+class Corridor:
+    """Scans every 0.2 s, four odometry readings to each, at 0.5 m/s."""
+
+    scans: int = 12
+    name: str = "corridor"
+
+    @property
+    def scan_count(self):
+        return self.scans
+
+    @property
+    def duration(self):
+        return 0.2 * (self.scans - 1)
+
+    def records(self):
+        for k in range(4 * (self.scans - 1) + 1):
+            stamp = START + k * SECOND // 20
+            pose = np.array([0.025 * k, 0.0, 0.002 * k])
+            yield LogRecord(stamp, Odometry(stamp, pose))
+            if k % 4 == 0:
+                yield LogRecord(stamp, scan_in(WALLS, pose, stamp, laser_pose=LASER, beams=91))
+
+
+def corridor_bag(folder, scans=12):
+    """The corridor as a rosbag2 folder."""
+    path = folder / "corridor"
+    write_bag(Corridor(scans), path)
+    return path

@@ -1,0 +1,213 @@
+"""Every node starts, says how it is, and ends with status 0 when told to."""
+
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+from logs_for_nodes import corridor_bag
+
+pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from nav_msgs.msg import Odometry as OdometryMessage
+from std_msgs.msg import Float64MultiArray, String
+
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.nodes import conversions, qos
+from hmt_slam_ros.nodes.topics import DIAGNOSTICS, DOCUMENTS, HMT_POSE, KEYFRAMES, POSE
+from hmt_slam_ros.processes.documents import encode
+from hmt_slam_ros.processes.messages import Accepted, AreaEvents, Hypotheses, Leaf, LocalEstimate
+from hmt_slam_ros.sensing import Odometry
+
+NODES = ("slam", "aam", "tsbi", "tlca", "rtl", "robot")
+
+
+def parameters(name, tmp_path):
+    return {"log": corridor_bag(tmp_path), "robot__patience": 3600.0} if name == "robot" else {}
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=lambda number: number.name)
+@pytest.mark.parametrize("name", NODES)
+def test_a_node_that_runs_ends_well_when_told_to(tmp_path, listener, start, name, number):
+    told = listener.hear(DiagnosticArray, DIAGNOSTICS, qos.STREAM)
+    process = start(name, **parameters(name, tmp_path))
+    listener.until(lambda: told, alive=[process])
+    assert told[0].status[0].name == f"/{name}"
+    assert told[0].status[0].level == DiagnosticStatus.OK
+    process.send_signal(number)
+    error = process.communicate(timeout=20)[1]
+    assert process.returncode == 0
+    assert "Traceback" not in error
+    assert "terminate called" not in error
+
+
+@pytest.mark.parametrize("name", NODES)
+def test_a_value_out_of_range_keeps_a_node_from_starting(tmp_path, start, name):
+    process = start(name, filter__particles=0, **parameters(name, tmp_path))
+    error = process.communicate(timeout=40)[1]
+    assert process.returncode == 2
+    assert "filter.particles = 0" in error
+    assert len(error.strip().splitlines()) == 1
+
+
+def test_two_signals_in_a_row_do_no_harm(listener, start):
+    told = listener.hear(DiagnosticArray, DIAGNOSTICS, qos.STREAM)
+    process = start("rtl")
+    listener.until(lambda: told)
+    process.send_signal(signal.SIGINT)
+    process.send_signal(signal.SIGINT)
+    error = process.communicate(timeout=20)[1]
+    assert process.returncode == 0, error
+
+
+def level(told, name):
+    levels = [status for message in told for status in message.status if status.name == f"/{name}"]
+    return levels[-1] if levels else None
+
+
+def test_a_malformed_document_is_told_and_survived(listener, start):
+    told = listener.hear(DiagnosticArray, DIAGNOSTICS, qos.STREAM)
+    events = listener.node.create_publisher(String, DOCUMENTS[Accepted], qos.CHAIN)
+    process = start("rtl")
+    events.publish(String(data='{"document":"accepted","version":99}'))
+    listener.until(lambda: (status := level(told, "rtl")) and status.level == DiagnosticStatus.ERROR, alive=[process])
+    assert "has version 99, not 1" in level(told, "rtl").message
+
+
+def test_a_lost_message_of_the_chain_is_told(listener, start):
+    told = listener.hear(DiagnosticArray, DIAGNOSTICS, qos.STREAM)
+    accepted = listener.node.create_publisher(String, DOCUMENTS[Accepted], qos.CHAIN)
+    process = start("rtl")
+    accepted.publish(String(data=encode(Accepted(0))))
+    accepted.publish(String(data=encode(Accepted(2))))
+    listener.until(lambda: (status := level(told, "rtl")) and status.level == DiagnosticStatus.ERROR, alive=[process])
+    assert "Accepted 1 never came, 2 did" in level(told, "rtl").message
+
+
+def test_a_node_that_starts_late_catches_up(listener, start):
+    """What was said before a node started is latched, and reaches it in the order of the chain."""
+    keyframes = listener.node.create_publisher(String, KEYFRAMES, qos.CHAIN)
+    hypotheses = listener.node.create_publisher(String, DOCUMENTS[Hypotheses], qos.CHAIN)
+    accepted = listener.node.create_publisher(String, DOCUMENTS[Accepted], qos.CHAIN)
+    told = listener.hear(DiagnosticArray, DIAGNOSTICS, qos.STREAM)
+    assert keyframes
+    for sequence in range(3):
+        hypotheses.publish(String(data=encode(Hypotheses(sequence, (Leaf(0, 0, 1.0, 0),)))))
+        accepted.publish(String(data=encode(Accepted(sequence))))
+    process = start("rtl")
+
+    def received():
+        status = level(told, "rtl")
+        return {entry.key: entry.value for entry in status.values} if status else {}
+
+    listener.until(lambda: received().get("received Accepted") == "3", alive=[process])
+    listener.until(lambda: received().get("received Hypotheses") == "3", alive=[process])
+    listener.until(lambda: received().get("waiting for their turn") == "0", alive=[process])
+
+
+def test_rtl_answers_every_odometry_reading(listener, start):
+    odom = listener.node.create_publisher(OdometryMessage, "odom", qos.SENSOR)
+    estimates = listener.node.create_publisher(String, DOCUMENTS[LocalEstimate], qos.CHAIN)
+    local = listener.hear(PoseWithCovarianceStamped, HMT_POSE, qos.STREAM)
+    placed = listener.hear(PoseWithCovarianceStamped, POSE, qos.STREAM)
+    process = start("rtl")
+    matched = (odom, estimates)
+    listener.until(lambda: all(publisher.get_subscription_count() for publisher in matched), alive=[process])
+    belief = PoseGaussian(np.array([1.0, 2.0, 0.0]), 1e-4 * np.eye(3))
+    reading = Odometry(0, np.zeros(3))
+    while not placed:  # the publishers of rtl may find this node later than its subscriptions do
+        reading = Odometry(reading.stamp + 20_000_000, reading.pose)
+        odom.publish(conversions.odometry_message(reading, "odom", "base_link"))
+        estimates.publish(String(data=encode(LocalEstimate(reading.stamp, 0, 0, belief, reading.pose, 0))))
+        listener.spin(0.1)
+    listener.until(lambda: len(local) == len(placed))
+    before = len(placed)
+    for k in range(1, 51):
+        step = Odometry(reading.stamp + k * 20_000_000, np.array([0.01 * k, 0.0, 0.0]))
+        odom.publish(conversions.odometry_message(step, "odom", "base_link"))
+    listener.until(lambda: len(placed) == len(local) == before + 50)
+    assert local[-1].header.frame_id == "area_0"
+    assert placed[-1].header.frame_id == "map"
+    assert conversions.planar_pose(placed[-1].pose.pose) == pytest.approx([1.5, 2.0, 0.0])
+    assert placed[-1].pose.covariance[0] > placed[before].pose.covariance[0]
+
+
+def test_rtl_publishes_the_transform_from_map_to_odom(listener, start):
+    reason = "tf2_msgs is not installed: run scripts/test.sh, which builds it"
+    TFMessage = pytest.importorskip("tf2_msgs.msg", reason=reason).TFMessage
+    moving = listener.hear(TFMessage, "tf", qos.STREAM)
+    odom = listener.node.create_publisher(OdometryMessage, "odom", qos.SENSOR)
+    estimates = listener.node.create_publisher(String, DOCUMENTS[LocalEstimate], qos.CHAIN)
+    start("rtl")
+    listener.until(lambda: all(publisher.get_subscription_count() for publisher in (odom, estimates)))
+    belief = PoseGaussian(np.array([1.0, 2.0, 0.0]), 1e-4 * np.eye(3))
+    stamp = 0
+    while not moving:
+        stamp += 20_000_000
+        estimates.publish(String(data=encode(LocalEstimate(stamp, 0, 0, belief, np.array([5.0, 0.0, 0.0]), 0))))
+        odom.publish(conversions.odometry_message(Odometry(stamp, np.array([5.0, 0.0, 0.0])), "odom", "base_link"))
+        listener.spin(0.1)
+    (joint,) = moving[0].transforms
+    assert (joint.header.frame_id, joint.child_frame_id) == ("map", "odom")
+    assert (joint.transform.translation.x, joint.transform.translation.y) == pytest.approx((-4.0, 2.0))
+
+
+def test_a_driver_that_may_lose_messages_is_heard_too(listener, start):
+    live = listener.node.create_publisher(OdometryMessage, "odom", qos.LIVE_SENSOR)
+    told = listener.hear(DiagnosticArray, DIAGNOSTICS, qos.STREAM)
+    process = start("rtl")
+    reading = Odometry(0, np.zeros(3))
+
+    def counted():
+        status = level(told, "rtl")
+        return status is not None and any(entry.key == "received Odometry" for entry in status.values)
+
+    while not counted():
+        reading = Odometry(reading.stamp + 20_000_000, reading.pose)
+        live.publish(conversions.odometry_message(reading, "odom", "base_link"))
+        listener.spin(0.1)
+        assert process.poll() is None
+
+
+def test_aam_answers_nothing_it_was_not_asked(listener, start):
+    answers = listener.hear(String, DOCUMENTS[AreaEvents], qos.CHAIN)
+    costs = listener.hear(Float64MultiArray, "hmt/cost", qos.CHAIN)
+    told = listener.hear(DiagnosticArray, DIAGNOSTICS, qos.STREAM)
+    start("aam")
+    listener.until(lambda: told)
+    assert not answers
+    assert not costs
+
+
+def test_a_node_ends_with_the_program_that_started_it(tmp_path, domain):
+    """A helper that dies without a word, as by SIGKILL, leaves no node behind."""
+    script = (
+        "import os, subprocess, sys, time\n"
+        "environment = {**os.environ, 'HMT_SLAM_PARENT': str(os.getpid())}\n"
+        "node = subprocess.Popen([sys.executable, '-m', 'hmt_slam_ros.nodes.rtl_node'], env=environment)\n"
+        "print(node.pid, flush=True)\n"
+        "time.sleep(600)\n"
+    )
+    parent = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True)
+    node = int(parent.stdout.readline())
+    time.sleep(1.5)
+    assert is_alive(node)
+    parent.kill()
+    parent.communicate()
+    deadline = time.monotonic() + 10
+    while is_alive(node):
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
+def is_alive(pid):
+    from pathlib import Path
+
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False

@@ -1,0 +1,86 @@
+"""When the records of a log are due."""
+
+import pytest
+from logs_for_nodes import START, Corridor
+
+pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
+
+from hmt_slam_ros.configuration.tree import Robot
+from hmt_slam_ros.nodes.player import Player
+from hmt_slam_ros.sensing import Odometry, Scan
+
+
+def play(player, until, step=0.001, acknowledge=True):
+    """(time, measurement) of all that is handed out in ``until`` seconds."""
+    out, now = [], 0.0
+    while now < until and not player.ended:
+        while not player.ended and (wait := player.wait(now)) is not None and wait <= 0.0:
+            taken = player.take(now)
+            out.append((now, taken))
+            if acknowledge and isinstance(taken, Scan):
+                player.acknowledge(taken.stamp)
+        now += step
+    return out
+
+
+@pytest.mark.parametrize("rate", [0.5, 1.0, 4.0])
+def test_measurements_come_at_the_rate_of_the_log_times_the_factor(rate):
+    out = play(Player(Corridor(5), Robot(rate=rate)), 10.0)
+    assert len(out) == 22
+    for now, measurement in out:
+        assert now == pytest.approx((measurement.stamp - START) / 1e9 / rate, abs=0.002 + 0.001)
+
+
+def test_rate_0_waits_for_nothing():
+    out = play(Player(Corridor(5), Robot(rate=0.0)), 10.0)
+    assert len(out) == 22
+    assert out[-1][0] == 0.0
+
+
+def test_no_more_scans_are_under_way_than_the_window_holds():
+    player = Player(Corridor(9), Robot(rate=0.0, window=3))
+    out = play(player, 1.0, acknowledge=False)
+    scans = [measurement for _, measurement in out if isinstance(measurement, Scan)]
+    assert len(scans) == 3
+    assert player.held
+    player.acknowledge(scans[1].stamp)
+    assert player.acknowledged == 2
+    assert len(play(player, 1.0, acknowledge=False)) > 2
+    assert player.scans == 5
+
+
+def test_without_pace_nothing_is_held_back():
+    player = Player(Corridor(9), Robot(rate=0.0, paced=False, window=1))
+    play(player, 1.0, acknowledge=False)
+    assert player.ended
+    assert (player.scans, player.odometry) == (9, 33)
+
+
+def test_a_pause_does_not_end_in_a_burst():
+    player = Player(Corridor(9), Robot(rate=1.0))
+    assert play(player, 0.3)
+    player.paused = True
+    assert player.wait(5.0) is None
+    player.paused = False
+    player.take(5.0)
+    assert player.wait(5.0) == pytest.approx(0.05, abs=1e-6)
+
+
+def test_a_log_that_loops_has_stamps_that_go_on_increasing():
+    player = Player(Corridor(3), Robot(rate=0.0, loop=True))
+    taken = []
+    while len(taken) < 40:
+        taken.append(player.take(0.0))
+        player.acknowledge(player.stamp)
+    for kind in (Scan, Odometry):
+        stamps = [measurement.stamp for measurement in taken if isinstance(measurement, kind)]
+        assert all(a < b for a, b in zip(stamps, stamps[1:], strict=False))
+    assert not player.ended
+    assert len(taken[0].pose) == 3
+
+
+def test_an_acknowledgement_of_something_else_changes_nothing():
+    player = Player(Corridor(5), Robot(rate=0.0, window=2))
+    play(player, 1.0, acknowledge=False)
+    player.acknowledge(START - 1)
+    assert player.acknowledged == 0
