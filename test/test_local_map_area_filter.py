@@ -142,3 +142,14 @@ def test_beams_beyond_the_range_tell_free_space_up_to_it():
     assert np.hypot(*(points - (0.2, 0.1)).T).max() <= 5.0
     np.testing.assert_allclose(np.hypot(*(free - (0.2, 0.1)).T), 5.0)
     assert len(points) + len(free) == 181
+
+
+def test_a_keyframe_moved_under_the_leader_moves_alike_under_all_particles():
+    area_filter, _ = driven(LocalMapping(Configuration()), steps=30)
+    before = area_filter.keyframe_poses[:, 2].copy()
+    target = before[area_filter.leader] + np.array([0.03, -0.02, 0.01])
+    area_filter.move_keyframe(2, target)
+    area_filter.move_keyframe(12345, target)
+    np.testing.assert_allclose(area_filter.keyframe_poses[area_filter.leader, 2], target, atol=1e-12)
+    shifts = se2.between(before, area_filter.keyframe_poses[:, 2])
+    np.testing.assert_allclose(shifts, np.broadcast_to(shifts[0], shifts.shape), atol=1e-12)

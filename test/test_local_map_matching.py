@@ -79,14 +79,14 @@ def test_without_points_the_prior_stands(room):
 def test_correlation_finds_the_best_pose_of_its_grid(room):
     truth = np.array([0.4, -0.4, 0.2])
     points = scan_in(ROOM, truth, beams=61).points
-    prior = Prior(truth + (0.3, -0.2, 0.2), np.diag([0.1, 0.1, 0.1]))
+    prior = Prior(truth + np.array([0.3, -0.2, 0.2]), np.diag([0.1, 0.1, 0.1]))
     steps, counts = np.array([0.1, 0.1, 0.05]), np.array([4, 4, 5])
     best = correlative_search(points, prior, steps, counts, room, MODEL, 0.1)
     scores = {}
     for i in range(-4, 5):
         for j in range(-4, 5):
             for k in range(-5, 6):
-                pose = prior.mean + (0.0, 0.0, k * 0.05)
+                pose = prior.mean + np.array([0.0, 0.0, k * 0.05])
                 pose[:2] = se2.transform(prior.mean, np.array([[0.1 * i, 0.1 * j]]))[0]
                 offset = pose - prior.mean
                 scores[tuple(pose)] = 0.1 * log_ratio(points, *pose, room, MODEL) - 0.05 * offset @ offset

@@ -264,6 +264,17 @@ class AreaFilter:
         self.keyframe_areas.append(self.area)
         self.keyframe_poses = np.concatenate((self.keyframe_poses, self.poses[:, None]), axis=1)
 
+    def move_keyframe(self, keyframe: int, pose: Float64) -> None:
+        """Give a keyframe the pose ``map_T_base`` (3,) under the leader, and shift it alike under the others.
+
+        The grid keeps the scan where it is until the local map is built anew.
+        """
+        if keyframe not in self.keyframes:
+            return
+        row = self.keyframes.index(keyframe)
+        shift = se2.between(self.keyframe_poses[self.leader, row], pose)
+        self.keyframe_poses[:, row] = se2.compose(self.keyframe_poses[:, row], shift)
+
     def change_area(self, area: int, area_T_previous: Float64, content: Sequence[PlacedKeyframe]) -> None:
         """Go over to the frame of another area and load its local map, the same for all particles.
 

@@ -129,7 +129,8 @@ class MetricSlam:
             said += self._notice(
                 "order",
                 f"A scan is stamped {scan.stamp / 1e9:.6f} s, not after its predecessor "
-                f"({self._last_stamp / 1e9:.6f} s); scans are taken in the order of their arrival: check the clocks or the order of the log.",
+                f"({self._last_stamp / 1e9:.6f} s); scans are taken in the order of their arrival: check the clocks or "
+                "the order of the log.",
             )
         if not scan.valid.any():
             said += self._notice(
@@ -306,7 +307,11 @@ class MetricSlam:
     def _accept(self, accepted: Accepted) -> None:
         self._replica.accept(accepted)
         if accepted.hypothesis is not None:
-            self._replace_live({accepted.hypothesis: self._live[accepted.hypothesis]})
+            live = self._live[accepted.hypothesis]
+            self._replace_live({accepted.hypothesis: live})
+            for refined in accepted.relabelled:
+                if refined.area == live.filter.area:
+                    live.filter.move_keyframe(refined.keyframe, refined.pose)
         self._waiting = False
 
     def _replace_live(self, live: dict[int, _LiveHypothesis]) -> None:
