@@ -18,7 +18,7 @@ WAIT = 40.0  # s, for what normally takes less than one
 def domain(monkeypatch):
     """A ROS domain in which nobody else is; set for this process and its children."""
     pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
-    from hmt_slam_ros.nodes.domain import own_domain
+    from hmt_slam_ros.nodes.domain import own_domain  # noqa: PLC0415  only where there is ROS
 
     with own_domain() as number:
         monkeypatch.setenv("ROS_DOMAIN_ID", str(number))
@@ -30,9 +30,9 @@ class Listener:
     """A node of the test's own, and what it heard."""
 
     def __init__(self, domain):
-        from rclpy.context import Context
-        from rclpy.executors import SingleThreadedExecutor
-        from rclpy.node import Node
+        from rclpy.context import Context  # noqa: PLC0415  only where there is ROS
+        from rclpy.executors import SingleThreadedExecutor  # noqa: PLC0415
+        from rclpy.node import Node  # noqa: PLC0415
 
         self.context = Context()
         self.context.init(domain_id=domain)

@@ -1,6 +1,7 @@
-"""A small log for the robot node: a drive along a corridor, with odometry faster than the scans."""
+"""For tests of the nodes: a small log of a drive along a corridor, with odometry faster than the scans."""
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from worlds import box, scan_in
@@ -43,3 +44,11 @@ def corridor_bag(folder, scans=12):
     path = folder / "corridor"
     write_bag(Corridor(scans), path)
     return path
+
+
+def is_alive(pid):
+    """Whether an OS process runs."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False

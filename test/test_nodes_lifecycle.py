@@ -3,11 +3,10 @@
 import signal
 import subprocess
 import sys
-import time
 
 import numpy as np
 import pytest
-from logs_for_nodes import corridor_bag
+from logs_for_nodes import corridor_bag, is_alive
 
 pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
 
@@ -31,27 +30,27 @@ def parameters(name, tmp_path):
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=lambda number: number.name)
-@pytest.mark.parametrize("name", NODES)
-def test_a_node_that_runs_ends_well_when_told_to(tmp_path, listener, start, name, number):
+def test_every_node_that_runs_ends_well_when_told_to(tmp_path, listener, start, number):
     told = listener.hear(DiagnosticArray, DIAGNOSTICS, qos.STREAM)
-    process = start(name, **parameters(name, tmp_path))
-    listener.until(lambda: told, alive=[process])
-    assert told[0].status[0].name == f"/{name}"
-    assert told[0].status[0].level == DiagnosticStatus.OK
-    process.send_signal(number)
-    error = process.communicate(timeout=20)[1]
-    assert process.returncode == 0
-    assert "Traceback" not in error
-    assert "terminate called" not in error
+    processes = {name: start(name, **parameters(name, tmp_path)) for name in NODES}
+    listener.until(lambda: all(level(told, name) for name in NODES), alive=processes.values())
+    for name, process in processes.items():
+        assert level(told, name).level == DiagnosticStatus.OK
+        process.send_signal(number)
+    for name, process in processes.items():
+        error = process.communicate(timeout=20)[1]
+        assert process.returncode == 0, name
+        assert "Traceback" not in error, name
+        assert "terminate called" not in error, name
 
 
-@pytest.mark.parametrize("name", NODES)
-def test_a_value_out_of_range_keeps_a_node_from_starting(tmp_path, start, name):
-    process = start(name, filter__particles=0, **parameters(name, tmp_path))
-    error = process.communicate(timeout=40)[1]
-    assert process.returncode == 2
-    assert "filter.particles = 0" in error
-    assert len(error.strip().splitlines()) == 1
+def test_a_value_out_of_range_keeps_every_node_from_starting(tmp_path, start):
+    processes = {name: start(name, filter__particles=0, **parameters(name, tmp_path)) for name in NODES}
+    for name, process in processes.items():
+        error = process.communicate(timeout=40)[1]
+        assert process.returncode == 2, name
+        assert "filter.particles = 0" in error, name
+        assert len(error.strip().splitlines()) == 1, name
 
 
 def test_two_signals_in_a_row_do_no_harm(listener, start):
@@ -183,8 +182,8 @@ def test_aam_answers_nothing_it_was_not_asked(listener, start):
     assert not costs
 
 
-def test_a_node_ends_with_the_program_that_started_it(tmp_path, domain):
-    """A helper that dies without a word, as by SIGKILL, leaves no node behind."""
+def test_a_node_ends_with_the_program_that_started_it(listener):
+    """A program that dies without a word, as by SIGKILL, leaves no node behind."""
     script = (
         "import os, subprocess, sys, time\n"
         "environment = {**os.environ, 'HMT_SLAM_PARENT': str(os.getpid())}\n"
@@ -192,22 +191,11 @@ def test_a_node_ends_with_the_program_that_started_it(tmp_path, domain):
         "print(node.pid, flush=True)\n"
         "time.sleep(600)\n"
     )
+    told = listener.hear(DiagnosticArray, DIAGNOSTICS, qos.STREAM)
     parent = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True)
     node = int(parent.stdout.readline())
-    time.sleep(1.5)
+    listener.until(lambda: told, alive=[parent])
     assert is_alive(node)
     parent.kill()
     parent.communicate()
-    deadline = time.monotonic() + 10
-    while is_alive(node):
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
-
-
-def is_alive(pid):
-    from pathlib import Path
-
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    except OSError:
-        return False
+    listener.until(lambda: not is_alive(node))

@@ -1,5 +1,7 @@
 """When the records of a log are due."""
 
+from itertools import pairwise
+
 import pytest
 from logs_for_nodes import START, Corridor
 
@@ -74,7 +76,7 @@ def test_a_log_that_loops_has_stamps_that_go_on_increasing():
         player.acknowledge(player.stamp)
     for kind in (Scan, Odometry):
         stamps = [measurement.stamp for measurement in taken if isinstance(measurement, kind)]
-        assert all(a < b for a, b in zip(stamps, stamps[1:], strict=False))
+        assert all(a < b for a, b in pairwise(stamps))
     assert not player.ended
     assert len(taken[0].pose) == 3
 

@@ -1,0 +1,153 @@
+"""A whole run of robot and nodes: the same map as in lock-step, and nothing left behind where it fails."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from logs_for_nodes import corridor_bag, is_alive
+
+pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
+
+ROOT = Path(__file__).resolve().parent.parent
+BUNDLED = ROOT / "data" / "malaga_one_loop"
+COMMAND = (sys.executable, "-m", "hmt_slam_ros.cli.main")
+NODES = {"slam", "aam", "tsbi", "tlca", "rtl", "robot"}
+
+
+def children_of(pid):
+    """{node: its process id} of a running replay."""
+    found = {}
+    for folder in Path("/proc").iterdir():
+        if folder.name.isdigit():
+            try:
+                parent = int((folder / "stat").read_text().rpartition(")")[2].split()[1])
+                words = (folder / "cmdline").read_text().split("\0")
+            except (OSError, ValueError):
+                continue
+            module = next((word for word in words if word.startswith("hmt_slam_ros.nodes.")), None)
+            if parent == pid and module:
+                found[module.removeprefix("hmt_slam_ros.nodes.").removesuffix("_node")] = int(folder.name)
+    return found
+
+
+def wait_until(condition, seconds=60.0):
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline, "waited in vain"
+        time.sleep(0.02)
+
+
+@pytest.fixture
+def running(tmp_path):
+    """A replay in real time of a drive of 40 s, that has all its nodes."""
+    log = corridor_bag(tmp_path, 200)
+    process = subprocess.Popen(
+        [*COMMAND, "replay", str(log), "--out", str(tmp_path / "out"), "--rate", "1.0"],
+        cwd=ROOT,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    wait_until(lambda: set(children_of(process.pid)) == NODES or process.poll() is not None)
+    nodes = children_of(process.pid)
+    yield process, nodes
+    process.kill()
+    process.wait()
+    process.stderr.close()
+    wait_until(lambda: not any(is_alive(pid) for pid in nodes.values()))
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory):
+    """The bundled log, mapped by the nodes and in lock-step."""
+    top = tmp_path_factory.mktemp("runs")
+    for command in ("replay", "map"):
+        arguments = [*COMMAND, command, str(BUNDLED), "--out", str(top / command), "--set", "robot.rate=0"]
+        done = subprocess.run(arguments, cwd=ROOT, capture_output=True, text=True, timeout=280, check=False)
+        assert done.returncode == 0, done.stderr
+    return top / "replay", top / "map"
+
+
+@pytest.mark.parametrize("name", ["trajectory.tum", "trajectory_online.tum", "graph.g2o", "pmf.csv", "map.pgm"])
+def test_the_nodes_take_the_same_decisions_as_the_lock_step_run(folders, name):
+    nodes, lock_step = folders
+    assert (nodes / name).read_bytes() == (lock_step / name).read_bytes()
+
+
+def test_the_report_accounts_for_every_scan_and_every_process(folders):
+    report = json.loads((folders[0] / "report.json").read_text())
+    assert report["runtime"] == "nodes"
+    assert report["scans"] == {"in": 225, "processed": 225, "dropped": 0}
+    assert set(report["processes"]) == NODES - {"robot"}
+    assert set(report["peak_rss_bytes"]) == NODES
+    assert all(20e6 < rss < 4e9 for rss in report["peak_rss_bytes"].values())
+    slam = report["processes"]["slam"]
+    assert 0.0 < slam["mean_ms_per_scan"] < slam["max_ms_per_scan"]
+    assert report["cpu_s"] > slam["total_s"]
+
+
+@pytest.mark.parametrize("name", ["tlca", "robot"])
+def test_a_node_that_dies_ends_the_run_with_its_name_and_leaves_nothing(running, tmp_path, name):
+    process, nodes = running
+    os.kill(nodes[name], signal.SIGKILL)
+    error = process.communicate(timeout=40)[1]
+    assert process.returncode == 2
+    assert f"the node {name} ended with status -9" in error
+    assert not (tmp_path / "out").exists()
+    assert {entry.name for entry in tmp_path.iterdir()} == {"corridor"}
+    assert not any(is_alive(pid) for pid in nodes.values())
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_run_that_is_stopped_takes_its_nodes_with_it(running, tmp_path, number, status):
+    process, nodes = running
+    process.send_signal(number)
+    error = process.communicate(timeout=40)[1]
+    assert process.returncode == status
+    assert "Traceback" not in error
+    assert not any(is_alive(pid) for pid in nodes.values())
+    assert {entry.name for entry in tmp_path.iterdir()} == {"corridor"}
+
+
+def test_a_run_that_is_killed_takes_its_nodes_with_it(running):
+    process, nodes = running
+    process.kill()
+    process.communicate()
+    wait_until(lambda: not any(is_alive(pid) for pid in nodes.values()))
+
+
+def test_a_run_that_stands_still_names_the_node_it_waits_for(tmp_path):
+    script = (
+        "import sys\n"
+        "from pathlib import Path\n"
+        "from hmt_slam_ros.configuration import load_configuration\n"
+        "from hmt_slam_ros.errors import HmtSlamError\n"
+        "from hmt_slam_ros.nodes.replay import replay\n"
+        "try:\n"
+        f"    replay(Path({str(corridor_bag(tmp_path, 200))!r}), Path({str(tmp_path / 'out')!r}),\n"
+        "           load_configuration(settings=['robot.rate=1.0']), stall=6.0)\n"
+        "except HmtSlamError as error:\n"
+        "    sys.exit(str(error))\n"
+    )
+    process = subprocess.Popen([sys.executable, "-c", script], cwd=ROOT, stderr=subprocess.PIPE, text=True)
+    wait_until(lambda: "aam" in children_of(process.pid) or process.poll() is not None)
+    os.kill(children_of(process.pid)["aam"], signal.SIGSTOP)
+    error = process.communicate(timeout=100)[1]
+    assert process.returncode == 1
+    assert "the run waits for the node aam" in error
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_truncated_log_is_one_sentence_before_anything_starts(tmp_path):
+    log = corridor_bag(tmp_path)
+    (storage,) = log.glob("*.mcap")
+    storage.write_bytes(storage.read_bytes()[: storage.stat().st_size // 2])
+    arguments = [*COMMAND, "replay", str(log), "--out", str(tmp_path / "out")]
+    done = subprocess.run(arguments, cwd=ROOT, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 2
+    assert len(done.stderr.strip().splitlines()) == 1
+    assert not (tmp_path / "out").exists()
