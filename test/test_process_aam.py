@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-import rooms
+import worlds
 
 from hmt_slam_ros.configuration import Configuration, with_changes
 from hmt_slam_ros.geometry import se2
@@ -21,8 +21,8 @@ from hmt_slam_ros.processes.messages import (
     Relabelled,
 )
 
-WORLD = rooms.two_rooms()
-THERE = rooms.drive((1.0, 2.0), (4.0, 3.0), (8.0, 3.0), (10.5, 3.5), (10.5, 5.0), (7.5, 5.0), (7.5, 2.0))
+WORLD = worlds.two_rooms()
+THERE = worlds.drive((1.0, 2.0), (4.0, 3.0), (8.0, 3.0), (10.5, 3.5), (10.5, 5.0), (7.5, 5.0), (7.5, 2.0))
 OPTIONS = {"aam.ncut_threshold": 0.8, "aam.overlap_radius": 0.15, "aam.persistence": 1}
 
 
@@ -39,7 +39,7 @@ def estimate(hypothesis, area, pose, stored=True):
 
 
 def keyframe(k, world_pose, *leaves):
-    return Keyframe(k, rooms.scan_at(WORLD, world_pose), 0.5 * k, leaves)
+    return Keyframe(k, worlds.scan_at(WORLD, world_pose), 0.5 * k, leaves)
 
 
 def stay(k, *hypotheses, area=0):
@@ -86,7 +86,7 @@ def test_the_second_room_is_cut_off_from_the_first():
 
 def test_a_robot_that_goes_about_in_one_room_stays_in_its_area():
     process = aam()
-    for k, pose in enumerate(rooms.drive((1.0, 1.0), (5.0, 1.0), (5.0, 4.0), (2.0, 4.0), (2.0, 2.0))):
+    for k, pose in enumerate(worlds.drive((1.0, 1.0), (5.0, 1.0), (5.0, 4.0), (2.0, 4.0), (2.0, 2.0))):
         assert process.handle(keyframe(k, pose, estimate(0, 0, pose)))[0].events == ()
         process.handle(stay(k, 0))
 
@@ -122,7 +122,7 @@ def test_every_keyframe_is_answered_once_and_nothing_else_is():
     assert process.handle(stay(0, 0)) == []
     assert process.handle(Accepted(0)) == []
     assert process.handle(LocalEstimate(0, 0, 0, exact(np.zeros(3)), np.zeros(3), 0)) == []
-    assert process.handle(rooms.scan_at(WORLD, THERE[0])) == []
+    assert process.handle(worlds.scan_at(WORLD, THERE[0])) == []
 
 
 def test_the_keyframes_that_left_begin_the_new_area():
@@ -179,7 +179,7 @@ def answered_in_first_room(process):
 
 def drive_back(process):
     """Drive back into the first room over known ground until something happens; (keyframe, world pose, event)."""
-    back = rooms.drive((7.5, 2.0), (7.5, 3.0), (5.0, 3.0), (1.0, 2.0))
+    back = worlds.drive((7.5, 2.0), (7.5, 3.0), (5.0, 3.0), (1.0, 2.0))
     for k, pose in enumerate(back, start=answered_in_first_room(process)):
         leaf = estimate(0, 1, se2.between(THERE[0], pose), stored=False)
         (answer,) = process.handle(keyframe(k, pose, leaf))
@@ -225,7 +225,7 @@ def test_the_robots_own_keyframes_stay_where_they_are_and_become_known_ground():
     k, _, event = drive_back(process)
     process.handle(stay(k, 0, area=event.area))
     # In room 0 again: its keyframes are known ground and cannot leave it, however few of them are asked for.
-    for step, pose in enumerate(rooms.drive((4.0, 4.0), (4.0, 2.0)), start=k + 1):
+    for step, pose in enumerate(worlds.drive((4.0, 4.0), (4.0, 2.0)), start=k + 1):
         (answer,) = process.handle(keyframe(step, pose, estimate(0, 0, se2.between(THERE[0], pose))))
         cut = [event for event in answer.events if event.kind == "cut"]
         assert all(min(event.keyframes) > k for event in cut)

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import rooms
+import worlds
 
 from hmt_slam_ros.configuration import Configuration, with_changes
 from hmt_slam_ros.geometry import se2
@@ -22,7 +22,7 @@ from hmt_slam_ros.processes.messages import (
 )
 from hmt_slam_ros.processes.tlca import Tlca
 
-WORLD = rooms.two_rooms()
+WORLD = worlds.two_rooms()
 SPREAD = np.diag([0.1**2, 0.1**2, 0.02**2])
 HOME = np.array([1.0, 2.0, 0.0])  # where the map's frame lies in the world
 
@@ -52,7 +52,7 @@ class Play:
             leaves = [self._with_first_keyframe(leaf, replica) for leaf in leaves]
         estimates = tuple(LeafEstimate(h, area, belief(pose), True, 0.0, 12.0) for h, area, pose in places)
         travelled = 0.5 * self.k if travelled is None else travelled
-        assert self.process.handle(Keyframe(self.k, rooms.scan_at(WORLD, world), travelled, estimates)) == []
+        assert self.process.handle(Keyframe(self.k, worlds.scan_at(WORLD, world), travelled, estimates)) == []
         said = self.process.handle(Hypotheses(self.k, tuple(leaves) or (Leaf(0, 0, 1.0, 0),)))
         verdicts = [message for message in said if isinstance(message, Accepted)]
         self.notices += [message for message in said if isinstance(message, Notice)]
@@ -258,8 +258,8 @@ def test_arcs_are_never_more_certain_than_the_floor():
     assert np.degrees(sigma[2]) >= 1.0 - 1e-9
 
 
-ROOM_A = rooms.drive((1.0, 2.0), (4.5, 3.0), (4.0, 5.0))
-ROOM_B = rooms.drive((7.0, 3.0), (10.0, 4.0))
+ROOM_A = worlds.drive((1.0, 2.0), (4.5, 3.0), (4.0, 5.0))
+ROOM_B = worlds.drive((7.0, 3.0), (10.0, 4.0))
 
 
 def closing_play(error, spread=SPREAD):
@@ -278,7 +278,7 @@ def closing_play(error, spread=SPREAD):
             else Leaf(0, 0, 1.0, 1)
         )
         play.step(leaf, places=[(0, area, where)], world=pose)
-    back = rooms.drive((3.5, 2.0), (2.0, 3.5))
+    back = worlds.drive((3.5, 2.0), (2.0, 3.5))
     first = play.k + 1
     for pose in back[:-1]:
         play.step(Leaf(0, 0, 1.0, 1), places=[(0, 1, se2.between(ROOM_B[0], pose))], world=pose)
@@ -310,7 +310,7 @@ def test_an_arc_found_between_areas_that_keep_their_keyframes_is_finely_aligned(
         play.step(places=[(0, 0, se2.between(ROOM_A[0], pose))], world=pose)
     play.step(new_area(0, 0, 1.0, 1, [6.0, 0.0, 0.0]), world=ROOM_B[0])
     # Area 2 is taken for new ground, though it lies in the first room.
-    again = rooms.drive((3.5, 2.0), (2.0, 3.5))
+    again = worlds.drive((3.5, 2.0), (2.0, 3.5))
     play.step(new_area(0, 0, 1.0, 2, [0.0, 6.0, 0.0], source=1), world=again[0])
     for pose in again[1:]:
         play.step(Leaf(0, 0, 1.0, 2), places=[(0, 2, se2.between(again[0], pose))], world=pose)
@@ -370,7 +370,7 @@ def test_messages_of_others_are_ignored():
     play = Play()
     play.start()
     assert play.process.handle(AreaEvents(0, ())) == []
-    assert play.process.handle(rooms.scan_at(WORLD, HOME)) == []
+    assert play.process.handle(worlds.scan_at(WORLD, HOME)) == []
 
 
 def test_the_same_messages_give_the_same_verdicts():

@@ -1,16 +1,16 @@
-"""Fine alignment of keyframes that joined an area, in a world of rooms."""
+"""Fine alignment of keyframes that joined an area, in a world of worlds."""
 
 import numpy as np
 import pytest
-import rooms
+import worlds
 
 from hmt_slam_ros.configuration import Configuration, with_changes
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.topology.fine_alignment import FineAlignment
 
-ROOMS = rooms.two_rooms()
+ROOMS = worlds.two_rooms()
 # An endless corridor leaves the direction along it open.
-CORRIDOR = np.array([[[-100.0, 0.0], [100.0, 0.0]], [[-100.0, 2.0], [100.0, 2.0]]])
+CORRIDOR = np.array([[-100.0, 0.0, 100.0, 0.0], [-100.0, 2.0, 100.0, 2.0]])
 LOOSE = np.diag([0.3**2, 0.3**2, 0.05**2])
 
 
@@ -19,15 +19,15 @@ def alignment():
     return FineAlignment(Configuration())
 
 
-def placed(walls, poses, error=None, beams=rooms.BEAMS):
+def placed(walls, poses, error=None, beams=180):
     """Scans at the poses, put down with a common error in the area's frame."""
     put = poses if error is None else se2.compose(error, poses)
     rng = np.random.default_rng(8)
-    return [(rooms.scan_at(walls, pose, 0.01, rng, beams), where) for pose, where in zip(poses, put, strict=True)]
+    return [(worlds.scan_at(walls, pose, 0.01, rng, beams), where) for pose, where in zip(poses, put, strict=True)]
 
 
-KNOWN = rooms.drive((1.0, 2.0), (4.5, 3.0), (4.0, 5.0))
-JOINED = rooms.drive((3.5, 2.0), (2.0, 3.5))
+KNOWN = worlds.drive((1.0, 2.0), (4.5, 3.0), (4.0, 5.0))
+JOINED = worlds.drive((3.5, 2.0), (2.0, 3.5))
 
 
 @pytest.mark.parametrize("error", [[0.08, -0.06, 0.02], [-0.15, 0.1, -0.03], [0.0, 0.2, 0.0]])
@@ -54,7 +54,7 @@ def test_a_motion_outside_the_gate_of_the_closure_is_refused(alignment):
 def test_along_a_corridor_the_closure_decides_and_across_it_the_walls():
     # Dense scans of short range: single points far down a wall would stand for features that are not there.
     alignment = FineAlignment(with_changes(Configuration(), {"local_map.max_range": 5.0}))
-    known = rooms.drive((0.0, 1.0), (6.0, 1.0))
+    known = worlds.drive((0.0, 1.0), (6.0, 1.0))
     error = np.array([0.15, 0.1, 0.0])
     joined = np.add(known[3:8], [0.23, 0.1, 0.1])
     motion = alignment.offset(placed(CORRIDOR, known, beams=720), placed(CORRIDOR, joined, error, 720), LOOSE)

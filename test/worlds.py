@@ -1,4 +1,9 @@
-"""Small worlds of wall segments, and the scans that a laser would take in them."""
+"""Small worlds of wall segments, the scans that a laser would take in them, and drives through them.
+
+Walls are arrays (n, 4): x, y of both ends, m.
+"""
+
+from itertools import pairwise
 
 import numpy as np
 
@@ -9,24 +14,54 @@ RANGE_MAX = 30.0
 
 
 def box(x0, y0, x1, y1):
-    """The four walls of a room, shape (4, 4): x, y of both ends."""
+    """The four walls of a room."""
     return np.array([[x0, y0, x1, y0], [x1, y0, x1, y1], [x1, y1, x0, y1], [x0, y1, x0, y0]], dtype=float)
 
 
-def scan_in(walls, pose, stamp=0, beams=181, field_of_view=np.pi, noise=0.0, seed=0, laser_pose=(0.0, 0.0, 0.0)):
-    """The scan at ``world_T_base`` among walls (n, 4); beams that meet no wall report RANGE_MAX."""
-    sensor = se2.compose(pose, laser_pose)
-    angles = np.linspace(-field_of_view / 2, field_of_view / 2, beams)
+def two_rooms():
+    """Rooms of 6 m x 6 m on both sides of a wall at x = 6 m with a door of 1 m, each with a box in a corner."""
+    outer = box(0.0, 0.0, 12.0, 6.0)
+    doorway = np.array([[6.0, 0.0, 6.0, 2.5], [6.0, 3.5, 6.0, 6.0]])
+    return np.concatenate((outer, doorway, box(0.5, 4.5, 1.5, 5.5), box(10.0, 0.5, 11.5, 1.5)))
+
+
+def distances(walls, sensor, angles):
+    """Distance from ``world_T_laser`` to the nearest wall along each angle, shape (n,), m; inf where there is none."""
     directions = np.stack((np.cos(angles + sensor[2]), np.sin(angles + sensor[2])), axis=1)
-    start, along = walls[:, :2], walls[:, 2:] - walls[:, :2]
-    offset = start - sensor[:2]
+    offset, along = walls[:, :2] - sensor[:2], walls[:, 2:] - walls[:, :2]
     cross = directions[:, None, 0] * along[None, :, 1] - directions[:, None, 1] * along[None, :, 0]
     with np.errstate(divide="ignore", invalid="ignore"):
         distance = (offset[None, :, 0] * along[None, :, 1] - offset[None, :, 1] * along[None, :, 0]) / cross
-        fraction = (
-            offset[None, :, 0] * directions[:, None, 1] - offset[None, :, 1] * directions[:, None, 0]
-        ) / cross
-    distance = np.where((distance > 1e-6) & (fraction >= 0.0) & (fraction <= 1.0), distance, np.inf)
-    ranges = distance.min(axis=1) + noise * np.random.default_rng(seed).standard_normal(beams)
-    ranges = np.where(np.isfinite(ranges), np.minimum(ranges, RANGE_MAX), RANGE_MAX).astype(np.float32)
-    return Scan(stamp, ranges, angles[0], angles[1] - angles[0], 0.0, RANGE_MAX, np.asarray(laser_pose, dtype=float))
+        share = (offset[None, :, 0] * directions[:, None, 1] - offset[None, :, 1] * directions[:, None, 0]) / cross
+    return np.where((distance > 1e-6) & (share >= 0.0) & (share <= 1.0), distance, np.inf).min(axis=1)
+
+
+def scan_in(walls, pose, stamp=0, beams=181, field_of_view=np.pi, noise=0.0, seed=0, laser_pose=(0.0, 0.0, 0.0)):
+    """The scan at ``world_T_base``; beams that meet no wall report RANGE_MAX."""
+    angles = np.linspace(-field_of_view / 2, field_of_view / 2, beams)
+    ranges = distances(walls, se2.compose(pose, laser_pose), angles)
+    ranges = np.minimum(ranges + noise * np.random.default_rng(seed).standard_normal(beams), RANGE_MAX)
+    return Scan(
+        stamp, ranges.astype(np.float32), angles[0], angles[1] - angles[0], 0.0, RANGE_MAX,
+        np.asarray(laser_pose, dtype=float),
+    )  # fmt: skip
+
+
+def scan_at(walls, pose, noise=0.0, rng=None, beams=180):
+    """The scan of a laser that sees all round, no angle twice."""
+    angles = np.linspace(-np.pi, np.pi, beams, endpoint=False)
+    ranges = distances(walls, np.asarray(pose, dtype=float), angles)
+    if rng is not None:
+        ranges = ranges + rng.normal(size=beams) * noise
+    return Scan(0, ranges.astype(np.float32), -np.pi, 2.0 * np.pi / beams, 0.05, RANGE_MAX)
+
+
+def drive(*corners, step=0.5):
+    """Poses every ``step`` m along the straight lines between the corners, looking ahead, shape (n, 3)."""
+    poses = []
+    for start, end in pairwise(corners):
+        leg = np.subtract(end, start)
+        length = np.hypot(*leg)
+        heading = np.arctan2(leg[1], leg[0])
+        poses += [[*(start + leg * s / length), heading] for s in np.arange(0.0, length - 1e-9, step)]
+    return np.array(poses)
