@@ -1,8 +1,10 @@
 """JSON documents: what is sent comes back bit for bit, and what is malformed is refused by name."""
 
 import json
+import re
 import types
 from dataclasses import fields, is_dataclass
+from pathlib import Path
 from typing import Literal, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
@@ -141,3 +143,22 @@ def test_json_that_is_no_document_is_refused(text):
 
 def test_a_status_is_readable_by_people():
     assert json.loads(encode(STATUS))["state"] == "playing"
+
+
+def test_the_examples_in_the_documentation_are_documents_and_all_of_them():
+    text = (Path(__file__).resolve().parent.parent / "docs" / "messages.md").read_text()
+    examples = re.findall(r"```json\n(.*?)\n```", text, re.DOTALL)
+    by_name = {json.loads(encode(decode_any(example)))["document"] for example in examples}
+    assert len(examples) == len(by_name) == len(KINDS)
+
+
+def decode_any(text):
+    """The one kind of document that a text is."""
+    decoded = []
+    for kind in KINDS:
+        try:
+            decoded.append(decode(text, kind))
+        except HmtSlamError:
+            continue
+    assert len(decoded) == 1, text
+    return decoded[0]
