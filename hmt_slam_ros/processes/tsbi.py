@@ -19,14 +19,19 @@ from hmt_slam_ros.processes.messages import (
     Hypotheses,
     Keyframe,
     Leaf,
+    LeafEstimate,
     LocalArea,
     Message,
 )
 from hmt_slam_ros.processes.replica import FIRST_HYPOTHESIS, Replica
 from hmt_slam_ros.processes.tsbi_branching import Branches, Branching, Child, Parent
 from hmt_slam_ros.random_streams import Purpose, stream
+from hmt_slam_ros.sensing import Scan
 from hmt_slam_ros.topology.hypothesis_tree import LeafNotes, Settled, settle
 from hmt_slam_ros.topology.surroundings import agreeing, areas_around
+
+# Keyframe events in a row that the robot has to spend in an area of the local map before an arc joins it.
+_ASTRAY = 3
 
 
 class Tsbi:
@@ -41,8 +46,8 @@ class Tsbi:
         self._replica = Replica()
         self._branching = Branching(configuration, self._replica)
         self._notes = {FIRST_HYPOTHESIS: LeafNotes()}
-        self._evidence: dict[int, float] = {}
-        self._keyframe = -1
+        self._keyframe: Keyframe | None = None
+        self._estimates: dict[int, LeafEstimate] = {}
         self._next_hypothesis = FIRST_HYPOTHESIS + 1
         self._unexamined = 0.0
         self._global_poses: dict[int, NDArray[np.float64]] = {}
@@ -60,8 +65,8 @@ class Tsbi:
     def _note(self, keyframe: Keyframe) -> None:
         """Store the keyframe and what its scan says of every hypothesis."""
         self._replica.add(keyframe)
-        self._keyframe = keyframe.sequence
-        self._evidence = {leaf.hypothesis: leaf.log_evidence for leaf in keyframe.leaves}
+        self._keyframe = keyframe
+        self._estimates = {leaf.hypothesis: leaf for leaf in keyframe.leaves}
         for leaf in keyframe.leaves:
             if leaf.stored and leaf.hypothesis in self._notes:
                 notes = self._notes[leaf.hypothesis]
@@ -69,13 +74,15 @@ class Tsbi:
 
     def _infer(self, events: AreaEvents) -> Hypotheses:
         """Weight, branch, normalise, reduce."""
-        if events.sequence != self._keyframe:
+        if self._keyframe is None or self._keyframe.sequence != events.sequence:
+            last = "none" if self._keyframe is None else self._keyframe.sequence
             raise HmtSlamError(
-                f"area events {events.sequence} came after keyframe {self._keyframe}: a message was lost, start again"
+                f"area events {events.sequence} came, but the last keyframe is {last}: a message was lost, start again"
             )
         self._branching.begin_event()
         by_hypothesis = {event.hypothesis: event for event in events.events}
-        branches = [self._branch(hypothesis, by_hypothesis.get(hypothesis)) for hypothesis in sorted(self._notes)]
+        scan = self._keyframe.scan
+        branches = [self._branch(hypothesis, by_hypothesis.get(hypothesis), scan) for hypothesis in sorted(self._notes)]
         children = [child for branch in branches for child in branch.children]
         settled = self._settle(events.sequence, children, branches)
         chosen = [children[k] for k in settled.kept]
@@ -86,19 +93,27 @@ class Tsbi:
         leaves = tuple(sorted(loaded, key=lambda leaf: leaf.hypothesis))
         return Hypotheses(events.sequence, leaves, settled.unexamined)
 
-    def _branch(self, hypothesis: int, event: AreaEvent | None) -> Branches:
+    def _branch(self, hypothesis: int, event: AreaEvent | None, scan: Scan) -> Branches:
         """The continuations of one hypothesis, each with its weight."""
-        probability = self._replica.probabilities[hypothesis]
-        log_weight = math.log(max(probability, 1e-300)) + self._evidence.get(hypothesis, 0.0)
-        notes, area = self._notes[hypothesis], self._replica.areas[hypothesis]
-        parent = Parent(hypothesis, area, self._replica.maps[hypothesis], notes, log_weight)
+        estimate = self._estimates[hypothesis]
+        log_weight = math.log(max(self._replica.probabilities[hypothesis], 1e-300)) + estimate.log_evidence
+        area, hybrid_map = self._replica.areas[hypothesis], self._replica.maps[hypothesis]
+        parent = Parent(hypothesis, area, hybrid_map, self._notes[hypothesis], log_weight)
         if event is not None and event.kind == "cut":
             return self._branching.cut(parent, event.keyframes)
         if event is not None:
             return self._branching.move(parent, event.area)
+        return self._go_on(parent, estimate, scan)
+
+    def _go_on(self, parent: Parent, estimate: LeafEstimate, scan: Scan) -> Branches:
+        """No area was left; but the robot may be in known ground that area abstraction does not know to be near."""
+        notes = parent.notes.seen_in(self._branching.astray(parent, estimate.pose.mean))
+        parent = replace(parent, notes=notes)
+        if notes.astray is not None and notes.astray[1] >= _ASTRAY:
+            return self._branching.link(parent, notes.astray[0], scan, estimate.pose)
         if len(notes.unchecked) >= self._options.recheck_keyframes:
             return self._branching.recheck(parent)
-        return Branches([Child(hypothesis, log_weight, area, notes)])
+        return Branches([Child(parent.hypothesis, parent.log_weight, parent.area, notes)])
 
     def _settle(self, sequence: int, children: Sequence[Child], branches: Sequence[Branches]) -> Settled:
         generator = stream(self._seed, Purpose.HYPOTHESES, sequence)
@@ -139,9 +154,9 @@ class Tsbi:
         """The leaf with the areas that its local map must hold, where that is to be loaded anew."""
         if not child.reload:
             return leaf
-        around = areas_around(self._replica.maps[leaf.hypothesis], leaf.area, self._branching.nearness)
+        around = areas_around(self._replica.maps[leaf.hypothesis], leaf.area, self._branching.search.nearness)
         poses = {
-            area: agreeing(belief, leaf.area, area, self._global_poses, self._branching.gate)
+            area: agreeing(belief, leaf.area, area, self._global_poses, self._branching.search.gate)
             for area, belief in around.items()
             if area != leaf.area
         }

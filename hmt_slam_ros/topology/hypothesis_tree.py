@@ -25,12 +25,15 @@ class LeafNotes:
         known area once.
     :ivar local: {area: ``current_T_area``} of the areas in the local map besides the robot's own.
     :ivar unchecked: the unsettled keyframes that no re-check has looked at.
+    :ivar astray: the area of the local map, joined to the robot's own by no arc, in whose place the robot seems to be,
+        and for how many keyframe events in a row; or None.
     """
 
     covariances: Mapping[int, Covariance] = field(default_factory=dict)
     compared: Mapping[int, frozenset[int]] = field(default_factory=dict)
     local: Mapping[int, NDArray[np.float64]] = field(default_factory=dict)
     unchecked: tuple[int, ...] = ()
+    astray: tuple[int, int] | None = None
 
     def stored(self, keyframe: int, covariance: Covariance) -> LeafNotes:
         """After a keyframe entered the robot's area."""
@@ -42,6 +45,11 @@ class LeafNotes:
         """After keyframes were compared with known areas."""
         added = {area: self.compared.get(area, frozenset()) | set(keyframes) for area in areas}
         return replace(self, compared={**self.compared, **added}, unchecked=())
+
+    def seen_in(self, area: int | None) -> LeafNotes:
+        """After a keyframe event at which the robot seemed to be in ``area`` of the local map, or in none such."""
+        times = self.astray[1] if self.astray is not None and self.astray[0] == area else 0
+        return replace(self, astray=None if area is None else (area, times + 1))
 
     def entered(self, covariances: Mapping[int, Covariance]) -> LeafNotes:
         """After the robot entered another area together with the keyframes of ``covariances``."""

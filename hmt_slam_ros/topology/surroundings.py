@@ -41,22 +41,27 @@ def areas_around(
 ) -> dict[int, PoseGaussian]:
     """{other area: belief over ``area_T_other``}, the area itself first, then by growing uncertainty."""
     beliefs = reachable(hybrid_map, area, nearness.sigma**2, _MOST_AROUND)
-    here = _positions(hybrid_map, area, np.zeros(3))
+    here = positions(hybrid_map, area, np.zeros(3))
     found = {}
     for other, belief in beliefs.items():
-        near = other == area or _gap(here, _positions(hybrid_map, other, belief.mean)) <= nearness.reach
+        near = other == area or gap(here, positions(hybrid_map, other, belief.mean)) <= nearness.reach
         if near and other not in without:
             found[other] = belief
     return found
 
 
-def _positions(hybrid_map: HybridMap, area: int, pose: Pose) -> NDArray[np.float64]:
+def stacked(poses: Mapping[int, Pose]) -> NDArray[np.float64]:
+    """The poses as an array, shape (n, 3)."""
+    return np.array(list(poses.values())).reshape(-1, 3)
+
+
+def positions(hybrid_map: HybridMap, area: int, pose: Pose) -> NDArray[np.float64]:
     """Positions of an area's keyframes, shape (n, 2), where the area's frame stands at ``pose``."""
-    poses = np.array(list(hybrid_map.keyframes(area).values())).reshape(-1, 3)
-    return se2.transform(pose, poses[:, :2])
+    return se2.transform(pose, stacked(hybrid_map.keyframes(area))[:, :2])
 
 
-def _gap(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
+def gap(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
+    """Distance between the nearest points of two sets (n, 2), (m, 2), m; inf where one is empty."""
     between = a[:, None] - b[None]
     return float(np.hypot(between[..., 0], between[..., 1]).min(initial=np.inf))
 
@@ -86,7 +91,7 @@ class Views:
 
     def grid(self, keyframes: Mapping[int, Pose]) -> AreaGrid:
         """What the keyframes saw, placed at the given poses."""
-        poses = np.array(list(keyframes.values())).reshape(-1, 3)
+        poses = stacked(keyframes)
         key = np.array(list(keyframes), dtype=np.int64).tobytes() + poses.tobytes()
         if key not in self._grids:
             self._grids[key] = build_area_grid([self._scans[k] for k in keyframes], poses, self._model)
@@ -110,5 +115,4 @@ class Views:
             for keyframe, at in hybrid_map.keyframes(other).items():
                 keyframes[keyframe] = se2.compose(pose, at)
                 owners.append(other)
-        positions = np.array(list(keyframes.values())).reshape(-1, 3)[:, :2]
-        return Place(area, np.array(owners, dtype=np.int64), positions, self.grid(keyframes))
+        return Place(area, np.array(owners, dtype=np.int64), stacked(keyframes)[:, :2], self.grid(keyframes))

@@ -1,0 +1,194 @@
+"""In which known areas may some keyframes lie, and how do they fit there? Prior, appearance and evidence of Eq. (6)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from hmt_slam_ros.configuration.tree import Configuration
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.sensing import Scan
+from hmt_slam_ros.topology.appearance import appearance_log_ratio, signature
+from hmt_slam_ros.topology.area_grid import GridModel, build_area_grid
+from hmt_slam_ros.topology.area_matching import MatchSettings, Mode, match
+from hmt_slam_ros.topology.hybrid_map import HybridMap
+from hmt_slam_ros.topology.shortest_path import reachable
+from hmt_slam_ros.topology.surroundings import Nearness, Views, gap, positions, stacked
+from hmt_slam_ros.topology.transition import Place, Transition, entry_probability, owner_at, transition
+
+Pose = NDArray[np.float64]
+
+# Bounds the search for candidates in maps with thousands of areas within the limit of certainty.
+_MOST_AREAS = 500
+
+
+@dataclass(frozen=True, eq=False)
+class Query:
+    """Keyframes in question.
+
+    :ivar belief: over ``area_T_reference``, of the area that they are in; the reference is the first keyframe.
+    :ivar poses: {keyframe: ``reference_T_base``}.
+    """
+
+    belief: PoseGaussian
+    poses: Mapping[int, Pose]
+
+    @property
+    def in_area(self) -> NDArray[np.float64]:
+        """``area_T_base`` of the keyframes, shape (n, 3)."""
+        return se2.compose(self.belief.mean, stacked(self.poses))
+
+
+class Fit(NamedTuple):
+    """One way in which the keyframes lie in a known area; ``log_weight`` = log pi p(phi) p(z), relative to unknown."""
+
+    area: int
+    mode: Mode
+    log_weight: float
+
+
+class Comparison(NamedTuple):
+    """What came of comparing keyframes with the known areas.
+
+    :ivar transition: pi of the known areas and of new ground.
+    :ivar fits: all modes in all areas that were examined.
+    :ivar examined: those areas.
+    :ivar skipped: probability of those that were not.
+    """
+
+    transition: Transition
+    fits: tuple[Fit, ...]
+    examined: tuple[int, ...]
+    skipped: float
+
+
+class _Candidate(NamedTuple):
+    """A known area, the belief over ``candidate_T_reference`` by the arcs, the keyframes not yet compared with it."""
+
+    place: Place
+    prior: PoseGaussian
+    fresh: Mapping[int, Pose]
+
+
+class ClosureSearch:
+    """Compares keyframes with the areas of a hybrid map."""
+
+    def __init__(self, configuration: Configuration, scans: Mapping[int, Scan]) -> None:
+        """:param scans: {keyframe: scan}, which may grow."""
+        self._options = options = configuration.tsbi
+        self._scans = scans
+        self.gate = float(chi2.ppf(options.gate_probability, 3))
+        self.nearness = Nearness(options.local_sigma, options.local_reach)
+        self._settings = MatchSettings(temper=options.temper, gate=self.gate, max_modes=options.max_modes)
+        self._model = GridModel(
+            options.search_cell, options.surface_sigma, options.surface_ratio, options.free_ratio,
+            configuration.local_map.max_range, options.sample_spacing,
+        )  # fmt: skip
+        self._views = Views(scans, self._model, self.nearness)
+
+    def tracked_area(
+        self, hybrid_map: HybridMap, area: int, around: Mapping[int, Pose], poses: NDArray[np.float64]
+    ) -> int | None:
+        """The area in whose place most of the poses lie, of areas whose position is certain.
+
+        :param area: in whose frame the poses are.
+        :param around: {other area: ``area_T_other``}.
+        :param poses: shape (n, 3), ``area_T_base``.
+        """
+        gaps = [gap(poses[:, :2], positions(hybrid_map, other, pose)) for other, pose in around.items()]
+        if min(gaps, default=math.inf) > self._options.place_radius:
+            return None
+        return owner_at(self._views.place_of(hybrid_map, area, around), poses, self._options.place_radius)
+
+    def measured(
+        self, hybrid_map: HybridMap, other: int, without: int, scan: Scan, prior: PoseGaussian
+    ) -> PoseGaussian | None:
+        """The belief over ``other_T_base`` of a scan from its match with a known area, or None where it fits nowhere.
+
+        :param without: an area that is left out of the map.
+        :param prior: over ``other_T_base``.
+        """
+        place = self._views.place(hybrid_map, other, (without,))
+        query = build_area_grid([scan], np.zeros((1, 3)), self._model)
+        found = match(query, place.grid, prior, self._settings).modes
+        return found[0].measured if found else None
+
+    def compare(
+        self, hybrid_map: HybridMap, area: int, query: Query, compared: Mapping[int, Collection[int]],
+        excluded: Collection[int],
+    ) -> Comparison:
+        """Prior, appearance and evidence of all admitted areas.
+
+        :param area: the area that the keyframes are in.
+        :param compared: {known area: keyframes that were compared with it}.
+        :param excluded: areas that are neither candidates nor part of a candidate's map.
+        """  # fmt: skip
+        candidates = {c.place.area: c for c in self._candidates(hybrid_map, area, query, compared, excluded)}
+        radius = self._options.place_radius
+        entries = {
+            known: entry_probability(c.place, c.prior, stacked(c.fresh), radius) for known, c in candidates.items()
+        }
+        shares = {known: share for known, share in entries.items() if share > 0.0}
+        model = transition(shares, self._options.new_probability)
+        ranked = sorted(shares, key=lambda known: (-shares[known], known))
+        examined, rest = ranked[: self._options.max_candidates], ranked[self._options.max_candidates :]
+        fits = [
+            Fit(known, mode, math.log(model.known[known] / shares[known]) + look + mode.log_mass)
+            for known in examined
+            for look, mode in self._fits(hybrid_map, candidates[known])
+        ]
+        return Comparison(model, tuple(fits), tuple(examined), sum(model.known[known] for known in rest))
+
+    def _candidates(
+        self, hybrid_map: HybridMap, area: int, query: Query, compared: Mapping[int, Collection[int]],
+        excluded: Collection[int],
+    ) -> Iterator[_Candidate]:
+        """The known areas whose keyframes the query can be near to under the arcs' belief."""
+        limit = self._options.prior_limit**2
+        for known, belief in reachable(hybrid_map, area, limit, _MOST_AREAS).items():
+            fresh = {k: pose for k, pose in query.poses.items() if k not in compared.get(known, ())}
+            # An area with which most of the keyframes were compared has had its chance.
+            if known in excluded or 2 * len(fresh) < len(query.poses):
+                continue
+            prior = self._prior(belief, query)
+            if self._within_reach(hybrid_map, known, prior, fresh):
+                yield _Candidate(self._views.place(hybrid_map, known, excluded), prior, fresh)
+
+    def _prior(self, belief: PoseGaussian, query: Query) -> PoseGaussian:
+        """``candidate_T_reference`` from ``area_T_candidate`` and ``area_T_reference``, widened."""
+        prior = belief.inverse().compose(query.belief)
+        return PoseGaussian(prior.mean, self._options.prior_scale**2 * prior.covariance)
+
+    def _within_reach(
+        self, hybrid_map: HybridMap, area: int, prior: PoseGaussian, poses: Mapping[int, Pose]
+    ) -> bool:
+        """Whether a keyframe of the area is near enough to one of the query's, somewhere within the gate."""
+        asked = se2.compose(prior.mean, stacked(poses))[:, :2]
+        lever = float(np.hypot(*(asked - prior.mean[:2]).T).max())
+        spread = math.sqrt(np.linalg.eigvalsh(prior.covariance[:2, :2])[-1]) + lever * math.sqrt(prior.covariance[2, 2])
+        known = positions(hybrid_map, area, np.zeros(3))
+        return gap(asked, known) <= self._options.place_radius + math.sqrt(self.gate) * spread
+
+    def _fits(self, hybrid_map: HybridMap, candidate: _Candidate) -> Iterator[tuple[float, Mode]]:
+        """Appearance ratio and modes of the query in the candidate's place.
+
+        The mass of a mode is its part of the integral of p(x) p(z | x) over all poses. Of it counts what lies in the
+        candidate's place; so p(x | gamma) is not computed and pi(gamma) cancels.
+        """
+        place, fresh = candidate.place, candidate.fresh
+        known = hybrid_map.keyframes(place.area)
+        look = appearance_log_ratio(self._signature(fresh), self._signature(known), self._options.appearance_weight)
+        for mode in match(self._views.grid(fresh), place.grid, candidate.prior, self._settings).modes:
+            poses = se2.compose(mode.pose.mean, stacked(fresh))
+            if owner_at(place, poses, self._options.place_radius) == place.area:
+                yield look, mode
+
+    def _signature(self, keyframes: Collection[int]) -> NDArray[np.float64]:
+        return signature([self._scans[keyframe] for keyframe in keyframes])
