@@ -212,3 +212,9 @@ def test_every_function_broadcasts_over_leading_dimensions():
     np.testing.assert_array_equal(se2.log(b)[3], se2.log(b[3]))
     np.testing.assert_array_equal(se2.adjoint(b)[3], se2.adjoint(b[3]))
     np.testing.assert_array_equal(se2.right_jacobian_inverse(b)[3], se2.right_jacobian_inverse(b[3]))
+
+
+@given(poses, poses)
+def test_one_pose_by_itself_is_moved_as_it_is_among_many(a, b):
+    assert_same_pose(se2.compose(a, b), se2.compose(a[None], b[None])[0])
+    assert_same_pose(se2.inverse(a), se2.inverse(a[None])[0])
