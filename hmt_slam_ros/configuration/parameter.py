@@ -7,14 +7,14 @@ from typing import Any
 
 
 def parameter(
-    default: Any,
+    default: Any,  # noqa: ANN401  bool, int, float or str
     description: str,
     *,
     unit: str = "",
     low: float | None = None,
     high: float | None = None,
     choices: tuple[str, ...] = (),
-) -> Any:
+) -> Any:  # noqa: ANN401  type checkers are to see the default's type, not a Field
     """A dataclass field of the configuration tree.
 
     :param default: default value; its type (bool, int, float, str) is the parameter's type.

@@ -132,6 +132,6 @@ class Rtl:
 def _reset_notice(stamp: int, distance: float, angle: float) -> Notice:
     return Notice(
         "rtl",
-        f"the odometry jumped by {distance:.2f} m and {math.degrees(angle):.0f} degrees at stamp {stamp} ns: taken for a "
-        "reset, with the robot standing; if it does move so fast, raise rtl.max_speed or rtl.max_turn_rate",
+        f"the odometry jumped by {distance:.2f} m and {math.degrees(angle):.0f} degrees at stamp {stamp} ns: taken for "
+        "a reset, with the robot standing; if it does move so fast, raise rtl.max_speed or rtl.max_turn_rate",
     )
