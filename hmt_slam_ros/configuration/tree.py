@@ -189,7 +189,7 @@ class TopologicalInference:
         low=0.1, high=20.0,
     )
     temper: float = parameter(
-        0.1, "Exponent on the likelihood of an area's surface samples in the weight of a hypothesis.",
+        0.3, "Exponent on the likelihood of an area's surface samples in the weight of a hypothesis.",
         low=1e-4, high=1.0,
     )
     sample_spacing: float = parameter(
