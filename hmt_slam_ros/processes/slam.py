@@ -333,9 +333,10 @@ class MetricSlam:
         ]
         live.filter.change_area(leaf.area, area_T_previous, content)
         live.event_pose = se2.compose(area_T_previous, live.event_pose)
-        moved = {relabelled.keyframe for relabelled in leaf.relabelled}
-        live.fresh = {keyframe: step for keyframe, step in live.fresh.items() if keyframe in moved}
-        live.drift = self._drift_from_reference(live)
+        if leaf.rebase is not None:
+            moved = {relabelled.keyframe for relabelled in leaf.relabelled}
+            live.fresh = {keyframe: step for keyframe, step in live.fresh.items() if keyframe in moved}
+            live.drift = self._drift_from_reference(live)
         live.anchor = self._nearest_keyframe(live)
 
     @staticmethod
