@@ -65,7 +65,8 @@ def quaternion(theta: float) -> Quaternion:
     """Rotation by ``theta`` rad, in [-pi, pi), about z, from which the receiver gets ``theta`` back bit for bit.
 
     Sine and cosine are rounded, so the angle may come back with another last bit, and a run of the nodes would drift
-    away from the lock-step run. The last bits of the quaternion are chosen such that it does not.
+    away from the lock-step run. The last bits of the quaternion are chosen such that it does not, for any angle of
+    1e-300 rad or more.
     """
     sin, cos = math.sin(0.5 * theta), math.cos(0.5 * theta)
     for steps_z, steps_w in _NUDGES:
