@@ -65,6 +65,7 @@ class Run:
         self.true_pose = None
         self.answers = []
         self.evidence = {}
+        self.stored = True
 
     def keyframe(self, true_pose, cut=0, moved=None, only=None):
         """One keyframe event; ``cut`` is how many of the newest keyframes leave the area, in every hypothesis."""
@@ -79,7 +80,7 @@ class Run:
         scan = scan_in(self.walls, true_pose, stamp=sequence, noise=0.01, seed=sequence, **self.laser)
         leaves = tuple(
             LeafEstimate(
-                h, self.replica.areas[h], PoseGaussian(self.poses[h], self.covariances[h]), True,
+                h, self.replica.areas[h], PoseGaussian(self.poses[h], self.covariances[h]), self.stored,
                 self.evidence.get(h, 0.0), 12.0,
             )
             for h in sorted(self.poses)
@@ -219,6 +220,23 @@ def test_turning_back_into_tracked_ground_is_no_new_area():
     (leaf,) = run.keyframe(np.array([*poses[1][:2], math.pi]), cut=5).leaves
     assert (leaf.area, leaf.probability, leaf.arcs) == (0, 1.0, ())
     assert {r.area for r in leaf.relabelled} == {0}
+
+
+def test_ground_tracked_by_way_of_another_area_is_joined_by_a_measured_arc():
+    """The robot is back in area 0, which the local map holds, but only area 1 has an arc to it."""
+    run = Run(RING, field_of_view=2 * np.pi, beams=241)
+    poses = ring_drive(20)
+    for k, pose in enumerate(poses):
+        run.keyframe(pose, cut=4 if k in (8, 14) else 0)
+    assert run.replica.maps[0].arc(2, 0) is None
+    run.stored = False
+    answers = [run.keyframe(np.array([*poses[k][:2], math.pi])) for k in (14, 8, 2, 2, 2)]
+    (arc,) = [arc for answer in answers for leaf in answer.leaves for arc in leaf.arcs]
+    assert (arc.source, arc.target, arc.closure) == (2, 0, True)
+    reference = min(run.replica.maps[0].keyframes(2))
+    assert np.allclose(arc.pose.mean, se2.between(poses[reference], poses[0]), atol=0.03)
+    assert np.sqrt(arc.pose.covariance[1, 1]) < 0.2
+    assert answers[-1].leaves[0].probability == 1.0
 
 
 def test_the_ring_closes(ring):

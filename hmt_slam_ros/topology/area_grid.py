@@ -64,6 +64,11 @@ class AreaGrid:
     free: NDArray[np.bool_]
     points: Points
 
+    @property
+    def nbytes(self) -> int:
+        """Memory that the grid takes."""
+        return self.log_ratio.nbytes + self.fine.nbytes + self.free.nbytes + self.points.nbytes
+
     def moved(self, shift: Points) -> AreaGrid:
         """The same grid in a frame whose origin lies at ``shift``, shape (2,), of this one and is not turned."""
         return replace(self, origin=self.origin - shift, points=self.points - shift)

@@ -21,7 +21,8 @@ Pose = NDArray[np.float64]
 
 # An area has few others around it; this bounds the work where hundreds are joined by tight arcs.
 _MOST_AROUND = 64
-_GRIDS = 48
+# Grids are kept up to this size, bytes: some twenty areas of a large building.
+_KEPT = 1 << 26
 
 
 @dataclass(frozen=True)
@@ -95,10 +96,15 @@ class Views:
         key = np.array(list(keyframes), dtype=np.int64).tobytes() + poses.tobytes()
         if key not in self._grids:
             self._grids[key] = build_area_grid([self._scans[k] for k in keyframes], poses, self._model)
+            self._drop_oldest()
         self._grids.move_to_end(key)
-        while len(self._grids) > _GRIDS:
-            self._grids.popitem(last=False)
         return self._grids[key]
+
+    def _drop_oldest(self) -> None:
+        """Forget the grids that were not used for longest, but not the newest."""
+        size = sum(grid.nbytes for grid in self._grids.values())
+        while size > _KEPT and len(self._grids) > 1:
+            size -= self._grids.popitem(last=False)[1].nbytes
 
     def place(self, hybrid_map: HybridMap, area: int, without: Collection[int]) -> Place:
         """An area with those around it, so that an overlap is not cut off at the area's edge.

@@ -1,0 +1,97 @@
+"""Which areas are surely around, the grids that are kept of them, and the look of places."""
+
+import numpy as np
+import pytest
+from worlds import box, scan_in
+
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.topology.appearance import appearance_log_ratio, signature
+from hmt_slam_ros.topology.area_grid import GridModel
+from hmt_slam_ros.topology.hybrid_map import HybridMap
+from hmt_slam_ros.topology.surroundings import Nearness, Views, agreeing, areas_around
+
+NEAR = Nearness(sigma=0.3, reach=6.0)
+
+
+def belief(x, sigma):
+    return PoseGaussian(np.array([x, 0.0, 0.0]), np.diag([sigma, sigma, 0.01]) ** 2)
+
+
+def chain(*sigmas, spacing=4.0):
+    """Areas 0, 1, ... in a row, each with one keyframe at its origin, joined by arcs of the given deviations."""
+    hybrid_map = HybridMap()
+    for area in range(len(sigmas) + 1):
+        hybrid_map.place(area, area, np.zeros(3))
+    for area, sigma in enumerate(sigmas):
+        hybrid_map.set_arc(area, area + 1, belief(spacing, sigma), closure=False)
+    return hybrid_map
+
+
+def test_areas_within_reach_whose_position_is_certain_are_around():
+    assert list(areas_around(chain(0.05, 0.05), 0, NEAR)) == [0, 1]
+
+
+def test_an_area_with_a_loose_arc_is_not_around():
+    assert list(areas_around(chain(0.5), 0, NEAR)) == [0]
+
+
+def test_an_area_beyond_reach_does_not_hide_one_behind_it():
+    """Arcs lead over an area far away back to one nearby."""
+    hybrid_map = chain(0.02, 0.02, spacing=9.0)
+    hybrid_map.set_arc(1, 2, belief(-7.0, 0.02), closure=False)
+    assert list(areas_around(hybrid_map, 0, NEAR)) == [0, 2]
+
+
+def test_excluded_areas_are_left_out():
+    assert list(areas_around(chain(0.05), 0, NEAR, without={1})) == [0]
+
+
+def test_a_global_pose_that_agrees_with_the_arcs_is_taken():
+    poses = {0: np.array([1.0, 1.0, 0.5]), 1: se2.compose([1.0, 1.0, 0.5], [4.05, 0.0, 0.0])}
+    assert np.allclose(agreeing(belief(4.0, 0.1), 0, 1, poses, 16.0), [4.05, 0.0, 0.0])
+
+
+def test_a_global_pose_that_contradicts_the_arcs_is_not():
+    poses = {0: np.zeros(3), 1: np.array([6.0, 0.0, 0.0])}
+    assert np.allclose(agreeing(belief(4.0, 0.1), 0, 1, poses, 16.0), [4.0, 0.0, 0.0])
+    assert np.allclose(agreeing(belief(4.0, 0.1), 0, 7, poses, 16.0), [4.0, 0.0, 0.0])
+
+
+@pytest.fixture
+def views():
+    room = box(-2.0, -2.0, 10.0, 2.0)
+    scans = {area: scan_in(room, np.array([4.0 * area, 0.0, 0.0])) for area in range(3)}
+    return Views(scans, GridModel(), NEAR)
+
+
+def test_a_place_has_the_keyframes_of_the_areas_around_in_its_frame(views):
+    place = views.place(chain(0.05, 0.05), 1, ())
+    assert sorted(zip(place.owners.tolist(), place.positions[:, 0].tolist(), strict=True)) == [
+        (0, -4.0), (1, 0.0), (2, 4.0)
+    ]  # fmt: skip
+
+
+def test_a_grid_is_built_once_for_the_same_keyframes_at_the_same_poses(views):
+    pose = np.array([0.0, 0.0, 0.1])
+    assert views.grid({1: pose}) is views.grid({1: pose.copy()})
+    assert views.grid({1: pose}) is not views.grid({1: pose + 0.01})
+
+
+def test_the_grids_that_are_kept_take_bounded_memory(views, monkeypatch):
+    monkeypatch.setattr("hmt_slam_ros.topology.surroundings._KEPT", 100_000)
+    first = views.grid({0: np.zeros(3)})
+    for k in range(40):
+        views.grid({0: np.array([0.0, 0.0, 0.05 * k])})
+    assert sum(grid.nbytes for grid in views._grids.values()) <= max(100_000, 2 * first.nbytes)
+    assert views.grid({0: np.zeros(3)}) is not first
+
+
+def test_places_that_look_alike_have_a_positive_ratio_whatever_the_heading():
+    small, large = box(-1.0, -1.0, 1.0, 1.0), box(-8.0, -8.0, 8.0, 8.0)
+    seen = [
+        signature([scan_in(walls, np.array([0.1, 0.0, heading]), field_of_view=2 * np.pi)])
+        for walls, heading in ((small, 0.0), (small, 2.0), (large, 0.0))
+    ]
+    assert 0.3 < appearance_log_ratio(seen[0], seen[1], 0.5) <= 0.5
+    assert appearance_log_ratio(seen[0], seen[2], 0.5) == -0.5
