@@ -17,6 +17,9 @@ def _laser_at_base() -> NDArray[np.float64]:
 class Scan:
     """One sweep of a planar range finder.
 
+    Angles, range limits and ``time_increment`` are kept in the precision of sensor_msgs/LaserScan, float32, so that a
+    log, the bag made from it and its replay are one and the same.
+
     :ivar stamp: time of the first beam, integer nanoseconds, increasing within one source.
     :ivar ranges: shape (n,), float32, metres. NaN, inf, values below ``range_min`` and values at or beyond
         ``range_max`` are beams without a return.
@@ -36,6 +39,10 @@ class Scan:
     range_max: float
     laser_pose: NDArray[np.float64] = field(default_factory=_laser_at_base)
     time_increment: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("angle_min", "angle_increment", "range_min", "range_max", "time_increment"):
+            object.__setattr__(self, name, float(np.float32(getattr(self, name))))
 
     @cached_property
     def valid(self) -> NDArray[np.bool_]:
