@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 from collections.abc import Sequence
@@ -28,6 +29,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except HmtSlamError as fault:
         print(f"hmt_slam {options.command}: {fault}", file=sys.stderr)
         return FAULT
+    except BrokenPipeError:
+        # The reader of the output, such as `head`, has gone; so has what the interpreter would flush at its end.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except KeyboardInterrupt:
         print(f"hmt_slam {options.command}: stopped, nothing was written", file=sys.stderr)
         return INTERRUPTED
