@@ -37,7 +37,7 @@ def test_the_robot_is_found_though_odometry_drifts():
     area_filter, truth = driven(LocalMapping(Configuration()), odometry_error=(0.02, 0.01, 0.01))
     dead_reckoned = 59 * np.array([0.02, 0.01, 0.01])
     error = se2.between(truth, area_filter.pose)
-    assert np.hypot(*error[:2]) < 0.05 * np.hypot(*dead_reckoned[:2])
+    assert np.hypot(*error[:2]) < 0.1 * np.hypot(*dead_reckoned[:2])
     assert abs(error[2]) < np.radians(0.5)
 
 
