@@ -138,7 +138,7 @@ def test_a_wider_prior_costs_evidence(known, visit):
     assert evidence[0] > evidence[1] > evidence[2]
 
 
-def test_both_of_two_like_rooms_come_back_as_modes():
+def test_each_of_three_like_niches_comes_back_as_a_mode():
     """A corridor with equal niches every 3 m: a visit to one of them fits all of them."""
     corridor = np.array([[-2.0, 0.0, 11.0, 0.0]])
     niches = [
@@ -153,9 +153,8 @@ def test_both_of_two_like_rooms_come_back_as_modes():
     visit = build_area_grid(scans, se2.between(poses[0], poses), GridModel(max_range=2.5))
     truth = np.array([4.0, 0.0, 0.0])
     found = match(visit, known, prior_around(truth, 1.6, 3.0, (0.0, 0.0, 0.0)), SETTINGS)
-    places = sorted(round(float(mode.pose.mean[0]), 1) for mode in found.modes)
-    assert len(places) == 3
-    assert np.allclose(places, [1.0, 4.0, 7.0], atol=0.21)
+    heavy = [mode for mode in found.modes if mode.log_mass > found.modes[0].log_mass - 4.0]
+    assert np.allclose(sorted(mode.pose.mean[0] for mode in heavy), [1.0, 4.0, 7.0], atol=0.2)
     assert found.modes[0].pose.mean[0] == pytest.approx(4.0, abs=0.1)
 
 
