@@ -224,7 +224,9 @@ def test_turning_back_into_tracked_ground_is_no_new_area():
 
 def test_ground_tracked_by_way_of_another_area_is_joined_by_a_measured_arc():
     """The robot is back in area 0, which the local map holds, but only area 1 has an arc to it."""
-    run = Run(RING, field_of_view=2 * np.pi, beams=241)
+    settings = Configuration()
+    settings = replace(settings, tsbi=replace(settings.tsbi, local_sigma=0.3))
+    run = Run(RING, configuration=settings, field_of_view=2 * np.pi, beams=241)
     poses = ring_drive(20)
     for k, pose in enumerate(poses):
         run.keyframe(pose, cut=4 if k in (8, 14) else 0)

@@ -214,7 +214,8 @@ class TopologicalInference:
         5, "Keyframes stored without a cut after which known ground is looked for.", low=1, high=1000
     )
     local_sigma: float = parameter(
-        0.3, "An area whose position is at least this certain is part of the local map.", unit="m", low=0.01, high=5.0
+        0.1, "An area whose position is at least this certain, about as certain as a wall, is in the local map.",
+        unit="m", low=0.01, high=5.0,
     )
     local_reach: float = parameter(
         12.0, "An area with a keyframe this close to the robot's area is part of the local map.", unit="m",
