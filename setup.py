@@ -40,7 +40,7 @@ setup(
         "numba>=0.59",
         "numpy>=1.26",
         "PyYAML>=6.0",
-        "rosbags>=0.10.10",
+        "rosbags>=0.11",
         "scipy>=1.11",
     ],
     extras_require={"test": ["hypothesis", "mypy", "pytest", "ruff"]},
