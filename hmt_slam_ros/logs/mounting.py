@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -65,7 +66,8 @@ def heading_of_quaternion(quaternion: ArrayLike) -> float:
     :param quaternion: (x, y, z, w), of any length but zero.
     """
     x, y, z, w = np.asarray(quaternion, dtype=np.float64).tolist()
+    # The arctan2 of numpy 1.26 is off by several last bits on processors with AVX-512; that of the C library is not.
     if x == 0.0 and y == 0.0:
-        heading = 2.0 * np.arctan2(z, w)
-        return float(heading - 2.0 * np.pi * np.round(heading / (2.0 * np.pi)))
-    return float(np.arctan2(2.0 * (w * z + x * y), w * w + x * x - y * y - z * z))
+        heading = 2.0 * math.atan2(z, w)
+        return heading - 2.0 * math.pi * round(heading / (2.0 * math.pi))
+    return math.atan2(2.0 * (w * z + x * y), w * w + x * x - y * y - z * z)
