@@ -8,16 +8,14 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass, field
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.local_map.area_filter import AreaFilter, FilterStep, LocalMapping, PlacedKeyframe
+from hmt_slam_ros.local_map.area_filter import AreaFilter, LocalMapping, PlacedKeyframe
+from hmt_slam_ros.processes.live_hypothesis import LiveHypothesis
 from hmt_slam_ros.processes.messages import (
     Accepted,
     EndOfLog,
@@ -25,44 +23,13 @@ from hmt_slam_ros.processes.messages import (
     Hypotheses,
     Keyframe,
     Leaf,
-    LeafEstimate,
     LocalEstimate,
     Message,
     Notice,
-    Relabelled,
-    Trail,
 )
 from hmt_slam_ros.processes.replica import FIRST_AREA, FIRST_HYPOTHESIS, Replica
 from hmt_slam_ros.sensing import Odometry, Scan
 from hmt_slam_ros.sensing.motion import OdometryBuffer, increment_covariance
-
-_FIRST_COVARIANCE = np.diag([1e-8, 1e-8, 1e-8])
-# Below 1, since the filter step at a keyframe may move the robot a little back towards the last one.
-_SAME_PLACE = 0.8
-
-
-@dataclass
-class _LiveHypothesis:
-    """A filter and what metric SLAM remembers beside it.
-
-    :ivar event_pose: ``area_T_base`` at the last keyframe event, shape (3,).
-    :ivar anchor: the stored keyframe to which scans are now related.
-    :ivar fresh: {keyframe: covariance (3, 3) of the step that led to it}, of those stored since the area was entered.
-    :ivar drift: covariance of the last keyframe's pose in the area's frame, right tangent.
-    :ivar trail: (stamp, anchor, ``anchor_T_base``) of the scans since the last keyframe event.
-    """
-
-    filter: AreaFilter
-    event_pose: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
-    anchor: int = 0
-    fresh: dict[int, NDArray[np.float64]] = field(default_factory=dict)
-    drift: NDArray[np.float64] = field(default_factory=_FIRST_COVARIANCE.copy)
-    trail: list[tuple[int, int, NDArray[np.float64]]] = field(default_factory=list)
-
-    def branch(self, hypothesis: int) -> _LiveHypothesis:
-        return _LiveHypothesis(
-            self.filter.branch(hypothesis), self.event_pose, self.anchor, dict(self.fresh), self.drift, list(self.trail)
-        )
 
 
 class MetricSlam:
@@ -79,7 +46,8 @@ class MetricSlam:
         self._queue: deque[Scan] = deque()
         self._last_stamp = -1
         self._noticed: set[str] = set()
-        self._live = {FIRST_HYPOTHESIS: _LiveHypothesis(AreaFilter(self._mapping, FIRST_HYPOTHESIS, FIRST_AREA))}
+        first = AreaFilter(self._mapping, FIRST_HYPOTHESIS, FIRST_AREA)
+        self._live = {FIRST_HYPOTHESIS: LiveHypothesis(first, configuration.filter)}
         self._events = 0
         self._waiting = False
         self._last_odometry: NDArray[np.float64] | None = None
@@ -97,8 +65,11 @@ class MetricSlam:
     @property
     def particles(self) -> tuple[int, NDArray[np.float64]]:
         """Area of the most probable hypothesis and the poses of its particles, ``area_T_base``, shape (M, 3)."""
-        best = self._live[self._replica.best].filter
-        return best.area, best.poses
+        return self._best.filter.area, self._best.filter.poses
+
+    @property
+    def _best(self) -> LiveHypothesis:
+        return self._live[self._replica.best]
 
     def handle(self, message: Message) -> list[Message]:
         """Take in one message, work off what can be worked off, return what there is to say."""
@@ -177,121 +148,32 @@ class MetricSlam:
             for live in self._live.values():
                 live.filter.track(points, increment, covariance)
         self._travelled += math.hypot(increment[0], increment[1])
-        said = self._keyframe_event(scan, points) if self._event_due() else []
-        self._note_trail(scan.stamp)
+        due = not self._events or self._best.event_due()
+        said = self._keyframe_event(scan, points) if due else []
+        for live in self._live.values():
+            live.note_scan(scan.stamp)
         self._scans += 1
         return [*said, self._estimate(scan.stamp, odometry)]
-
-    def _event_due(self) -> bool:
-        """Whether the robot moved or turned far enough, under the most probable hypothesis."""
-        if not self._events:
-            return True
-        live = self._live[self._replica.best]
-        moved = se2.between(live.event_pose, live.filter.pose)
-        settings = self._configuration.filter
-        return (
-            math.hypot(moved[0], moved[1]) >= settings.keyframe_distance
-            or abs(moved[2]) >= math.radians(settings.keyframe_angle)
-        )
 
     def _keyframe_event(self, scan: Scan, points: NDArray[np.float64]) -> list[Message]:
         sequence = self._events
         trails: list[Message] = self._trails()
-        leaves = tuple(self._leaf_event(live, sequence, scan, points) for live in self._live.values())
+        leaves = tuple(live.event(sequence, scan, points) for live in self._live.values())
         keyframe = Keyframe(sequence, scan, self._travelled, leaves)
         self._replica.add(keyframe)
         self._events += 1
         self._waiting = True
         return [*trails, keyframe]
 
-    def _leaf_event(
-        self, live: _LiveHypothesis, sequence: int, scan: Scan, points: NDArray[np.float64]
-    ) -> LeafEstimate:
-        """One filter step; the keyframe enters the map where it adds something new."""
-        area_filter = live.filter
-        if sequence == 0:
-            step = FilterStep(_FIRST_COVARIANCE, 0.0, float(len(area_filter.poses)), False)
-        else:
-            step = area_filter.update(points, sequence)
-        inflated = self._configuration.filter.covariance_inflation * step.covariance
-        stored = self._is_new(live)
-        if stored:
-            moved = se2.between(live.event_pose, area_filter.pose)
-            ad = se2.adjoint(se2.inverse(moved))
-            live.drift = ad @ live.drift @ ad.T + inflated
-            live.fresh[sequence] = inflated
-            area_filter.add_keyframe(sequence, scan)
-        else:
-            live.drift = inflated
-        live.event_pose = area_filter.pose
-        live.anchor = self._nearest_keyframe(live)
-        return LeafEstimate(
-            area_filter.hypothesis,
-            area_filter.area,
-            PoseGaussian(area_filter.pose, live.drift),
-            stored,
-            step.log_evidence,
-            step.effective_samples,
-            self._revised(live, sequence) if step.history_changed else (),
-        )
-
-    def _is_new(self, live: _LiveHypothesis) -> bool:
-        """Whether no keyframe of the local map was taken from nearby with a like heading."""
-        if not live.filter.keyframes:
-            return True
-        settings = self._configuration.filter
-        relative = se2.between(live.filter.leading_keyframe_poses(), live.filter.pose)
-        near = np.hypot(relative[:, 0], relative[:, 1]) < _SAME_PLACE * settings.keyframe_distance
-        alike = np.abs(relative[:, 2]) < _SAME_PLACE * math.radians(settings.keyframe_angle)
-        return not bool(np.any(near & alike))
-
-    @staticmethod
-    def _nearest_keyframe(live: _LiveHypothesis) -> int:
-        relative = se2.between(live.filter.leading_keyframe_poses(), live.filter.pose)
-        cost = np.hypot(relative[:, 0], relative[:, 1]) + np.abs(relative[:, 2])
-        return live.filter.keyframes[int(np.argmin(cost))]
-
-    @staticmethod
-    def _revised(live: _LiveHypothesis, newest: int) -> tuple[Relabelled, ...]:
-        area_filter = live.filter
-        poses = area_filter.leading_keyframe_poses()
-        return tuple(
-            Relabelled(keyframe, area_filter.area, area_filter.area, poses[area_filter.keyframes.index(keyframe)])
-            for keyframe in live.fresh
-            if keyframe != newest
-        )
-
-    def _note_trail(self, stamp: int) -> None:
-        for live in self._live.values():
-            row = live.filter.keyframes.index(live.anchor)
-            anchor_pose = live.filter.leading_keyframe_poses()[row]
-            live.trail.append((stamp, live.anchor, se2.between(anchor_pose, live.filter.pose)))
-
     def _trails(self) -> list[Message]:
         """The trails since the last event, of every hypothesis."""
-        said: list[Message] = []
-        for live in self._live.values():
-            if live.trail:
-                stamps, anchors, poses = zip(*live.trail, strict=True)
-                said.append(
-                    Trail(
-                        live.filter.hypothesis,
-                        self._first_of_trail,
-                        np.array(stamps, dtype=np.int64),
-                        np.array(anchors, dtype=np.int64),
-                        np.array(poses),
-                    )
-                )
-            live.trail = []
+        said: list[Message] = [trail for live in self._live.values() for trail in live.take_trail(self._first_of_trail)]
         self._first_of_trail = self._scans
         return said
 
     def _estimate(self, stamp: int, odometry: NDArray[np.float64]) -> LocalEstimate:
-        live = self._live[self._replica.best]
-        ad = se2.adjoint(se2.inverse(se2.between(live.event_pose, live.filter.pose)))
-        covariance = ad @ live.drift @ ad.T + live.filter.tracking_covariance
-        belief = PoseGaussian(live.filter.pose, covariance)
-        return LocalEstimate(stamp, self._scans - 1, live.filter.area, belief, odometry, self._dropped)
+        best = self._best
+        return LocalEstimate(stamp, self._scans - 1, best.filter.area, best.belief(), odometry, self._dropped)
 
     def _change_hypotheses(self, hypotheses: Hypotheses) -> None:
         """Branch, re-base and drop filters as TSBI decided."""
@@ -300,7 +182,8 @@ class MetricSlam:
         for leaf in hypotheses.leaves:
             parent = self._live[leaf.parent]
             live = parent if leaf.hypothesis == leaf.parent else parent.branch(leaf.hypothesis)
-            self._change_area(live, leaf)
+            if leaf.local:
+                live.change_area(leaf, self._content(leaf))
             children[leaf.hypothesis] = live
         self._replace_live(children)
 
@@ -309,46 +192,23 @@ class MetricSlam:
         if accepted.hypothesis is not None:
             live = self._live[accepted.hypothesis]
             self._replace_live({accepted.hypothesis: live})
-            for refined in accepted.relabelled:
-                if refined.area == live.filter.area:
-                    live.filter.move_keyframe(refined.keyframe, refined.pose)
+            live.refine(accepted.relabelled)
         self._waiting = False
 
-    def _replace_live(self, live: dict[int, _LiveHypothesis]) -> None:
+    def _replace_live(self, live: dict[int, LiveHypothesis]) -> None:
         for hypothesis, old in self._live.items():
             if live.get(hypothesis) is not old:
                 old.filter.release()
         self._live = live
 
-    def _change_area(self, live: _LiveHypothesis, leaf: Leaf) -> None:
-        """Change the reference frame and load the local map: the keyframes of the areas that TSBI names."""
-        if not leaf.local:
-            return
+    def _content(self, leaf: Leaf) -> list[PlacedKeyframe]:
+        """The keyframes of the areas that the local map has to hold, in the frame of the robot's area."""
         hybrid_map = self._replica.maps[leaf.hypothesis]
-        area_T_previous = np.zeros(3) if leaf.rebase is None else leaf.rebase.mean
-        content = [
+        return [
             PlacedKeyframe(keyframe, local.area, self._replica.scans[keyframe], se2.compose(local.pose, pose))
             for local in leaf.local
             for keyframe, pose in hybrid_map.keyframes(local.area).items()
         ]
-        live.filter.change_area(leaf.area, area_T_previous, content)
-        live.event_pose = se2.compose(area_T_previous, live.event_pose)
-        if leaf.rebase is not None:
-            moved = {relabelled.keyframe for relabelled in leaf.relabelled}
-            live.fresh = {keyframe: step for keyframe, step in live.fresh.items() if keyframe in moved}
-            live.drift = self._drift_from_reference(live)
-        live.anchor = self._nearest_keyframe(live)
-
-    @staticmethod
-    def _drift_from_reference(live: _LiveHypothesis) -> NDArray[np.float64]:
-        """Covariance of the last keyframe relative to the area's reference keyframe, the first that moved with it."""
-        drift = _FIRST_COVARIANCE
-        poses = dict(zip(live.filter.keyframes, live.filter.leading_keyframe_poses(), strict=True))
-        ordered = sorted(live.fresh)
-        for previous, keyframe in pairwise(ordered):
-            ad = se2.adjoint(se2.between(poses[keyframe], poses[previous]))
-            drift = ad @ drift @ ad.T + live.fresh[keyframe]
-        return drift
 
     def _finish(self) -> list[Message]:
         self._ended = False
