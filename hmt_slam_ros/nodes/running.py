@@ -10,7 +10,9 @@ from collections.abc import Callable
 from typing import TypeVar
 
 import rclpy
+from rclpy.exceptions import NotInitializedException
 from rclpy.executors import ExternalShutdownException
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 
 from hmt_slam_ros.errors import HmtSlamError
@@ -20,6 +22,7 @@ PARENT_VARIABLE = "HMT_SLAM_PARENT"
 
 FAULT = 2
 _PR_SET_PDEATHSIG = 1
+_CONTEXT_LOST = (NotInitializedException, rclpy_implementation.InvalidHandle, rclpy_implementation.RCLError)
 
 NodeType = TypeVar("NodeType", bound=Node)
 
@@ -37,7 +40,12 @@ def run(make: Callable[[], NodeType], spin: Callable[[NodeType], None] = rclpy.s
     try:
         _end_with_parent()
         rclpy.init()
-        _live(make, spin)
+        try:
+            _live(make, spin)
+        except _CONTEXT_LOST:
+            # rclpy's own handler takes the context away at any moment, also from under a node that is being made.
+            if rclpy.ok():
+                raise
     except (KeyboardInterrupt, ExternalShutdownException):
         return 0
     except HmtSlamError as error:
