@@ -8,7 +8,8 @@ from worlds import box, scan_in
 
 from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.local_map.area_filter import AreaFilter, LocalMapping, PlacedKeyframe
+from hmt_slam_ros.local_map.area_filter import AreaFilter, PlacedKeyframe
+from hmt_slam_ros.local_map.local_mapping import LocalMapping
 
 ROOM = np.concatenate((box(-6.02, -4.03, 6.03, 7.01), box(3.51, 1.02, 4.53, 2.52), box(-4.02, 3.03, -3.52, 7.01)))
 STEP = np.array([0.1, 0.0, 0.05])

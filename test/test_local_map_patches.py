@@ -5,7 +5,8 @@ import pytest
 from scipy.ndimage import distance_transform_edt
 from worlds import box, scan_in
 
-from hmt_slam_ros.local_map.patches import FAR, PATCH, InverseModel, PatchPool, field_at, odds_at
+from hmt_slam_ros.local_map.patch_pool import PatchPool
+from hmt_slam_ros.local_map.patches import FAR, PATCH, InverseModel, field_at, odds_at
 
 CELL, RADIUS = 0.05, 0.5
 MODEL = InverseModel(17, -8, 70)

@@ -12,15 +12,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hmt_slam_ros.arrays import Float64, Int32
-from hmt_slam_ros.configuration.tree import Configuration
+from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.local_map import batch, matching
-from hmt_slam_ros.local_map.patches import FAR, InverseModel, MapView, PatchPool
+from hmt_slam_ros.local_map.local_mapping import LocalMapping
+from hmt_slam_ros.local_map.patches import MapView
 from hmt_slam_ros.random_streams import Purpose, stream
 from hmt_slam_ros.sensing import Scan
 
-_ODDS_PER_NAT = 20.0
 _SEARCH_POINTS = 90
 # The search is called where odometry is in doubt: its prior is trusted less.
 _SEARCH_PRIOR = 0.1
@@ -50,46 +49,6 @@ class FilterStep:
     log_evidence: float
     effective_samples: float
     history_changed: bool
-
-
-class LocalMapping:
-    """What all filters of a process share: the pool of patches, the beam model, the settings."""
-
-    def __init__(self, configuration: Configuration) -> None:
-        self.configuration = configuration
-        local_map, match = configuration.local_map, configuration.matching
-        patch = 32 * local_map.cell
-        self.pool = PatchPool(2 * math.ceil(local_map.extent / patch), local_map.cell, local_map.field_radius)
-        self.model = matching.beam_model(
-            local_map.field_radius, match.sigma_hit, match.unknown_range, match.random_returns
-        )
-        self.alignment = matching.Alignment(match.sigma_match, match.robust_scale, match.iterations)
-        self._inverse_model = InverseModel(
-            round(local_map.log_odds_hit * _ODDS_PER_NAT),
-            round(-local_map.log_odds_miss * _ODDS_PER_NAT),
-            round(local_map.log_odds_limit * _ODDS_PER_NAT),
-        )
-        self.near = int(match.matched_distance / local_map.field_radius * FAR)
-
-    def matching_points(self, scan: Scan) -> Float64:
-        """The points that are matched: within the map's range, evenly thinned; shape (n, 2), base frame, m."""
-        points = self.mapped_points(scan)[0]
-        stride = -(-len(points) // self.configuration.matching.max_points)
-        return np.ascontiguousarray(points[:: max(1, stride)])
-
-    def mapped_points(self, scan: Scan) -> tuple[Float64, Float64]:
-        """End points within the map's range, and where longer beams leave that range; (n, 2), (k, 2), base frame, m."""
-        limit = self.configuration.local_map.max_range
-        relative = scan.points - scan.laser_pose[:2]
-        distance = np.hypot(relative[:, 0], relative[:, 1])
-        near = distance <= limit
-        beyond = scan.laser_pose[:2] + relative[~near] * (limit / distance[~near, None])
-        return scan.points[near], beyond
-
-    def insert(self, table: Int32, pose: Float64, scan: Scan) -> None:
-        """Enter a scan at ``map_T_base`` into a map."""
-        points, free = self.mapped_points(scan)
-        self.pool.insert(table, pose, scan.laser_pose, points, free, self._inverse_model)
 
 
 class AreaFilter:

@@ -1,6 +1,6 @@
-"""Occupancy and distance field of many particles, in shared patches that are copied only when written to.
+"""Patches of cells and the kernels that read and write them.
 
-A map is a table (T, T) of indices into a pool of square patches; -1 is a patch never seen. Map frame and table are
+A map is a table (T, T) of indices into a store of square patches; -1 is a patch never seen. Map frame and table are
 aligned: the origin lies at the corner between the four middle patches. Each patch holds, for 32 x 32 cells,
 
 - ``odds``: int8, evidence of occupancy in units of 0.05 nats, positive occupied, negative free, 0 unknown;
@@ -15,7 +15,6 @@ import numpy as np
 from numba import njit
 
 from hmt_slam_ros.arrays import Float64, Int8, Int32, Int64, UInt8
-from hmt_slam_ros.geometry import se2
 
 PATCH = 32
 SHIFT = 5
@@ -25,8 +24,6 @@ FAR = 255
 
 _PASSED = 1
 _HIT = 2
-
-_GROWTH = 1024
 
 
 class MapView(NamedTuple):
@@ -46,7 +43,7 @@ class MapView(NamedTuple):
     radius: float
 
 
-class _Store(NamedTuple):
+class Store(NamedTuple):
     """The arrays of the pool that change when a map is written to; ``free[:free_count[0]]`` are the free patches."""
 
     odds: Int8
@@ -67,109 +64,6 @@ class InverseModel(NamedTuple):
     hit: int
     miss: int
     limit: int
-
-
-class PatchPool:
-    """Storage of the patches of all maps of one process.
-
-    :ivar odds: shape (capacity, 32, 32), int8.
-    :ivar field: shape (capacity, 32, 32), uint8.
-    :ivar references: shape (capacity,), int32, how many tables name the patch.
-    """
-
-    def __init__(self, table_size: int, cell: float, radius: float) -> None:
-        """An empty pool.
-
-        :param table_size: T, patches along one edge of a map; even.
-        :param cell: edge of a cell, m.
-        :param radius: truncation of the distance field, m.
-        """
-        self.table_size = table_size
-        self.cell = cell
-        self.radius = radius
-        self.radius_cells = int(np.ceil(radius / cell))
-        self.odds = np.zeros((0, PATCH, PATCH), dtype=np.int8)
-        self.field = np.zeros((0, PATCH, PATCH), dtype=np.uint8)
-        self.references = np.zeros(0, dtype=np.int32)
-        self._free = np.zeros(0, dtype=np.int32)
-        self._free_count = np.zeros(1, dtype=np.int64)
-        edge = table_size * PATCH
-        self._marks = np.zeros((edge, edge), dtype=np.uint8)
-        self._stamp = _distance_stamp(self.radius_cells, cell, radius)
-
-    @property
-    def used(self) -> int:
-        """Patches in use."""
-        return self.references.size - int(self._free_count[0])
-
-    @property
-    def nbytes(self) -> int:
-        """Bytes held, used or not."""
-        return self.odds.nbytes + self.field.nbytes + self._marks.nbytes
-
-    def empty_table(self) -> Int32:
-        """The table of a map in which nothing is known."""
-        return np.full((self.table_size, self.table_size), NO_PATCH, dtype=np.int32)
-
-    def share(self, table: Int32) -> Int32:
-        """A further map with the same content; patches are copied when either is written to."""
-        _reference(table, self.references)
-        return table.copy()
-
-    def release(self, table: Int32) -> None:
-        """Give up a map; patches that no other map names are free again."""
-        _release(table, self._store())
-
-    def view(self, table: Int32) -> MapView:
-        """The map of ``table`` for the kernels; valid until the next insertion."""
-        return MapView(table, self.odds, self.field, self.cell, self.radius)
-
-    def insert(
-        self, table: Int32, pose: Float64, laser: Float64, points: Float64, free: Float64, model: InverseModel
-    ) -> None:
-        """Enter a scan into a map: free space along the beams, surfaces at their ends, the distance field around them.
-
-        A cell is counted once per scan, so that many beams through one cell weigh as one.
-
-        :param table: the map, changed in place.
-        :param pose: ``map_T_base``, shape (3,).
-        :param laser: ``base_T_laser``, shape (3,).
-        :param points: end points on surfaces, shape (n, 2), m, base frame.
-        :param free: end points of beams that only tell free space, shape (k, 2), m, base frame.
-        :param model: the inverse sensor model.
-        """
-        self._reserve(self.table_size * self.table_size)
-        half = 0.5 * self.table_size * PATCH
-        origin = se2.compose(pose, laser)[:2] / self.cell + half
-        ends = se2.transform(pose, np.concatenate((points, free))) / self.cell + half
-        _insert(table, self._store(), self._marks, self._stamp, origin, ends, len(points), model)
-
-    def _store(self) -> _Store:
-        return _Store(self.odds, self.field, self.references, self._free, self._free_count)
-
-    def _reserve(self, count: int) -> None:
-        missing = count - int(self._free_count[0])
-        if missing <= 0:
-            return
-        old = self.references.size
-        grown = max(_GROWTH, missing, old // 4)
-        self.odds = np.concatenate((self.odds, np.zeros((grown, PATCH, PATCH), dtype=np.int8)))
-        self.field = np.concatenate((self.field, np.full((grown, PATCH, PATCH), FAR, dtype=np.uint8)))
-        self.references = np.concatenate((self.references, np.zeros(grown, dtype=np.int32)))
-        free = np.empty(old + grown, dtype=np.int32)
-        kept = int(self._free_count[0])
-        # Free patches are taken from the end: the lowest index first.
-        free[:grown] = np.arange(old + grown - 1, old - 1, -1)
-        free[grown : grown + kept] = self._free[:kept]
-        self._free = free
-        self._free_count[0] = grown + kept
-
-
-def _distance_stamp(radius_cells: int, cell: float, radius: float) -> UInt8:
-    """Quantised distances around an occupied cell, shape (2r+1, 2r+1)."""
-    offsets = np.arange(-radius_cells, radius_cells + 1) * cell
-    distance = np.hypot(offsets[:, None], offsets[None, :])
-    return np.minimum(np.rint(distance / radius * FAR), FAR).astype(np.uint8)
 
 
 @njit(cache=True)
@@ -201,7 +95,8 @@ def field_at(view: MapView, column: int, row: int) -> int:
 
 
 @njit(cache=True)
-def _reference(table: Int32, references: Int32) -> None:
+def add_references(table: Int32, references: Int32) -> None:
+    """Count one reference more to every patch of a map."""
     for row in range(table.shape[0]):
         for column in range(table.shape[1]):
             if table[row, column] >= 0:
@@ -209,7 +104,8 @@ def _reference(table: Int32, references: Int32) -> None:
 
 
 @njit(cache=True)
-def _release(table: Int32, store: _Store) -> None:
+def release(table: Int32, store: Store) -> None:
+    """Empty a map's table; patches that no other table names are free again."""
     for row in range(table.shape[0]):
         for column in range(table.shape[1]):
             patch = table[row, column]
@@ -222,7 +118,7 @@ def _release(table: Int32, store: _Store) -> None:
 
 
 @njit(cache=True)
-def _writable(table: Int32, store: _Store, column: int, row: int) -> int:
+def _writable(table: Int32, store: Store, column: int, row: int) -> int:
     """The patch that holds a cell, made or unshared where needed."""
     old = table[row >> SHIFT, column >> SHIFT]
     if old >= 0 and store.references[old] == 1:
@@ -242,9 +138,9 @@ def _writable(table: Int32, store: _Store, column: int, row: int) -> int:
 
 
 @njit(cache=True)
-def _insert(
+def insert(
     table: Int32,
-    store: _Store,
+    store: Store,
     marks: UInt8,
     stamp: UInt8,
     origin: Float64,
@@ -331,7 +227,7 @@ def _axis_steps(start: float, end: float) -> tuple[int, float, float]:
 
 
 @njit(cache=True)
-def _lower_field(table: Int32, store: _Store, stamp: UInt8, column: int, row: int) -> None:
+def _lower_field(table: Int32, store: Store, stamp: UInt8, column: int, row: int) -> None:
     """Enter a newly occupied cell into the distance field."""
     radius = stamp.shape[0] // 2
     edge = table.shape[0] * PATCH
@@ -344,7 +240,7 @@ def _lower_field(table: Int32, store: _Store, stamp: UInt8, column: int, row: in
 
 
 @njit(cache=True)
-def _raise_field(table: Int32, store: _Store, stamp: UInt8, column: int, row: int) -> None:
+def _raise_field(table: Int32, store: Store, stamp: UInt8, column: int, row: int) -> None:
     """Take a cell that is no longer occupied out of the distance field: measure anew where it was the nearest."""
     radius = stamp.shape[0] // 2
     edge = table.shape[0] * PATCH

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.local_map.area_filter import AreaFilter, LocalMapping, PlacedKeyframe
+from hmt_slam_ros.local_map.area_filter import AreaFilter, PlacedKeyframe
+from hmt_slam_ros.local_map.local_mapping import LocalMapping
 from hmt_slam_ros.processes.live_hypothesis import LiveHypothesis
 from hmt_slam_ros.processes.messages import (
     Accepted,

@@ -11,7 +11,7 @@ from scipy.stats import chi2
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.local_map import matching
-from hmt_slam_ros.local_map.area_filter import LocalMapping
+from hmt_slam_ros.local_map.local_mapping import LocalMapping
 from hmt_slam_ros.local_map.patches import MapView
 from hmt_slam_ros.sensing import Scan
 

@@ -1,0 +1,115 @@
+"""Occupancy and distance field of many particles, in shared patches that are copied only when written to."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hmt_slam_ros.arrays import Float64, Int32, UInt8
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.local_map import patches
+from hmt_slam_ros.local_map.patches import FAR, NO_PATCH, PATCH, InverseModel, MapView, Store
+
+_GROWTH = 1024
+
+
+class PatchPool:
+    """Storage of the patches of all maps of one process.
+
+    :ivar odds: shape (capacity, 32, 32), int8.
+    :ivar field: shape (capacity, 32, 32), uint8.
+    :ivar references: shape (capacity,), int32, how many tables name the patch.
+    """
+
+    def __init__(self, table_size: int, cell: float, radius: float) -> None:
+        """An empty pool.
+
+        :param table_size: T, patches along one edge of a map; even.
+        :param cell: edge of a cell, m.
+        :param radius: truncation of the distance field, m.
+        """
+        self.table_size = table_size
+        self.cell = cell
+        self.radius = radius
+        self.radius_cells = int(np.ceil(radius / cell))
+        self.odds = np.zeros((0, PATCH, PATCH), dtype=np.int8)
+        self.field = np.zeros((0, PATCH, PATCH), dtype=np.uint8)
+        self.references = np.zeros(0, dtype=np.int32)
+        self._free = np.zeros(0, dtype=np.int32)
+        self._free_count = np.zeros(1, dtype=np.int64)
+        edge = table_size * PATCH
+        self._marks = np.zeros((edge, edge), dtype=np.uint8)
+        self._stamp = _distance_stamp(self.radius_cells, cell, radius)
+
+    @property
+    def used(self) -> int:
+        """Patches in use."""
+        return self.references.size - int(self._free_count[0])
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes held, used or not."""
+        return self.odds.nbytes + self.field.nbytes + self._marks.nbytes
+
+    def empty_table(self) -> Int32:
+        """The table of a map in which nothing is known."""
+        return np.full((self.table_size, self.table_size), NO_PATCH, dtype=np.int32)
+
+    def share(self, table: Int32) -> Int32:
+        """A further map with the same content; patches are copied when either is written to."""
+        patches.add_references(table, self.references)
+        return table.copy()
+
+    def release(self, table: Int32) -> None:
+        """Give up a map; patches that no other map names are free again."""
+        patches.release(table, self._store())
+
+    def view(self, table: Int32) -> MapView:
+        """The map of ``table`` for the kernels; valid until the next insertion."""
+        return MapView(table, self.odds, self.field, self.cell, self.radius)
+
+    def insert(
+        self, table: Int32, pose: Float64, laser: Float64, points: Float64, free: Float64, model: InverseModel
+    ) -> None:
+        """Enter a scan into a map: free space along the beams, surfaces at their ends, the distance field around them.
+
+        A cell is counted once per scan, so that many beams through one cell weigh as one.
+
+        :param table: the map, changed in place.
+        :param pose: ``map_T_base``, shape (3,).
+        :param laser: ``base_T_laser``, shape (3,).
+        :param points: end points on surfaces, shape (n, 2), m, base frame.
+        :param free: end points of beams that only tell free space, shape (k, 2), m, base frame.
+        :param model: the inverse sensor model.
+        """
+        self._reserve(self.table_size * self.table_size)
+        half = 0.5 * self.table_size * PATCH
+        origin = se2.compose(pose, laser)[:2] / self.cell + half
+        ends = se2.transform(pose, np.concatenate((points, free))) / self.cell + half
+        patches.insert(table, self._store(), self._marks, self._stamp, origin, ends, len(points), model)
+
+    def _store(self) -> Store:
+        return Store(self.odds, self.field, self.references, self._free, self._free_count)
+
+    def _reserve(self, count: int) -> None:
+        missing = count - int(self._free_count[0])
+        if missing <= 0:
+            return
+        old = self.references.size
+        grown = max(_GROWTH, missing, old // 4)
+        self.odds = np.concatenate((self.odds, np.zeros((grown, PATCH, PATCH), dtype=np.int8)))
+        self.field = np.concatenate((self.field, np.full((grown, PATCH, PATCH), FAR, dtype=np.uint8)))
+        self.references = np.concatenate((self.references, np.zeros(grown, dtype=np.int32)))
+        free = np.empty(old + grown, dtype=np.int32)
+        kept = int(self._free_count[0])
+        # Free patches are taken from the end: the lowest index first.
+        free[:grown] = np.arange(old + grown - 1, old - 1, -1)
+        free[grown : grown + kept] = self._free[:kept]
+        self._free = free
+        self._free_count[0] = grown + kept
+
+
+def _distance_stamp(radius_cells: int, cell: float, radius: float) -> UInt8:
+    """Quantised distances around an occupied cell, shape (2r+1, 2r+1)."""
+    offsets = np.arange(-radius_cells, radius_cells + 1) * cell
+    distance = np.hypot(offsets[:, None], offsets[None, :])
+    return np.minimum(np.rint(distance / radius * FAR), FAR).astype(np.uint8)
