@@ -1,6 +1,10 @@
 """How a node ends when it is told to at an awkward moment."""
 
 import multiprocessing
+import os
+import signal
+import time
+from functools import partial
 
 import pytest
 import rclpy
@@ -30,3 +34,20 @@ def test_a_signal_amid_the_making_of_a_node_is_no_fault_but_a_broken_middleware_
     process.start()
     process.join(20)
     assert process.exitcode == status
+
+
+def compile_for_a_minute(begun):
+    """Make a node as a cold cache of kernels makes it: for long nothing looks at signals."""
+    begun.set()
+    time.sleep(60.0)
+
+
+def test_what_takes_long_is_broken_off_after_a_while_without_a_fault():
+    context = multiprocessing.get_context("spawn")
+    begun = context.Event()
+    process = context.Process(target=status_of, args=(partial(compile_for_a_minute, begun),))
+    process.start()
+    assert begun.wait(20)
+    os.kill(process.pid, signal.SIGTERM)
+    process.join(20)
+    assert process.exitcode == 0

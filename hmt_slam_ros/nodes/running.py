@@ -6,6 +6,7 @@ import ctypes
 import os
 import signal
 import sys
+import threading
 from collections.abc import Callable
 from typing import TypeVar
 
@@ -22,6 +23,8 @@ PARENT_VARIABLE = "HMT_SLAM_PARENT"
 
 FAULT = 2
 _PR_SET_PDEATHSIG = 1
+# How long what is being done may take to end, such as the compilation of a kernel, before it is broken off.
+_GRACE = 8.0  # s
 _CONTEXT_LOST = (NotInitializedException, rclpy_implementation.InvalidHandle, rclpy_implementation.RCLError)
 
 NodeType = TypeVar("NodeType", bound=Node)
@@ -34,14 +37,15 @@ def run(make: Callable[[], NodeType], spin: Callable[[NodeType], None] = rclpy.s
     :param spin: returns when the node has nothing more to do.
     :returns: exit status.
     """
-    # From here to rclpy's own handlers, and while a node is made, a signal ends the program just as well.
+    stop = _Stop()
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, _stop)
+        signal.signal(number, stop)
     try:
         _end_with_parent()
         rclpy.init()
         try:
-            _live(make, spin)
+            if not stop.told:
+                _live(make, spin)
         except _CONTEXT_LOST:
             # rclpy's own handler takes the context away at any moment, also from under a node that is being made.
             if rclpy.ok():
@@ -67,8 +71,21 @@ def _live(make: Callable[[], NodeType], spin: Callable[[NodeType], None]) -> Non
         node.destroy_node()
 
 
-def _stop(_number: int, _frame: object) -> None:
-    raise KeyboardInterrupt
+class _Stop:
+    """Takes note of a signal; rclpy's own handler, which calls this one, shuts the context down, and spinning ends.
+
+    Nothing is raised: an exception would come up at any line, also inside of a compiler, which cannot bear it.
+    """
+
+    def __init__(self) -> None:
+        self.told = False
+
+    def __call__(self, _number: int, _frame: object) -> None:
+        if not self.told:
+            self.told = True
+            deadline = threading.Timer(_GRACE, os._exit, (0,))
+            deadline.daemon = True
+            deadline.start()
 
 
 def _ignore_signals() -> None:
