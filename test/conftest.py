@@ -11,6 +11,9 @@ import pytest
 # Messages check the names and types of their fields, which they do not by default.
 os.environ["ROS_PYTHON_CHECK_FIELDS"] = "1"
 
+# A shell that runs the tests in the background has SIGINT ignored, and all programs that they start would inherit it.
+signal.signal(signal.SIGINT, signal.default_int_handler)
+
 WAIT = 40.0  # s, for what normally takes less than one
 
 
