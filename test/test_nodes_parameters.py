@@ -4,44 +4,62 @@ import pytest
 
 pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
 
+from logs_for_nodes import corridor_bag
+from rcl_interfaces.msg import Parameter as ParameterMessage
+from rcl_interfaces.srv import DescribeParameters, GetParameters, SetParameters, SetParametersAtomically
 from rclpy.context import Context
-from rclpy.node import Node
-from rclpy.parameter import Parameter
+from rclpy.parameter import Parameter, parameter_value_to_python
 
 from hmt_slam_ros.configuration import Configuration, flat_parameters
 from hmt_slam_ros.errors import HmtSlamError
-from hmt_slam_ros.nodes.parameters import declare_configuration, declare_laser_pose
+from hmt_slam_ros.nodes.parameters import ConfiguredNode, declare_laser_pose
 
 
 @pytest.fixture
 def make(domain):
     contexts = []
 
-    def make(*arguments):
+    def make(*arguments, changeable=()):
         context = Context()
         context.init(args=["--ros-args", *arguments], domain_id=domain)
         contexts.append(context)
-        return Node("tested", context=context)
+        return ConfiguredNode("tested", changeable, context=context)
 
     yield make
     for context in contexts:
         context.try_shutdown()
 
 
-def test_every_parameter_has_its_default_its_description_and_its_range(make):
-    node = make()
-    declare_configuration(node)
-    for leaf in flat_parameters(Configuration()):
-        assert node.get_parameter(leaf.name).value == leaf.default
-        descriptor = node.describe_parameter(leaf.name)
+@pytest.fixture
+def robot(tmp_path, listener, start):
+    """A robot node that runs as a process of its own, and its services by their last name."""
+    start("robot", log=corridor_bag(tmp_path), robot__patience=3600.0)
+    return lambda kind, name, **request: listener.call(kind, f"robot/{name}", kind.Request(**request))
+
+
+def message(name, value):
+    """As `ros2 param set` sends it."""
+    return Parameter(name, value=value).to_parameter_msg()
+
+
+def test_every_parameter_has_its_default_its_description_and_its_range(robot):
+    leaves = [leaf for leaf in flat_parameters(Configuration()) if leaf.name != "robot.patience"]
+    names = [leaf.name for leaf in leaves]
+    values = robot(GetParameters, "get_parameters", names=names).values
+    descriptors = robot(DescribeParameters, "describe_parameters", names=names).descriptors
+    for leaf, value, descriptor in zip(leaves, values, descriptors, strict=True):
+        assert parameter_value_to_python(value) == leaf.default
         assert descriptor.description.startswith(leaf.description)
-        ranges = list(descriptor.floating_point_range) + list(descriptor.integer_range)
-        if leaf.low is not None and leaf.high is not None:
-            assert (ranges[0].from_value, ranges[0].to_value) == (leaf.low, leaf.high)
+        ranges = [*descriptor.floating_point_range, *descriptor.integer_range]
+        assert [(allowed.from_value, allowed.to_value) for allowed in ranges] == (
+            [(leaf.low, leaf.high)] if leaf.kind in (int, float) else []
+        )
+        assert all(choice in descriptor.additional_constraints for choice in leaf.choices)
 
 
-def test_a_value_from_the_command_line_reaches_the_configuration(make):
-    assert declare_configuration(make("-p", "filter.particles:=30")).filter.particles == 30
+def test_a_value_from_the_command_line_reaches_the_configuration_and_the_parameter(make):
+    node = make("-p", "filter.particles:=30")
+    assert node.configuration.filter.particles == node.get_parameter("filter.particles").value == 30
 
 
 @pytest.mark.parametrize(
@@ -56,36 +74,72 @@ def test_a_value_from_the_command_line_reaches_the_configuration(make):
 )
 def test_a_value_that_cannot_be_is_refused_with_advice(make, setting, sentence):
     with pytest.raises(HmtSlamError, match=sentence):
-        declare_configuration(make("-p", setting))
+        make("-p", setting)
 
 
 def test_parameters_of_ros_itself_and_of_the_nodes_are_no_misspellings(make):
-    declare_configuration(make("-p", "use_sim_time:=false", "-p", "log:=x", "-p", "base_frame:=base"))
+    node = make("-p", "use_sim_time:=false", "-p", "log:=x", "-p", "base_frame:=base")
+    assert node.configuration == Configuration()
 
 
-def test_a_change_within_reason_reaches_the_node(make):
-    node, heard = make(), []
-    declare_configuration(node, ("robot.rate",), heard.append)
+def test_a_change_within_reason_reaches_a_running_node(robot):
+    (result,) = robot(SetParameters, "set_parameters", parameters=[message("robot.rate", 4.0)]).results
+    assert result.successful
+    (value,) = robot(GetParameters, "get_parameters", names=["robot.rate"]).values
+    assert value.double_value == 4.0
+
+
+def test_a_change_within_reason_reaches_the_configuration(make):
+    node = make(changeable=("robot.rate",))
     assert node.set_parameters([Parameter("robot.rate", value=4.0)])[0].successful
-    assert [configuration.robot.rate for configuration in heard] == [4.0]
+    assert node.configuration.robot.rate == 4.0
+
+
+REFUSED = [
+    ("robot.rate", -1.0, "robot.rate = -1.0 is out of range: use a number from 0 to 1000"),
+    ("robot.window", 0, "robot.window = 0 is out of range: use a whole number from 1 to 10000"),
+    ("robot.rate", 2, "robot.rate = 2 has the wrong type for ROS: write 2.0"),
+    ("robot.paced", "no", "robot.paced = 'no' is not true or false: use true or false"),
+    ("robot.rat", 2.0, "there is no parameter 'robot.rat': did you mean robot.rate"),
+    ("filter.particles", 20, "filter.particles is fixed while the node runs: set it in the parameter file"),
+    ("local_map.field_radius", 0.06, "contradicts itself"),
+]
+
+
+def test_a_running_node_refuses_a_change_that_cannot_be_with_advice(robot):
+    """As the command line refuses it, and all over DDS: the words are those that `ros2 param set` shows."""
+    changes = [message(name, value) for name, value, _ in REFUSED]
+    results = robot(SetParameters, "set_parameters", parameters=changes).results
+    for (name, _, sentence), result in zip(REFUSED, results, strict=True):
+        assert not result.successful, name
+        assert sentence in result.reason
+    mixed = [message("robot.rate", 4.0), message("robot.window", 0)]
+    result = robot(SetParametersAtomically, "set_parameters_atomically", parameters=mixed).result
+    assert "robot.window = 0 is out of range: use" in result.reason
+    values = robot(GetParameters, "get_parameters", names=["robot.rate", "robot.window"]).values
+    assert [parameter_value_to_python(value) for value in values] == [1.0, 20]
+
+
+def test_a_parameter_is_not_taken_away(robot):
+    nothing = ParameterMessage(name="robot.rate")
+    (result,) = robot(SetParameters, "set_parameters", parameters=[nothing]).results
+    assert "robot.rate = None is not a number: use" in result.reason
 
 
 @pytest.mark.parametrize(
     ("name", "value", "sentence"),
     [
         ("robot.rate", -1.0, "range"),
-        ("robot.window", 0, "range"),
         ("filter.particles", 20, "is fixed while the node runs"),
         ("local_map.field_radius", 0.06, "contradicts itself"),
     ],
 )
-def test_a_change_that_cannot_be_is_refused_with_a_reason(make, name, value, sentence):
-    node, heard = make(), []
-    declare_configuration(node, ("robot.rate", "robot.window"), heard.append)
+def test_a_node_cannot_change_its_own_parameters_past_the_check(make, name, value, sentence):
+    node = make(changeable=("robot.rate",))
     result = node.set_parameters([Parameter(name, value=value)])[0]
     assert not result.successful
     assert sentence in result.reason
-    assert not heard
+    assert node.configuration == Configuration()
 
 
 def test_a_laser_pose_is_three_numbers(make):

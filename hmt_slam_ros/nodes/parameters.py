@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
-from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
@@ -19,91 +18,92 @@ from hmt_slam_ros.errors import HmtSlamError
 _NODE_PARAMETERS = ("base_frame", "odom_frame", "map_frame", "laser_pose", "log")
 _ROS_PARAMETERS = ("use_sim_time", "start_type_description_service", "qos_overrides.")
 
-ChangeListener = Callable[[Configuration], None]
 
+class ConfiguredNode(Node):
+    """A node that has every parameter of the tree as a ROS parameter.
 
-def declare_configuration(
-    node: Node, changeable: Collection[str] = (), changed: ChangeListener | None = None
-) -> Configuration:
-    """Declare every parameter of the tree, and watch over later changes.
-
-    :param changeable: dotted names that may change while the node runs.
-    :param changed: called with the new configuration after each change.
-    :returns: the configuration with the values that the node was started with.
-    :raises HmtSlamError: for a value that cannot be, or a name that there is not.
+    :ivar configuration: the tree with the values of now.
     """
-    configuration = Configuration()
-    _refuse_unknown(node, configuration)
-    values = {leaf.name: _declare(node, leaf) for leaf in flat_parameters(configuration)}
-    configuration = with_changes(configuration, values)
-    watch = _Watch(configuration, changeable, changed or (lambda _: None))
-    node.add_on_set_parameters_callback(watch.check)
-    node.add_post_set_parameters_callback(watch.apply)
-    return configuration
 
+    def __init__(self, name: str, changeable: Iterable[str] = (), **options: Any) -> None:  # noqa: ANN401  Node's own
+        """Declare the parameters with the values that the node is started with, and watch over later changes.
 
-def _refuse_unknown(node: Node, configuration: Configuration) -> None:
-    """A misspelt name in a parameter file is told rather than passed over, which is what ROS does."""
-    known = {leaf.name for leaf in flat_parameters(configuration)} | set(_NODE_PARAMETERS)
-    for name, override in node._parameter_overrides.items():  # rclpy has no public way to list them
-        if name not in known and not name.startswith(_ROS_PARAMETERS):
-            with_changes(configuration, {name: override.value})
+        :param name: of the node.
+        :param changeable: dotted names of the parameters that may change while the node runs.
+        :raises HmtSlamError: for a value that cannot be, or a name that there is not, which ROS would pass over.
+        """
+        super().__init__(name, **options)
+        self._changeable = frozenset(changeable)
+        # rclpy has no public way to list what the node is started with.
+        self.configuration = _changed(Configuration(), self._parameter_overrides.values())
+        for leaf in flat_parameters(self.configuration):
+            self.declare_parameter(leaf.name, leaf.default, _descriptor(leaf))
+        self.add_on_set_parameters_callback(self._check)
+        self.add_post_set_parameters_callback(self._apply)
 
+    def configuration_changed(self, configuration: Configuration) -> None:
+        """Take note of new values of the parameters that may change."""
+        self.configuration = configuration
 
-def _declare(node: Node, leaf: FlatParameter) -> Any:  # noqa: ANN401  bool, int, float or str
-    descriptor = ParameterDescriptor(
-        description=f"{leaf.description} {leaf.unit}".strip(),
-        additional_constraints=f"one of {', '.join(leaf.choices)}" if leaf.choices else "",
-    )
-    _set_range(descriptor, leaf)
-    try:
-        return node.declare_parameter(leaf.name, leaf.default, descriptor).value
-    except (InvalidParameterTypeException, InvalidParameterValueException) as error:
-        value = node._parameter_overrides[leaf.name].value
-        with_changes(Configuration(), {leaf.name: value})
-        raise HmtSlamError(f"{leaf.name} = {value} has the wrong type for ROS: write {float(value)!r}") from error
+    def set_parameters_atomically(self, parameter_list: list[Parameter]) -> SetParametersResult:
+        """Set parameters, as the services do.
 
+        rclpy looks at types and ranges before it asks the callbacks, and refuses without advice: ours is asked first.
+        """
+        result = self._check(parameter_list)
+        return super().set_parameters_atomically(parameter_list) if result.successful else result
 
-def _set_range(descriptor: ParameterDescriptor, leaf: FlatParameter) -> None:
-    if leaf.low is None or leaf.high is None:
-        return
-    if leaf.kind is int:
-        descriptor.integer_range = [IntegerRange(from_value=int(leaf.low), to_value=int(leaf.high))]
-    else:
-        descriptor.floating_point_range = [FloatingPointRange(from_value=float(leaf.low), to_value=float(leaf.high))]
-
-
-class _Watch:
-    """Refuses changes that cannot be, and hands on those that can."""
-
-    def __init__(self, configuration: Configuration, changeable: Collection[str], changed: ChangeListener) -> None:
-        self._configuration = configuration
-        self._changeable = changeable
-        self._changed = changed
-
-    def check(self, parameters: list[Parameter]) -> SetParametersResult:
+    def _check(self, parameters: list[Parameter]) -> SetParametersResult:
         """Whether all of the changes are possible."""
-        changes = {parameter.name: parameter.value for parameter in self._ours(parameters)}
         try:
-            with_changes(self._configuration, changes)
+            _changed(self.configuration, parameters)
         except HmtSlamError as error:
             return SetParametersResult(successful=False, reason=str(error))
-        fixed = sorted(changes.keys() - set(self._changeable))
+        fixed = sorted(_ours(parameters).keys() - self._changeable)
         if fixed:
             reason = f"{fixed[0]} is fixed while the node runs: set it in the parameter file and restart"
             return SetParametersResult(successful=False, reason=reason)
         return SetParametersResult(successful=True)
 
-    def apply(self, parameters: list[Parameter]) -> None:
-        """Hand on what was changed."""
-        changes = {parameter.name: parameter.value for parameter in self._ours(parameters)}
-        if changes:
-            self._configuration = with_changes(self._configuration, changes)
-            self._changed(self._configuration)
+    def _apply(self, parameters: list[Parameter]) -> None:
+        if _ours(parameters):
+            self.configuration_changed(_changed(self.configuration, parameters))
 
-    def _ours(self, parameters: list[Parameter]) -> list[Parameter]:
-        names = {leaf.name for leaf in flat_parameters(self._configuration)}
-        return [parameter for parameter in parameters if parameter.name in names]
+
+def _ours(parameters: Iterable[Parameter]) -> dict[str, Any]:
+    """Name -> value of those that the tree has, or that nobody has."""
+    return {
+        parameter.name: parameter.value
+        for parameter in parameters
+        if parameter.name not in _NODE_PARAMETERS and not parameter.name.startswith(_ROS_PARAMETERS)
+    }
+
+
+def _changed(configuration: Configuration, parameters: Iterable[Parameter]) -> Configuration:
+    """The configuration with new values, which have to be of the type that ROS wants too."""
+    changes = _ours(parameters)
+    changed = with_changes(configuration, changes)
+    for leaf in flat_parameters(changed):
+        if leaf.kind is float and type(changes.get(leaf.name)) is int:
+            raise HmtSlamError(
+                f"{leaf.name} = {changes[leaf.name]} has the wrong type for ROS: write {float(leaf.value)!r}"
+            )
+    return changed
+
+
+def _descriptor(leaf: FlatParameter) -> ParameterDescriptor:
+    descriptor = ParameterDescriptor(
+        description=f"{leaf.description} {leaf.unit}".strip(),
+        additional_constraints=f"one of {', '.join(leaf.choices)}" if leaf.choices else "",
+    )
+    if leaf.low is not None and leaf.high is not None:
+        if leaf.kind is int:
+            descriptor.integer_range = [IntegerRange(from_value=int(leaf.low), to_value=int(leaf.high))]
+        else:
+            descriptor.floating_point_range = [
+                FloatingPointRange(from_value=float(leaf.low), to_value=float(leaf.high))
+            ]
+    return descriptor
 
 
 def declare_frame(node: Node, which: str, default: str) -> str:

@@ -4,18 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 
-from rclpy.node import Node
-
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.nodes.figures import Figures
 from hmt_slam_ros.nodes.inbox import Inbox
 from hmt_slam_ros.nodes.outbox import Outbox
-from hmt_slam_ros.nodes.parameters import declare_configuration
+from hmt_slam_ros.nodes.parameters import ConfiguredNode
 from hmt_slam_ros.processes.messages import Message, Notice
 from hmt_slam_ros.processes.routing import HEARD_BY, Process
 
 
-class ProcessNode(Node):
+class ProcessNode(ConfiguredNode):
     """A process of :mod:`hmt_slam_ros.processes` as a node of the same name."""
 
     def __init__(
@@ -32,16 +30,11 @@ class ProcessNode(Node):
         :param changeable: parameters that may change while the node runs.
         :raises HmtSlamError: for a parameter that cannot be.
         """
-        super().__init__(name)
-        self.configuration = declare_configuration(self, tuple(changeable), self.configuration_changed)
+        super().__init__(name, changeable)
         self.figures = Figures(self)
         self.process = make_process(self.configuration)
         self.outbox = Outbox(self, (*said, Notice))
         self.inbox = Inbox(self, HEARD_BY[name], self.deliver, self.figures)
-
-    def configuration_changed(self, configuration: Configuration) -> None:
-        """Take note of new values of the parameters that may change."""
-        self.configuration = configuration
 
     def deliver(self, message: Message) -> None:
         """Let the process handle a message and publish its answers."""

@@ -13,7 +13,6 @@ from nav_msgs.msg import Odometry as OdometryMessage
 from numpy.typing import NDArray
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
-from rclpy.node import Node
 from rosgraph_msgs.msg import Clock as ClockMessage
 from sensor_msgs.msg import LaserScan
 from std_msgs.msg import String
@@ -26,7 +25,7 @@ from hmt_slam_ros.nodes import conversions, qos
 from hmt_slam_ros.nodes.figures import Figures
 from hmt_slam_ros.nodes.inbox import Inbox
 from hmt_slam_ros.nodes.outbox import publish_surely
-from hmt_slam_ros.nodes.parameters import declare_configuration, declare_frame
+from hmt_slam_ros.nodes.parameters import ConfiguredNode, declare_frame
 from hmt_slam_ros.nodes.player import Player
 from hmt_slam_ros.nodes.running import run
 from hmt_slam_ros.nodes.topics import CLOCK, ODOM, ROBOT_STATUS, SCAN
@@ -44,13 +43,12 @@ _SILENCE = 10.0  # s without an acknowledgement before the robot complains
 State = Literal["waiting", "playing", "paused", "ended"]
 
 
-class RobotNode(Node):
+class RobotNode(ConfiguredNode):
     """The node ``robot``."""
 
     def __init__(self) -> None:
-        super().__init__("robot")
-        configuration = declare_configuration(self, _CHANGEABLE, self._configuration_changed)
-        self._settings = configuration.robot
+        super().__init__("robot", _CHANGEABLE)
+        self._settings = self.configuration.robot
         self._odom, self._base = declare_frame(self, "odom", "odom"), declare_frame(self, "base", "base_link")
         self.figures = Figures(self)
         self._log = self._open_log()
@@ -79,7 +77,9 @@ class RobotNode(Node):
             raise HmtSlamError(f"{path} has no scans in the part asked for: check robot.start and robot.duration")
         return log
 
-    def _configuration_changed(self, configuration: Configuration) -> None:
+    def configuration_changed(self, configuration: Configuration) -> None:
+        """Take note of another rate, window or pace."""
+        super().configuration_changed(configuration)
         self._settings = self._player.settings = configuration.robot
 
     def play(self) -> None:
