@@ -1,0 +1,127 @@
+"""The branches of a hypothesis: which known areas are candidates, how they are weighed and entered."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+from worlds import box, scan_in
+
+from hmt_slam_ros.configuration import Configuration
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.processes.replica import Replica
+from hmt_slam_ros.processes.tsbi_branching import Branching, Parent
+from hmt_slam_ros.topology.hypothesis_tree import LeafNotes
+
+PATH = np.array([[1.2 + 0.5 * k, 2.2, 0.1 * math.sin(k)] for k in range(6)])
+ROOM = np.concatenate((box(0.0, 0.0, 5.0, 5.0), box(1.0, 3.0, 2.0, 3.5)))
+OTHER = np.concatenate((box(-0.8, 1.2, 7.5, 3.4), box(3.0, 1.2, 3.4, 1.5)))
+
+
+def rooms_apart(rooms, offsets, sigma, configuration=None):
+    """The children of a hypothesis whose robot maps the last of several rooms, which may be one of the others.
+
+    :param rooms: walls of areas 0, 1, ...; the robot is in the last. All were driven through on the same path.
+    :param offsets: where the arcs place the frames of the known areas in that of the last one, (2,) each.
+    :param sigma: deviation of the arcs, m.
+    """
+    replica = Replica()
+    hybrid_map, here = replica.maps[0], len(rooms) - 1
+    for area, walls in enumerate(rooms):
+        for k, pose in enumerate(PATH):
+            keyframe = 6 * area + k
+            replica.scans[keyframe] = scan_in(
+                walls, pose, noise=0.01, seed=keyframe, field_of_view=2 * np.pi, beams=361
+            )
+            hybrid_map.place(keyframe, area, se2.between(PATH[0], pose))
+    for area, offset in enumerate(offsets):
+        spread = np.diag([sigma, sigma, math.radians(5.0)]) ** 2
+        hybrid_map.set_arc(here, area, PoseGaussian(np.array([*offset, 0.0]), spread), closure=False)
+    newest = range(6 * here, 6 * here + 6)
+    notes = LeafNotes({k: 1e-3 * np.eye(3) for k in newest}, unchecked=tuple(newest))
+    parent = Parent(0, here, hybrid_map, notes, 0.0)
+    return parent, Branching(configuration or Configuration(), replica), list(newest)
+
+
+def weights_by_area(branches):
+    weights = {}
+    for child in branches.children:
+        weights[child.area] = weights.get(child.area, 0.0) + math.exp(child.log_weight)
+    total = sum(weights.values())
+    return {area: weight / total for area, weight in weights.items()}
+
+
+def test_one_of_two_rooms_that_look_alike_to_the_prior_is_recognised():
+    parent, branching, newest = rooms_apart((OTHER, ROOM, ROOM), ((0.6, 0.4), (-0.5, 0.3)), 1.0)
+    weights = weights_by_area(branching.cut(parent, newest[1:]))
+    assert weights[1] > 0.9
+    assert weights.get(0, 0.0) < weights[parent.area + 1]
+
+
+def test_two_identical_rooms_and_a_loose_prior_stay_both():
+    parent, branching, newest = rooms_apart((ROOM, ROOM, ROOM), ((0.6, 0.4), (-0.5, 0.3)), 1.0)
+    weights = weights_by_area(branching.cut(parent, newest[1:]))
+    assert weights[0] > 0.25
+    assert weights[1] > 0.25
+
+
+def test_an_unknown_room_is_new_though_the_arcs_point_into_known_ones():
+    parent, branching, newest = rooms_apart((ROOM, ROOM, OTHER), ((0.6, 0.4), (-0.5, 0.3)), 1.0)
+    weights = weights_by_area(branching.cut(parent, newest[1:]))
+    assert weights[parent.area + 1] > 0.8
+
+
+def test_an_area_beyond_the_gate_is_no_candidate():
+    parent, branching, newest = rooms_apart((ROOM, ROOM), ((9.0, 9.0),), 0.5)
+    branches = branching.cut(parent, newest[1:])
+    assert [child.area for child in branches.children] == [parent.area + 1]
+    assert branches.children[0].log_weight == 0.0
+
+
+def test_a_recognised_area_is_entered_at_the_pose_of_the_match():
+    parent, branching, newest = rooms_apart((ROOM, ROOM), ((0.6, -0.4),), 1.0)
+    child = max(branching.cut(parent, newest[1:]).children, key=lambda child: child.log_weight)
+    assert child.area == 0
+    truth = se2.between(PATH[0], PATH[1])
+    entered = {r.keyframe: r.pose for r in child.relabelled}
+    assert np.allclose(entered[newest[1]], truth, atol=0.03)
+    assert np.allclose(child.rebase.mean, 0.0, atol=0.04)
+    (arc,) = child.arcs
+    assert (arc.source, arc.target) == (1, 0)
+    assert np.allclose(arc.pose.mean, 0.0, atol=0.04)
+    assert not arc.closure  # an arc joined the two before
+    assert np.sqrt(arc.pose.covariance[0, 0]) < 0.2
+
+
+def test_candidates_beyond_the_number_that_is_examined_keep_their_prior_mass():
+    settings = Configuration()
+    settings = replace(settings, tsbi=replace(settings.tsbi, max_candidates=1))
+    parent, branching, newest = rooms_apart((ROOM, ROOM, ROOM), ((0.6, 0.4), (-0.5, 0.3)), 1.0, settings)
+    branches = branching.cut(parent, newest[1:])
+    assert len({child.area for child in branches.children}) == 2  # new, and one of the two
+    assert 0.05 < math.exp(branches.log_skipped) < 0.6
+
+
+def test_a_re_check_joins_areas_by_an_arc_and_moves_nothing():
+    parent, branching, _ = rooms_apart((ROOM, ROOM, ROOM), ((0.6, 0.4), (-0.5, 0.3)), 1.0)
+    # Area 0 is the robot's neighbour; let it be known only by way of area 1.
+    hybrid_map = parent.hybrid_map
+    arc_1_0 = hybrid_map.arc(2, 1).inverse().compose(hybrid_map.arc(2, 0))
+    del hybrid_map.arcs[0, 2]
+    hybrid_map.set_arc(1, 0, arc_1_0, closure=False)
+    children = branching.recheck(parent).children
+    stay, *joined = children
+    assert (stay.area, stay.arcs, stay.reload) == (2, (), False)
+    assert stay.notes.unchecked == ()
+    assert joined
+    for child in joined:
+        assert (child.area, child.relabelled, child.rebase) == (2, (), None)
+        (arc,) = child.arcs
+        assert (arc.source, arc.target, arc.closure) == (2, 0, True)
+
+
+def test_a_keyframe_speaks_for_or_against_an_area_once():
+    parent, branching, newest = rooms_apart((ROOM, ROOM), ((0.6, -0.4),), 1.0)
+    stay = replace(parent, notes=parent.notes.checked([0], newest))
+    branches = branching.cut(stay, newest[1:])
+    assert [child.area for child in branches.children] == [parent.area + 1]
