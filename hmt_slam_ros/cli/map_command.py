@@ -24,12 +24,13 @@ def run(options: argparse.Namespace) -> None:
         log = open_log(options.log, start=configuration.robot.start, duration=configuration.robot.duration or None)
         if not log.scan_count:
             raise HmtSlamError(f"{options.log} has no scans in the part asked for: check --start and --duration")
-        result, figures = _measured_run(log, configuration)
+        result, figures = measured_run(log, configuration)
         recording = write_output(folder, result.recorder, result.stamps, result.source_stamps, figures)
     print(summary(options.out, recording, log.duration, figures.wall_seconds))
 
 
-def _measured_run(log: Log, configuration: Configuration) -> tuple[RunResult, RunFigures]:
+def measured_run(log: Log, configuration: Configuration) -> tuple[RunResult, RunFigures]:
+    """Map a log, and measure what that costs."""
     wall, cpu = time.monotonic(), time.process_time()
     with Progress(log.scan_count, log.duration) as progress:
         result = run_log(log, configuration, progress)

@@ -2,18 +2,21 @@
 
 from hmt_slam_ros.evaluation.relations import (
     ErrorStatistics,
+    PairErrors,
     RelationErrors,
     Relations,
     RelationScore,
     evaluate_folder,
     evaluate_relations,
     format_table,
+    pair_errors,
     read_relations,
 )
 from hmt_slam_ros.evaluation.trajectory import StampedPoses, odometry_of, read_tum, write_tum
 
 __all__ = [
     "ErrorStatistics",
+    "PairErrors",
     "RelationErrors",
     "RelationScore",
     "Relations",
@@ -22,6 +25,7 @@ __all__ = [
     "evaluate_relations",
     "format_table",
     "odometry_of",
+    "pair_errors",
     "read_relations",
     "read_tum",
     "write_tum",

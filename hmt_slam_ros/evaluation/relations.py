@@ -77,6 +77,24 @@ class RelationErrors:
     over_60_s: RelationScore
 
 
+@dataclass(frozen=True, eq=False)
+class PairErrors:
+    """Error of every relation; arrays of shape (n,).
+
+    :ivar translation: norm of the difference of the two translations, metres.
+    :ivar rotation: absolute difference of heading, degrees.
+    :ivar span: time between the two poses, ns, int64.
+    :ivar found: whether there is a pose at both ends; where not, the errors mean nothing.
+    :ivar carried: whether one end or both were reached along the odometry.
+    """
+
+    translation: NDArray[np.float64]
+    rotation: NDArray[np.float64]
+    span: NDArray[np.int64]
+    found: NDArray[np.bool_]
+    carried: NDArray[np.bool_]
+
+
 def read_relations(path: Path) -> Relations:
     """Relations from lines ``t1 t2 x y z roll pitch yaw`` (s, m, rad); ``#`` begins a comment.
 
@@ -121,6 +139,24 @@ def evaluate_folder(output_dir: Path, relations_file: Path, odometry_log: Path |
 def evaluate_relations(
     trajectory: StampedPoses, relations: Relations, odometry: StampedPoses | None = None
 ) -> RelationErrors:
+    """Errors of a trajectory over all relations and over the long ones; parameters as of :func:`pair_errors`."""
+    errors = pair_errors(trajectory, relations, odometry)
+
+    def score(chosen: NDArray[np.bool_]) -> RelationScore:
+        kept = chosen & errors.found
+        return RelationScore(
+            count=int(chosen.sum()),
+            matched=int(kept.sum()),
+            missed=int((chosen & ~errors.found).sum()),
+            carried=int((kept & errors.carried).sum()),
+            translation=_statistics(errors.translation[kept]),
+            rotation=_statistics(errors.rotation[kept]),
+        )
+
+    return RelationErrors(score(np.ones(errors.span.size, dtype=np.bool_)), score(errors.span > LONG_SPAN))
+
+
+def pair_errors(trajectory: StampedPoses, relations: Relations, odometry: StampedPoses | None = None) -> PairErrors:
     """Errors of a trajectory at each relation.
 
     The pose at a stamp is the one nearest in time if that is within 0.1 s. Else, with odometry, the nearest pose is
@@ -134,23 +170,13 @@ def evaluate_relations(
     starts, start_found, start_carried = _poses_at(relations.starts, trajectory, odometry)
     ends, end_found, end_carried = _poses_at(relations.ends, trajectory, odometry)
     estimates = se2.between(starts, ends)
-    translation = np.hypot(*(estimates[:, :2] - relations.poses[:, :2]).T)
-    rotation = np.rad2deg(np.abs(se2.wrap(estimates[:, 2] - relations.poses[:, 2])))
-    found, carried = start_found & end_found, start_carried | end_carried
-    span = np.abs(relations.ends - relations.starts)
-
-    def score(chosen: NDArray[np.bool_]) -> RelationScore:
-        kept = chosen & found
-        return RelationScore(
-            count=int(chosen.sum()),
-            matched=int(kept.sum()),
-            missed=int((chosen & ~found).sum()),
-            carried=int((kept & carried).sum()),
-            translation=_statistics(translation[kept]),
-            rotation=_statistics(rotation[kept]),
-        )
-
-    return RelationErrors(score(np.ones(span.size, dtype=np.bool_)), score(span > LONG_SPAN))
+    return PairErrors(
+        translation=np.hypot(*(estimates[:, :2] - relations.poses[:, :2]).T),
+        rotation=np.rad2deg(np.abs(se2.wrap(estimates[:, 2] - relations.poses[:, 2]))),
+        span=np.abs(relations.ends - relations.starts),
+        found=start_found & end_found,
+        carried=start_carried | end_carried,
+    )
 
 
 def _poses_at(
