@@ -139,7 +139,7 @@ def test_a_change_of_area_moves_frame_and_map_together():
 def test_beams_beyond_the_range_tell_free_space_up_to_it():
     configuration = Configuration()
     mapping = LocalMapping(replace(configuration, local_map=replace(configuration.local_map, max_range=5.0)))
-    points, free = mapping.mapped_points(scan_in(ROOM, (0, 0, 0), laser_pose=(0.2, 0.1, 0.3)))
+    points, free, _ = mapping.mapped_beams(scan_in(ROOM, (0, 0, 0), laser_pose=(0.2, 0.1, 0.3)))
     assert np.hypot(*(points - (0.2, 0.1)).T).max() <= 5.0
     np.testing.assert_allclose(np.hypot(*(free - (0.2, 0.1)).T), 5.0)
     assert len(points) + len(free) == 181

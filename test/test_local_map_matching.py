@@ -9,7 +9,7 @@ from worlds import box, scan_in
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.local_map.batch import propose_all
 from hmt_slam_ros.local_map.matching import Alignment, Prior, align, beam_model, correlative_search, log_ratio
-from hmt_slam_ros.local_map.patch_pool import PatchPool
+from hmt_slam_ros.local_map.patch_pool import Beams, PatchPool
 from hmt_slam_ros.local_map.patches import FAR, PATCH, InverseModel, field_at, odds_at
 
 CELL, RADIUS = 0.05, 0.5
@@ -24,9 +24,9 @@ def mapped(walls, poses, beams=721):
     table = pool.empty_table()
     for pose in poses:
         scan = scan_in(walls, pose, beams=beams, field_of_view=2 * np.pi)
-        near = scan.points[np.hypot(*scan.points.T) < 12.0]
-        at = np.asarray(pose, dtype=float)
-        pool.insert(table, at, scan.laser_pose, near, np.empty((0, 2)), InverseModel(17, -8, 70))
+        near = np.hypot(*scan.points.T) < 12.0
+        told = Beams(scan.points[near], np.empty((0, 2)), scan.origins[near])
+        pool.insert(table, np.asarray(pose, dtype=float), told, InverseModel(17, -8, 70))
     return pool, table
 
 

@@ -5,7 +5,7 @@ import pytest
 from scipy.ndimage import distance_transform_edt
 from worlds import box, scan_in
 
-from hmt_slam_ros.local_map.patch_pool import PatchPool
+from hmt_slam_ros.local_map.patch_pool import Beams, PatchPool
 from hmt_slam_ros.local_map.patches import FAR, PATCH, InverseModel, field_at, odds_at
 
 CELL, RADIUS = 0.05, 0.5
@@ -18,7 +18,7 @@ def pool():
 
 
 def insert(pool, table, scan, pose=(0.0, 0.0, 0.0)):
-    pool.insert(table, np.asarray(pose, dtype=float), scan.laser_pose, scan.points, np.empty((0, 2)), MODEL)
+    pool.insert(table, np.asarray(pose, dtype=float), Beams(scan.points, np.empty((0, 2)), scan.origins), MODEL)
 
 
 def dense(pool, table, read):
@@ -52,6 +52,16 @@ def test_a_cell_counts_once_per_scan_however_many_beams_pass_it(pool):
     table = pool.empty_table()
     insert(pool, table, scan_in(box(-3, -3, 3, 3), (0, 0, 0), beams=721, field_of_view=2 * np.pi))
     assert odds_at(pool.view(table), 4 * PATCH + 1, 4 * PATCH + 1) == MODEL.miss
+
+
+def test_each_beam_frees_the_cells_from_its_own_origin(pool):
+    table = pool.empty_table()
+    origins = np.array([[0.01, 0.01], [0.01, 1.01]])
+    pool.insert(table, np.zeros(3), Beams(origins + np.array([2.0, 0.0]), np.empty((0, 2)), origins), MODEL)
+    odds = dense(pool, table, odds_at)
+    assert sorted(set(np.nonzero(odds < 0)[0])) == [4 * PATCH, 4 * PATCH + 20]
+    assert (odds < 0).sum() == 80
+    assert (odds > 0).sum() == 2
 
 
 def test_a_shared_map_keeps_its_content_when_its_twin_is_written_to(pool):

@@ -75,10 +75,12 @@ def between(c_T_a: ArrayLike, c_T_b: ArrayLike) -> Pose:
 
 
 def transform(a_T_b: ArrayLike, points: ArrayLike) -> NDArray[np.float64]:
-    """Points (n, 2) of frame b in frame a, for one pose (3,)."""
+    """Points (n, 2) of frame b in frame a, for one pose (3,), or one for each point (n, 3)."""
     a, p = np.asarray(a_T_b, dtype=np.float64), np.asarray(points, dtype=np.float64)
-    cos, sin = np.cos(a[2]), np.sin(a[2])
-    return np.stack((a[0] + cos * p[..., 0] - sin * p[..., 1], a[1] + sin * p[..., 0] + cos * p[..., 1]), axis=-1)
+    cos, sin = np.cos(a[..., 2]), np.sin(a[..., 2])
+    x = a[..., 0] + cos * p[..., 0] - sin * p[..., 1]
+    y = a[..., 1] + sin * p[..., 0] + cos * p[..., 1]
+    return np.stack((x, y), axis=-1)
 
 
 def exp(xi: ArrayLike) -> Pose:

@@ -9,7 +9,7 @@ import numpy as np
 from hmt_slam_ros.arrays import Float64, Int32
 from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.local_map import matching
-from hmt_slam_ros.local_map.patch_pool import PatchPool
+from hmt_slam_ros.local_map.patch_pool import Beams, PatchPool
 from hmt_slam_ros.local_map.patches import FAR, PATCH, InverseModel
 from hmt_slam_ros.sensing import Scan
 
@@ -37,20 +37,19 @@ class LocalMapping:
 
     def matching_points(self, scan: Scan) -> Float64:
         """The points that are matched: within the map's range, evenly thinned; shape (n, 2), base frame, m."""
-        points = self.mapped_points(scan)[0]
+        points = self.mapped_beams(scan).points
         stride = -(-len(points) // self.configuration.matching.max_points)
         return np.ascontiguousarray(points[:: max(1, stride)])
 
-    def mapped_points(self, scan: Scan) -> tuple[Float64, Float64]:
-        """End points within the map's range, and where longer beams leave that range; (n, 2), (k, 2), base frame, m."""
+    def mapped_beams(self, scan: Scan) -> Beams:
+        """The part of a scan within the map's range."""
         limit = self.configuration.local_map.max_range
-        relative = scan.points - scan.laser_pose[:2]
-        distance = np.hypot(relative[:, 0], relative[:, 1])
+        beams, origins = scan.beams, scan.origins
+        distance = np.hypot(beams[:, 0], beams[:, 1])
         near = distance <= limit
-        beyond = scan.laser_pose[:2] + relative[~near] * (limit / distance[~near, None])
-        return scan.points[near], beyond
+        beyond = origins[~near] + beams[~near] * (limit / distance[~near, None])
+        return Beams(scan.points[near], beyond, np.concatenate((origins[near], origins[~near])))
 
     def insert(self, table: Int32, pose: Float64, scan: Scan) -> None:
         """Enter a scan at ``map_T_base`` into a map."""
-        points, free = self.mapped_points(scan)
-        self.pool.insert(table, pose, scan.laser_pose, points, free, self._inverse_model)
+        self.pool.insert(table, pose, self.mapped_beams(scan), self._inverse_model)

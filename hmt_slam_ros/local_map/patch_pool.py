@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from hmt_slam_ros.arrays import Float64, Int32, UInt8
@@ -10,6 +12,19 @@ from hmt_slam_ros.local_map import patches
 from hmt_slam_ros.local_map.patches import FAR, NO_PATCH, PATCH, InverseModel, MapView, Store
 
 _GROWTH = 1024
+
+
+class Beams(NamedTuple):
+    """What a scan tells a map; m, base frame.
+
+    :ivar points: shape (n, 2), ends on surfaces.
+    :ivar free: shape (k, 2), ends of beams that only tell free space.
+    :ivar origins: shape (n + k, 2), where the laser was at each of them, in that order.
+    """
+
+    points: Float64
+    free: Float64
+    origins: Float64
 
 
 class PatchPool:
@@ -67,25 +82,20 @@ class PatchPool:
         """The map of ``table`` for the kernels; valid until the next insertion."""
         return MapView(table, self.odds, self.field, self.cell, self.radius)
 
-    def insert(
-        self, table: Int32, pose: Float64, laser: Float64, points: Float64, free: Float64, model: InverseModel
-    ) -> None:
+    def insert(self, table: Int32, pose: Float64, beams: Beams, model: InverseModel) -> None:
         """Enter a scan into a map: free space along the beams, surfaces at their ends, the distance field around them.
 
         A cell is counted once per scan, so that many beams through one cell weigh as one.
 
         :param table: the map, changed in place.
         :param pose: ``map_T_base``, shape (3,).
-        :param laser: ``base_T_laser``, shape (3,).
-        :param points: end points on surfaces, shape (n, 2), m, base frame.
-        :param free: end points of beams that only tell free space, shape (k, 2), m, base frame.
         :param model: the inverse sensor model.
         """
         self._reserve(self.table_size * self.table_size)
         half = 0.5 * self.table_size * PATCH
-        origin = se2.compose(pose, laser)[:2] / self.cell + half
-        ends = se2.transform(pose, np.concatenate((points, free))) / self.cell + half
-        patches.insert(table, self._store(), self._marks, self._stamp, origin, ends, len(points), model)
+        origins = se2.transform(pose, beams.origins) / self.cell + half
+        ends = se2.transform(pose, np.concatenate((beams.points, beams.free))) / self.cell + half
+        patches.insert(table, self._store(), self._marks, self._stamp, origins, ends, len(beams.points), model)
 
     def _store(self) -> Store:
         return Store(self.odds, self.field, self.references, self._free, self._free_count)

@@ -143,13 +143,13 @@ def insert(
     store: Store,
     marks: UInt8,
     stamp: UInt8,
-    origin: Float64,
+    origins: Float64,
     ends: Float64,
     hits: int,
     model: InverseModel,
 ) -> None:
-    """Enter beams from ``origin`` to ``ends`` (n, 2), in cells, of which the first ``hits`` end on a surface."""
-    touched = _mark(marks, origin, ends, hits)
+    """Enter beams from ``origins`` to ``ends`` (n, 2), in cells, of which the first ``hits`` end on a surface."""
+    touched = _mark(marks, origins, ends, hits)
     added = np.empty((hits, 2), dtype=np.int32)
     removed = np.empty((touched.shape[0], 2), dtype=np.int32)
     n_added, n_removed = 0, 0
@@ -174,12 +174,12 @@ def insert(
 
 
 @njit(cache=True)
-def _mark(marks: UInt8, origin: Float64, ends: Float64, hits: int) -> Int32:
+def _mark(marks: UInt8, origins: Float64, ends: Float64, hits: int) -> Int32:
     """Mark the cells in which beams end and which they pass; each is listed once as (column, row)."""
     edge = marks.shape[0]
     length = 0
     for i in range(ends.shape[0]):
-        length += int(abs(ends[i, 0] - origin[0])) + int(abs(ends[i, 1] - origin[1])) + 4
+        length += int(abs(ends[i, 0] - origins[i, 0])) + int(abs(ends[i, 1] - origins[i, 1])) + 4
     touched = np.empty((length, 2), dtype=np.int32)
     count = 0
     for i in range(hits):
@@ -189,7 +189,7 @@ def _mark(marks: UInt8, origin: Float64, ends: Float64, hits: int) -> Int32:
             touched[count, 0], touched[count, 1] = column, row
             count += 1
     for i in range(ends.shape[0]):
-        count = _mark_beam(marks, touched, count, origin, ends[i])
+        count = _mark_beam(marks, touched, count, origins[i], ends[i])
     return touched[:count]
 
 

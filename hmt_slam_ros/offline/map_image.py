@@ -51,7 +51,8 @@ def occupancy_image(
     :param max_range: m.
     """
     beams = [_beams(scan, pose, max_range) for scan, pose in zip(scans, poses, strict=True)]
-    corners = np.concatenate([points for _, points, _ in beams] + [start[None] for start, _, _ in beams])
+    lasers = [se2.transform(pose, scan.laser_pose[:2])[None] for scan, pose in zip(scans, poses, strict=True)]
+    corners = np.concatenate([points for starts, ends, _ in beams for points in (starts, ends)] + lasers)
     low, high = corners.min(axis=0) - _MARGIN, corners.max(axis=0) + _MARGIN
     while np.prod((high - low) / resolution) > _MAX_CELLS:
         resolution *= 2.0
@@ -59,8 +60,8 @@ def occupancy_image(
     width, height = (np.ceil((high - origin) / resolution).astype(int) + 1).tolist()
     votes = np.zeros((3, height, width), dtype=np.int32)
     votes[_LAST_SCAN] = -1
-    for k, (start, points, returned) in enumerate(beams):
-        _vote((start - origin) / resolution, (points - origin) / resolution, returned, k, votes)
+    for k, (starts, ends, returned) in enumerate(beams):
+        _vote((starts - origin) / resolution, (ends - origin) / resolution, returned, k, votes)
     return OccupancyImage(_classified(votes[_HITS], votes[_MISSES])[::-1], resolution, origin)
 
 
@@ -75,16 +76,15 @@ def _classified(hits: NDArray[np.int32], misses: NDArray[np.int32]) -> NDArray[n
 def _beams(
     scan: Scan, pose: NDArray[np.float64], max_range: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
-    """Start (2,), ends (k, 2) of the valid beams cut off at ``max_range``, and whether each end is a return."""
-    points = scan.points - scan.laser_pose[:2]
-    ranges = np.hypot(points[:, 0], points[:, 1])
-    cut = points * (np.minimum(ranges, max_range) / np.maximum(ranges, 1e-9))[:, None] + scan.laser_pose[:2]
-    return se2.transform(pose, scan.laser_pose[:2]), se2.transform(pose, cut), ranges <= max_range
+    """Starts and ends (k, 2) of the valid beams cut off at ``max_range``, and whether each end is a return."""
+    ranges = np.hypot(*scan.beams.T)
+    cut = scan.beams * (np.minimum(ranges, max_range) / np.maximum(ranges, 1e-9))[:, None] + scan.origins
+    return se2.transform(pose, scan.origins), se2.transform(pose, cut), ranges <= max_range
 
 
 @njit(cache=True)
 def _vote(
-    start: NDArray[np.float64],
+    starts: NDArray[np.float64],
     ends: NDArray[np.float64],
     returned: NDArray[np.bool_],
     scan: int,
@@ -97,7 +97,7 @@ def _vote(
             votes[_LAST_SCAN, i, j] = scan
             votes[_HITS, i, j] += 1
     for k in range(ends.shape[0]):
-        _clear(start, ends[k], scan, votes)
+        _clear(starts[k], ends[k], scan, votes)
 
 
 @njit(cache=True)

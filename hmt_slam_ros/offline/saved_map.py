@@ -25,7 +25,7 @@ from hmt_slam_ros.processes.replica import Replica
 from hmt_slam_ros.sensing import Scan
 from hmt_slam_ros.topology.hybrid_map import ArcValue, HybridMap
 
-FORMAT, VERSION = "hmt_map", 1
+FORMAT, VERSION = "hmt_map", 2
 MANIFEST = "manifest.json"
 
 # Columns of scans/geometry.npy after which the laser's pose (x, y, theta) follows.
@@ -162,6 +162,7 @@ def _write_scans(directory: Path, scans: Mapping[int, Scan]) -> None:
         "beams": np.array([scan.ranges.size for scan in rows], dtype=np.int64),
         "geometry": np.array([[getattr(scan, name) for name in _GEOMETRY] for scan in rows], dtype=np.float64),
         "laser_poses": np.array([scan.laser_pose for scan in rows], dtype=np.float64),
+        "motions": np.array([scan.motion for scan in rows], dtype=np.float64),
         "ranges": np.concatenate([scan.ranges for scan in rows]).astype(np.float32, copy=False),
     }
     for name, array in arrays.items():
@@ -171,19 +172,24 @@ def _write_scans(directory: Path, scans: Mapping[int, Scan]) -> None:
 def _read_scans(directory: Path) -> dict[int, Scan]:
     arrays = {
         name: np.load(directory / f"{name}.npy")
-        for name in ("keyframes", "stamps", "beams", "geometry", "laser_poses", "ranges")
+        for name in ("keyframes", "stamps", "beams", "geometry", "laser_poses", "motions", "ranges")
     }
     ends = np.cumsum(arrays["beams"])[:-1]
     return {
         int(keyframe): Scan(
-            stamp=int(stamp), ranges=ranges, laser_pose=laser_pose, **dict(zip(_GEOMETRY, geometry, strict=True))
+            stamp=int(stamp),
+            ranges=ranges,
+            laser_pose=laser_pose,
+            motion=motion,
+            **dict(zip(_GEOMETRY, geometry, strict=True)),
         )
-        for keyframe, stamp, ranges, geometry, laser_pose in zip(
+        for keyframe, stamp, ranges, geometry, laser_pose, motion in zip(
             arrays["keyframes"],
             arrays["stamps"],
             np.split(arrays["ranges"], ends),
             arrays["geometry"].tolist(),
             arrays["laser_poses"],
+            arrays["motions"],
             strict=True,
         )
     }

@@ -46,6 +46,7 @@ class ScanGeometry:
     range_max: float
     laser_pose: NDArray[np.float64]
     time_increment: float
+    motion: NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +112,7 @@ class RobotStatus:
 
 # Raise a document's version with every change of its dataclass: a receiver refuses any other.
 _DOCUMENTS: dict[type, tuple[str, int]] = {
-    KeyframeHead: ("keyframe", 1),
+    KeyframeHead: ("keyframe", 2),
     AreaEvents: ("area_events", 1),
     Hypotheses: ("hypotheses", 1),
     Accepted: ("accepted", 1),

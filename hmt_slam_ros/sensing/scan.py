@@ -8,8 +8,12 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from hmt_slam_ros.geometry import se2
 
-def _laser_at_base() -> NDArray[np.float64]:
+_MICROSECONDS = 1e6
+
+
+def _zeros() -> NDArray[np.float64]:
     return np.zeros(3)
 
 
@@ -20,6 +24,9 @@ class Scan:
     Angles, range limits and ``time_increment`` are kept in the precision of sensor_msgs/LaserScan, float32, so that a
     log, the bag made from it and its replay are one and the same.
 
+    Points and origins are those of the base at ``stamp``: a beam that came later is carried back along the motion, at
+    constant velocity in between.
+
     :ivar stamp: time of the first beam, integer nanoseconds, increasing within one source.
     :ivar ranges: shape (n,), float32, metres. NaN, inf, values below ``range_min`` and values at or beyond
         ``range_max`` are beams without a return.
@@ -29,6 +36,8 @@ class Scan:
     :ivar range_max: smallest range that means "no return", metres.
     :ivar laser_pose: shape (3,), ``base_T_laser`` as (x, y, theta) in m and rad.
     :ivar time_increment: seconds from one beam to the next, 0 where unknown.
+    :ivar motion: shape (3,), the base's motion from the first beam to the last as a twist, m, m, rad: its exponential
+        is the base at the last beam as seen from the base at the first. Zeros where it is not known.
     """
 
     stamp: int
@@ -37,12 +46,23 @@ class Scan:
     angle_increment: float
     range_min: float
     range_max: float
-    laser_pose: NDArray[np.float64] = field(default_factory=_laser_at_base)
+    laser_pose: NDArray[np.float64] = field(default_factory=_zeros)
     time_increment: float = 0.0
+    motion: NDArray[np.float64] = field(default_factory=_zeros)
 
     def __post_init__(self) -> None:
         for name in ("angle_min", "angle_increment", "range_min", "range_max", "time_increment"):
             object.__setattr__(self, name, float(np.float32(getattr(self, name))))
+
+    @property
+    def sweep(self) -> float:
+        """Seconds from the first beam to the last."""
+        return max(0, self.ranges.size - 1) * self.time_increment
+
+    @property
+    def end(self) -> int:
+        """Time of the last beam, ns, to the microsecond that float32 is good for; needs a finite ``time_increment``."""
+        return self.stamp + 1000 * round(self.sweep * _MICROSECONDS)
 
     @cached_property
     def valid(self) -> NDArray[np.bool_]:
@@ -58,4 +78,21 @@ class Scan:
         points = np.empty((ranges.size, 2))
         points[:, 0] = self.laser_pose[0] + ranges * np.cos(angles)
         points[:, 1] = self.laser_pose[1] + ranges * np.sin(angles)
-        return points
+        return self._carried_back(points)
+
+    @property
+    def origins(self) -> NDArray[np.float64]:
+        """Where the laser was at each of those beams, shape (k, 2), metres, robot base frame."""
+        return self._carried_back(np.tile(self.laser_pose[:2], (int(self.valid.sum()), 1)))
+
+    @property
+    def beams(self) -> NDArray[np.float64]:
+        """From the laser to the end point, for each of those beams, shape (k, 2), metres, robot base frame."""
+        return self.points - self.origins
+
+    def _carried_back(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """One point (k, 2) for each beam with a return, from the base at that beam to the base at the first."""
+        if not self.motion.any():
+            return points
+        passed = np.flatnonzero(self.valid) / max(1, self.ranges.size - 1)
+        return se2.transform(se2.exp(passed[:, None] * self.motion), points)

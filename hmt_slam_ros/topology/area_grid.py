@@ -84,13 +84,13 @@ def build_area_grid(scans: Sequence[Scan], poses: NDArray[np.float64], model: Gr
     if not hits:
         return _blank(model.cell)
     reach = 5.0 * model.sigma
-    everything = np.concatenate((*hits, np.array(lasers)))
+    everything = np.concatenate((*hits, *lasers))
     # The corner is a multiple of the cell, so that grids of one area agree on where cells lie.
     origin = np.floor((everything.min(axis=0) - reach) / model.cell) * model.cell
     columns, rows = np.ceil((everything.max(axis=0) + reach - origin) / model.cell).astype(np.int64) + 1
     free = np.zeros((rows, columns), dtype=np.bool_)
-    for laser, points in zip(lasers, hits, strict=True):
-        _mark_free(free, origin, model.cell, laser, points)
+    for origins, points in zip(lasers, hits, strict=True):
+        _mark_free(free, origin, model.cell, origins, points)
     distance2 = np.full((2 * rows, 2 * columns), np.inf)
     surfaces = np.concatenate([_joined(points, 0.5 * model.cell) for points in hits])
     _lower_distances(distance2, origin, 0.5 * model.cell, surfaces, reach)
@@ -107,14 +107,13 @@ def _blank(cell: float) -> AreaGrid:
 def _end_points(
     scans: Sequence[Scan], poses: NDArray[np.float64], max_range: float
 ) -> tuple[list[Points], list[Points]]:
-    """End points and laser position of every scan that has any, area frame."""
+    """End points and where the laser was at each of them, of every scan that has any, area frame."""
     hits, lasers = [], []
     for scan, pose in zip(scans, poses, strict=True):
-        beams = scan.points - scan.laser_pose[:2]
-        points = scan.points[np.hypot(beams[:, 0], beams[:, 1]) <= max_range]
-        if points.size:
-            hits.append(se2.transform(pose, points))
-            lasers.append(se2.compose(pose, scan.laser_pose)[:2])
+        near = np.hypot(*scan.beams.T) <= max_range
+        if near.any():
+            hits.append(se2.transform(pose, scan.points[near]))
+            lasers.append(se2.transform(pose, scan.origins[near]))
     return hits, lasers
 
 
@@ -152,10 +151,10 @@ def _log_ratio(distance2: NDArray[np.float64], free: NDArray[np.bool_], model: G
 
 
 @njit(cache=True)
-def _mark_free(free: NDArray[np.bool_], origin: Points, cell: float, laser: Points, points: Points) -> None:
+def _mark_free(free: NDArray[np.bool_], origin: Points, cell: float, lasers: Points, points: Points) -> None:
     """Mark the cells between the laser and one cell before each end point."""
-    x0, y0 = (laser[0] - origin[0]) / cell, (laser[1] - origin[1]) / cell
     for k in range(points.shape[0]):
+        x0, y0 = (lasers[k, 0] - origin[0]) / cell, (lasers[k, 1] - origin[1]) / cell
         dx = (points[k, 0] - origin[0]) / cell - x0
         dy = (points[k, 1] - origin[1]) / cell - y0
         steps = int(np.ceil(max(abs(dx), abs(dy))))

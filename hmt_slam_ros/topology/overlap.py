@@ -21,8 +21,7 @@ def sensed_points(scan: Scan, max_range: float, count: int = 180) -> NDArray[np.
 
     :returns: shape (k, 2), m, robot base frame.
     """
-    points = scan.points
-    near = points[np.hypot(*(points - scan.laser_pose[:2]).T) <= max_range]
+    near = scan.points[np.hypot(*scan.beams.T) <= max_range]
     if len(near) <= count:
         return near
     return near[np.linspace(0.0, len(near) - 1.0, count).round().astype(np.int64)]
