@@ -26,24 +26,33 @@ def two_rooms():
 
 
 def distances(walls, sensor, angles):
-    """Distance from ``world_T_laser`` to the nearest wall along each angle, shape (n,), m; inf where there is none."""
-    directions = np.stack((np.cos(angles + sensor[2]), np.sin(angles + sensor[2])), axis=1)
-    offset, along = walls[:, :2] - sensor[:2], walls[:, 2:] - walls[:, :2]
+    """Distance from ``world_T_laser`` to the nearest wall along each angle, shape (n,), m; inf where there is none.
+
+    The laser has one pose (3,), or one for each angle (n, 3).
+    """
+    sensor = np.atleast_2d(sensor)
+    directions = np.stack((np.cos(angles + sensor[:, 2]), np.sin(angles + sensor[:, 2])), axis=1)
+    offset, along = walls[:, :2] - sensor[:, None, :2], walls[:, 2:] - walls[:, :2]
     cross = directions[:, None, 0] * along[None, :, 1] - directions[:, None, 1] * along[None, :, 0]
     with np.errstate(divide="ignore", invalid="ignore"):
-        distance = (offset[None, :, 0] * along[None, :, 1] - offset[None, :, 1] * along[None, :, 0]) / cross
-        share = (offset[None, :, 0] * directions[:, None, 1] - offset[None, :, 1] * directions[:, None, 0]) / cross
+        distance = (offset[..., 0] * along[None, :, 1] - offset[..., 1] * along[None, :, 0]) / cross
+        share = (offset[..., 0] * directions[:, None, 1] - offset[..., 1] * directions[:, None, 0]) / cross
     return np.where((distance > 1e-6) & (share >= 0.0) & (share <= 1.0), distance, np.inf).min(axis=1)
 
 
-def scan_in(walls, pose, stamp=0, beams=181, field_of_view=np.pi, noise=0.0, seed=0, laser_pose=(0.0, 0.0, 0.0)):
-    """The scan at ``world_T_base``; beams that meet no wall report RANGE_MAX."""
+def scan_in(
+    walls, pose, stamp=0, beams=181, field_of_view=np.pi, noise=0.0, seed=0, laser_pose=(0.0, 0.0, 0.0), sweep=0.0
+):
+    """The scan at ``world_T_base``, (3,), or (beams, 3) where the robot moves during the sweep of ``sweep`` s.
+
+    Beams that meet no wall report RANGE_MAX. A negative field of view is that of a laser mounted upside down.
+    """
     angles = np.linspace(-field_of_view / 2, field_of_view / 2, beams)
     ranges = distances(walls, se2.compose(pose, laser_pose), angles)
     ranges = np.minimum(ranges + noise * np.random.default_rng(seed).standard_normal(beams), RANGE_MAX)
     return Scan(
         stamp, ranges.astype(np.float32), angles[0], angles[1] - angles[0], 0.0, RANGE_MAX,
-        np.asarray(laser_pose, dtype=float),
+        np.asarray(laser_pose, dtype=float), sweep / (beams - 1),
     )  # fmt: skip
 
 

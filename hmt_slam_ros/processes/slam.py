@@ -30,6 +30,7 @@ from hmt_slam_ros.processes.messages import (
 )
 from hmt_slam_ros.processes.replica import FIRST_AREA, FIRST_HYPOTHESIS, Replica
 from hmt_slam_ros.sensing import Odometry, Scan
+from hmt_slam_ros.sensing.deskew import SweepCheck, deskewed
 from hmt_slam_ros.sensing.motion import OdometryBuffer, increment_covariance
 
 
@@ -45,6 +46,7 @@ class MetricSlam:
         self._replica = Replica()
         self._odometry = OdometryBuffer()
         self._queue: deque[Scan] = deque()
+        self._sweeps = SweepCheck()
         self._last_stamp = -1
         self._noticed: set[str] = set()
         first = AreaFilter(self._mapping, FIRST_HYPOTHESIS, FIRST_AREA)
@@ -97,6 +99,9 @@ class MetricSlam:
     def _receive(self, scan: Scan) -> list[Message]:
         """Put a scan into the queue; say, once for each fault, what is wrong with it."""
         said: list[Message] = []
+        scan, fault = self._sweeps.checked(scan)
+        if fault is not None:
+            said += self._notice("sweep", fault)
         if scan.stamp <= self._last_stamp:
             said += self._notice(
                 "order",
@@ -128,13 +133,13 @@ class MetricSlam:
 
     def _out_of_patience(self) -> bool:
         return len(self._queue) > self._configuration.filter.patience and not self._odometry.covers(
-            self._queue[0].stamp
+            self._queue[0].end
         )
 
     def _odometry_known(self) -> bool:
         return (
             self._ended
-            or self._odometry.covers(self._queue[0].stamp)
+            or self._odometry.covers(self._queue[0].end)
             or self._out_of_patience()
         )
 
@@ -143,6 +148,7 @@ class MetricSlam:
         odometry = np.zeros(3) if odometry is None else odometry
         increment = np.zeros(3) if self._last_odometry is None else se2.between(self._last_odometry, odometry)
         self._last_odometry = odometry
+        scan = deskewed(scan, self._odometry, self._configuration.rtl)
         points = self._mapping.matching_points(scan)
         if self._events:
             covariance = increment_covariance(increment, self._configuration.motion)

@@ -32,16 +32,35 @@ class OdometryBuffer:
     def at(self, stamp: int) -> NDArray[np.float64] | None:
         """``odom_T_base`` (3,) at ``stamp`` (ns): interpolated, held at the ends, None without any reading.
 
-        Readings before the one that is needed are forgotten.
+        Readings before those that are needed are forgotten.
         """
-        while len(self._readings) > 1 and self._readings[1].stamp <= stamp:
+        while len(self._readings) > 2 and self._readings[2].stamp <= stamp:
             self._readings.popleft()
-        if not self._readings:
-            return None
-        first = self._readings[0]
-        if first.stamp >= stamp or len(self._readings) == 1:
+        return self._pose(min(stamp, self._readings[-1].stamp)) if self._readings else None
+
+    def motion(self, start: int, end: int) -> NDArray[np.float64]:
+        """The motion of the base from ``start`` to ``end`` (ns) as a twist (3,); zeros where nothing is known of it.
+
+        After the newest reading the speed between the last two goes on, for as long as they lie apart.
+
+        :param start: not before the time for which :meth:`at` was asked last.
+        """
+        if len(self._readings) < 2:
+            return np.zeros(3)
+        limit = 2 * self._readings[-1].stamp - self._readings[-2].stamp
+        return se2.log(se2.between(self._pose(min(start, limit)), self._pose(min(end, limit))))
+
+    def _pose(self, stamp: int) -> NDArray[np.float64]:
+        """``odom_T_base`` (3,): held before the first reading, interpolated, carried on after the last."""
+        first = second = self._readings[0]
+        for reading in self._readings:
+            first, second = second, reading
+            if stamp < reading.stamp:
+                break
+        if stamp == second.stamp:
+            return second.pose
+        if stamp <= first.stamp:
             return first.pose
-        second = self._readings[1]
         fraction = (stamp - first.stamp) / (second.stamp - first.stamp)
         return se2.interpolate(first.pose, second.pose, fraction)
 
