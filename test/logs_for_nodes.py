@@ -12,15 +12,18 @@ from hmt_slam_ros.sensing import Odometry
 SECOND = 1_000_000_000
 START = 1_700_000_000 * SECOND
 LASER = np.array([0.1, 0.0, 0.05])
+PACE = np.array([0.025, 0.0, 0.002])
+BEAMS = 91
 WALLS = np.concatenate([box(-3, -3, 12, 3), box(4, 1, 5, 3)])
 
 
 @dataclass
 class Corridor:
-    """Scans every 0.2 s, four odometry readings to each, at 0.5 m/s."""
+    """Scans every 0.2 s, four odometry readings to each, at 0.5 m/s; a scan's sweep takes ``sweep`` s."""
 
     scans: int = 12
     name: str = "corridor"
+    sweep: float = 0.0
 
     @property
     def scan_count(self):
@@ -33,16 +36,17 @@ class Corridor:
     def records(self):
         for k in range(4 * (self.scans - 1) + 1):
             stamp = START + k * SECOND // 20
-            pose = np.array([0.025 * k, 0.0, 0.002 * k])
-            yield LogRecord(stamp, Odometry(stamp, pose))
+            yield LogRecord(stamp, Odometry(stamp, k * PACE))
             if k % 4 == 0:
-                yield LogRecord(stamp, scan_in(WALLS, pose, stamp, laser_pose=LASER, beams=91))
+                poses = (k + 20.0 * self.sweep * np.linspace(0.0, 1.0, BEAMS)[:, None]) * PACE
+                scan = scan_in(WALLS, poses, stamp, beams=BEAMS, laser_pose=LASER, sweep=self.sweep)
+                yield LogRecord(stamp, scan)
 
 
-def corridor_bag(folder, scans=12):
+def corridor_bag(folder, scans=12, sweep=0.0):
     """The corridor as a rosbag2 folder."""
     path = folder / "corridor"
-    write_bag(Corridor(scans), path)
+    write_bag(Corridor(scans, sweep=sweep), path)
     return path
 
 

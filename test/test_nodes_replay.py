@@ -8,6 +8,7 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 from logs_for_nodes import corridor_bag, is_alive
 
@@ -61,21 +62,34 @@ def running(tmp_path):
     wait_until(lambda: not any(is_alive(pid) for pid in nodes.values()))
 
 
-@pytest.fixture(scope="module")
-def folders(tmp_path_factory):
-    """The bundled log, mapped by the nodes and in lock-step."""
-    top = tmp_path_factory.mktemp("runs")
+def mapped_twice(log, top):
+    """The output folders of a log, mapped by the nodes and in lock-step."""
     for command in ("replay", "map"):
-        arguments = [*COMMAND, command, str(BUNDLED), "--out", str(top / command), "--set", "robot.rate=0"]
+        arguments = [*COMMAND, command, str(log), "--out", str(top / command), "--set", "robot.rate=0"]
         done = subprocess.run(arguments, cwd=ROOT, capture_output=True, text=True, timeout=280, check=False)
         assert done.returncode == 0, done.stderr
     return top / "replay", top / "map"
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory):
+    """The bundled log, mapped by the nodes and in lock-step."""
+    return mapped_twice(BUNDLED, tmp_path_factory.mktemp("runs"))
 
 
 @pytest.mark.parametrize("name", ["trajectory.tum", "trajectory_online.tum", "graph.g2o", "pmf.csv", "map.pgm"])
 def test_the_nodes_take_the_same_decisions_as_the_lock_step_run(folders, name):
     nodes, lock_step = folders
     assert (nodes / name).read_bytes() == (lock_step / name).read_bytes()
+
+
+def test_the_nodes_correct_scans_for_the_motion_during_their_sweeps_as_the_lock_step_run_does(tmp_path):
+    nodes, lock_step = mapped_twice(corridor_bag(tmp_path, scans=60, sweep=0.15), tmp_path)
+    motions = np.load(nodes / "hmt_map" / "scans" / "motions.npy")
+    np.testing.assert_allclose(np.hypot(motions[:, 0], motions[:, 1]), 0.075, rtol=1e-3)
+    np.testing.assert_allclose(motions[:, 2], 0.006, rtol=1e-3)
+    for name in ("trajectory.tum", "map.pgm", "hmt_map/scans/motions.npy"):
+        assert (nodes / name).read_bytes() == (lock_step / name).read_bytes()
 
 
 def test_the_report_accounts_for_every_scan_and_every_process(folders):
