@@ -252,6 +252,49 @@ class LoopClosureAcceptance:
 
 
 @dataclass(frozen=True)
+class Refinement:
+    """Refinement of the poses by registering the scans with each other, when a path is accepted and at the end."""
+
+    iterations: int = parameter(4, "Linearisations of all pairs of keyframes.", low=0, high=100)
+    neighbours: int = parameter(15, "Keyframes that a keyframe is registered with at most.", low=1, high=1000)
+    scan_neighbours: int = parameter(
+        4, "Keyframes that a scan between keyframes is registered with at most.", low=1, high=100
+    )
+    reach: float = parameter(
+        4.0, "Scans taken farther apart than this are not registered with each other.", unit="m", low=0.1, high=100.0
+    )
+    max_points: int = parameter(360, "Points of a scan that are registered; evenly thinned.", low=10, high=5000)
+    first_gate: float = parameter(
+        0.4, "A point and a wall meet within this distance at the first linearisation.", unit="m", low=0.01, high=5.0
+    )
+    last_gate: float = parameter(0.15, "The same at the last linearisation.", unit="m", low=0.01, high=5.0)
+    min_share: float = parameter(
+        0.3, "Two scans overlap when at least this share of their points meet.", low=0.01, high=1.0
+    )
+    sigma: float = parameter(0.05, "Deviation of a point from its wall.", unit="m", low=0.001, high=1.0)
+    robust_scale: float = parameter(
+        0.05, "Scale of the Cauchy weight on the distance of a point from its wall.", unit="m", low=0.001, high=5.0
+    )
+    temper: float = parameter(
+        0.3, "Exponent on the likelihood, since beams and overlapping pairs are correlated.", low=1e-4, high=1.0
+    )
+    patience: float = parameter(
+        50.0, "A pair of scans whose chi-square exceeds this loses weight.", low=1.0, high=1e6
+    )
+    motion_patience: float = parameter(
+        10.0, "An odometry increment whose chi-square exceeds this loses weight.", low=1.0, high=1e6
+    )
+    scan_sigma: float = parameter(
+        0.1, "Deviation of a scan's place relative to its keyframe before it is registered.", unit="m",
+        low=0.001, high=5.0,
+    )
+    scan_angle: float = parameter(
+        3.0, "Deviation of a scan's heading relative to its keyframe before it is registered.", unit="deg",
+        low=0.01, high=90.0,
+    )
+
+
+@dataclass(frozen=True)
 class RealTimeLocalization:
     """RTL: the pose at the rate of the odometry."""
 
@@ -300,6 +343,7 @@ class Configuration:
     aam: AreaAbstraction = field(default_factory=AreaAbstraction)
     tsbi: TopologicalInference = field(default_factory=TopologicalInference)
     tlca: LoopClosureAcceptance = field(default_factory=LoopClosureAcceptance)
+    refinement: Refinement = field(default_factory=Refinement)
     rtl: RealTimeLocalization = field(default_factory=RealTimeLocalization)
     robot: Robot = field(default_factory=Robot)
 
