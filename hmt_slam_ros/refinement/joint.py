@@ -1,0 +1,77 @@
+"""Joint refinement of many scans: all overlapping pairs are registered at once, and the poses solved for together.
+
+Iterates between two steps: every overlapping pair of scans is linearised at the present poses (point-to-line, so that
+a pair in a bare corridor says nothing about the direction along it), which makes it an edge of a pose graph; the graph,
+with the odometry's edges, is solved (Lu and Milios 1997). Edges that contradict the others lose their weight.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hmt_slam_ros.configuration.tree import Refinement
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.refinement.registration import normal_equations, weighting
+from hmt_slam_ros.refinement.surfaces import Surfaces
+from hmt_slam_ros.topology.pose_graph import Edges, optimise
+
+# Keeps the information of a pair regular: 3 m and 3 rad.
+_VAGUE = 0.1 * np.eye(3)
+
+
+def refine_jointly(
+    surfaces: Surfaces,
+    poses: NDArray[np.float64],
+    pairs: NDArray[np.int64],
+    motion: Edges,
+    options: Refinement,
+    fixed: int = 0,
+) -> NDArray[np.float64]:
+    """The poses that agree best with all registrations and the motion between them.
+
+    :param surfaces: of n scans.
+    :param poses: shape (n, 3), ``map_T_base`` to start from.
+    :param pairs: shape (m, 2), scans that may overlap.
+    :param motion: edges that join all scans, such as the odometry's; they hold the directions that walls leave open.
+    :param fixed: the scan that stays.
+    :returns: shape (n, 3).
+    """
+    gates = np.geomspace(options.first_gate, options.last_gate, options.iterations)
+    for gate in gates.tolist():
+        edges = _with(motion, _registered(surfaces, poses, pairs, gate, options))
+        poses = optimise(poses, edges, fixed, marginals=False).poses
+    return poses
+
+
+def _registered(
+    surfaces: Surfaces, poses: NDArray[np.float64], pairs: NDArray[np.int64], gate: float, options: Refinement
+) -> Edges:
+    """One Gauss-Newton step of every pair on its own, as edges from the second scan to the first."""
+    relative = se2.between(poses[pairs[:, 1]], poses[pairs[:, 0]])
+    one, other = pairs.T
+    information, gradient, share = normal_equations(
+        surfaces, one, surfaces, other, relative, gate, weighting(options)
+    )
+    meets = share >= options.min_share
+    information = information[meets] + _VAGUE
+    step = -np.linalg.solve(information, gradient[meets, :, None])[..., 0]
+    return Edges(
+        pairs[meets, 1],
+        pairs[meets, 0],
+        se2.compose(relative[meets], se2.exp(step)),
+        np.linalg.inv(information),
+        np.full(int(meets.sum()), options.patience),
+    )
+
+
+def _with(motion: Edges, registered: Edges) -> Edges:
+    patience = np.full(len(motion.sources), np.inf) if motion.patience is None else motion.patience
+    assert registered.patience is not None
+    return Edges(
+        np.concatenate((motion.sources, registered.sources)),
+        np.concatenate((motion.targets, registered.targets)),
+        np.concatenate((motion.poses, registered.poses)),
+        np.concatenate((motion.covariances, registered.covariances)),
+        np.concatenate((patience, registered.patience)),
+    )

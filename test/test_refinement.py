@@ -1,0 +1,182 @@
+"""Registration of scans with each other: equations, joint solution, placement of the scans between keyframes."""
+
+import numpy as np
+import pytest
+from worlds import drive, scan_in, two_rooms
+
+from hmt_slam_ros.configuration.tree import Refinement
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.refinement.joint import refine_jointly
+from hmt_slam_ros.refinement.neighbours import linked_areas, neighbours, pairs_of
+from hmt_slam_ros.refinement.placement import place
+from hmt_slam_ros.refinement.registration import normal_equations, weighting
+from hmt_slam_ros.refinement.surfaces import surfaces_of
+from hmt_slam_ros.topology.hybrid_map import HybridMap
+from hmt_slam_ros.topology.pose_graph import Edges
+
+OPTIONS = Refinement()
+CORRIDOR = np.array([[-200.0, -1.0, 200.0, -1.0], [-200.0, 1.0, 200.0, 1.0]])
+# Through the door and back, every half metre.
+TRUTH = np.concatenate((drive((2.0, 2.0), (5.0, 3.0), (9.0, 3.0)), drive((9.0, 3.2), (5.0, 3.2), (2.0, 2.5))))
+
+
+def scans_at(poses: np.ndarray, walls: np.ndarray, noise: float = 0.01, **laser: object) -> list:
+    return [scan_in(walls, pose, noise=noise, seed=k, **laser) for k, pose in enumerate(poses)]
+
+
+def surfaces(scans: list):
+    return surfaces_of(scans, 30.0, OPTIONS.max_points)
+
+
+def equations(walls: np.ndarray, truth: np.ndarray, relative: np.ndarray, noise: float = 0.0, gate: float = 0.3):
+    seen = surfaces(scans_at(truth, walls, noise))
+    one, other = np.array([0]), np.array([1])
+    information, gradient, share = normal_equations(seen, one, seen, other, relative[None], gate, weighting(OPTIONS))
+    return information[0], gradient[0], share[0]
+
+
+def odometry(poses: np.ndarray, sigma: float, angle: float, seed: int) -> Edges:
+    """Noisy increments between successive poses."""
+    count = len(poses) - 1
+    deviations = np.array([sigma, sigma, angle])
+    noise = deviations * np.random.default_rng(seed).standard_normal((count, 3))
+    increments = se2.compose(se2.between(poses[:-1], poses[1:]), se2.exp(noise))
+    covariance = np.broadcast_to(np.diag(deviations**2), (count, 3, 3))
+    return Edges(np.arange(count), np.arange(1, count + 1), increments, covariance.copy(), np.full(count, 10.0))
+
+
+def errors(found: np.ndarray, truth: np.ndarray) -> tuple[float, float]:
+    """Largest error of place, m, and of heading, deg, in the frame of the first pose."""
+    off = se2.between(se2.between(truth[0], truth), se2.between(found[0], found))
+    return np.hypot(off[:, 0], off[:, 1]).max(), np.degrees(np.abs(off[:, 2])).max()
+
+
+def test_normals_stand_upright_on_the_walls_and_point_to_the_laser() -> None:
+    pose = np.array([3.0, 2.0, 0.3])
+    seen = surfaces([scan_in(two_rooms(), pose)])
+    points, normals = se2.transform(pose, seen.points), se2.transform([0.0, 0.0, pose[2]], seen.normals)
+    assert seen.flat.mean() > 0.8
+    assert np.all(np.sum((points - pose[:2]) * normals, axis=1)[seen.flat] < 0.0)
+    south = seen.flat & (points[:, 1] < 1e-3) & (np.abs(points[:, 0] - 3.0) < 2.0)
+    assert south.sum() > 10
+    np.testing.assert_allclose(normals[south], np.tile([0.0, 1.0], (south.sum(), 1)), atol=1e-3)
+
+
+def test_at_the_true_pose_nothing_pulls() -> None:
+    truth = np.array([[2.0, 2.0, 0.2], [2.4, 2.3, 0.5]])
+    information, gradient, share = equations(two_rooms(), truth, se2.between(truth[1], truth[0]))
+    assert share > 0.8
+    assert np.abs(np.linalg.solve(information, gradient)).max() < 2e-3
+
+
+@pytest.mark.parametrize("off", [(0.05, 0.0, 0.0), (0.0, -0.05, 0.0), (0.0, 0.0, 0.02), (0.04, 0.03, -0.02)])
+def test_one_step_leads_to_the_true_pose(off: tuple[float, float, float]) -> None:
+    truth = np.array([[2.0, 2.0, 0.2], [2.4, 2.3, 0.5]])
+    start = se2.compose(se2.between(truth[1], truth[0]), se2.exp(off))
+    information, gradient, _ = equations(two_rooms(), truth, start)
+    step = -np.linalg.solve(information, gradient)
+    np.testing.assert_allclose(step, -np.array(off), atol=0.2 * np.abs(off).max())
+
+
+def test_a_bare_corridor_tells_nothing_of_the_direction_along_it() -> None:
+    truth = np.array([[0.0, 0.1, 0.0], [0.5, -0.1, 0.05]])
+    information, _, share = equations(CORRIDOR, truth, se2.between(truth[1], truth[0]), noise=0.01)
+    assert share > 0.5
+    along = np.linalg.eigvalsh(information)[0]
+    assert along < 1e-2 * np.sort(np.diag(information))[1]
+
+
+def test_the_two_sides_of_a_thin_wall_are_not_the_same_wall() -> None:
+    walls = np.array([[-5.0, 0.0, 5.0, 0.0]])
+    truth = np.array([[0.0, -2.0, np.pi / 2], [0.0, 2.0, -np.pi / 2]])
+    _, _, share = equations(walls, truth, se2.between(truth[1], truth[0]))
+    assert share == 0.0
+
+
+def test_scans_of_other_resolution_and_mounting_register_with_each_other() -> None:
+    truth = np.array([[2.0, 2.0, 0.2], [2.4, 2.3, 0.5]])
+    one = scan_in(two_rooms(), truth[0], beams=721, laser_pose=(0.2, 0.0, 0.1))
+    other = scan_in(two_rooms(), truth[1], beams=181, laser_pose=(-0.1, 0.05, -0.4))
+    seen = surfaces([one, other])
+    start = se2.compose(se2.between(truth[1], truth[0]), se2.exp([0.03, -0.03, 0.01]))
+    pair = np.array([0]), seen, np.array([1])
+    information, gradient, share = normal_equations(seen, *pair, start[None], 0.3, weighting(OPTIONS))
+    assert share[0] > 0.2
+    np.testing.assert_allclose(
+        -np.linalg.solve(information[0], gradient[0]), [-0.03, 0.03, -0.01], atol=0.008
+    )
+
+
+def test_joint_refinement_takes_the_drift_of_odometry_away() -> None:
+    motion = odometry(TRUTH, 0.02, 0.01, seed=3)
+    drifted = [TRUTH[0]]
+    for increment in motion.poses:
+        drifted.append(se2.compose(drifted[-1], increment))
+    start = np.array(drifted)
+    everything = np.zeros(len(TRUTH), dtype=np.int64)
+    around = neighbours(start, everything, start, everything, {0: frozenset({0})}, OPTIONS.reach, 16)
+    refined = refine_jointly(surfaces(scans_at(TRUTH, two_rooms())), start, pairs_of(around), motion, OPTIONS)
+    before, after = errors(start, TRUTH), errors(refined, TRUTH)
+    # 0.1 degrees of noise in the first scan alone are 15 mm at the far end.
+    assert before[0] > 0.15
+    assert after[0] < 0.03
+    assert after[1] < 0.3
+    np.testing.assert_array_equal(refined[0], start[0])
+
+
+def test_a_slip_of_the_odometry_is_overruled() -> None:
+    motion = odometry(TRUTH, 0.02, 0.01, seed=4)
+    motion.poses[7] = se2.compose(motion.poses[7], [0.0, 0.0, np.radians(20.0)])
+    everything = np.zeros(len(TRUTH), dtype=np.int64)
+    pairs = pairs_of(neighbours(TRUTH, everything, TRUTH, everything, {0: frozenset({0})}, OPTIONS.reach, 16))
+    refined = refine_jointly(surfaces(scans_at(TRUTH, two_rooms())), TRUTH, pairs, motion, OPTIONS)
+    assert errors(refined, TRUTH)[0] < 0.03
+
+
+def test_a_scan_is_placed_among_keyframes_that_stay() -> None:
+    between = np.array([[2.3, 2.15, 0.3], [7.2, 3.05, 0.1], [4.0, 3.05, np.pi]])
+    off = np.array([[0.05, 0.03, 0.02], [-0.06, 0.02, -0.02], [0.0, -0.06, 0.03]])
+    start = se2.compose(between, se2.exp(off))
+    rows = np.zeros(len(TRUTH), dtype=np.int64)
+    around = neighbours(TRUTH, rows, start, np.zeros(3, np.int64), {0: frozenset({0})}, OPTIONS.reach, 4)
+    placed = place(
+        surfaces(scans_at(TRUTH, two_rooms())),
+        TRUTH,
+        surfaces(scans_at(between, two_rooms())),
+        start,
+        around,
+        OPTIONS,
+    )
+    error = np.abs(se2.between(between, placed))
+    assert error[:, :2].max() < 0.012
+    assert np.degrees(error[:, 2]).max() < 0.3
+
+
+def test_a_scan_that_shows_nothing_stays_where_it_is() -> None:
+    start = np.array([[2.0, 2.0, 0.2]])
+    blind = scan_in(np.array([[500.0, 0.0, 500.0, 1.0]]), start[0])
+    keyframes = surfaces(scans_at(TRUTH, two_rooms()))
+    around = [np.array([0, 1], dtype=np.int64)]
+    np.testing.assert_allclose(place(keyframes, TRUTH, surfaces([blind]), start, around, OPTIONS), start, atol=1e-12)
+
+
+def test_keyframes_in_areas_that_no_arcs_link_are_not_paired() -> None:
+    hybrid_map = HybridMap()
+    for area in range(5):
+        hybrid_map.place(area, area, np.zeros(3))
+    for area in range(4):
+        hybrid_map.set_arc(area, area + 1, PoseGaussian(np.zeros(3), np.eye(3)), closure=False)
+    linked = linked_areas(hybrid_map)
+    assert linked[0] == {0, 1, 2}
+    assert linked[2] == {0, 1, 2, 3, 4}
+    poses, areas = np.zeros((5, 3)), np.arange(5)
+    pairs = pairs_of(neighbours(poses, areas, poses, areas, linked, 4.0, 10))
+    assert pairs.tolist() == [[0, 1], [0, 2], [1, 2], [1, 3], [2, 3], [2, 4], [3, 4]]
+
+
+def test_the_nearest_in_place_and_heading_come_first() -> None:
+    poses = np.array([[0.0, 0.0, 0.0], [0.5, 0.0, 3.0], [1.0, 0.0, 0.1], [9.0, 0.0, 0.0]])
+    areas = np.zeros(4, dtype=np.int64)
+    found = neighbours(poses, areas, poses[:1], areas[:1], {0: frozenset({0})}, 4.0, 2)
+    assert found[0].tolist() == [0, 2]
