@@ -12,6 +12,7 @@ from hmt_slam_ros.evaluation import read_tum
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.offline import plots
+from hmt_slam_ros.offline.final_map import FinalMap, final_map
 from hmt_slam_ros.offline.map_image import read_map
 from hmt_slam_ros.offline.output_folder import replacing, write_output
 from hmt_slam_ros.offline.recorder import Recorder
@@ -130,7 +131,13 @@ def accepted(k: int) -> Accepted:
 
 
 FIGURES = RunFigures(
-    "by hand", "lock-step", {"slam": np.arange(SCANS) * 1e-3, "aam": np.zeros(SCANS)}, {"hmt_slam": 10**8}, 2.0, 1.5
+    "by hand",
+    "lock-step",
+    {"slam": np.arange(SCANS) * 1e-3, "aam": np.zeros(SCANS)},
+    {"hmt_slam": 10**8},
+    wall_seconds=2.0,
+    cpu_seconds=1.5,
+    refinement_seconds=0.1,
 )
 
 
@@ -142,10 +149,18 @@ def recorded(order: int = 0, without: type | None = None) -> Recorder:
     return recorder
 
 
+def finished(recorder: Recorder) -> FinalMap:
+    return final_map(recorder.finish(STAMPS), map(scan, range(SCANS)), recorder.configuration)
+
+
+def write(directory: Path, recorder: Recorder) -> None:
+    write_output(directory, finished(recorder), SOURCE, FIGURES, recorder.configuration)
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     directory = tmp_path_factory.mktemp("output")
-    write_output(directory, recorded(), STAMPS, SOURCE, FIGURES)
+    write(directory, recorded())
     return directory
 
 
@@ -166,7 +181,7 @@ def test_both_trajectories_are_true_and_carry_the_logs_own_stamps(folder: Path, 
 
 
 def test_the_order_in_which_messages_arrive_does_not_matter(folder: Path, tmp_path: Path) -> None:
-    write_output(tmp_path, recorded(order=3), STAMPS, SOURCE, FIGURES)
+    write(tmp_path, recorded(order=3))
     assert contents(tmp_path) == contents(folder)
 
 
@@ -174,7 +189,7 @@ def test_a_message_that_comes_twice_counts_once(folder: Path, tmp_path: Path) ->
     recorder = recorded()
     for message in messages():
         recorder.handle(message)
-    write_output(tmp_path, recorder, STAMPS, SOURCE, FIGURES)
+    write(tmp_path, recorder)
     assert contents(tmp_path) == contents(folder)
 
 
@@ -269,7 +284,7 @@ def test_the_map_shows_the_round_room(folder: Path) -> None:
 
 def test_the_saved_map_reads_back_complete(folder: Path) -> None:
     saved = read_saved_map(folder / "hmt_map")
-    recording = recorded().finish(STAMPS)
+    recording = finished(recorded()).recording
     hybrid_map = saved.replica.maps[1]
     assert saved.replica.best == recording.replica.best == 1
     assert saved.configuration.seed == 7
@@ -291,7 +306,7 @@ def test_the_saved_map_keeps_every_live_hypothesis(tmp_path: Path) -> None:
     for k in range(VERDICT, SCANS // EVERY):
         recorder.hypotheses[k] = Hypotheses(k, (Leaf(1, 1, 0.6, 1), Leaf(2, 2, 0.4, 0)))
         recorder.accepted[k] = Accepted(k)
-    write_output(tmp_path, recorder, STAMPS, SOURCE, FIGURES)
+    write(tmp_path, recorder)
     saved = read_saved_map(tmp_path / "hmt_map")
     assert saved.replica.probabilities == {1: 0.6, 2: 0.4}
     assert {h: m.area_ids() for h, m in saved.replica.maps.items()} == {1: [0, 1], 2: [0]}

@@ -6,15 +6,20 @@ import argparse
 import resource
 import time
 
+import numpy as np
+from numpy.typing import NDArray
+
 from hmt_slam_ros.cli.arguments import chosen_configuration
 from hmt_slam_ros.cli.progress import Progress
 from hmt_slam_ros.cli.summary import summary
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.logs import Log, open_log
+from hmt_slam_ros.offline.corrected_scans import corrected_scans
+from hmt_slam_ros.offline.final_map import FinalMap, final_map
 from hmt_slam_ros.offline.output_folder import replacing, write_output
 from hmt_slam_ros.offline.report import RunFigures
-from hmt_slam_ros.offline.runtime import RunResult, run_log
+from hmt_slam_ros.offline.runtime import run_log
 
 
 def run(options: argparse.Namespace) -> None:
@@ -24,16 +29,21 @@ def run(options: argparse.Namespace) -> None:
         log = open_log(options.log, start=configuration.robot.start, duration=configuration.robot.duration or None)
         if not log.scan_count:
             raise HmtSlamError(f"{options.log} has no scans in the part asked for: check --start and --duration")
-        result, figures = measured_run(log, configuration)
-        recording = write_output(folder, result.recorder, result.stamps, result.source_stamps, figures)
-    print(summary(options.out, recording, log.duration, figures.wall_seconds))
+        final, source_stamps, figures = measured_run(log, configuration)
+        write_output(folder, final, source_stamps, figures, configuration)
+    print(summary(options.out, final.recording, log.duration, figures.wall_seconds))
 
 
-def measured_run(log: Log, configuration: Configuration) -> tuple[RunResult, RunFigures]:
-    """Map a log, and measure what that costs."""
+def measured_run(log: Log, configuration: Configuration) -> tuple[FinalMap, NDArray[np.int64], RunFigures]:
+    """Map a log, and measure what that costs.
+
+    :returns: the map, the log's own stamps of all scans (n,), ns, and the figures.
+    """
     wall, cpu = time.monotonic(), time.process_time()
     with Progress(log.scan_count, log.duration) as progress:
         result = run_log(log, configuration, progress)
+    begin = time.process_time()
+    final = final_map(result.recorder.finish(result.stamps), corrected_scans(log, configuration), configuration)
     figures = RunFigures(
         log=log.name,
         runtime="lock-step",
@@ -42,5 +52,6 @@ def measured_run(log: Log, configuration: Configuration) -> tuple[RunResult, Run
         peak_rss={"hmt_slam": 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss},
         wall_seconds=time.monotonic() - wall,
         cpu_seconds=time.process_time() - cpu,
+        refinement_seconds=time.process_time() - begin,
     )
-    return result, figures
+    return final, result.source_stamps, figures

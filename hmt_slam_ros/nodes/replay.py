@@ -23,6 +23,8 @@ from hmt_slam_ros.nodes.children import Children, Usage
 from hmt_slam_ros.nodes.domain import own_domain
 from hmt_slam_ros.nodes.recorder_node import RecorderNode
 from hmt_slam_ros.nodes.transforms import TFMessage
+from hmt_slam_ros.offline.corrected_scans import corrected_scans
+from hmt_slam_ros.offline.final_map import final_map
 from hmt_slam_ros.offline.output_folder import replacing, write_output
 from hmt_slam_ros.offline.recorder import Recording
 from hmt_slam_ros.offline.report import RunFigures
@@ -72,16 +74,21 @@ def replay(
     with replacing(output) as folder:
         run = _Run(configuration, progress or (lambda _: None), stall)
         run.play(log, _slam_settings(contents.laser_poses))
+        begin = time.process_time()
+        recording = run.node.recorder.finish(contents.stamps)
+        final = final_map(recording, corrected_scans(opened, configuration), configuration)
+        refinement = time.process_time() - begin
         figures = RunFigures(
             log=opened.name,
             runtime="nodes",
             seconds_per_scan=run.node.seconds_per_scan(contents.stamps),
             peak_rss={name: usage.peak_rss for name, usage in run.usage.items()},
             wall_seconds=run.wall_seconds,
-            cpu_seconds=sum(usage.cpu_seconds for usage in run.usage.values()),
+            cpu_seconds=sum(usage.cpu_seconds for usage in run.usage.values()) + refinement,
+            refinement_seconds=refinement,
         )
-        recording = write_output(folder, run.node.recorder, contents.stamps, contents.source_stamps, figures)
-    return Replay(recording, run.wall_seconds)
+        write_output(folder, final, contents.source_stamps, figures, configuration)
+    return Replay(final.recording, run.wall_seconds)
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.evaluation import StampedPoses, write_tum
-from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.offline import plots
+from hmt_slam_ros.offline.final_map import FinalMap
 from hmt_slam_ros.offline.map_image import occupancy_image, write_map
-from hmt_slam_ros.offline.recorder import Recorder, Recording
+from hmt_slam_ros.offline.recorder import Recording, keyframe_poses
 from hmt_slam_ros.offline.report import RunFigures, report, write_cost, write_probabilities
 from hmt_slam_ros.offline.saved_map import MANIFEST, write_json, write_saved_map
 
@@ -27,6 +27,7 @@ OWN_NAMES = frozenset(
     {
         "trajectory.tum",
         "trajectory_online.tum",
+        "stages",
         "map.pgm",
         "map.yaml",
         "map.png",
@@ -88,21 +89,22 @@ def check_replaceable(directory: Path) -> None:
 
 def write_output(
     directory: Path,
-    recorder: Recorder,
-    stamps: NDArray[np.int64],
+    final: FinalMap,
     source_stamps: NDArray[np.int64],
     figures: RunFigures,
-) -> Recording:
+    configuration: Configuration,
+) -> None:
     """Write every file of a run.
 
     :param directory: an empty folder, see :func:`replacing`.
-    :param stamps: shape (n,), stamps of all scans of the log as the processes got them, ns, increasing.
-    :param source_stamps: shape (n,), the log's own stamps of the same scans, ns, in file order.
-    :raises HmtSlamError: where the run gave no map.
+    :param source_stamps: shape (n,), the log's own stamps of all scans, ns, in file order.
     """
-    recording, configuration = recorder.finish(stamps), recorder.configuration
+    recording = final.recording
     write_tum(directory / "trajectory.tum", StampedPoses(source_stamps, recording.trajectory))
     write_tum(directory / "trajectory_online.tum", StampedPoses(source_stamps, recording.online))
+    (directory / "stages").mkdir()
+    for name, trajectory in final.stages.items():
+        write_tum(directory / "stages" / f"{name}.tum", StampedPoses(source_stamps, trajectory))
     _write_map(directory, recording, configuration)
     write_saved_map(directory / "hmt_map", recording, configuration)
     write_graph(directory / "graph.g2o", recording)
@@ -110,16 +112,10 @@ def write_output(
     write_cost(directory / "cost.csv", figures.seconds_per_scan)
     write_json(directory / "report.json", report(recording, configuration, figures))
     plots.plot_map(directory)
-    return recording
 
 
 def _write_map(directory: Path, recording: Recording, configuration: Configuration) -> None:
-    hybrid_map, poses = recording.hybrid_map, recording.area_poses
-    placed = {
-        keyframe: se2.compose(poses[area].mean, pose)
-        for area in hybrid_map.area_ids()
-        for keyframe, pose in hybrid_map.keyframes(area).items()
-    }
+    placed = keyframe_poses(recording.hybrid_map, recording.area_poses)
     scans = [recording.replica.scans[keyframe] for keyframe in placed]
     settings = configuration.local_map
     write_map(directory, occupancy_image(scans, np.array(list(placed.values())), settings.cell, settings.max_range))

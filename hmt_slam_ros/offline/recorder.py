@@ -6,6 +6,7 @@ matter; :meth:`Recorder.finish` then goes through the keyframe events in their o
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TypeVar
 
@@ -14,8 +15,16 @@ from numpy.typing import NDArray
 
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.errors import HmtSlamError
+from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.offline.trajectories import Trajectory, final_trajectory, online_trajectory
+from hmt_slam_ros.offline.trajectories import (
+    Anchored,
+    Trajectory,
+    anchored,
+    carried,
+    odometry_trajectory,
+    online_trajectory,
+)
 from hmt_slam_ros.processes.messages import (
     Accepted,
     Finished,
@@ -70,7 +79,10 @@ class Recording:
 
     :ivar replica: scans and maps of the hypotheses that are alive at the end.
     :ivar area_poses: {area: belief over ``map_T_area``} of the most probable hypothesis.
-    :ivar trajectory: ``map_T_base`` of the scans in the final map.
+    :ivar stamps: shape (n,), of all scans of the log, ns, increasing.
+    :ivar scans: the scans of the log relative to the keyframes of the most probable hypothesis.
+    :ivar odometry: ``odom_T_base`` of the scans.
+    :ivar trajectory: ``map_T_base`` of the scans in the map.
     :ivar online: the same as it was known when the scan was taken.
     :ivar probabilities: of every live topology at every keyframe event, in their order.
     :ivar last: the last estimate of metric SLAM.
@@ -80,6 +92,9 @@ class Recording:
 
     replica: Replica
     area_poses: dict[int, PoseGaussian]
+    stamps: NDArray[np.int64]
+    scans: Anchored
+    odometry: Trajectory
     trajectory: Trajectory
     online: Trajectory
     probabilities: list[TopologyProbability]
@@ -161,10 +176,14 @@ class Recorder:
         accepted = _gapless("Accepted", self.accepted, events)
         replica, probabilities = _replay(keyframes, hypotheses, accepted)
         area_poses = _area_poses(replica.maps[replica.best], accepted)
+        scans = anchored(stamps, self._own_trails(replica.best))
         return Recording(
             replica,
             area_poses,
-            final_trajectory(stamps, self._own_trails(replica.best), replica.maps[replica.best], area_poses),
+            stamps,
+            scans,
+            odometry_trajectory(stamps, self.estimates),
+            carried(scans, keyframe_poses(replica.maps[replica.best], area_poses)),
             online_trajectory(stamps, self.estimates, keyframes, accepted),
             probabilities,
             self.estimates[max(self.estimates)],
@@ -238,6 +257,17 @@ def _area_poses(hybrid_map: HybridMap, accepted: list[Accepted]) -> dict[int, Po
     along_arcs = reachable(hybrid_map, start)
     origin = known.get(start, along_arcs[start])
     return {area: known[area] if area in known else origin.compose(along_arcs[area]) for area in areas}
+
+
+def keyframe_poses(
+    hybrid_map: HybridMap, area_poses: Mapping[int, PoseGaussian]
+) -> dict[int, NDArray[np.float64]]:
+    """{keyframe: ``map_T_base``, shape (3,)} in the order of the areas."""
+    return {
+        keyframe: se2.compose(area_poses[area].mean, pose)
+        for area in hybrid_map.area_ids()
+        for keyframe, pose in hybrid_map.keyframes(area).items()
+    }
 
 
 def latest_poses(accepted: list[Accepted]) -> dict[int, PoseGaussian]:

@@ -30,6 +30,7 @@ class RunFigures:
     :ivar peak_rss: {OS process: largest resident memory, bytes}.
     :ivar wall_seconds: from the first record to the last answer.
     :ivar cpu_seconds: of all OS processes together.
+    :ivar refinement_seconds: CPU time of the final refinement.
     """
 
     log: str
@@ -38,6 +39,7 @@ class RunFigures:
     peak_rss: Mapping[str, int]
     wall_seconds: float
     cpu_seconds: float
+    refinement_seconds: float
 
 
 def report(recording: Recording, configuration: Configuration, figures: RunFigures) -> dict[str, Any]:
@@ -64,6 +66,7 @@ def report(recording: Recording, configuration: Configuration, figures: RunFigur
         "peak_rss_bytes": dict(figures.peak_rss),
         "wall_s": figures.wall_seconds,
         "cpu_s": figures.cpu_seconds,
+        "refinement_s": figures.refinement_seconds,
         "seed": configuration.seed,
         "configuration": as_nested(configuration),
         "versions": _versions(),

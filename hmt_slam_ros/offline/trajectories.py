@@ -3,40 +3,69 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.processes.messages import Accepted, Keyframe, LocalEstimate, Trail
 from hmt_slam_ros.processes.replica import FIRST_AREA
-from hmt_slam_ros.topology.hybrid_map import HybridMap
 
 Trajectory = NDArray[np.float64]
 """Shape (scans, 3), ``map_T_base`` as (x, y, theta), m and rad, in the order of the log."""
 
 
-def final_trajectory(
-    stamps: NDArray[np.int64], trails: Sequence[Trail], hybrid_map: HybridMap, area_poses: Mapping[int, PoseGaussian]
-) -> Trajectory:
-    """``map_T_area`` * ``area_T_anchor`` * ``anchor_T_base`` of every scan.
+class Anchored(NamedTuple):
+    """Where the scans of a log were taken, relative to keyframes.
+
+    :ivar keyframes: shape (n,), the keyframe to which a scan is related, -1 for none.
+    :ivar poses: shape (n, 3), ``keyframe_T_base``, m and rad.
+    """
+
+    keyframes: NDArray[np.int64]
+    poses: Trajectory
+
+
+def anchored(stamps: NDArray[np.int64], trails: Sequence[Trail]) -> Anchored:
+    """The scans of one hypothesis relative to its keyframes.
 
     :param stamps: shape (n,), of all scans, ns, increasing.
     :param trails: of one hypothesis; where two speak of the same scan the later one counts.
     :raises HmtSlamError: where no trail holds any scan.
     """
-    anchors = {
-        keyframe: se2.compose(area_poses[area].mean, pose)
-        for area in hybrid_map.area_ids()
-        for keyframe, pose in hybrid_map.keyframes(area).items()
-    }
-    poses = np.full((stamps.size, 3), np.nan)
+    keyframes, poses = np.full(stamps.size, -1, dtype=np.int64), np.zeros((stamps.size, 3))
     for trail in trails:
-        if trail.stamps.size:
-            map_T_anchor = np.array([anchors[anchor] for anchor in trail.anchors.tolist()])
-            poses[_rows(stamps, trail.stamps)] = se2.compose(map_T_anchor, trail.poses)
+        rows = _rows(stamps, trail.stamps)
+        keyframes[rows], poses[rows] = trail.anchors, trail.poses
+    if not (keyframes >= 0).any():
+        raise HmtSlamError(f"none of the {len(poses)} scans gave a pose: check the ranges and the odometry of the log")
+    return Anchored(keyframes, poses)
+
+
+def carried(scans: Anchored, keyframes: Mapping[int, NDArray[np.float64]]) -> Trajectory:
+    """``map_T_keyframe`` * ``keyframe_T_base`` of every scan.
+
+    :param keyframes: {keyframe: ``map_T_base``, shape (3,)}.
+    """
+    poses = np.full(scans.poses.shape, np.nan)
+    known = scans.keyframes >= 0
+    map_T_keyframe = np.array([keyframes[keyframe] for keyframe in scans.keyframes[known].tolist()])
+    poses[known] = se2.compose(map_T_keyframe, scans.poses[known])
+    return _filled(poses)
+
+
+def odometry_trajectory(stamps: NDArray[np.int64], estimates: Mapping[int, LocalEstimate]) -> Trajectory:
+    """``odom_T_base`` at every scan, shape (n, 3).
+
+    :param stamps: shape (n,), of all scans, ns, increasing.
+    """
+    poses = np.full((stamps.size, 3), np.nan)
+    given = list(estimates.values())
+    poses[_rows(stamps, np.array([estimate.stamp for estimate in given], dtype=np.int64))] = np.array(
+        [estimate.odometry for estimate in given]
+    )
     return _filled(poses)
 
 

@@ -66,13 +66,16 @@ class OdometryBuffer:
 
 
 def increment_covariance(increment: NDArray[np.float64], motion: Motion) -> NDArray[np.float64]:
-    """Covariance (3, 3) of an odometry increment in the frame of its end, m and rad.
+    """Covariance (3, 3) of an odometry increment in the frame of its end, m and rad."""
+    return path_covariance(math.hypot(increment[0], increment[1]), abs(float(se2.wrap(increment[2]))), motion)
 
-    Standard deviations grow linearly with the distance and the angle travelled; the lateral deviation equals the
-    longitudinal one.
+
+def path_covariance(distance: float, angle: float, motion: Motion) -> NDArray[np.float64]:
+    """Covariance (3, 3) of the odometry over a path, in the frame of its end, m and rad.
+
+    Standard deviations grow linearly with the distance (m) and the angle (rad) travelled; the lateral deviation equals
+    the longitudinal one.
     """
-    distance = math.hypot(increment[0], increment[1])
-    angle = abs(float(se2.wrap(increment[2])))
     translation = (
         motion.translation_floor
         + motion.translation_from_translation * distance

@@ -1,0 +1,170 @@
+"""The final map: keyframes refined jointly over all areas, and every scan of the log placed among them."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hmt_slam_ros.configuration import Configuration
+from hmt_slam_ros.configuration.tree import Motion
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.offline.recorder import Recording, keyframe_poses
+from hmt_slam_ros.offline.trajectories import Trajectory, carried
+from hmt_slam_ros.refinement.joint import refine_jointly
+from hmt_slam_ros.refinement.neighbours import linked_areas, neighbours, pairs_of
+from hmt_slam_ros.refinement.placement import place
+from hmt_slam_ros.refinement.surfaces import Surfaces, surfaces_of
+from hmt_slam_ros.sensing import Scan
+from hmt_slam_ros.sensing.motion import path_covariance
+from hmt_slam_ros.topology.hybrid_map import HybridMap
+from hmt_slam_ros.topology.pose_graph import Edges
+from hmt_slam_ros.topology.shortest_path import reachable
+
+# Scans whose surfaces are in memory at once.
+_BATCH = 500
+
+
+@dataclass(frozen=True, eq=False)
+class FinalMap:
+    """A run's map and trajectory at their best.
+
+    :ivar recording: with the refined map and trajectory.
+    :ivar stages: {name: trajectory} before each step: ``filter`` with the areas as they were travelled through, no loop
+        closed, ``arcs`` with the areas where the arcs put them, ``keyframes`` with the refined keyframes.
+    """
+
+    recording: Recording
+    stages: dict[str, Trajectory]
+
+
+def final_map(recording: Recording, scans: Iterable[Scan], configuration: Configuration) -> FinalMap:
+    """Refine a run's map.
+
+    :param scans: all scans of the log in its order, those that the recording's trajectory has poses for.
+    """
+    travelled = carried(recording.scans, keyframe_poses(recording.hybrid_map, _areas_as_travelled(recording)))
+    stages = {"filter": travelled, "arcs": recording.trajectory}
+    if not configuration.refinement.iterations:
+        return FinalMap(recording, stages)
+    keyframes = _Keyframes(recording, configuration)
+    refined = _with_keyframes(recording, keyframes.refined(recording))
+    stages["keyframes"] = refined.trajectory
+    return FinalMap(replace(refined, trajectory=keyframes.placed(refined, scans)), stages)
+
+
+class _Keyframes:
+    """The keyframes of the most probable map, in the order in which they were taken.
+
+    :ivar ids: their ids, ascending.
+    :ivar areas: shape (n,), theirs.
+    """
+
+    def __init__(self, recording: Recording, configuration: Configuration) -> None:
+        hybrid_map = recording.hybrid_map
+        area_of = {keyframe: area for area in hybrid_map.area_ids() for keyframe in hybrid_map.keyframes(area)}
+        self._configuration = configuration
+        self._options = configuration.refinement
+        self._linked = linked_areas(hybrid_map)
+        self.ids = sorted(area_of)
+        self.areas = np.array([area_of[keyframe] for keyframe in self.ids], dtype=np.int64)
+        self._surfaces = self._surfaces_of([recording.replica.scans[keyframe] for keyframe in self.ids])
+
+    def _surfaces_of(self, scans: list[Scan]) -> Surfaces:
+        return surfaces_of(scans, self._configuration.local_map.max_range, self._options.max_points)
+
+    def _poses(self, recording: Recording) -> NDArray[np.float64]:
+        poses = keyframe_poses(recording.hybrid_map, recording.area_poses)
+        return np.array([poses[keyframe] for keyframe in self.ids])
+
+    def _around(
+        self, poses: NDArray[np.float64], seen_from: NDArray[np.float64], areas: NDArray[np.int64], count: int
+    ) -> list[NDArray[np.int64]]:
+        return neighbours(poses, self.areas, seen_from, areas, self._linked, self._options.reach, count)
+
+    def refined(self, recording: Recording) -> dict[int, NDArray[np.float64]]:
+        """{keyframe: ``map_T_base``} by joint refinement; the first keyframe stays."""
+        poses = self._poses(recording)
+        # Each keyframe is the nearest to itself.
+        pairs = pairs_of(self._around(poses, poses, self.areas, self._options.neighbours + 1))
+        motion = self._odometry(recording)
+        refined = refine_jointly(self._surfaces, poses, pairs, motion, self._options)
+        return dict(zip(self.ids, refined, strict=True))
+
+    def _odometry(self, recording: Recording) -> Edges:
+        """What the odometry measured from each keyframe to the next."""
+        rows = _scan_rows(recording, self.ids)
+        odometry, motion = recording.odometry, self._configuration.motion
+        increments = se2.between(odometry[rows[:-1]], odometry[rows[1:]])
+        count = len(increments)
+        return Edges(
+            np.arange(count),
+            np.arange(1, count + 1),
+            increments,
+            _path_covariances(odometry, rows, motion),
+            np.full(count, self._options.motion_patience),
+        )
+
+    def placed(self, recording: Recording, scans: Iterable[Scan]) -> Trajectory:
+        """Every scan of the log, registered with the keyframes around it."""
+        poses, options = self._poses(recording), self._options
+        areas = self.areas[np.searchsorted(self.ids, np.maximum(recording.scans.keyframes, self.ids[0]))]
+        placed, remaining = recording.trajectory.copy(), iter(scans)
+        for first in range(0, len(placed), _BATCH):
+            batch = list(itertools.islice(remaining, _BATCH))
+            rows = slice(first, first + len(batch))
+            around = self._around(poses, placed[rows], areas[rows], options.scan_neighbours)
+            placed[rows] = place(self._surfaces, poses, self._surfaces_of(batch), placed[rows], around, options)
+        return placed
+
+
+def _scan_rows(recording: Recording, keyframes: list[int]) -> NDArray[np.intp]:
+    """Where in the log the scans of keyframes are."""
+    stamps = [recording.replica.scans[keyframe].stamp for keyframe in keyframes]
+    return np.searchsorted(recording.stamps, stamps)
+
+
+def _path_covariances(odometry: Trajectory, rows: NDArray[np.intp], motion: Motion) -> NDArray[np.float64]:
+    """Covariances (n - 1, 3, 3) of the odometry along the paths between n scans of the log."""
+    steps = se2.between(odometry[:-1], odometry[1:])
+    distance = np.concatenate(([0.0], np.cumsum(np.hypot(steps[:, 0], steps[:, 1]))))[rows]
+    angle = np.concatenate(([0.0], np.cumsum(np.abs(steps[:, 2]))))[rows]
+    return np.array(
+        [path_covariance(*path, motion) for path in zip(np.diff(distance), np.diff(angle), strict=True)]
+    ).reshape(-1, 3, 3)
+
+
+def _with_keyframes(recording: Recording, poses: Mapping[int, NDArray[np.float64]]) -> Recording:
+    """The recording with its keyframes at given ``map_T_base``.
+
+    An area's frame moves with the first of its keyframes. Arcs take over the poses between the frames, and keep their
+    covariances as what is known of them at least.
+    """
+    hybrid_map = recording.hybrid_map.branch()
+    area_poses = {}
+    for area in hybrid_map.area_ids():
+        keyframes = dict(hybrid_map.keyframes(area))
+        reference, area_T_reference = next(iter(keyframes.items()))
+        frame = se2.compose(poses[reference], se2.inverse(area_T_reference))
+        area_poses[area] = PoseGaussian(frame, recording.area_poses[area].covariance)
+        for keyframe in keyframes:
+            hybrid_map.place(keyframe, area, se2.between(frame, poses[keyframe]))
+    for a, b, arc in list(hybrid_map.all_arcs()):
+        mean = se2.between(area_poses[a].mean, area_poses[b].mean)
+        hybrid_map.set_arc(a, b, PoseGaussian(mean, arc.pose.covariance), closure=arc.closure)
+    replica = replace(recording.replica, maps=recording.replica.maps | {recording.replica.best: hybrid_map})
+    return replace(recording, replica=replica, area_poses=area_poses, trajectory=carried(recording.scans, poses))
+
+
+def _areas_as_travelled(recording: Recording) -> dict[int, PoseGaussian]:
+    """``map_T_area`` along the arcs that closed no loop; as it is where no such arc leads there."""
+    hybrid_map = recording.hybrid_map
+    open_map = HybridMap(areas={area: dict(hybrid_map.keyframes(area)) for area in hybrid_map.area_ids()})
+    for a, b, arc in hybrid_map.all_arcs():
+        if not arc.closure:
+            open_map.set_arc(a, b, arc.pose, closure=False)
+    return recording.area_poses | reachable(open_map, hybrid_map.area_ids()[0])
