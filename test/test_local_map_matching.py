@@ -8,9 +8,10 @@ from worlds import box, scan_in
 
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.local_map.batch import propose_all
+from hmt_slam_ros.local_map.insertion import InverseModel
 from hmt_slam_ros.local_map.matching import Alignment, Prior, align, beam_model, correlative_search, log_ratio
 from hmt_slam_ros.local_map.patch_pool import Beams, PatchPool
-from hmt_slam_ros.local_map.patches import FAR, PATCH, InverseModel, field_at, odds_at
+from hmt_slam_ros.local_map.patches import FAR, PATCH, field_at, odds_at
 
 CELL, RADIUS = 0.05, 0.5
 MODEL = beam_model(RADIUS, 0.1, 10.0, 0.1)

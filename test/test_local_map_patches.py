@@ -2,11 +2,17 @@
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numba import njit
 from scipy.ndimage import distance_transform_edt
 from worlds import box, scan_in
 
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.local_map.bits import lowest
+from hmt_slam_ros.local_map.insertion import InverseModel
 from hmt_slam_ros.local_map.patch_pool import Beams, PatchPool
-from hmt_slam_ros.local_map.patches import FAR, PATCH, InverseModel, field_at, odds_at
+from hmt_slam_ros.local_map.patches import FAR, PATCH, field_at, odds_at
 
 CELL, RADIUS = 0.05, 0.5
 MODEL = InverseModel(17, -8, 70)
@@ -15,6 +21,11 @@ MODEL = InverseModel(17, -8, 70)
 @pytest.fixture
 def pool():
     return PatchPool(table_size=8, cell=CELL, radius=RADIUS)
+
+
+@njit
+def lowest_bit(word):
+    return lowest(word)
 
 
 def insert(pool, table, scan, pose=(0.0, 0.0, 0.0)):
@@ -27,16 +38,46 @@ def dense(pool, table, read):
     return np.array([[read(view, column, row) for column in range(edge)] for row in range(edge)])
 
 
-def test_the_distance_field_equals_the_exact_distance_transform_after_walls_came_and_went(pool):
-    table = pool.empty_table()
-    for k in range(3):
-        insert(pool, table, scan_in(box(-3, -3, 3, 3), (0.1 * k, 0, 0.3 * k), field_of_view=2 * np.pi))
-    for k in range(6):
-        insert(pool, table, scan_in(box(-4, -4, 4, 4), (0.1 * k, 0, 0.3 * k), field_of_view=2 * np.pi))
-    odds, field = dense(pool, table, odds_at), dense(pool, table, field_at)
-    assert (odds > 0).any()
-    exact = np.minimum(np.rint(distance_transform_edt(odds <= 0) * CELL / RADIUS * FAR), FAR)
-    np.testing.assert_array_equal(field, exact)
+@pytest.mark.parametrize("radius", [0.12, RADIUS, 1.93], ids=["two cells and a bit", "ten cells", "beyond a patch"])
+def test_the_distance_field_equals_the_exact_distance_transform_after_walls_came_and_went(radius):
+    pool = PatchPool(table_size=8, cell=CELL, radius=radius)
+    table, went = pool.empty_table(), 0
+    for k in range(12):
+        before = dense(pool, table, odds_at) > 0
+        walls = box(-3, -3, 3, 3) if k < 3 else box(-4, -4, 4, 4)
+        insert(pool, table, scan_in(walls, (0.0, 0.0, 0.0), field_of_view=2 * np.pi), (0.1 * k, 0.03 * k, 0.3 * k))
+        odds, field = dense(pool, table, odds_at), dense(pool, table, field_at)
+        went += (before & (odds <= 0)).sum()
+        exact = np.minimum(np.rint(distance_transform_edt(odds <= 0) * CELL / radius * FAR), FAR)
+        np.testing.assert_array_equal(field, exact)
+    assert went > 100
+
+
+def test_odds_follow_from_the_cells_that_beams_pass_and_in_which_they_end(pool):
+    table, expected = pool.empty_table(), np.zeros((8 * PATCH, 8 * PATCH), dtype=int)
+    for k in range(8):
+        pose = (0.1 * k + 0.013, 0.217, 0.3 * k)
+        scan = scan_in(box(-3, -4, 5, 4), pose, noise=0.1, seed=k)
+        insert(pool, table, scan, pose)
+        hit, passed = np.zeros(expected.shape, dtype=bool), np.zeros(expected.shape, dtype=bool)
+        origins = se2.transform(pose, scan.origins) / CELL + 4 * PATCH
+        ends = se2.transform(pose, scan.points) / CELL + 4 * PATCH
+        for origin, end in zip(origins, ends, strict=True):
+            # The cells between two crossings of the grid's lines, from their middles.
+            lines = [np.arange(np.ceil(min(a, b)), max(a, b)) for a, b in zip(origin, end, strict=True)]
+            crossings = [(line - a) / (b - a) for line, a, b in zip(lines, origin, end, strict=True)]
+            shares = np.sort(np.concatenate(([0.0], *crossings)))
+            middles = origin + 0.5 * (shares[:-1] + shares[1:])[:, None] * (end - origin)
+            passed[tuple(np.floor(middles).astype(int)[:, ::-1].T)] = True
+            hit[tuple(np.floor(end).astype(int)[::-1])] = True
+        change = np.where(hit, MODEL.hit, np.where(passed, MODEL.miss, 0))
+        expected = np.clip(expected + change, -MODEL.limit, MODEL.limit)
+        np.testing.assert_array_equal(dense(pool, table, odds_at), expected)
+
+
+@given(st.integers(1, 2**32 - 1))
+def test_the_lowest_bit_of_a_word_is_found(word):
+    assert lowest_bit(np.uint32(word)) == f"{word:b}"[::-1].index("1")
 
 
 def test_a_wall_is_occupied_the_room_is_free_and_what_lies_behind_is_unknown(pool):

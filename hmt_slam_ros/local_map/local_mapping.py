@@ -9,8 +9,9 @@ import numpy as np
 from hmt_slam_ros.arrays import Float64, Int32
 from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.local_map import matching
+from hmt_slam_ros.local_map.insertion import InverseModel
 from hmt_slam_ros.local_map.patch_pool import Beams, PatchPool
-from hmt_slam_ros.local_map.patches import FAR, PATCH, InverseModel
+from hmt_slam_ros.local_map.patches import FAR, PATCH
 from hmt_slam_ros.sensing import Scan
 
 _ODDS_PER_NAT = 20.0

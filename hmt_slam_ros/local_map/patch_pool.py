@@ -6,10 +6,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hmt_slam_ros.arrays import Float64, Int32, UInt8
+from hmt_slam_ros.arrays import Float64, Int32
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.local_map import patches
-from hmt_slam_ros.local_map.patches import FAR, NO_PATCH, PATCH, InverseModel, MapView, Store
+from hmt_slam_ros.local_map import insertion, patches
+from hmt_slam_ros.local_map.distance_field import field_work
+from hmt_slam_ros.local_map.insertion import InverseModel
+from hmt_slam_ros.local_map.patches import FAR, NO_PATCH, PATCH, MapView, Store
 
 _GROWTH = 1024
 
@@ -32,6 +34,7 @@ class PatchPool:
 
     :ivar odds: shape (capacity, 32, 32), int8.
     :ivar field: shape (capacity, 32, 32), uint8.
+    :ivar occupied: shape (capacity, 32), uint32, a bit for every cell.
     :ivar references: shape (capacity,), int32, how many tables name the patch.
     """
 
@@ -45,15 +48,14 @@ class PatchPool:
         self.table_size = table_size
         self.cell = cell
         self.radius = radius
-        self.radius_cells = int(np.ceil(radius / cell))
         self.odds = np.zeros((0, PATCH, PATCH), dtype=np.int8)
         self.field = np.zeros((0, PATCH, PATCH), dtype=np.uint8)
+        self.occupied = np.zeros((0, PATCH), dtype=np.uint32)
         self.references = np.zeros(0, dtype=np.int32)
         self._free = np.zeros(0, dtype=np.int32)
         self._free_count = np.zeros(1, dtype=np.int64)
-        edge = table_size * PATCH
-        self._marks = np.zeros((edge, edge), dtype=np.uint8)
-        self._stamp = _distance_stamp(self.radius_cells, cell, radius)
+        self._marks = insertion.marks(table_size)
+        self._field_work = field_work(table_size, cell, radius)
 
     @property
     def used(self) -> int:
@@ -63,7 +65,7 @@ class PatchPool:
     @property
     def nbytes(self) -> int:
         """Bytes held, used or not."""
-        return self.odds.nbytes + self.field.nbytes + self._marks.nbytes
+        return self.odds.nbytes + self.field.nbytes + self.occupied.nbytes + 2 * self._marks.hit.nbytes
 
     def empty_table(self) -> Int32:
         """The table of a map in which nothing is known."""
@@ -95,10 +97,10 @@ class PatchPool:
         half = 0.5 * self.table_size * PATCH
         origins = se2.transform(pose, beams.origins) / self.cell + half
         ends = se2.transform(pose, np.concatenate((beams.points, beams.free))) / self.cell + half
-        patches.insert(table, self._store(), self._marks, self._stamp, origins, ends, len(beams.points), model)
+        insertion.insert(table, self._store(), self._marks, self._field_work, origins, ends, len(beams.points), model)
 
     def _store(self) -> Store:
-        return Store(self.odds, self.field, self.references, self._free, self._free_count)
+        return Store(self.odds, self.field, self.occupied, self.references, self._free, self._free_count)
 
     def _reserve(self, count: int) -> None:
         missing = count - int(self._free_count[0])
@@ -108,6 +110,7 @@ class PatchPool:
         grown = max(_GROWTH, missing, old // 4)
         self.odds = np.concatenate((self.odds, np.zeros((grown, PATCH, PATCH), dtype=np.int8)))
         self.field = np.concatenate((self.field, np.full((grown, PATCH, PATCH), FAR, dtype=np.uint8)))
+        self.occupied = np.concatenate((self.occupied, np.zeros((grown, PATCH), dtype=np.uint32)))
         self.references = np.concatenate((self.references, np.zeros(grown, dtype=np.int32)))
         free = np.empty(old + grown, dtype=np.int32)
         kept = int(self._free_count[0])
@@ -116,10 +119,3 @@ class PatchPool:
         free[grown : grown + kept] = self._free[:kept]
         self._free = free
         self._free_count[0] = grown + kept
-
-
-def _distance_stamp(radius_cells: int, cell: float, radius: float) -> UInt8:
-    """Quantised distances around an occupied cell, shape (2r+1, 2r+1)."""
-    offsets = np.arange(-radius_cells, radius_cells + 1) * cell
-    distance = np.hypot(offsets[:, None], offsets[None, :])
-    return np.minimum(np.rint(distance / radius * FAR), FAR).astype(np.uint8)

@@ -1,0 +1,31 @@
+"""Words of 32 bits as sets of columns."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from llvmlite import ir
+from numba import njit, types
+from numba.extending import intrinsic
+
+from hmt_slam_ros.arrays import UInt32
+
+
+@intrinsic
+def lowest(_context: Any, word: Any) -> Any:  # noqa: ANN401  numba's own types
+    """The number of the lowest bit that is set; a word without any has no answer."""
+
+    def count_trailing_zeros(_context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:  # noqa: ANN401
+        return builder.zext(builder.cttz(arguments[0], ir.Constant(ir.IntType(1), 1)), ir.IntType(64))
+
+    return types.int64(word), count_trailing_zeros
+
+
+@njit(cache=True)
+def any_set(words: UInt32) -> bool:
+    """Whether a bit is set in any of the words (n,)."""
+    found = np.uint32(0)
+    for word in words:
+        found |= word
+    return found != 0

@@ -1,0 +1,251 @@
+"""The distance field kept exact while cells become occupied and free again.
+
+A cell that becomes occupied lowers the field around it. Where one becomes free, the rows of a patch in which it was the
+nearest are measured anew from all occupied cells in reach, by the separable transform of squared distances: along the
+rows first, then across (Felzenszwalb and Huttenlocher 2012).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from hmt_slam_ros.arrays import Float32, Int32, UInt8, UInt32
+from hmt_slam_ros.local_map.bits import lowest
+from hmt_slam_ros.local_map.patches import FAR, MASK, PATCH, SHIFT, Store, writable
+
+
+class FieldWork(NamedTuple):
+    """Tables of distances, in cells around an occupied one, and room to work in; r is the field's radius in cells.
+
+    The tables have 31 columns of "far" on both sides, so that a row of a patch always takes 32 of theirs.
+
+    :ivar quanta: shape (r^2 + 2,), the field's value of a squared distance; the last is FAR.
+    :ivar stamp: shape (2r + 1, 2r + 63), the field's values around an occupied cell.
+    :ivar squares: shape (1, 2r + 63), squared distances along a row.
+    :ivar empty: shape (32, 32), the field of a patch never seen.
+    :ivar dirty: shape (T, T), a bit for each row of a patch that has to be measured anew; zeros between insertions.
+    :ivar across: shape (1, 32), squared distances to the occupied cells of one row.
+    :ivar nearest: shape (32, 32), squared distances to the nearest occupied cells.
+    """
+
+    quanta: UInt8
+    stamp: UInt8
+    squares: Float32
+    empty: UInt8
+    dirty: UInt32
+    across: Float32
+    nearest: Float32
+
+
+def field_work(table_size: int, cell: float, radius: float) -> FieldWork:
+    """The tables for cells of edge ``cell``, m, and a field that ends at ``radius``, m."""
+    reach = int(np.ceil(radius / cell))
+    far = reach * reach + 1
+    quanta = np.minimum(np.rint(np.sqrt(np.arange(far + 1)) * cell / radius * FAR), FAR).astype(np.uint8)
+    quanta[far] = FAR
+    square = np.arange(-reach, reach + 1) ** 2
+    stamp = quanta[np.minimum(square[:, None] + square, far)]
+    return FieldWork(
+        quanta,
+        np.pad(stamp, ((0, 0), (MASK, MASK)), constant_values=FAR),
+        np.pad(square[None], ((0, 0), (MASK, MASK)), constant_values=far).astype(np.float32),
+        np.full((PATCH, PATCH), FAR, dtype=np.uint8),
+        np.zeros((table_size, table_size), dtype=np.uint32),
+        np.empty((1, PATCH), dtype=np.float32),
+        np.empty((PATCH, PATCH), dtype=np.float32),
+    )
+
+
+@njit(cache=True)
+def in_reach(work: FieldWork, table_size: int, at: int) -> range:
+    """The rows of patches, or the columns of them, that the field around those at ``at`` reaches."""
+    margin = (work.stamp.shape[0] // 2 + MASK) >> SHIFT
+    return range(max(0, at - margin), min(table_size, at + margin + 1))
+
+
+@njit(cache=True)
+def lower(table: Int32, store: Store, work: FieldWork, cells: UInt32, tr: int, tc: int) -> None:
+    """Enter the newly occupied cells of a patch, as bits of shape (32,)."""
+    for r in in_reach(work, table.shape[0], tr):
+        for c in in_reach(work, table.shape[0], tc):
+            row, column = (tr - r) << SHIFT, (tc - c) << SHIFT
+            patch = table[r, c]
+            if patch < 0 or store.references[patch] > 1:
+                field = work.empty if patch < 0 else store.field[patch]
+                if not _lowers(field, work.stamp, cells, row, column):
+                    continue
+                patch = writable(table, store, r, c)
+            _take_lower(store.field[patch], work.stamp, cells, row, column)
+
+
+@njit(cache=True)
+def mark_dirty(table: Int32, store: Store, work: FieldWork, cells: UInt32, tr: int, tc: int) -> None:
+    """Mark the rows in which cells of a patch that became free, as bits of shape (32,), were the nearest."""
+    for r in in_reach(work, table.shape[0], tr):
+        for c in in_reach(work, table.shape[0], tc):
+            patch = table[r, c]
+            if patch >= 0:
+                alike = _rows_alike(store.field[patch], work.stamp, cells, (tr - r) << SHIFT, (tc - c) << SHIFT)
+                work.dirty[r, c] |= alike
+
+
+@njit(cache=True)
+def _near(reach: int, at: int) -> tuple[int, int]:
+    """The rows or columns, from ... to, of a patch that begins ``at`` relative to another, which are in its reach."""
+    return max(0, -reach - at), max(0, min(PATCH, PATCH + reach - at))
+
+
+@njit(cache=True)
+def _between(begin: int, end: int) -> np.uint32:
+    """The bits of the columns from ... to."""
+    if begin >= end:
+        return np.uint32(0)
+    return (np.uint32(0xFFFFFFFF) >> np.uint32(PATCH - end + begin)) << np.uint32(begin)
+
+
+@njit(cache=True)
+def _covered(stamp: UInt8, row: int, column: int) -> tuple[int, int, UInt8]:
+    """The rows of a patch, from ... to, that the stamp around a cell in reach covers, and the stamp's part on them."""
+    reach = stamp.shape[0] // 2
+    top, bottom, left = max(0, row - reach), min(PATCH, row + reach + 1), MASK + reach - column
+    return top, bottom, stamp[top - row + reach : bottom - row + reach, left : left + PATCH]
+
+
+@njit(cache=True)
+def _lowers(field: UInt8, stamp: UInt8, cells: UInt32, row: int, column: int) -> bool:
+    """Whether cells, in a patch that begins at (row, column) relative to the field's, lower the field."""
+    reach = stamp.shape[0] // 2
+    columns = _between(*_near(reach, column))
+    begin, end = _near(reach, row)
+    for r in range(begin, end):
+        bits = cells[r] & columns
+        while bits:
+            top, bottom, values = _covered(stamp, row + r, column + lowest(bits))
+            bits &= bits - np.uint32(1)
+            if _any_lower(field[top:bottom], values):
+                return True
+    return False
+
+
+@njit(cache=True)
+def _any_lower(field: UInt8, values: UInt8) -> bool:
+    count = 0
+    for r in range(field.shape[0]):
+        for c in range(field.shape[1]):
+            count += values[r, c] < field[r, c]
+    return count > 0
+
+
+@njit(cache=True)
+def _take_lower(field: UInt8, stamp: UInt8, cells: UInt32, row: int, column: int) -> None:
+    """Lower a field by cells in a patch that begins at (row, column) relative to the field's."""
+    reach = stamp.shape[0] // 2
+    columns = _between(*_near(reach, column))
+    begin, end = _near(reach, row)
+    for r in range(begin, end):
+        bits = cells[r] & columns
+        while bits:
+            top, bottom, values = _covered(stamp, row + r, column + lowest(bits))
+            bits &= bits - np.uint32(1)
+            _take_minimum(field[top:bottom], values)
+
+
+@njit(cache=True)
+def _take_minimum(kept: UInt8 | Float32, values: UInt8 | Float32) -> None:
+    for r in range(kept.shape[0]):
+        for c in range(kept.shape[1]):
+            kept[r, c] = min(kept[r, c], values[r, c])
+
+
+@njit(cache=True)
+def _rows_alike(field: UInt8, stamp: UInt8, cells: UInt32, row: int, column: int) -> np.uint32:
+    """The rows, as bits, of a field that may come from cells in a patch that begins at (row, column) relative to it."""
+    reach = stamp.shape[0] // 2
+    columns = _between(*_near(reach, column))
+    begin, end = _near(reach, row)
+    alike = np.uint32(0)
+    for r in range(begin, end):
+        bits = cells[r] & columns
+        while bits:
+            top, bottom, values = _covered(stamp, row + r, column + lowest(bits))
+            bits &= bits - np.uint32(1)
+            alike |= _alike(field[top:bottom], values) << np.uint32(top)
+    return alike
+
+
+@njit(cache=True)
+def _alike(field: UInt8, values: UInt8) -> np.uint32:
+    """The rows, as bits, in which both have a value below FAR in common."""
+    rows = np.uint32(0)
+    for r in range(field.shape[0]):
+        count = 0
+        for c in range(field.shape[1]):
+            count += (values[r, c] == field[r, c]) & (values[r, c] < FAR)
+        if count > 0:
+            rows |= np.uint32(1) << np.uint32(r)
+    return rows
+
+
+@njit(cache=True)
+def measure_dirty(table: Int32, store: Store, work: FieldWork, tr: int, tc: int) -> None:
+    """Measure the dirty rows of a patch anew."""
+    dirty = work.dirty[tr, tc]
+    work.dirty[tr, tc] = 0
+    top = lowest(dirty)
+    bottom = top
+    while bottom < PATCH and dirty >> np.uint32(bottom) != 0:
+        bottom += 1
+    _find_nearest(table, store, work, tr, tc, top, bottom)
+    field = store.field[writable(table, store, tr, tc)]
+    for r in range(top, bottom):
+        if dirty >> np.uint32(r) & np.uint32(1):
+            for c in range(PATCH):
+                field[r, c] = work.quanta[int(work.nearest[r, c])]
+
+
+@njit(cache=True)
+def _find_nearest(
+    table: Int32, store: Store, work: FieldWork, tr: int, tc: int, top: int, bottom: int
+) -> None:
+    """Squared distances from the cells in rows ``top`` to ``bottom`` of a patch to their nearest occupied ones."""
+    reach = work.stamp.shape[0] // 2
+    work.nearest[top:bottom] = work.quanta.size - 1
+    first = tr << SHIFT
+    for row in range(max(0, first + top - reach), min(table.shape[0] * PATCH, first + bottom + reach)):
+        if _measure_across(table, store, work, row, tc):
+            at = row - first
+            begin, end = max(top, at - reach), min(bottom, at + reach + 1)
+            _take_nearer(work.nearest[begin:end], work.across, begin - at)
+
+
+@njit(cache=True)
+def _measure_across(table: Int32, store: Store, work: FieldWork, row: int, tc: int) -> bool:
+    """Squared distances within a row, from the columns of a patch to the occupied ones; False where there is none."""
+    reach = work.stamp.shape[0] // 2
+    first = tc << SHIFT
+    found = False
+    for t in range(max(0, (first - reach) >> SHIFT), min(table.shape[0], ((first + MASK + reach) >> SHIFT) + 1)):
+        patch = table[row >> SHIFT, t]
+        bits = np.uint32(0) if patch < 0 else store.occupied[patch, row & MASK]
+        while bits:
+            column = ((t - tc) << SHIFT) + lowest(bits)
+            bits &= bits - np.uint32(1)
+            if -reach <= column <= MASK + reach:
+                if not found:
+                    work.across[:] = work.quanta.size - 1
+                    found = True
+                left = reach + MASK - column
+                _take_minimum(work.across, work.squares[:, left : left + PATCH])
+    return found
+
+
+@njit(cache=True)
+def _take_nearer(nearest: Float32, across: Float32, offset: int) -> None:
+    """Take what is nearer by way of the row ``offset`` rows before the first."""
+    for r in range(nearest.shape[0]):
+        square = np.float32((r + offset) * (r + offset))
+        for c in range(nearest.shape[1]):
+            nearest[r, c] = min(nearest[r, c], across[0, c] + square)
