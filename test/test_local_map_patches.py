@@ -139,6 +139,12 @@ def test_a_patch_used_again_starts_empty(pool):
     assert np.abs(occupied - 4 * PATCH).max() <= int(1.0 / CELL) + 1
 
 
+def test_a_scan_without_a_return_changes_nothing(pool):
+    table = pool.empty_table()
+    insert(pool, table, scan_in(np.full((1, 4), 99.0), (0, 0, 0)))
+    assert pool.used == 0
+
+
 def test_a_scan_that_leaves_the_map_is_cut_off_there(pool):
     table = pool.empty_table()
     insert(pool, table, scan_in(box(-20, -20, 20, 20), (0, 0, 0), field_of_view=2 * np.pi))

@@ -55,6 +55,8 @@ def insert(
     model: InverseModel,
 ) -> None:
     """Enter beams from ``origins`` to ``ends`` (n, 2), in cells, of which the first ``hits`` end on a surface."""
+    if not len(ends):
+        return
     _mark(marks, origins, ends, hits)
     top, bottom, left, right = patches_around(origins, ends, table.shape[0])
     for tr in range(top, bottom):
