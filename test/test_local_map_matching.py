@@ -27,7 +27,7 @@ def mapped(walls, poses, beams=721):
         scan = scan_in(walls, pose, beams=beams, field_of_view=2 * np.pi)
         near = np.hypot(*scan.points.T) < 12.0
         told = Beams(scan.points[near], np.empty((0, 2)), scan.origins[near])
-        pool.insert(table, np.asarray(pose, dtype=float), told, InverseModel(17, -8, 70))
+        pool.insert(table[None], np.array([pose], dtype=float), told, InverseModel(17, -8, 70))
     return pool, table
 
 

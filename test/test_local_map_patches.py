@@ -29,7 +29,7 @@ def lowest_bit(word):
 
 
 def insert(pool, table, scan, pose=(0.0, 0.0, 0.0)):
-    pool.insert(table, np.asarray(pose, dtype=float), Beams(scan.points, np.empty((0, 2)), scan.origins), MODEL)
+    pool.insert(table[None], np.array([pose], dtype=float), Beams(scan.points, np.empty((0, 2)), scan.origins), MODEL)
 
 
 def dense(pool, table, read):
@@ -98,7 +98,7 @@ def test_a_cell_counts_once_per_scan_however_many_beams_pass_it(pool):
 def test_each_beam_frees_the_cells_from_its_own_origin(pool):
     table = pool.empty_table()
     origins = np.array([[0.01, 0.01], [0.01, 1.01]])
-    pool.insert(table, np.zeros(3), Beams(origins + np.array([2.0, 0.0]), np.empty((0, 2)), origins), MODEL)
+    pool.insert(table[None], np.zeros((1, 3)), Beams(origins + np.array([2.0, 0.0]), np.empty((0, 2)), origins), MODEL)
     odds = dense(pool, table, odds_at)
     assert sorted(set(np.nonzero(odds < 0)[0])) == [4 * PATCH, 4 * PATCH + 20]
     assert (odds < 0).sum() == 80

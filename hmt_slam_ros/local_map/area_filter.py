@@ -217,8 +217,7 @@ class AreaFilter:
 
     def add_keyframe(self, keyframe: int, scan: Scan) -> None:
         """Enter the scan into every particle's map at that particle's pose."""
-        for table, pose in zip(self._tables, self.poses, strict=True):
-            self.mapping.insert(table, pose, scan)
+        self.mapping.insert(self._tables, self.poses, scan)
         self.keyframes.append(keyframe)
         self.keyframe_areas.append(self.area)
         self.keyframe_poses = np.concatenate((self.keyframe_poses, self.poses[:, None]), axis=1)
@@ -247,7 +246,7 @@ class AreaFilter:
         self.release()
         table = self.mapping.pool.empty_table()
         for placed in content:
-            self.mapping.insert(table, placed.pose, placed.scan)
+            self.mapping.insert(table[None], placed.pose[None], placed.scan)
         count = len(self.poses)
         self._tables = np.stack([table] + [self.mapping.pool.share(table) for _ in range(count - 1)])
         self.keyframes = [placed.keyframe for placed in content]

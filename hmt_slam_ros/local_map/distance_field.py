@@ -60,17 +60,17 @@ def field_work(table_size: int, cell: float, radius: float) -> FieldWork:
 
 
 @njit(cache=True)
-def in_reach(work: FieldWork, table_size: int, at: int) -> range:
-    """The rows of patches, or the columns of them, that the field around those at ``at`` reaches."""
+def in_reach(work: FieldWork, table_size: int, patches: range) -> range:
+    """The rows of patches, or the columns of them, that the field around those in ``patches`` reaches."""
     margin = (work.stamp.shape[0] // 2 + MASK) >> SHIFT
-    return range(max(0, at - margin), min(table_size, at + margin + 1))
+    return range(max(0, patches.start - margin), min(table_size, patches.stop + margin))
 
 
 @njit(cache=True)
 def lower(table: Int32, store: Store, work: FieldWork, cells: UInt32, tr: int, tc: int) -> None:
     """Enter the newly occupied cells of a patch, as bits of shape (32,)."""
-    for r in in_reach(work, table.shape[0], tr):
-        for c in in_reach(work, table.shape[0], tc):
+    for r in in_reach(work, table.shape[0], range(tr, tr + 1)):
+        for c in in_reach(work, table.shape[0], range(tc, tc + 1)):
             row, column = (tr - r) << SHIFT, (tc - c) << SHIFT
             patch = table[r, c]
             if patch < 0 or store.references[patch] > 1:
@@ -84,8 +84,8 @@ def lower(table: Int32, store: Store, work: FieldWork, cells: UInt32, tr: int, t
 @njit(cache=True)
 def mark_dirty(table: Int32, store: Store, work: FieldWork, cells: UInt32, tr: int, tc: int) -> None:
     """Mark the rows in which cells of a patch that became free, as bits of shape (32,), were the nearest."""
-    for r in in_reach(work, table.shape[0], tr):
-        for c in in_reach(work, table.shape[0], tc):
+    for r in in_reach(work, table.shape[0], range(tr, tr + 1)):
+        for c in in_reach(work, table.shape[0], range(tc, tc + 1)):
             patch = table[r, c]
             if patch >= 0:
                 alike = _rows_alike(store.field[patch], work.stamp, cells, (tr - r) << SHIFT, (tc - c) << SHIFT)
@@ -190,56 +190,60 @@ def _alike(field: UInt8, values: UInt8) -> np.uint32:
 
 
 @njit(cache=True)
-def measure_dirty(table: Int32, store: Store, work: FieldWork, tr: int, tc: int) -> None:
-    """Measure the dirty rows of a patch anew."""
-    dirty = work.dirty[tr, tc]
-    work.dirty[tr, tc] = 0
-    top = lowest(dirty)
-    bottom = top
-    while bottom < PATCH and dirty >> np.uint32(bottom) != 0:
-        bottom += 1
-    _find_nearest(table, store, work, tr, tc, top, bottom)
-    field = store.field[writable(table, store, tr, tc)]
-    for r in range(top, bottom):
-        if dirty >> np.uint32(r) & np.uint32(1):
-            for c in range(PATCH):
-                field[r, c] = work.quanta[int(work.nearest[r, c])]
+def measure_dirty(table: Int32, store: Store, work: FieldWork, rows: range, columns: range) -> None:
+    """Measure the dirty rows anew, in a part of the table and around it."""
+    for tr in in_reach(work, table.shape[0], rows):
+        for tc in in_reach(work, table.shape[0], columns):
+            dirty = work.dirty[tr, tc]
+            if dirty:
+                work.dirty[tr, tc] = 0
+                _find_nearest(table, store, work, dirty, tr, tc)
+                _write(store.field[writable(table, store, tr, tc)], dirty, work.nearest, work.quanta)
 
 
 @njit(cache=True)
-def _find_nearest(
-    table: Int32, store: Store, work: FieldWork, tr: int, tc: int, top: int, bottom: int
-) -> None:
-    """Squared distances from the cells in rows ``top`` to ``bottom`` of a patch to their nearest occupied ones."""
+def _write(field: UInt8, rows: np.uint32, nearest: Float32, quanta: UInt8) -> None:
+    """Enter squared distances into rows, given as bits, of a field."""
+    while rows:
+        r = lowest(rows)
+        rows &= rows - np.uint32(1)
+        for c in range(PATCH):
+            field[r, c] = quanta[int(nearest[r, c])]
+
+
+@njit(cache=True)
+def _find_nearest(table: Int32, store: Store, work: FieldWork, rows: np.uint32, tr: int, tc: int) -> None:
+    """Squared distances from the cells in rows, given as bits, of a patch to their nearest occupied ones."""
     reach = work.stamp.shape[0] // 2
+    top, bottom = lowest(rows), PATCH
+    while not rows >> np.uint32(bottom - 1):
+        bottom -= 1
     work.nearest[top:bottom] = work.quanta.size - 1
+    patches = in_reach(work, table.shape[0], range(tc, tc + 1))
     first = tr << SHIFT
     for row in range(max(0, first + top - reach), min(table.shape[0] * PATCH, first + bottom + reach)):
-        if _measure_across(table, store, work, row, tc):
-            at = row - first
-            begin, end = max(top, at - reach), min(bottom, at + reach + 1)
-            _take_nearer(work.nearest[begin:end], work.across, begin - at)
+        found = False
+        for t in patches:
+            patch = table[row >> SHIFT, t]
+            if patch >= 0 and store.occupied[patch, row & MASK]:
+                if not found:
+                    work.across[:] = work.quanta.size - 1
+                found = True
+                _measure_across(store.occupied[patch, row & MASK], (t - tc) << SHIFT, work.squares, work.across)
+        if found:
+            begin, end = max(top, row - first - reach), min(bottom, row - first + reach + 1)
+            _take_nearer(work.nearest[begin:end], work.across, begin - row + first)
 
 
 @njit(cache=True)
-def _measure_across(table: Int32, store: Store, work: FieldWork, row: int, tc: int) -> bool:
-    """Squared distances within a row, from the columns of a patch to the occupied ones; False where there is none."""
-    reach = work.stamp.shape[0] // 2
-    first = tc << SHIFT
-    found = False
-    for t in range(max(0, (first - reach) >> SHIFT), min(table.shape[0], ((first + MASK + reach) >> SHIFT) + 1)):
-        patch = table[row >> SHIFT, t]
-        bits = np.uint32(0) if patch < 0 else store.occupied[patch, row & MASK]
-        while bits:
-            column = ((t - tc) << SHIFT) + lowest(bits)
-            bits &= bits - np.uint32(1)
-            if -reach <= column <= MASK + reach:
-                if not found:
-                    work.across[:] = work.quanta.size - 1
-                    found = True
-                left = reach + MASK - column
-                _take_minimum(work.across, work.squares[:, left : left + PATCH])
-    return found
+def _measure_across(occupied: np.uint32, column: int, squares: Float32, across: Float32) -> None:
+    """Squared distances from the columns of a patch to occupied ones of a patch that begins at ``column``."""
+    reach = squares.shape[1] // 2 - MASK
+    occupied &= _between(*_near(reach, column))
+    while occupied:
+        left = reach + MASK - column - lowest(occupied)
+        occupied &= occupied - np.uint32(1)
+        _take_minimum(across, squares[:, left : left + PATCH])
 
 
 @njit(cache=True)

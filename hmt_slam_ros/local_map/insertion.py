@@ -9,7 +9,7 @@ from numba import njit
 
 from hmt_slam_ros.arrays import Float64, Int8, Int32, UInt32
 from hmt_slam_ros.local_map.bits import any_set, lowest
-from hmt_slam_ros.local_map.distance_field import FieldWork, lower, mark_dirty, measure_dirty
+from hmt_slam_ros.local_map.distance_field import FieldWork, in_reach, lower, mark_dirty, measure_dirty
 from hmt_slam_ros.local_map.patches import MASK, PATCH, SHIFT, Store, writable
 
 
@@ -44,7 +44,54 @@ def marks(table_size: int) -> Marks:
 
 
 @njit(cache=True)
+def in_cells(points: Float64, poses: Float64, cell: float, table_size: int) -> Float64:
+    """Points (n, 2) of the base, m, in cells of a map, for each of several ``map_T_base`` (m, 3); shape (m, n, 2)."""
+    placed = np.empty((poses.shape[0], points.shape[0], 2))
+    half = 0.5 * table_size * PATCH
+    for i in range(poses.shape[0]):
+        cos, sin = np.cos(poses[i, 2]), np.sin(poses[i, 2])
+        for n in range(points.shape[0]):
+            placed[i, n, 0] = (poses[i, 0] + cos * points[n, 0] - sin * points[n, 1]) / cell + half
+            placed[i, n, 1] = (poses[i, 1] + sin * points[n, 0] + cos * points[n, 1]) / cell + half
+    return placed
+
+
+@njit(cache=True)
+def patches_needed(tables: Int32, store: Store, work: FieldWork, origins: Float64, ends: Float64) -> int:
+    """How many new patches :func:`insert` may take at most, with the same arguments."""
+    count = 0
+    for i in range(tables.shape[0]):
+        rows, columns = _patches_around(origins[i], ends[i], tables.shape[1])
+        for tr in in_reach(work, tables.shape[1], rows):
+            for tc in in_reach(work, tables.shape[1], columns):
+                patch = tables[i, tr, tc]
+                count += patch < 0 or store.references[patch] > 1
+    return count
+
+
+@njit(cache=True)
 def insert(
+    tables: Int32,
+    store: Store,
+    marks: Marks,
+    work: FieldWork,
+    origins: Float64,
+    ends: Float64,
+    hits: int,
+    model: InverseModel,
+) -> None:
+    """Enter beams into several maps.
+
+    :param tables: the maps, shape (m, T, T).
+    :param origins: where the beams begin in each, shape (m, n, 2), cells.
+    :param ends: likewise where they end; the first ``hits`` end on a surface.
+    """
+    for i in range(tables.shape[0]):
+        _insert(tables[i], store, marks, work, origins[i], ends[i], hits, model)
+
+
+@njit(cache=True)
+def _insert(
     table: Int32,
     store: Store,
     marks: Marks,
@@ -54,41 +101,47 @@ def insert(
     hits: int,
     model: InverseModel,
 ) -> None:
-    """Enter beams from ``origins`` to ``ends`` (n, 2), in cells, of which the first ``hits`` end on a surface."""
-    if not len(ends):
-        return
     _mark(marks, origins, ends, hits)
-    top, bottom, left, right = patches_around(origins, ends, table.shape[0])
-    for tr in range(top, bottom):
-        for tc in range(left, right):
+    rows, columns = _patches_around(origins, ends, table.shape[0])
+    for tr in rows:
+        for tc in columns:
             hit, passed = marks.hit[tr, tc], marks.passed[tr, tc]
             if any_set(hit) or any_set(passed):
                 patch = writable(table, store, tr, tc)
                 _count(store.odds[patch], store.occupied[patch], hit, passed, model)
-                if any_set(passed):
-                    mark_dirty(table, store, work, passed, tr, tc)
-                    passed[:] = 0
-    _measure_dirty(table, store, work, top, bottom, left, right)
-    for tr in range(top, bottom):
-        for tc in range(left, right):
-            hit = marks.hit[tr, tc]
-            if any_set(hit):
-                lower(table, store, work, hit, tr, tc)
-                hit[:] = 0
+    _renew_field(table, store, marks, work, rows, columns)
 
 
 @njit(cache=True)
-def patches_around(origins: Float64, ends: Float64, table_size: int) -> tuple[int, int, int, int]:
-    """The part of a table that beams can touch: rows from, to, columns from, to."""
-    low_x, high_x = min(origins[:, 0].min(), ends[:, 0].min()), max(origins[:, 0].max(), ends[:, 0].max())
-    low_y, high_y = min(origins[:, 1].min(), ends[:, 1].min()), max(origins[:, 1].max(), ends[:, 1].max())
+def _renew_field(table: Int32, store: Store, marks: Marks, work: FieldWork, rows: range, columns: range) -> None:
+    """Bring the field up to date with the cells that became free or occupied, and empty the marks."""
+    for tr in rows:
+        for tc in columns:
+            if any_set(marks.passed[tr, tc]):
+                mark_dirty(table, store, work, marks.passed[tr, tc], tr, tc)
+                marks.passed[tr, tc] = 0
+    measure_dirty(table, store, work, rows, columns)
+    for tr in rows:
+        for tc in columns:
+            if any_set(marks.hit[tr, tc]):
+                lower(table, store, work, marks.hit[tr, tc], tr, tc)
+                marks.hit[tr, tc] = 0
+
+
+@njit(cache=True)
+def _patches_around(origins: Float64, ends: Float64, table_size: int) -> tuple[range, range]:
+    """The rows and the columns of a table that beams (n, 2), in cells, can touch."""
+    return _span(origins[:, 1], ends[:, 1], table_size), _span(origins[:, 0], ends[:, 0], table_size)
+
+
+@njit(cache=True)
+def _span(starts: Float64, ends: Float64, table_size: int) -> range:
+    if ends.size == 0:
+        return range(0, 0)
+    low, high = min(starts.min(), ends.min()), max(starts.max(), ends.max())
     # Rounding may lead the traversal of a beam one cell astray.
-    return (
-        min(table_size, max(0, (int(np.floor(low_y)) - 1) >> SHIFT)),
-        max(0, min(table_size, ((int(np.floor(high_y)) + 1) >> SHIFT) + 1)),
-        min(table_size, max(0, (int(np.floor(low_x)) - 1) >> SHIFT)),
-        max(0, min(table_size, ((int(np.floor(high_x)) + 1) >> SHIFT) + 1)),
-    )
+    first, last = (int(np.floor(low)) - 1) >> SHIFT, (int(np.floor(high)) + 1) >> SHIFT
+    return range(max(0, first), min(table_size, last + 1))
 
 
 @njit(cache=True)
@@ -172,14 +225,3 @@ def _positive(odds: Int8, row: int, columns: np.uint32) -> np.uint32:
         columns &= columns - np.uint32(1)
     return positive
 
-
-@njit(cache=True)
-def _measure_dirty(
-    table: Int32, store: Store, work: FieldWork, top: int, bottom: int, left: int, right: int
-) -> None:
-    """Measure anew what is dirty in a part of the table, and around it as far as the field reaches."""
-    margin = (work.stamp.shape[0] // 2 + MASK) >> SHIFT
-    for tr in range(max(0, top - margin), min(table.shape[0], bottom + margin)):
-        for tc in range(max(0, left - margin), min(table.shape[0], right + margin)):
-            if work.dirty[tr, tc]:
-                measure_dirty(table, store, work, tr, tc)

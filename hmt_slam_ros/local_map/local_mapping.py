@@ -51,6 +51,6 @@ class LocalMapping:
         beyond = origins[~near] + beams[~near] * (limit / distance[~near, None])
         return Beams(scan.points[near], beyond, np.concatenate((origins[near], origins[~near])))
 
-    def insert(self, table: Int32, pose: Float64, scan: Scan) -> None:
-        """Enter a scan at ``map_T_base`` into a map."""
-        self.pool.insert(table, pose, self.mapped_beams(scan), self._inverse_model)
+    def insert(self, tables: Int32, poses: Float64, scan: Scan) -> None:
+        """Enter a scan into maps (m, T, T), into each at its own ``map_T_base`` (m, 3)."""
+        self.pool.insert(tables, poses, self.mapped_beams(scan), self._inverse_model)

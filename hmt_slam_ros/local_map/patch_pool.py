@@ -7,7 +7,6 @@ from typing import NamedTuple
 import numpy as np
 
 from hmt_slam_ros.arrays import Float64, Int32
-from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.local_map import insertion, patches
 from hmt_slam_ros.local_map.distance_field import field_work
 from hmt_slam_ros.local_map.insertion import InverseModel
@@ -84,20 +83,20 @@ class PatchPool:
         """The map of ``table`` for the kernels; valid until the next insertion."""
         return MapView(table, self.odds, self.field, self.cell, self.radius)
 
-    def insert(self, table: Int32, pose: Float64, beams: Beams, model: InverseModel) -> None:
-        """Enter a scan into a map: free space along the beams, surfaces at their ends, the distance field around them.
+    def insert(self, tables: Int32, poses: Float64, beams: Beams, model: InverseModel) -> None:
+        """Enter a scan into maps: free space along the beams, surfaces at their ends, the distance field around them.
 
         A cell is counted once per scan, so that many beams through one cell weigh as one.
 
-        :param table: the map, changed in place.
-        :param pose: ``map_T_base``, shape (3,).
+        :param tables: the maps, shape (m, T, T), changed in place.
+        :param poses: ``map_T_base`` in each, shape (m, 3).
         :param model: the inverse sensor model.
         """
-        self._reserve(self.table_size * self.table_size)
-        half = 0.5 * self.table_size * PATCH
-        origins = se2.transform(pose, beams.origins) / self.cell + half
-        ends = se2.transform(pose, np.concatenate((beams.points, beams.free))) / self.cell + half
-        insertion.insert(table, self._store(), self._marks, self._field_work, origins, ends, len(beams.points), model)
+        origins = insertion.in_cells(beams.origins, poses, self.cell, self.table_size)
+        ends = insertion.in_cells(np.concatenate((beams.points, beams.free)), poses, self.cell, self.table_size)
+        work = self._field_work
+        self._reserve(insertion.patches_needed(tables, self._store(), work, origins, ends))
+        insertion.insert(tables, self._store(), self._marks, work, origins, ends, len(beams.points), model)
 
     def _store(self) -> Store:
         return Store(self.odds, self.field, self.occupied, self.references, self._free, self._free_count)

@@ -43,7 +43,7 @@ class FineAlignment:
         """
         table = self._mapping.pool.empty_table()
         for scan, pose in known:
-            self._mapping.insert(table, pose, scan)
+            self._mapping.insert(table[None], pose[None], scan)
         points = np.concatenate(
             [
                 np.zeros((0, 2)),
