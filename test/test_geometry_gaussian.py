@@ -10,7 +10,7 @@ from hypothesis.extra.numpy import arrays
 from scipy.stats import chi2
 
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.geometry.gaussian import PoseGaussian, fuse
+from hmt_slam_ros.geometry.gaussian import PoseGaussian, fuse, gate
 
 SAMPLES = 200_000
 
@@ -196,3 +196,8 @@ def test_fusion_never_adds_uncertainty(seed):
     both = fuse([a, b])
     volumes = [np.linalg.det(belief.covariance) for belief in (a, b)]
     assert np.linalg.det(both.covariance) < min(volumes)
+
+
+@pytest.mark.parametrize("probability", [0.5, 0.95, 0.999])
+def test_the_gate_is_the_quantile_of_chi_square(probability):
+    assert gate(probability) == pytest.approx(chi2.ppf(probability, 3), rel=1e-12)

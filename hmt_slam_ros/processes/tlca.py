@@ -7,11 +7,10 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.geometry.gaussian import PoseGaussian, gate
 from hmt_slam_ros.processes.messages import (
     Accepted,
     Arc,
@@ -95,7 +94,7 @@ class Tlca:
         self._travelled = 0.0
         self._changes = 0
         self._published = -1
-        self._gate = float(chi2.ppf(configuration.tsbi.gate_probability, 3))
+        self._gate = gate(configuration.tsbi.gate_probability)
         self._doubted: set[Pair] = set()
 
     def handle(self, message: Message) -> list[Message]:

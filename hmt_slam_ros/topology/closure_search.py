@@ -9,11 +9,10 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.geometry.gaussian import PoseGaussian, gate
 from hmt_slam_ros.sensing import Scan
 from hmt_slam_ros.topology.appearance import appearance_log_ratio, signature
 from hmt_slam_ros.topology.area_grid import GridModel, build_area_grid
@@ -84,7 +83,7 @@ class ClosureSearch:
         """:param scans: {keyframe: scan}, which may grow."""
         self._options = options = configuration.tsbi
         self._scans = scans
-        self.gate = float(chi2.ppf(options.gate_probability, 3))
+        self.gate = gate(options.gate_probability)
         self.nearness = Nearness(options.local_sigma, options.local_reach)
         self._settings = MatchSettings(temper=options.temper, gate=self.gate, max_modes=options.max_modes)
         self._model = GridModel(

@@ -6,10 +6,10 @@ from collections.abc import Iterable
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.geometry.gaussian import gate
 from hmt_slam_ros.local_map import matching
 from hmt_slam_ros.local_map.local_mapping import LocalMapping
 from hmt_slam_ros.local_map.patches import MapView
@@ -28,7 +28,7 @@ class FineAlignment:
     def __init__(self, configuration: Configuration) -> None:
         self._mapping = LocalMapping(configuration)
         self._temper = configuration.matching.temper
-        self._gate = float(chi2.ppf(configuration.tsbi.gate_probability, 3))
+        self._gate = gate(configuration.tsbi.gate_probability)
 
     def offset(
         self, known: Iterable[Placed], joined: Iterable[Placed], covariance: NDArray[np.float64]
