@@ -1,0 +1,28 @@
+"""Tables in docs/, written by the program that measured them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from benchmark.logs import ROOT
+from hmt_slam_ros.errors import HmtSlamError
+
+ACCURACY = ROOT / "docs" / "accuracy.md"
+
+
+def marks(kind: str) -> tuple[str, str]:
+    """The lines between which the tables of a measurement stand."""
+    return f"<!-- python -m benchmark {kind} --write-docs -->", f"<!-- end of {kind} -->"
+
+
+def write_between_marks(path: Path, kind: str, text: str) -> None:
+    """Replace what stands between the marks of a measurement.
+
+    :raises HmtSlamError: where the marks are missing.
+    """
+    begin, end = marks(kind)
+    before, found, rest = path.read_text(encoding="utf-8").partition(begin)
+    _, closed, after = rest.partition(end)
+    if not found or not closed:
+        raise HmtSlamError(f"{path.name} has no lines '{begin}' and '{end}': put them where the tables belong")
+    path.write_text(f"{before}{begin}\n{text}\n{end}{after}", encoding="utf-8")

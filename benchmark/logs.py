@@ -1,0 +1,104 @@
+"""The logs that are measured on, decompressed where they need to be."""
+
+from __future__ import annotations
+
+import lzma
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+from hmt_slam_ros.errors import HmtSlamError
+from hmt_slam_ros.evaluation import Relations, StampedPoses, odometry_of, read_relations
+from hmt_slam_ros.logs import open_log
+from hmt_slam_ros.sensing import Scan
+
+ROOT = Path(__file__).resolve().parents[1]
+VARIABLE = "HMT_SLAM_DATASETS"
+
+# The file of each log and, where there is one, of its true relations, below the folder of the data sets.
+_FILES = {
+    "aces": ("aces.clf.xz", "aces.relations.xz"),
+    "intel": ("intel.clf.xz", "intel.relations.xz"),
+    "edmonton": ("edmonton.kf.clf.xz", None),
+    "freiburg-101": ("freiburg-101.kf.clf.xz", None),
+}
+BUNDLED = "malaga"
+LOGS = (*_FILES, BUNDLED)
+WITH_RELATIONS = tuple(name for name, (_, relations) in _FILES.items() if relations)
+
+
+@dataclass(frozen=True)
+class MeasuredLog:
+    """A log, and what is known about it.
+
+    :ivar name: one of ``LOGS``.
+    :ivar path: of the log, as ``hmt_slam map`` takes it.
+    :ivar relations_file: true relations, None where there are none.
+    """
+
+    name: str
+    path: Path
+    relations_file: Path | None = None
+
+    @cached_property
+    def relations(self) -> Relations | None:
+        """True relations, None where there are none."""
+        return None if self.relations_file is None else read_relations(self.relations_file)
+
+    @cached_property
+    def odometry(self) -> StampedPoses:
+        """Wheel odometry with source stamps."""
+        return odometry_of(open_log(self.path))
+
+    @cached_property
+    def scans(self) -> list[Scan]:
+        """All scans, in the order of the log."""
+        return [r.measurement for r in open_log(self.path).records() if isinstance(r.measurement, Scan)]
+
+
+def datasets() -> Path:
+    """The folder of the data sets."""
+    return Path(os.environ.get(VARIABLE) or ROOT.parent / "shared" / "datasets")
+
+
+def missing(name: str) -> str:
+    """Why a log cannot be had, as a sentence; empty where it can.
+
+    :param name: one of ``LOGS``.
+    """
+    absent = [file for file in _FILES.get(name, ()) if file and not (datasets() / file).is_file()]
+    return f"{absent[0]} is not in {datasets()}: set {VARIABLE} to the folder of the data sets" if absent else ""
+
+
+@contextmanager
+def opened(names: Sequence[str]) -> Iterator[list[MeasuredLog]]:
+    """The logs of some names, decompressed into a folder that vanishes at the end.
+
+    :raises HmtSlamError: for a name that is none, or a file that is not there.
+    """
+    for name in names:
+        if name not in LOGS:
+            raise HmtSlamError(f"there is no log {name!r}: choose from {', '.join(LOGS)}")
+        if reason := missing(name):
+            raise HmtSlamError(reason)
+    with tempfile.TemporaryDirectory(prefix="hmt_slam_benchmark_") as folder:
+        yield [_opened(name, Path(folder)) for name in names]
+
+
+def _opened(name: str, folder: Path) -> MeasuredLog:
+    if name == BUNDLED:
+        return MeasuredLog(name, ROOT / "data" / "malaga_one_loop")
+    log, relations = _FILES[name]
+    return MeasuredLog(name, _decompressed(log, folder), _decompressed(relations, folder) if relations else None)
+
+
+def _decompressed(file: str, folder: Path) -> Path:
+    plain = folder / file.removesuffix(".xz")
+    with lzma.open(datasets() / file) as source, plain.open("wb") as target:
+        shutil.copyfileobj(source, target)
+    return plain

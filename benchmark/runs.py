@@ -1,0 +1,134 @@
+"""Runs of ``hmt_slam map``, each in a process of its own, a few at a time."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from benchmark.logs import ROOT, MeasuredLog
+from hmt_slam_ros.errors import HmtSlamError
+
+PARAMETERS = ROOT / "config" / "hmt_slam.yaml"
+"""The parameter file of every run."""
+
+_TAIL = 3  # lines of a failed run that go into a message
+
+
+@dataclass(frozen=True)
+class Case:
+    """What is run.
+
+    :ivar log: the log.
+    :ivar seed: of all random numbers.
+    :ivar kind: of degradation of the odometry, empty for none.
+    :ivar changes: parameters that differ from the file, as ``name=value``.
+    :ivar duration: seconds of the log that are used, 0 for all.
+    """
+
+    log: MeasuredLog
+    seed: int
+    kind: str = ""
+    changes: tuple[str, ...] = ()
+    duration: float = 0.0
+
+    @property
+    def name(self) -> str:
+        """Of the output folder."""
+        return "-".join(filter(None, (self.log.name, self.kind, str(self.seed))))
+
+    def command(self, folder: Path) -> list[str]:
+        """The command line that maps the log into a folder."""
+        program = ["benchmark.map_degraded", self.kind] if self.kind else ["hmt_slam_ros.cli.main", "map"]
+        options = ["--out", str(folder), "--seed", str(self.seed), "--config", str(PARAMETERS)]
+        part = ["--duration", str(self.duration)] if self.duration else []
+        changes = [word for change in self.changes for word in ("--set", change)]
+        return [sys.executable, "-m", *program, str(self.log.path), *options, *part, *changes]
+
+
+@dataclass(frozen=True)
+class Run:
+    """What came of a case.
+
+    :ivar case: what was run.
+    :ivar folder: its output folder.
+    :ivar cpu_seconds: of the whole process, user and system.
+    :ivar wall_seconds: likewise.
+    :ivar peak_rss: likewise, bytes.
+    :ivar fault: what a failed run said last, empty for one that went well.
+    """
+
+    case: Case
+    folder: Path
+    cpu_seconds: float
+    wall_seconds: float
+    peak_rss: int
+    fault: str = ""
+
+    @cached_property
+    def report(self) -> dict[str, Any]:
+        """The run's own report.json."""
+        content: dict[str, Any] = json.loads((self.folder / "report.json").read_text(encoding="utf-8"))
+        return content
+
+
+class Runner:
+    """Runs cases, each once, however often it is asked for.
+
+    :ivar folder: gets a folder for each run.
+    :ivar jobs: runs at the same time.
+    """
+
+    def __init__(self, folder: Path, jobs: int) -> None:
+        self.folder, self.jobs = folder, jobs
+        self._done: dict[Case, Run] = {}
+
+    def attempts(self, cases: Sequence[Case]) -> list[Run]:
+        """The runs of some cases in their order, also of those that failed."""
+        waiting = [case for case in dict.fromkeys(cases) if case not in self._done]
+        with ThreadPoolExecutor(self.jobs) as pool:
+            self._done.update(zip(waiting, pool.map(self._run, waiting), strict=True))
+        return [self._done[case] for case in cases]
+
+    def runs(self, cases: Sequence[Case]) -> list[Run]:
+        """Likewise, where none may fail.
+
+        :raises HmtSlamError: where one did.
+        """
+        return list(_successful(self.attempts(cases)))
+
+    def _run(self, case: Case) -> Run:
+        run = run_case(case, self.folder.absolute() / case.name)
+        print(f"{case.name}: {run.cpu_seconds:.1f} CPU s {run.fault}".rstrip(), file=sys.stderr, flush=True)
+        return run
+
+
+def _successful(runs: Iterable[Run]) -> Iterable[Run]:
+    for run in runs:
+        if run.fault:
+            raise HmtSlamError(f"the run {run.case.name} failed, it said: {run.fault}")
+        yield run
+
+
+def run_case(case: Case, folder: Path) -> Run:
+    """Run a case in a process of its own."""
+    result = subprocess.run(
+        [sys.executable, "-m", "benchmark.measured", *case.command(folder)],
+        cwd=ROOT,
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    last_words = " | ".join(result.stderr.strip().splitlines()[-_TAIL:]) or "nothing"
+    if result.returncode:
+        return Run(case, folder, 0.0, 0.0, 0, last_words)
+    usage = json.loads(result.stdout.splitlines()[-1])
+    fault = last_words if usage["status"] else ""
+    return Run(case, folder, usage["cpu_s"], usage["wall_s"], int(usage["peak_rss_bytes"]), fault)
