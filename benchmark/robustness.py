@@ -1,0 +1,116 @@
+"""What worse odometry does to accuracy and topology."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmark.closures import ClosureError, closure_errors
+from benchmark.degraded_odometry import KINDS
+from benchmark.logs import WITH_RELATIONS, MeasuredLog, opened
+from benchmark.report import Report, Requirement, table
+from benchmark.runs import Case, Run
+from benchmark.scoring import FINAL, over_seeds, score
+from benchmark.settings import Settings
+from hmt_slam_ros.evaluation import RelationErrors, read_tum
+from hmt_slam_ros.offline.saved_map import read_saved_map
+
+SEEDS = 5
+LONG_LIMIT = 1.0
+"""Largest error of a relation over more than 60 s in a map of the right topology, m: a missed loop leaves more."""
+
+CLOSURE_LIMIT, CLOSURE_ANGLE = 0.5, 10.0
+"""Largest error of an arc that closed a loop and joins what is joined, m and degrees."""
+
+POLICY = (
+    "The kinds are those of `benchmark/degraded_odometry.py`, drawn anew for every seed. A map has the right topology "
+    f"where every relation over more than 60 s is within {LONG_LIMIT:g} m of the truth, and every arc that closed a "
+    f"loop is within {CLOSURE_LIMIT:g} m and {CLOSURE_ANGLE:g} degrees of the run of the same seed with the odometry "
+    "as recorded, between the two keyframes of its areas that are nearest to each other there. Errors are means over "
+    "all seeds, also of the maps with a wrong topology; relations are matched as for accuracy."
+)
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """On the topology of a run.
+
+    :ivar scores: of the final trajectory; None for a run that failed.
+    :ivar closures: errors of the arcs that closed a loop.
+    """
+
+    scores: RelationErrors | None
+    closures: tuple[ClosureError, ...] = ()
+
+    @property
+    def wrong_closures(self) -> list[ClosureError]:
+        """The arcs that join what is not joined."""
+        return [c for c in self.closures if not (c.translation <= CLOSURE_LIMIT and c.rotation <= CLOSURE_ANGLE)]
+
+    @property
+    def right(self) -> bool:
+        """Whether no loop was missed and none closed wrongly."""
+        if self.scores is None:
+            return False
+        return self.scores.over_60_s.translation.max <= LONG_LIMIT and not self.wrong_closures
+
+
+def measure_robustness(settings: Settings) -> Report:
+    """Map every log with every kind of degraded odometry and every seed."""
+    seeds = settings.seeds_or(SEEDS)
+    report = Report("robustness", "Accuracy with degraded odometry", seeds=seeds)
+    rows: list[list[str]] = []
+    with opened(settings.logs_or(WITH_RELATIONS)) as logs:
+        for log in logs:
+            references = settings.runner.runs([Case(log, seed, "", settings.changes) for seed in seeds])
+            for kind in ("", *KINDS):
+                runs = settings.runner.attempts([Case(log, seed, kind, settings.changes) for seed in seeds])
+                verdicts = [verdict(run, reference) for run, reference in zip(runs, references, strict=True)]
+                name = kind or "as recorded"
+                wrong = sum(not given.right for given in verdicts)
+                report.requirements.append(Requirement(f"{log.name}, {name}: seeds with a wrong topology", wrong, 0))
+                report.data[f"{log.name} {name}"] = [asdict(given) | {"right": given.right} for given in verdicts]
+                rows.append([log.name, name, *_cells(runs, verdicts)])
+    head = ["log", "odometry", "translation [m]", "between seeds", "worst seed", "over 60 s [m]", "its max"]
+    head += ["rotation [deg]", "areas", "loop closures", "wrong ones", "right topology"]
+    report.body += [table(head, rows), POLICY]
+    return report
+
+
+def verdict(run: Run, reference: Run) -> Verdict:
+    """Judge a run by the truth and by the run with the odometry as recorded."""
+    if run.fault:
+        return Verdict(None)
+    closures = closure_errors(read_saved_map(run.folder / "hmt_map"), _true_poses(reference))
+    return Verdict(score(run.folder, run.case.log), tuple(closures))
+
+
+def _true_poses(reference: Run) -> dict[int, NDArray[np.float64]]:
+    log: MeasuredLog = reference.case.log
+    poses = read_tum(reference.folder / FINAL).poses
+    # The run may have been of the beginning of the log.
+    return {scan.stamp: pose for scan, pose in zip(log.scans[: len(poses)], poses, strict=True)}
+
+
+def _cells(runs: Sequence[Run], verdicts: Sequence[Verdict]) -> list[str]:
+    scores = [given.scores for given in verdicts if given.scores is not None]
+    right = f"{sum(given.right for given in verdicts)} of {len(verdicts)}"
+    if not scores:
+        return [*["-"] * 9, right]
+    mean = over_seeds(scores)
+    reports = [run.report for run in runs if not run.fault]
+    return [
+        f"{mean.translation:.3f}",
+        f"± {mean.translation_std:.3f}",
+        f"{mean.worst:.3f}",
+        f"{mean.long:.3f}",
+        f"{mean.long_max:.2f}",
+        f"{mean.rotation:.2f}",
+        f"{np.mean([report['areas'] for report in reports]):.1f}",
+        f"{np.mean([report['loop_closures'] for report in reports]):.1f}",
+        str(sum(len(given.wrong_closures) for given in verdicts)),
+        right,
+    ]
