@@ -1,7 +1,8 @@
 #!/usr/bin/env bash
 # Makes the environment where it is missing and passes the tests.
 # Usage: scripts/test.sh [--floor] [pytest arguments]
-#   --floor  with the oldest versions supported (requirements/floor.txt), in .venv-floor, pytest only
+#   Without pytest arguments the accuracy is compared with benchmark/expected.toml after the tests.
+#   --floor  with the oldest versions supported (requirements/floor.txt), in .venv-floor, without ruff and mypy
 set -uo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 . scripts/environment.sh
@@ -27,4 +28,5 @@ fi
 # Misspelled message fields and wrong types fail; nodes of other machines on the network are not seen.
 export ROS_PYTHON_CHECK_FIELDS=1 ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST
 check pytest "$@"
+[ "$#" != 0 ] || check benchmark short
 exit "$status"

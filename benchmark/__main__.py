@@ -1,0 +1,106 @@
+"""The command line of the measurements: ``python -m benchmark accuracy|robustness|speed|steps|short|all``.
+
+Exit status: 0 where all that is asked for holds, 1 where something does not, 2 where nothing could be measured.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from importlib import import_module
+from pathlib import Path
+
+from benchmark.circumstances import circumstances, summary
+from benchmark.documents import ACCURACY, write_between_marks
+from benchmark.logs import LOGS, ROOT
+from benchmark.report import Report
+from benchmark.runs import Runner
+from benchmark.settings import Settings
+from hmt_slam_ros.cli.arguments import OneSentenceParser
+from hmt_slam_ros.errors import HmtSlamError
+
+UNMET, FAULT = 1, 2
+
+MEASUREMENTS = {
+    "accuracy": "errors at true relations, torn walls where there is no truth",
+    "steps": "what arc optimisation and keyframe refinement gain",
+    "robustness": "the same with degraded odometry",
+    "speed": "CPU time, memory, cost of a scan, start",
+    "short": "for CI: has accuracy become worse than benchmark/expected.toml beyond noise?",
+}
+_ALL = ("accuracy", "steps", "robustness", "speed")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Measure, write the reports, say what holds; return the exit status."""
+    options = _parser().parse_args(arguments)
+    try:
+        reports = _measure(options)
+    except HmtSlamError as fault:
+        print(f"benchmark: {fault}", file=sys.stderr)
+        return FAULT
+    return 0 if all(report.met for report in reports) else UNMET
+
+
+def _measure(options: argparse.Namespace) -> list[Report]:
+    if options.write_docs and (options.set or options.logs):
+        raise HmtSlamError("--write-docs is for the whole measurement: leave --set and --logs away")
+    out = _folder(options)
+    runner = Runner(out / "runs", options.jobs)
+    changes, seeds = tuple(options.set), tuple(range(options.seeds))
+    settings = Settings(options.logs, seeds, changes, out, options.write_expected, runner)
+    kinds = _ALL if options.measurement == "all" else (options.measurement,)
+    reports = []
+    for kind in kinds:
+        module = import_module(f"benchmark.{kind}")
+        report: Report = getattr(module, f"measure_{kind}")(settings)
+        facts = circumstances(report.seeds, options.jobs, options.set)
+        report.write(out, facts)
+        if options.write_docs:
+            write_between_marks(ACCURACY, kind, f"{summary(facts)}\n\n{report.text}")
+        print(f"\n# {report.title}\n\n{report.text}\n\n{out / f'{kind}.md'}", flush=True)
+        reports.append(report)
+    return reports
+
+
+def _folder(options: argparse.Namespace) -> Path:
+    """The empty folder of the report."""
+    chosen: Path | None = options.out
+    if chosen is None:
+        name = f"{datetime.now(UTC).date()}-{options.measurement}"
+        names = [name, *(f"{name}-{k}" for k in range(2, 1000))]
+        chosen = next(folder for folder in (ROOT / "benchmark" / "reports" / n for n in names) if not folder.exists())
+    if chosen.exists() and (not chosen.is_dir() or any(chosen.iterdir())):
+        raise HmtSlamError(f"{chosen} is there already: choose another --out or remove it")
+    chosen.mkdir(parents=True, exist_ok=True)
+    return chosen
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = OneSentenceParser(prog="python -m benchmark", description="Measurements of hmt_slam_ros on logs.")
+    parser.add_argument("measurement", choices=(*MEASUREMENTS, "all"), help="what is measured")
+    parser.add_argument("--logs", type=_names, default=(), metavar="A,B", help=f"of {', '.join(LOGS)}")
+    parser.add_argument("--seeds", type=_count, default=0, metavar="N", help="seeds 0 to N-1")
+    parser.add_argument("--jobs", type=_count, default=2, metavar="N", help="runs at the same time; 1 for speed")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="folder of the report")
+    parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help="set one parameter")
+    parser.add_argument("--write-expected", action="store_true", help="put what short measures on record")
+    parser.add_argument("--write-docs", action="store_true", help="put the tables into docs/accuracy.md")
+    return parser
+
+
+def _names(text: str) -> tuple[str, ...]:
+    return tuple(text.split(","))
+
+
+def _count(text: str) -> int:
+    count = int(text)
+    if count < 1:
+        raise argparse.ArgumentTypeError(f"{text} is not a positive number")
+    return count
+
+
+if __name__ == "__main__":
+    sys.exit(main())
