@@ -92,6 +92,18 @@ def test_a_new_area_waits_for_its_place_in_the_map(rtl):
     assert np.allclose(after.map_pose.mean, (0.3, 0, 0))
 
 
+def test_the_robots_area_keeps_its_place_when_a_hypothesis_without_it_takes_the_lead(rtl):
+    rtl.handle(accepted(a0=(0, 0, 0), a3=(10, 0, 0)))
+    rtl.handle(odometry(0.0, 0, 0, 0))
+    rtl.handle(estimate(0.0, (1, 0, 0), (0, 0, 0), area=3))
+    rtl.handle(accepted(a0=(0, 5, 0), a1=(4, 0, 0)))
+    (said,) = rtl.handle(odometry(0.1, 0.1, 0, 0))
+    assert np.allclose(said.map_pose.mean, (11.1, 0, 0))
+    rtl.handle(estimate(0.2, (2, 0, 0), (0.2, 0, 0), area=1))
+    (said,) = rtl.handle(odometry(0.3, 0.3, 0, 0))
+    assert np.allclose(said.map_pose.mean, (6.1, 0, 0))
+
+
 def test_the_uncertainty_grows_with_the_path_and_shrinks_with_the_next_estimate(rtl):
     rtl.handle(odometry(0.0, 0, 0, 0))
     rtl.handle(estimate(0.0, (0, 0, 0), (0, 0, 0)))

@@ -69,9 +69,15 @@ class Rtl:
                 self._newest = message
                 self._correct()
         elif isinstance(message, Accepted) and message.global_poses:
-            self._areas = {area.area: area.pose for area in message.global_poses}
+            self._place_areas({area.area: area.pose for area in message.global_poses})
             self._correct()
         return []
+
+    def _place_areas(self, areas: dict[int, PoseGaussian]) -> None:
+        """Take over where the areas are; where another hypothesis leads, the robot's area may not be among them."""
+        if self._estimate is not None:
+            areas.setdefault(self._estimate.area, self._areas[self._estimate.area])
+        self._areas = areas
 
     def _hear_odometry(self, reading: Odometry) -> list[Message]:
         """Carry the path on to a reading; one that is not newer than its predecessor is passed over."""
