@@ -1,4 +1,4 @@
-"""The command line of the measurements: ``python -m benchmark accuracy|robustness|speed|steps|short|all``.
+"""The command line of the measurements: ``python -m benchmark accuracy steps robustness speed|all|short``.
 
 Exit status: 0 where all that is asked for holds, 1 where something does not, 2 where nothing could be measured.
 """
@@ -28,7 +28,7 @@ MEASUREMENTS = {
     "steps": "what arc optimisation and keyframe refinement gain",
     "robustness": "the same with degraded odometry",
     "speed": "CPU time, memory, cost of a scan, start",
-    "short": "for CI: has accuracy become worse than benchmark/expected.toml beyond noise?",
+    "short": "for CI, whether accuracy became worse than benchmark/expected.toml beyond noise",
 }
 _ALL = ("accuracy", "steps", "robustness", "speed")
 
@@ -51,9 +51,8 @@ def _measure(options: argparse.Namespace) -> list[Report]:
     runner = Runner(out / "runs", options.jobs)
     changes, seeds = tuple(options.set), tuple(range(options.seeds))
     settings = Settings(options.logs, seeds, changes, out, options.write_expected, runner)
-    kinds = _ALL if options.measurement == "all" else (options.measurement,)
     reports = []
-    for kind in kinds:
+    for kind in _kinds(options):
         module = import_module(f"benchmark.{kind}")
         report: Report = getattr(module, f"measure_{kind}")(settings)
         facts = circumstances(report.seeds, options.jobs, options.set)
@@ -65,11 +64,15 @@ def _measure(options: argparse.Namespace) -> list[Report]:
     return reports
 
 
+def _kinds(options: argparse.Namespace) -> tuple[str, ...]:
+    return _ALL if "all" in options.measurements else tuple(dict.fromkeys(options.measurements))
+
+
 def _folder(options: argparse.Namespace) -> Path:
     """The empty folder of the report."""
     chosen: Path | None = options.out
     if chosen is None:
-        name = f"{datetime.now(UTC).date()}-{options.measurement}"
+        name = f"{datetime.now(UTC).date()}-{'-'.join(options.measurements)}"
         names = [name, *(f"{name}-{k}" for k in range(2, 1000))]
         chosen = next(folder for folder in (ROOT / "benchmark" / "reports" / n for n in names) if not folder.exists())
     if chosen.exists() and (not chosen.is_dir() or any(chosen.iterdir())):
@@ -80,7 +83,8 @@ def _folder(options: argparse.Namespace) -> Path:
 
 def _parser() -> argparse.ArgumentParser:
     parser = OneSentenceParser(prog="python -m benchmark", description="Measurements of hmt_slam_ros on logs.")
-    parser.add_argument("measurement", choices=(*MEASUREMENTS, "all"), help="what is measured")
+    told = "; ".join(f"{name}: {text}" for name, text in MEASUREMENTS.items())
+    parser.add_argument("measurements", nargs="+", choices=(*MEASUREMENTS, "all"), metavar="KIND", help=told)
     parser.add_argument("--logs", type=_names, default=(), metavar="A,B", help=f"of {', '.join(LOGS)}")
     parser.add_argument("--seeds", type=_count, default=0, metavar="N", help="seeds 0 to N-1")
     parser.add_argument("--jobs", type=_count, default=2, metavar="N", help="runs at the same time; 1 for speed")
