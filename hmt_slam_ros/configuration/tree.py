@@ -36,6 +36,20 @@ class Motion:
     rotation_floor: float = parameter(
         0.2, "Smallest deviation of an increment's heading.", unit="deg", low=1e-3, high=45.0
     )
+    acceleration: float = parameter(
+        0.5,
+        "Deviation of the robot's acceleration. Without odometry, and where the scans contradict it, the next pose is "
+        "predicted from the velocity.",
+        unit="m/s^2",
+        low=0.01,
+        high=50.0,
+    )
+    turn_acceleration: float = parameter(
+        60.0, "Deviation of the acceleration of a turn, likewise.", unit="deg/s^2", low=1.0, high=10000.0
+    )
+    fault_probability: float = parameter(
+        0.01, "Probability that the odometry of a scan is wrong beyond its deviations.", low=1e-9, high=0.5
+    )
 
 
 @dataclass(frozen=True)
@@ -108,6 +122,13 @@ class Matching:
     search_step: float = parameter(
         1.5, "Angular step of the correlative search.", unit="deg", low=0.1, high=30.0
     )
+    wide_distance: float = parameter(
+        1.5, "Half side of the window at most, where the prediction is uncertain.", unit="m", low=0.0, high=10.0
+    )
+    wide_angle: float = parameter(
+        45.0, "Half width of the angular window at most, where the prediction is uncertain.", unit="deg", low=0.0,
+        high=180.0,
+    )
 
 
 @dataclass(frozen=True)
@@ -128,7 +149,8 @@ class Filter:
         4.0, "Factor on the covariance of a matched keyframe, since its beams are correlated.", low=0.1, high=100.0
     )
     patience: int = parameter(
-        50, "Scans that wait for odometry at most, before the last reading is taken to hold.", low=1, high=100000
+        15, "Scans that wait for odometry at most, before they are placed by the velocity and their match.", low=1,
+        high=100000,
     )
 
 
@@ -367,5 +389,10 @@ RULES: tuple[Rule, ...] = (
     Rule(
         lambda tree: tree.filter.keyframe_distance <= tree.local_map.max_range,
         "filter.keyframe_distance exceeds local_map.max_range, so keyframes would not overlap; lower it",
+    ),
+    Rule(
+        lambda tree: not tree.robot.paced or tree.filter.patience < tree.robot.window,
+        "filter.patience is not below robot.window, so without odometry metric SLAM would wait for scans that the "
+        "paced robot holds back; lower the one or raise the other",
     ),
 )

@@ -6,7 +6,6 @@ entered. The map frame is the frame of the current area.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -14,15 +13,13 @@ import numpy as np
 
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.local_map import batch, matching
+from hmt_slam_ros.local_map import batch
 from hmt_slam_ros.local_map.local_mapping import LocalMapping
 from hmt_slam_ros.local_map.patches import MapView
+from hmt_slam_ros.local_map.tracking import ScanMatcher, Tracked, in_body_frame, map_information
 from hmt_slam_ros.random_streams import Purpose, stream
 from hmt_slam_ros.sensing import Scan
-
-_SEARCH_POINTS = 90
-# The search is called where odometry is in doubt: its prior is trusted less.
-_SEARCH_PRIOR = 0.1
+from hmt_slam_ros.sensing.motion import NO_STEP, Prediction
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,12 +37,14 @@ class FilterStep:
     """What a filter step found.
 
     :ivar covariance: of the leading particle's pose, shape (3, 3), right tangent frame.
+    :ivar information: of the match alone, for correlated beams, in the frame of the pose, shape (3, 3).
     :ivar log_evidence: log p(z_t | past), tempered, relative to unknown space, nats.
     :ivar effective_samples: ESS before resampling.
     :ivar history_changed: whether another particle leads than before, so that keyframe poses differ from those told.
     """
 
     covariance: Float64
+    information: Float64
     log_evidence: float
     effective_samples: float
     history_changed: bool
@@ -75,8 +74,9 @@ class AreaFilter:
         self.keyframe_poses = np.zeros((count, 0, 3))
         self._tables = np.stack([mapping.pool.empty_table()] * count)
         self._priors = self.poses.copy()
-        self._odometry_covariance = np.zeros((3, 3))
+        self._since_update = NO_STEP
         self._told_leader = 0
+        self._matcher = ScanMatcher(mapping)
         self.tracking_covariance = np.zeros((3, 3))
 
     @property
@@ -100,7 +100,7 @@ class AreaFilter:
         child.keyframes, child.keyframe_areas = list(self.keyframes), list(self.keyframe_areas)
         child.keyframe_poses = self.keyframe_poses.copy()
         child._tables = np.stack([self.mapping.pool.share(table) for table in self._tables])
-        child._priors, child._odometry_covariance = self._priors.copy(), self._odometry_covariance
+        child._priors, child._since_update = self._priors.copy(), self._since_update
         child._told_leader, child.tracking_covariance = self._told_leader, self.tracking_covariance
         return child
 
@@ -109,55 +109,26 @@ class AreaFilter:
         for table in self._tables:
             self.mapping.pool.release(table)
 
-    def track(
-        self, points: Float64, increment: Float64, covariance: Float64
-    ) -> None:
+    def track(self, points: Float64, prediction: Prediction) -> Tracked:
         """Move all particles by the leader's matched increment: a pose for a scan between two keyframes.
 
         :param points: of the scan, shape (n, 2), m, base frame.
-        :param increment: odometry increment since the last scan, shape (3,).
-        :param covariance: its covariance (3, 3) in the frame of its end.
         """
-        self._priors = se2.compose(self._priors, increment)
-        ad = se2.adjoint(se2.inverse(increment))
-        self._odometry_covariance = ad @ self._odometry_covariance @ ad.T + covariance
         before = self.pose
-        predicted = se2.compose(before, increment)
-        matched = self._match(points, matching.Prior(predicted, _information(covariance, predicted[2])))
-        self.poses = se2.compose(self.poses, se2.between(before, matched))
+        match = self._matcher.match(points, before, prediction, self._leading_view())
+        moved = se2.between(before, match.pose)
+        contradicted = prediction.odometry is not None and match.step is not prediction.odometry
+        believed = match.step if prediction.odometry is None else prediction.odometry
+        if contradicted:
+            believed = believed.widened(moved)
+        self._priors = se2.compose(self._priors, believed.increment)
+        self._since_update = self._since_update.then(believed)
+        self.poses = se2.compose(self.poses, moved)
+        self.tracking_covariance = match.covariance
+        return Tracked(moved, self._matcher.tempered(match), contradicted)
 
     def _leading_view(self) -> MapView:
         return self.mapping.pool.view(self._tables[self.leader])
-
-    def _match(self, points: Float64, prior: matching.Prior) -> Float64:
-        """The pose that fits the leader's map best; where the prediction leads to a poor fit, search around it."""
-        view, near, alignment = self._leading_view(), self.mapping.near, self.mapping.alignment
-        pose, hessian = matching.align(points, prior.mean, prior, view, alignment)
-        fraction = matching.matched_fraction(points, pose, view, near)
-        if len(points) and fraction < self.mapping.configuration.matching.matched_fraction:
-            start = self._search(points, prior)
-            around = matching.Prior(start, prior.information)
-            found, found_hessian = matching.align(points, start, around, view, alignment)
-            if matching.matched_fraction(points, found, view, near) > fraction:
-                pose, hessian = found, found_hessian
-        self.tracking_covariance = _in_body_frame(np.linalg.inv(hessian + prior.information), pose[2])
-        return pose
-
-    def _search(self, points: Float64, prior: matching.Prior) -> Float64:
-        """The best start in the search window, by correlation with the leader's map."""
-        settings = self.mapping.configuration.matching
-        distance_step, angle_step = 2.0 * self.mapping.pool.cell, math.radians(settings.search_step)
-        reach = math.ceil(settings.search_distance / distance_step)
-        counts = np.array([reach, reach, math.ceil(math.radians(settings.search_angle) / angle_step)])
-        return matching.correlative_search(
-            points[:: max(1, len(points) // _SEARCH_POINTS)],
-            matching.Prior(prior.mean, _SEARCH_PRIOR * prior.information),
-            np.array([distance_step, distance_step, angle_step]),
-            counts,
-            self._leading_view(),
-            self.mapping.model,
-            settings.temper,
-        )
 
     def update(self, points: Float64, step: int) -> FilterStep:
         """Draw every particle from its optimal proposal, weigh it, resample where ESS fell below its bound.
@@ -166,11 +137,11 @@ class AreaFilter:
         :param step: number of the keyframe event, for the random streams.
         """
         settings = self.mapping.configuration
-        modes, means, covariances, evidences = batch.propose_all(
+        modes, hessians, means, covariances, evidences = batch.propose_all(
             points,
             self.poses,
             self._priors,
-            _information(self._odometry_covariance, self.pose[2]),
+            map_information(self._since_update.covariance, self.pose[2]),
             self._tables,
             self._leading_view(),
             self.mapping.alignment,
@@ -188,18 +159,21 @@ class AreaFilter:
         # The leader keeps the mode, so that the published path has no sampling noise.
         self.poses[leader] = modes[leader]
         self.poses[:, 2] = se2.wrap(self.poses[:, 2])
-        covariance = _in_body_frame(covariances[leader], self.poses[leader, 2])
+        heading = self.poses[leader, 2]
+        covariance = in_body_frame(covariances[leader], heading)
+        information = in_body_frame(settings.matching.temper * hessians[leader], heading)
         effective = 1.0 / float(np.sum(_normalised(self.log_weights) ** 2))
         changed = leader != self._told_leader
         if effective < settings.filter.ess_fraction * len(self.poses):
             self._resample(step)
         self._told_leader = self.leader
-        self._restart_odometry()
-        return FilterStep(covariance, log_evidence, effective, changed)
+        self._restart()
+        return FilterStep(covariance, information, log_evidence, effective, changed)
 
-    def _restart_odometry(self) -> None:
+    def _restart(self) -> None:
+        """Predict from here."""
         self._priors = self.poses.copy()
-        self._odometry_covariance = np.zeros((3, 3))
+        self._since_update = NO_STEP
 
     def _resample(self, step: int) -> None:
         """Systematic resampling; the leader stands first, so that it still leads."""
@@ -263,19 +237,3 @@ def _normalised(log_weights: Float64) -> Float64:
 def _log_mean(log_values: Float64, weights: Float64) -> float:
     top = log_values.max()
     return float(top + np.log(np.sum(weights * np.exp(log_values - top))))
-
-
-def _information(covariance: Float64, theta: float) -> Float64:
-    """Inverse, in the map frame, of a covariance in the body's tangent frame, both (3, 3)."""
-    return np.asarray(np.linalg.inv(_in_map_frame(covariance, theta)), dtype=np.float64)
-
-
-def _in_map_frame(covariance: Float64, theta: float) -> Float64:
-    """A covariance in the body's tangent frame as one of (x, y, theta) in the map frame, both (3, 3)."""
-    turn = se2.adjoint(np.array([0.0, 0.0, theta]))
-    return turn @ covariance @ turn.T
-
-
-def _in_body_frame(covariance: Float64, theta: float) -> Float64:
-    """The inverse of :func:`_in_map_frame`."""
-    return _in_map_frame(covariance, -theta)

@@ -82,21 +82,22 @@ def propose_all(
     model: BeamModel,
     sharpness: float,
     temper: float,
-) -> tuple[Float64, Float64, Float64, Float64]:
+) -> tuple[Float64, Float64, Float64, Float64, Float64]:
     """The optimal proposal of every particle.
 
     :param starts: (m, 3) poses to start matching from; ``priors``: (m, 3) poses that odometry predicts.
     :param tables: (m, T, T), the particles' maps; ``view`` is any view of the same pool.
-    :returns: modes (m, 3), means (m, 3), covariances (m, 3, 3), log-evidences (m,).
+    :returns: modes (m, 3), information of the points at them (m, 3, 3), means (m, 3), covariances (m, 3, 3),
+        log-evidences (m,).
     """
     m = starts.shape[0]
-    modes, means = np.empty((m, 3)), np.empty((m, 3))
+    modes, hessians, means = np.empty((m, 3)), np.empty((m, 3, 3)), np.empty((m, 3))
     covariances, evidences = np.empty((m, 3, 3)), np.empty(m)
     for i in range(m):
         own = MapView(tables[i], view.odds, view.field, view.cell, view.radius)
         prior = Prior(priors[i], information)
-        modes[i], hessian = align(points, starts[i], prior, own, settings)
+        modes[i], hessians[i] = align(points, starts[i], prior, own, settings)
         means[i], covariances[i], evidences[i] = proposal(
-            points, modes[i], hessian, prior, own, model, sharpness, temper
+            points, modes[i], hessians[i], prior, own, model, sharpness, temper
         )
-    return modes, means, covariances, evidences
+    return modes, hessians, means, covariances, evidences

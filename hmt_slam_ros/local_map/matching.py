@@ -104,31 +104,100 @@ def log_prior(pose: Float64, prior: Prior) -> float:
 
 
 @njit(cache=True)
-def correlative_search(
-    points: Float64, prior: Prior, steps: Float64, counts: Int64, view: MapView, model: BeamModel, temper: float
-) -> Float64:
-    """The best pose on a regular grid around the prior's mean, by tempered likelihood ratio times prior (Olson 2009).
+def evidence(
+    points: Float64, mode: Float64, hessian: Float64, prior: Prior, view: MapView, model: BeamModel, temper: float
+) -> float:
+    """Log of the Laplace integral of prior times tempered likelihood around a mode, relative to unknown space, nats.
 
-    :param steps: (3,) spacing of the grid along and across the mean's heading and in heading, m, m, rad.
-    :param counts: (3,) steps to each side.
+    :param hessian: (3, 3) information of the points at the mode.
     """
-    best_score = -np.inf
-    best = prior.mean.copy()
+    ratio = log_ratio(points, mode[0], mode[1], mode[2], view, model)
+    occam = np.linalg.det(prior.information) / np.linalg.det(prior.information + temper * hessian)
+    return log_prior(mode, prior) + temper * ratio + 0.5 * np.log(occam)
+
+
+class Lattice(NamedTuple):
+    """The poses that a search tries: around a centre, along the axes of the map and in heading.
+
+    :ivar stride: from one pose to the next, cells.
+    :ivar turn: from one heading to the next, rad.
+    :ivar counts: (3,), int64, steps to each side in x, y and heading.
+    """
+
+    stride: int
+    turn: float
+    counts: Int64
+
+
+@njit(cache=True)
+def correlative_search(
+    points: Float64, prior: Prior, lattice: Lattice, view: MapView, model: BeamModel, temper: float, most: int
+) -> Float64:
+    """The highest peaks of tempered likelihood ratio times prior on a lattice around the prior's mean (Olson 2009).
+
+    :param most: how many peaks at most.
+    :returns: (k, 3) poses, the best first; no two are neighbours or neighbours' neighbours on the lattice.
+    """
+    counts = lattice.counts
+    sizes = (2 * counts[0] + 1, 2 * counts[1] + 1, 2 * counts[2] + 1)
+    scores = np.empty(sizes)
     pose = np.empty(3)
-    cos, sin = np.cos(prior.mean[2]), np.sin(prior.mean[2])
-    for k in range(-counts[2], counts[2] + 1):
-        pose[2] = prior.mean[2] + k * steps[2]
-        for i in range(-counts[0], counts[0] + 1):
-            for j in range(-counts[1], counts[1] + 1):
-                along, across = i * steps[0], j * steps[1]
-                pose[0] = prior.mean[0] + cos * along - sin * across
-                pose[1] = prior.mean[1] + sin * along + cos * across
-                ratio = log_ratio(points, pose[0], pose[1], pose[2], view, model)
-                score = log_prior(pose, prior) + temper * ratio
-                if score > best_score:
-                    best_score = score
-                    best[:] = pose
-    return best
+    for k in range(sizes[2]):
+        pose[2] = prior.mean[2] + (k - counts[2]) * lattice.turn
+        columns, rows = _cells_at(points, prior.mean[0], prior.mean[1], pose[2], view)
+        for i in range(sizes[0]):
+            right = (i - counts[0]) * lattice.stride
+            pose[0] = prior.mean[0] + right * view.cell
+            for j in range(sizes[1]):
+                up = (j - counts[1]) * lattice.stride
+                pose[1] = prior.mean[1] + up * view.cell
+                ratio = _log_ratio_of_cells(columns, rows, right, up, view, model)
+                scores[i, j, k] = log_prior(pose, prior) + temper * ratio
+    return _peaks(scores, prior.mean, lattice, view.cell, most)
+
+
+@njit(cache=True)
+def _cells_at(points: Float64, x: float, y: float, theta: float, view: MapView) -> tuple[Int64, Int64]:
+    """Columns and rows of the points at the pose (x, y, theta), each (n,)."""
+    cos, sin = np.cos(theta) / view.cell, np.sin(theta) / view.cell
+    half = 0.5 * view.table.shape[0] * PATCH
+    columns, rows = np.empty(points.shape[0], dtype=np.int64), np.empty(points.shape[0], dtype=np.int64)
+    for n in range(points.shape[0]):
+        columns[n] = int(x / view.cell + half + cos * points[n, 0] - sin * points[n, 1])
+        rows[n] = int(y / view.cell + half + sin * points[n, 0] + cos * points[n, 1])
+    return columns, rows
+
+
+@njit(cache=True)
+def _log_ratio_of_cells(
+    columns: Int64, rows: Int64, right: int, up: int, view: MapView, model: BeamModel
+) -> float:
+    """Sum of the log-likelihood ratios of end points in these cells, all shifted, nats."""
+    total = 0.0
+    for n in range(columns.size):
+        distance = field_at(view, columns[n] + right, rows[n] + up)
+        if odds_at(view, columns[n] + right, rows[n] + up) == 0:
+            total += model.in_unknown[distance]
+        else:
+            total += model.in_known[distance]
+    return total
+
+
+@njit(cache=True)
+def _peaks(scores: Float64, centre: Float64, lattice: Lattice, cell: float, most: int) -> Float64:
+    """The poses (k, 3) of the highest scores, each at least three steps from those before it; empties ``scores``."""
+    found = np.empty((most, 3))
+    counts = lattice.counts
+    step = np.array([lattice.stride * cell, lattice.stride * cell, lattice.turn])
+    for n in range(most):
+        best = np.argmax(scores)
+        i, rest = divmod(best, scores.shape[1] * scores.shape[2])
+        j, k = divmod(rest, scores.shape[2])
+        if scores[i, j, k] == -np.inf:
+            return found[:n]
+        found[n] = centre + step * (np.array([i, j, k]) - counts)
+        scores[max(0, i - 2) : i + 3, max(0, j - 2) : j + 3, max(0, k - 2) : k + 3] = -np.inf
+    return found
 
 
 @njit(cache=True)

@@ -27,6 +27,8 @@ class LiveHypothesis:
     """A filter and what metric SLAM remembers beside it.
 
     :ivar settings: when keyframes are taken, and how far their covariance is to be trusted.
+    :ivar moved: the motion between the last two keyframe events, as matched, shape (3,).
+    :ivar information: of the last keyframe event's match alone, in the frame of its pose, shape (3, 3).
     :ivar event_pose: ``area_T_base`` at the last keyframe event, shape (3,).
     :ivar anchor: the stored keyframe to which scans are now related.
     :ivar fresh: {keyframe: covariance (3, 3) of the step that led to it}, of those stored since the area was entered.
@@ -37,6 +39,8 @@ class LiveHypothesis:
     filter: AreaFilter
     settings: Filter
     event_pose: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
+    moved: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
+    information: NDArray[np.float64] = field(default_factory=lambda: np.zeros((3, 3)))
     anchor: int = 0
     fresh: dict[int, NDArray[np.float64]] = field(default_factory=dict)
     drift: NDArray[np.float64] = field(default_factory=_FIRST_COVARIANCE.copy)
@@ -48,6 +52,8 @@ class LiveHypothesis:
             self.filter.branch(hypothesis),
             self.settings,
             self.event_pose,
+            self.moved,
+            self.information,
             self.anchor,
             dict(self.fresh),
             self.drift,
@@ -67,13 +73,14 @@ class LiveHypothesis:
         :param points: of the scan, to be matched, shape (n, 2), m, base frame.
         """
         if sequence == 0:
-            step = FilterStep(_FIRST_COVARIANCE, 0.0, float(len(self.filter.poses)), False)
+            step = FilterStep(_FIRST_COVARIANCE, np.zeros((3, 3)), 0.0, float(len(self.filter.poses)), False)
         else:
             step = self.filter.update(points, sequence)
         stored = self._is_new()
         self._drift_on(step.covariance * self.settings.covariance_inflation, sequence if stored else None)
         if stored:
             self.filter.add_keyframe(sequence, scan)
+        self.moved, self.information = se2.between(self.event_pose, self.filter.pose), step.information
         self.event_pose = self.filter.pose
         self._relate()
         return LeafEstimate(

@@ -31,7 +31,7 @@ from hmt_slam_ros.processes.messages import (
 from hmt_slam_ros.processes.replica import FIRST_AREA, FIRST_HYPOTHESIS, Replica
 from hmt_slam_ros.sensing import Odometry, Scan
 from hmt_slam_ros.sensing.deskew import SweepCheck, deskewed
-from hmt_slam_ros.sensing.motion import OdometryBuffer, increment_covariance
+from hmt_slam_ros.sensing.motion import MotionModel
 
 
 class MetricSlam:
@@ -44,7 +44,7 @@ class MetricSlam:
         self._configuration = configuration
         self._mapping = LocalMapping(configuration)
         self._replica = Replica()
-        self._odometry = OdometryBuffer()
+        self._motion = MotionModel(configuration.motion)
         self._queue: deque[Scan] = deque()
         self._sweeps = SweepCheck()
         self._last_stamp = -1
@@ -53,7 +53,7 @@ class MetricSlam:
         self._live = {FIRST_HYPOTHESIS: LiveHypothesis(first, configuration.filter)}
         self._events = 0
         self._waiting = False
-        self._last_odometry: NDArray[np.float64] | None = None
+        self._patient = True
         self._travelled = 0.0
         self._scans = 0
         self._dropped = 0
@@ -77,7 +77,8 @@ class MetricSlam:
     def handle(self, message: Message) -> list[Message]:
         """Take in one message, work off what can be worked off, return what there is to say."""
         if isinstance(message, Odometry):
-            self._odometry.add(message)
+            self._motion.odometry.add(message)
+            self._patient = True
         elif isinstance(message, Scan):
             return self._receive(message) + self._work()
         elif isinstance(message, Hypotheses):
@@ -117,13 +118,20 @@ class MetricSlam:
             )
         self._queue.append(scan)
         self._last_stamp = scan.stamp
-        if self._out_of_patience():
-            said += self._notice(
-                "odometry",
-                f"{len(self._queue)} scans wait for odometry at {self._queue[0].stamp / 1e9:.6f} s and are now matched "
-                "from the last reading: check the odometry topic and its stamps.",
-            )
-        return said
+        return said + self._lose_patience()
+
+    def _lose_patience(self) -> list[Message]:
+        """Where enough scans wait for odometry, go on without until there is more."""
+        first = self._queue[0]
+        waited = len(self._queue) > self._configuration.filter.patience
+        if not waited or not self._patient or self._motion.odometry.covers(first.end):
+            return []
+        self._patient = False
+        return self._notice(
+            "odometry",
+            f"{len(self._queue)} scans wait for odometry at {first.stamp / 1e9:.6f} s and are matched without from "
+            "here on, until there is a reading: check the odometry topic and its stamps.",
+        )
 
     def _notice(self, fault: str, text: str) -> list[Message]:
         if fault in self._noticed:
@@ -131,41 +139,30 @@ class MetricSlam:
         self._noticed.add(fault)
         return [Notice("slam", text)]
 
-    def _out_of_patience(self) -> bool:
-        return len(self._queue) > self._configuration.filter.patience and not self._odometry.covers(
-            self._queue[0].end
-        )
-
     def _odometry_known(self) -> bool:
-        return (
-            self._ended
-            or self._odometry.covers(self._queue[0].end)
-            or self._out_of_patience()
-        )
+        return self._ended or not self._patient or self._motion.odometry.covers(self._queue[0].end)
 
     def _process(self, scan: Scan) -> list[Message]:
-        odometry = self._odometry.at(scan.stamp)
-        odometry = np.zeros(3) if odometry is None else odometry
-        increment = np.zeros(3) if self._last_odometry is None else se2.between(self._last_odometry, odometry)
-        self._last_odometry = odometry
-        scan = deskewed(scan, self._odometry, self._configuration.rtl)
+        prediction = self._motion.predict(scan.stamp)
+        scan = deskewed(scan, self._motion.odometry, self._configuration.rtl)
         points = self._mapping.matching_points(scan)
         if self._events:
-            covariance = increment_covariance(increment, self._configuration.motion)
-            for live in self._live.values():
-                live.filter.track(points, increment, covariance)
-        self._travelled += math.hypot(increment[0], increment[1])
+            tracked = {hypothesis: live.filter.track(points, prediction) for hypothesis, live in self._live.items()}
+            best = tracked[self._replica.best]
+            self._motion.observe(best.moved, best.information)
+            self._travelled += math.hypot(best.moved[0], best.moved[1])
         due = not self._events or self._best.event_due()
         said = self._keyframe_event(scan, points) if due else []
         for live in self._live.values():
             live.note_scan(scan.stamp)
         self._scans += 1
-        return [*said, self._estimate(scan.stamp, odometry)]
+        return [*said, self._estimate(scan.stamp)]
 
     def _keyframe_event(self, scan: Scan, points: NDArray[np.float64]) -> list[Message]:
         sequence = self._events
         trails: list[Message] = self._trails()
         leaves = tuple(live.event(sequence, scan, points) for live in self._live.values())
+        self._motion.keyframe(self._best.moved, self._best.information)
         keyframe = Keyframe(sequence, scan, self._travelled, leaves)
         self._replica.add(keyframe)
         self._events += 1
@@ -178,8 +175,9 @@ class MetricSlam:
         self._first_of_trail = self._scans
         return said
 
-    def _estimate(self, stamp: int, odometry: NDArray[np.float64]) -> LocalEstimate:
+    def _estimate(self, stamp: int) -> LocalEstimate:
         best = self._best
+        odometry = self._motion.odometry_pose
         return LocalEstimate(stamp, self._scans - 1, best.filter.area, best.belief(), odometry, self._dropped)
 
     def _change_hypotheses(self, hypotheses: Hypotheses) -> None:

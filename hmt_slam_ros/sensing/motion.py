@@ -1,9 +1,10 @@
-"""Odometry increments between any two times, and how far they can be trusted."""
+"""Where the robot goes between two scans, and how far that is to be trusted: by its odometry, by its inertia alone."""
 
 from __future__ import annotations
 
 import math
 from collections import deque
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,12 +13,61 @@ from hmt_slam_ros.configuration.tree import Motion
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.sensing.odometry import Odometry
 
+# Weight of the newest scan in the mean time between scans, and of the past when odometry is judged once more.
+_NEWEST = 0.1
+_PAST = 0.95
+# For about this time, in s, a robot goes on as it went, forward and aside, and turning.
+_MEMORY = np.array([2.0, 2.0, 1.0])
+# A step beyond this many deviations says that something slipped, not how noisy the odometry is.
+_OUTLIER = 3.0
+
+
+class Step(NamedTuple):
+    """A motion between two scans.
+
+    :ivar increment: shape (3,), ``start_T_end``.
+    :ivar covariance: shape (3, 3), in the frame of its end.
+    """
+
+    increment: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+
+    def then(self, other: Step) -> Step:
+        """Both motions, one after the other."""
+        ad = se2.adjoint(se2.inverse(other.increment))
+        return Step(se2.compose(self.increment, other.increment), ad @ self.covariance @ ad.T + other.covariance)
+
+    def widened(self, found: NDArray[np.float64]) -> Step:
+        """The same motion, so much less certain that ``found`` (3,) is within a deviation; other directions stay."""
+        difference = se2.log(se2.between(self.increment, found))
+        return Step(self.increment, self.covariance + np.outer(difference, difference))
+
+
+NO_STEP = Step(np.zeros(3), np.zeros((3, 3)))
+"""The robot stood still, for certain."""
+
+
+class Prediction(NamedTuple):
+    """The motion since the last scan, before this one is matched.
+
+    :ivar odometry: what odometry says, None where it says nothing.
+    :ivar inertia: what the velocity says.
+    """
+
+    odometry: Step | None
+    inertia: Step
+
 
 class OdometryBuffer:
     """The recent odometry readings, from which the pose at a scan is interpolated."""
 
     def __init__(self) -> None:
         self._readings: deque[Odometry] = deque()
+
+    @property
+    def empty(self) -> bool:
+        """Whether no reading ever came."""
+        return not self._readings
 
     def add(self, reading: Odometry) -> None:
         """Append a reading; one whose stamp goes back starts a new sequence."""
@@ -29,14 +79,18 @@ class OdometryBuffer:
         """Whether a reading at or after ``stamp`` (ns) has come."""
         return bool(self._readings) and self._readings[-1].stamp >= stamp
 
-    def at(self, stamp: int) -> NDArray[np.float64] | None:
-        """``odom_T_base`` (3,) at ``stamp`` (ns): interpolated, held at the ends, None without any reading.
+    def at(self, stamp: int) -> tuple[NDArray[np.float64], float] | None:
+        """``odom_T_base`` (3,) at ``stamp`` (ns), interpolated, or None where no two readings enclose it.
 
-        Readings before those that are needed are forgotten.
+        With it comes half the product of the times to both readings, s^2: the factor on a constant acceleration by
+        which the pose differs from the interpolated one. Readings before those that are needed are forgotten.
         """
         while len(self._readings) > 2 and self._readings[2].stamp <= stamp:
             self._readings.popleft()
-        return self._pose(min(stamp, self._readings[-1].stamp)) if self._readings else None
+        if not self._readings or not self._readings[0].stamp <= stamp <= self._readings[-1].stamp:
+            return None
+        first, second = self._enclosing(stamp)
+        return self._pose(stamp), 0.5e-18 * (stamp - first.stamp) * (second.stamp - stamp)
 
     def motion(self, start: int, end: int) -> NDArray[np.float64]:
         """The motion of the base from ``start`` to ``end`` (ns) as a twist (3,); zeros where nothing is known of it.
@@ -52,17 +106,177 @@ class OdometryBuffer:
 
     def _pose(self, stamp: int) -> NDArray[np.float64]:
         """``odom_T_base`` (3,): held before the first reading, interpolated, carried on after the last."""
-        first = second = self._readings[0]
-        for reading in self._readings:
-            first, second = second, reading
-            if stamp < reading.stamp:
-                break
+        first, second = self._enclosing(stamp)
         if stamp == second.stamp:
             return second.pose
         if stamp <= first.stamp:
             return first.pose
         fraction = (stamp - first.stamp) / (second.stamp - first.stamp)
         return se2.interpolate(first.pose, second.pose, fraction)
+
+    def _enclosing(self, stamp: int) -> tuple[Odometry, Odometry]:
+        """The reading at or before ``stamp`` and the one after it; else the two first or the two last."""
+        first = second = self._readings[0]
+        for reading in self._readings:
+            first, second = second, reading
+            if stamp < reading.stamp:
+                break
+        return first, second
+
+
+class Inertia:
+    """The robot's velocity, from the motions that scan matching found: a Kalman filter on the body's twist.
+
+    Stamps may be those of arrival, in bursts, while the scans were taken evenly; so the time between two scans is
+    taken to lie between its stamps' difference and the mean of late.
+    """
+
+    def __init__(self, motion: Motion) -> None:
+        turn = math.radians(motion.turn_acceleration)
+        self._acceleration = np.diag([motion.acceleration**2, motion.acceleration**2, turn**2])
+        self._floor = increment_covariance(np.zeros(3), motion)
+        self._velocity = np.zeros(3)
+        self._usual = self._acceleration * _MEMORY**2
+        self._covariance = self._usual
+        self._period: float | None = None
+        self._seconds = 0.0
+        self._doubt = np.zeros(3)
+
+    def predict(self, seconds: float) -> Step:
+        """The motion of the next ``seconds`` since the last scan."""
+        self._period = seconds if self._period is None else self._period + _NEWEST * (seconds - self._period)
+        self._seconds = 0.5 * (seconds + self._period)
+        self._doubt = 0.5 * (seconds - self._period) * self._velocity
+        changed = self._covariance + self._acceleration * self._seconds**2
+        # However long it takes, the velocity stays within the usual.
+        self._covariance = np.linalg.inv(np.linalg.inv(changed) + np.linalg.inv(self._usual)).astype(np.float64)
+        lasting = -_MEMORY * np.expm1(-self._seconds / _MEMORY)
+        spread = self._covariance * self._seconds**2 + np.outer(self._doubt, self._doubt) + self._floor
+        return Step(se2.exp(self._velocity * lasting), spread)
+
+    def observe(self, increment: NDArray[np.float64], information: NDArray[np.float64]) -> None:
+        """Learn from the motion that was predicted last.
+
+        :param increment: ``start_T_end`` (3,) as matched.
+        :param information: of the match (3, 3), in the frame of its end; 0 along directions that scans do not show.
+        """
+        if self._seconds <= 0.0:
+            return
+        doubted = information @ self._doubt
+        certain = information - np.outer(doubted, doubted) / (1.0 + self._doubt @ doubted)
+        measured = certain * self._seconds**2
+        self._covariance = np.linalg.inv(np.linalg.inv(self._covariance) + measured).astype(np.float64)
+        residual = se2.log(increment) / self._seconds - self._velocity
+        self._velocity = self._velocity + self._covariance @ (measured @ residual)
+
+
+class OdometryNoise:
+    """How many times as noisy as its model the odometry turned out to be: factors on its deviations, at least 1.
+
+    The squared difference between odometry and match over the steps of late, against what the model expects of it.
+    """
+
+    def __init__(self) -> None:
+        # One step that was as the model says, so that the first few do not count for much.
+        self._ratios = np.ones(2)
+        self._weights = np.ones(2)
+
+    @property
+    def factors(self) -> NDArray[np.float64]:
+        """On the deviation of translation and of rotation, shape (2,)."""
+        return np.sqrt(np.maximum(1.0, self._ratios / self._weights))
+
+    def scaled(self, covariance: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The model's covariance (3, 3) as it turned out to be."""
+        scale = self.factors[[0, 0, 1]]
+        return covariance * np.outer(scale, scale)
+
+    def learn(self, odometry: Step, matched: NDArray[np.float64], information: NDArray[np.float64]) -> None:
+        """Compare a step by odometry, with the model's covariance P, with the matched one.
+
+        A match of covariance R moves the estimate by P (P + R)^-1 of the difference. What that is expected to be, as
+        a share of P, is also how much the scans show of a direction, and the weight of the step.
+
+        :param matched: ``start_T_end`` (3,).
+        :param information: R^-1 in the frame of the end, shape (3, 3).
+        """
+        prior = np.linalg.inv(odometry.covariance)
+        expected = np.diag(np.linalg.solve(information + prior, information) @ odometry.covariance)
+        squares = se2.log(se2.between(odometry.increment, matched)) ** 2
+        shown = expected / np.diag(odometry.covariance)
+        for k, rows in enumerate(([0, 1], [2])):
+            weight = shown[rows].mean()
+            ratio = squares[rows].sum() / max(expected[rows].sum(), 1e-12)
+            self._ratios[k] = _PAST * self._ratios[k] + weight * min(ratio, (_OUTLIER * self.factors[k]) ** 2)
+            self._weights[k] = _PAST * self._weights[k] + weight
+
+
+class MotionModel:
+    """Predicts the motion between scans, and learns from what scan matching makes of it.
+
+    :ivar odometry: the readings.
+    :ivar noise: what they turned out to be worth.
+    :ivar odometry_pose: ``odom_T_base`` (3,) at the last scan; where odometry said nothing, carried on as matched.
+    """
+
+    def __init__(self, motion: Motion) -> None:
+        self.odometry = OdometryBuffer()
+        self.noise = OdometryNoise()
+        self.odometry_pose: NDArray[np.float64] = np.zeros(3)
+        self._motion = motion
+        self._inertia = Inertia(motion)
+        self._stamp: int | None = None
+        self._gap: float | None = None
+        self._leg: Step | None = None
+
+    def predict(self, stamp: int) -> Prediction:
+        """The motion from the last scan to the one at ``stamp``, ns; at the first scan, which sets the start, none."""
+        step = self._by_odometry(stamp)
+        if self._stamp is None:
+            self._stamp = stamp
+            return Prediction(None, NO_STEP)
+        seconds = max(0.0, 1e-9 * (stamp - self._stamp))
+        self._stamp = stamp
+        if self._leg is not None:
+            self._leg = None if step is None else self._leg.then(step)
+        if step is not None:
+            step = Step(step.increment, self.noise.scaled(step.covariance))
+        return Prediction(step, self._inertia.predict(seconds))
+
+    def _by_odometry(self, stamp: int) -> Step | None:
+        """What odometry says of the motion from the last scan, None where it is unknown at either end."""
+        found, gap = self.odometry.at(stamp), self._gap
+        if found is None:
+            self._gap = None
+            return None
+        before, (self.odometry_pose, self._gap) = self.odometry_pose, found
+        if gap is None:
+            return None
+        increment = se2.between(before, self.odometry_pose)
+        covariance = increment_covariance(increment, self._motion)
+        turn = math.radians(self._motion.turn_acceleration)
+        bounds = np.array([self._motion.acceleration, self._motion.acceleration, turn])
+        return Step(increment, covariance + np.diag((gap * bounds) ** 2 + (self._gap * bounds) ** 2))
+
+    def observe(self, increment: NDArray[np.float64], information: NDArray[np.float64]) -> None:
+        """Learn the velocity from the motion that was predicted last.
+
+        :param increment: ``start_T_end`` (3,) as matched.
+        :param information: of the match (3, 3), in the frame of its end; 0 along directions that scans do not show.
+        """
+        self._inertia.observe(increment, information)
+        if self._gap is None:
+            self.odometry_pose = se2.compose(self.odometry_pose, increment)
+
+    def keyframe(self, moved: NDArray[np.float64], information: NDArray[np.float64]) -> None:
+        """Learn the noise of odometry from the motion since the last keyframe.
+
+        :param moved: (3,), as matched.
+        :param information: of the keyframe's match, in its own frame, (3, 3).
+        """
+        if self._leg is not None:
+            self.noise.learn(self._leg, moved, information)
+        self._leg = NO_STEP
 
 
 def increment_covariance(increment: NDArray[np.float64], motion: Motion) -> NDArray[np.float64]:

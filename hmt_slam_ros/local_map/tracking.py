@@ -1,0 +1,154 @@
+"""Where a scan was taken: matching from what odometry predicts, and from inertia where the scans contradict that.
+
+Odometry is right or, with a small probability, says nothing about the motion (wheels slip, readings are lost); then
+inertia predicts it. Each of the two is a prior; the one under which scan and map have the larger evidence is believed.
+In a corridor that looks the same all along, both fit, and odometry as the sharper prior wins.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from scipy.stats import chi2
+
+from hmt_slam_ros.arrays import Float64
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.local_map import matching
+from hmt_slam_ros.local_map.local_mapping import LocalMapping
+from hmt_slam_ros.local_map.patches import MapView
+from hmt_slam_ros.sensing.motion import Prediction, Step
+
+_SEARCH_POINTS = 90
+# Peaks of a search that are refined.
+_PEAKS = 4
+# Farther from the prediction than this, in m and rad, Gauss-Newton may end in another minimum.
+_BASIN_DISTANCE, _BASIN_ANGLE = 0.2, math.radians(6.0)
+# Deviations of the prediction to which a search reaches.
+_REACH = 2.5
+# Odometry whose distance from the match is within this share of all is not doubted.
+_GATE = float(chi2.ppf(0.999, 3))
+
+
+class Match(NamedTuple):
+    """A scan matched under one prior.
+
+    :ivar pose: the mode, ``map_T_base``, shape (3,).
+    :ivar hessian: information of the points at the mode, map coordinates, shape (3, 3).
+    :ivar prior: over poses.
+    :ivar step: the motion that the prior came from.
+    :ivar log_evidence: of scan and map under the prior, nats.
+    """
+
+    pose: Float64
+    hessian: Float64
+    prior: matching.Prior
+    step: Step
+    log_evidence: float
+
+    @property
+    def covariance(self) -> Float64:
+        """Of the pose, right tangent frame, shape (3, 3)."""
+        return np.linalg.inv(in_body_frame(self.hessian + self.prior.information, self.pose[2])).astype(np.float64)
+
+
+class Tracked(NamedTuple):
+    """What tracking made of a prediction.
+
+    :ivar moved: the matched motion, ``start_T_end``, shape (3,).
+    :ivar information: of the match, for correlated beams, in the frame of its end, shape (3, 3).
+    :ivar contradicted: whether there was odometry and the scan contradicts it.
+    """
+
+    moved: Float64
+    information: Float64
+    contradicted: bool
+
+
+class ScanMatcher:
+    """Matches scans against one map after another, with the settings of a process."""
+
+    def __init__(self, mapping: LocalMapping) -> None:
+        self._mapping = mapping
+        self._settings = mapping.configuration.matching
+        fault = mapping.configuration.motion.fault_probability
+        self._log_fault, self._log_right = math.log(fault), math.log1p(-fault)
+
+    def match(self, points: Float64, before: Float64, prediction: Prediction, view: MapView) -> Match:
+        """The scan's pose.
+
+        :param points: of the scan, shape (n, 2), m, base frame.
+        :param before: ``map_T_base`` at the last scan, shape (3,).
+        """
+        if prediction.odometry is None:
+            return self._match(points, before, prediction.inertia, view)
+        by_odometry = self._match(points, before, prediction.odometry, view)
+        if self._agrees(points, by_odometry, view):
+            return by_odometry
+        by_inertia = self._match(points, before, prediction.inertia, view)
+        contradicted = by_inertia.log_evidence + self._log_fault > by_odometry.log_evidence + self._log_right
+        return by_inertia if contradicted and self._fits(points, by_inertia.pose, view) else by_odometry
+
+    def tempered(self, match: Match) -> Float64:
+        """Information of the match alone, for correlated beams, in the frame of the pose, shape (3, 3)."""
+        return in_body_frame(self._settings.temper * match.hessian, match.pose[2])
+
+    def _agrees(self, points: Float64, match: Match, view: MapView) -> bool:
+        far = -2.0 * matching.log_prior(match.pose, match.prior) > _GATE
+        return not far and self._fits(points, match.pose, view)
+
+    def _fits(self, points: Float64, pose: Float64, view: MapView) -> bool:
+        share = matching.matched_fraction(points, pose, view, self._mapping.near)
+        return not len(points) or share >= self._settings.matched_fraction
+
+    def _match(self, points: Float64, before: Float64, step: Step, view: MapView) -> Match:
+        """The pose under one prior; where that is wide, or the prediction leads to a poor fit, search around it."""
+        predicted = se2.compose(before, step.increment)
+        prior = matching.Prior(predicted, map_information(step.covariance, predicted[2]))
+        match = self._refined(points, predicted, prior, step, view)
+        lattice, wide = self._lattice(step.covariance, predicted[2])
+        if not wide and self._fits(points, match.pose, view):
+            return match
+        starts = matching.correlative_search(
+            points[:: max(1, len(points) // _SEARCH_POINTS)], prior, lattice, view, self._mapping.model,
+            self._settings.temper, _PEAKS,
+        )  # fmt: skip
+        found = [self._refined(points, start, prior, step, view) for start in starts]
+        # Relative to unknown space: where nothing fits, the scan shows nothing of the map.
+        unmatched = Match(predicted, np.zeros((3, 3)), prior, step, self._log_fault)
+        return max([unmatched, match, *found], key=lambda one: one.log_evidence)
+
+    def _refined(self, points: Float64, start: Float64, prior: matching.Prior, step: Step, view: MapView) -> Match:
+        pose, hessian = matching.align(points, start, prior, view, self._mapping.alignment)
+        log_evidence = matching.evidence(
+            points, pose, hessian, prior, view, self._mapping.model, self._settings.temper
+        )
+        return Match(pose, hessian, prior, step, log_evidence)
+
+    def _lattice(self, covariance: Float64, theta: float) -> tuple[matching.Lattice, bool]:
+        """The poses to search for a prediction of this covariance, and whether they are beyond Gauss-Newton's basin."""
+        settings, cell = self._settings, self._mapping.pool.cell
+        reach = _REACH * np.sqrt(np.diag(in_map_frame(covariance, theta)))
+        wide = bool(reach[:2].max() > _BASIN_DISTANCE or reach[2] > _BASIN_ANGLE)
+        reach[:2] = np.clip(reach[:2], settings.search_distance, settings.wide_distance)
+        reach[2] = np.clip(reach[2], math.radians(settings.search_angle), math.radians(settings.wide_angle))
+        turn = math.radians(settings.search_step)
+        counts = np.ceil(reach / np.array([2.0 * cell, 2.0 * cell, turn])).astype(np.int64)
+        return matching.Lattice(2, turn, counts), wide
+
+
+def map_information(covariance: Float64, theta: float) -> Float64:
+    """Inverse, in the map frame, of a covariance in the body's tangent frame, both (3, 3)."""
+    return np.asarray(np.linalg.inv(in_map_frame(covariance, theta)), dtype=np.float64)
+
+
+def in_map_frame(covariance: Float64, theta: float) -> Float64:
+    """A covariance in the body's tangent frame as one of (x, y, theta) in the map frame, both (3, 3)."""
+    turn = se2.adjoint(np.array([0.0, 0.0, theta]))
+    return turn @ covariance @ turn.T
+
+
+def in_body_frame(covariance: Float64, theta: float) -> Float64:
+    """The inverse of :func:`in_map_frame`; a rotation, so that it serves information matrices as well."""
+    return in_map_frame(covariance, -theta)
