@@ -137,7 +137,7 @@ class AreaFilter:
         :param step: number of the keyframe event, for the random streams.
         """
         settings = self.mapping.configuration
-        modes, hessians, means, covariances, evidences = batch.propose_all(
+        drawn = batch.propose_all(
             points,
             self.poses,
             self._priors,
@@ -150,18 +150,18 @@ class AreaFilter:
             settings.matching.temper,
         )
         weights = _normalised(self.log_weights)
-        log_evidence = _log_mean(evidences, weights)
-        self.log_weights = self.log_weights + evidences
+        log_evidence = _log_mean(drawn.evidences, weights)
+        self.log_weights = self.log_weights + drawn.evidences
         self.log_weights -= self.log_weights.max()
         leader = self.leader
-        random = stream(settings.seed, Purpose.PARTICLES, step).standard_normal((len(means), 3))
-        self.poses = means + np.einsum("mij,mj->mi", np.linalg.cholesky(covariances), random)
+        random = stream(settings.seed, Purpose.PARTICLES, step).standard_normal((len(drawn.means), 3))
+        self.poses = drawn.means + np.einsum("mij,mj->mi", np.linalg.cholesky(drawn.covariances), random)
         # The leader keeps the mode, so that the published path has no sampling noise.
-        self.poses[leader] = modes[leader]
+        self.poses[leader] = drawn.modes[leader]
         self.poses[:, 2] = se2.wrap(self.poses[:, 2])
         heading = self.poses[leader, 2]
-        covariance = in_body_frame(covariances[leader], heading)
-        information = in_body_frame(settings.matching.temper * hessians[leader], heading)
+        covariance = in_body_frame(drawn.covariances[leader], heading)
+        information = in_body_frame(settings.matching.temper * drawn.hessians[leader], heading)
         effective = 1.0 / float(np.sum(_normalised(self.log_weights) ** 2))
         changed = leader != self._told_leader
         if effective < settings.filter.ess_fraction * len(self.poses):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
 
@@ -11,6 +13,23 @@ from hmt_slam_ros.local_map.patches import MapView
 
 _STEPS = 5
 _GRID = _STEPS**3
+
+
+class Proposals(NamedTuple):
+    """The optimal proposals of m particles, in map coordinates.
+
+    :ivar modes: shape (m, 3).
+    :ivar hessians: information of the points at the modes, shape (m, 3, 3).
+    :ivar means: shape (m, 3).
+    :ivar covariances: shape (m, 3, 3).
+    :ivar evidences: log p(z | x_{t-1}, u), shape (m,), nats.
+    """
+
+    modes: Float64
+    hessians: Float64
+    means: Float64
+    covariances: Float64
+    evidences: Float64
 
 
 @njit(cache=True)
@@ -82,13 +101,11 @@ def propose_all(
     model: BeamModel,
     sharpness: float,
     temper: float,
-) -> tuple[Float64, Float64, Float64, Float64, Float64]:
+) -> Proposals:
     """The optimal proposal of every particle.
 
     :param starts: (m, 3) poses to start matching from; ``priors``: (m, 3) poses that odometry predicts.
     :param tables: (m, T, T), the particles' maps; ``view`` is any view of the same pool.
-    :returns: modes (m, 3), information of the points at them (m, 3, 3), means (m, 3), covariances (m, 3, 3),
-        log-evidences (m,).
     """
     m = starts.shape[0]
     modes, hessians, means = np.empty((m, 3)), np.empty((m, 3, 3)), np.empty((m, 3))
@@ -100,4 +117,4 @@ def propose_all(
         means[i], covariances[i], evidences[i] = proposal(
             points, modes[i], hessians[i], prior, own, model, sharpness, temper
         )
-    return modes, hessians, means, covariances, evidences
+    return Proposals(modes, hessians, means, covariances, evidences)

@@ -28,16 +28,17 @@ from hmt_slam_ros.processes.messages import (
     Message,
     Notice,
 )
+from hmt_slam_ros.processes.odometry_watch import OdometryWatch
 from hmt_slam_ros.processes.replica import FIRST_AREA, FIRST_HYPOTHESIS, Replica
 from hmt_slam_ros.sensing import Odometry, Scan
 from hmt_slam_ros.sensing.deskew import SweepCheck, deskewed
-from hmt_slam_ros.sensing.motion import MotionModel
+from hmt_slam_ros.sensing.motion import MotionModel, Prediction
 
 
 class MetricSlam:
     """The metric SLAM process.
 
-    Consumes Scan, Odometry, Hypotheses, Accepted, EndOfLog; produces Keyframe, Trail, LocalEstimate, Finished.
+    Consumes Scan, Odometry, Hypotheses, Accepted, EndOfLog; produces Keyframe, Trail, LocalEstimate, Notice, Finished.
     """
 
     def __init__(self, configuration: Configuration) -> None:
@@ -45,6 +46,7 @@ class MetricSlam:
         self._mapping = LocalMapping(configuration)
         self._replica = Replica()
         self._motion = MotionModel(configuration.motion)
+        self._watch = OdometryWatch()
         self._queue: deque[Scan] = deque()
         self._sweeps = SweepCheck()
         self._last_stamp = -1
@@ -146,17 +148,25 @@ class MetricSlam:
         prediction = self._motion.predict(scan.stamp)
         scan = deskewed(scan, self._motion.odometry, self._configuration.rtl)
         points = self._mapping.matching_points(scan)
-        if self._events:
-            tracked = {hypothesis: live.filter.track(points, prediction) for hypothesis, live in self._live.items()}
-            best = tracked[self._replica.best]
-            self._motion.observe(best.moved, best.information)
-            self._travelled += math.hypot(best.moved[0], best.moved[1])
-        due = not self._events or self._best.event_due()
-        said = self._keyframe_event(scan, points) if due else []
+        said = self._track(scan.stamp, points, prediction) if self._events else []
+        if not self._events or self._best.event_due():
+            said += self._keyframe_event(scan, points)
         for live in self._live.values():
             live.note_scan(scan.stamp)
         self._scans += 1
         return [*said, self._estimate(scan.stamp)]
+
+    def _track(self, stamp: int, points: NDArray[np.float64], prediction: Prediction) -> list[Message]:
+        """Move every hypothesis on to the scan, and learn from what the best one found."""
+        tracked = {hypothesis: live.filter.track(points, prediction) for hypothesis, live in self._live.items()}
+        best = tracked[self._replica.best]
+        self._motion.observe(best.moved, best.information)
+        self._travelled += math.hypot(best.moved[0], best.moved[1])
+        return self._tell(self._watch.hear(stamp, prediction, best))
+
+    @staticmethod
+    def _tell(text: str | None) -> list[Message]:
+        return [] if text is None else [Notice("slam", text)]
 
     def _keyframe_event(self, scan: Scan, points: NDArray[np.float64]) -> list[Message]:
         sequence = self._events
@@ -167,7 +177,7 @@ class MetricSlam:
         self._replica.add(keyframe)
         self._events += 1
         self._waiting = True
-        return [*trails, keyframe]
+        return [*trails, keyframe, *self._tell(self._watch.judge(self._motion.noise))]
 
     def _trails(self) -> list[Message]:
         """The trails since the last event, of every hypothesis."""
