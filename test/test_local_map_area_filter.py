@@ -10,10 +10,17 @@ from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.local_map.area_filter import AreaFilter, PlacedKeyframe
 from hmt_slam_ros.local_map.local_mapping import LocalMapping
+from hmt_slam_ros.sensing.motion import Prediction, Step
 
 ROOM = np.concatenate((box(-6.02, -4.03, 6.03, 7.01), box(3.51, 1.02, 4.53, 2.52), box(-4.02, 3.03, -3.52, 7.01)))
 STEP = np.array([0.1, 0.0, 0.05])
 COVARIANCE = np.diag([0.02, 0.02, 0.01]) ** 2
+# About what the velocity tells of the next 0.2 s.
+INERTIA = Step(STEP, np.diag([0.03, 0.03, 0.04]) ** 2)
+
+
+def predicted(increment, covariance=COVARIANCE, inertia=INERTIA):
+    return Prediction(Step(np.asarray(increment), covariance), inertia)
 
 
 def driven(mapping, odometry_error=(0.0, 0.0, 0.0), steps=60, hypothesis=0):
@@ -26,7 +33,7 @@ def driven(mapping, odometry_error=(0.0, 0.0, 0.0), steps=60, hypothesis=0):
         truth = se2.compose(truth, STEP)
         scan = scan_in(ROOM, truth, noise=0.01, seed=k)
         points = mapping.matching_points(scan)
-        area_filter.track(points, STEP + np.asarray(odometry_error), COVARIANCE)
+        area_filter.track(points, predicted(STEP + np.asarray(odometry_error)))
         if k % 5 == 0:
             events += 1
             area_filter.update(points, events)
@@ -57,7 +64,7 @@ def test_a_branch_goes_its_own_way():
     child = parent.branch(1)
     before = parent.poses.copy(), parent.keyframe_poses.copy()
     scan = scan_in(ROOM, (1.0, 0.5, 0.3))
-    child.track(mapping.matching_points(scan), STEP, COVARIANCE)
+    child.track(mapping.matching_points(scan), predicted(STEP))
     child.update(mapping.matching_points(scan), 99)
     child.add_keyframe(99, scan)
     np.testing.assert_array_equal(parent.poses, before[0])
@@ -88,7 +95,7 @@ def test_resampling_keeps_the_leader_and_drops_what_has_no_weight():
 def test_effective_samples_equal_the_particles_where_all_weigh_the_same():
     mapping = LocalMapping(Configuration())
     area_filter = AreaFilter(mapping, 0, 0)
-    area_filter.track(np.empty((0, 2)), STEP, COVARIANCE)
+    area_filter.track(np.empty((0, 2)), predicted(STEP))
     step = area_filter.update(np.empty((0, 2)), 1)
     assert step.effective_samples == pytest.approx(len(area_filter.poses))
     assert step.log_evidence == pytest.approx(0.0, abs=1e-9)
@@ -98,7 +105,7 @@ def test_without_returns_the_particles_spread_as_odometry_says():
     configuration = Configuration()
     configuration = replace(configuration, filter=replace(configuration.filter, particles=400))
     area_filter = AreaFilter(LocalMapping(configuration), 0, 0)
-    area_filter.track(np.empty((0, 2)), np.array([1.0, 0.0, 0.0]), np.diag([0.2, 0.1, 0.05]) ** 2)
+    area_filter.track(np.empty((0, 2)), predicted([1.0, 0.0, 0.0], np.diag([0.2, 0.1, 0.05]) ** 2))
     area_filter.update(np.empty((0, 2)), 1)
     # Five points to two deviations on each side hold 0.88 of a Gaussian's deviation.
     spread = area_filter.poses[1:].std(axis=0)
@@ -109,7 +116,7 @@ def test_a_lost_robot_is_found_by_the_search():
     mapping = LocalMapping(Configuration())
     area_filter, truth = driven(mapping, steps=30)
     scan = scan_in(ROOM, se2.compose(truth, (0.3, 0.2, np.radians(12))))
-    area_filter.track(mapping.matching_points(scan), np.zeros(3), np.diag([0.1, 0.1, 0.1]) ** 2)
+    area_filter.track(mapping.matching_points(scan), predicted(np.zeros(3), np.diag([0.1, 0.1, 0.1]) ** 2))
     error = se2.between(se2.compose(truth, (0.3, 0.2, np.radians(12))), area_filter.pose)
     assert np.hypot(*error[:2]) < 0.05
     assert abs(error[2]) < np.radians(1.0)
@@ -127,7 +134,7 @@ def test_a_change_of_area_moves_frame_and_map_together():
     ]
     area_filter.change_area(7, new_T_old, content)
     truth = se2.compose(truth, STEP)
-    area_filter.track(mapping.matching_points(scan_in(ROOM, truth)), STEP, COVARIANCE)
+    area_filter.track(mapping.matching_points(scan_in(ROOM, truth)), predicted(STEP))
     error = se2.between(se2.compose(new_T_old, truth), area_filter.pose)
     assert np.hypot(*error[:2]) < 0.03
     assert area_filter.area == 7

@@ -9,7 +9,15 @@ from worlds import box, scan_in
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.local_map.batch import propose_all
 from hmt_slam_ros.local_map.insertion import InverseModel
-from hmt_slam_ros.local_map.matching import Alignment, Prior, align, beam_model, correlative_search, log_ratio
+from hmt_slam_ros.local_map.matching import (
+    Alignment,
+    Lattice,
+    Prior,
+    align,
+    beam_model,
+    correlative_search,
+    log_ratio,
+)
 from hmt_slam_ros.local_map.patch_pool import Beams, PatchPool
 from hmt_slam_ros.local_map.patches import FAR, PATCH, field_at, odds_at
 
@@ -82,18 +90,19 @@ def test_correlation_finds_the_best_pose_of_its_grid(room):
     truth = np.array([0.4, -0.4, 0.2])
     points = scan_in(ROOM, truth, beams=61).points
     prior = Prior(truth + np.array([0.3, -0.2, 0.2]), np.diag([0.1, 0.1, 0.1]))
-    steps, counts = np.array([0.1, 0.1, 0.05]), np.array([4, 4, 5])
-    best = correlative_search(points, prior, steps, counts, room, MODEL, 0.1)
+    best, *others = correlative_search(points, prior, Lattice(2, 0.05, np.array([4, 4, 5])), room, MODEL, 0.1, 3)
     scores = {}
     for i in range(-4, 5):
         for j in range(-4, 5):
             for k in range(-5, 6):
-                pose = prior.mean + np.array([0.0, 0.0, k * 0.05])
-                pose[:2] = se2.transform(prior.mean, np.array([[0.1 * i, 0.1 * j]]))[0]
+                pose = prior.mean + np.array([0.1 * i, 0.1 * j, 0.05 * k])
                 offset = pose - prior.mean
                 scores[tuple(pose)] = 0.1 * log_ratio(points, *pose, room, MODEL) - 0.05 * offset @ offset
     np.testing.assert_allclose(best, max(scores, key=scores.get), atol=1e-9)
     assert np.hypot(*(best - truth)[:2]) < 0.15
+    assert len(others) == 2
+    for other in others:
+        assert (np.abs(other - best) > [0.25, 0.25, 0.12]).any()
 
 
 def propose(pool, table, points, truth, deviations):
@@ -108,8 +117,8 @@ def test_in_a_corridor_the_proposal_keeps_the_prior_along_it_and_is_sharp_across
     truth = np.array([0.0, 0.1, 0.0])
     near = scan_in(CORRIDOR, truth, beams=361, field_of_view=2 * np.pi).points
     near = near[np.hypot(*near.T) < 5.0]
-    _, _, covariances, _ = propose(pool, table, near, truth, (0.2, 0.2, 0.05))
-    along, across = np.sqrt(np.diag(covariances[0])[:2])
+    covariance = propose(pool, table, near, truth, (0.2, 0.2, 0.05)).covariances[0]
+    along, across = np.sqrt(np.diag(covariance)[:2])
     # A grid of two deviations to each side holds 95 % of a Gaussian: its moments read low by up to a fifth.
     assert 0.12 < along < 0.25
     assert across < 0.02
@@ -120,7 +129,7 @@ def test_evidence_is_zero_in_unknown_space_positive_in_the_right_place_and_negat
     points = scan_in(ROOM, (0, 0, 0), beams=181).points
     deviations = (0.05, 0.05, 0.02)
     empty = pool.empty_table()
-    assert propose(pool, empty, points, np.zeros(3), deviations)[3][0] == pytest.approx(0.0, abs=0.1)
-    assert propose(pool, table, points, np.zeros(3), deviations)[3][0] > 10.0
+    assert propose(pool, empty, points, np.zeros(3), deviations).evidences[0] == pytest.approx(0.0, abs=0.1)
+    assert propose(pool, table, points, np.zeros(3), deviations).evidences[0] > 10.0
     wrong = scan_in(box(-1.5, -1.5, 1.5, 1.5), (0, 0, 0), beams=181).points
-    assert propose(pool, table, wrong, np.zeros(3), deviations)[3][0] < -3.0
+    assert propose(pool, table, wrong, np.zeros(3), deviations).evidences[0] < -3.0

@@ -6,8 +6,8 @@ from worlds import box, scan_in
 
 from hmt_slam_ros.configuration.tree import Motion
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.sensing import Odometry, Scan
-from hmt_slam_ros.sensing.motion import OdometryBuffer, increment_covariance
+from hmt_slam_ros.sensing import Scan
+from hmt_slam_ros.sensing.motion import increment_covariance
 
 
 def test_only_beams_with_a_return_become_points():
@@ -27,32 +27,6 @@ def test_points_are_in_the_base_frame():
 def test_a_laser_mounted_upside_down_turns_the_other_way():
     scan = Scan(0, np.array([1.0, 1.0], dtype=np.float32), 0.0, -0.5, 0.0, 10.0)
     np.testing.assert_allclose(scan.points[1], [np.cos(0.5), -np.sin(0.5)], atol=1e-7)
-
-
-def test_odometry_is_interpolated_along_the_arc():
-    buffer = OdometryBuffer()
-    buffer.add(Odometry(0, np.zeros(3)))
-    buffer.add(Odometry(100, np.array([1.0, 1.0, np.pi / 2])))
-    np.testing.assert_allclose(buffer.at(50), [np.sin(np.pi / 4), 1 - np.cos(np.pi / 4), np.pi / 4], atol=1e-12)
-
-
-def test_odometry_is_held_at_its_ends_and_unknown_without_readings():
-    buffer = OdometryBuffer()
-    assert buffer.at(5) is None
-    assert not buffer.covers(5)
-    buffer.add(Odometry(10, np.array([1.0, 0.0, 0.0])))
-    np.testing.assert_array_equal(buffer.at(5), [1.0, 0.0, 0.0])
-    np.testing.assert_array_equal(buffer.at(15), [1.0, 0.0, 0.0])
-    assert buffer.covers(10)
-    assert not buffer.covers(11)
-
-
-def test_odometry_whose_stamps_jump_back_starts_anew():
-    buffer = OdometryBuffer()
-    buffer.add(Odometry(1000, np.array([5.0, 0.0, 0.0])))
-    buffer.add(Odometry(10, np.zeros(3)))
-    buffer.add(Odometry(20, np.array([1.0, 0.0, 0.0])))
-    np.testing.assert_allclose(buffer.at(15), [0.5, 0.0, 0.0])
 
 
 def test_the_covariance_of_an_increment_grows_with_the_way_and_has_a_floor():

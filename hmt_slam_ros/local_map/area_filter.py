@@ -117,15 +117,11 @@ class AreaFilter:
         before = self.pose
         match = self._matcher.match(points, before, prediction, self._leading_view())
         moved = se2.between(before, match.pose)
-        contradicted = prediction.odometry is not None and match.step is not prediction.odometry
-        believed = match.step if prediction.odometry is None else prediction.odometry
-        if contradicted:
-            believed = believed.widened(moved)
-        self._priors = se2.compose(self._priors, believed.increment)
-        self._since_update = self._since_update.then(believed)
+        self._priors = se2.compose(self._priors, match.step.increment)
+        self._since_update = self._since_update.then(match.step)
         self.poses = se2.compose(self.poses, moved)
         self.tracking_covariance = match.covariance
-        return Tracked(moved, self._matcher.tempered(match), contradicted)
+        return Tracked(moved, self._matcher.tempered(match), match.contradicted)
 
     def _leading_view(self) -> MapView:
         return self.mapping.pool.view(self._tables[self.leader])

@@ -39,6 +39,7 @@ class Match(NamedTuple):
     :ivar prior: over poses.
     :ivar step: the motion that the prior came from.
     :ivar log_evidence: of scan and map under the prior, nats.
+    :ivar contradicted: whether the scan contradicts the odometry that there was.
     """
 
     pose: Float64
@@ -46,6 +47,7 @@ class Match(NamedTuple):
     prior: matching.Prior
     step: Step
     log_evidence: float
+    contradicted: bool = False
 
     @property
     def covariance(self) -> Float64:
@@ -88,7 +90,19 @@ class ScanMatcher:
             return by_odometry
         by_inertia = self._match(points, before, prediction.inertia, view)
         contradicted = by_inertia.log_evidence + self._log_fault > by_odometry.log_evidence + self._log_right
-        return by_inertia if contradicted and self._fits(points, by_inertia.pose, view) else by_odometry
+        if not contradicted or not self._fits(points, by_inertia.pose, view):
+            return by_odometry
+        return self._reconciled(points, before, prediction.odometry, by_inertia, view)
+
+    def _reconciled(self, points: Float64, before: Float64, odometry: Step, found: Match, view: MapView) -> Match:
+        """The match with odometry widened along what the scan contradicts; along a corridor it still tells how far."""
+        predicted = se2.compose(before, odometry.increment)
+        information = in_body_frame(self._settings.temper * found.hessian, predicted[2])
+        shown = np.linalg.solve(information + np.linalg.inv(odometry.covariance), information)
+        difference = shown @ se2.log(se2.between(predicted, found.pose))
+        step = Step(odometry.increment, odometry.covariance + np.outer(difference, difference))
+        prior = matching.Prior(predicted, map_information(step.covariance, predicted[2]))
+        return self._refined(points, found.pose, prior, step, view)._replace(contradicted=True)
 
     def tempered(self, match: Match) -> Float64:
         """Information of the match alone, for correlated beams, in the frame of the pose, shape (3, 3)."""

@@ -7,62 +7,85 @@ import math
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.local_map.tracking import Tracked
-from hmt_slam_ros.sensing.motion import NO_STEP, OdometryNoise, Prediction
+from hmt_slam_ros.sensing.motion import NO_STEP, OdometryNoise, Step
 
 # An episode ends when for so long the scans contradicted no more, s.
 _QUIET = 1.0
 # Time between two sentences at least, s.
 _PAUSE = 60.0
 # A smaller difference over a whole episode is one of stamps, made up for by the next readings.
-_DISTANCE, _ANGLE = 0.1, math.radians(5.0)
+_DISTANCE, _ANGLE = 0.2, math.radians(10.0)
 # Noise beyond this many times the model's is said.
 _NOISY = 2.0
 _SECOND = 1e-9
+
+
+class _Episode:
+    """From the first contradicted scan to the last.
+
+    :ivar begin: stamp of the scan before the first one, ns.
+    :ivar end: stamp of the last one, ns.
+    :ivar odometry: the motion in between by odometry, shape (3,).
+    :ivar scans: the same by the scans.
+    """
+
+    def __init__(self, begin: int) -> None:
+        self.begin = self.end = begin
+        self.odometry = self.scans = self._odometry = self._scans = NO_STEP.increment
+
+    def add(self, stamp: int, step: Step, tracked: Tracked) -> None:
+        """Go on by a scan."""
+        self._odometry = se2.compose(self._odometry, step.increment)
+        self._scans = se2.compose(self._scans, tracked.moved)
+        if tracked.contradicted:
+            self.end, self.odometry, self.scans = stamp, self._odometry, self._scans
+
+    def matters(self) -> bool:
+        """Whether odometry was wrong altogether, not early or late."""
+        difference = se2.between(self.odometry, self.scans)
+        return math.hypot(difference[0], difference[1]) >= _DISTANCE or abs(difference[2]) >= _ANGLE
 
 
 class OdometryWatch:
     """Collects what odometry and scans say while they contradict each other."""
 
     def __init__(self) -> None:
-        self._begin: int | None = None
-        self._last = 0
-        self._odometry: Float64 = NO_STEP.increment
-        self._scans: Float64 = NO_STEP.increment
+        self._before = 0
+        self._episode: _Episode | None = None
         self._told = -math.inf
         self._untold = 0
         self._noise_told = False
 
-    def hear(self, stamp: int, prediction: Prediction, tracked: Tracked) -> str | None:
+    def hear(self, stamp: int, step: Step | None, tracked: Tracked) -> str | None:
         """Take note of a scan; the sentence about an episode that is over, if there is one.
 
         :param stamp: of the scan, ns.
+        :param step: odometry's motion since the scan before, None where it is unknown.
         """
-        if tracked.contradicted:
-            if self._begin is None:
-                self._begin, self._odometry, self._scans = stamp, NO_STEP.increment, NO_STEP.increment
-            self._last = stamp
-        if self._begin is None:
+        before, self._before = self._before, stamp
+        if tracked.contradicted and self._episode is None:
+            self._episode = _Episode(before)
+        if self._episode is None:
             return None
-        if prediction.odometry is not None and (stamp - self._last) * _SECOND <= _QUIET:
-            self._odometry = se2.compose(self._odometry, prediction.odometry.increment)
-            self._scans = se2.compose(self._scans, tracked.moved)
+        if step is not None and (tracked.contradicted or (stamp - self._episode.end) * _SECOND <= _QUIET):
+            self._episode.add(stamp, step, tracked)
             return None
-        begin, self._begin = self._begin, None
-        return self._sentence(begin)
+        return self.close()
 
-    def _sentence(self, begin: int) -> str | None:
-        difference = se2.between(self._odometry, self._scans)
-        if math.hypot(difference[0], difference[1]) < _DISTANCE and abs(difference[2]) < _ANGLE:
+    def close(self) -> str | None:
+        """The sentence about the episode that is open, if it matters and none was said of late."""
+        episode, self._episode = self._episode, None
+        if episode is None or not episode.matters():
             return None
-        if self._last * _SECOND - self._told < _PAUSE:
+        if episode.end * _SECOND - self._told < _PAUSE:
             self._untold += 1
             return None
         since = f" ({self._untold} times more since it was last said)" if self._untold else ""
-        self._told, self._untold = self._last * _SECOND, 0
+        self._told, self._untold = episode.end * _SECOND, 0
         return (
-            f"odometry {_motion(self._odometry)} from {begin * _SECOND:.3f} s to {self._last * _SECOND:.3f} s, where "
-            f"the scans say that it {_motion(self._scans)}{since}: the scans are believed; look for slipping wheels "
-            "and late stamps."
+            f"odometry {_motion(episode.odometry)} from {episode.begin * _SECOND:.3f} s to "
+            f"{episode.end * _SECOND:.3f} s, where the scans say that it {_motion(episode.scans)}{since}: the scans are "
+            "believed; look for slipping wheels and late stamps."
         )
 
     def judge(self, noise: OdometryNoise) -> str | None:

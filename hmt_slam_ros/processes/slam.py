@@ -162,7 +162,7 @@ class MetricSlam:
         best = tracked[self._replica.best]
         self._motion.observe(best.moved, best.information)
         self._travelled += math.hypot(best.moved[0], best.moved[1])
-        return self._tell(self._watch.hear(stamp, prediction, best))
+        return self._tell(self._watch.hear(stamp, prediction.odometry, best))
 
     @staticmethod
     def _tell(text: str | None) -> list[Message]:
@@ -227,4 +227,5 @@ class MetricSlam:
 
     def _finish(self) -> list[Message]:
         self._ended = False
-        return [*self._trails(), Finished(self._scans + self._dropped, self._scans, self._dropped)]
+        finished = Finished(self._scans + self._dropped, self._scans, self._dropped)
+        return [*self._trails(), *self._tell(self._watch.close()), finished]

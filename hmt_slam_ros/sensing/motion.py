@@ -37,11 +37,6 @@ class Step(NamedTuple):
         ad = se2.adjoint(se2.inverse(other.increment))
         return Step(se2.compose(self.increment, other.increment), ad @ self.covariance @ ad.T + other.covariance)
 
-    def widened(self, found: NDArray[np.float64]) -> Step:
-        """The same motion, so much less certain that ``found`` (3,) is within a deviation; other directions stay."""
-        difference = se2.log(se2.between(self.increment, found))
-        return Step(self.increment, self.covariance + np.outer(difference, difference))
-
 
 NO_STEP = Step(np.zeros(3), np.zeros((3, 3)))
 """The robot stood still, for certain."""

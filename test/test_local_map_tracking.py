@@ -1,0 +1,114 @@
+"""Tracking: odometry is believed, unless the scan fits much better elsewhere."""
+
+import numpy as np
+import pytest
+from worlds import box, scan_in
+
+from hmt_slam_ros.configuration.tree import Configuration
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.local_map.area_filter import AreaFilter
+from hmt_slam_ros.local_map.local_mapping import LocalMapping
+from hmt_slam_ros.sensing.motion import Prediction, Step
+
+ROOM = np.concatenate((box(-6.02, -4.03, 6.03, 7.01), box(3.51, 1.02, 4.53, 2.52), box(-4.02, 3.03, -3.52, 7.01)))
+CORRIDOR = np.array([[-100.0, -1.22, 100.0, -1.22], [-100.0, 1.22, 100.0, 1.22]])
+SURE = np.diag([0.02, 0.02, 0.01]) ** 2
+# What the velocity tells of the next second or so.
+VAGUE = np.diag([0.5, 0.5, 1.0]) ** 2
+STILL = Step(np.zeros(3), VAGUE)
+
+
+@pytest.fixture(scope="module")
+def mapping():
+    return LocalMapping(Configuration())
+
+
+def mapped(mapping, walls, poses, beams=361):
+    """A filter at the origin whose map holds the walls, as seen all round from some poses."""
+    area_filter = AreaFilter(mapping, 0, 0)
+    for k, pose in enumerate(poses):
+        area_filter.poses[:] = pose
+        area_filter.add_keyframe(k, scan_in(walls, pose, beams=beams, field_of_view=2 * np.pi))
+    area_filter.poses[:] = 0.0
+    area_filter._restart()
+    return area_filter
+
+
+def track(area_filter, walls, truth, odometry, inertia=STILL):
+    points = area_filter.mapping.matching_points(scan_in(walls, truth, noise=0.01))
+    return area_filter.track(points, Prediction(odometry, inertia))
+
+
+def error_of(pose, truth):
+    error = se2.between(truth, pose)
+    return np.hypot(error[0], error[1]), abs(np.degrees(error[2]))
+
+
+@pytest.mark.parametrize("slip", [-35.0, -10.0, 10.0, 35.0])
+def test_a_heading_slip_is_found_and_told(mapping, slip):
+    area_filter = mapped(mapping, ROOM, [(0, 0, 0)])
+    truth = np.array([0.3, 0.1, 0.2])
+    slipped = se2.compose(truth, (0.0, 0.0, np.radians(slip)))
+    tracked = track(area_filter, ROOM, truth, Step(slipped, SURE))
+    distance, angle = error_of(area_filter.pose, truth)
+    assert distance < 0.05
+    assert angle < 1.0
+    assert tracked.contradicted
+
+
+def test_odometry_that_the_scan_confirms_is_not_doubted(mapping):
+    area_filter = mapped(mapping, ROOM, [(0, 0, 0)])
+    truth = np.array([0.3, 0.1, 0.2])
+    tracked = track(area_filter, ROOM, truth, Step(truth + np.array([0.02, -0.02, 0.01]), SURE))
+    assert not tracked.contradicted
+    np.testing.assert_allclose(area_filter.pose, truth, atol=0.02)
+
+
+def test_after_a_slip_the_particles_spread_in_heading_alone(mapping):
+    area_filter = mapped(mapping, CORRIDOR, [(x, 0, 0) for x in range(-6, 7)])
+    truth = np.array([0.3, 0.0, 0.0])
+    track(area_filter, CORRIDOR, truth, Step(np.array([0.3, 0.0, np.radians(30.0)]), SURE))
+    spread = np.sqrt(np.diag(area_filter._since_update.covariance))
+    assert 20.0 < np.degrees(spread[2]) < 31.0
+    assert spread[:2].max() < 0.2
+    np.testing.assert_allclose(area_filter.pose, truth, atol=0.05)
+
+
+def test_in_a_corridor_that_looks_the_same_all_along_odometry_tells_how_far(mapping):
+    area_filter = mapped(mapping, CORRIDOR, [(x, 0, 0) for x in range(-6, 7)])
+    for k in range(1, 11):
+        truth = np.array([0.3 * k, 0.0, 0.0])
+        # The velocity has it that the robot stands; and people hide a third of the walls.
+        scan = scan_in(CORRIDOR, truth, noise=0.01, seed=k)
+        scan.ranges[60:120] = 0.9
+        points = mapping.matching_points(scan)
+        tracked = area_filter.track(points, Prediction(Step(np.array([0.3, 0.0, 0.0]), SURE), STILL))
+        assert not tracked.contradicted
+    assert area_filter.pose[0] == pytest.approx(3.0, abs=0.1)
+
+
+def test_a_scan_that_shows_nothing_of_the_map_is_placed_by_odometry(mapping):
+    area_filter = mapped(mapping, ROOM, [(0, 0, 0)])
+    elsewhere = box(-1.0, -0.6, 14.0, 0.9)
+    area_filter.poses[:] = area_filter._priors[:] = (40.0, 0.0, 0.0)
+    points = mapping.matching_points(scan_in(elsewhere, np.zeros(3)))
+    tracked = area_filter.track(points, Prediction(Step(np.array([0.3, 0.0, 0.1]), SURE), STILL))
+    np.testing.assert_allclose(area_filter.pose, [40.3, 0.0, 0.1], atol=1e-6)
+    np.testing.assert_allclose(tracked.information, 0.0, atol=1e-9)
+    assert not tracked.contradicted
+
+
+def test_without_odometry_the_scan_is_searched_for_around_what_the_velocity_predicts(mapping):
+    area_filter = mapped(mapping, ROOM, [(0, 0, 0), (1, 1, 2)])
+    truth = np.array([0.8, 0.6, np.radians(40.0)])
+    tracked = track(area_filter, ROOM, truth, None)
+    distance, angle = error_of(area_filter.pose, truth)
+    assert distance < 0.05
+    assert angle < 1.0
+    assert not tracked.contradicted
+
+
+def test_a_certain_prediction_stands_where_there_is_nothing_to_match(mapping):
+    area_filter = AreaFilter(mapping, 0, 0)
+    area_filter.track(np.empty((0, 2)), Prediction(Step(np.array([0.1, 0.0, 0.0]), SURE), STILL))
+    np.testing.assert_allclose(area_filter.pose, [0.1, 0.0, 0.0], atol=1e-12)

@@ -1,0 +1,121 @@
+"""Metric SLAM where odometry is wrong, silent or missing."""
+
+import re
+
+import numpy as np
+import pytest
+from test_process_slam import WALLS, Dialogue
+from worlds import scan_in
+
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.processes.messages import EndOfLog, LocalEstimate, Notice
+from hmt_slam_ros.sensing import Odometry
+
+SECOND = 10**9
+
+
+def turning_drive(rate, seconds=24.0):
+    """(stamp, true pose, scan) at ``rate`` Hz: 6 s ahead and then a quarter turn within 3 s, again and again."""
+    step, poses = 1.0 / rate, [np.zeros(3)]
+    for k in range(1, int(seconds * rate)):
+        ahead = (k * step) % 9.0 < 6.0
+        twist = np.array([0.4, 0.0, 0.0]) if ahead else np.array([0.1, 0.0, np.radians(30.0)])
+        poses.append(se2.compose(poses[-1], se2.exp(step * twist)))
+    for k, pose in enumerate(poses):
+        stamp = SECOND + round(k * step * SECOND)
+        yield stamp, pose, scan_in(WALLS, pose, stamp=stamp, noise=0.01, seed=k)
+
+
+def errors(dialogue, truths):
+    """Largest distance, m, and angle, degrees, of any estimate from the truth."""
+    poses = np.array([estimate.pose.mean for estimate in dialogue.of(LocalEstimate)])
+    difference = se2.between(np.array(truths), poses)
+    return np.hypot(*difference[:, :2].T).max(), np.degrees(np.abs(difference[:, 2])).max()
+
+
+@pytest.mark.parametrize("rate", [1.0, 5.0])
+@pytest.mark.parametrize("slip", [-40.0, 40.0])
+def test_a_slip_in_a_turn_does_not_lose_the_robot_and_is_said_once(rate, slip):
+    dialogue, truths = Dialogue(), []
+    odometry, before = np.zeros(3), np.zeros(3)
+    for stamp, pose, scan in turning_drive(rate):
+        slipped = np.radians(slip) * np.array([0.0, 0.0, 1.0 / rate]) * (7.0 < stamp / SECOND - 1.0 <= 8.0)
+        odometry = se2.compose(odometry, se2.compose(se2.between(before, pose), slipped))
+        before = pose
+        dialogue.tell(Odometry(stamp, odometry), scan)
+        truths.append(pose)
+    dialogue.tell(EndOfLog())
+    distance, angle = errors(dialogue, truths)
+    assert distance < 0.08
+    assert angle < 1.5
+    (notice,) = dialogue.of(Notice)
+    by_odometry, by_scans = map(float, re.findall(r"turned by (-?\d+) degrees", notice.text))
+    assert by_odometry - by_scans == pytest.approx(slip, abs=6.0)
+    begin, end = map(float, re.search(r"from ([\d.]+) s to ([\d.]+) s", notice.text).groups())
+    assert 8.0 <= begin < end <= 9.0 + 1.0 / rate
+
+
+@pytest.mark.parametrize("rate", [1.0, 2.0, 5.0, 10.0])
+def test_without_odometry_the_robot_is_tracked_from_its_first_scan_on(rate):
+    dialogue, truths = Dialogue(), []
+    for _, pose, scan in turning_drive(rate):
+        dialogue.tell(scan)
+        truths.append(pose)
+    dialogue.tell(EndOfLog())
+    assert len(dialogue.of(LocalEstimate)) == len(truths)
+    distance, angle = errors(dialogue, truths)
+    assert distance < 0.08
+    assert angle < 1.5
+    (notice,) = dialogue.of(Notice)
+    assert "wait for odometry" in notice.text
+
+
+def test_without_odometry_no_scan_waits_once_patience_is_lost():
+    dialogue = Dialogue()
+    for k, (_, _, scan) in enumerate(turning_drive(5.0)):
+        dialogue.tell(scan)
+        waited = dialogue.slam.waiting_scans
+        assert waited == (k + 1 if k < 15 else 0)
+
+
+def test_odometry_that_falls_silent_and_comes_back_is_used_again():
+    dialogue, truths = Dialogue(), []
+    for k, (stamp, pose, scan) in enumerate(turning_drive(5.0)):
+        messages = [scan] if 30 <= k < 70 else [Odometry(stamp, pose), scan]
+        dialogue.tell(*messages)
+        truths.append(pose)
+    dialogue.tell(EndOfLog())
+    distance, angle = errors(dialogue, truths)
+    assert distance < 0.08
+    assert angle < 1.5
+    assert len(dialogue.of(LocalEstimate)) == len(truths)
+
+
+def test_readings_that_are_missing_here_and_there_are_bridged():
+    random = np.random.default_rng(0)
+    dialogue, truths = Dialogue(), []
+    for stamp, pose, scan in turning_drive(5.0):
+        dialogue.tell(*([scan] if random.random() < 0.3 else [Odometry(stamp, pose), scan]))
+        truths.append(pose)
+    dialogue.tell(EndOfLog())
+    distance, angle = errors(dialogue, truths)
+    assert distance < 0.08
+    assert angle < 1.5
+    assert not dialogue.of(Notice)
+
+
+def test_noise_beyond_the_model_is_learnt_and_said_once():
+    random = np.random.default_rng(0)
+    dialogue, truths = Dialogue(), []
+    odometry, before = np.zeros(3), np.zeros(3)
+    for stamp, pose, scan in turning_drive(5.0, seconds=60.0):
+        error = np.array([0.08, 0.08, np.radians(4.0)]) * random.standard_normal(3)
+        odometry = se2.compose(odometry, se2.compose(se2.between(before, pose), error))
+        before = pose
+        dialogue.tell(Odometry(stamp, odometry), scan)
+        truths.append(pose)
+    dialogue.tell(EndOfLog())
+    distance, angle = errors(dialogue, truths)
+    assert distance < 0.1
+    assert angle < 2.0
+    assert len([notice for notice in dialogue.of(Notice) if "noise model" in notice.text]) == 1

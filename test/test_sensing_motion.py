@@ -1,0 +1,170 @@
+"""Motion between scans: odometry interpolated, its noise learnt, and the velocity that stands in for it."""
+
+import numpy as np
+import pytest
+
+from hmt_slam_ros.configuration.tree import Motion
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.sensing import Odometry
+from hmt_slam_ros.sensing.motion import (
+    Inertia,
+    MotionModel,
+    OdometryBuffer,
+    OdometryNoise,
+    Step,
+    increment_covariance,
+)
+
+SECOND = 10**9
+SHARP = np.diag([1e4, 1e4, 1e6])
+TURNING = np.array([0.5, 0.0, 0.3])
+
+
+def test_odometry_is_interpolated_along_the_arc():
+    buffer = OdometryBuffer()
+    buffer.add(Odometry(0, np.zeros(3)))
+    buffer.add(Odometry(SECOND, np.array([1.0, 1.0, np.pi / 2])))
+    pose, gap = buffer.at(SECOND // 2)
+    np.testing.assert_allclose(pose, [np.sin(np.pi / 4), 1 - np.cos(np.pi / 4), np.pi / 4], atol=1e-12)
+    # Speeding up and braking with 1 m/s^2 for half a second each, the robot would be off by this much half way.
+    assert gap == pytest.approx(0.125)
+
+
+def test_odometry_is_unknown_before_the_first_reading_and_after_the_last():
+    buffer = OdometryBuffer()
+    assert buffer.at(5) is None
+    assert not buffer.covers(5)
+    buffer.add(Odometry(10, np.array([1.0, 0.0, 0.0])))
+    assert buffer.at(5) is None
+    assert buffer.at(15) is None
+    pose, gap = buffer.at(10)
+    np.testing.assert_array_equal(pose, [1.0, 0.0, 0.0])
+    assert gap == 0.0
+    assert buffer.covers(10)
+    assert not buffer.covers(11)
+
+
+def test_odometry_whose_stamps_jump_back_starts_anew():
+    buffer = OdometryBuffer()
+    buffer.add(Odometry(1000, np.array([5.0, 0.0, 0.0])))
+    buffer.add(Odometry(10, np.zeros(3)))
+    buffer.add(Odometry(20, np.array([1.0, 0.0, 0.0])))
+    np.testing.assert_allclose(buffer.at(15)[0], [0.5, 0.0, 0.0])
+
+
+def driven(inertia, velocity, times):
+    """Let the robot go on at a steady velocity, scans at these times; the last prediction and the truth."""
+    prediction = truth = None
+    for seconds, step in zip(np.diff(times), np.full(len(times) - 1, times[-1] / (len(times) - 1)), strict=True):
+        prediction, truth = inertia.predict(seconds), se2.exp(velocity * step)
+        inertia.observe(truth, SHARP)
+    return prediction, truth
+
+
+def deviations(step, truth):
+    """How many deviations a prediction is off."""
+    difference = se2.log(se2.between(step.increment, truth))
+    return np.sqrt(difference @ np.linalg.solve(step.covariance, difference))
+
+
+def test_a_steady_velocity_is_learnt():
+    prediction, truth = driven(Inertia(Motion()), TURNING, 0.2 * np.arange(20))
+    np.testing.assert_allclose(prediction.increment, truth, atol=0.01)
+    assert deviations(prediction, truth) < 0.3
+    assert np.sqrt(np.diag(prediction.covariance))[0] < 0.05
+
+
+def test_scans_whose_stamps_come_in_bursts_are_predicted_as_evenly_taken_within_the_deviation():
+    times = 0.2 * np.arange(60)
+    bursts = 0.8 * np.ceil(times / 0.8) + 1e-5 * np.arange(60)
+    inertia = Inertia(Motion())
+    for k in range(1, 60):
+        step = inertia.predict(bursts[k] - bursts[k - 1])
+        truth = se2.exp(0.2 * TURNING)
+        if k > 20:
+            assert deviations(step, truth) < 3.0
+            assert np.sqrt(step.covariance[0, 0]) < 0.3
+        inertia.observe(truth, SHARP)
+
+
+def test_where_scans_do_not_show_the_motion_the_velocity_becomes_uncertain():
+    inertia = Inertia(Motion())
+    driven(inertia, np.array([0.5, 0.0, 0.0]), 0.2 * np.arange(20))
+    spreads = []
+    for _ in range(10):
+        step = inertia.predict(0.2)
+        spreads.append(np.sqrt(np.diag(step.covariance)))
+        inertia.observe(step.increment, np.diag([0.0, 1e4, 1e6]))
+    along, across, _ = np.transpose(spreads)
+    assert (np.diff(along) > 0).all()
+    assert along[-1] > 2.0 * across[-1]
+    assert across[-1] < 1.2 * across[0]
+
+
+def test_after_a_long_pause_the_robot_is_not_believed_to_have_turned_on_and_on():
+    inertia = Inertia(Motion())
+    driven(inertia, np.array([0.0, 0.0, np.radians(-60.0)]), 0.2 * np.arange(20))
+    step = inertia.predict(6.0)
+    assert np.degrees(step.increment[2]) > -65.0
+    assert np.degrees(np.sqrt(step.covariance[2, 2])) > 60.0
+
+
+def learnt(factor, steps=400, slips=()):
+    """The noise learnt from odometry with ``factor`` times the model's noise; at ``slips`` 20 degrees on top."""
+    random = np.random.default_rng(0)
+    noise, motion = OdometryNoise(), Motion()
+    increment = np.array([0.5, 0.0, 0.1])
+    covariance = increment_covariance(increment, motion)
+    for k in range(steps):
+        error = factor * np.sqrt(np.diag(covariance)) * random.standard_normal(3)
+        error[2] += np.radians(20.0) * (k in slips)
+        noise.learn(Step(se2.compose(increment, se2.exp(error)), covariance), increment, SHARP)
+    return noise
+
+
+@pytest.mark.parametrize("factor", [1.0, 2.0, 4.0])
+def test_the_noise_of_odometry_is_learnt(factor):
+    np.testing.assert_allclose(learnt(factor).factors, factor, rtol=0.25)
+
+
+def test_odometry_better_than_its_model_is_taken_as_the_model_says():
+    np.testing.assert_array_equal(learnt(0.3).factors, 1.0)
+    covariance = np.diag([1.0, 2.0, 3.0])
+    np.testing.assert_array_equal(learnt(0.3).scaled(covariance), covariance)
+
+
+def test_a_slip_is_not_taken_for_noise():
+    assert learnt(1.0, slips=(399,)).factors[1] < 1.6
+    assert learnt(1.0, slips=(200,)).factors[1] < 1.3
+
+
+def test_what_scans_do_not_show_says_nothing_of_the_noise():
+    noise = OdometryNoise()
+    covariance = np.diag([0.01, 0.01, 0.001])
+    for _ in range(100):
+        # Matched where odometry predicts, along the corridor; twice the deviation off, across.
+        odometry = Step(np.array([0.5, 0.0, 0.0]), covariance)
+        noise.learn(odometry, np.array([0.5, 0.2, 0.0]), np.diag([0.0, 1e6, 1e6]))
+    assert noise.factors[0] == pytest.approx(2.0, rel=0.05)
+
+
+def test_odometry_predicts_where_readings_enclose_both_scans_and_inertia_elsewhere():
+    model = MotionModel(Motion())
+    for k in (0, 1, 2, 6, 7):
+        model.odometry.add(Odometry(k * SECOND // 10, np.array([0.05 * k, 0.0, 0.0])))
+    said = [model.predict(k * SECOND // 10).odometry for k in range(10)]
+    assert [step is None for step in said] == [True] + 7 * [False] + 2 * [True]
+    for step in said[1:8]:
+        np.testing.assert_allclose(step.increment, [0.05, 0.0, 0.0], atol=1e-12)
+    # Between readings 0.4 s apart the robot may have sped up and braked.
+    assert said[4].covariance[0, 0] > said[1].covariance[0, 0]
+    assert said[7].covariance[0, 0] == pytest.approx(said[1].covariance[0, 0])
+
+
+def test_where_odometry_is_silent_its_pose_is_carried_on_by_the_match():
+    model = MotionModel(Motion())
+    model.odometry.add(Odometry(0, np.array([3.0, 0.0, 0.0])))
+    for k in range(4):
+        model.predict(k * SECOND // 10)
+        model.observe(np.zeros(3) if k == 0 else np.array([0.1, 0.0, 0.0]), SHARP)
+    np.testing.assert_allclose(model.odometry_pose, [3.3, 0.0, 0.0], atol=1e-9)
