@@ -10,7 +10,7 @@ from hmt_slam_ros.configuration.tree import RealTimeLocalization
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.sensing import Odometry, Scan
 from hmt_slam_ros.sensing.deskew import SweepCheck, deskewed
-from hmt_slam_ros.sensing.motion import OdometryBuffer
+from hmt_slam_ros.sensing.odometry import OdometryBuffer
 
 ROOM = box(-3, -4, 5, 4)
 START = np.array([0.5, -0.3, 0.4])

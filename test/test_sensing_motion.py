@@ -9,11 +9,11 @@ from hmt_slam_ros.sensing import Odometry
 from hmt_slam_ros.sensing.motion import (
     Inertia,
     MotionModel,
-    OdometryBuffer,
     OdometryNoise,
     Step,
     increment_covariance,
 )
+from hmt_slam_ros.sensing.odometry import OdometryBuffer
 
 SECOND = 10**9
 SHARP = np.diag([1e4, 1e4, 1e6])

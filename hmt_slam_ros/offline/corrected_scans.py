@@ -9,7 +9,7 @@ from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.logs import Log
 from hmt_slam_ros.sensing import Odometry, Scan
 from hmt_slam_ros.sensing.deskew import SweepCheck, deskewed
-from hmt_slam_ros.sensing.motion import OdometryBuffer
+from hmt_slam_ros.sensing.odometry import OdometryBuffer
 
 
 def corrected_scans(log: Log, configuration: Configuration) -> Iterator[Scan]:

@@ -15,22 +15,25 @@ _QUIET = 1.0
 _PAUSE = 60.0
 # A smaller difference over a whole episode is one of stamps, made up for by the next readings.
 _DISTANCE, _ANGLE = 0.2, math.radians(10.0)
+# An episode goes on while the headings part by more than this from scan to scan.
+_GROWTH = math.radians(1.0)
 # Noise beyond this many times the model's is said.
 _NOISY = 2.0
 _SECOND = 1e-9
 
 
 class _Episode:
-    """From the first contradicted scan to the last.
+    """From the first contradicted scan until odometry and scans go on alike.
 
     :ivar begin: stamp of the scan before the first one, ns.
-    :ivar end: stamp of the last one, ns.
+    :ivar last: stamp of the last contradicted scan, ns.
+    :ivar end: stamp of the scan by which their headings had parted, ns.
     :ivar odometry: the motion in between by odometry, shape (3,).
     :ivar scans: the same by the scans.
     """
 
     def __init__(self, begin: int) -> None:
-        self.begin = self.end = begin
+        self.begin = self.last = self.end = begin
         self.odometry = self.scans = self._odometry = self._scans = NO_STEP.increment
 
     def add(self, stamp: int, step: Step, tracked: Tracked) -> None:
@@ -38,12 +41,15 @@ class _Episode:
         self._odometry = se2.compose(self._odometry, step.increment)
         self._scans = se2.compose(self._scans, tracked.moved)
         if tracked.contradicted:
+            self.last = stamp
+        turned, angle = _apart(self._odometry, self._scans)[1], _apart(self.odometry, self.scans)[1]
+        if tracked.contradicted or turned > angle + _GROWTH:
             self.end, self.odometry, self.scans = stamp, self._odometry, self._scans
 
     def matters(self) -> bool:
         """Whether odometry was wrong altogether, not early or late."""
-        difference = se2.between(self.odometry, self.scans)
-        return math.hypot(difference[0], difference[1]) >= _DISTANCE or abs(difference[2]) >= _ANGLE
+        distance, angle = _apart(self.odometry, self.scans)
+        return distance >= _DISTANCE or angle >= _ANGLE
 
 
 class OdometryWatch:
@@ -67,7 +73,7 @@ class OdometryWatch:
             self._episode = _Episode(before)
         if self._episode is None:
             return None
-        if step is not None and (tracked.contradicted or (stamp - self._episode.end) * _SECOND <= _QUIET):
+        if step is not None and (tracked.contradicted or (stamp - self._episode.last) * _SECOND <= _QUIET):
             self._episode.add(stamp, step, tracked)
             return None
         return self.close()
@@ -84,8 +90,8 @@ class OdometryWatch:
         self._told, self._untold = episode.end * _SECOND, 0
         return (
             f"odometry {_motion(episode.odometry)} from {episode.begin * _SECOND:.3f} s to "
-            f"{episode.end * _SECOND:.3f} s, where the scans say that it {_motion(episode.scans)}{since}: the scans are "
-            "believed; look for slipping wheels and late stamps."
+            f"{episode.end * _SECOND:.3f} s, where the scans say that it {_motion(episode.scans)}{since}: the scans "
+            "are believed; look for slipping wheels and late stamps."
         )
 
     def judge(self, noise: OdometryNoise) -> str | None:
@@ -99,6 +105,12 @@ class OdometryWatch:
             "much in heading as its noise model expects, and is trusted less: raise "
             "motion.translation_from_translation and its neighbours if it stays so."
         )
+
+
+def _apart(odometry: Float64, scans: Float64) -> tuple[float, float]:
+    """Distance, m, and angle, rad, between two motions."""
+    difference = se2.between(odometry, scans)
+    return math.hypot(difference[0], difference[1]), abs(float(difference[2]))
 
 
 def _motion(increment: Float64) -> str:

@@ -14,7 +14,7 @@ from dataclasses import replace
 from statistics import median
 
 from hmt_slam_ros.configuration.tree import RealTimeLocalization
-from hmt_slam_ros.sensing.motion import OdometryBuffer
+from hmt_slam_ros.sensing.odometry import OdometryBuffer
 from hmt_slam_ros.sensing.scan import Scan
 
 _LONGEST_SWEEP = 1.0  # s; scanners turn ten times faster

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import deque
 from typing import NamedTuple
 
 import numpy as np
@@ -11,7 +10,7 @@ from numpy.typing import NDArray
 
 from hmt_slam_ros.configuration.tree import Motion
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.sensing.odometry import Odometry
+from hmt_slam_ros.sensing.odometry import OdometryBuffer
 
 # Weight of the newest scan in the mean time between scans, and of the past when odometry is judged once more.
 _NEWEST = 0.1
@@ -51,72 +50,6 @@ class Prediction(NamedTuple):
 
     odometry: Step | None
     inertia: Step
-
-
-class OdometryBuffer:
-    """The recent odometry readings, from which the pose at a scan is interpolated."""
-
-    def __init__(self) -> None:
-        self._readings: deque[Odometry] = deque()
-
-    @property
-    def empty(self) -> bool:
-        """Whether no reading ever came."""
-        return not self._readings
-
-    def add(self, reading: Odometry) -> None:
-        """Append a reading; one whose stamp goes back starts a new sequence."""
-        if self._readings and reading.stamp < self._readings[-1].stamp:
-            self._readings.clear()
-        self._readings.append(reading)
-
-    def covers(self, stamp: int) -> bool:
-        """Whether a reading at or after ``stamp`` (ns) has come."""
-        return bool(self._readings) and self._readings[-1].stamp >= stamp
-
-    def at(self, stamp: int) -> tuple[NDArray[np.float64], float] | None:
-        """``odom_T_base`` (3,) at ``stamp`` (ns), interpolated, or None where no two readings enclose it.
-
-        With it comes half the product of the times to both readings, s^2: the factor on a constant acceleration by
-        which the pose differs from the interpolated one. Readings before those that are needed are forgotten.
-        """
-        while len(self._readings) > 2 and self._readings[2].stamp <= stamp:
-            self._readings.popleft()
-        if not self._readings or not self._readings[0].stamp <= stamp <= self._readings[-1].stamp:
-            return None
-        first, second = self._enclosing(stamp)
-        return self._pose(stamp), 0.5e-18 * (stamp - first.stamp) * (second.stamp - stamp)
-
-    def motion(self, start: int, end: int) -> NDArray[np.float64]:
-        """The motion of the base from ``start`` to ``end`` (ns) as a twist (3,); zeros where nothing is known of it.
-
-        After the newest reading the speed between the last two goes on, for as long as they lie apart.
-
-        :param start: not before the time for which :meth:`at` was asked last.
-        """
-        if len(self._readings) < 2:
-            return np.zeros(3)
-        limit = 2 * self._readings[-1].stamp - self._readings[-2].stamp
-        return se2.log(se2.between(self._pose(min(start, limit)), self._pose(min(end, limit))))
-
-    def _pose(self, stamp: int) -> NDArray[np.float64]:
-        """``odom_T_base`` (3,): held before the first reading, interpolated, carried on after the last."""
-        first, second = self._enclosing(stamp)
-        if stamp == second.stamp:
-            return second.pose
-        if stamp <= first.stamp:
-            return first.pose
-        fraction = (stamp - first.stamp) / (second.stamp - first.stamp)
-        return se2.interpolate(first.pose, second.pose, fraction)
-
-    def _enclosing(self, stamp: int) -> tuple[Odometry, Odometry]:
-        """The reading at or before ``stamp`` and the one after it; else the two first or the two last."""
-        first = second = self._readings[0]
-        for reading in self._readings:
-            first, second = second, reading
-            if stamp < reading.stamp:
-                break
-        return first, second
 
 
 class Inertia:
