@@ -101,9 +101,9 @@ class OdometryWatch:
             return None
         self._noise_told = True
         return (
-            f"odometry differs from the scans {translation:.1f} times as much in distance and {rotation:.1f} times as "
-            "much in heading as its noise model expects, and is trusted less: raise "
-            "motion.translation_from_translation and its neighbours if it stays so."
+            f"odometry and scans differ {translation:.1f} times as much in distance and {rotation:.1f} times as much in "
+            "heading as the noise model of odometry expects, so it is trusted less: raise "
+            "motion.rotation_from_rotation and its neighbours if it stays so."
         )
 
 
