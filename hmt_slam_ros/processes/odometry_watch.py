@@ -101,8 +101,8 @@ class OdometryWatch:
             return None
         self._noise_told = True
         return (
-            f"odometry and scans differ {translation:.1f} times as much in distance and {rotation:.1f} times as much in "
-            "heading as the noise model of odometry expects, so it is trusted less: raise "
+            f"odometry and scans differ {translation:.1f} times as much in distance and {rotation:.1f} times as much "
+            "in heading as the noise model of odometry expects, so it is trusted less: raise "
             "motion.rotation_from_rotation and its neighbours if it stays so."
         )
 
