@@ -112,12 +112,19 @@ def log(pose: ArrayLike) -> NDArray[np.float64]:
 def adjoint(pose: ArrayLike) -> NDArray[np.float64]:
     """Ad_T, shape (..., 3, 3), with ``T exp(xi) = exp(Ad_T xi) T``."""
     pose = np.asarray(pose, dtype=np.float64)
+    if pose.ndim == 1:
+        return _adjoint_one(pose.tolist())
     cos, sin = np.cos(pose[..., 2]), np.sin(pose[..., 2])
     ad = np.zeros((*pose.shape[:-1], 3, 3))
     ad[..., 0, 0], ad[..., 0, 1], ad[..., 0, 2] = cos, -sin, pose[..., 1]
     ad[..., 1, 0], ad[..., 1, 1], ad[..., 1, 2] = sin, cos, -pose[..., 0]
     ad[..., 2, 2] = 1.0
     return ad
+
+
+def _adjoint_one(pose: list[float]) -> NDArray[np.float64]:
+    cos, sin = math.cos(pose[2]), math.sin(pose[2])
+    return np.array(((cos, -sin, pose[1]), (sin, cos, -pose[0]), (0.0, 0.0, 1.0)))
 
 
 def right_jacobian_inverse(xi: ArrayLike) -> NDArray[np.float64]:

@@ -33,17 +33,22 @@ class LockStep:
 
     processes: Mapping[str, Process]
     seconds: dict[str, float] = field(default_factory=dict)
+    _hearers: dict[type, list[tuple[str, Process]]] = field(default_factory=dict)
 
     def feed(self, message: Message) -> None:
         """Deliver a message and everything that is said because of it."""
         pending: deque[Message] = deque([message])
         while pending:
             current = pending.popleft()
-            for name, process in self.processes.items():
-                if isinstance(current, HEARD_BY[name]):
-                    begin = time.perf_counter()
-                    pending.extend(process.handle(current))
-                    self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - begin
+            for name, process in self._hearers_of(type(current)):
+                begin = time.perf_counter()
+                pending.extend(process.handle(current))
+                self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - begin
+
+    def _hearers_of(self, kind: type) -> list[tuple[str, Process]]:
+        if kind not in self._hearers:
+            self._hearers[kind] = [entry for entry in self.processes.items() if issubclass(kind, HEARD_BY[entry[0]])]
+        return self._hearers[kind]
 
     def take_seconds(self) -> dict[str, float]:
         """Seconds that each process spent since the last call."""

@@ -8,11 +8,13 @@ SLAM takes up the scans that waited.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.sensing import Odometry, Scan
 
@@ -233,16 +235,34 @@ class RealTimePose:
 
     :ivar stamp: of the odometry reading, ns.
     :ivar area: area gamma of the pose.
-    :ivar local: belief over ``area_T_base``, p(s_t+k | s_t, u), the HMT pose by dead reckoning from the last estimate.
-    :ivar map_pose: belief over ``map_T_base``.
-    :ivar map_T_odom: shape (3,), takes the odometry's pose to the map.
+    :ivar area_pose: belief over ``map_T_area``.
+    :ivar estimate: belief over ``area_T_base`` at the last estimate.
+    :ivar since: belief over the motion of the base since then, from the odometry.
+    :ivar odometry: the reading, ``odom_T_base``, shape (3,).
     """
 
     stamp: int
     area: int
-    local: PoseGaussian
-    map_pose: PoseGaussian
-    map_T_odom: Pose  # noqa: N815  named as every transform is
+    area_pose: PoseGaussian
+    estimate: PoseGaussian
+    since: PoseGaussian
+    odometry: Pose
+
+    # In an offline run nobody asks for the poses, and they take longer than all else that rtl does.
+    @cached_property
+    def local(self) -> PoseGaussian:
+        """Belief over ``area_T_base``, p(s_t+k | s_t, u), the HMT pose by dead reckoning from the last estimate."""
+        return self.estimate.compose(self.since)
+
+    @cached_property
+    def map_pose(self) -> PoseGaussian:
+        """Belief over ``map_T_base``."""
+        return self.area_pose.compose(self.local)
+
+    @property
+    def map_T_odom(self) -> Pose:  # noqa: N802  named as every transform is
+        """What takes the odometry's pose to the map, shape (3,)."""
+        return se2.compose(self.map_pose.mean, se2.inverse(self.odometry))
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,7 +19,7 @@ from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.processes.messages import Accepted, LocalEstimate, Message, Notice, RealTimePose
 from hmt_slam_ros.processes.replica import FIRST_AREA
 from hmt_slam_ros.sensing import Odometry
-from hmt_slam_ros.sensing.motion import increment_covariance
+from hmt_slam_ros.sensing.motion import path_covariance
 
 # Beyond the bounds of speed: two readings of one moment may differ by this much without a reset.
 _SLACK_DISTANCE = 0.5  # m
@@ -43,9 +43,9 @@ class _Reading(NamedTuple):
     distance: float
     angle: float
 
-    def at(self, raw: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The pose without resets of a measured pose near this reading, shape (3,)."""
-        return se2.compose(self.smooth, se2.between(self.raw, raw))
+    def moved_to(self, raw: NDArray[np.float64]) -> _Reading:
+        """This reading with another measured pose nearby, shape (3,)."""
+        return self._replace(raw=raw, smooth=se2.compose(self.smooth, se2.between(self.raw, raw)))
 
 
 class Rtl:
@@ -57,6 +57,7 @@ class Rtl:
         self._readings: deque[_Reading] = deque(maxlen=_READINGS_KEPT)
         self._newest: LocalEstimate | None = None
         self._estimate: LocalEstimate | None = None
+        self._start: _Reading | None = None
         # The map's frame is the first area's: known before TLCA has spoken.
         self._areas = {FIRST_AREA: PoseGaussian(np.zeros(3), np.zeros((3, 3)))}
 
@@ -112,27 +113,23 @@ class Rtl:
         """
         if self._newest is None or self._newest.area not in self._areas:
             return
-        self._estimate = self._newest
+        self._estimate, self._start = self._newest, None
         while len(self._readings) > 1 and self._readings[1].stamp <= self._estimate.stamp:
             self._readings.popleft()
 
     def _predict(self) -> list[Message]:
-        """The estimate carried on by the odometry since its scan, in the area and in the map."""
-        if self._estimate is None:
+        """The estimate carried on by the odometry since its scan."""
+        estimate = self._estimate
+        if estimate is None:
             return []
-        start, now = self._readings[0], self._readings[-1]
+        if self._start is None:
+            self._start = self._readings[0].moved_to(estimate.odometry)
+        start, now = self._start, self._readings[-1]
         since = PoseGaussian(
-            se2.between(start.at(self._estimate.odometry), now.smooth),
-            self._spread(now.distance - start.distance, now.angle - start.angle),
+            se2.between(start.smooth, now.smooth),
+            path_covariance(now.distance - start.distance, min(now.angle - start.angle, math.pi), self._motion),
         )
-        local = self._estimate.pose.compose(since)
-        map_pose = self._areas[self._estimate.area].compose(local)
-        map_T_odom = se2.compose(map_pose.mean, se2.inverse(now.raw))
-        return [RealTimePose(now.stamp, self._estimate.area, local, map_pose, map_T_odom)]
-
-    def _spread(self, distance: float, angle: float) -> NDArray[np.float64]:
-        """Covariance (3, 3) of a piece of the path, of which the motion model sees the length and the turns."""
-        return increment_covariance(np.array([distance, 0.0, min(angle, math.pi)]), self._motion)
+        return [RealTimePose(now.stamp, estimate.area, self._areas[estimate.area], estimate.pose, since, now.raw)]
 
 
 def _reset_notice(stamp: int, distance: float, angle: float) -> Notice:

@@ -225,4 +225,4 @@ def path_covariance(distance: float, angle: float, motion: Motion) -> NDArray[np
     )
     rotation = math.radians(motion.rotation_floor + motion.rotation_from_translation * distance)
     rotation += motion.rotation_from_rotation * angle
-    return np.diag([translation**2, translation**2, rotation**2])
+    return np.array(((translation**2, 0.0, 0.0), (0.0, translation**2, 0.0), (0.0, 0.0, rotation**2)))
