@@ -11,10 +11,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import chi2
 
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.geometry.gaussian import gate
 from hmt_slam_ros.local_map import matching
 from hmt_slam_ros.local_map.local_mapping import LocalMapping
 from hmt_slam_ros.local_map.patches import MapView
@@ -28,7 +28,7 @@ _BASIN_DISTANCE, _BASIN_ANGLE = 0.2, math.radians(6.0)
 # Deviations of the prediction to which a search reaches.
 _REACH = 2.5
 # Odometry whose distance from the match is within this share of all is not doubted.
-_GATE = float(chi2.ppf(0.999, 3))
+_GATE = gate(0.999)
 
 
 class Match(NamedTuple):

@@ -14,9 +14,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 from scipy.linalg import eigh
-from scipy.sparse.csgraph import connected_components
 
 # Similarity of neighbours in the order of the nodes, relative to the largest, that joins what is not connected.
 _CHAIN = 1e-6
@@ -81,16 +81,37 @@ def _orders(similarity: NDArray[np.float64]) -> list[NDArray[np.intp]]:
     # x = D^-1/2 y with y an eigenvector of the symmetric I - D^-1/2 A D^-1/2.
     laplacian = np.eye(n) - scale[:, None] * joined * scale
     # Each component beyond the first has an eigenvalue near 0; the next solution bisects a component.
-    last = min(n - 1, int(connected_components(similarity, directed=False)[0]) + 1)
+    last = min(n - 1, _component_count(similarity) + 1)
     vectors = eigh(laplacian, subset_by_index=(0, last))[1]
     return [np.argsort(scale * vector, kind="stable") for vector in vectors.T]
+
+
+@njit(cache=True)
+def _component_count(similarity: NDArray[np.float64]) -> int:
+    """How many parts the graph falls into."""
+    n = len(similarity)
+    seen, waiting = np.zeros(n, np.bool_), np.empty(n, np.int64)
+    components = 0
+    for root in range(n):
+        if seen[root]:
+            continue
+        components += 1
+        seen[root], waiting[0], count = True, root, 1
+        while count:
+            count -= 1
+            node = waiting[count]
+            for other in range(n):
+                if similarity[node, other] > 0.0 and not seen[other]:
+                    seen[other], waiting[count] = True, other
+                    count += 1
+    return components
 
 
 def _sweep(
     similarity: NDArray[np.float64], order: NDArray[np.intp], min_size: int, sizes: NDArray[np.int64]
 ) -> Cut | None:
     """The best of the bipartitions that divide ``order`` in two, or None where each has too small a part."""
-    within = np.diag(np.cumsum(np.cumsum(similarity[np.ix_(order, order)], axis=0), axis=1))[:-1]
+    within = _within_prefixes(similarity, order)[:-1]
     assoc = np.cumsum(similarity.sum(axis=1)[order])
     values = _value(np.maximum(assoc[:-1] - within, 0.0), assoc[:-1], assoc[-1] - assoc[:-1])
     size = np.cumsum(sizes[order])
@@ -102,6 +123,18 @@ def _sweep(
     side[prefix] = True
     side ^= side[0]
     return Cut(side, ncut(similarity, side))
+
+
+@njit(cache=True)
+def _within_prefixes(similarity: NDArray[np.float64], order: NDArray[np.intp]) -> NDArray[np.float64]:
+    """The sums of the similarities within the first 1, 2, ... n nodes of an order, shape (n,)."""
+    to_prefix, within = np.zeros(len(order)), np.zeros(len(order))
+    for k in range(len(order)):
+        for j in range(len(order)):
+            to_prefix[j] += similarity[order[k], order[j]]
+        for j in range(k + 1):
+            within[k] += to_prefix[j]
+    return within
 
 
 def recursive_cut(

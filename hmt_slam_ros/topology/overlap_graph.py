@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable
+from bisect import bisect_left
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -32,15 +33,17 @@ class OverlapGraph:
 
     def with_keyframe(self, keyframe: int, overlaps: NDArray[np.float64]) -> OverlapGraph:
         """The graph with one keyframe more, whose overlaps with ``keyframes``, shape (n,), are known."""
-        at = int(np.searchsorted(self.keyframes, keyframe))
-        row = np.insert(overlaps, at, 0.0)
-        similarity = np.insert(np.insert(self.similarity, at, overlaps, axis=0), at, row, axis=1)
+        at, n = bisect_left(self.keyframes, keyframe), len(self.keyframes)
+        old = np.delete(np.arange(n + 1), at)
+        similarity = np.zeros((n + 1, n + 1))
+        similarity[np.ix_(old, old)] = self.similarity
+        similarity[at, old] = similarity[old, at] = overlaps
         return OverlapGraph((*self.keyframes[:at], keyframe, *self.keyframes[at:]), similarity)
 
-    def between(self, keyframe: int, others: Iterable[int]) -> NDArray[np.float64]:
+    def between(self, keyframe: int, others: Collection[int]) -> NDArray[np.float64]:
         """Overlaps of a keyframe with others, NaN where either is not in this graph."""
         if keyframe not in self.keyframes:
-            return np.array([np.nan for _ in others])
+            return np.full(len(others), np.nan)
         row = dict(zip(self.keyframes, self.similarity[self.keyframes.index(keyframe)], strict=True))
         return np.array([row.get(other, np.nan) for other in others])
 
@@ -110,10 +113,10 @@ _OLD_GROUND = -1
 def _contracted(graph: OverlapGraph, own: Collection[int]) -> tuple[NDArray[np.float64], NDArray[np.int64], list[int]]:
     """Similarities, shape (m, m), and sizes, shape (m,), of the old ground (where there is any) and own keyframes."""
     nodes = [keyframe for keyframe in graph.keyframes if keyframe in own]
-    if len(nodes) < len(graph.keyframes):
+    is_own = np.array([keyframe in own for keyframe in graph.keyframes])
+    if not is_own.all():
         nodes.insert(0, _OLD_GROUND)
-    column = {keyframe: i for i, keyframe in enumerate(nodes)}
-    membership = np.zeros((len(graph.keyframes), len(nodes)))
-    for row, keyframe in enumerate(graph.keyframes):
-        membership[row, column[keyframe] if keyframe in own else 0] = 1.0
+    membership = np.zeros((len(is_own), len(nodes)))
+    membership[~is_own, 0] = 1.0
+    membership[is_own, len(nodes) - np.arange(is_own.sum(), 0, -1)] = 1.0
     return membership.T @ graph.similarity @ membership, membership.sum(axis=0).astype(np.int64), nodes
