@@ -13,6 +13,7 @@ from benchmark.report import Report, Requirement, table
 from benchmark.runs import Case, Run
 from benchmark.scoring import FINAL, ONLINE, POLICY, SeedMeans, errors, over_seeds, score
 from benchmark.settings import Settings
+from benchmark.walls import POLICY as WALLS
 from benchmark.walls import Walls, judge_walls
 from hmt_slam_ros.evaluation import RelationErrors, read_tum
 
@@ -30,12 +31,6 @@ class Bound:
 
 
 BOUNDS = {"aces": Bound(0.043, 0.9), "intel": Bound(0.022, 0.8)}
-
-WALLS = (
-    "Every 10 m of the path are laid over the map of all that lies more than 20 m of path before. The agreement of a "
-    "return is 1 on a wall, 0 at 0.3 m from the nearest one and -1 in free space. A stretch is torn where a shift "
-    "within 1 m and 3 degrees raises its agreement by more than 0.2, or the agreement is below 0.1."
-)
 
 Scores = dict[str, list[RelationErrors]]
 """{file of the trajectory: score of each seed}."""

@@ -8,7 +8,7 @@ import shutil
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
@@ -34,7 +34,7 @@ WITH_RELATIONS = tuple(name for name, (_, relations) in _FILES.items() if relati
 
 @dataclass(frozen=True)
 class MeasuredLog:
-    """A log, and what is known about it.
+    """A log, and what is known about it; two of the same name are equal, wherever they were decompressed to.
 
     :ivar name: one of ``LOGS``.
     :ivar path: of the log, as ``hmt_slam map`` takes it.
@@ -42,8 +42,8 @@ class MeasuredLog:
     """
 
     name: str
-    path: Path
-    relations_file: Path | None = None
+    path: Path = field(compare=False)
+    relations_file: Path | None = field(default=None, compare=False)
 
     @cached_property
     def relations(self) -> Relations | None:

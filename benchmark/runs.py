@@ -7,7 +7,7 @@ import subprocess
 import sys
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -94,7 +94,8 @@ class Runner:
         waiting = [case for case in dict.fromkeys(cases) if case not in self._done]
         with ThreadPoolExecutor(self.jobs) as pool:
             self._done.update(zip(waiting, pool.map(self._run, waiting), strict=True))
-        return [self._done[case] for case in cases]
+        # The log of an earlier measurement may have vanished since.
+        return [replace(self._done[case], case=case) for case in cases]
 
     def runs(self, cases: Sequence[Case]) -> list[Run]:
         """Likewise, where none may fail.

@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
+from pathlib import Path
+from typing import TypeVar
 
-from benchmark.logs import WITH_RELATIONS, MeasuredLog, opened
+import numpy as np
+
+from benchmark.logs import LOGS, MeasuredLog, opened
 from benchmark.report import Report, table
 from benchmark.runs import Case, Run
 from benchmark.scoring import FINAL, ONLINE, POLICY, SeedMeans, over_seeds, score
 from benchmark.settings import Settings
+from benchmark.walls import POLICY as WALLS
+from benchmark.walls import Walls, judge_walls
+from hmt_slam_ros.evaluation import read_tum
 
 SEEDS = 5
 STEPS = {
@@ -20,35 +28,57 @@ STEPS = {
 }
 """{file of an output folder: what it holds}, in the order of the steps."""
 
+Judged = TypeVar("Judged")
+
 
 def measure_steps(settings: Settings) -> Report:
-    """Score every trajectory that an output folder holds."""
+    """Score every trajectory that an output folder holds; where there is no truth, look at the walls."""
     seeds = settings.seeds_or(SEEDS)
     report = Report("steps", "What each step gains", seeds=seeds)
-    with opened(settings.logs_or(WITH_RELATIONS)) as logs:
+    with opened(settings.logs_or(LOGS)) as logs:
         cases = {log: [Case(log, seed, changes=settings.changes) for seed in seeds] for log in logs}
         settings.runner.runs([case for own in cases.values() for case in own])
-        means = {log.name: score_steps(log, settings.runner.runs(own)) for log, own in cases.items()}
-    report.body += [steps_table(means), *missing_steps(means), POLICY]
-    report.data["steps"] = {
-        name: {file: asdict(mean) for file, mean in of_log.items()} for name, of_log in means.items()
+        runs = {log: settings.runner.runs(own) for log, own in cases.items()}
+        scored = {log.name: score_steps(log, own) for log, own in runs.items() if log.relations is not None}
+        judged = {log.name: _judge_steps(log, own) for log, own in runs.items() if log.relations is None}
+    if scored:
+        report.body += [steps_table(scored), POLICY]
+    if judged:
+        report.body += [_walls_table(judged), WALLS]
+    report.body += missing_steps(scored | judged)
+    report.data["steps"] = {name: {file: asdict(mean) for file, mean in own.items()} for name, own in scored.items()}
+    report.data["walls"] = {
+        name: {file: [asdict(walls) for walls in of_seeds] for file, of_seeds in own.items()}
+        for name, own in judged.items()
     }
     return report
 
 
 def score_steps(log: MeasuredLog, runs: list[Run]) -> dict[str, SeedMeans]:
     """{file: means over the seeds}, of the trajectories that every run has."""
+    scores = _of_every_step(runs, lambda folder, file: score(folder, log, file))
+    return {file: over_seeds(of_seeds) for file, of_seeds in scores.items()}
+
+
+def _judge_steps(log: MeasuredLog, runs: list[Run]) -> dict[str, list[Walls]]:
+    return _of_every_step(runs, lambda folder, file: judge_walls(log.scans, read_tum(folder / file).poses))
+
+
+def _of_every_step(runs: list[Run], judge: Callable[[Path, str], Judged]) -> dict[str, list[Judged]]:
     there = [file for file in STEPS if all((run.folder / file).is_file() for run in runs)]
-    return {file: over_seeds([score(run.folder, log, file) for run in runs]) for file in there}
+    return {file: [judge(run.folder, file) for run in runs] for file in there}
 
 
-def missing_steps(means: dict[str, dict[str, SeedMeans]]) -> list[str]:
-    """A sentence that names the trajectories that there are not; none where all are there."""
-    missing = [file for file in STEPS if any(file not in of_log for of_log in means.values())]
+def missing_steps(steps: Mapping[str, Mapping[str, object]]) -> list[str]:
+    """A sentence that names the trajectories that there are not; none where all are there.
+
+    :param steps: {log: {file: anything}}.
+    """
+    missing = [file for file in STEPS if any(file not in of_log for of_log in steps.values())]
     return [f"The output folders hold no {', '.join(missing)}: these steps are not measured."] if missing else []
 
 
-def steps_table(means: dict[str, dict[str, SeedMeans]]) -> str:
+def steps_table(means: Mapping[str, Mapping[str, SeedMeans]]) -> str:
     """One line for every log and step."""
     head = ["log", "step", "translation [m]", "between seeds", "worst seed", "over 60 s [m]", "rotation [deg]"]
     rows = [
@@ -63,5 +93,20 @@ def steps_table(means: dict[str, dict[str, SeedMeans]]) -> str:
         ]
         for name, of_log in means.items()
         for file, mean in of_log.items()
+    ]
+    return table(head, rows)
+
+
+def _walls_table(judged: Mapping[str, Mapping[str, list[Walls]]]) -> str:
+    head = ["log without truth", "step", "agreement of the walls", "torn stretches a seed"]
+    rows = [
+        [
+            name,
+            STEPS[file],
+            f"{np.mean([walls.agreement for walls in of_seeds]):.3f}",
+            f"{np.mean([len(walls.torn) for walls in of_seeds]):.1f}",
+        ]
+        for name, of_log in judged.items()
+        for file, of_seeds in of_log.items()
     ]
     return table(head, rows)
