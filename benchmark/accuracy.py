@@ -15,7 +15,7 @@ from benchmark.scoring import FINAL, ONLINE, POLICY, SeedMeans, errors, over_see
 from benchmark.settings import Settings
 from benchmark.walls import POLICY as WALLS
 from benchmark.walls import Walls, judge_walls
-from hmt_slam_ros.evaluation import RelationErrors, read_tum
+from hmt_slam_ros.evaluation import read_tum
 
 SEEDS = 5
 LONG_FACTOR, WORST_FACTOR = 1.5, 1.25
@@ -31,9 +31,6 @@ class Bound:
 
 
 BOUNDS = {"aces": Bound(0.043, 0.9), "intel": Bound(0.022, 0.8)}
-
-Scores = dict[str, list[RelationErrors]]
-"""{file of the trajectory: score of each seed}."""
 
 
 def measure_accuracy(settings: Settings) -> Report:

@@ -21,7 +21,9 @@ def main(arguments: list[str]) -> int:
     options = parser().parse_args(["map", *rest])
     try:
         configuration = chosen_configuration(options)
-        log = degraded(open_log(options.log), kind, configuration.seed)
+        part = configuration.robot
+        recorded = open_log(options.log, start=part.start, duration=part.duration or None)
+        log = degraded(recorded, kind, configuration.seed)
         with replacing(options.out) as folder:
             final, source_stamps, figures = measured_run(log, configuration)
             write_output(folder, final, source_stamps, figures, configuration)

@@ -45,7 +45,7 @@ def measure_steps(settings: Settings) -> Report:
         report.body += [steps_table(scored), POLICY]
     if judged:
         report.body += [_walls_table(judged), WALLS]
-    report.body += missing_steps(scored | judged)
+    report.body += missing_steps({**scored, **judged})
     report.data["steps"] = {name: {file: asdict(mean) for file, mean in own.items()} for name, own in scored.items()}
     report.data["walls"] = {
         name: {file: [asdict(walls) for walls in of_seeds] for file, of_seeds in own.items()}
