@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
-from hmt_slam_ros.arrays import Float64, Int32
+from hmt_slam_ros.arrays import Float64, Int8, Int32, UInt8, UInt32
 from hmt_slam_ros.local_map import insertion, patches
 from hmt_slam_ros.local_map.distance_field import field_work
 from hmt_slam_ros.local_map.insertion import InverseModel
-from hmt_slam_ros.local_map.patches import FAR, NO_PATCH, PATCH, MapView, Store
+from hmt_slam_ros.local_map.patches import NO_PATCH, PATCH, MapView, Store
 
-_GROWTH = 1024
+# Patches; some 36 MB, of which only what is used is ever touched.
+_FIRST_CAPACITY = 1 << 14
+_PATCH_BYTES = PATCH * PATCH * 2 + PATCH * 4
+
+Array = TypeVar("Array", Int8, UInt8, UInt32, Int32)
 
 
 class Beams(NamedTuple):
@@ -63,8 +67,8 @@ class PatchPool:
 
     @property
     def nbytes(self) -> int:
-        """Bytes held, used or not."""
-        return self.odds.nbytes + self.field.nbytes + self.occupied.nbytes + 2 * self._marks.hit.nbytes
+        """Bytes of the patches in use."""
+        return self.used * _PATCH_BYTES
 
     def empty_table(self) -> Int32:
         """The table of a map in which nothing is known."""
@@ -105,16 +109,18 @@ class PatchPool:
         missing = count - int(self._free_count[0])
         if missing <= 0:
             return
-        old = self.references.size
-        grown = max(_GROWTH, missing, old // 4)
-        self.odds = np.concatenate((self.odds, np.zeros((grown, PATCH, PATCH), dtype=np.int8)))
-        self.field = np.concatenate((self.field, np.full((grown, PATCH, PATCH), FAR, dtype=np.uint8)))
-        self.occupied = np.concatenate((self.occupied, np.zeros((grown, PATCH), dtype=np.uint32)))
-        self.references = np.concatenate((self.references, np.zeros(grown, dtype=np.int32)))
-        free = np.empty(old + grown, dtype=np.int32)
-        kept = int(self._free_count[0])
+        old, kept = self.references.size, int(self._free_count[0])
+        capacity = max(_FIRST_CAPACITY, 2 * old, old + missing)
+        self.odds, self.field = _enlarged(self.odds, capacity), _enlarged(self.field, capacity)
+        self.occupied, self.references = _enlarged(self.occupied, capacity), _enlarged(self.references, capacity)
         # Free patches are taken from the end: the lowest index first.
-        free[:grown] = np.arange(old + grown - 1, old - 1, -1)
-        free[grown : grown + kept] = self._free[:kept]
-        self._free = free
-        self._free_count[0] = grown + kept
+        self._free = np.concatenate((np.arange(capacity - 1, old - 1, -1, dtype=np.int32), self._free[:kept]))
+        self._free = _enlarged(self._free, capacity)
+        self._free_count[0] = capacity - old + kept
+
+
+def _enlarged(array: Array, size: int) -> Array:
+    """The array with zeros behind it; zeros that nobody writes to take no memory."""
+    enlarged = np.zeros((size, *array.shape[1:]), dtype=array.dtype)
+    enlarged[: len(array)] = array
+    return enlarged

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.evaluation import StampedPoses, write_tum
-from hmt_slam_ros.offline import plots
 from hmt_slam_ros.offline.final_map import FinalMap
 from hmt_slam_ros.offline.map_image import occupancy_image, write_map
 from hmt_slam_ros.offline.recorder import Recording, keyframe_poses
@@ -111,7 +110,10 @@ def write_output(
     write_probabilities(directory / "pmf.csv", recording.probabilities)
     write_cost(directory / "cost.csv", figures.seconds_per_scan)
     write_json(directory / "report.json", report(recording, configuration, figures))
-    plots.plot_map(directory)
+    # matplotlib is loaded when the processes have given their memory back, and only where something is drawn.
+    from hmt_slam_ros.offline.plots import plot_map  # noqa: PLC0415
+
+    plot_map(directory)
 
 
 def _write_map(directory: Path, recording: Recording, configuration: Configuration) -> None:

@@ -118,7 +118,8 @@ class LiveHypothesis:
         self.anchor = self.filter.keyframes[int(np.argmin(cost))]
 
     def _revised(self, newest: int) -> tuple[Relabelled, ...]:
-        poses = self.filter.leading_keyframe_poses()
+        # The messages must not hold on to the poses under all particles.
+        poses = self.filter.leading_keyframe_poses().copy()
         return tuple(
             Relabelled(keyframe, self.filter.area, self.filter.area, poses[self.filter.keyframes.index(keyframe)])
             for keyframe in self.fresh

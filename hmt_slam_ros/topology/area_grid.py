@@ -94,7 +94,7 @@ def build_area_grid(scans: Sequence[Scan], poses: NDArray[np.float64], model: Gr
     distance2 = np.full((2 * rows, 2 * columns), np.inf)
     surfaces = np.concatenate([_joined(points, 0.5 * model.cell) for points in hits])
     _lower_distances(distance2, origin, 0.5 * model.cell, surfaces, reach)
-    fine = _log_ratio(distance2, free.repeat(2, axis=0).repeat(2, axis=1), model)
+    fine = _log_ratio(distance2, free, model.sigma, model.surface_ratio, model.free_ratio)
     coarse = fine.reshape(rows, 2, columns, 2).mean(axis=(1, 3))
     return AreaGrid(origin, model.cell, coarse, fine, free, thinned(np.concatenate(hits), model.spacing))
 
@@ -137,17 +137,26 @@ def _joined(points: Points, step: float) -> Points:
     return np.concatenate((between, points[-1:]))
 
 
-def _log_ratio(distance2: NDArray[np.float64], free: NDArray[np.bool_], model: GridModel) -> NDArray[np.float32]:
-    """Blend from the surface to what lies beside it.
+@njit(cache=True)
+def _log_ratio(
+    distance2: NDArray[np.float64], free: NDArray[np.bool_], sigma: float, surface_ratio: float, free_ratio: float
+) -> NDArray[np.float32]:
+    """Blend from the surface to what lies beside it, for cells half as long as those of ``free``.
 
     Free space counts in full only from two or three sigma on: beams that graze a wall see free space right up to it,
     and unlike flanks would draw a match away from the wall.
     """
-    spread = -0.5 * distance2 / model.sigma**2
-    away = np.where(free, 1.0 + (model.free_ratio - 1.0) * (1.0 - np.exp(0.25 * spread)), 1.0)
-    near = np.exp(spread)
-    near[near < 1e-3] = 0.0
-    return np.log(away + (model.surface_ratio - away) * near).astype(np.float32)
+    ratio = np.zeros_like(distance2, np.float32)
+    for r in range(ratio.shape[0]):
+        for c in range(ratio.shape[1]):
+            spread = -0.5 * distance2[r, c] / sigma**2
+            if spread == -np.inf:
+                ratio[r, c] = np.log(free_ratio) if free[r // 2, c // 2] else 0.0
+                continue
+            away = 1.0 + (free_ratio - 1.0) * (1.0 - np.exp(0.25 * spread)) if free[r // 2, c // 2] else 1.0
+            near = np.exp(spread)
+            ratio[r, c] = np.log(away + (surface_ratio - away) * (near if near >= 1e-3 else 0.0))
+    return ratio
 
 
 @njit(cache=True)
