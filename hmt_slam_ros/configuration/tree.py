@@ -201,7 +201,12 @@ class TopologicalInference:
         1.5, "Factor on the deviations of the arc prior, as drift is estimated from few particles.", low=0.1, high=10.0
     )
     prior_limit: float = parameter(
-        10.0, "Known areas whose position is less certain than this are not looked at.", unit="m", low=0.1, high=1000.0
+        100.0,
+        "Known areas whose position is less certain than this are not looked at. After a long way round the right one "
+        "is among the uncertain ones, and without it a wrong one would win.",
+        unit="m",
+        low=0.1,
+        high=1000.0,
     )
     new_probability: float = parameter(
         0.05, "Probability of new ground at least, where the arcs point into known areas.", low=0.0, high=1.0
