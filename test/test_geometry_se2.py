@@ -218,3 +218,13 @@ def test_every_function_broadcasts_over_leading_dimensions():
 def test_one_pose_by_itself_is_moved_as_it_is_among_many(a, b):
     assert_same_pose(se2.compose(a, b), se2.compose(a[None], b[None])[0])
     assert_same_pose(se2.inverse(a), se2.inverse(a[None])[0])
+
+
+def test_the_best_fit_is_the_motion_between_equal_constellations_and_minds_noise_little():
+    rng = np.random.default_rng(4)
+    motion = np.array([3.0, -2.0, 2.9])
+    a = np.column_stack((rng.uniform(-5.0, 5.0, (20, 2)), rng.uniform(-np.pi, np.pi, 20)))
+    np.testing.assert_allclose(se2.best_fit(a, se2.compose(motion, a)), motion, atol=1e-12)
+    np.testing.assert_allclose(se2.best_fit(a[:1], se2.compose(motion, a[:1])), motion, atol=1e-12)
+    noisy = se2.compose(se2.compose(motion, a), se2.exp(0.05 * rng.standard_normal((20, 3))))
+    assert np.abs(se2.between(motion, se2.best_fit(a, noisy))).max() < 0.05

@@ -142,6 +142,19 @@ def right_jacobian_inverse(xi: ArrayLike) -> NDArray[np.float64]:
     return np.eye(3) + 0.5 * ad + quadratic[..., None, None] * (ad @ ad)
 
 
+def best_fit(a: ArrayLike, b: ArrayLike) -> Pose:
+    """The motion T, shape (3,), by which ``compose(T, a)`` comes nearest to ``b``, both (n, 3) with n >= 1.
+
+    Least squares over the positions, with a radian of heading counted as a metre.
+    """
+    a, b = np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64)
+    (ax, ay), (bx, by) = (a[:, :2] - a[:, :2].mean(axis=0)).T, (b[:, :2] - b[:, :2].mean(axis=0)).T
+    turned = b[:, 2] - a[:, 2]
+    angle = np.arctan2((ax * by - ay * bx + np.sin(turned)).sum(), (ax * bx + ay * by + np.cos(turned)).sum())
+    rotated = transform(np.array([0.0, 0.0, angle]), a[:, :2].mean(axis=0))
+    return np.array([*(b[:, :2].mean(axis=0) - rotated), float(wrap(angle))])
+
+
 def interpolate(start: ArrayLike, end: ArrayLike, fraction: ArrayLike) -> Pose:
     """The pose at ``fraction`` of the way from ``start`` to ``end`` along a constant twist."""
     return compose(start, exp(np.asarray(fraction)[..., None] * log(between(start, end))))
