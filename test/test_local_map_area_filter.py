@@ -10,6 +10,7 @@ from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.local_map.area_filter import AreaFilter, PlacedKeyframe
 from hmt_slam_ros.local_map.local_mapping import LocalMapping
+from hmt_slam_ros.local_map.matching import matched_fraction
 from hmt_slam_ros.sensing.motion import Prediction, Step
 
 ROOM = np.concatenate((box(-6.02, -4.03, 6.03, 7.01), box(3.51, 1.02, 4.53, 2.52), box(-4.02, 3.03, -3.52, 7.01)))
@@ -152,12 +153,21 @@ def test_beams_beyond_the_range_tell_free_space_up_to_it():
     assert len(points) + len(free) == 181
 
 
-def test_a_keyframe_moved_under_the_leader_moves_alike_under_all_particles():
+def test_when_keyframes_move_the_map_is_built_anew_and_the_robot_stays_where_it_is_from_its_anchor():
     area_filter, _ = driven(LocalMapping(Configuration()), steps=30)
-    before = area_filter.keyframe_poses[:, 2].copy()
-    target = before[area_filter.leader] + np.array([0.03, -0.02, 0.01])
-    area_filter.move_keyframe(2, target)
-    area_filter.move_keyframe(12345, target)
-    np.testing.assert_allclose(area_filter.keyframe_poses[area_filter.leader, 2], target, atol=1e-12)
-    shifts = se2.between(before, area_filter.keyframe_poses[:, 2])
-    np.testing.assert_allclose(shifts, np.broadcast_to(shifts[0], shifts.shape), atol=1e-12)
+    scans = {0: scan_in(ROOM, np.zeros(3))}
+    truth = np.zeros(3)
+    for k in range(1, 30):
+        truth = se2.compose(truth, STEP)
+        if k % 5 == 0:
+            scans[k // 5] = scan_in(ROOM, truth, noise=0.01, seed=k)
+    anchor = area_filter.keyframes.index(2)
+    seen = se2.between(area_filter.keyframe_poses[:, anchor], area_filter.poses)
+    shift = np.array([0.3, -0.2, 0.1])
+    poses = se2.compose(shift, area_filter.leading_keyframe_poses())
+    content = [PlacedKeyframe(k, 0, scans[k], pose) for k, pose in zip(area_filter.keyframes, poses, strict=True)]
+    area_filter.reload(content, 2)
+    np.testing.assert_allclose(area_filter.leading_keyframe_poses(), poses)
+    np.testing.assert_allclose(se2.between(poses[anchor], area_filter.poses), seen, atol=1e-9)
+    points = area_filter.mapping.matching_points(scans[2])
+    assert matched_fraction(points, poses[anchor], area_filter._leading_view(), area_filter.mapping.near) > 0.9

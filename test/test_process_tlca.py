@@ -34,9 +34,10 @@ def belief(pose, spread=SPREAD):
 class Play:
     """TLCA with slam and TSBI played: keyframes are stored where the leaves say, one after another."""
 
-    def __init__(self, **changes):
+    def __init__(self, refinement=0, **changes):
         options = {"accept_keyframes": 3, "accept_distance": 1.0, "accept_probability": 0.9} | changes
-        self.process = Tlca(with_changes(Configuration(), {f"tlca.{name}": value for name, value in options.items()}))
+        named = {f"tlca.{name}": value for name, value in options.items()}
+        self.process = Tlca(with_changes(Configuration(), named | {"refinement.iterations": refinement}))
         self.k = -1
         self.notices = []
 
@@ -262,9 +263,9 @@ ROOM_A = worlds.drive((1.0, 2.0), (4.5, 3.0), (4.0, 5.0))
 ROOM_B = worlds.drive((7.0, 3.0), (10.0, 4.0))
 
 
-def closing_play(error, spread=SPREAD):
+def closing_play(error, spread=SPREAD, refinement=0):
     """Drive room A (area 0) and room B (area 1), come back into A and close the loop with an error in its frame."""
-    play = Play()
+    play = Play(refinement)
     for pose in ROOM_A:
         play.step(places=[(0, 0, se2.between(ROOM_A[0], pose))], world=pose)
     a_T_b = se2.between(ROOM_A[0], ROOM_B[0])
@@ -302,6 +303,17 @@ def test_keyframes_that_closed_a_loop_are_finely_aligned_with_the_area_and_the_a
     assert np.hypot(*off[:2]) < 0.04
     assert abs(np.degrees(off[2])) < 0.3
     assert play.notices == []
+
+
+def test_after_an_acceptance_the_keyframes_of_both_areas_are_refined_jointly_and_their_arc_with_them():
+    play, verdict, first, truth, a_T_b = closing_play(np.array([0.1, -0.08, 0.02]), refinement=4)
+    placed = play.process._replica.maps[0]
+    assert {r.keyframe for r in verdict.relabelled} == {*placed.keyframes(0), *placed.keyframes(1)}
+    assert all(r.source == r.area for r in verdict.relabelled)
+    for i, true in enumerate(truth):
+        assert np.hypot(*(placed.keyframes(0)[first + i][:2] - true[:2])) < 0.02
+    off = se2.between(a_T_b, play.arc(0, 1).mean)
+    assert np.hypot(*off[:2]) < 0.03
 
 
 def test_an_arc_found_between_areas_that_keep_their_keyframes_is_finely_aligned():

@@ -192,17 +192,6 @@ class AreaFilter:
         self.keyframe_areas.append(self.area)
         self.keyframe_poses = np.concatenate((self.keyframe_poses, self.poses[:, None]), axis=1)
 
-    def move_keyframe(self, keyframe: int, pose: Float64) -> None:
-        """Give a keyframe the pose ``map_T_base`` (3,) under the leader, and shift it alike under the others.
-
-        The grid keeps the scan where it is until the local map is built anew.
-        """
-        if keyframe not in self.keyframes:
-            return
-        row = self.keyframes.index(keyframe)
-        shift = se2.between(self.keyframe_poses[self.leader, row], pose)
-        self.keyframe_poses[:, row] = se2.compose(self.keyframe_poses[:, row], shift)
-
     def change_area(self, area: int, area_T_previous: Float64, content: Sequence[PlacedKeyframe]) -> None:
         """Go over to the frame of another area and load its local map, the same for all particles.
 
@@ -213,6 +202,21 @@ class AreaFilter:
         self.area = area
         self.poses = se2.compose(area_T_previous, self.poses)
         self._priors = se2.compose(area_T_previous, self._priors)
+        self._load(content)
+
+    def reload(self, content: Sequence[PlacedKeyframe], anchor: int) -> None:
+        """Build the local map anew after its keyframes moved; all particles stay where they are from one of them.
+
+        :param content: all keyframes of the local map.
+        :param anchor: the keyframe by which the robot's place is known.
+        """
+        before = self.keyframe_poses[:, self.keyframes.index(anchor)]
+        seen, expected = se2.between(before, self.poses), se2.between(before, self._priors)
+        self._load(content)
+        after = self.keyframe_poses[:, self.keyframes.index(anchor)]
+        self.poses, self._priors = se2.compose(after, seen), se2.compose(after, expected)
+
+    def _load(self, content: Sequence[PlacedKeyframe]) -> None:
         self.release()
         table = self.mapping.pool.empty_table()
         for placed in content:

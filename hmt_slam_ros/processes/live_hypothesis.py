@@ -175,8 +175,11 @@ class LiveHypothesis:
             drift = ad @ drift @ ad.T + self.fresh[keyframe]
         return drift
 
-    def refine(self, refined: Sequence[Relabelled]) -> None:
-        """Take over keyframe poses of the robot's area that TLCA refined."""
-        for keyframe in refined:
-            if keyframe.area == self.filter.area:
-                self.filter.move_keyframe(keyframe.keyframe, keyframe.pose)
+    def reload(self, content: Sequence[PlacedKeyframe]) -> None:
+        """Build the local map anew after TLCA refined its keyframes; the robot stays where it is from its anchor.
+
+        :param content: all keyframes of the local map, in the frame of the robot's area.
+        """
+        before = self.filter.pose
+        self.filter.reload(content, self.anchor)
+        self.event_pose = se2.compose(self.filter.pose, se2.between(before, self.event_pose))

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +24,6 @@ from hmt_slam_ros.processes.messages import (
     Finished,
     Hypotheses,
     Keyframe,
-    Leaf,
     LocalEstimate,
     Message,
     Notice,
@@ -33,6 +33,7 @@ from hmt_slam_ros.processes.replica import FIRST_AREA, FIRST_HYPOTHESIS, Replica
 from hmt_slam_ros.sensing import Odometry, Scan
 from hmt_slam_ros.sensing.deskew import SweepCheck, deskewed
 from hmt_slam_ros.sensing.motion import MotionModel, Prediction
+from hmt_slam_ros.topology.shortest_path import reachable
 
 
 class MetricSlam:
@@ -198,7 +199,8 @@ class MetricSlam:
             parent = self._live[leaf.parent]
             live = parent if leaf.hypothesis == leaf.parent else parent.branch(leaf.hypothesis)
             if leaf.local:
-                live.change_area(leaf, self._content(leaf))
+                areas = {local.area: local.pose for local in leaf.local}
+                live.change_area(leaf, self._content(leaf.hypothesis, areas))
             children[leaf.hypothesis] = live
         self._replace_live(children)
 
@@ -207,7 +209,8 @@ class MetricSlam:
         if accepted.hypothesis is not None:
             live = self._live[accepted.hypothesis]
             self._replace_live({accepted.hypothesis: live})
-            live.refine(accepted.relabelled)
+            if accepted.relabelled:
+                live.reload(self._surroundings(live))
         self._waiting = False
 
     def _replace_live(self, live: dict[int, LiveHypothesis]) -> None:
@@ -216,14 +219,23 @@ class MetricSlam:
                 old.filter.release()
         self._live = live
 
-    def _content(self, leaf: Leaf) -> list[PlacedKeyframe]:
-        """The keyframes of the areas that the local map has to hold, in the frame of the robot's area."""
-        hybrid_map = self._replica.maps[leaf.hypothesis]
+    def _content(self, hypothesis: int, areas: Mapping[int, NDArray[np.float64]]) -> list[PlacedKeyframe]:
+        """The keyframes of the areas that the local map has to hold, in the frame of the robot's area.
+
+        :param areas: {area: ``robot_area_T_area``, shape (3,)}.
+        """
+        hybrid_map = self._replica.maps[hypothesis]
         return [
-            PlacedKeyframe(keyframe, local.area, self._replica.scans[keyframe], se2.compose(local.pose, pose))
-            for local in leaf.local
-            for keyframe, pose in hybrid_map.keyframes(local.area).items()
+            PlacedKeyframe(keyframe, area, self._replica.scans[keyframe], se2.compose(frame, pose))
+            for area, frame in areas.items()
+            for keyframe, pose in hybrid_map.keyframes(area).items()
         ]
+
+    def _surroundings(self, live: LiveHypothesis) -> list[PlacedKeyframe]:
+        """The local map's areas as they are now known."""
+        held = dict.fromkeys(live.filter.keyframe_areas)
+        reached = reachable(self._replica.maps[live.filter.hypothesis], live.filter.area)
+        return self._content(live.filter.hypothesis, {area: reached[area].mean for area in held if area in reached})
 
     def _finish(self) -> list[Message]:
         self._ended = False

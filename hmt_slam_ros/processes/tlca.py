@@ -23,6 +23,7 @@ from hmt_slam_ros.processes.messages import (
     Relabelled,
 )
 from hmt_slam_ros.processes.replica import FIRST_HYPOTHESIS, Replica
+from hmt_slam_ros.refinement.closure import ClosureRefinement
 from hmt_slam_ros.topology.arc_fusion import floored, fused
 from hmt_slam_ros.topology.fine_alignment import FineAlignment
 from hmt_slam_ros.topology.global_map import consistent_map, shortest_path_map
@@ -89,6 +90,7 @@ class Tlca:
     def __init__(self, configuration: Configuration) -> None:
         self._options = configuration.tlca
         self._alignment = FineAlignment(configuration)
+        self._refinement = ClosureRefinement(configuration)
         self._replica = Replica()
         self._paths = {FIRST_HYPOTHESIS: _Path()}
         self._travelled = 0.0
@@ -167,11 +169,32 @@ class Tlca:
             old = arcs.get(seen.pair, seen.before)
             arcs[seen.pair] = self._fused(aligned, old, witnesses.get(seen.pair, frozenset()))
             witnesses[seen.pair] = witnesses.get(seen.pair, frozenset()) | seen.witnesses
+        closed = {area for seen in path.observations if seen.closure for area in seen.pair}
+        if closed:
+            relabelled = self._refined_around(hybrid_map, closed, arcs, relabelled)
         if arcs:
             self._changes += 1
         version = self._changes if arcs else path.version
         self._paths[hypothesis] = replace(path, version=version, definite=True, observations=(), witnesses=witnesses)
         return tuple(arcs.values()), tuple(relabelled)
+
+    def _refined_around(
+        self, hybrid_map: HybridMap, closed: set[int], arcs: dict[Pair, Arc], relabelled: list[Relabelled]
+    ) -> list[Relabelled]:
+        """Refine the areas that closures joined; the arcs around them follow, with the covariances they have."""
+        for arc in arcs.values():
+            hybrid_map.set_arc(arc.source, arc.target, arc.pose, closure=arc.closure)
+        found = self._refinement.refined(hybrid_map, self._replica.scans, closed)
+        for (a, b), pose in found.arcs.items():
+            value = hybrid_map.arc_value(a, b)
+            assert value is not None
+            arcs[a, b] = Arc(a, b, PoseGaussian(pose, value.pose.covariance), value.closure)
+        moved = {
+            keyframe: Relabelled(keyframe, area, area, pose)
+            for area, keyframes in found.keyframes.items()
+            for keyframe, pose in keyframes.items()
+        }
+        return list(({r.keyframe: r for r in relabelled} | moved).values())
 
     def _aligned(self, hybrid_map: HybridMap, seen: _Observation) -> tuple[_Observation, list[Relabelled]]:
         """A closure that was found by matching areas, finely aligned."""

@@ -1,0 +1,99 @@
+"""Joint refinement of the areas that a closure joined."""
+
+import numpy as np
+import pytest
+import worlds
+
+from hmt_slam_ros.configuration import Configuration, with_changes
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.refinement.closure import ClosureRefinement
+from hmt_slam_ros.topology.hybrid_map import HybridMap
+
+ROOMS = worlds.two_rooms()
+# The first room twice, and between the visits the second one, which lies beside the closure.
+VISITS = {
+    0: worlds.drive((1.0, 2.0), (4.5, 3.0), (4.0, 5.0)),
+    1: worlds.drive((6.5, 3.0), (9.0, 3.0), (9.0, 4.5)),
+    2: worlds.drive((4.5, 2.0), (2.0, 2.5), (2.0, 4.0)),
+}
+ERROR = np.array([0.12, -0.08, 0.03])
+CLOSURE = np.diag([0.2**2, 0.2**2, 0.05**2])
+TRAVELLED = np.diag([0.03**2, 0.03**2, 0.01**2])
+
+
+def visited(bend=0.0):
+    """Areas in frames at their first keyframes; the closing arc is off by ERROR, area 2 is bent, rad a keyframe."""
+    hybrid_map, scans, truth, k = HybridMap(), {}, {}, 0
+    for area, poses in VISITS.items():
+        for i, pose in enumerate(poses):
+            turned = se2.compose([0.0, 0.0, bend * i * (area == 2)], se2.between(poses[0], pose))
+            hybrid_map.place(k, area, turned)
+            scans[k], truth[k] = worlds.scan_in(ROOMS, pose, noise=0.01, seed=k), pose
+            k += 1
+    first = {area: poses[0] for area, poses in VISITS.items()}
+    hybrid_map.set_arc(0, 1, PoseGaussian(se2.between(first[0], first[1]), TRAVELLED), closure=False)
+    off = se2.compose(se2.between(first[0], first[2]), se2.exp(ERROR))
+    hybrid_map.set_arc(0, 2, PoseGaussian(off, CLOSURE), closure=True)
+    return hybrid_map, scans, truth
+
+
+def refined(hybrid_map, scans, closed=(0, 2), **changes):
+    return ClosureRefinement(with_changes(Configuration(), changes)).refined(hybrid_map, scans, set(closed))
+
+
+@pytest.mark.parametrize("bend", [0.0, 0.004])
+def test_the_closing_arc_and_the_keyframes_of_both_areas_come_to_where_their_scans_agree(bend):
+    hybrid_map, scans, truth = visited(bend)
+    found = refined(hybrid_map, scans)
+    assert found.keyframes.keys() == {0, 2}
+    arc = found.arcs[0, 2]
+    for k, pose in found.keyframes[2].items():
+        error = se2.between(truth[k], se2.compose(VISITS[0][0], se2.compose(arc, pose)))
+        assert np.hypot(*error[:2]) < 0.03
+        assert np.degrees(abs(error[2])) < 0.5
+
+
+def test_the_frame_of_an_area_stays_where_its_keyframes_move_least():
+    hybrid_map, scans, _ = visited(bend=0.004)
+    found = refined(hybrid_map, scans)
+    for area, keyframes in found.keyframes.items():
+        before, after = np.array(list(hybrid_map.keyframes(area).values())), np.array(list(keyframes.values()))
+        np.testing.assert_allclose((after - before)[:, :2].mean(axis=0), 0.0, atol=1e-9)
+        np.testing.assert_allclose(se2.best_fit(before, after), 0.0, atol=1e-9)
+
+
+def test_an_area_beside_the_closure_moves_as_a_whole_if_at_all():
+    hybrid_map, scans, _ = visited()
+    found = refined(hybrid_map, scans)
+    assert 1 not in found.keyframes
+    moved = se2.between(hybrid_map.arc(0, 1).mean, found.arcs[0, 1])
+    assert np.hypot(*moved[:2]) < 0.03
+
+
+def test_closures_far_from_each_other_are_refined_each_for_itself():
+    hybrid_map, scans, _ = visited()
+    far, first = HybridMap(), len(scans)
+    for area in hybrid_map.area_ids():
+        for k, pose in hybrid_map.keyframes(area).items():
+            far.place(k, area, pose)
+            far.place(first + k, 10 + area, pose)
+            scans[first + k] = scans[k]
+    for a, b, arc in hybrid_map.all_arcs():
+        far.set_arc(a, b, arc.pose, closure=arc.closure)
+        far.set_arc(10 + a, 10 + b, arc.pose, closure=arc.closure)
+    # The way from one to the other leads through areas that lie beside neither.
+    far.place(2 * first, 5, np.zeros(3))
+    far.place(2 * first + 1, 6, np.zeros(3))
+    for a, b in ((1, 5), (5, 6), (6, 11)):
+        far.set_arc(a, b, PoseGaussian(np.array([30.0, 0.0, 0.0]), TRAVELLED), closure=False)
+    alone, both = refined(hybrid_map, scans), refined(far, scans, (0, 2, 10, 12))
+    assert both.keyframes.keys() == {0, 2, 10, 12}
+    for pair in ((0, 2), (10, 12)):
+        np.testing.assert_allclose(both.arcs[pair], alone.arcs[0, 2], atol=1e-6)
+
+
+def test_without_iterations_nothing_changes():
+    hybrid_map, scans, _ = visited()
+    found = refined(hybrid_map, scans, **{"refinement.iterations": 0})
+    assert found.keyframes == found.arcs == {}
