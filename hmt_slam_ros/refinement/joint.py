@@ -16,6 +16,8 @@ from hmt_slam_ros.refinement.registration import normal_equations, weighting
 from hmt_slam_ros.refinement.surfaces import Surfaces
 from hmt_slam_ros.topology.pose_graph import Edges, optimise
 
+# The graph changes with the next linearisation: it need not be solved to the last digit.
+_TOLERANCE = 1e-3
 # Keeps the information of a pair regular: 3 m and 3 rad.
 _VAGUE = 0.1 * np.eye(3)
 
@@ -40,7 +42,7 @@ def refine_jointly(
     gates = np.geomspace(options.first_gate, options.last_gate, options.iterations)
     for gate in gates.tolist():
         edges = _with(motion, _registered(surfaces, poses, pairs, gate, options))
-        poses = optimise(poses, edges, fixed, marginals=False).poses
+        poses = optimise(poses, edges, fixed, marginals=False, tolerance=_TOLERANCE).poses
     return poses
 
 

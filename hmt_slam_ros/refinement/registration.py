@@ -84,6 +84,7 @@ def _add_points(
     """
     points = ones.points
     cos, sin = np.cos(pose[2]), np.sin(pose[2])
+    most, sharpness = weights.temper / weights.sigma**2, 1.0 / weights.robust
     row = np.empty(3)
     met = 0
     first, last = ones.starts[one], ones.starts[one + 1]
@@ -102,7 +103,7 @@ def _add_points(
         error = nx * (x - others.points[q, 0]) + ny * (y - others.points[q, 1])
         row[0], row[1] = cos * nx + sin * ny, -sin * nx + cos * ny
         row[2] = row[1] * points[k, 0] - row[0] * points[k, 1]
-        weight = weights.temper / ((1.0 + (error / weights.robust) ** 2) * weights.sigma**2)
+        weight = most / (1.0 + (error * sharpness) ** 2)
         for i in range(3):
             gradient[i] += weight * error * row[i]
             for j in range(3):
@@ -118,16 +119,18 @@ def _nearest(surfaces: Surfaces, scan: int, x: float, y: float, gate: float) -> 
     count = surfaces.bin_starts[scan + 1] - first
     middle = bin_of(np.arctan2(dy, dx), count)
     # What is seen so many bins away is at least so far off: the chord grows by about this with each bin.
-    width = 2.0 * np.pi / count * np.hypot(dx, dy)
-    nearest, best, offset = -1, gate * gate, 0
-    while offset <= min(_WINDOW, count // 2) and (max(0, offset - 1) * width) ** 2 < best:
-        for place in (middle - offset, middle + offset):
-            k = surfaces.bins[first + place % count]
+    squared_width = (2.0 * np.pi / count) ** 2 * (dx * dx + dy * dy)
+    nearest, best = -1, gate * gate
+    for offset in range(min(_WINDOW, count // 2) + 1):
+        if offset > 1 and (offset - 1) ** 2 * squared_width >= best:
+            break
+        below, above = middle - offset, middle + offset
+        for place in (below if below >= 0 else below + count, above if above < count else above - count):
+            k = surfaces.bins[first + place]
             if k < 0:
                 continue
             ex, ey = surfaces.points[k, 0] - x, surfaces.points[k, 1] - y
-            if ex * ex + ey * ey < best:
-                best = ex * ex + ey * ey
-                nearest = k
-        offset += 1
+            squared = ex * ex + ey * ey
+            if squared < best:
+                best, nearest = squared, k
     return nearest

@@ -144,4 +144,5 @@ def _binned(points: Float64, starts: Int64, lasers: Float64, bin_starts: Int64) 
 @njit(cache=True)
 def bin_of(bearing: float, count: int) -> int:
     """The bin of a bearing in [-pi, pi], rad, where ``count`` bins divide the circle."""
-    return int(np.floor(bearing * count / (2.0 * np.pi) + 0.5)) % count
+    place = int(np.floor(bearing * count / (2.0 * np.pi) + 0.5))
+    return place + count if place < 0 else min(place, count - 1)

@@ -65,7 +65,14 @@ class Solution:
     steps: int
 
 
-def optimise(initial: NDArray[np.float64], edges: Edges, fixed: int = 0, *, marginals: bool = True) -> Solution:
+def optimise(
+    initial: NDArray[np.float64],
+    edges: Edges,
+    fixed: int = 0,
+    *,
+    marginals: bool = True,
+    tolerance: float = _SMALLEST_GAIN,
+) -> Solution:
     """Solve a pose graph.
 
     A step costs one sparse factorisation. Marginals cost a solution of the factored system for each of 3 n columns,
@@ -75,6 +82,7 @@ def optimise(initial: NDArray[np.float64], edges: Edges, fixed: int = 0, *, marg
     :param edges: at least enough to join every node with the fixed one.
     :param fixed: the node that defines the frame.
     :param marginals: whether to compute the covariances.
+    :param tolerance: a step that lowers the cost by no more than this share of it is the last.
     :raises ValueError: where a node is not joined with the fixed one, so that its pose is not determined.
     """
     system = _System(len(initial), edges, fixed)
@@ -92,7 +100,7 @@ def optimise(initial: NDArray[np.float64], edges: Edges, fixed: int = 0, *, marg
         gain = state.cost - next_state.cost
         poses, state, steps = tried, next_state, steps + 1
         damping = 0.1 * damping if damping > _FIRST_DAMPING else 0.0
-        if gain <= _SMALLEST_GAIN * state.cost:
+        if gain <= tolerance * state.cost:
             break
     covariances = system.marginals(state) if marginals else None
     return Solution(poses, covariances, float(state.chi2.sum()), state.chi2, state.weights, steps)
