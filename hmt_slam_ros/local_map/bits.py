@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from llvmlite import ir
 from numba import njit, types
+from numba.core import cgutils
 from numba.extending import intrinsic
 
 from hmt_slam_ros.arrays import UInt32
@@ -16,8 +16,9 @@ from hmt_slam_ros.arrays import UInt32
 def lowest(_context: Any, word: Any) -> Any:  # noqa: ANN401  numba's own types
     """The number of the lowest bit that is set; a word without any has no answer."""
 
-    def count_trailing_zeros(_context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:  # noqa: ANN401
-        return builder.zext(builder.cttz(arguments[0], ir.Constant(ir.IntType(1), 1)), ir.IntType(64))
+    def count_trailing_zeros(context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:  # noqa: ANN401
+        zeros = builder.cttz(arguments[0], cgutils.true_bit)
+        return builder.zext(zeros, context.get_value_type(types.int64))
 
     return types.int64(word), count_trailing_zeros
 
