@@ -108,7 +108,7 @@ def test_a_pause_stops_the_robot_and_its_end_lets_it_go_on(tmp_path, listener, s
 
 def test_a_paced_robot_waits_for_the_acknowledgement(tmp_path, listener, start, heard):
     estimates = listener.node.create_publisher(String, DOCUMENTS[LocalEstimate], qos.CHAIN)
-    start("robot", log=corridor_bag(tmp_path), robot__rate=0.0, robot__paced=True, robot__window=4)
+    start("robot", log=corridor_bag(tmp_path), robot__rate=0.0, robot__window=4, filter__patience=3)
     listener.until(lambda: len(heard["scan"]) == 4)
     listener.spin(0.5)
     assert len(heard["scan"]) == 4
