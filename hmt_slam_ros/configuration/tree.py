@@ -149,7 +149,10 @@ class Filter:
         4.0, "Factor on the covariance of a matched keyframe, since its beams are correlated.", low=0.1, high=100.0
     )
     patience: int = parameter(
-        15, "Scans that wait for odometry at most, before they are placed by the velocity and their match.", low=1,
+        15,
+        "Scans that wait for the first odometry at most, before they are placed by the velocity and their match; four "
+        "times as many where odometry has come before.",
+        low=1,
         high=100000,
     )
 

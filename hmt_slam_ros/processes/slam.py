@@ -35,6 +35,9 @@ from hmt_slam_ros.sensing.deskew import SweepCheck, deskewed
 from hmt_slam_ros.sensing.motion import MotionModel, Prediction
 from hmt_slam_ros.topology.shortest_path import reachable
 
+# Odometry that has come before may only be late, by more scans than a paced robot runs ahead of its acknowledgements.
+_LATE = 4
+
 
 class MetricSlam:
     """The metric SLAM process.
@@ -126,7 +129,8 @@ class MetricSlam:
     def _lose_patience(self) -> list[Message]:
         """Where enough scans wait for odometry, go on without until there is more."""
         first = self._queue[0]
-        waited = len(self._queue) > self._configuration.filter.patience
+        patience = self._configuration.filter.patience * (1 if self._motion.odometry.empty else _LATE)
+        waited = len(self._queue) > patience
         if not waited or not self._patient or self._motion.odometry.covers(first.end):
             return []
         self._patient = False
