@@ -10,7 +10,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import gammaincinv
 
 from hmt_slam_ros.geometry import se2
 
@@ -53,12 +52,6 @@ class PoseGaussian:
         """This belief's covariance, shape (3, 3), carried into the tangent space of the nearby pose ``mean``."""
         ad = se2.adjoint(se2.between(mean, self.mean)) if ad is None else ad
         return ad @ self.covariance @ ad.T
-
-
-def gate(probability: float) -> float:
-    """The bound below which :meth:`PoseGaussian.mahalanobis2` of true pairs stays with this probability."""
-    # The quantile of chi-square with 3 degrees of freedom. scipy.stats, which has it too, takes half a second to load.
-    return 2.0 * float(gammaincinv(1.5, probability))
 
 
 def fuse(beliefs: list[PoseGaussian], iterations: int = 10) -> PoseGaussian:

@@ -14,7 +14,7 @@ import numpy as np
 
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.geometry.gaussian import gate
+from hmt_slam_ros.geometry.chi_square import gate
 from hmt_slam_ros.local_map import matching
 from hmt_slam_ros.local_map.local_mapping import LocalMapping
 from hmt_slam_ros.local_map.patches import MapView

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.geometry.gaussian import PoseGaussian, gate
+from hmt_slam_ros.geometry.chi_square import gate
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.processes.messages import (
     Accepted,
     Arc,

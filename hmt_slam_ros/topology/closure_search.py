@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.geometry.gaussian import PoseGaussian, gate
+from hmt_slam_ros.geometry.chi_square import gate
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.sensing import Scan
 from hmt_slam_ros.topology.appearance import appearance_log_ratio, signature
 from hmt_slam_ros.topology.area_grid import GridModel, build_area_grid
