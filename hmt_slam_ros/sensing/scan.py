@@ -83,7 +83,7 @@ class Scan:
     @property
     def origins(self) -> NDArray[np.float64]:
         """Where the laser was at each of those beams, shape (k, 2), metres, robot base frame."""
-        return self._carried_back(np.tile(self.laser_pose[:2], (int(self.valid.sum()), 1)))
+        return self._carried_back(np.full((len(self.points), 2), self.laser_pose[:2]))
 
     @property
     def beams(self) -> NDArray[np.float64]:
