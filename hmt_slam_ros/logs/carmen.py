@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -105,8 +106,8 @@ def _entries(readings: Iterable[_Reading], limits: dict[float, float], mountings
 
 def _parse(content: bytes, name: str) -> _Content:
     parsed = _Content()
-    lines = content.split(b"\n")
-    for number, line in enumerate(lines, start=1):
+    # Line by line: all of them at once would leave as much memory in pieces as the log itself takes.
+    for number, line in enumerate(io.BytesIO(content), start=1):
         tokens = line.split()
         if not tokens:
             continue
@@ -118,7 +119,7 @@ def _parse(content: bytes, name: str) -> _Content:
             elif any(kind.startswith(tokens[0]) for kind in _MEASUREMENTS):
                 raise ValueError("cut off within its first word")
         except (ValueError, IndexError):
-            end = " (the last one)" if number == len(lines) else ""
+            end = "" if line.endswith(b"\n") else " (the last one)"
             raise HmtSlamError(
                 f"line {number}{end} of {name} is cut off or malformed: copy the log anew or remove that line."
             ) from None
