@@ -10,6 +10,7 @@ from importlib import import_module
 from types import FrameType
 
 from hmt_slam_ros.cli.arguments import parser
+from hmt_slam_ros.compilation import tell_of_compilation
 from hmt_slam_ros.errors import HmtSlamError
 
 FAULT, INTERRUPTED, TERMINATED = 2, 130, 143
@@ -25,7 +26,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser().parse_args(arguments)
     try:
         # Each subcommand loads what it needs itself, so that --help does not wait for numba and matplotlib.
-        import_module(f"hmt_slam_ros.cli.{options.command}_command").run(options)
+        command = import_module(f"hmt_slam_ros.cli.{options.command}_command")
+        tell_of_compilation(lambda text: print(f"hmt_slam {options.command}: {text}", file=sys.stderr))
+        command.run(options)
     except HmtSlamError as fault:
         print(f"hmt_slam {options.command}: {fault}", file=sys.stderr)
         return FAULT

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 
+from hmt_slam_ros.compilation import tell_of_compilation
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.nodes.figures import Figures
 from hmt_slam_ros.nodes.inbox import Inbox
@@ -33,6 +34,7 @@ class ProcessNode(ConfiguredNode):
         super().__init__(name, changeable)
         self.figures = Figures(self)
         self.process = make_process(self.configuration)
+        tell_of_compilation(self.get_logger().info)
         self.outbox = Outbox(self, (*said, Notice))
         self.inbox = Inbox(self, HEARD_BY[name], self.deliver, self.figures)
 

@@ -1,0 +1,67 @@
+"""That kernels are being compiled is said where it is so, and only there."""
+
+import os
+import signal
+import subprocess
+import sys
+
+TELLING = """
+import sys
+from hmt_slam_ros.compilation import tell_of_compilation
+{load}
+tell_of_compilation(print)
+{use}
+"""
+LOAD = "import numpy as np; from hmt_slam_ros.local_map.bits import any_set"
+USE = "any_set(np.zeros(3, np.uint32)); any_set(np.zeros((1, 3), np.uint32)[0, ::2])"
+
+
+def said(cache, load=LOAD, use=USE):
+    finished = subprocess.run(
+        [sys.executable, "-c", TELLING.format(load=load, use=use)],
+        env=os.environ | {"NUMBA_CACHE_DIR": str(cache)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert finished.returncode == 0, finished.stderr
+    return finished.stdout.splitlines()
+
+
+def test_a_program_says_once_that_it_compiles_and_the_next_finds_everything_in_the_cache(tmp_path):
+    (sentence,) = said(tmp_path)
+    assert "compiling" in sentence
+    assert said(tmp_path) == []
+
+
+def test_a_program_without_kernels_does_not_load_numba_for_this(tmp_path):
+    assert said(tmp_path, load="", use="print('numba' in sys.modules)") == ["False"]
+
+
+def test_a_command_says_it_once_and_never_again(tmp_path):
+    log, lines = tmp_path / "short.clf", "FLASER 3 1.0 1.1 1.2 {x} 0 0 {x} 0 0 {t} robot {t}\n"
+    log.write_text("".join(lines.format(x=0.2 * k, t=float(k)) for k in range(6)))
+    command = [sys.executable, "-m", "hmt_slam_ros.cli.main", "map", log, "--out", tmp_path / "out"]
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+    for times in (1, 0):
+        finished = subprocess.run(command, env=environment, capture_output=True, text=True, check=True, timeout=300)
+        assert finished.stderr.count("compiling kernels") == times
+
+
+def test_a_node_says_it_once_and_never_again(tmp_path, listener, start, monkeypatch):
+    from logs_for_nodes import corridor_bag  # noqa: PLC0415  see the import of rclpy in the fixtures
+    from std_msgs.msg import String  # noqa: PLC0415
+
+    from hmt_slam_ros.nodes import qos  # noqa: PLC0415
+    from hmt_slam_ros.nodes.topics import DOCUMENTS  # noqa: PLC0415
+    from hmt_slam_ros.processes.messages import LocalEstimate  # noqa: PLC0415
+
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
+    log = corridor_bag(tmp_path)
+    for times in (1, 0):
+        heard = listener.hear(String, DOCUMENTS[LocalEstimate], qos.CHAIN)
+        slam = start("slam")
+        start("robot", log=log, robot__rate=0.0, robot__paced=False)
+        listener.until(lambda heard=heard: heard, seconds=120.0, alive=[slam])
+        slam.send_signal(signal.SIGINT)
+        assert slam.communicate(timeout=60.0)[1].count("compiling kernels") == times
