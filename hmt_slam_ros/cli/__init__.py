@@ -1,1 +1,5 @@
 """Commands."""
+
+from hmt_slam_ros.process_settings import settle
+
+settle()

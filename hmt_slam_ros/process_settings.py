@@ -1,0 +1,26 @@
+"""Settings of the whole OS process, for the commands and the nodes; to be made before numpy is loaded."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+
+_M_MMAP_THRESHOLD = -3  # <malloc.h>
+_LARGE = 1 << 20  # bytes
+
+
+def settle() -> None:
+    """One thread for BLAS, and large arrays apart from small objects.
+
+    The matrices here are small, so that several threads of BLAS would spend more time in waiting for each other than in
+    computing; and the order in which they add up, and with it the last bits of a result, would depend on the machine.
+    ``OPENBLAS_NUM_THREADS`` in the environment goes before.
+
+    glibc's malloc maps large arrays one by one, and unmaps them when they are freed, but raises the bound from which on
+    it does so up to 32 MB with every such array. What it takes from the heap instead, later small objects keep from
+    going back: a tenth of a run's memory. A bound that was set stays.
+    """
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
+    if mallopt is not None:
+        mallopt(_M_MMAP_THRESHOLD, _LARGE)

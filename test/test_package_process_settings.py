@@ -1,0 +1,55 @@
+"""The settings that commands and nodes make for their whole process."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+# Modules that a console script, `ros2 run` or `python -m` starts.
+NODES = ("slam", "aam", "tsbi", "tlca", "rtl", "robot")
+ENTRIES = ("hmt_slam_ros.cli.main", *(f"hmt_slam_ros.nodes.{node}_node" for node in NODES))
+WORK = """
+import numpy as np, scipy.linalg
+scipy.linalg.eigh(np.eye(300) @ np.eye(300))
+"""
+# A thread of BLAS is one of the process for good, once the library is loaded.
+THREADS = "import os; print(len(os.listdir('/proc/self/task')))"
+# 20 MB go and come back as 10 MB, behind which a small object stays.
+HEAP = """
+import numpy as np
+def resident():
+    return int(open("/proc/self/statm").read().split()[1]) * 4096
+first = np.ones(20_000_000, np.uint8); del first
+second = np.ones(10_000_000, np.uint8); small = [np.ones(8) for _ in range(1000)]
+before = resident(); del second; print(before - resident())
+"""
+
+
+def run(code, **variables):
+    environment = {name: value for name, value in os.environ.items() if name != "OPENBLAS_NUM_THREADS"}
+    finished = subprocess.run(
+        [sys.executable, "-c", code], env=environment | variables, capture_output=True, text=True, check=False
+    )
+    assert finished.returncode == 0, finished.stderr
+    return int(finished.stdout)
+
+
+@pytest.mark.parametrize("entry", ENTRIES)
+def test_blas_has_one_thread_in_every_program(entry):
+    if ".nodes." in entry:
+        pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
+    # rclpy has threads of its own.
+    load = f"import {entry}\n"
+    assert run(load + WORK + THREADS) == run(load + WORK + THREADS, OPENBLAS_NUM_THREADS="1")
+
+
+@pytest.mark.skipif((os.cpu_count() or 1) < 2, reason="BLAS has one thread anyway on one core")
+def test_blas_has_as_many_threads_as_the_environment_says():
+    assert run(WORK + THREADS) > 1
+    assert run("import hmt_slam_ros.cli.main\n" + WORK + THREADS, OPENBLAS_NUM_THREADS="2") > 1
+
+
+def test_a_large_array_gives_its_memory_back_whatever_was_made_after_it():
+    assert run(HEAP) < 1_000_000
+    assert run("import hmt_slam_ros.cli\n" + HEAP) > 9_000_000
