@@ -53,6 +53,20 @@ def test_the_distance_field_equals_the_exact_distance_transform_after_walls_came
     assert went > 100
 
 
+def test_the_most_patches_ever_in_use_are_on_record(pool):
+    first, second = pool.empty_table(), pool.empty_table()
+    scan = scan_in(box(-3, -4, 5, 4), (0.0, 0.0, 0.0))
+    insert(pool, first, scan)
+    alone = pool.peak_bytes
+    assert alone == pool.used * PATCH * (2 * PATCH + 4) > 0
+    insert(pool, second, scan)
+    pool.release(second)
+    pool.release(first)
+    insert(pool, pool.empty_table(), scan)
+    assert pool.used * PATCH * (2 * PATCH + 4) == alone
+    assert pool.peak_bytes == 2 * alone
+
+
 def test_odds_follow_from_the_cells_that_beams_pass_and_in_which_they_end(pool):
     table, expected = pool.empty_table(), np.zeros((8 * PATCH, 8 * PATCH), dtype=int)
     for k in range(8):

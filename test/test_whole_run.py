@@ -54,6 +54,10 @@ def test_the_report_tells_time_and_memory_of_every_process(report):
     for figures in report["processes"].values():
         assert 0.0 < figures["mean_ms_per_scan"] <= figures["max_ms_per_scan"]
     assert min(report["peak_rss_bytes"].values()) > 0
+    memory = report["memory_bytes"]
+    assert set(memory) == {"particle_maps", "libraries", "kernels", "keyframe_scans"}
+    assert min(memory.values()) > 100_000
+    assert sum(memory.values()) < report["peak_rss_bytes"]["hmt_slam"]
     assert report["wall_s"] > 0.0
     assert report["cpu_s"] > 0.0
     assert {"configuration", "seed", "versions"} <= set(report)

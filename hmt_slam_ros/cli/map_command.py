@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import resource
 import time
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,7 @@ from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.logs import Log, open_log
 from hmt_slam_ros.offline.corrected_scans import corrected_scans
 from hmt_slam_ros.offline.final_map import FinalMap, final_map
+from hmt_slam_ros.offline.memory import code_bytes
 from hmt_slam_ros.offline.output_folder import replacing, write_output
 from hmt_slam_ros.offline.report import RunFigures
 from hmt_slam_ros.offline.runtime import run_log
@@ -26,12 +28,17 @@ def run(options: argparse.Namespace) -> None:
     """Map the log and say what came of it."""
     configuration = chosen_configuration(options)
     with replacing(options.out) as folder:
-        log = open_log(options.log, start=configuration.robot.start, duration=configuration.robot.duration or None)
-        if not log.scan_count:
-            raise HmtSlamError(f"{options.log} has no scans in the part asked for: check --start and --duration")
-        final, source_stamps, figures = measured_run(log, configuration)
+        final, source_stamps, figures, log_seconds = _mapped(options.log, configuration)
         write_output(folder, final, source_stamps, figures, configuration)
-    print(summary(options.out, final.recording, log.duration, figures.wall_seconds))
+    print(summary(options.out, final.recording, log_seconds, figures.wall_seconds))
+
+
+def _mapped(path: Path, configuration: Configuration) -> tuple[FinalMap, NDArray[np.int64], RunFigures, float]:
+    """:func:`measured_run` and the log's duration, s; the log, which may be large, is forgotten."""
+    log = open_log(path, start=configuration.robot.start, duration=configuration.robot.duration or None)
+    if not log.scan_count:
+        raise HmtSlamError(f"{path} has no scans in the part asked for: check --start and --duration")
+    return *measured_run(log, configuration), log.duration
 
 
 def measured_run(log: Log, configuration: Configuration) -> tuple[FinalMap, NDArray[np.int64], RunFigures]:
@@ -53,5 +60,6 @@ def measured_run(log: Log, configuration: Configuration) -> tuple[FinalMap, NDAr
         wall_seconds=time.monotonic() - wall,
         cpu_seconds=time.process_time() - cpu,
         refinement_seconds=time.process_time() - begin,
+        memory={"particle_maps": result.map_bytes} | code_bytes(),
     )
     return final, result.source_stamps, figures

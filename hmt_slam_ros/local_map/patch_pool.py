@@ -57,6 +57,7 @@ class PatchPool:
         self.references = np.zeros(0, dtype=np.int32)
         self._free = np.zeros(0, dtype=np.int32)
         self._free_count = np.zeros(1, dtype=np.int64)
+        self._most_used = 0
         self._marks = insertion.marks(table_size)
         self._field_work = field_work(table_size, cell, radius)
 
@@ -66,9 +67,9 @@ class PatchPool:
         return self.references.size - int(self._free_count[0])
 
     @property
-    def nbytes(self) -> int:
-        """Bytes of the patches in use."""
-        return self.used * _PATCH_BYTES
+    def peak_bytes(self) -> int:
+        """Bytes of the patches when most of them were in use."""
+        return self._most_used * _PATCH_BYTES
 
     def empty_table(self) -> Int32:
         """The table of a map in which nothing is known."""
@@ -101,6 +102,7 @@ class PatchPool:
         work = self._field_work
         self._reserve(insertion.patches_needed(tables, self._store(), work, origins, ends))
         insertion.insert(tables, self._store(), self._marks, work, origins, ends, len(beams.points), model)
+        self._most_used = max(self._most_used, self.used)
 
     def _store(self) -> Store:
         return Store(self.odds, self.field, self.occupied, self.references, self._free, self._free_count)

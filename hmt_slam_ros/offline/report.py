@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import platform
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from hmt_slam_ros import __version__
 from hmt_slam_ros.configuration import Configuration, as_nested
+from hmt_slam_ros.offline.memory import scan_bytes
 from hmt_slam_ros.offline.recorder import Recording, TopologyProbability
 
 _LIBRARIES = ("numpy", "scipy", "networkx", "numba", "rosbags", "matplotlib")
@@ -31,6 +32,7 @@ class RunFigures:
     :ivar wall_seconds: from the first record to the last answer.
     :ivar cpu_seconds: of all OS processes together.
     :ivar refinement_seconds: CPU time of the final refinement.
+    :ivar memory: {part of the program: bytes}, where that is known.
     """
 
     log: str
@@ -40,6 +42,7 @@ class RunFigures:
     wall_seconds: float
     cpu_seconds: float
     refinement_seconds: float
+    memory: Mapping[str, int] = field(default_factory=dict)
 
 
 def report(recording: Recording, configuration: Configuration, figures: RunFigures) -> dict[str, Any]:
@@ -64,6 +67,7 @@ def report(recording: Recording, configuration: Configuration, figures: RunFigur
         "notices": [{"process": notice.process, "text": notice.text} for notice in recording.notices],
         "processes": {name: _cost(seconds) for name, seconds in figures.seconds_per_scan.items()},
         "peak_rss_bytes": dict(figures.peak_rss),
+        "memory_bytes": dict(figures.memory) | {"keyframe_scans": scan_bytes(replica.scans.values())},
         "wall_s": figures.wall_seconds,
         "cpu_s": figures.cpu_seconds,
         "refinement_s": figures.refinement_seconds,

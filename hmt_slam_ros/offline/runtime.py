@@ -64,12 +64,14 @@ class RunResult:
     :ivar stamps: shape (n,), int64, stamp of every scan on the log's running clock, ns, increasing.
     :ivar source_stamps: shape (n,), int64, the log's own stamp of every scan in file order, ns.
     :ivar seconds_per_scan: {process: shape (n,) seconds}.
+    :ivar map_bytes: what the maps of all particles took at most.
     """
 
     recorder: Recorder
     stamps: NDArray[np.int64]
     source_stamps: NDArray[np.int64]
     seconds_per_scan: dict[str, NDArray[np.float64]]
+    map_bytes: int
 
 
 def run_log(log: Log, configuration: Configuration, progress: Callable[[int], None] | None = None) -> RunResult:
@@ -78,10 +80,10 @@ def run_log(log: Log, configuration: Configuration, progress: Callable[[int], No
     :param progress: called with the number of scans read, after each.
     :raises HmtSlamError: where the log is faulty.
     """
-    recorder = Recorder(configuration)
+    recorder, slam = Recorder(configuration), MetricSlam(configuration)
     lock_step = LockStep(
         {
-            "slam": MetricSlam(configuration),
+            "slam": slam,
             "aam": Aam(configuration),
             "tsbi": Tsbi(configuration),
             "tlca": Tlca(configuration),
@@ -103,4 +105,4 @@ def run_log(log: Log, configuration: Configuration, progress: Callable[[int], No
         name: np.array([taken.get(name, 0.0) for taken in spent]) for name in lock_step.processes if name != "recorder"
     }
     running, source = np.array(stamps, dtype=np.int64).reshape(-1, 2).T
-    return RunResult(recorder, running, source, seconds)
+    return RunResult(recorder, running, source, seconds, slam.map_bytes)

@@ -72,6 +72,11 @@ class MetricSlam:
         return len(self._queue)
 
     @property
+    def map_bytes(self) -> int:
+        """What the maps of all particles took at most, bytes."""
+        return self._mapping.pool.peak_bytes
+
+    @property
     def particles(self) -> tuple[int, NDArray[np.float64]]:
         """Area of the most probable hypothesis and the poses of its particles, ``area_T_base``, shape (M, 3)."""
         return self._best.filter.area, self._best.filter.poses

@@ -1,0 +1,37 @@
+"""Memory by part: what report.json tells of it is what the parts take."""
+
+import subprocess
+import sys
+
+import numpy as np
+from worlds import box, scan_in
+
+from hmt_slam_ros.offline.memory import code_bytes, scan_bytes
+
+COMPILED = """
+from hmt_slam_ros.offline.memory import code_bytes
+before = code_bytes()
+from numba import njit
+njit(lambda x: x + 1)(1)
+ballast = bytearray(300_000_000)
+after = code_bytes()
+print(before["libraries"], before["kernels"], after["libraries"], after["kernels"])
+"""
+
+
+def test_libraries_and_compiled_kernels_are_told_from_data():
+    told = subprocess.run([sys.executable, "-c", COMPILED], capture_output=True, text=True, check=True).stdout
+    libraries, kernels, more_libraries, more_kernels = map(int, told.split())
+    assert libraries > 1_000_000
+    assert kernels < more_kernels < 10_000_000
+    # LLVM, which compiles, is a library; the ballast is none.
+    assert 10_000_000 < more_libraries - libraries < 200_000_000
+    assert code_bytes()["libraries"] > 1_000_000
+
+
+def test_scans_count_with_what_was_worked_out_of_them():
+    scan = scan_in(box(-3, -3, 3, 3), (0.0, 0.0, 0.0), beams=181)
+    bare = scan.ranges.nbytes + scan.laser_pose.nbytes + scan.motion.nbytes
+    assert scan_bytes([scan]) == bare
+    points = scan.points
+    assert scan_bytes([scan, scan]) == 2 * (bare + points.nbytes + np.count_nonzero(scan.valid))
