@@ -299,7 +299,7 @@ class Refinement:
     )
     last_gate: float = parameter(0.15, "The same at the last linearisation.", unit="m", low=0.01, high=5.0)
     min_share: float = parameter(
-        0.3, "Two scans overlap when at least this share of their points meet.", low=0.01, high=1.0
+        0.1, "Two scans overlap when at least this share of their points meet.", low=0.01, high=1.0
     )
     sigma: float = parameter(0.05, "Deviation of a point from its wall.", unit="m", low=0.001, high=1.0)
     robust_scale: float = parameter(
@@ -312,7 +312,7 @@ class Refinement:
         50.0, "A pair of scans whose chi-square exceeds this loses weight.", low=1.0, high=1e6
     )
     motion_patience: float = parameter(
-        10.0, "An odometry increment whose chi-square exceeds this loses weight.", low=1.0, high=1e6
+        10.0, "A motion between two keyframes whose chi-square exceeds this loses weight.", low=1.0, high=1e6
     )
     scan_sigma: float = parameter(
         0.1, "Deviation of a scan's place relative to its keyframe before it is registered.", unit="m",

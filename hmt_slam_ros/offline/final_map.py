@@ -91,21 +91,20 @@ class _Keyframes:
         poses = self._poses(recording)
         # Each keyframe is the nearest to itself.
         pairs = pairs_of(self._around(poses, poses, self.areas, self._options.neighbours + 1))
-        motion = self._odometry(recording)
-        refined = refine_jointly(self._surfaces, poses, pairs, motion, self._options)
+        refined = refine_jointly(self._surfaces, poses, pairs, self._motion(recording, poses), self._options)
         return dict(zip(self.ids, refined, strict=True))
 
-    def _odometry(self, recording: Recording) -> Edges:
-        """What the odometry measured from each keyframe to the next."""
-        rows = _scan_rows(recording, self.ids)
-        odometry, motion = recording.odometry, self._configuration.motion
-        increments = se2.between(odometry[rows[:-1]], odometry[rows[1:]])
-        count = len(increments)
+    def _motion(self, recording: Recording, poses: NDArray[np.float64]) -> Edges:
+        """From each keyframe to the next the motion that metric SLAM found, as uncertain as the odometry of that way.
+
+        Where no pair of scans overlaps enough, metric SLAM has seen more in its map than odometry could tell.
+        """
+        rows, count = _scan_rows(recording, self.ids), len(poses) - 1
         return Edges(
             np.arange(count),
             np.arange(1, count + 1),
-            increments,
-            _path_covariances(odometry, rows, motion),
+            se2.between(poses[:-1], poses[1:]),
+            _path_covariances(recording.odometry, rows, self._configuration.motion),
             np.full(count, self._options.motion_patience),
         )
 

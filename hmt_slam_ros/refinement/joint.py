@@ -2,7 +2,7 @@
 
 Iterates between two steps: every overlapping pair of scans is linearised at the present poses (point-to-line, so that
 a pair in a bare corridor says nothing about the direction along it), which makes it an edge of a pose graph; the graph,
-with the odometry's edges, is solved (Lu and Milios 1997). Edges that contradict the others lose their weight.
+with the edges of the motion, is solved (Lu and Milios 1997). Edges that contradict the others lose their weight.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def refine_jointly(
     :param surfaces: of n scans.
     :param poses: shape (n, 3), ``map_T_base`` to start from.
     :param pairs: shape (m, 2), scans that may overlap.
-    :param motion: edges that join all scans, such as the odometry's; they hold the directions that walls leave open.
+    :param motion: edges of the motion, which join all scans; they hold the directions that walls leave open.
     :param fixed: the scan that stays.
     :returns: shape (n, 3).
     """
