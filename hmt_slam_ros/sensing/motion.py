@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,9 @@ _PAST = 0.95
 _MEMORY = np.array([2.0, 2.0, 1.0])
 # A step beyond this many deviations says that something slipped, not how noisy the odometry is.
 _OUTLIER = 3.0
+_DEGREES, _RADIANS = 180.0 / math.pi, math.pi / 180.0
+
+Length = TypeVar("Length", float, NDArray[np.float64])
 
 
 class Step(NamedTuple):
@@ -218,11 +221,20 @@ def path_covariance(distance: float, angle: float, motion: Motion) -> NDArray[np
     Standard deviations grow linearly with the distance (m) and the angle (rad) travelled; the lateral deviation equals
     the longitudinal one.
     """
+    translation, rotation = path_deviations(distance, angle, motion)
+    return np.array(((translation**2, 0.0, 0.0), (0.0, translation**2, 0.0), (0.0, 0.0, rotation**2)))
+
+
+def path_deviations(distance: Length, angle: Length, motion: Motion) -> tuple[Length, Length]:
+    """The deviations of translation (m), in either direction, and rotation (rad) that `path_covariance` squares.
+
+    :param distance: m, one or an array of them.
+    :param angle: rad, likewise.
+    """
     translation = (
         motion.translation_floor
         + motion.translation_from_translation * distance
-        + motion.translation_from_rotation * math.degrees(angle)
+        + motion.translation_from_rotation * (angle * _DEGREES)
     )
-    rotation = math.radians(motion.rotation_floor + motion.rotation_from_translation * distance)
-    rotation += motion.rotation_from_rotation * angle
-    return np.array(((translation**2, 0.0, 0.0), (0.0, translation**2, 0.0), (0.0, 0.0, rotation**2)))
+    rotation = (motion.rotation_floor + motion.rotation_from_translation * distance) * _RADIANS
+    return translation, rotation + motion.rotation_from_rotation * angle
