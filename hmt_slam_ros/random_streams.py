@@ -13,6 +13,11 @@ class Purpose(IntEnum):
     PARTICLES = 1
     RESAMPLING = 2
     HYPOTHESES = 3
+    BUILDING = 101
+    FURNITURE = 102
+    PEOPLE = 103
+    WHEELS = 104
+    LASER = 105
 
 
 def stream(seed: int, purpose: Purpose, step: int) -> np.random.Generator:
@@ -23,6 +28,6 @@ def stream(seed: int, purpose: Purpose, step: int) -> np.random.Generator:
 
     :param seed: seed of the run.
     :param purpose: what the numbers are for.
-    :param step: keyframe event, from 0.
+    :param step: keyframe event, scan, piece of furniture or person, from 0.
     """
     return np.random.Generator(np.random.Philox(key=[seed, int(purpose)], counter=[0, 0, 0, step]))

@@ -50,9 +50,9 @@ class FlatParameter:
         return type(self.default)
 
 
-def flat_parameters(configuration: Configuration) -> list[FlatParameter]:
-    """Every parameter of the tree, in the order of declaration."""
-    return list(_leaves(configuration, ""))
+def flat_parameters(tree: DataclassInstance) -> list[FlatParameter]:
+    """Every parameter of a tree, in the order of declaration."""
+    return list(_leaves(tree, ""))
 
 
 def _leaves(node: DataclassInstance, prefix: str) -> Iterator[FlatParameter]:
@@ -104,13 +104,23 @@ def with_changes(configuration: Configuration, changes: Mapping[str, Any]) -> Co
     :raises HmtSlamError: for an unknown name, a value of the wrong type or out of range, or values that do not fit
         together.
     """
-    known = {leaf.name: leaf for leaf in flat_parameters(configuration)}
-    checked = {name: _checked(_named(name, known), value) for name, value in changes.items()}
-    changed = _replaced(configuration, nested(checked))
+    changed = changed_one_by_one(configuration, changes, "docs/parameters.md")
     for rule in RULES:
         if not rule.holds(changed):
             raise HmtSlamError(f"the configuration contradicts itself: {rule.advice}")
     return changed
+
+
+def changed_one_by_one(tree: Node, changes: Mapping[str, Any], document: str) -> Node:
+    """A tree of parameters with some values changed, each checked by itself.
+
+    :param changes: dotted name -> value; an int serves where a float is expected.
+    :param document: where the names are described.
+    :raises HmtSlamError: for an unknown name, a value of the wrong type or out of range.
+    """
+    known = {leaf.name: leaf for leaf in flat_parameters(tree)}
+    checked = {name: _checked(_named(name, known, document), value) for name, value in changes.items()}
+    return _replaced(tree, nested(checked))
 
 
 def _replaced(node: Node, changes: Mapping[str, Any]) -> Node:
@@ -121,11 +131,11 @@ def _replaced(node: Node, changes: Mapping[str, Any]) -> Node:
     return replace(node, **values)
 
 
-def _named(name: str, known: Mapping[str, FlatParameter]) -> FlatParameter:
+def _named(name: str, known: Mapping[str, FlatParameter], document: str) -> FlatParameter:
     if name in known:
         return known[name]
     near = nearest_names(name, known)
-    advice = f"did you mean {' or '.join(near)}?" if near else "see docs/parameters.md for the names"
+    advice = f"did you mean {' or '.join(near)}?" if near else f"see {document} for the names"
     raise HmtSlamError(f"there is no parameter '{name}': {advice}")
 
 

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from hmt_slam_ros.configuration.flat import Value, flat_parameters, flattened, with_changes
 from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.errors import HmtSlamError
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
 
 # Parameters that every ROS node has and that a params file may set beside ours.
 _FOREIGN = ("use_sim_time", "start_type_description_service", "qos_overrides.")
@@ -89,8 +92,10 @@ def _merged(file: Path, sections: Iterable[Mapping[str, Any]]) -> dict[str, Any]
     return merged
 
 
-def parse_setting(setting: str) -> tuple[str, Value]:
+def parse_setting(setting: str, tree: DataclassInstance | None = None) -> tuple[str, Value]:
     """Name and value of a text ``name=value``, the value read as the type that the parameter has.
+
+    :param tree: of the parameters, None for the configuration.
 
     An unknown name passes, for :func:`hmt_slam_ros.configuration.flat.with_changes` to refuse it with advice.
 
@@ -100,7 +105,7 @@ def parse_setting(setting: str) -> tuple[str, Value]:
     if not equals:
         raise HmtSlamError(f"'{setting}' is no setting: write name=value, such as filter.particles=12")
     name, text = name.strip(), text.strip()
-    kinds = {leaf.name: leaf.kind for leaf in flat_parameters(Configuration())}
+    kinds = {leaf.name: leaf.kind for leaf in flat_parameters(tree or Configuration())}
     try:
         return name, _READERS[kinds.get(name, str)](text)
     except ValueError:
