@@ -40,7 +40,7 @@ def carmen(tmp_path: Path) -> Path:
     return log
 
 
-@pytest.mark.parametrize("command", ["", "map", "replay", "convert", "evaluate", "plot", "parameters"])
+@pytest.mark.parametrize("command", ["", "map", "replay", "convert", "simulate", "evaluate", "plot", "parameters"])
 def test_help_is_there_for_every_command_and_comes_at_once(command: str) -> None:
     fastest = float("inf")
     for _ in range(3):

@@ -9,7 +9,7 @@ from typing import NoReturn
 from hmt_slam_ros import __version__
 from hmt_slam_ros.configuration import Configuration, load_configuration
 
-_LOG = "rosbag2 folder, .mcap or .db3 file, CARMEN log or MRPT rawlog"
+_LOG = "rosbag2 folder, .mcap or .db3 file, CARMEN log, MRPT rawlog, or sim:WORLD"
 
 
 class OneSentenceParser(argparse.ArgumentParser):
@@ -28,6 +28,7 @@ def parser() -> argparse.ArgumentParser:
     _map(commands.add_parser("map", help="map a log, all in one process, the same for one seed"))
     _replay(commands.add_parser("replay", help="map a log by a simulated robot and the ROS nodes"))
     _convert(commands.add_parser("convert", help="write a log as a rosbag2"))
+    _simulate(commands.add_parser("simulate", help="write a drive through a simulated world as a rosbag2"))
     _evaluate(commands.add_parser("evaluate", help="errors of an output folder against true relations"))
     _plot(commands.add_parser("plot", help="draw map, probabilities and cost of an output folder"))
     _parameters(commands.add_parser("parameters", help="print every parameter as a YAML file"))
@@ -79,13 +80,30 @@ def _part(command: argparse.ArgumentParser) -> None:
 def _convert(command: argparse.ArgumentParser) -> None:
     command.add_argument("source", type=Path, metavar="SRC", help=_LOG)
     command.add_argument("destination", type=Path, metavar="DST", help="rosbag2 folder to make")
+    _storage(command)
+    _part(command)
+
+
+def _storage(command: argparse.ArgumentParser) -> None:
     command.add_argument("--storage", choices=("mcap", "sqlite3"), default="mcap", help="format of the bag's file")
+
+
+def _simulate(command: argparse.ArgumentParser) -> None:
+    command.add_argument("world", metavar="WORLD", help="family of buildings or .yaml file, see docs/simulation.md")
+    command.add_argument("--out", type=Path, required=True, metavar="BAG", help="rosbag2 folder to make")
+    command.add_argument("--seed", type=int, metavar="N", help="seed of building, noise, people and furniture")
+    command.add_argument(
+        "--set", action="append", default=[], dest="settings", metavar="NAME=VALUE", help="set one setting of the world"
+    )
+    _storage(command)
     _part(command)
 
 
 def _evaluate(command: argparse.ArgumentParser) -> None:
     command.add_argument("directory", type=Path, metavar="DIR", help="output folder")
-    command.add_argument("--relations", type=Path, required=True, metavar="FILE", help="lines t1 t2 x y z r p yaw")
+    true = command.add_mutually_exclusive_group(required=True)
+    true.add_argument("--relations", type=Path, metavar="FILE", help="lines t1 t2 x y z r p yaw")
+    true.add_argument("--truth", type=Path, metavar="LOG", help="the log, if it was simulated and knows the truth")
     command.add_argument(
         "--odometry", type=Path, metavar="LOG", help="the log, to reach times without a pose within 0.1 s"
     )

@@ -4,9 +4,22 @@ from __future__ import annotations
 
 import argparse
 
-from hmt_slam_ros.evaluation import evaluate_folder, format_table
+from hmt_slam_ros.evaluation import (
+    evaluate_folder,
+    evaluate_relations,
+    format_table,
+    read_tum,
+    true_relations,
+    truth_of,
+)
+from hmt_slam_ros.logs import open_log
 
 
 def run(options: argparse.Namespace) -> None:
     """Print the table of errors."""
-    print(format_table(evaluate_folder(options.directory, options.relations, options.odometry)))
+    if options.truth is None:
+        errors = evaluate_folder(options.directory, options.relations, options.odometry)
+    else:
+        relations = true_relations(truth_of(open_log(options.truth)))
+        errors = evaluate_relations(read_tum(options.directory / "trajectory.tum"), relations)
+    print(format_table(errors))

@@ -12,7 +12,8 @@ from hmt_slam_ros.evaluation.relations import (
     pair_errors,
     read_relations,
 )
-from hmt_slam_ros.evaluation.trajectory import StampedPoses, odometry_of, read_tum, write_tum
+from hmt_slam_ros.evaluation.trajectory import StampedPoses, odometry_of, read_tum, truth_of, write_tum
+from hmt_slam_ros.evaluation.truth import true_relations
 
 __all__ = [
     "ErrorStatistics",
@@ -28,5 +29,7 @@ __all__ = [
     "pair_errors",
     "read_relations",
     "read_tum",
+    "true_relations",
+    "truth_of",
     "write_tum",
 ]

@@ -12,7 +12,7 @@ from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.logs import Log
 from hmt_slam_ros.logs.mounting import heading_of_quaternion
 from hmt_slam_ros.logs.stamps import seconds_from_stamp, stamp_from_seconds
-from hmt_slam_ros.sensing import Odometry
+from hmt_slam_ros.sensing import Odometry, Scan
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,6 +75,18 @@ def write_tum(path: Path, trajectory: StampedPoses) -> None:
     with path.open("w", encoding="utf-8", newline="\n") as file:
         for stamp, (x, y, _), sin, cos in rows:
             file.write(f"{seconds_from_stamp(stamp)} {x:.9f} {y:.9f} 0 0 0 {sin:.12f} {cos:.12f}\n")
+
+
+def truth_of(log: Log) -> StampedPoses:
+    """The true pose at every scan of a log, with its source stamp.
+
+    :raises HmtSlamError: where the log does not know it.
+    """
+    scans = [record for record in log.records() if isinstance(record.measurement, Scan)]
+    poses = [record.truth for record in scans if record.truth is not None]
+    if len(poses) < len(scans):
+        raise HmtSlamError(f"{log.name} does not tell the truth: give a simulated log, or a bag of one.")
+    return StampedPoses(np.array([record.source_stamp for record in scans], dtype=np.int64), np.array(poses))
 
 
 def odometry_of(log: Log) -> StampedPoses:

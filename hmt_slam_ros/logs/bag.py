@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
@@ -22,7 +22,15 @@ from hmt_slam_ros.logs.bag_messages import (
 from hmt_slam_ros.logs.entries import Window, require_scans
 from hmt_slam_ros.logs.mounting import Mounting, heading_of_quaternion, planar_mounting
 from hmt_slam_ros.logs.records import LogRecord
-from hmt_slam_ros.logs.ros_types import LASER_SCAN, ODOMETRY, TRANSFORMS, RosMessage, deserialize
+from hmt_slam_ros.logs.ros_types import (
+    LASER_SCAN,
+    ODOMETRY,
+    POSE,
+    TRANSFORMS,
+    TRUTH_TOPIC,
+    RosMessage,
+    deserialize,
+)
 from hmt_slam_ros.logs.stamps import NANOSECONDS, running_stamps
 from hmt_slam_ros.logs.transforms import FrameTree, frame_name
 from hmt_slam_ros.sensing import Odometry, Scan
@@ -70,6 +78,7 @@ class BagLog:
         self._part = window.among(self._stamps)
         self._scan_count = sum(is_scan[self._part])
         require_scans(path.name, self._scan_count, sum(is_scan))
+        self._truth = self._true_poses(topics)
         self._mountings = self._find_mountings(sorted({frame for _, _, frame in headers if frame is not None}))
 
     @property
@@ -96,17 +105,25 @@ class BagLog:
             if k >= self._part.start:
                 yield self._record(measurement, int(self._stamps[k]))
 
+    def _true_poses(self, topics: Mapping[str, str]) -> dict[int, NDArray[np.float64]]:
+        """True poses (3,) by their source stamps, ns; none where the bag does not tell them."""
+        if topics.get(TRUTH_TOPIC) != POSE:
+            return {}
+        messages = (deserialize(message.content, POSE) for message in read_messages(self._path, {TRUTH_TOPIC}))
+        return {_stamp(message.header): _planar(message.pose) for message in messages}
+
     def _record(self, measurement: _Measurement, stamp: int) -> LogRecord:
+        truth = self._truth.get(measurement.source_stamp)
         if measurement.scan_frame is not None:
             message = deserialize(measurement.content, LASER_SCAN)
-            return LogRecord(measurement.source_stamp, _scan(message, stamp, self._mountings[measurement.scan_frame]))
+            scan = _scan(message, stamp, self._mountings[measurement.scan_frame])
+            return LogRecord(measurement.source_stamp, scan, truth)
         if self._odom_topic is None:
-            move, turn = measurement.content.translation, measurement.content.rotation
+            joint = measurement.content
+            pose = _planar_pose(joint.translation, joint.rotation)
         else:
-            pose = deserialize(measurement.content, ODOMETRY).pose.pose
-            move, turn = pose.position, pose.orientation
-        heading = heading_of_quaternion((turn.x, turn.y, turn.z, turn.w))
-        return LogRecord(measurement.source_stamp, Odometry(stamp, np.array([move.x, move.y, heading])))
+            pose = _planar(deserialize(measurement.content, ODOMETRY).pose.pose)
+        return LogRecord(measurement.source_stamp, Odometry(stamp, pose), truth)
 
     def _measurements(self) -> Iterator[_Measurement]:
         for message in read_messages(self._path, {self._scan_topic, self._odom_topic or "/tf"}):
@@ -120,8 +137,7 @@ class BagLog:
     def _odometry_transforms(self, message: BagMessage) -> Iterator[_Measurement]:
         for joint in deserialize(message.content, TRANSFORMS).transforms:
             if (frame_name(joint.header.frame_id), frame_name(joint.child_frame_id)) == (_ODOM_FRAME, self._base):
-                stamp = joint.header.stamp.sec * NANOSECONDS + joint.header.stamp.nanosec
-                yield _Measurement(message.bag_time, stamp, None, joint.transform)
+                yield _Measurement(message.bag_time, _stamp(joint.header), None, joint.transform)
 
     def _base_frame(self) -> str:
         """The robot's frame: the child frame of the odometry."""
@@ -165,6 +181,20 @@ class BagLog:
             base_T_laser = tree.pose(self._base, frame)
             if frame not in mountings and base_T_laser is not None:
                 mountings[frame] = planar_mounting(base_T_laser, f"the laser {frame!r} of {self._path.name}")
+
+
+def _stamp(header: RosMessage) -> int:
+    """Of a header, ns."""
+    return int(header.stamp.sec * NANOSECONDS + header.stamp.nanosec)
+
+
+def _planar(pose: RosMessage) -> NDArray[np.float64]:
+    """A geometry_msgs/Pose as (x, y, theta), shape (3,), m and rad."""
+    return _planar_pose(pose.position, pose.orientation)
+
+
+def _planar_pose(place: RosMessage, turn: RosMessage) -> NDArray[np.float64]:
+    return np.array([place.x, place.y, heading_of_quaternion((turn.x, turn.y, turn.z, turn.w))])
 
 
 def _precedes_its_scan(headers: list[tuple[int, int, str | None]]) -> list[bool]:

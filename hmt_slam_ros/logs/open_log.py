@@ -15,6 +15,9 @@ from hmt_slam_ros.logs.mrpt_objects import looks_like_rawlog
 from hmt_slam_ros.logs.rawlog import open_rawlog
 from hmt_slam_ros.logs.records import Log
 
+SIMULATED = "sim:"
+"""What the name of a log begins with that is made while it is read."""
+
 _MCAP, _SQLITE, _GZIP, _XZ = b"\x89MCAP0\r\n", b"SQLite format 3\x00", b"\x1f\x8b", b"\xfd7zXZ\x00"
 
 
@@ -28,7 +31,7 @@ def open_log(
 ) -> Log:
     """Open a rosbag2 (folder, .mcap, .db3), a CARMEN log (plain, .gz, .xz) or an MRPT rawlog; content tells which.
 
-    :param path: file or folder.
+    :param path: file or folder, or ``sim:WORLD,name=value,...`` for a simulated drive (docs/simulation.md).
     :param scan_topic: of a bag; where the default is missing, the only topic with scans serves.
     :param odom_topic: of a bag; likewise, and without any, the transform odom -> base on /tf.
     :param start: seconds from the log's first stamp at which the wanted part begins.
@@ -36,8 +39,13 @@ def open_log(
     :raises HmtSlamError: one sentence where there is no such file, it is of no known format, truncated, damaged,
         or lacks what is asked for.
     """
-    path = Path(path)
     window = Window(start, duration)
+    if is_simulated(path):
+        # The simulation makes logs, so it imports this package; and its kernels are for those who simulate.
+        from hmt_slam_ros.simulation.simulated_log import open_simulated  # noqa: PLC0415
+
+        return open_simulated(path, window)
+    path = Path(path)
     try:
         if path.is_dir():
             return BagLog(_bag_folder(path), window, scan_topic, odom_topic)
@@ -50,6 +58,11 @@ def open_log(
     return _open_file(path, head, window)
 
 
+def is_simulated(path: str | Path) -> bool:
+    """Whether a log is made while it is read, and no file."""
+    return str(path).startswith(SIMULATED)
+
+
 def _open_file(path: Path, head: bytes, window: Window) -> Log:
     content = _plain(path, head)
     if looks_like_rawlog(content):
@@ -57,7 +70,8 @@ def _open_file(path: Path, head: bytes, window: Window) -> Log:
     if looks_like_carmen(content):
         return open_carmen(path, content, window)
     raise HmtSlamError(
-        f"{path} is of no known format: give a rosbag2 folder, a .mcap or .db3 file, a CARMEN log or an MRPT rawlog."
+        f"{path} is of no known format: give a rosbag2 folder, a .mcap or .db3 file, a CARMEN log, an MRPT rawlog, or "
+        f"{SIMULATED}WORLD for a simulated drive."
     )
 
 

@@ -6,6 +6,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Protocol
 
+import numpy as np
+from numpy.typing import NDArray
+
 from hmt_slam_ros.sensing import Odometry, Scan
 
 
@@ -22,10 +25,12 @@ class LogRecord:
 
     :ivar source_stamp: the log's own time stamp in ns, which may jump back; results are keyed by it.
     :ivar measurement: the scan or odometry reading, with its ``stamp`` from the running clock, ns.
+    :ivar truth: shape (3,), the robot's true pose ``world_T_base`` at that time, m and rad; None where nobody knows it.
     """
 
     source_stamp: int
     measurement: Scan | Odometry
+    truth: NDArray[np.float64] | None = None
 
 
 class Log(Protocol):

@@ -11,6 +11,10 @@ from rosbags.typesys.store import Typestore
 LASER_SCAN = "sensor_msgs/msg/LaserScan"
 ODOMETRY = "nav_msgs/msg/Odometry"
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
+POSE = "geometry_msgs/msg/PoseStamped"
+
+TRUTH_TOPIC = "/ground_truth"
+"""Of the robot's true poses, where somebody knows them."""
 
 RosMessage: TypeAlias = Any
 """A message of the rosbags library, whose classes are made at run time: type checkers do not know their fields."""

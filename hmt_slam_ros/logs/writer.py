@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Iterable, Iterator
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -14,11 +15,11 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, W
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.logs.open_log import open_log
 from hmt_slam_ros.logs.records import Log, LogRecord
-from hmt_slam_ros.logs.ros_types import LASER_SCAN, ODOMETRY, TRANSFORMS, RosMessage, typestore
+from hmt_slam_ros.logs.ros_types import LASER_SCAN, ODOMETRY, POSE, TRANSFORMS, TRUTH_TOPIC, RosMessage, typestore
 from hmt_slam_ros.logs.stamps import NANOSECONDS
 from hmt_slam_ros.sensing import Odometry, Scan
 
-ODOM_FRAME, BASE_FRAME, LASER_FRAME = "odom", "base_link", "laser"
+ODOM_FRAME, BASE_FRAME, LASER_FRAME, WORLD_FRAME = "odom", "base_link", "laser", "world"
 
 _STORAGES = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}
 _NEVER = QosTime(9223372036, 854775807)  # "no deadline", as rosbag2 itself writes it
@@ -50,6 +51,8 @@ def convert(
 def write_bag(log: Log, destination: Path, *, storage: str = "mcap") -> None:
     """Write a log as a rosbag2 folder with /scan, /odom, /tf (odom -> base_link) and /tf_static (base_link -> laser).
 
+    Where the log knows the truth, /ground_truth has the pose ``world_T_base`` at every scan and odometry reading.
+
     The bag's own times are the running clock's, so they never jump back; each header holds the source stamp, so a
     reader gets back the log's own stamps, and by the same rule the same running clock. Angles become float32, as the
     message has them. Where the laser's pose changes within the log, each pose is a frame of its own: laser, laser_1...
@@ -77,6 +80,8 @@ def _write(log: Log, folder: Path, storage: StoragePlugin) -> None:
         writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
     with writer:
         types = {"/scan": LASER_SCAN, "/odom": ODOMETRY, "/tf": TRANSFORMS, "/tf_static": TRANSFORMS}
+        if any(record.truth is not None for record in islice(log.records(), 1)):
+            types[TRUTH_TOPIC] = POSE
         connections = {
             topic: writer.add_connection(topic, kind, typestore=typestore(), offered_qos_profiles=[_qos(topic)])
             for topic, kind in types.items()
@@ -116,11 +121,16 @@ def _messages(
     records: Iterable[LogRecord], frames: dict[bytes, tuple[str, NDArray[np.float64]]]
 ) -> Iterator[tuple[str, int, RosMessage]]:
     """Topic, bag time in ns and message, in the order of the bag."""
+    told = None
     for k, record in enumerate(records):
         measurement, source = record.measurement, record.source_stamp
         if k == 0:
             joints = [_transform(source, BASE_FRAME, frame, pose) for frame, pose in frames.values()]
             yield "/tf_static", measurement.stamp, _message(TRANSFORMS, transforms=joints)
+        if record.truth is not None and measurement.stamp != told:
+            told = measurement.stamp
+            pose = _pose(record.truth)
+            yield TRUTH_TOPIC, told, _message(POSE, header=_header(source, WORLD_FRAME), pose=pose)
         if isinstance(measurement, Odometry):
             yield "/odom", measurement.stamp, _odometry(source, measurement)
             joints = [_transform(source, ODOM_FRAME, BASE_FRAME, measurement.pose)]
@@ -159,8 +169,6 @@ def _transform(stamp: int, parent: str, child: str, parent_T_child: NDArray[np.f
 
 
 def _odometry(stamp: int, reading: Odometry) -> RosMessage:
-    x, y, theta = reading.pose.tolist()
-    pose = _message("geometry_msgs/msg/Pose", position=_vector("Point", x, y), orientation=_rotation(theta))
     still = _message(
         "geometry_msgs/msg/Twist", linear=_vector("Vector3", 0.0, 0.0), angular=_vector("Vector3", 0.0, 0.0)
     )
@@ -168,9 +176,15 @@ def _odometry(stamp: int, reading: Odometry) -> RosMessage:
         ODOMETRY,
         header=_header(stamp, ODOM_FRAME),
         child_frame_id=BASE_FRAME,
-        pose=_message("geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=np.zeros(36)),
+        pose=_message("geometry_msgs/msg/PoseWithCovariance", pose=_pose(reading.pose), covariance=np.zeros(36)),
         twist=_message("geometry_msgs/msg/TwistWithCovariance", twist=still, covariance=np.zeros(36)),
     )
+
+
+def _pose(pose: NDArray[np.float64]) -> RosMessage:
+    """A geometry_msgs/Pose of a planar pose (3,)."""
+    x, y, theta = pose.tolist()
+    return _message("geometry_msgs/msg/Pose", position=_vector("Point", x, y), orientation=_rotation(theta))
 
 
 def _laser_scan(stamp: int, scan: Scan, frame: str) -> RosMessage:

@@ -18,7 +18,7 @@ from rclpy.executors import SingleThreadedExecutor
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.configuration.documents import ros_yaml, yaml_value
 from hmt_slam_ros.errors import HmtSlamError
-from hmt_slam_ros.logs import Log, open_log
+from hmt_slam_ros.logs import Log, is_simulated, open_log
 from hmt_slam_ros.nodes.children import Children, Usage
 from hmt_slam_ros.nodes.domain import own_domain
 from hmt_slam_ros.nodes.recorder_node import RecorderNode
@@ -187,7 +187,7 @@ class _Run:
         for name in PROCESSES:
             children.start(name, shared + (slam_settings if name == "slam" else []), environment)
         own = {
-            "log": yaml_value(str(log.absolute())),
+            "log": yaml_value(str(log if is_simulated(log) else log.absolute())),
             "robot.odometry_listeners": 2,  # slam and rtl
             "robot.patience": _LISTENERS_PATIENCE,
         }

@@ -1,0 +1,19 @@
+"""``hmt_slam simulate``: a drive through a simulated world as a rosbag2 with its ground truth."""
+
+from __future__ import annotations
+
+import argparse
+
+from hmt_slam_ros.evaluation import truth_of, write_tum
+from hmt_slam_ros.logs import open_log, write_bag
+from hmt_slam_ros.logs.open_log import SIMULATED
+
+
+def run(options: argparse.Namespace) -> None:
+    """Write the bag, and the truth beside its data, and say what is in it."""
+    seed = [] if options.seed is None else [f"seed={options.seed}"]
+    name = SIMULATED + ",".join([options.world, *options.settings, *seed])
+    log = open_log(name, start=options.start or 0.0, duration=options.duration or None)
+    write_bag(log, options.out, storage=options.storage)
+    write_tum(options.out / "ground_truth.tum", truth_of(log))
+    print(f"{options.out}: {log.scan_count} scans, {log.duration:.1f} s; the same as the log {name}")

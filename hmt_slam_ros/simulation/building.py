@@ -1,0 +1,118 @@
+"""Buildings: walls, furniture, and the way that the robot drives through them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.simulation.outline import outline_of_rectangles
+
+Point = tuple[float, float]
+
+
+def _no_pieces() -> NDArray[np.float64]:
+    return np.empty((0, 5))
+
+
+@dataclass(frozen=True, eq=False)
+class Building:
+    """A world for one robot; all in one frame, m and rad.
+
+    :ivar walls: shape (n, 4), x and y of both ends of each wall.
+    :ivar route: shape (k, 2), way-points of the robot, k >= 2; the same one first and last for a closed route.
+    :ivar furniture: shape (m, 5), x, y, heading, length and width of each piece that may be moved.
+    :ivar places: {name: shape (3,)}, frames in which parts of the building that are the same look the same.
+    """
+
+    walls: NDArray[np.float64]
+    route: NDArray[np.float64]
+    furniture: NDArray[np.float64] = field(default_factory=_no_pieces)
+    places: dict[str, NDArray[np.float64]] = field(default_factory=dict)
+
+    def placed(self, pose: NDArray[np.float64]) -> Building:
+        """The same building, its origin at a pose (3,)."""
+        ends = [se2.transform(pose, self.walls[:, :2]), se2.transform(pose, self.walls[:, 2:])]
+        pieces = np.concatenate((se2.compose(pose, self.furniture[:, :3]), self.furniture[:, 3:]), axis=1)
+        places = {name: se2.compose(pose, place) for name, place in self.places.items()}
+        return Building(np.concatenate(ends, axis=1), se2.transform(pose, self.route), pieces, places)
+
+
+def boxes(pieces: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The walls (4 n, 4), m, of pieces of furniture (n, 5) as in `Building`."""
+    signs = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])
+    corners = [
+        se2.transform(piece[:3], signs * piece[3:]) for piece in pieces
+    ]  # fmt: skip
+    sides = [np.concatenate((four, np.roll(four, -1, axis=0)), axis=1) for four in corners]
+    return np.concatenate(sides) if sides else np.empty((0, 4))
+
+
+class Side(NamedTuple):
+    """One side of a corridor in a floor plan: along it and out of it, in steps of right angles.
+
+    :ivar origin: where it begins, m.
+    :ivar along: unit vector along it.
+    :ivar out: unit vector away from the corridor.
+    """
+
+    origin: Point
+    along: Point
+    out: Point
+
+    def point(self, along: float, out: float) -> Point:
+        """A point by its distances from the side's begin, m."""
+        return (
+            self.origin[0] + along * self.along[0] + out * self.out[0],
+            self.origin[1] + along * self.along[1] + out * self.out[1],
+        )
+
+    def rectangle(self, along: Point, out: Point) -> tuple[float, float, float, float]:
+        """The rectangle between two distances along and two out of the side, m, as `FloorPlan.free` takes it."""
+        (ax, ay), (bx, by) = self.point(along[0], out[0]), self.point(along[1], out[1])
+        return min(ax, bx), min(ay, by), max(ax, bx), max(ay, by)
+
+
+class FloorPlan:
+    """A floor plan that is made by cutting free rectangles out of solid stone; they may overlap."""
+
+    def __init__(self) -> None:
+        self._free: list[tuple[float, float, float, float]] = []
+
+    def free(self, x0: float, y0: float, x1: float, y1: float) -> None:
+        """Cut out a rectangle, m."""
+        self._free.append((x0, y0, x1, y1))
+
+    def corridor(self, start: Point, end: Point, width: float) -> None:
+        """Cut out a corridor along the x or the y axis; its ends are half a width beyond both points of its middle."""
+        (x0, x1), (y0, y1) = sorted((start[0], end[0])), sorted((start[1], end[1]))
+        self.free(x0 - 0.5 * width, y0 - 0.5 * width, x1 + 0.5 * width, y1 + 0.5 * width)
+
+    def ring(self, half_x: float, half_y: float, width: float) -> None:
+        """Cut out a ring of corridors around the origin; its middle is a rectangle of the half sides given."""
+        corners = [(-half_x, -half_y), (half_x, -half_y), (half_x, half_y), (-half_x, half_y)]
+        for start, end in zip(corners, corners[1:] + corners[:1], strict=True):
+            self.corridor(start, end, width)
+
+    def walls(self) -> NDArray[np.float64]:
+        """The walls around all that is free, shape (n, 4), m."""
+        return outline_of_rectangles(np.array(self._free))
+
+
+def sides_of_ring(half_x: float, half_y: float, width: float, *, outer: bool) -> list[Side]:
+    """The four outer or inner sides of a ring as `FloorPlan.ring` makes it, counter-clockwise from the lower one.
+
+    Each begins at its corner; the lengths are 2 half_x and 2 half_y in turn, plus or minus a width.
+    """
+    away = 0.5 * width if outer else -0.5 * width
+    x, y = half_x + away, half_y + away
+    out = 1.0 if outer else -1.0
+    return [
+        Side((-x, -y), (1.0, 0.0), (0.0, -out)),
+        Side((x, -y), (0.0, 1.0), (out, 0.0)),
+        Side((x, y), (-1.0, 0.0), (0.0, out)),
+        Side((-x, y), (0.0, -1.0), (-out, 0.0)),
+    ]

@@ -1,0 +1,212 @@
+"""Families of buildings made of corridors."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hmt_slam_ros.simulation.building import Building, FloorPlan, Point, Side, sides_of_ring
+from hmt_slam_ros.simulation.furniture import Rectangle, furnish
+from hmt_slam_ros.simulation.settings import Settings
+
+_WALL = 0.2  # m, between two rooms
+_OVERLAP = 0.05  # m, by which an opening reaches into what it opens to
+
+
+class Ring(NamedTuple):
+    """The middle of a ring of corridors around the origin: half sides, m."""
+
+    half_x: float
+    half_y: float
+
+    @property
+    def length(self) -> float:
+        """Once around, m."""
+        return 4.0 * (self.half_x + self.half_y)
+
+    @property
+    def corners(self) -> list[float]:
+        """Where the corners are behind the first, (-half_x, -half_y), counter-clockwise, m."""
+        x, y = 2.0 * self.half_x, 2.0 * self.half_y
+        return [x, x + y, 2.0 * x + y, 2.0 * (x + y)]
+
+    def point(self, along: float) -> Point:
+        """The point some way behind the first corner, counter-clockwise, m."""
+        along %= self.length
+        x, y = self.half_x, self.half_y
+        first, second, third, _ = self.corners
+        if along <= first:
+            return along - x, -y
+        if along <= second:
+            return x, along - first - y
+        if along <= third:
+            return x - (along - second), y
+        return -x, y - (along - third)
+
+    def walk(self, start: float, end: float) -> list[Point]:
+        """Way-points counter-clockwise from one place to a later one, the first corner being at 0; m."""
+        laps = range(int(start // self.length), int(end // self.length) + 1)
+        corners = [lap * self.length + corner for lap in laps for corner in self.corners]
+        return [self.point(along) for along in (start, *(c for c in corners if start < c < end), end)]
+
+
+class Room(NamedTuple):
+    """A room beside a corridor.
+
+    :ivar floor: its rectangle.
+    :ivar along: where its door is on the corridor's side, m.
+    :ivar front: in the corridor's middle before the door.
+    :ivar inside: where a visitor turns back.
+    :ivar is_open: whether the door is.
+    """
+
+    floor: Rectangle
+    along: float
+    front: Point
+    inside: Point
+    is_open: bool
+
+
+def rooms_along(
+    draw: np.random.Generator, plan: FloorPlan, side: Side, length: float, depths: tuple[float, float], width: float
+) -> list[Room]:
+    """Cut rooms with doors out of one side of a corridor.
+
+    :param length: of the side, m.
+    :param depths: smallest and largest depth of a room, m.
+    :param width: of the corridor, m.
+    """
+    rooms = []
+    begin = _WALL
+    while (end := begin + draw.uniform(3.0, 5.5)) <= length - _WALL:
+        depth, door = draw.uniform(*depths), draw.uniform(0.9, 1.1)
+        left = draw.uniform(begin + 0.4, end - 0.4 - door)
+        is_open = bool(draw.random() < 0.6)
+        floor = side.rectangle((begin, end), (_WALL, _WALL + depth))
+        if is_open:
+            plan.free(*floor)
+        plan.free(*side.rectangle((left, left + door), (-_OVERLAP, _WALL + _OVERLAP if is_open else 0.4 * _WALL)))
+        middle = left + 0.5 * door
+        inside = side.point(middle, _WALL + 0.5 * depth)
+        rooms.append(Room(floor, middle, side.point(middle, -0.5 * width), inside, is_open))
+        begin = end + _WALL
+    return rooms
+
+
+def niches_along(draw: np.random.Generator, plan: FloorPlan, side: Side, length: float) -> None:
+    """Cut niches out of one side of a corridor, some metres apart, no two alike."""
+    begin = draw.uniform(1.5, 6.0)
+    while (end := begin + draw.uniform(0.5, 1.5)) <= length - 1.5:
+        plan.free(*side.rectangle((begin, end), (-_OVERLAP, draw.uniform(0.1, 0.4))))
+        begin = end + draw.uniform(2.0, 8.0)
+
+
+def office(draw: np.random.Generator, settings: Settings) -> Building:
+    """Offices on both sides of a ring of corridors; the robot looks into some of them."""
+    ring = Ring(settings.size * draw.uniform(10.0, 14.0), settings.size * draw.uniform(6.0, 8.0))
+    width = draw.uniform(1.8, 2.4)
+    plan = FloorPlan()
+    plan.ring(*ring, width)
+    lengths = [2.0 * half + width for half in (ring.half_x, ring.half_y) * 2]
+    outer = [
+        rooms_along(draw, plan, side, length, (3.0, 5.0), width)
+        for side, length in zip(sides_of_ring(*ring, width, outer=True), lengths, strict=True)
+    ]
+    depth = ring.half_y - 0.5 * width - 1.5 * _WALL
+    inner = [
+        rooms_along(draw, plan, side, 2.0 * ring.half_x - width, (0.8 * depth, depth), width)
+        for side in sides_of_ring(*ring, width, outer=False)[::2]
+    ]
+    route: list[Point] = []
+    for k, rooms in enumerate(outer):
+        route.append(ring.point(([0.0, *ring.corners])[k]))
+        for room in rooms:
+            if room.is_open and 1.0 < room.along - 0.5 * width < lengths[k] - width - 1.0 and draw.random() < 0.5:
+                route += [room.front, room.inside, room.front]
+    route.append(route[0])
+    floors = [room.floor for rooms in (*outer, *inner) for room in rooms if room.is_open]
+    return Building(plan.walls(), np.array(route), furnish(draw, floors, np.array(route)))
+
+
+def nested(draw: np.random.Generator, settings: Settings) -> Building:
+    """Rings of corridors, one inside the other, joined below and above; each is driven around before the next."""
+    unit, width = 8.0 * settings.size, 2.0
+    rings = [Ring(1.3 * unit * (1 + k), 0.9 * unit * (1 + k)) for k in range(settings.count)]
+    plan = FloorPlan()
+    for ring in rings:
+        plan.ring(*ring, width)
+        for outer in (False, True):
+            sides = sides_of_ring(*ring, width, outer=outer)
+            for side, half in zip(sides, (ring.half_x, ring.half_y) * 2, strict=True):
+                niches_along(draw, plan, side, 2.0 * half + (width if outer else -width))
+    # Where the passages leave each ring, from the middle of its sides, m.
+    below, above = (draw.uniform(-0.6, 0.6, len(rings)) * [ring.half_x for ring in rings] for _ in range(2))
+    for k, (ring, next_ring) in enumerate(pairwise(rings)):
+        plan.corridor((below[k], -ring.half_y), (below[k], -next_ring.half_y), width)
+        plan.corridor((above[k], ring.half_y), (above[k], next_ring.half_y), width)
+    return Building(plan.walls(), np.array(_inside_out(rings, below, above)))
+
+
+def _inside_out(rings: list[Ring], below: NDArray[np.float64], above: NDArray[np.float64]) -> list[Point]:
+    """Around each ring, out by the passages below, and from the outermost back in by those above."""
+    route: list[Point] = []
+    entry = 0.0
+    for ring, leave in zip(rings, below.tolist(), strict=True):
+        start = ring.half_x + entry
+        out = ring.half_x + leave
+        route += ring.walk(start, start + ring.length)
+        # The last ring has no passage to the outside; there the way goes on to the top.
+        if ring is not rings[-1]:
+            route += ring.walk(start, out) if out >= start else [ring.point(out)]
+        entry = leave
+    at = rings[-1].half_x + (below[-2] if len(rings) > 1 else 0.0)
+    for k in reversed(range(len(rings))):
+        ring = rings[k]
+        top = ring.corners[1] + ring.half_x
+        down = top - above[k - 1] if k else ring.length + ring.half_x
+        route += ring.walk(at, down) if down >= at else [ring.point(at), ring.point(down)]
+        at = rings[k - 1].corners[1] + rings[k - 1].half_x - above[k - 1] if k else at
+    return route
+
+
+def grid(draw: np.random.Generator, settings: Settings) -> Building:
+    """Corridors that cross at equal distances, all alike; the robot strolls through them and returns."""
+    pitch, last = 9.0 * settings.size, settings.count
+    plan = FloorPlan()
+    for k in range(last + 1):
+        plan.corridor((k * pitch, 0.0), (k * pitch, last * pitch), 2.0)
+        plan.corridor((0.0, k * pitch), (last * pitch, k * pitch), 2.0)
+    here, before = (0, 0), (0, 0)
+    crossings = [here]
+    for _ in range(2 * (last + 1) ** 2):
+        steps = [(here[0] + dx, here[1] + dy) for dx, dy in ((1, 0), (0, 1), (-1, 0), (0, -1))]
+        ways = [way for way in steps if way != before and max(way) <= last and min(way) >= 0]
+        here, before = ways[draw.integers(len(ways))], here
+        crossings.append(here)
+    crossings += [(0, here[1]), (0, 0)]
+    return Building(plan.walls(), pitch * np.array(crossings, dtype=np.float64))
+
+
+def symmetric_ring(_draw: np.random.Generator, settings: Settings) -> Building:
+    """A square ring of corridors, each side like the others: a quarter turn changes nothing."""
+    half, width = 7.0 * settings.size, 2.0
+    plan = FloorPlan()
+    plan.ring(half, half, width)
+    for side in sides_of_ring(half, half, width, outer=True):
+        plan.free(*side.rectangle((half + 0.4, half + 1.6), (-_OVERLAP, 0.5)))
+    quarter = 0.5 * np.pi
+    places = {f"side {k}": np.array([0.0, 0.0, k * quarter]) for k in range(4)}
+    return Building(plan.walls(), np.array(Ring(half, half).walk(half, 9.0 * half)), places=places)
+
+
+def straight(draw: np.random.Generator, settings: Settings) -> Building:
+    """Two long halls with nothing in them, joined at both ends by short corridors with niches."""
+    ring, width = Ring(25.0 * settings.size, 4.0), 2.5
+    plan = FloorPlan()
+    plan.ring(*ring, width)
+    for side in sides_of_ring(*ring, width, outer=True)[1::2]:
+        niches_along(draw, plan, side, 2.0 * ring.half_y + width)
+    return Building(plan.walls(), np.array(ring.walk(ring.half_x, ring.half_x + ring.length)))

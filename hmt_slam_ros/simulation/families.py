@@ -1,0 +1,52 @@
+"""The families of buildings by their names."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from hmt_slam_ros.configuration.flat import Value
+from hmt_slam_ros.simulation import corridors, halls
+from hmt_slam_ros.simulation.building import Building
+from hmt_slam_ros.simulation.settings import Settings
+
+
+@dataclass(frozen=True)
+class Family:
+    """A kind of building.
+
+    :ivar build: draws one.
+    :ivar description: one sentence.
+    :ivar own: settings that differ from the defaults where nobody sets them.
+    """
+
+    build: Callable[[np.random.Generator, Settings], Building]
+    description: str
+    own: Mapping[str, Value] = field(default_factory=dict)
+
+
+FAMILIES: dict[str, Family] = {
+    "office": Family(corridors.office, "Offices with furniture on both sides of a ring of corridors."),
+    "busy": Family(
+        corridors.office, "The same with people in the corridors, and furniture that is moved between visits.",
+        {"people": 6, "moved": 0.5},
+    ),
+    "nested": Family(
+        corridors.nested, "Loops inside loops, 0.5 km of corridors with niches; size=4 makes 2 km of them.",
+        {"laps": 1},
+    ),
+    "grid": Family(corridors.grid, "Corridors that cross at equal distances and look all alike.", {"laps": 1}),
+    "ring": Family(corridors.symmetric_ring, "A square ring of corridors whose four sides are alike."),
+    "straight": Family(
+        corridors.straight, "A ring with two long halls without any feature.", {"range": 10.0}
+    ),
+    "hall": Family(
+        halls.hall, "An open hall in whose middle the laser reaches nothing.", {"range": 8.0, "laps": 1}
+    ),
+    "twins": Family(
+        halls.twins, "Two identical rooms, and a hall between them in which the robot loses its way.",
+        {"range": 5.0, "laps": 1},
+    ),
+}  # fmt: skip

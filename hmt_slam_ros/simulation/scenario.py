@@ -1,0 +1,135 @@
+"""All of a simulated drive: the building, the robot's way, what its wheels say and what its laser sees."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hmt_slam_ros.errors import HmtSlamError
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.random_streams import Purpose, stream
+from hmt_slam_ros.sensing import Scan
+from hmt_slam_ros.simulation.building import Building, boxes
+from hmt_slam_ros.simulation.driver import Drive, drive_along
+from hmt_slam_ros.simulation.furniture import furnishing
+from hmt_slam_ros.simulation.laser import Laser
+from hmt_slam_ros.simulation.path import path_through
+from hmt_slam_ros.simulation.people import people_on
+from hmt_slam_ros.simulation.raycast import WallIndex, clearance, wall_index
+from hmt_slam_ros.simulation.settings import Settings
+from hmt_slam_ros.simulation.wheels import chained, noisy_increments, slips
+
+START = 1_000_000_000_000
+"""Stamp of the first scan, ns."""
+
+_SECOND = 1e9
+_CLOSED = 1e-6  # m
+_STEP = 0.1  # s, between two points of the way that have to be clear
+
+
+class Scenario:
+    """A robot's drive through a building.
+
+    :ivar settings: what was chosen.
+    :ivar building: walls, route and furniture at the start.
+    :ivar drive: where the robot truly is.
+    :ivar laser: the robot's.
+    :ivar people: who else is about.
+    :ivar walls: of the building, without furniture.
+    :ivar stamps: shape (n,), of the odometry readings, ns; every ``settings.readings``-th is a scan's as well.
+    :ivar poses: shape (n, 3), ``world_T_base`` at these stamps, m and rad.
+    :ivar odometry: shape (n, 3), ``odom_T_base`` as the wheels have it.
+
+    :raises HmtSlamError: where the route comes closer to a wall or to furniture than the robot's radius.
+    """
+
+    def __init__(self, building: Building, settings: Settings) -> None:
+        self.settings, self.building = settings, building
+        route = driven_route(building.route, settings.laps)
+        path = path_through(route, settings.rounding)
+        self.drive: Drive = drive_along(path, settings.speed, math.radians(settings.turn_rate))
+        self.laser = Laser(settings)
+        self.walls: WallIndex = wall_index(building.walls)
+        self._furnishing = furnishing(building, self.walls, self.drive, settings)
+        self._check_clear()
+        self._furnished = [
+            wall_index(np.concatenate((building.walls, boxes(pieces)))) for pieces in self._furnishing.pieces
+        ]
+        self.people = people_on(self.drive, settings.people, settings.seed)
+        scans = 1 + math.floor(self.drive.duration * settings.rate)
+        ticks = np.arange((scans - 1) * settings.readings + 1)
+        self._period = 1.0 / (settings.rate * settings.readings)
+        self.stamps: NDArray[np.int64] = START + np.round(_SECOND * self._period * ticks).astype(np.int64)
+        self.poses = self.true_poses(self.stamps)
+        self.odometry = self._odometry()
+
+    @property
+    def scan_stamps(self) -> NDArray[np.int64]:
+        """Stamps of the scans, shape (k,), ns."""
+        return self.stamps[:: self.settings.readings]
+
+    def true_poses(self, stamps: NDArray[np.int64]) -> NDArray[np.float64]:
+        """``world_T_base`` (n, 3), m and rad, at any stamps (n,), ns."""
+        return self.drive.poses(self._seconds(stamps))
+
+    def scan(self, number: int) -> Scan:
+        """A scan by its number, from 0."""
+        stamp = int(self.scan_stamps[number])
+        seconds = float(self._seconds(np.array([stamp]))[0])
+        poses = self.drive.poses(seconds + self.laser.times)
+        epoch = int(np.searchsorted(self._furnishing.times, seconds, side="right")) - 1
+        distances = self.laser.distances(poses, self._furnished[epoch], self.people.discs(seconds, poses[0]))
+        return self.laser.scan(number, stamp, distances)
+
+    def furniture(self, stamp: int) -> NDArray[np.float64]:
+        """Where the furniture stands at a stamp, ns, (m, 5) as in `Building`."""
+        seconds = self._seconds(np.array([stamp]))[0]
+        return self._furnishing.pieces[int(np.searchsorted(self._furnishing.times, seconds, side="right")) - 1]
+
+    def _seconds(self, stamps: NDArray[np.int64]) -> NDArray[np.float64]:
+        return (stamps - START) / _SECOND
+
+    def _odometry(self) -> NDArray[np.float64]:
+        """Noise from scan to scan, spread evenly over the readings between them."""
+        settings = self.settings
+        at_scans = self.poses[:: settings.readings]
+        if len(at_scans) < 2:
+            return np.zeros((1, 3))
+        random = stream(settings.seed, Purpose.WHEELS, 0)
+        true = se2.between(at_scans[:-1], at_scans[1:])
+        measured = noisy_increments(true, settings.odometry, random) if settings.odometry > 0.0 else true
+        distances = np.hypot(true[:, 0], true[:, 1])
+        slipped = slips(distances, 1.0 / settings.rate, settings.slips, random)
+        measured = se2.compose(measured, se2.exp(slipped))
+        at_scans = chained(measured)
+        errors = se2.log(se2.between(true, measured))
+        starts = np.repeat(self.poses[:: settings.readings][:-1], settings.readings, axis=0)
+        shares = np.tile(np.arange(settings.readings) / settings.readings, len(true))
+        partial = se2.compose(
+            se2.between(starts, self.poses[:-1]),
+            se2.exp(shares[:, None] * np.repeat(errors, settings.readings, axis=0)),
+        )
+        between = se2.compose(np.repeat(at_scans[:-1], settings.readings, axis=0), partial)
+        return np.concatenate((between, at_scans[-1:]))
+
+    def _check_clear(self) -> None:
+        points = self.drive.poses(np.arange(0.0, self.drive.duration + _STEP, _STEP))[:, :2].copy()
+        pieces = self._furnishing.pieces.reshape(-1, 5)
+        for name, walls in (("a wall", self.building.walls), ("furniture", boxes(np.unique(pieces, axis=0)))):
+            free = clearance(walls, points)
+            nearest = int(np.argmin(free))
+            if free[nearest] < self.settings.radius:
+                x, y = points[nearest]
+                raise HmtSlamError(
+                    f"the route passes {free[nearest]:.2f} m from {name} at ({x:.1f}, {y:.1f}), and the robot's radius "
+                    f"is {self.settings.radius:g} m: move a way-point, or choose a smaller radius or rounding."
+                )
+
+
+def driven_route(route: NDArray[np.float64], laps: int) -> NDArray[np.float64]:
+    """All way-points of some laps, shape (n, 2), m; a route that is not closed is driven there and back in turn."""
+    closed = bool(np.hypot(*(route[-1] - route[0])) < _CLOSED)
+    ways = [route if closed or lap % 2 == 0 else route[::-1] for lap in range(laps)]
+    return np.concatenate([ways[0], *(way[1:] for way in ways[1:])])

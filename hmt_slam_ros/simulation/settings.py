@@ -1,0 +1,66 @@
+"""What can be chosen of a simulated world, and how it is written: ``sim:office,seed=3,people=4``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from hmt_slam_ros.configuration.flat import Value, changed_one_by_one
+from hmt_slam_ros.configuration.loading import parse_setting
+from hmt_slam_ros.configuration.parameter import parameter
+from hmt_slam_ros.logs.open_log import SIMULATED
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Building, robot, laser and company of a simulated drive."""
+
+    seed: int = parameter(0, "Seed of building, noise, people and furniture.", low=0, high=2**31 - 1)
+    size: float = parameter(1.0, "Factor on the building's lengths; corridors stay as wide.", low=0.7, high=20.0)
+    count: int = parameter(3, "Rings of nested loops, blocks on a side of a grid of corridors.", low=1, high=20)
+    laps: int = parameter(2, "How often the route is driven.", low=1, high=100)
+    speed: float = parameter(0.6, "Speed of the robot at most.", unit="m/s", low=0.05, high=5.0)
+    turn_rate: float = parameter(45.0, "Turn rate of the robot at most.", unit="deg/s", low=1.0, high=360.0)
+    rounding: float = parameter(0.5, "Radius of the arc at a corner of the route.", unit="m", low=0.05, high=10.0)
+    radius: float = parameter(
+        0.25, "Radius of the robot, which keeps that far away from walls and furniture.", unit="m", low=0.01, high=2.0
+    )
+    odometry: float = parameter(
+        1.0, "Factor on the deviations that the motion model states for odometry from scan to scan.", low=0.0, high=2.0
+    )
+    slips: float = parameter(
+        0.0, "Slips of the wheels to be expected on 100 m, of 15 degrees and 0.3 m deviation.", low=0.0, high=100.0
+    )
+    readings: int = parameter(2, "Odometry readings to a scan.", low=1, high=100)
+    rate: float = parameter(5.0, "Scans a second.", unit="1/s", low=0.1, high=100.0)
+    beams: int = parameter(361, "Beams of a scan.", low=2, high=20000)
+    field_of_view: float = parameter(180.0, "Angle from the first beam to the last.", unit="deg", low=1.0, high=360.0)
+    range: float = parameter(20.0, "Reach of the laser.", unit="m", low=0.5, high=200.0)
+    range_noise: float = parameter(0.015, "Deviation of a range.", unit="m", low=0.0, high=1.0)
+    dropout: float = parameter(0.01, "Share of beams that do not return.", low=0.0, high=1.0)
+    sweep: float = parameter(
+        0.0, "Time from the first beam to the last, during which the robot moves on.", unit="s", low=0.0, high=1.0
+    )
+    forward: float = parameter(0.0, "How far before the robot's middle the laser is.", unit="m", low=-2.0, high=2.0)
+    people: int = parameter(0, "People who walk to and fro on the robot's way.", low=0, high=200)
+    moved: float = parameter(
+        0.0, "Probability that a piece of furniture is moved while the robot does not see it.", low=0.0, high=1.0
+    )
+
+
+def parse_name(log: str | Path) -> tuple[str, dict[str, Value]]:
+    """The world, and the settings given, of ``sim:WORLD,name=value,...``.
+
+    :raises HmtSlamError: for a setting without ``=``; names and values are checked by `chosen_settings`.
+    """
+    world, *settings = str(log).removeprefix(SIMULATED).split(",")
+    return world, dict(parse_setting(setting, Settings()) for setting in settings)
+
+
+def chosen_settings(own: Mapping[str, Value], given: Mapping[str, Value]) -> Settings:
+    """Defaults, then those of a world's own, then those given.
+
+    :raises HmtSlamError: for an unknown name, a value of the wrong type or out of range.
+    """
+    return changed_one_by_one(Settings(), {**own, **given}, "docs/simulation.md")

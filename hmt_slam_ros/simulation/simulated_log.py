@@ -1,0 +1,109 @@
+"""A log that is made while it is read."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hmt_slam_ros.errors import HmtSlamError
+from hmt_slam_ros.logs.entries import Window, require_scans
+from hmt_slam_ros.logs.open_log import SIMULATED
+from hmt_slam_ros.logs.records import LogRecord
+from hmt_slam_ros.logs.stamps import NANOSECONDS
+from hmt_slam_ros.random_streams import Purpose, stream
+from hmt_slam_ros.sensing import Odometry
+from hmt_slam_ros.simulation.families import FAMILIES
+from hmt_slam_ros.simulation.raycast import clear_between
+from hmt_slam_ros.simulation.scenario import Scenario
+from hmt_slam_ros.simulation.settings import chosen_settings, parse_name
+from hmt_slam_ros.simulation.world_file import read_world
+
+
+class SimulatedLog:
+    """A simulated drive as a log; every record tells the truth.
+
+    :ivar scenario: the world behind it.
+    """
+
+    def __init__(self, name: str, scenario: Scenario, window: Window) -> None:
+        self.scenario = scenario
+        self._name = name
+        stamps, readings = scenario.stamps, scenario.settings.readings
+        self._part = window.among(stamps)
+        in_part = np.arange(stamps.size)[self._part] % readings == 0
+        self._scan_count = int(in_part.sum())
+        require_scans(name, self._scan_count, stamps.size)
+
+    @property
+    def name(self) -> str:
+        """World and settings."""
+        return self._name
+
+    @property
+    def scan_count(self) -> int:
+        """Number of scans."""
+        return self._scan_count
+
+    @property
+    def duration(self) -> float:
+        """Seconds from the first to the last record."""
+        part = self.scenario.stamps[self._part]
+        return float(part[-1] - part[0]) / NANOSECONDS
+
+    def true_poses(self, stamps: NDArray[np.int64]) -> NDArray[np.float64]:
+        """``world_T_base`` (n, 3), m and rad, at any stamps (n,), ns."""
+        return self.scenario.true_poses(stamps)
+
+    def same_place(self, stamps: NDArray[np.int64], others: NDArray[np.int64], radius: float) -> NDArray[np.bool_]:
+        """Whether the robot was in the same place at two times: within a radius, and in sight of where it was.
+
+        Walls hide; furniture and people do not.
+
+        :param stamps: shape (n,), ns.
+        :param others: shape (m,), ns.
+        :param radius: m, such as ``tsbi.place_radius``.
+        :returns: shape (n, m).
+        """
+        one, other = self.true_poses(stamps)[:, :2], self.true_poses(others)[:, :2]
+        near = np.hypot(*(one[:, None] - other[None]).transpose(2, 0, 1)) <= radius
+        rows, columns = np.nonzero(near)
+        near[rows, columns] = clear_between(self.scenario.walls, one[rows], other[columns])
+        return near
+
+    def records(self) -> Iterator[LogRecord]:
+        """All measurements in the order of time, each scan behind the odometry of the same stamp."""
+        scenario = self.scenario
+        for k in range(self._part.start, self._part.stop):
+            stamp, truth = int(scenario.stamps[k]), scenario.poses[k]
+            yield LogRecord(stamp, Odometry(stamp, scenario.odometry[k]), truth)
+            scan, between = divmod(k, scenario.settings.readings)
+            if not between:
+                yield LogRecord(stamp, scenario.scan(scan), truth)
+
+
+def open_simulated(log: str | Path, window: Window | None = None) -> SimulatedLog:
+    """Make the drive that ``sim:WORLD,name=value,...`` names.
+
+    :param log: WORLD is the name of a family or the path of a world file (.yaml).
+    :param window: the part wanted, None for all.
+    :raises HmtSlamError: for a world or a setting that there is not, or a route too close to a wall.
+    """
+    world, given = parse_name(log)
+    if world in FAMILIES:
+        family = FAMILIES[world]
+        settings = chosen_settings(family.own, given)
+        draw = stream(settings.seed, Purpose.BUILDING, 0)
+        building = family.build(draw, settings)
+        # So that neither the world's axes nor its origin are the map's.
+        building = building.placed(np.array([*draw.uniform(-50.0, 50.0, 2), draw.uniform(-np.pi, np.pi)]))
+    elif Path(world).suffix in {".yaml", ".yml"}:
+        building, own = read_world(Path(world))
+        settings = chosen_settings(own, given)
+    else:
+        raise HmtSlamError(
+            f"there is no simulated world {world!r}: choose one of {', '.join(FAMILIES)}, or give a .yaml file."
+        )
+    return SimulatedLog(str(log).removeprefix(SIMULATED), Scenario(building, settings), window or Window())

@@ -1,0 +1,100 @@
+"""A world of one's own: a YAML file with walls, an occupancy image as nav2's map_server reads it, and a route."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from hmt_slam_ros.errors import HmtSlamError
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.simulation.building import Building
+from hmt_slam_ros.simulation.outline import outline_of_cells
+
+_KEYS = ("walls", "furniture", "route", "settings", "image", "resolution", "origin", "negate", "occupied_thresh")
+# map_server's, that this needs not.
+_IGNORED = ("free_thresh", "mode")
+
+
+def read_world(path: Path) -> tuple[Building, dict[str, Any]]:
+    """The building of a world file, and its settings.
+
+    ``walls`` are lists of x0, y0, x1, y1 (m), ``route`` of x, y (m), ``furniture`` of x, y, heading (degrees), length,
+    width (m). ``image`` (relative to the file), ``resolution``, ``origin``, ``negate`` and ``occupied_thresh`` are
+    those of map_server's map.yaml: the edges of occupied pixels are walls.
+
+    :raises HmtSlamError: where file or image cannot be read, a key is unknown, or a table is none.
+    """
+    content = _content(path)
+    unknown = sorted(set(content) - {*_KEYS, *_IGNORED})
+    if unknown:
+        raise HmtSlamError(f"{path} has an unknown key {unknown[0]!r}: use {', '.join(_KEYS)}.")
+    walls = [_table(path, content, "walls", 4)]
+    if "image" in content:
+        walls.append(_walls_of_image(path, content))
+    route, furniture = _table(path, content, "route", 2), _table(path, content, "furniture", 5)
+    if not sum(map(len, walls)) or len(route) < 2:
+        raise HmtSlamError(f"{path} has no walls or fewer than two way-points: give walls or an image, and a route.")
+    furniture[:, 2] = np.deg2rad(furniture[:, 2])
+    settings = content.get("settings") or {}
+    if not isinstance(settings, Mapping):
+        raise HmtSlamError(f"settings in {path} is {settings!r}: write lines such as 'range: 8.0' below it.")
+    return Building(np.concatenate(walls), route, furniture), dict(settings)
+
+
+def walls_of_image(occupied: NDArray[np.bool_], resolution: float, origin: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The edges of the occupied pixels as walls (n, 4), m.
+
+    :param occupied: shape (height, width); row 0 is the top, largest y.
+    :param resolution: side of a pixel, m.
+    :param origin: shape (3,), pose of the lower left corner of the image, m and rad.
+    """
+    height, width = occupied.shape
+    edges = outline_of_cells(occupied[::-1], resolution * np.arange(width + 1.0), resolution * np.arange(height + 1.0))
+    return np.concatenate((se2.transform(origin, edges[:, :2]), se2.transform(origin, edges[:, 2:])), axis=1)
+
+
+def _content(path: Path) -> Mapping[str, Any]:
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as fault:
+        reason = str(fault).replace("\n", " ")
+        raise HmtSlamError(f"the world {path} cannot be read ({reason}): give a YAML file.") from fault
+    if not isinstance(content, Mapping):
+        raise HmtSlamError(f"the world {path} holds no keys: write lines such as 'route: [[0, 0], [5, 0]]'.")
+    return content
+
+
+def _table(path: Path, content: Mapping[str, Any], key: str, columns: int) -> NDArray[np.float64]:
+    """Rows of numbers, shape (n, columns); none where there is no such key."""
+    try:
+        rows = np.array(content.get(key) or [], dtype=np.float64).reshape(-1, columns)
+        lengths = {len(row) for row in content.get(key) or []}
+    except (TypeError, ValueError):
+        lengths = {0}
+    if lengths - {columns} or not np.isfinite(rows).all():
+        raise HmtSlamError(f"{key} in {path} is no list of rows of {columns} numbers: correct it.")
+    return rows
+
+
+def _walls_of_image(path: Path, content: Mapping[str, Any]) -> NDArray[np.float64]:
+    from matplotlib.image import imread  # noqa: PLC0415  slow to import, and seldom needed
+
+    file = path.parent / str(content["image"])
+    try:
+        resolution, threshold = float(content["resolution"]), float(content.get("occupied_thresh", 0.65))
+        origin = np.array(content.get("origin", (0.0, 0.0, 0.0)), dtype=np.float64).reshape(3)
+    except (KeyError, TypeError, ValueError) as fault:
+        raise HmtSlamError(f"{path} lacks resolution or has a wrong origin ({fault}): write map_server's.") from fault
+    try:
+        pixels = np.asarray(imread(file))
+    except (OSError, ValueError, SyntaxError) as fault:
+        raise HmtSlamError(f"the image {file} cannot be read ({fault}): give a PGM or PNG file.") from fault
+    brightness = pixels / 255.0 if pixels.dtype == np.uint8 else pixels.astype(np.float64)
+    grey = brightness if brightness.ndim == 2 else brightness[..., : min(3, brightness.shape[2])].mean(axis=2)
+    occupancy = grey if content.get("negate") else 1.0 - grey
+    return walls_of_image(occupancy > threshold, resolution, origin)
