@@ -40,9 +40,13 @@ def reference(configuration: Configuration) -> str:
     ]
     for room, leaves in _by_room(configuration):
         heading = [f"## {room}", "", _room_description(configuration, room)] if room else ["## The run"]
-        lines += ["", *heading, "", "| name | default | unit | allowed | meaning |", "|---|---|---|---|---|"]
-        lines += [_row(leaf) for leaf in leaves]
+        lines += ["", *heading, "", *parameter_table(leaves)]
     return "\n".join(lines) + "\n"
+
+
+def parameter_table(leaves: list[FlatParameter]) -> list[str]:
+    """The lines of a table of parameters: default, unit, range and description."""
+    return ["| name | default | unit | allowed | meaning |", "|---|---|---|---|---|", *map(_row, leaves)]
 
 
 def yaml_value(value: Value) -> str:
