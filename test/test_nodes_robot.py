@@ -18,6 +18,7 @@ from std_msgs.msg import String
 from std_srvs.srv import SetBool
 
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.logs import open_log
 from hmt_slam_ros.nodes import conversions, qos
 from hmt_slam_ros.nodes.topics import DOCUMENTS, ROBOT_STATUS
 from hmt_slam_ros.nodes.transforms import TFMessage
@@ -169,3 +170,16 @@ def test_a_log_that_is_not_there_is_one_sentence(domain, start, log, sentence):
     assert robot.returncode == 2
     assert sentence in error
     assert len(error.strip().splitlines()) == 1
+
+
+def test_a_simulated_robot_drives_live(listener, start, heard):
+    name = "sim:ring,seed=3,people=2"
+    start("robot", log=name, robot__rate=0.0, robot__paced=False, robot__duration=3.0)
+    listener.until(ended(heard))
+    records = list(open_log(name, duration=3.0).records())
+    scans = [record.measurement for record in records if isinstance(record.measurement, Scan)]
+    listener.until(lambda: len(heard["odom"]) == len(records) - len(scans))
+    assert len(scans) == len(heard["scan"]) == 16
+    for message, scan in zip(heard["scan"], scans, strict=True):
+        assert conversions.stamp_of(message.header.stamp) == scan.stamp
+        assert np.array_equal(conversions.ranges_of(message), scan.ranges)

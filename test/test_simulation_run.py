@@ -1,0 +1,66 @@
+"""A simulated drive through the whole system, against the truth."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from hmt_slam_ros.configuration.tree import Motion
+from hmt_slam_ros.evaluation import evaluate_relations, read_tum, true_relations, truth_of
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.logs import open_log
+from hmt_slam_ros.sensing import Odometry, Scan
+from hmt_slam_ros.sensing.motion import MotionModel
+
+LOG = "sim:ring,seed=2,size=0.8"
+
+
+def hmt_slam(*arguments):
+    command = [sys.executable, "-m", "hmt_slam_ros.cli.main", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, check=True, timeout=300).stdout
+
+
+@pytest.fixture(scope="module")
+def mapped(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("runs") / "out"
+    said = hmt_slam("map", LOG, "--out", folder)
+    return folder, said
+
+
+def test_a_small_loop_is_closed_and_mapped_to_two_centimetres(mapped):
+    """Two laps of 45 m: the mean error of relations to the next metres, and to where the robot was a lap before."""
+    folder, said = mapped
+    assert "0 dropped" in said
+    assert "loop closures: 0" not in said
+    errors = evaluate_relations(read_tum(folder / "trajectory.tum"), true_relations(truth_of(open_log(LOG))))
+    assert errors.overall.missed == 0
+    assert errors.over_60_s.count > 30
+    for score in (errors.overall, errors.over_60_s):
+        assert score.translation.mean < 0.02
+        assert score.rotation.mean < 0.2
+
+
+def test_its_bag_makes_the_same_map(mapped, tmp_path):
+    folder, _ = mapped
+    hmt_slam("simulate", "ring", "--seed", "2", "--set", "size=0.8", "--out", tmp_path / "bag")
+    hmt_slam("map", tmp_path / "bag", "--out", tmp_path / "out")
+    assert (tmp_path / "out" / "trajectory.tum").read_bytes() == (folder / "trajectory.tum").read_bytes()
+
+
+def test_a_motion_model_that_is_told_the_truth_finds_nothing_wrong_with_the_odometry():
+    model, last, factors = MotionModel(Motion()), None, []
+    certain = 1e8 * np.eye(3)
+    for record in open_log("sim:nested,seed=1", duration=600.0).records():
+        if isinstance(record.measurement, Odometry):
+            model.odometry.add(record.measurement)
+            continue
+        assert isinstance(record.measurement, Scan)
+        model.predict(record.measurement.stamp)
+        moved = np.zeros(3) if last is None else se2.between(last, record.truth)
+        if last is None or np.hypot(*moved[:2]) > 0.5:
+            model.keyframe(moved, certain)
+            last = record.truth
+            factors.append(model.noise.factors)
+    # The factors are 1 at least, and their memory is of 20 keyframes.
+    assert np.mean(factors, axis=0).max() < 1.15
