@@ -2,7 +2,8 @@
 
 A keyframe every half metre or twenty degrees of the log's odometry is entered into the maps of the particles, which
 stand beside each other a few centimetres apart; every forty keyframes the maps are forgotten, as at a change of area.
-The bundled log serves where none is named.
+The bundled log serves where none is named. Scans are simulated in an office with people in it, 361 beams each, by ray
+casting alone and with all that belongs to a scan; a laser of 10 Hz takes 100 000 us for one.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from hmt_slam_ros.logs import open_log
 from hmt_slam_ros.processes.messages import LocalEstimate
 from hmt_slam_ros.processes.rtl import Rtl
 from hmt_slam_ros.sensing import Odometry, Scan
+from hmt_slam_ros.simulation import open_simulated
 from hmt_slam_ros.topology.overlap import overlaps, sensed_points
 
 _KEYFRAMES, _PER_AREA = 400, 40
@@ -68,6 +70,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         _measure_maps(keyframes, figures)
         _measure_overlaps(keyframes, figures)
         _measure_rtl(readings, figures)
+        _measure_simulation(figures)
         rounds.append(figures.microseconds())
     # The first round compiles, or loads what was compiled.
     for name in rounds[0]:
@@ -167,6 +170,20 @@ def _measure_rtl(readings: list[Odometry], figures: Figures) -> None:
                 process.handle(LocalEstimate(reading.stamp, k, 0, estimate, reading.pose, 0))
 
     figures.timed("real-time localisation, an odometry reading", len(readings), play)
+
+
+def _measure_simulation(figures: Figures) -> None:
+    scenario = open_simulated("sim:busy").scenario
+    numbers = range(0, scenario.scan_stamps.size, 10)
+    poses = scenario.true_poses(scenario.scan_stamps)
+    nobody = np.empty((0, 3))
+
+    def cast_all() -> None:
+        for number in numbers:
+            scenario.laser.distances(poses[number : number + 1], scenario.walls, nobody)
+
+    figures.timed("ray casting, a scan of 361 beams", len(numbers), cast_all)
+    figures.timed("simulation, a scan of 361 beams", len(numbers), lambda: [scenario.scan(k) for k in numbers])
 
 
 if __name__ == "__main__":
