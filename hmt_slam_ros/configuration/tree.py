@@ -126,7 +126,7 @@ class Matching:
         1.5, "Half side of the window at most, where the prediction is uncertain.", unit="m", low=0.0, high=10.0
     )
     wide_angle: float = parameter(
-        45.0, "Half width of the angular window at most, where the prediction is uncertain.", unit="deg", low=0.0,
+        90.0, "Half width of the angular window at most, where the prediction is uncertain.", unit="deg", low=0.0,
         high=180.0,
     )
 
