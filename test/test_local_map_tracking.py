@@ -96,6 +96,9 @@ def test_a_scan_that_shows_nothing_of_the_map_is_placed_by_odometry(mapping):
     np.testing.assert_allclose(area_filter.pose, [40.3, 0.0, 0.1], atol=1e-6)
     np.testing.assert_allclose(tracked.information, 0.0, atol=1e-9)
     assert not tracked.contradicted
+    # Nothing proves odometry: with a probability of 1 % it is wrong.
+    wider = np.diag(area_filter._since_update.covariance - SURE)
+    assert (wider[:2] >= 0.01 * np.diag(VAGUE)[:2]).all()
 
 
 def test_without_odometry_the_scan_is_searched_for_around_what_the_velocity_predicts(mapping):

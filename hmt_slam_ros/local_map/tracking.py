@@ -74,8 +74,8 @@ class ScanMatcher:
     def __init__(self, mapping: LocalMapping) -> None:
         self._mapping = mapping
         self._settings = mapping.configuration.matching
-        fault = mapping.configuration.motion.fault_probability
-        self._log_fault, self._log_right = math.log(fault), math.log1p(-fault)
+        self._fault = mapping.configuration.motion.fault_probability
+        self._log_fault, self._log_right = math.log(self._fault), math.log1p(-self._fault)
 
     def match(self, points: Float64, before: Float64, prediction: Prediction, view: MapView) -> Match:
         """The scan's pose.
@@ -89,10 +89,11 @@ class ScanMatcher:
         if self._agrees(points, by_odometry, view):
             return by_odometry
         by_inertia = self._match(points, before, prediction.inertia, view)
-        contradicted = by_inertia.log_evidence + self._log_fault > by_odometry.log_evidence + self._log_right
-        if not contradicted or not self._fits(points, by_inertia.pose, view):
-            return by_odometry
-        return self._reconciled(points, before, prediction.odometry, by_inertia, view)
+        # Unknown space has evidence 0: what was found has to be part of the map as well.
+        right = max(0.0, by_odometry.log_evidence + self._log_right)
+        if by_inertia.log_evidence + self._log_fault > right:
+            return self._reconciled(points, before, prediction.odometry, by_inertia, view)
+        return by_odometry if by_odometry.hessian.any() else self._unproven(by_odometry, prediction.inertia)
 
     def _reconciled(self, points: Float64, before: Float64, odometry: Step, found: Match, view: MapView) -> Match:
         """The match with odometry widened along what the scan contradicts; along a corridor it still tells how far."""
@@ -103,6 +104,13 @@ class ScanMatcher:
         step = Step(odometry.increment, odometry.covariance + np.outer(difference, difference))
         prior = matching.Prior(predicted, map_information(step.covariance, predicted[2]))
         return self._refined(points, found.pose, prior, step, view)._replace(contradicted=True)
+
+    def _unproven(self, match: Match, inertia: Step) -> Match:
+        """Odometry where no scan proves it: its covariance is that of both predictions, each by its probability."""
+        step = match.step
+        difference = se2.log(se2.between(step.increment, inertia.increment))
+        otherwise = inertia.covariance + np.outer(difference, difference)
+        return match._replace(step=Step(step.increment, step.covariance + self._fault * otherwise))
 
     def tempered(self, match: Match) -> Float64:
         """Information of the match alone, for correlated beams, in the frame of the pose, shape (3, 3)."""
