@@ -20,6 +20,7 @@ from hmt_slam_ros.local_map.matching import (
 )
 from hmt_slam_ros.local_map.patch_pool import Beams, PatchPool
 from hmt_slam_ros.local_map.patches import FAR, PATCH, field_at, odds_at
+from hmt_slam_ros.sensing.surfels import surfels
 
 CELL, RADIUS = 0.05, 0.5
 MODEL = beam_model(RADIUS, 0.1, 10.0, 0.1)
@@ -37,6 +38,12 @@ def mapped(walls, poses, beams=721):
         told = Beams(scan.points[near], np.empty((0, 2)), scan.origins[near])
         pool.insert(table[None], np.array([pose], dtype=float), told, InverseModel(17, -8, 70))
     return pool, table
+
+
+def seen(walls, pose, **settings):
+    """The surfels of a scan."""
+    scan = scan_in(walls, pose, **settings)
+    return surfels(scan.points, scan.origins)
 
 
 @pytest.fixture(scope="module")
@@ -71,7 +78,7 @@ def test_unknown_space_says_nothing_and_known_free_space_contradicts():
 @pytest.mark.parametrize("offset", [(0.1, -0.05, 0.03), (-0.15, 0.1, -0.05), (0.0, 0.2, 0.0)])
 def test_gauss_newton_finds_the_true_pose_to_a_third_of_a_cell(room, offset):
     truth = np.array([0.5, -0.4, 0.7])
-    points = scan_in(ROOM, truth, beams=361, noise=0.01).points
+    points = seen(ROOM, truth, beams=361, noise=0.01)
     start = se2.compose(truth, offset)
     pose, information = align(points, start, Prior(start, np.diag([1.0, 1.0, 1.0])), room, ALIGNMENT)
     assert np.abs(pose - truth)[:2].max() < CELL / 3
@@ -81,7 +88,7 @@ def test_gauss_newton_finds_the_true_pose_to_a_third_of_a_cell(room, offset):
 
 def test_without_points_the_prior_stands(room):
     prior = Prior(np.array([0.3, 0.2, 0.1]), np.diag([4.0, 5.0, 6.0]))
-    pose, information = align(np.empty((0, 2)), np.zeros(3), prior, room, ALIGNMENT)
+    pose, information = align(np.empty((0, 4)), np.zeros(3), prior, room, ALIGNMENT)
     np.testing.assert_allclose(pose, prior.mean, atol=1e-12)
     np.testing.assert_array_equal(information, 0.0)
 
@@ -115,21 +122,32 @@ def propose(pool, table, points, truth, deviations):
 def test_in_a_corridor_the_proposal_keeps_the_prior_along_it_and_is_sharp_across():
     pool, table = mapped(CORRIDOR, [(x, 0, 0) for x in range(-6, 7)], beams=2881)
     truth = np.array([0.0, 0.1, 0.0])
-    near = scan_in(CORRIDOR, truth, beams=361, field_of_view=2 * np.pi).points
-    near = near[np.hypot(*near.T) < 5.0]
-    covariance = propose(pool, table, near, truth, (0.2, 0.2, 0.05)).covariances[0]
-    along, across = np.sqrt(np.diag(covariance)[:2])
-    # A grid of two deviations to each side holds 95 % of a Gaussian: its moments read low by up to a fifth.
-    assert 0.12 < along < 0.25
+    near = seen(CORRIDOR, truth, beams=361, field_of_view=2 * np.pi)
+    drawn = propose(pool, table, near[np.hypot(near[:, 0], near[:, 1]) < 5.0], truth, (0.2, 0.2, 0.05))
+    along, across = np.sqrt(np.diag(drawn.covariances[0])[:2])
+    assert along == pytest.approx(0.2, rel=0.02)
     assert across < 0.02
+
+
+def test_along_a_corridor_whose_far_walls_are_a_few_cells_a_pose_stays_where_odometry_has_it():
+    pool, table = mapped(CORRIDOR, [(0.0, 0.1, 0.05)], beams=361)
+    prior = Prior(np.array([0.5, 0.1, 0.05]), np.diag([1.0 / 0.05**2, 1.0 / 0.05**2, 1.0 / 0.01**2]))
+    pose, information = align(seen(CORRIDOR, prior.mean, beams=361), prior.mean, prior, pool.view(table), ALIGNMENT)
+    assert np.abs(pose - prior.mean).max() < 1e-3
+    assert information[0, 0] < 0.02 * prior.information[0, 0]
+
+
+def test_points_without_normals_are_refused(room):
+    with pytest.raises(ValueError, match="surfels"):
+        align(np.ones((3, 2)), np.zeros(3), Prior(np.zeros(3), np.eye(3)), room, ALIGNMENT)
 
 
 def test_evidence_is_zero_in_unknown_space_positive_in_the_right_place_and_negative_in_a_wrong_one():
     pool, table = mapped(ROOM, [(0, 0, 0), (-1, 0.5, 1), (3, -1, 2)])
-    points = scan_in(ROOM, (0, 0, 0), beams=181).points
+    points = seen(ROOM, (0, 0, 0))
     deviations = (0.05, 0.05, 0.02)
     empty = pool.empty_table()
     assert propose(pool, empty, points, np.zeros(3), deviations).evidences[0] == pytest.approx(0.0, abs=0.1)
     assert propose(pool, table, points, np.zeros(3), deviations).evidences[0] > 10.0
-    wrong = scan_in(box(-1.5, -1.5, 1.5, 1.5), (0, 0, 0), beams=181).points
+    wrong = seen(box(-1.5, -1.5, 1.5, 1.5), (0, 0, 0))
     assert propose(pool, table, wrong, np.zeros(3), deviations).evidences[0] < -3.0

@@ -113,5 +113,5 @@ def test_without_odometry_the_scan_is_searched_for_around_what_the_velocity_pred
 
 def test_a_certain_prediction_stands_where_there_is_nothing_to_match(mapping):
     area_filter = AreaFilter(mapping, 0, 0)
-    area_filter.track(np.empty((0, 2)), Prediction(Step(np.array([0.1, 0.0, 0.0]), SURE), STILL))
+    area_filter.track(np.empty((0, 4)), Prediction(Step(np.array([0.1, 0.0, 0.0]), SURE), STILL))
     np.testing.assert_allclose(area_filter.pose, [0.1, 0.0, 0.0], atol=1e-12)

@@ -112,7 +112,7 @@ class AreaFilter:
     def track(self, points: Float64, prediction: Prediction) -> Tracked:
         """Move all particles by the leader's matched increment: a pose for a scan between two keyframes.
 
-        :param points: of the scan, shape (n, 2), m, base frame.
+        :param points: surfels of the scan, shape (n, 4), base frame.
         """
         before = self.pose
         match = self._matcher.match(points, before, prediction, self._leading_view())
@@ -129,7 +129,7 @@ class AreaFilter:
     def update(self, points: Float64, step: int) -> FilterStep:
         """Draw every particle from its optimal proposal, weigh it, resample where ESS fell below its bound.
 
-        :param points: of the keyframe's scan, shape (n, 2), m, base frame.
+        :param points: surfels of the keyframe's scan, shape (n, 4), base frame.
         :param step: number of the keyframe event, for the random streams.
         """
         settings = self.mapping.configuration
@@ -150,8 +150,8 @@ class AreaFilter:
         self.log_weights = self.log_weights + drawn.evidences
         self.log_weights -= self.log_weights.max()
         leader = self.leader
-        random = stream(settings.seed, Purpose.PARTICLES, step).standard_normal((len(drawn.means), 3))
-        self.poses = drawn.means + np.einsum("mij,mj->mi", np.linalg.cholesky(drawn.covariances), random)
+        random = stream(settings.seed, Purpose.PARTICLES, step).standard_normal(drawn.modes.shape)
+        self.poses = drawn.modes + np.einsum("mij,mj->mi", np.linalg.cholesky(drawn.covariances), random)
         # The leader keeps the mode, so that the published path has no sampling noise.
         self.poses[leader] = drawn.modes[leader]
         self.poses[:, 2] = se2.wrap(self.poses[:, 2])

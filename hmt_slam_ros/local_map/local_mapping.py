@@ -13,6 +13,7 @@ from hmt_slam_ros.local_map.insertion import InverseModel
 from hmt_slam_ros.local_map.patch_pool import Beams, PatchPool
 from hmt_slam_ros.local_map.patches import FAR, PATCH
 from hmt_slam_ros.sensing import Scan
+from hmt_slam_ros.sensing.surfels import surfels
 
 _ODDS_PER_NAT = 20.0
 
@@ -37,10 +38,11 @@ class LocalMapping:
         self.near = int(match.matched_distance / local_map.field_radius * FAR)
 
     def matching_points(self, scan: Scan) -> Float64:
-        """The points that are matched: within the map's range, evenly thinned; shape (n, 2), base frame, m."""
-        points = self.mapped_beams(scan).points
-        stride = -(-len(points) // self.configuration.matching.max_points)
-        return np.ascontiguousarray(points[:: max(1, stride)])
+        """The surfels that are matched: within the map's range, evenly thinned; shape (n, 4), base frame."""
+        beams = self.mapped_beams(scan)
+        count = len(beams.points)
+        stride = -(-count // self.configuration.matching.max_points)
+        return surfels(beams.points, beams.origins[:count], max(1, stride))
 
     def mapped_beams(self, scan: Scan) -> Beams:
         """The part of a scan within the map's range."""

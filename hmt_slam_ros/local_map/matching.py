@@ -1,6 +1,7 @@
 """Scan matching against a map of patches: likelihood, correlative search, Gauss-Newton on the distance field.
 
-Poses are ``map_T_base`` (x, y, theta); points are (n, 2) in m in the base frame. The likelihood of a beam is taken
+Poses are ``map_T_base`` (x, y, theta); points are (n, 2) in m in the base frame, surfels (n, 4) points with normals
+(``sensing/surfels.py``), which serve wherever points do. The likelihood of a beam is taken
 relative to unknown space, so that 0 means "nothing known here", and maps of different extent compare.
 """
 
@@ -216,7 +217,10 @@ def _smooth_distance(view: MapView, u: float, v: float) -> tuple[float, float, f
 
 @njit(cache=True)
 def _linearise(points: Float64, pose: Float64, view: MapView, settings: Alignment) -> tuple[Float64, Float64]:
-    """Normal equations of the points at a pose: J' W J (3, 3) and J' W r (3,)."""
+    """Normal equations of the surfels (n, 4) at a pose: J' W J (3, 3) and J' W r (3,).
+
+    Distance and gradient of a point on a surface count by what they have in the direction of its normal.
+    """
     hessian, gradient, row = np.zeros((3, 3)), np.zeros(3), np.empty(3)
     half = 0.5 * view.table.shape[0] * PATCH - 0.5
     quantum = view.radius / FAR
@@ -231,8 +235,13 @@ def _linearise(points: Float64, pose: Float64, view: MapView, settings: Alignmen
             continue
         distance *= quantum
         row[0], row[1] = gu * quantum / view.cell, gv * quantum / view.cell
-        row[2] = row[1] * rx - row[0] * ry
         weight = 1.0 / ((1.0 + (distance / settings.robust) ** 2) * settings.sigma**2)
+        if points[n, 2] != 0.0 or points[n, 3] != 0.0:
+            normal_x, normal_y = cos * points[n, 2] - sin * points[n, 3], sin * points[n, 2] + cos * points[n, 3]
+            across = row[0] * normal_x + row[1] * normal_y
+            row[0], row[1] = across * normal_x, across * normal_y
+            distance *= abs(across)
+        row[2] = row[1] * rx - row[0] * ry
         for i in range(3):
             gradient[i] += weight * distance * row[i]
             for j in range(3):
@@ -248,9 +257,12 @@ def align(
 
     Minimises sum rho(d(T p)^2) / sigma^2 + (T - prior)' information (T - prior), rho being Cauchy's.
 
+    :param points: surfels (n, 4).
     :param start: (3,) pose to start from.
     :returns: the mode (3,), and the information (3, 3) of the points alone, map coordinates.
     """
+    if points.shape[1] != 4:
+        raise ValueError("points are aligned with their normals: give surfels (n, 4)")
     pose = start.copy()
     hessian = np.zeros((3, 3))
     for _ in range(settings.iterations):

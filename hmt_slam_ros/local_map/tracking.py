@@ -80,7 +80,7 @@ class ScanMatcher:
     def match(self, points: Float64, before: Float64, prediction: Prediction, view: MapView) -> Match:
         """The scan's pose.
 
-        :param points: of the scan, shape (n, 2), m, base frame.
+        :param points: surfels of the scan, shape (n, 4), base frame.
         :param before: ``map_T_base`` at the last scan, shape (3,).
         """
         if prediction.odometry is None:

@@ -70,7 +70,7 @@ class LiveHypothesis:
         """One filter step with a keyframe's scan, which enters the map where it adds something new.
 
         :param sequence: number of the keyframe event; the first one finds the robot at the origin of its area.
-        :param points: of the scan, to be matched, shape (n, 2), m, base frame.
+        :param points: surfels of the scan, to be matched, shape (n, 4), base frame.
         """
         if sequence == 0:
             step = FilterStep(_FIRST_COVARIANCE, np.zeros((3, 3)), 0.0, float(len(self.filter.poses)), False)

@@ -8,12 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmt_slam_ros.configuration import Configuration
-from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.chi_square import gate
 from hmt_slam_ros.local_map import matching
 from hmt_slam_ros.local_map.local_mapping import LocalMapping
 from hmt_slam_ros.local_map.patches import MapView
 from hmt_slam_ros.sensing import Scan
+from hmt_slam_ros.sensing.surfels import moved
 
 Placed = tuple[Scan, NDArray[np.float64]]
 
@@ -46,8 +46,8 @@ class FineAlignment:
             self._mapping.insert(table[None], pose[None], scan)
         points = np.concatenate(
             [
-                np.zeros((0, 2)),
-                *(se2.transform(pose, self._mapping.matching_points(scan)) for scan, pose in joined),
+                np.zeros((0, 4)),
+                *(moved(pose, self._mapping.matching_points(scan)) for scan, pose in joined),
             ]
         )
         found = self._aligned(points, covariance, self._mapping.pool.view(table))

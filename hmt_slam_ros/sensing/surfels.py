@@ -1,0 +1,132 @@
+"""End points of a scan with the normals of the surfaces on which they lie.
+
+A wall tells a scan how far away it is, and nothing of where along it the robot is. The cells of a map do, falsely: far
+beams meet a wall so sparsely that their end points look like posts, a slanting wall has steps, a wall ends where the
+last scan did. So what a point may say of the pose is limited to the direction of its normal, which the scan itself
+shows. Points that lie on no surface, such as posts and corners, may say everything.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from hmt_slam_ros.arrays import Bool, Float64
+from hmt_slam_ros.geometry import se2
+
+# A surface is fitted to the points up to this far on each side, m, or to the next ones where beams are sparser.
+_REACH = 0.5
+# Neighbouring points farther apart than this share of their range lie on different surfaces.
+_GAP = 0.4
+# Deviation of the points along a surface at least, and across it at most, m, and as a share of that along it.
+_SHORT, _FLAT, _ROUND = 0.1, 0.03, 0.2
+# A point lies on the surface of those around it within so much, m, and within so many of their deviations across it.
+_OFF, _DEVIATIONS = 0.03, 3.0
+# A point and one in front of it show two things if they are farther apart than this, in m and as a share of the range.
+_APART, _APART_SHARE = 0.1, 0.05
+
+
+def surfels(points: Float64, origins: Float64, stride: int = 1) -> Float64:
+    """Every so many of the points, with their normals, which all points show.
+
+    :param points: shape (n, 2), m, in the order of the beams.
+    :param origins: shape (n, 2), where the laser was at each.
+    :returns: shape (k, 4): x, y, and the unit normal, of either sign, or zeros for a point on no surface. Points that
+        only show where the shadow of something nearer ends are left out.
+    """
+    found = np.zeros((-(-len(points) // stride), 4))
+    found[:, :2] = points[::stride]
+    beams = points - origins
+    shown = _find_normals(beams, np.hypot(beams[:, 0], beams[:, 1]), stride, found)
+    return np.ascontiguousarray(found[shown])
+
+
+def moved(a_T_b: Float64, surfels: Float64) -> Float64:
+    """Surfels (n, 4) of frame b in frame a, for one pose (3,)."""
+    turned = se2.transform((0.0, 0.0, a_T_b[2]), surfels[:, 2:])
+    return np.concatenate((se2.transform(a_T_b, surfels[:, :2]), turned), axis=1)
+
+
+@njit(cache=True)
+def _find_normals(beams: Float64, ranges: Float64, stride: int, found: Float64) -> Bool:
+    """Write the normals of the surfaces around every so many points; at an edge, of the surface on one side of it.
+
+    :param beams: shape (n, 2), m, from the laser to the points.
+    :returns: which of the points show more than a shadow.
+    """
+    shown = np.ones(len(found), np.bool_)
+    for k in range(len(found)):
+        i, normal = k * stride, found[k, 2:]
+        low, high = _last_within(beams, ranges, i, -1, 1), _last_within(beams, ranges, i, 1, 1)
+        if low < i < high and _fit(beams, low, i, high, normal):
+            continue
+        low, high = _last_within(beams, ranges, i, -1, 2), _last_within(beams, ranges, i, 1, 2)
+        if i - low >= 2 and _fit(beams, low, i, i, normal):
+            continue
+        if high - i >= 2 and _fit(beams, i, i, high, normal):
+            continue
+        shown[k] = not _shadowed(beams, ranges, i)
+    return shown
+
+
+@njit(cache=True)
+def _last_within(beams: Float64, ranges: Float64, i: int, step: int, fewest: int) -> int:
+    """The first point of those that follow ``i`` without a gap that is out of reach, or else the last of them."""
+    j = i
+    while 0 <= j + step < len(beams):
+        dx, dy = beams[j + step, 0] - beams[j, 0], beams[j + step, 1] - beams[j, 1]
+        if dx * dx + dy * dy > (_GAP * max(ranges[j], ranges[j + step])) ** 2:
+            break
+        j += step
+        dx, dy = beams[j, 0] - beams[i, 0], beams[j, 1] - beams[i, 1]
+        if abs(j - i) >= fewest and dx * dx + dy * dy >= _REACH * _REACH:
+            break
+    return j
+
+
+@njit(cache=True)
+def _fit(beams: Float64, low: int, own: int, high: int, normal: Float64) -> bool:
+    """Fit a line to the points from ``low`` to ``high``; False where they, or the point itself, do not lie on one.
+
+    On a line the inverse of the range is linear in the direction of the beam. The fit takes the ranges for uncertain
+    and the directions for exact: total least squares would turn all normals a little to the same side, and what is
+    seen ahead would draw the robot back. The point itself is left out of it, or its own error would turn its normal,
+    and the two together push along the wall.
+    """
+    xx = xy = yy = x = y = 0.0
+    for k in range(low, high + 1):
+        if k != own:
+            inverse = 1.0 / np.hypot(beams[k, 0], beams[k, 1])
+            cos, sin = beams[k, 0] * inverse, beams[k, 1] * inverse
+            xx, xy, yy = xx + cos * cos, xy + cos * sin, yy + sin * sin
+            x, y = x + cos * inverse, y + sin * inverse
+    across_x, across_y = yy * x - xy * y, xx * y - xy * x
+    length = np.hypot(across_x, across_y)
+    if length == 0.0:
+        return False
+    across_x, across_y, distance = across_x / length, across_y / length, (xx * yy - xy * xy) / length
+    off = mean = square = 0.0
+    for k in range(low, high + 1):
+        if k != own:
+            off += (across_x * beams[k, 0] + across_y * beams[k, 1] - distance) ** 2
+            along = across_x * beams[k, 1] - across_y * beams[k, 0]
+            mean, square = mean + along, square + along * along
+    count = high - low
+    off, spread = np.sqrt(off / count), np.sqrt(max(0.0, square / count - (mean / count) ** 2))
+    own_off = abs(across_x * beams[own, 0] + across_y * beams[own, 1] - distance)
+    if spread < _SHORT or off > min(_FLAT, _ROUND * spread) or own_off > _OFF + _DEVIATIONS * off:
+        return False
+    normal[0], normal[1] = across_x, across_y
+    return True
+
+
+@njit(cache=True)
+def _shadowed(beams: Float64, ranges: Float64, i: int) -> bool:
+    """Whether a point is beside one in front of it, so that the two do not show where it ends but where that does."""
+    limit = _APART + _APART_SHARE * ranges[i]
+    for j in (i - 1, i + 1):
+        if not 0 <= j < len(beams) or ranges[j] >= ranges[i]:
+            continue
+        if np.hypot(beams[i, 0] - beams[j, 0], beams[i, 1] - beams[j, 1]) > limit:
+            return True
+    return False
