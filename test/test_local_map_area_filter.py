@@ -93,6 +93,73 @@ def test_resampling_keeps_the_leader_and_drops_what_has_no_weight():
     np.testing.assert_array_equal(area_filter.log_weights, 0.0)
 
 
+def test_the_leader_stays_until_another_is_clearly_more_likely():
+    area_filter, _ = driven(LocalMapping(Configuration()), steps=8)
+    leader, count = area_filter.leader, len(area_filter.poses)
+    other = (leader + 1) % count
+    for advantage, leads in ((0.0, leader), (2.9, leader), (3.1, other)):
+        area_filter.log_weights = np.full(count, -5.0)
+        area_filter.log_weights[leader], area_filter.log_weights[other] = -advantage, 0.0
+        assert area_filter.leader == leads
+        np.testing.assert_array_equal(area_filter.pose, area_filter.poses[leads])
+
+
+def test_a_leader_that_is_less_likely_though_not_clearly_is_kept_by_resampling():
+    area_filter, _ = driven(LocalMapping(Configuration()), steps=8)
+    count = len(area_filter.poses)
+    leader, heaviest = area_filter.leader, (area_filter.leader + 1) % count
+    area_filter.log_weights = np.full(count, -50.0)
+    area_filter.log_weights[heaviest], area_filter.log_weights[leader] = 0.0, -2.9
+    histories = area_filter.keyframe_poses[[leader, heaviest]]
+    step = area_filter.update(np.empty((0, 4)), 50)
+    assert not step.history_changed
+    np.testing.assert_array_equal(area_filter.log_weights, 0.0)
+    np.testing.assert_array_equal(area_filter.leading_keyframe_poses(), histories[0])
+    shares = [(area_filter.keyframe_poses == history).all(axis=(1, 2)).sum() for history in histories]
+    assert shares == [1, count - 1]
+
+
+def test_a_particle_that_is_clearly_more_likely_takes_the_lead_and_it_is_told():
+    area_filter, _ = driven(LocalMapping(Configuration()), steps=8)
+    count = len(area_filter.poses)
+    heaviest = (area_filter.leader + 1) % count
+    area_filter.log_weights = np.full(count, -50.0)
+    area_filter.log_weights[heaviest] = 0.0
+    leading = area_filter.keyframe_poses[heaviest].copy()
+    assert area_filter.update(np.empty((0, 4)), 50).history_changed
+    np.testing.assert_array_equal(area_filter.leading_keyframe_poses(), leading)
+
+
+def test_the_motion_of_a_step_is_that_of_one_particle_also_where_the_lead_changes():
+    area_filter, _ = driven(LocalMapping(Configuration()), steps=8)
+    area_filter.update(np.empty((0, 4)), 49)
+    other = (area_filter.leader + 1) % len(area_filter.poses)
+    area_filter.poses[other] = area_filter._last_poses[other] = area_filter._priors[other] = (1.0, 2.0, 0.5)
+    area_filter.log_weights = np.full(len(area_filter.poses), -10.0)
+    area_filter.log_weights[other] = 0.0
+    area_filter.track(np.empty((0, 4)), predicted(STEP))
+    step = area_filter.update(np.empty((0, 4)), 50)
+    assert step.history_changed
+    np.testing.assert_allclose(step.moved, STEP, atol=1e-9)
+
+
+def test_what_the_scan_tells_of_a_step_is_inflated_and_what_odometry_tells_is_not():
+    configuration = Configuration()
+    deviations = np.array([0.1, 0.1, 0.1])
+    by_scan, by_odometry = [], []
+    for inflation in (1.0, 4.0):
+        settings = replace(configuration.filter, covariance_inflation=inflation)
+        area_filter, truth = driven(LocalMapping(replace(configuration, filter=settings)), steps=8)
+        scan = scan_in(ROOM, se2.compose(truth, STEP), noise=0.01)
+        for points, found in ((area_filter.mapping.matching_points(scan), by_scan), (np.empty((0, 4)), by_odometry)):
+            area_filter._restart()
+            area_filter.track(points, predicted(STEP, np.diag(deviations**2)))
+            found.append(np.sqrt(np.diag(area_filter.update(points, 60).covariance)))
+    np.testing.assert_allclose(by_odometry, [deviations, deviations], rtol=1e-6)
+    assert (by_scan[0] < 0.1 * deviations).all()
+    np.testing.assert_allclose(by_scan[1], 2.0 * by_scan[0], rtol=0.03)
+
+
 def test_effective_samples_equal_the_particles_where_all_weigh_the_same():
     mapping = LocalMapping(Configuration())
     area_filter = AreaFilter(mapping, 0, 0)

@@ -106,8 +106,7 @@ def test_one_seed_gives_the_same_bytes(output, tmp_path):
     assert filecmp.cmpfiles(output, again, names, shallow=False) == (names, [], [])
 
 
-def test_another_seed_gives_another_path(output, tmp_path):
+def test_another_seed_gives_nearly_the_same_path(output, tmp_path):
     other = mapped(tmp_path / "other", "--seed", "1")
-    assert (other / "trajectory.tum").read_bytes() != (output / "trajectory.tum").read_bytes()
     difference = se2.between(read_tum(output / "trajectory.tum").poses, read_tum(other / "trajectory.tum").poses)
-    assert np.hypot(*difference[:, :2].T).max() < 0.3
+    assert np.hypot(*difference[:, :2].T).max() < 0.1

@@ -21,6 +21,9 @@ from hmt_slam_ros.random_streams import Purpose, stream
 from hmt_slam_ros.sensing import Scan
 from hmt_slam_ros.sensing.motion import NO_STEP, Prediction
 
+# Another particle takes the lead when it is more likely by this much, nats.
+_CLEARLY = 3.0
+
 
 @dataclass(frozen=True, eq=False)
 class PlacedKeyframe:
@@ -36,13 +39,15 @@ class PlacedKeyframe:
 class FilterStep:
     """What a filter step found.
 
-    :ivar covariance: of the leading particle's pose, shape (3, 3), right tangent frame.
+    :ivar moved: the leading particle's motion since the last step, ``start_T_end``, shape (3,).
+    :ivar covariance: of that motion, shape (3, 3), in the frame of its end: odometry's, but where the scan tells more.
     :ivar information: of the match alone, for correlated beams, in the frame of the pose, shape (3, 3).
     :ivar log_evidence: log p(z_t | past), tempered, relative to unknown space, nats.
     :ivar effective_samples: ESS before resampling.
     :ivar history_changed: whether another particle leads than before, so that keyframe poses differ from those told.
     """
 
+    moved: Float64
     covariance: Float64
     information: Float64
     log_evidence: float
@@ -74,6 +79,7 @@ class AreaFilter:
         self.keyframe_poses = np.zeros((count, 0, 3))
         self._tables = np.stack([mapping.pool.empty_table()] * count)
         self._priors = self.poses.copy()
+        self._last_poses = self.poses.copy()
         self._since_update = NO_STEP
         self._told_leader = 0
         self._matcher = ScanMatcher(mapping)
@@ -81,8 +87,13 @@ class AreaFilter:
 
     @property
     def leader(self) -> int:
-        """The particle of largest weight; of equals the first."""
-        return int(np.argmax(self.log_weights))
+        """The particle of largest weight; where none is clearly more likely, the one that led at the last step.
+
+        Along a corridor nothing tells the particles apart, and the pose would jump from one to the other.
+        """
+        heaviest = int(np.argmax(self.log_weights))
+        lead = self.log_weights[heaviest] - self.log_weights[self._told_leader]
+        return heaviest if lead > _CLEARLY else self._told_leader
 
     @property
     def pose(self) -> Float64:
@@ -100,7 +111,8 @@ class AreaFilter:
         child.keyframes, child.keyframe_areas = list(self.keyframes), list(self.keyframe_areas)
         child.keyframe_poses = self.keyframe_poses.copy()
         child._tables = np.stack([self.mapping.pool.share(table) for table in self._tables])
-        child._priors, child._since_update = self._priors.copy(), self._since_update
+        child._priors, child._last_poses = self._priors.copy(), self._last_poses.copy()
+        child._since_update = self._since_update
         child._told_leader, child.tracking_covariance = self._told_leader, self.tracking_covariance
         return child
 
@@ -133,11 +145,12 @@ class AreaFilter:
         :param step: number of the keyframe event, for the random streams.
         """
         settings = self.mapping.configuration
+        prior = map_information(self._since_update.covariance, self.pose[2])
         drawn = batch.propose_all(
             points,
             self.poses,
             self._priors,
-            map_information(self._since_update.covariance, self.pose[2]),
+            prior,
             self._tables,
             self._leading_view(),
             self.mapping.alignment,
@@ -156,34 +169,41 @@ class AreaFilter:
         self.poses[leader] = drawn.modes[leader]
         self.poses[:, 2] = se2.wrap(self.poses[:, 2])
         heading = self.poses[leader, 2]
-        covariance = in_body_frame(drawn.covariances[leader], heading)
+        # The beams are correlated, what odometry knows is not.
+        told = drawn.hessians[leader] / settings.filter.covariance_inflation
+        covariance = in_body_frame(np.linalg.inv(prior + told), heading)
         information = in_body_frame(settings.matching.temper * drawn.hessians[leader], heading)
         effective = 1.0 / float(np.sum(_normalised(self.log_weights) ** 2))
+        moved = se2.between(self._last_poses[leader], self.poses[leader])
         changed = leader != self._told_leader
+        self._told_leader = leader
         if effective < settings.filter.ess_fraction * len(self.poses):
             self._resample(step)
-        self._told_leader = self.leader
         self._restart()
-        return FilterStep(covariance, information, log_evidence, effective, changed)
+        return FilterStep(moved, covariance, information, log_evidence, effective, changed)
 
     def _restart(self) -> None:
         """Predict from here."""
         self._priors = self.poses.copy()
+        self._last_poses = self.poses.copy()
         self._since_update = NO_STEP
 
     def _resample(self, step: int) -> None:
-        """Systematic resampling; the leader stands first, so that it still leads."""
+        """Systematic resampling; the leader is kept, and stands first afterwards."""
         weights = _normalised(self.log_weights)
         offset = stream(self.mapping.configuration.seed, Purpose.RESAMPLING, step).random()
         positions = (np.arange(len(weights)) + offset) / len(weights)
         ancestors = np.minimum(np.searchsorted(np.cumsum(weights), positions), len(weights) - 1)
         leader = self.leader
+        if leader not in ancestors:
+            ancestors[0] = leader
         ancestors = np.concatenate((ancestors[ancestors == leader], ancestors[ancestors != leader]))
         tables = np.stack([self.mapping.pool.share(self._tables[a]) for a in ancestors])
         self.release()
         self._tables = tables
         self.poses, self.keyframe_poses = self.poses[ancestors], self.keyframe_poses[ancestors]
         self.log_weights = np.zeros(len(weights))
+        self._told_leader = 0
 
     def add_keyframe(self, keyframe: int, scan: Scan) -> None:
         """Enter the scan into every particle's map at that particle's pose."""
@@ -202,6 +222,7 @@ class AreaFilter:
         self.area = area
         self.poses = se2.compose(area_T_previous, self.poses)
         self._priors = se2.compose(area_T_previous, self._priors)
+        self._last_poses = se2.compose(area_T_previous, self._last_poses)
         self._load(content)
 
     def reload(self, content: Sequence[PlacedKeyframe], anchor: int) -> None:
@@ -211,10 +232,10 @@ class AreaFilter:
         :param anchor: the keyframe by which the robot's place is known.
         """
         before = self.keyframe_poses[:, self.keyframes.index(anchor)]
-        seen, expected = se2.between(before, self.poses), se2.between(before, self._priors)
+        seen = [se2.between(before, poses) for poses in (self.poses, self._priors, self._last_poses)]
         self._load(content)
         after = self.keyframe_poses[:, self.keyframes.index(anchor)]
-        self.poses, self._priors = se2.compose(after, seen), se2.compose(after, expected)
+        self.poses, self._priors, self._last_poses = (se2.compose(after, poses) for poses in seen)
 
     def _load(self, content: Sequence[PlacedKeyframe]) -> None:
         self.release()

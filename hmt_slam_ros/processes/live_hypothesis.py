@@ -73,14 +73,15 @@ class LiveHypothesis:
         :param points: surfels of the scan, to be matched, shape (n, 4), base frame.
         """
         if sequence == 0:
-            step = FilterStep(_FIRST_COVARIANCE, np.zeros((3, 3)), 0.0, float(len(self.filter.poses)), False)
+            unmoved, nothing = np.zeros(3), np.zeros((3, 3))
+            step = FilterStep(unmoved, _FIRST_COVARIANCE, nothing, 0.0, float(len(self.filter.poses)), False)
         else:
             step = self.filter.update(points, sequence)
         stored = self._is_new()
-        self._drift_on(step.covariance * self.settings.covariance_inflation, sequence if stored else None)
+        self._drift_on(step.covariance, sequence if stored else None)
         if stored:
             self.filter.add_keyframe(sequence, scan)
-        self.moved, self.information = se2.between(self.event_pose, self.filter.pose), step.information
+        self.moved, self.information = step.moved, step.information
         self.event_pose = self.filter.pose
         self._relate()
         return LeafEstimate(
