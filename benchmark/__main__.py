@@ -1,4 +1,4 @@
-"""The command line of the measurements: ``python -m benchmark accuracy steps robustness speed|all|short``.
+"""The command line of the measurements: ``python -m benchmark accuracy steps robustness choices speed|all|short``.
 
 Exit status: 0 where all that is asked for holds, 1 where something does not, 2 where nothing could be measured.
 """
@@ -27,10 +27,11 @@ MEASUREMENTS = {
     "accuracy": "errors at true relations, torn walls where there is no truth",
     "steps": "what arc optimisation and keyframe refinement gain",
     "robustness": "the same with degraded odometry",
+    "choices": "what each choice of the design is worth, one parameter changed at a time",
     "speed": "CPU time, memory, cost of a scan, start",
     "short": "for CI, whether accuracy became worse than benchmark/expected.toml beyond noise",
 }
-_ALL = ("accuracy", "steps", "robustness", "speed")
+_ALL = ("accuracy", "steps", "robustness", "choices", "speed")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

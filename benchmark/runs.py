@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from collections.abc import Iterable, Sequence
@@ -41,7 +42,8 @@ class Case:
     @property
     def name(self) -> str:
         """Of the output folder."""
-        return "-".join(filter(None, (self.log.name, self.kind, str(self.seed))))
+        changes = "_".join(re.sub(r"[^\w.]+", "_", change) for change in self.changes)
+        return "-".join(filter(None, (self.log.name, self.kind, changes, str(self.seed))))
 
     def command(self, folder: Path) -> list[str]:
         """The command line that maps the log into a folder."""
