@@ -14,6 +14,8 @@ from hmt_slam_ros.evaluation import PairErrors, RelationErrors
 
 _DPI = 110
 _BINS = 12
+_LEAST = 20  # errors of a bin that is drawn
+_SHORTEST = 0.1  # s; shorter spans are drawn there
 
 
 def plot_errors_by_seed(
@@ -48,18 +50,18 @@ def plot_errors_by_span(path: Path, pairs: Mapping[str, Sequence[PairErrors]]) -
     """
     figure = Figure(figsize=(5.0 * len(pairs), 4.0), layout="constrained")
     for axes, (name, own) in zip(_panels(figure, len(pairs)), pairs.items(), strict=True):
-        seconds = np.concatenate([errors.span[errors.found] for errors in own]) * 1e-9
+        seconds = np.maximum(np.concatenate([errors.span[errors.found] for errors in own]) * 1e-9, _SHORTEST)
         translation = np.concatenate([errors.translation[errors.found] for errors in own])
         axes.plot(seconds, translation, ".", markersize=1.5, color="0.7", rasterized=True)
-        edges = np.quantile(seconds, np.linspace(0.0, 1.0, _BINS + 1))
+        edges = np.geomspace(seconds.min(), seconds.max(), _BINS + 1)
         bins = np.clip(np.searchsorted(edges, seconds, side="right") - 1, 0, _BINS - 1)
-        filled = np.unique(bins)
+        filled = np.flatnonzero(np.bincount(bins) >= _LEAST)
         centres = [np.median(seconds[bins == k]) for k in filled]
         for share, style in ((50, "o-"), (95, "^--")):
             heights = [np.percentile(translation[bins == k], share) for k in filled]
             axes.plot(centres, heights, style, label=f"{share} %")
         axes.axvline(60.0, color="black", linewidth=0.8)
-        axes.set_xscale("symlog", linthresh=1.0)
+        axes.set_xscale("log")
         axes.set_yscale("log")
         axes.set_ylim(bottom=1e-3)
         axes.set_title(name)
