@@ -78,59 +78,82 @@ def _add_points(
     information: Float64,
     gradient: Float64,
 ) -> float:
-    """Add the points of scan ``one`` that meet walls of scan ``other``, ``pose`` being ``other_T_one``.
+    """Enter the points of scan ``one`` that meet walls of scan ``other``, ``pose`` being ``other_T_one``.
 
+    :param information: shape (3, 3), ``gradient`` (3,): written to.
     :returns: the share of the points that meet a wall.
     """
-    points = ones.points
     cos, sin = np.cos(pose[2]), np.sin(pose[2])
     most, sharpness = weights.temper / weights.sigma**2, 1.0 / weights.robust
-    row = np.empty(3)
+    # Sums in variables of their own stay in registers.
+    xx = xy = xt = yy = yt = tt = gx = gy = gt = 0.0
     met = 0
     first, last = ones.starts[one], ones.starts[one + 1]
     for k in range(first, last):
-        x = pose[0] + cos * points[k, 0] - sin * points[k, 1]
-        y = pose[1] + sin * points[k, 0] + cos * points[k, 1]
+        px, py = ones.points[k, 0], ones.points[k, 1]
+        x = pose[0] + cos * px - sin * py
+        y = pose[1] + sin * px + cos * py
         q = _nearest(others, other, x, y, gate)
         if q < 0 or not others.flat[q]:
             continue
         nx, ny = others.normals[q, 0], others.normals[q, 1]
-        if ones.flat[k]:
-            ox, oy = ones.normals[k, 0], ones.normals[k, 1]
-            if (cos * ox - sin * oy) * nx + (sin * ox + cos * oy) * ny < _SAME_WALL:
-                continue
+        jx, jy = cos * nx + sin * ny, -sin * nx + cos * ny
+        if ones.flat[k] and jx * ones.normals[k, 0] + jy * ones.normals[k, 1] < _SAME_WALL:
+            continue
         met += 1
+        jt = jy * px - jx * py
         error = nx * (x - others.points[q, 0]) + ny * (y - others.points[q, 1])
-        row[0], row[1] = cos * nx + sin * ny, -sin * nx + cos * ny
-        row[2] = row[1] * points[k, 0] - row[0] * points[k, 1]
         weight = most / (1.0 + (error * sharpness) ** 2)
-        for i in range(3):
-            gradient[i] += weight * error * row[i]
-            for j in range(3):
-                information[i, j] += weight * row[i] * row[j]
+        wx, wy, wt = weight * jx, weight * jy, weight * jt
+        xx += wx * jx
+        xy += wx * jy
+        xt += wx * jt
+        yy += wy * jy
+        yt += wy * jt
+        tt += wt * jt
+        gx += wx * error
+        gy += wy * error
+        gt += wt * error
+    information[0, 0], information[1, 1], information[2, 2] = xx, yy, tt
+    information[0, 1] = information[1, 0] = xy
+    information[0, 2] = information[2, 0] = xt
+    information[1, 2] = information[2, 1] = yt
+    gradient[0], gradient[1], gradient[2] = gx, gy, gt
     return met / max(1, last - first)
 
 
-@njit(cache=True)
+@njit(cache=True, inline="always")
 def _nearest(surfaces: Surfaces, scan: int, x: float, y: float, gate: float) -> int:
     """The point of a scan nearest to (x, y) in its base frame, among those seen in that direction; -1 for none."""
+    points, bins = surfaces.points, surfaces.bins
     dx, dy = x - surfaces.lasers[scan, 0], y - surfaces.lasers[scan, 1]
     first = surfaces.bin_starts[scan]
     count = surfaces.bin_starts[scan + 1] - first
-    middle = bin_of(np.arctan2(dy, dx), count)
+    middle = bin_of(dx, dy, count)
     # What is seen so many bins away is at least so far off: the chord grows by about this with each bin.
     squared_width = (2.0 * np.pi / count) ** 2 * (dx * dx + dy * dy)
     nearest, best = -1, gate * gate
-    for offset in range(min(_WINDOW, count // 2) + 1):
-        if offset > 1 and (offset - 1) ** 2 * squared_width >= best:
-            break
-        below, above = middle - offset, middle + offset
-        for place in (below if below >= 0 else below + count, above if above < count else above - count):
-            k = surfaces.bins[first + place]
-            if k < 0:
-                continue
-            ex, ey = surfaces.points[k, 0] - x, surfaces.points[k, 1] - y
-            squared = ex * ex + ey * ey
-            if squared < best:
-                best, nearest = squared, k
+    k = bins[first + middle]
+    if k >= 0:
+        ex, ey = points[k, 0] - x, points[k, 1] - y
+        squared = ex * ex + ey * ey
+        if squared < best:
+            best, nearest = squared, k
+    # To one side and then to the other, as far as that may bring something nearer.
+    for step in (-1, 1):
+        place = middle
+        for passed in range(min(_WINDOW, count // 2)):
+            if passed * passed * squared_width >= best:
+                break
+            place += step
+            if place < 0:
+                place += count
+            elif place >= count:
+                place -= count
+            k = bins[first + place]
+            if k >= 0:
+                ex, ey = points[k, 0] - x, points[k, 1] - y
+                squared = ex * ex + ey * ey
+                if squared < best:
+                    best, nearest = squared, k
     return nearest
