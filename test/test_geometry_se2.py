@@ -218,6 +218,8 @@ def test_every_function_broadcasts_over_leading_dimensions():
 def test_one_pose_by_itself_is_moved_as_it_is_among_many(a, b):
     assert_same_pose(se2.compose(a, b), se2.compose(a[None], b[None])[0])
     assert_same_pose(se2.inverse(a), se2.inverse(a[None])[0])
+    assert_same_pose(se2.exp(a), se2.exp(a[None])[0])
+    np.testing.assert_allclose(se2.log(a), se2.log(a[None])[0], atol=1e-9)
 
 
 def test_the_best_fit_is_the_motion_between_equal_constellations_and_minds_noise_little():

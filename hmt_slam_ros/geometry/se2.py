@@ -21,6 +21,8 @@ _SMALL_ANGLE = 1e-5
 def wrap(angle: ArrayLike) -> NDArray[np.float64]:
     """``angle`` brought into [-pi, pi)."""
     angle = np.asarray(angle, dtype=np.float64)
+    if not angle.ndim:
+        return np.array(_wrap_one(angle.item()))
     inside = (angle >= -np.pi) & (angle < np.pi)
     if inside.all():
         return angle.copy()
@@ -96,6 +98,8 @@ def transform(a_T_b: ArrayLike, points: ArrayLike) -> NDArray[np.float64]:
 def exp(xi: ArrayLike) -> Pose:
     """The motion of the twist (..., 3) of (v_x, v_y, omega) over unit time."""
     xi = np.asarray(xi, dtype=np.float64)
+    if xi.ndim == 1:
+        return _exp_one(*xi.tolist())
     omega = xi[..., 2]
     small = np.abs(omega) < _SMALL_ANGLE
     safe = np.where(small, 1.0, omega)
@@ -107,9 +111,19 @@ def exp(xi: ArrayLike) -> Pose:
     return _stacked(x, y, wrap(omega))
 
 
+def _exp_one(x: float, y: float, omega: float) -> Pose:
+    if abs(omega) < _SMALL_ANGLE:
+        a, b = 1.0 - omega**2 / 6.0, 0.5 * omega
+    else:
+        a, b = math.sin(omega) / omega, 2.0 * math.sin(0.5 * omega) ** 2 / omega
+    return np.array((a * x - b * y, b * x + a * y, _wrap_one(omega)))
+
+
 def log(pose: ArrayLike) -> NDArray[np.float64]:
     """The twist (..., 3) with ``exp(twist) == pose`` and |omega| <= pi."""
     pose = np.asarray(pose, dtype=np.float64)
+    if pose.ndim == 1:
+        return _log_one(*pose.tolist())
     omega = wrap(pose[..., 2])
     small = np.abs(omega) < _SMALL_ANGLE
     safe = np.where(small, 1.0, omega)
@@ -117,6 +131,13 @@ def log(pose: ArrayLike) -> NDArray[np.float64]:
     x = half_cot * pose[..., 0] + 0.5 * omega * pose[..., 1]
     y = -0.5 * omega * pose[..., 0] + half_cot * pose[..., 1]
     return _stacked(x, y, omega)
+
+
+def _log_one(x: float, y: float, angle: float) -> NDArray[np.float64]:
+    omega = _wrap_one(angle)
+    half = 0.5 * omega
+    half_cot = 1.0 - omega**2 / 12.0 if abs(omega) < _SMALL_ANGLE else half / math.tan(half)
+    return np.array((half_cot * x + half * y, -half * x + half_cot * y, omega))
 
 
 def adjoint(pose: ArrayLike) -> NDArray[np.float64]:
