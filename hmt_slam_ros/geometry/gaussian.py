@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from hmt_slam_ros.geometry import se2
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, slots=True)
 class PoseGaussian:
     """N(mean, covariance) over the poses ``a_T_b``.
 

@@ -19,6 +19,7 @@ from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.offline.trajectories import (
     Anchored,
+    OnlinePose,
     Trajectory,
     anchored,
     carried,
@@ -115,7 +116,7 @@ class Recorder:
     :ivar configuration: that of the run, which goes into the output.
     :ivar keyframes: {keyframe event: message}, likewise ``hypotheses`` and ``accepted``.
     :ivar trails: {(hypothesis, first scan): message}.
-    :ivar estimates: {scan index: message}.
+    :ivar estimates: {scan index: what is kept of the message}; ``last``, the message of the last scan.
     :ivar notices: {(process, text): message} in the order of arrival.
     :ivar finished: the last word of metric SLAM, None before it.
     """
@@ -125,7 +126,8 @@ class Recorder:
     hypotheses: dict[int, Hypotheses] = field(default_factory=dict)
     accepted: dict[int, Accepted] = field(default_factory=dict)
     trails: dict[tuple[int, int], Trail] = field(default_factory=dict)
-    estimates: dict[int, LocalEstimate] = field(default_factory=dict)
+    estimates: dict[int, OnlinePose] = field(default_factory=dict)
+    last: LocalEstimate | None = None
     notices: dict[tuple[str, str], Notice] = field(default_factory=dict)
     finished: Finished | None = None
 
@@ -141,12 +143,19 @@ class Recorder:
             case Trail():
                 self.trails[message.hypothesis, message.first_scan] = message
             case LocalEstimate():
-                self.estimates.setdefault(message.scan_index, message)
+                self._keep(message)
             case Notice():
                 self.notices.setdefault((message.process, message.text), message)
             case Finished():
                 self.finished = message
         return []
+
+    def _keep(self, message: LocalEstimate) -> None:
+        # The pose is one of all particles', which a view of it would keep.
+        kept = OnlinePose(message.stamp, message.area, message.pose.mean.copy(), message.odometry)
+        self.estimates.setdefault(message.scan_index, kept)
+        if self.last is None or message.scan_index > self.last.scan_index:
+            self.last = message
 
     @property
     def complete(self) -> bool:
@@ -165,7 +174,7 @@ class Recorder:
             trajectories have a pose for each.
         :raises HmtSlamError: where no scan gave a pose, or messages were lost on the way.
         """
-        if not self.estimates or not self.keyframes or self.finished is None:
+        if self.last is None or not self.keyframes or self.finished is None:
             raise HmtSlamError(
                 f"none of the {stamps.size} scans gave a pose: check that their ranges lie between range_min and "
                 "range_max and that the log has odometry"
@@ -186,7 +195,7 @@ class Recorder:
             carried(scans, keyframe_poses(replica.maps[replica.best], area_poses)),
             online_trajectory(stamps, self.estimates, keyframes, accepted),
             probabilities,
-            self.estimates[max(self.estimates)],
+            self.last,
             self.finished,
             tuple(self.notices.values()),
         )

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.processes.messages import Accepted, Keyframe, LocalEstimate, Trail
+from hmt_slam_ros.processes.messages import Accepted, Keyframe, Trail
 from hmt_slam_ros.processes.replica import FIRST_AREA
 
 Trajectory = NDArray[np.float64]
@@ -26,6 +26,21 @@ class Anchored(NamedTuple):
 
     keyframes: NDArray[np.int64]
     poses: Trajectory
+
+
+class OnlinePose(NamedTuple):
+    """What is kept of a ``LocalEstimate``.
+
+    :ivar stamp: the scan's, ns.
+    :ivar area: the robot's.
+    :ivar pose: shape (3,), ``area_T_base``.
+    :ivar odometry: shape (3,), ``odom_T_base``.
+    """
+
+    stamp: int
+    area: int
+    pose: NDArray[np.float64]
+    odometry: NDArray[np.float64]
 
 
 def anchored(stamps: NDArray[np.int64], trails: Sequence[Trail]) -> Anchored:
@@ -56,7 +71,7 @@ def carried(scans: Anchored, keyframes: Mapping[int, NDArray[np.float64]]) -> Tr
     return _filled(poses)
 
 
-def odometry_trajectory(stamps: NDArray[np.int64], estimates: Mapping[int, LocalEstimate]) -> Trajectory:
+def odometry_trajectory(stamps: NDArray[np.int64], estimates: Mapping[int, OnlinePose]) -> Trajectory:
     """``odom_T_base`` at every scan, shape (n, 3).
 
     :param stamps: shape (n,), of all scans, ns, increasing.
@@ -71,7 +86,7 @@ def odometry_trajectory(stamps: NDArray[np.int64], estimates: Mapping[int, Local
 
 def online_trajectory(
     stamps: NDArray[np.int64],
-    estimates: Mapping[int, LocalEstimate],
+    estimates: Mapping[int, OnlinePose],
     keyframes: Sequence[Keyframe],
     accepted: Sequence[Accepted],
 ) -> Trajectory:
@@ -93,7 +108,7 @@ def online_trajectory(
             areas = {entry.area: entry.pose.mean for entry in given} if given else areas
             verdicts += 1
         if estimate.area in areas or previous is None:
-            pose = se2.compose(areas.get(estimate.area, np.zeros(3)), estimate.pose.mean)
+            pose = se2.compose(areas.get(estimate.area, np.zeros(3)), estimate.pose)
         else:
             pose = se2.compose(previous[0], se2.between(previous[1], estimate.odometry))
         poses[row] = pose

@@ -21,7 +21,7 @@ from hmt_slam_ros.sensing import Odometry, Scan
 Pose = NDArray[np.float64]
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, slots=True)
 class Relabelled:
     """Keyframe ``keyframe`` of area ``source`` now belongs to ``area``, at ``pose`` = ``area_T_base``, shape (3,)."""
 
@@ -31,7 +31,7 @@ class Relabelled:
     pose: Pose
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, slots=True)
 class LeafEstimate:
     """What metric SLAM says of one live hypothesis at a keyframe event.
 
@@ -56,7 +56,7 @@ class LeafEstimate:
     revised: tuple[Relabelled, ...] = ()
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, slots=True)
 class Keyframe:
     """A keyframe event: slam -> aam, tsbi, tlca, recorder.
 
@@ -72,7 +72,7 @@ class Keyframe:
     leaves: tuple[LeafEstimate, ...]
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, slots=True)
 class AreaEvent:
     """The AAM's finding for one hypothesis.
 
@@ -91,7 +91,7 @@ class AreaEvent:
     score: float
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, slots=True)
 class AreaEvents:
     """aam -> tsbi, one for every keyframe event, mostly without events."""
 
@@ -99,7 +99,7 @@ class AreaEvents:
     events: tuple[AreaEvent, ...]
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, slots=True)
 class Arc:
     """A directed arc of the topological graph.
 
@@ -115,7 +115,7 @@ class Arc:
     closure: bool = False
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, slots=True)
 class LocalArea:
     """An area that the local map must hold: ``pose`` = ``current_T_area``, shape (3,)."""
 
@@ -123,7 +123,7 @@ class LocalArea:
     pose: Pose
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, slots=True)
 class Leaf:
     """A live hypothesis after keyframe event k, as changes against the leaf ``parent`` before it.
 
@@ -149,7 +149,7 @@ class Leaf:
     local: tuple[LocalArea, ...] = ()
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, slots=True)
 class Hypotheses:
     """tsbi -> slam, aam, tlca, rtl, recorder; one for every keyframe event.
 
@@ -163,7 +163,7 @@ class Hypotheses:
     unexamined: float = 0.0
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, slots=True)
 class AreaPose:
     """Belief over ``map_T_area`` of the globally consistent map."""
 
@@ -171,7 +171,7 @@ class AreaPose:
     pose: PoseGaussian
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, slots=True)
 class Accepted:
     """tlca -> slam, aam, tsbi, rtl, recorder; one for every keyframe event.
 
@@ -191,7 +191,7 @@ class Accepted:
     global_poses: tuple[AreaPose, ...] = ()
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, slots=True)
 class LocalEstimate:
     """slam -> rtl, recorder, and to the robot as the acknowledgement of a scan; one for every scan.
 
@@ -211,7 +211,7 @@ class LocalEstimate:
     dropped: int
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, slots=True)
 class Trail:
     """slam -> tlca, recorder: where the scans since the last trail were taken, under one hypothesis.
 
@@ -265,12 +265,12 @@ class RealTimePose:
         return se2.compose(self.map_pose.mean, se2.inverse(self.odometry))
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, slots=True)
 class EndOfLog:
     """robot -> slam: no more scans will come; slam answers with the last trails and ``Finished``."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, slots=True)
 class Finished:
     """slam -> recorder, robot: every scan received has been processed.
 
@@ -284,7 +284,7 @@ class Finished:
     dropped: int
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, slots=True)
 class Notice:
     """Any process -> the log and the report: something a person should know; said once per cause.
 

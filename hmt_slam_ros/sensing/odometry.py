@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from hmt_slam_ros.geometry import se2
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, slots=True)
 class Odometry:
     """A reading of the wheel odometry.
 
