@@ -18,6 +18,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import SuperLU, splu
 
 from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.topology.linearised_edges import linearised, normal_matrix, pattern
 
 _STEPS, _SMALLEST_STEP, _SMALLEST_GAIN = 100, 1e-10, 1e-12
 _FIRST_DAMPING, _LAST_DAMPING = 1e-6, 1e8
@@ -130,12 +131,7 @@ class _System:
         row = np.full(nodes, -1)
         row[self._free] = np.arange(nodes - 1)
         i, j = row[edges.sources], row[edges.targets]
-        ends = np.stack((np.stack((i, i), 1), np.stack((i, j), 1), np.stack((j, i), 1), np.stack((j, j), 1)))
-        self._kept = (ends >= 0).all(axis=2)
-        blocks = 3 * ends[self._kept]
-        # Rows and columns of the nine entries of each 3 x 3 block.
-        self._rows = (blocks[:, 0, None, None] + np.arange(3)[:, None] + np.zeros(3, np.int64)).ravel()
-        self._columns = (blocks[:, 1, None, None] + np.arange(3) + np.zeros((3, 1), np.int64)).ravel()
+        self._pattern = pattern(np.stack((i, i, j, j), 1), np.stack((i, j, i, j), 1), nodes - 1)
 
     def _require_connected(self, fixed: int) -> None:
         ones = np.ones(len(self._edges.sources))
@@ -147,11 +143,10 @@ class _System:
 
     def evaluate(self, poses: NDArray[np.float64]) -> _State:
         """Residuals, Jacobians and cost at given poses, shape (n, 3)."""
-        relative = se2.between(poses[self._edges.sources], poses[self._edges.targets])
-        residuals = se2.log(se2.between(self._edges.poses, relative))
+        residuals, of_source, of_target = linearised(
+            poses, self._edges.sources, self._edges.targets, self._edges.poses
+        )
         chi2 = np.einsum("mi,mij,mj->m", residuals, self._information, residuals)
-        of_target = se2.right_jacobian_inverse(residuals)
-        of_source = -of_target @ se2.adjoint(se2.inverse(relative))
         scale, penalty = self._doubt(chi2)
         cost = float((scale**2 * chi2 + penalty).sum())
         return _State(residuals, of_source, of_target, chi2, scale**2, cost)
@@ -178,11 +173,7 @@ class _System:
 
     def _factor(self, state: _State, damping: float) -> SuperLU:
         information = state.weights[:, None, None] * self._information
-        of_source, of_target = state.of_source, state.of_target
-        left = of_source.transpose(0, 2, 1) @ information, of_target.transpose(0, 2, 1) @ information
-        blocks = np.stack((left[0] @ of_source, left[0] @ of_target, left[1] @ of_source, left[1] @ of_target))
-        size = 3 * self._free.size
-        hessian = csc_matrix((blocks[self._kept].ravel(), (self._rows, self._columns)), shape=(size, size))
+        hessian = normal_matrix(self._pattern, state.of_source, state.of_target, information)
         if damping > 0.0:
             hessian = (hessian + diags(damping * hessian.diagonal())).tocsc()
         # Symmetric and positive definite: no pivoting, so that the fill follows the graph.
