@@ -180,3 +180,17 @@ def test_the_nearest_in_place_and_heading_come_first() -> None:
     areas = np.zeros(4, dtype=np.int64)
     found = neighbours(poses, areas, poses[:1], areas[:1], {0: frozenset({0})}, 4.0, 2)
     assert found[0].tolist() == [0, 2]
+
+
+def test_of_many_keyframes_the_nearest_are_found_also_where_headings_lie_on_both_sides_of_half_a_turn() -> None:
+    random = np.random.default_rng(3)
+    poses = np.column_stack((random.uniform(-6.0, 6.0, (80, 2)), random.uniform(-np.pi, np.pi, 80)))
+    # Equals come in their order.
+    poses[40:50] = poses[30:40]
+    areas, linked = np.arange(80) % 3, {0: {0, 1}, 1: {0, 1, 2}, 2: {1, 2}}
+    found = neighbours(poses, areas, poses[:30], areas[:30], linked, 4.0, 9)
+    for pose, area, rows in zip(poses, areas, found, strict=False):
+        distance, turn = np.hypot(*(poses[:, :2] - pose[:2]).T), np.abs(se2.wrap(poses[:, 2] - pose[2]))
+        near = [k for k in range(80) if distance[k] <= 4.0 and areas[k] in linked[area]]
+        assert rows.tolist() == sorted(near, key=lambda k: distance[k] + turn[k])[:9]
+    assert min(map(len, found)) < 9 == max(map(len, found))

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
-from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.arrays import Bool, Float64, Int64
 from hmt_slam_ros.topology.hybrid_map import HybridMap
 
 
@@ -36,14 +36,38 @@ def neighbours(
     :param count: keyframes at most.
     :returns: m arrays of rows of ``poses``, nearest first; a radian counts as a metre.
     """
-    tree = cKDTree(poses[:, :2])
-    found = []
-    nearby = tree.query_ball_point(seen_from[:, :2], reach, return_sorted=True)
-    for pose, area, near in zip(seen_from, seen_from_areas.tolist(), nearby, strict=True):
-        rows = np.array([row for row in near if int(areas[row]) in linked[area]], dtype=np.int64)
-        cost = np.hypot(*(poses[rows, :2] - pose[:2]).T) + np.abs(se2.wrap(poses[rows, 2] - pose[2]))
-        found.append(rows[np.argsort(cost, kind="stable")[:count]])
-    return found
+    known = np.unique(np.concatenate((areas, seen_from_areas)))
+    allowed = np.array([[other in linked[area] for other in known.tolist()] for area in known.tolist()])
+    rows = _nearest(
+        poses, np.searchsorted(known, areas), seen_from, np.searchsorted(known, seen_from_areas), allowed, reach, count
+    )
+    return [own[own >= 0] for own in rows]
+
+
+@njit(cache=True)
+def _nearest(
+    poses: Float64, areas: Int64, seen_from: Float64, seen_from_areas: Int64, allowed: Bool, reach: float, count: int
+) -> Int64:
+    """:func:`neighbours` as an array (m, count), filled up with -1; ``allowed[a, b]`` where b is linked with a."""
+    rows, costs = np.full((len(seen_from), count), -1), np.empty(count)
+    for i in range(len(seen_from)):
+        held = 0
+        for k in range(len(poses)):
+            dx, dy = poses[k, 0] - seen_from[i, 0], poses[k, 1] - seen_from[i, 1]
+            squared = dx * dx + dy * dy
+            if squared > reach * reach or not allowed[seen_from_areas[i], areas[k]]:
+                continue
+            turn = poses[k, 2] - seen_from[i, 2]
+            cost = np.sqrt(squared) + abs(turn - 2.0 * np.pi * np.floor(turn / (2.0 * np.pi) + 0.5))
+            if held == count and cost >= costs[count - 1]:
+                continue
+            held = min(held + 1, count)
+            at = held - 1
+            while at > 0 and costs[at - 1] > cost:
+                costs[at], rows[i, at] = costs[at - 1], rows[i, at - 1]
+                at -= 1
+            costs[at], rows[i, at] = cost, k
+    return rows
 
 
 def pairs_of(around: list[NDArray[np.int64]]) -> NDArray[np.int64]:
