@@ -5,9 +5,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.offline.map_image import FREE, OCCUPIED, UNKNOWN, OccupancyImage, occupancy_image, read_map, write_map
+from hmt_slam_ros.offline.plots import _draw_grid
 from hmt_slam_ros.sensing import Scan
 
 AHEAD = np.zeros(3)
@@ -118,3 +121,23 @@ def test_a_damaged_map_is_refused(tmp_path: Path, name: str) -> None:
     (tmp_path / name).write_bytes(content[:20])
     with pytest.raises(HmtSlamError, match=r"no complete map\.pgm"):
         read_map(tmp_path)
+
+
+@pytest.mark.parametrize("cells", [25, 400], ids=["enlarged", "reduced"])
+def test_the_picture_shows_every_wall_where_it_is(cells: int) -> None:
+    pixels = np.full((cells, cells), FREE)
+    # Lower left quarter; a single wall across the upper half.
+    pixels[cells // 2 :, : cells // 2] = UNKNOWN
+    pixels[cells // 4] = OCCUPIED
+    figure = Figure(figsize=(1.0, 1.0), dpi=100)
+    axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
+    _draw_grid(axes, OccupancyImage(pixels, 0.1, np.zeros(2)))
+    axes.set_axis_off()
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    seen = np.asarray(canvas.buffer_rgba())[..., 0]
+    assert (seen[60:95, 5:45] == UNKNOWN).all()
+    assert (seen[60:95, 55:95] == FREE).all()
+    walls = np.flatnonzero((seen[5:-5, 5:-5] == OCCUPIED).all(axis=1)) + 5
+    assert walls.size == max(1, 100 // cells)
+    assert abs(walls.mean() - 100.0 * (cells // 4 + 0.5) / cells) <= 1.5
