@@ -46,7 +46,7 @@ FAMILIES: dict[str, Family] = {
         halls.hall, "An open hall in whose middle the laser reaches nothing.", {"range": 8.0, "laps": 1}
     ),
     "twins": Family(
-        halls.twins, "Two identical rooms, and a hall between them in which the robot loses its way.",
-        {"range": 5.0, "laps": 1},
+        halls.twins, "Two identical rooms; lost in a hall in between, the robot enters one of them again.",
+        {"range": 4.0, "laps": 1},
     ),
 }  # fmt: skip

@@ -9,7 +9,7 @@ from hmt_slam_ros.simulation.corridors import niches_along
 from hmt_slam_ros.simulation.settings import Settings
 
 _ROOM = 4.0  # m, side of a twin room
-_OFF = 7.0  # m, from the middle of the wall to each twin's door
+_OFF = 4.5  # m, from the middle of the wall to each twin's door
 _HALF_DOOR = 0.55  # m
 _WALL = 0.2  # m
 _BACK = 2.0  # m, width of the passage behind the twins
@@ -35,12 +35,12 @@ def hall(draw: np.random.Generator, settings: Settings) -> Building:
 
 
 def twins(draw: np.random.Generator, settings: Settings) -> Building:
-    """Two identical rooms side by side, before them a hall so large that the robot loses count of where it is.
+    """Two identical rooms side by side, and before them a hall so large that the robot loses count of where it is.
 
-    It visits the one room from the hall, drives about in the hall where it sees nothing, and enters the other. Behind
-    the rooms runs a passage that tells them apart, and by which it returns through the first.
+    It goes through both rooms, from the hall and from the passage behind them, makes a tour of the hall, in which it
+    sees nothing, and enters one of the two again. Which one, the niches of the passage tell.
     """
-    depth = 40.0 * settings.size
+    depth = 68.0 * settings.size
     plan = FloorPlan()
     plan.free(-_OFF - 9.0, 0.0, _OFF + 9.0, depth)
     back = -_ROOM - 2.0 * _WALL
@@ -52,9 +52,10 @@ def twins(draw: np.random.Generator, settings: Settings) -> Building:
     plan.free(-_OFF - 5.0, back - _BACK, _OFF + 5.0, back)
     niches_along(draw, plan, Side((-_OFF - 5.0, back - _BACK), (1.0, 0.0), (0.0, -1.0)), 2.0 * _OFF + 10.0)
     far, behind = depth - 8.0, back - 0.5 * _BACK
+    again = _OFF if draw.random() < 0.5 else -_OFF
     route = [
-        (-_OFF, 3.0), (-_OFF, -2.2), (-_OFF, 8.0), (-_OFF, far), (_OFF, far), (_OFF, -2.2), (_OFF, behind),
-        (-_OFF, behind), (-_OFF, -2.2), (-_OFF, 3.0),
+        (-_OFF, 3.0), (-_OFF, behind), (_OFF, behind), (_OFF, 3.0), (_OFF, behind), (-_OFF, behind), (-_OFF, 8.0),
+        (0.0, 14.0), (0.0, far), (again, far), (again, behind), (-again, behind), (-again, 3.0), (-_OFF, 3.0),
     ]  # fmt: skip
     places = {name: np.array([x, 0.0, -0.5 * np.pi]) for name, x in (("first", -_OFF), ("second", _OFF))}
     return Building(plan.walls(), np.array(route), places=places)
