@@ -9,6 +9,7 @@ import numpy as np
 
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.sensing import Scan
+from hmt_slam_ros.simulation.raycast import cast, wall_index
 
 RANGE_MAX = 30.0
 
@@ -30,14 +31,8 @@ def distances(walls, sensor, angles):
 
     The laser has one pose (3,), or one for each angle (n, 3).
     """
-    sensor = np.atleast_2d(sensor)
-    directions = np.stack((np.cos(angles + sensor[:, 2]), np.sin(angles + sensor[:, 2])), axis=1)
-    offset, along = walls[:, :2] - sensor[:, None, :2], walls[:, 2:] - walls[:, :2]
-    cross = directions[:, None, 0] * along[None, :, 1] - directions[:, None, 1] * along[None, :, 0]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        distance = (offset[..., 0] * along[None, :, 1] - offset[..., 1] * along[None, :, 0]) / cross
-        share = (offset[..., 0] * directions[:, None, 1] - offset[..., 1] * directions[:, None, 0]) / cross
-    return np.where((distance > 1e-6) & (share >= 0.0) & (share <= 1.0), distance, np.inf).min(axis=1)
+    sensor = np.broadcast_to(sensor, (angles.size, 3))
+    return cast(wall_index(walls), sensor[:, :2].copy(), angles + sensor[:, 2], np.inf)
 
 
 def scan_in(
