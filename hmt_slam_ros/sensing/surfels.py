@@ -54,16 +54,16 @@ def _find_normals(beams: Float64, ranges: Float64, stride: int, found: Float64) 
     :param beams: shape (n, 2), m, from the laser to the points.
     :returns: which of the points show more than a shadow.
     """
-    shown = np.ones(len(found), np.bool_)
+    sums, shown = _running_sums(beams, ranges), np.ones(len(found), np.bool_)
     for k in range(len(found)):
         i, normal = k * stride, found[k, 2:]
         low, high = _last_within(beams, ranges, i, -1, 1), _last_within(beams, ranges, i, 1, 1)
-        if low < i < high and _fit(beams, low, i, high, normal):
+        if low < i < high and _fit(beams, sums, low, i, high, normal):
             continue
         low, high = _last_within(beams, ranges, i, -1, 2), _last_within(beams, ranges, i, 1, 2)
-        if i - low >= 2 and _fit(beams, low, i, i, normal):
+        if i - low >= 2 and _fit(beams, sums, low, i, i, normal):
             continue
-        if high - i >= 2 and _fit(beams, i, i, high, normal):
+        if high - i >= 2 and _fit(beams, sums, i, i, high, normal):
             continue
         shown[k] = not _shadowed(beams, ranges, i)
     return shown
@@ -85,39 +85,58 @@ def _last_within(beams: Float64, ranges: Float64, i: int, step: int, fewest: int
 
 
 @njit(cache=True)
-def _fit(beams: Float64, low: int, own: int, high: int, normal: Float64) -> bool:
+def _running_sums(beams: Float64, ranges: Float64) -> Float64:
+    """Sums over the beams before each, shape (n + 1, 10).
+
+    They are of cos^2, cos sin, sin^2, cos / r, sin / r over the directions, and of x, y, x^2, x y, y^2 over the points.
+    """
+    sums = np.zeros((len(beams) + 1, 10))
+    for k in range(len(beams)):
+        x, y, inverse = beams[k, 0], beams[k, 1], 1.0 / ranges[k]
+        cos, sin = x * inverse, y * inverse
+        terms = (cos * cos, cos * sin, sin * sin, cos * inverse, sin * inverse, x, y, x * x, x * y, y * y)
+        for n in range(10):
+            sums[k + 1, n] = sums[k, n] + terms[n]
+    return sums
+
+
+@njit(cache=True)
+def _fit(beams: Float64, sums: Float64, low: int, own: int, high: int, normal: Float64) -> bool:
     """Fit a line to the points from ``low`` to ``high``; False where they, or the point itself, do not lie on one.
 
     On a line the inverse of the range is linear in the direction of the beam. The fit takes the ranges for uncertain
     and the directions for exact: total least squares would turn all normals a little to the same side, and what is
     seen ahead would draw the robot back. The point itself is left out of it, or its own error would turn its normal,
     and the two together push along the wall.
+
+    :param sums: of :func:`_running_sums`.
     """
-    xx = xy = yy = x = y = 0.0
-    for k in range(low, high + 1):
-        if k != own:
-            inverse = 1.0 / np.hypot(beams[k, 0], beams[k, 1])
-            cos, sin = beams[k, 0] * inverse, beams[k, 1] * inverse
-            xx, xy, yy = xx + cos * cos, xy + cos * sin, yy + sin * sin
-            x, y = x + cos * inverse, y + sin * inverse
+    xx, xy, yy = _total(sums, 0, low, own, high), _total(sums, 1, low, own, high), _total(sums, 2, low, own, high)
+    x, y = _total(sums, 3, low, own, high), _total(sums, 4, low, own, high)
     across_x, across_y = yy * x - xy * y, xx * y - xy * x
     length = np.hypot(across_x, across_y)
     if length == 0.0:
         return False
     across_x, across_y, distance = across_x / length, across_y / length, (xx * yy - xy * xy) / length
-    off = mean = square = 0.0
-    for k in range(low, high + 1):
-        if k != own:
-            off += (across_x * beams[k, 0] + across_y * beams[k, 1] - distance) ** 2
-            along = across_x * beams[k, 1] - across_y * beams[k, 0]
-            mean, square = mean + along, square + along * along
-    count = high - low
-    off, spread = np.sqrt(off / count), np.sqrt(max(0.0, square / count - (mean / count) ** 2))
+    share = 1.0 / (high - low)
+    x, y = share * _total(sums, 5, low, own, high), share * _total(sums, 6, low, own, high)
+    xx, xy = share * _total(sums, 7, low, own, high), share * _total(sums, 8, low, own, high)
+    yy = share * _total(sums, 9, low, own, high)
+    square = across_x * across_x * xx + 2.0 * across_x * across_y * xy + across_y * across_y * yy
+    off = np.sqrt(max(0.0, square - 2.0 * distance * (across_x * x + across_y * y) + distance * distance))
+    square = across_x * across_x * yy - 2.0 * across_x * across_y * xy + across_y * across_y * xx
+    spread = np.sqrt(max(0.0, square - (across_x * y - across_y * x) ** 2))
     own_off = abs(across_x * beams[own, 0] + across_y * beams[own, 1] - distance)
     if spread < _SHORT or off > min(_FLAT, _ROUND * spread) or own_off > _OFF + _DEVIATIONS * off:
         return False
     normal[0], normal[1] = across_x, across_y
     return True
+
+
+@njit(cache=True)
+def _total(sums: Float64, column: int, low: int, own: int, high: int) -> float:
+    """The sum over the points from ``low`` to ``high`` without ``own``, which is one of them."""
+    return sums[high + 1, column] - sums[low, column] - (sums[own + 1, column] - sums[own, column])
 
 
 @njit(cache=True)
