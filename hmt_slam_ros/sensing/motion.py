@@ -63,12 +63,12 @@ class Inertia:
     """
 
     def __init__(self, motion: Motion) -> None:
-        turn = math.radians(motion.turn_acceleration)
-        self._acceleration = np.diag([motion.acceleration**2, motion.acceleration**2, turn**2])
+        self._acceleration = _squared_accelerations(motion)
         self._floor = increment_covariance(np.zeros(3), motion)
         self._velocity = np.zeros(3)
-        self._usual = self._acceleration * _MEMORY**2
-        self._covariance = self._usual
+        self._covariance = self._acceleration * _MEMORY**2
+        self._usual = np.linalg.inv(self._covariance)
+        self._certainty = self._usual
         self._period: float | None = None
         self._seconds = 0.0
         self._doubt = np.zeros(3)
@@ -80,7 +80,8 @@ class Inertia:
         self._doubt = 0.5 * (seconds - self._period) * self._velocity
         changed = self._covariance + self._acceleration * self._seconds**2
         # However long it takes, the velocity stays within the usual.
-        self._covariance = np.linalg.inv(np.linalg.inv(changed) + np.linalg.inv(self._usual)).astype(np.float64)
+        self._certainty = np.linalg.inv(changed) + self._usual
+        self._covariance = np.asarray(np.linalg.inv(self._certainty), dtype=np.float64)
         lasting = -_MEMORY * np.expm1(-self._seconds / _MEMORY)
         spread = self._covariance * self._seconds**2 + np.outer(self._doubt, self._doubt) + self._floor
         return Step(se2.exp(self._velocity * lasting), spread)
@@ -96,7 +97,7 @@ class Inertia:
         doubted = information @ self._doubt
         certain = information - np.outer(doubted, doubted) / (1.0 + self._doubt @ doubted)
         measured = certain * self._seconds**2
-        self._covariance = np.linalg.inv(np.linalg.inv(self._covariance) + measured).astype(np.float64)
+        self._covariance = np.asarray(np.linalg.inv(self._certainty + measured), dtype=np.float64)
         residual = se2.log(increment) / self._seconds - self._velocity
         self._velocity = self._velocity + self._covariance @ (measured @ residual)
 
@@ -111,6 +112,7 @@ class OdometryNoise:
         # One step that was as the model says, so that the first few do not count for much.
         self._ratios = np.ones(2)
         self._weights = np.ones(2)
+        self._scales = np.ones((3, 3))
 
     @property
     def factors(self) -> NDArray[np.float64]:
@@ -119,8 +121,7 @@ class OdometryNoise:
 
     def scaled(self, covariance: NDArray[np.float64]) -> NDArray[np.float64]:
         """The model's covariance (3, 3) as it turned out to be."""
-        scale = self.factors[[0, 0, 1]]
-        return covariance * np.outer(scale, scale)
+        return covariance * self._scales
 
     def learn(self, odometry: Step, matched: NDArray[np.float64], information: NDArray[np.float64]) -> None:
         """Compare a step by odometry, with the model's covariance P, with the matched one.
@@ -140,6 +141,8 @@ class OdometryNoise:
             ratio = squares[rows].sum() / max(expected[rows].sum(), 1e-12)
             self._ratios[k] = _PAST * self._ratios[k] + weight * min(ratio, (_OUTLIER * self.factors[k]) ** 2)
             self._weights[k] = _PAST * self._weights[k] + weight
+        scale = self.factors[[0, 0, 1]]
+        self._scales = np.outer(scale, scale)
 
 
 class MotionModel:
@@ -156,6 +159,7 @@ class MotionModel:
         self.odometry_pose: NDArray[np.float64] = np.zeros(3)
         self._motion = motion
         self._inertia = Inertia(motion)
+        self._bounds = _squared_accelerations(motion)
         self._stamp: int | None = None
         self._gap: float | None = None
         self._leg: Step | None = None
@@ -185,9 +189,7 @@ class MotionModel:
             return None
         increment = se2.between(before, self.odometry_pose)
         covariance = increment_covariance(increment, self._motion)
-        turn = math.radians(self._motion.turn_acceleration)
-        bounds = np.array([self._motion.acceleration, self._motion.acceleration, turn])
-        return Step(increment, covariance + np.diag((gap * bounds) ** 2 + (self._gap * bounds) ** 2))
+        return Step(increment, covariance + (gap**2 + self._gap**2) * self._bounds)
 
     def observe(self, increment: NDArray[np.float64], information: NDArray[np.float64]) -> None:
         """Learn the velocity from the motion that was predicted last.
@@ -208,6 +210,11 @@ class MotionModel:
         if self._leg is not None:
             self.noise.learn(self._leg, moved, information)
         self._leg = NO_STEP
+
+
+def _squared_accelerations(motion: Motion) -> NDArray[np.float64]:
+    """Squares of the accelerations that robots have, on the diagonal (3, 3), in m^2/s^4 and rad^2/s^4."""
+    return np.diag([motion.acceleration**2, motion.acceleration**2, math.radians(motion.turn_acceleration) ** 2])
 
 
 def increment_covariance(increment: NDArray[np.float64], motion: Motion) -> NDArray[np.float64]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +11,13 @@ from numpy.typing import NDArray
 from hmt_slam_ros.geometry import se2
 
 _MICROSECONDS = 1e6
+
+
+@lru_cache(maxsize=4)
+def _directions(count: int, first: float, increment: float) -> NDArray[np.float64]:
+    """Unit vectors (n, 2) of evenly spaced angles, rad; the same for all scans of a laser."""
+    angles = first + increment * np.arange(count)
+    return np.stack((np.cos(angles), np.sin(angles)), axis=1)
 
 
 def _zeros() -> NDArray[np.float64]:
@@ -73,12 +80,9 @@ class Scan:
     @cached_property
     def points(self) -> NDArray[np.float64]:
         """End points of the beams with a return, shape (k, 2), metres, robot base frame."""
-        angles = (self.angle_min + self.laser_pose[2] + self.angle_increment * np.arange(self.ranges.size))[self.valid]
-        ranges = self.ranges[self.valid].astype(np.float64)
-        points = np.empty((ranges.size, 2))
-        points[:, 0] = self.laser_pose[0] + ranges * np.cos(angles)
-        points[:, 1] = self.laser_pose[1] + ranges * np.sin(angles)
-        return self._carried_back(points)
+        first = self.angle_min + float(self.laser_pose[2])
+        directions = _directions(self.ranges.size, first, self.angle_increment).compress(self.valid, axis=0)
+        return self._carried_back(self.laser_pose[:2] + self.ranges[self.valid][:, None] * directions)
 
     @property
     def origins(self) -> NDArray[np.float64]:
