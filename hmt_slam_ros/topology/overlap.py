@@ -7,6 +7,7 @@ of the points of j that have one of i (Blanco, Gonzalez, Fernandez-Madrigal, IRO
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -62,12 +63,16 @@ def _overlaps(
 ) -> NDArray[np.float64]:
     """:func:`overlaps` for points stacked over the others, each ending before ``ends[j]``."""
     result = np.zeros(ends.size)
-    start = 0
+    if not len(points):
+        return result
+    grid = _filed(points, radius)
+    # For each of the points the last other scan that met it, so that there is nothing to clear in between.
+    met_by, start = np.full(len(points), -1), 0
     for j in range(ends.size):
-        moved = _moved(stacked[start : ends[j]], pose, other_poses[j])
+        if ends[j] > start:
+            moved = _moved(stacked[start : ends[j]], pose, other_poses[j])
+            result[j] = _overlap(points, grid, moved, radius, met_by, j)
         start = ends[j]
-        if len(points) > 0 and len(moved) > 0:
-            result[j] = _overlap(points, moved, radius)
     return result
 
 
@@ -87,43 +92,69 @@ def _moved(
     return moved
 
 
+class _Grid(NamedTuple):
+    """Points in square cells.
+
+    :ivar low_x: lower edges, m, and ``low_y``.
+    :ivar edge: of a cell, m.
+    :ivar newest: shape (rows, columns), the newest point of each cell, -1 for none.
+    :ivar before: shape (n,), for each point the one before it in its cell, -1 for none.
+    """
+
+    low_x: float
+    low_y: float
+    edge: float
+    newest: NDArray[np.int32]
+    before: NDArray[np.int32]
+
+
 @njit(cache=True)
-def _overlap(a: NDArray[np.float64], b: NDArray[np.float64], radius: float) -> float:
-    """Overlap of two point sets in one frame, the second of which is filed in square cells."""
-    low_x, low_y = b[:, 0].min(), b[:, 1].min()
-    extent = max(b[:, 0].max() - low_x, b[:, 1].max() - low_y)
+def _filed(points: NDArray[np.float64], radius: float) -> _Grid:
+    low_x, low_y = points[:, 0].min(), points[:, 1].min()
+    extent = max(points[:, 0].max() - low_x, points[:, 1].max() - low_y)
     edge = max(2.0 * radius, extent / _CELLS)
     size = int(extent / edge) + 1
-    # Rounding must not hide a point at just this distance.
-    reach = radius * (1.0 + 1e-9)
-    newest, before = _filed(b, low_x, low_y, edge, size)
-    seen_a, seen_b = 0, np.zeros(len(b), np.bool_)
-    for i in range(len(a)):
-        x, y = a[i, 0] - low_x, a[i, 1] - low_y
-        left, right = int(np.floor((x - reach) / edge)), int(np.floor((x + reach) / edge))
-        bottom, top = int(np.floor((y - reach) / edge)), int(np.floor((y + reach) / edge))
-        met = False
-        for r in range(max(0, bottom), min(size, top + 1)):
-            for c in range(max(0, left), min(size, right + 1)):
-                k = newest[r, c]
-                while k >= 0:
-                    dx, dy = b[k, 0] - a[i, 0], b[k, 1] - a[i, 1]
-                    if dx * dx + dy * dy <= radius * radius:
-                        met = True
-                        seen_b[k] = True
-                    k = before[k]
-        seen_a += met
-    return 0.5 * (seen_a / len(a) + seen_b.sum() / len(b))
-
-
-@njit(cache=True)
-def _filed(
-    points: NDArray[np.float64], low_x: float, low_y: float, edge: float, size: int
-) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """For each cell (row, column) its newest point, for each point the one before it in its cell; -1 for none."""
     newest, before = np.full((size, size), -1, np.int32), np.empty(len(points), np.int32)
     for k in range(len(points)):
         column, row = int((points[k, 0] - low_x) / edge), int((points[k, 1] - low_y) / edge)
         before[k] = newest[row, column]
         newest[row, column] = k
-    return newest, before
+    return _Grid(low_x, low_y, edge, newest, before)
+
+
+@njit(cache=True)
+def _overlap(
+    points: NDArray[np.float64],
+    grid: _Grid,
+    others: NDArray[np.float64],
+    radius: float,
+    met_by: NDArray[np.int64],
+    number: int,
+) -> float:
+    """Overlap of the points in the grid with others in the same frame.
+
+    :param met_by: for each of the points the number of the last scan that met it, changed in place.
+    :param number: of this one.
+    """
+    size = len(grid.newest)
+    # Rounding must not hide a point at just this distance.
+    reach = radius * (1.0 + 1e-9)
+    met = met_others = 0
+    for i in range(len(others)):
+        x, y = others[i, 0] - grid.low_x, others[i, 1] - grid.low_y
+        left, right = int(np.floor((x - reach) / grid.edge)), int(np.floor((x + reach) / grid.edge))
+        bottom, top = int(np.floor((y - reach) / grid.edge)), int(np.floor((y + reach) / grid.edge))
+        near = False
+        for r in range(max(0, bottom), min(size, top + 1)):
+            for c in range(max(0, left), min(size, right + 1)):
+                k = grid.newest[r, c]
+                while k >= 0:
+                    dx, dy = points[k, 0] - others[i, 0], points[k, 1] - others[i, 1]
+                    if dx * dx + dy * dy <= radius * radius:
+                        near = True
+                        if met_by[k] != number:
+                            met_by[k] = number
+                            met += 1
+                    k = grid.before[k]
+        met_others += near
+    return 0.5 * (met / len(points) + met_others / len(others))
