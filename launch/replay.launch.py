@@ -19,7 +19,7 @@ def generate_launch_description() -> LaunchDescription:
             DeclareLaunchArgument(
                 "log",
                 default_value=PathJoinSubstitution([share, "data", "malaga_one_loop"]),
-                description="A rosbag2, CARMEN log or MRPT rawlog.",
+                description="A rosbag2, CARMEN log, MRPT rawlog, or sim:WORLD.",
             ),
             DeclareLaunchArgument("rate", default_value="1.0", description="Speed relative to real time."),
             DeclareLaunchArgument(

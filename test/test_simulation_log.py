@@ -8,12 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from rosbags.rosbag2 import Reader
 from test_logs_convert import assert_same_log
 
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.evaluation import odometry_of, read_tum, true_relations, truth_of
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.logs import open_log, write_bag
+from hmt_slam_ros.logs.ros_types import deserialize
 from hmt_slam_ros.sensing import Odometry, Scan
 from hmt_slam_ros.simulation import FAMILIES, SimulatedLog
 from hmt_slam_ros.simulation.outline import outline_of_cells
@@ -75,6 +77,18 @@ def test_a_part_of_a_log_is_that_part_of_the_whole():
     assert content(part) == content(whole)[10 * 15 : 10 * 15 + 4 * 15 + 2]
 
 
+def test_the_truth_in_a_bag_is_a_topic_that_other_tools_can_read(tmp_path):
+    write_bag(open_log("sim:ring", duration=2.0), tmp_path / "bag")
+    with Reader(tmp_path / "bag") as reader:
+        (topic,) = [connection for connection in reader.connections if connection.topic == "/ground_truth"]
+        messages = [deserialize(content, topic.msgtype) for _, _, content in reader.messages([topic])]
+    assert topic.msgtype == "geometry_msgs/msg/PoseStamped"
+    assert {message.header.frame_id for message in messages} == {"world"}
+    stamps = [message.header.stamp.sec * 10**9 + message.header.stamp.nanosec for message in messages]
+    # Ten odometry readings a second, of which every second has a scan's stamp.
+    assert np.diff(stamps).tolist() == [100_000_000] * 20
+
+
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
 def test_a_bag_of_a_simulated_log_is_the_same_log_and_knows_the_truth(tmp_path, storage):
     log = open_log("sim:busy,seed=1,sweep=0.05,forward=0.2", duration=20.0)
@@ -107,16 +121,6 @@ def test_truth_is_told_of_any_time_and_of_places():
     assert np.array_equal(same, near)
     half = len(same) // 2
     assert same[half + 3 :, : half - 3].any(axis=1).mean() > 0.9
-
-
-def test_on_the_other_side_of_a_wall_is_another_place(tmp_path):
-    walls, route = [[0, -9, 0, 3], [-9, -9, 9, -9]], [[-1, 0], [-1, 4], [1, 4], [1, 0]]
-    world = {"walls": walls, "route": route, "settings": {"laps": 1}}
-    (tmp_path / "wall.yaml").write_text(yaml.safe_dump(world))
-    log = open_log(f"sim:{tmp_path / 'wall.yaml'}")
-    ends = log.scenario.scan_stamps[[0, -1]]
-    assert not log.same_place(ends[:1], ends[1:], 3.0).any()
-    assert log.same_place(ends, ends, 3.0).tolist() == [[True, False], [False, True]]
 
 
 def test_true_relations_reach_to_the_next_metre_the_tenth_and_the_lap_before():

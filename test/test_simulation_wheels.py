@@ -88,3 +88,5 @@ def test_a_log_with_slips_goes_astray_by_more_than_the_model_says():
     assert np.array_equal(steady.poses, slipping.poses)
     astray = np.abs(se2.between(steady.odometry[-1], slipping.odometry[-1]))
     assert astray.max() > 0.1
+    assert slipping.slips.any()
+    assert not steady.slips.any()

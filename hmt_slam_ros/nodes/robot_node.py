@@ -1,4 +1,4 @@
-"""A simulated robot: replays a log as /scan, /odom, /tf, /tf_static and /clock."""
+"""A simulated robot: replays a log, or drives through a world, as /scan, /odom, /tf, /tf_static and /clock."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ class RobotNode(ConfiguredNode):
         self.create_timer(_STATUS_PERIOD, self._report, clock=self.figures.steady_clock)
 
     def _open_log(self) -> Log:
-        descriptor = ParameterDescriptor(description="The log to replay.", read_only=True)
+        descriptor = ParameterDescriptor(description="The log to replay, or sim:WORLD.", read_only=True)
         path = str(self.declare_parameter("log", "", descriptor).value)
         if not path:
             raise HmtSlamError("no log is given: set the parameter log, such as -p log:=data/malaga_one_loop")

@@ -20,6 +20,9 @@ class Laser:
     """A planar range finder that looks ahead.
 
     :ivar pose: shape (3,), ``base_T_laser``, m and rad.
+    :ivar angles: shape (n,), of the beams, rad.
+    :ivar half_field: largest angle to either side at which it sees, rad.
+    :ivar reach: m.
     :ivar times: shape (n,), of each beam after the first, s; shape (1,) where there is no time between them.
     """
 
@@ -27,11 +30,13 @@ class Laser:
         self.pose = np.array([settings.forward, 0.0, 0.0])
         self.times = np.linspace(0.0, settings.sweep, settings.beams if settings.sweep > 0.0 else 1)
         self._settings = settings
+        self.reach = settings.range
         field = math.radians(settings.field_of_view)
+        self.half_field = 0.5 * field
         # Beams all around: the last is not the first once more.
         gaps = settings.beams - 1 if settings.field_of_view < 360.0 else settings.beams
-        self._first, self._gap = -0.5 * field, field / gaps
-        self._angles = self._first + self._gap * np.arange(settings.beams)
+        self._first, self._gap = -self.half_field, field / gaps
+        self.angles = self._first + self._gap * np.arange(settings.beams)
 
     def distances(
         self, poses: NDArray[np.float64], walls: WallIndex, discs: NDArray[np.float64]
@@ -42,9 +47,9 @@ class Laser:
         :param discs: shape (k, 3), x, y and radius of people, m.
         """
         lasers = se2.compose(poses, self.pose)
-        origins = np.ascontiguousarray(np.broadcast_to(lasers[:, :2], (self._angles.size, 2)))
-        angles = lasers[:, 2] + self._angles
-        distances = cast(walls, origins, angles, self._settings.range)
+        origins = np.ascontiguousarray(np.broadcast_to(lasers[:, :2], (self.angles.size, 2)))
+        angles = lasers[:, 2] + self.angles
+        distances = cast(walls, origins, angles, self.reach)
         cast_discs(discs, origins, angles, distances)
         return distances
 

@@ -41,6 +41,7 @@ class Scenario:
     :ivar stamps: shape (n,), of the odometry readings, ns; every ``settings.readings``-th is a scan's as well.
     :ivar poses: shape (n, 3), ``world_T_base`` at these stamps, m and rad.
     :ivar odometry: shape (n, 3), ``odom_T_base`` as the wheels have it.
+    :ivar slips: shape (k - 1, 3), what slips added to the motion from each of the k scans to the next, m, m, rad.
 
     :raises HmtSlamError: where the route comes closer to a wall or to furniture than the robot's radius.
     """
@@ -63,6 +64,7 @@ class Scenario:
         self._period = 1.0 / (settings.rate * settings.readings)
         self.stamps: NDArray[np.int64] = START + np.round(_SECOND * self._period * ticks).astype(np.int64)
         self.poses = self.true_poses(self.stamps)
+        self.slips = self._slips()
         self.odometry = self._odometry()
 
     @property
@@ -91,6 +93,12 @@ class Scenario:
     def _seconds(self, stamps: NDArray[np.int64]) -> NDArray[np.float64]:
         return (stamps - START) / _SECOND
 
+    def _slips(self) -> NDArray[np.float64]:
+        settings = self.settings
+        steps = np.diff(self.poses[:: settings.readings, :2], axis=0)
+        random = stream(settings.seed, Purpose.WHEELS, 1)
+        return slips(np.hypot(steps[:, 0], steps[:, 1]), 1.0 / settings.rate, settings.slips, random)
+
     def _odometry(self) -> NDArray[np.float64]:
         """Noise from scan to scan, spread evenly over the readings between them."""
         settings = self.settings
@@ -100,9 +108,7 @@ class Scenario:
         random = stream(settings.seed, Purpose.WHEELS, 0)
         true = se2.between(at_scans[:-1], at_scans[1:])
         measured = noisy_increments(true, settings.odometry, random) if settings.odometry > 0.0 else true
-        distances = np.hypot(true[:, 0], true[:, 1])
-        slipped = slips(distances, 1.0 / settings.rate, settings.slips, random)
-        measured = se2.compose(measured, se2.exp(slipped))
+        measured = se2.compose(measured, se2.exp(self.slips))
         at_scans = chained(measured)
         errors = se2.log(se2.between(true, measured))
         starts = np.repeat(self.poses[:: settings.readings][:-1], settings.readings, axis=0)

@@ -15,8 +15,8 @@ from hmt_slam_ros.logs.records import LogRecord
 from hmt_slam_ros.logs.stamps import NANOSECONDS
 from hmt_slam_ros.random_streams import Purpose, stream
 from hmt_slam_ros.sensing import Odometry
+from hmt_slam_ros.simulation import sight
 from hmt_slam_ros.simulation.families import FAMILIES
-from hmt_slam_ros.simulation.raycast import clear_between
 from hmt_slam_ros.simulation.scenario import Scenario
 from hmt_slam_ros.simulation.settings import chosen_settings, parse_name
 from hmt_slam_ros.simulation.world_file import read_world
@@ -67,11 +67,12 @@ class SimulatedLog:
         :param radius: m, such as ``tsbi.place_radius``.
         :returns: shape (n, m).
         """
-        one, other = self.true_poses(stamps)[:, :2], self.true_poses(others)[:, :2]
-        near = np.hypot(*(one[:, None] - other[None]).transpose(2, 0, 1)) <= radius
-        rows, columns = np.nonzero(near)
-        near[rows, columns] = clear_between(self.scenario.walls, one[rows], other[columns])
-        return near
+        return sight.same_place(self.scenario.walls, self.true_poses(stamps), self.true_poses(others), radius)
+
+    def shared_view(self, stamps: NDArray[np.int64], others: NDArray[np.int64]) -> NDArray[np.float64]:
+        """How much of the walls that the laser saw at one time it saw at another, from 0 to 1; as `same_place`."""
+        scenario = self.scenario
+        return sight.shared_view(scenario.walls, scenario.laser, self.true_poses(stamps), self.true_poses(others))
 
     def records(self) -> Iterator[LogRecord]:
         """All measurements in the order of time, each scan behind the odometry of the same stamp."""
