@@ -44,9 +44,7 @@ class Building:
 def boxes(pieces: NDArray[np.float64]) -> NDArray[np.float64]:
     """The walls (4 n, 4), m, of pieces of furniture (n, 5) as in `Building`."""
     signs = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])
-    corners = [
-        se2.transform(piece[:3], signs * piece[3:]) for piece in pieces
-    ]  # fmt: skip
+    corners = [se2.transform(piece[:3], signs * piece[3:]) for piece in pieces]
     sides = [np.concatenate((four, np.roll(four, -1, axis=0)), axis=1) for four in corners]
     return np.concatenate(sides) if sides else np.empty((0, 4))
 

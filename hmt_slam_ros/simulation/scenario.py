@@ -19,7 +19,7 @@ from hmt_slam_ros.simulation.path import path_through
 from hmt_slam_ros.simulation.people import people_on
 from hmt_slam_ros.simulation.raycast import WallIndex, clearance, wall_index
 from hmt_slam_ros.simulation.settings import Settings
-from hmt_slam_ros.simulation.wheels import chained, noisy_increments, slips
+from hmt_slam_ros.simulation.wheels import noisy_increments, readings_between, slips
 
 START = 1_000_000_000_000
 """Stamp of the first scan, ns."""
@@ -61,8 +61,8 @@ class Scenario:
         self.people = people_on(self.drive, settings.people, settings.seed)
         scans = 1 + math.floor(self.drive.duration * settings.rate)
         ticks = np.arange((scans - 1) * settings.readings + 1)
-        self._period = 1.0 / (settings.rate * settings.readings)
-        self.stamps: NDArray[np.int64] = START + np.round(_SECOND * self._period * ticks).astype(np.int64)
+        period = 1.0 / (settings.rate * settings.readings)
+        self.stamps: NDArray[np.int64] = START + np.round(_SECOND * period * ticks).astype(np.int64)
         self.poses = self.true_poses(self.stamps)
         self.slips = self._slips()
         self.odometry = self._odometry()
@@ -100,25 +100,12 @@ class Scenario:
         return slips(np.hypot(steps[:, 0], steps[:, 1]), 1.0 / settings.rate, settings.slips, random)
 
     def _odometry(self) -> NDArray[np.float64]:
-        """Noise from scan to scan, spread evenly over the readings between them."""
         settings = self.settings
         at_scans = self.poses[:: settings.readings]
-        if len(at_scans) < 2:
-            return np.zeros((1, 3))
-        random = stream(settings.seed, Purpose.WHEELS, 0)
         true = se2.between(at_scans[:-1], at_scans[1:])
+        random = stream(settings.seed, Purpose.WHEELS, 0)
         measured = noisy_increments(true, settings.odometry, random) if settings.odometry > 0.0 else true
-        measured = se2.compose(measured, se2.exp(self.slips))
-        at_scans = chained(measured)
-        errors = se2.log(se2.between(true, measured))
-        starts = np.repeat(self.poses[:: settings.readings][:-1], settings.readings, axis=0)
-        shares = np.tile(np.arange(settings.readings) / settings.readings, len(true))
-        partial = se2.compose(
-            se2.between(starts, self.poses[:-1]),
-            se2.exp(shares[:, None] * np.repeat(errors, settings.readings, axis=0)),
-        )
-        between = se2.compose(np.repeat(at_scans[:-1], settings.readings, axis=0), partial)
-        return np.concatenate((between, at_scans[-1:]))
+        return readings_between(self.poses, settings.readings, se2.compose(measured, se2.exp(self.slips)))
 
     def _check_clear(self) -> None:
         points = self.drive.poses(np.arange(0.0, self.drive.duration + _STEP, _STEP))[:, :2].copy()

@@ -62,6 +62,23 @@ def slips(
     return spread / steps
 
 
+def readings_between(poses: NDArray[np.float64], per_scan: int, measured: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Odometry readings with given motions from scan to scan, whose errors grow evenly between two scans.
+
+    :param poses: shape (n, 3), true poses at the readings, the first of them and every ``per_scan``-th at a scan.
+    :param measured: shape (k - 1, 3), what odometry says of the motion between the k scans.
+    :returns: shape (n, 3), ``odom_T_base``, from the origin on.
+    """
+    starts = poses[::per_scan]
+    errors = se2.log(se2.between(se2.between(starts[:-1], starts[1:]), measured))
+    odometry = np.empty_like(poses)
+    odometry[::per_scan] = chained(measured)
+    for k in range(1, per_scan):
+        true = se2.between(starts[:-1], poses[k::per_scan])
+        odometry[k::per_scan] = se2.compose(odometry[:-1:per_scan], se2.compose(true, se2.exp(k / per_scan * errors)))
+    return odometry
+
+
 def chained(increments: NDArray[np.float64]) -> NDArray[np.float64]:
     """Poses (n + 1, 3) that begin at the origin and follow increments (n, 3)."""
     poses = [np.zeros(3)]
