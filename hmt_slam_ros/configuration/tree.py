@@ -214,6 +214,10 @@ class TopologicalInference:
     new_probability: float = parameter(
         0.05, "Probability of new ground at least, where the arcs point into known areas.", low=0.0, high=1.0
     )
+    alike_probability: float = parameter(
+        0.5, "Probability that new ground looks like another known place, such as one more corridor.", low=0.0,
+        high=0.999,
+    )
     place_radius: float = parameter(
         2.0, "A robot this close to a keyframe of an area, and in its sight, is in the area's place.", unit="m",
         low=0.1, high=20.0,

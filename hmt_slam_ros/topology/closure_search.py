@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -18,6 +18,7 @@ from hmt_slam_ros.sensing import Scan
 from hmt_slam_ros.topology.appearance import appearance_log_ratio, signature
 from hmt_slam_ros.topology.area_grid import GridModel, build_area_grid
 from hmt_slam_ros.topology.area_matching import MatchSettings, Mode, match
+from hmt_slam_ros.topology.chance import Elsewhere, log_chance
 from hmt_slam_ros.topology.hybrid_map import HybridMap
 from hmt_slam_ros.topology.shortest_path import reachable
 from hmt_slam_ros.topology.surroundings import Nearness, Views, gap, positions, stacked
@@ -27,6 +28,8 @@ Pose = NDArray[np.float64]
 
 # Bounds the search for candidates in maps with thousands of areas within the limit of certainty.
 _MOST_AREAS = 500
+# Areas in which the keyframes surely do not lie that they are compared with all the same.
+_ELSEWHERE = 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +50,10 @@ class Query:
 
 
 class Fit(NamedTuple):
-    """One way in which the keyframes lie in a known area; ``log_weight`` = log pi p(phi) p(z), relative to unknown."""
+    """One way in which the keyframes lie in a known area.
+
+    :ivar log_weight: log pi p(phi) p(z), p(z) relative to new ground.
+    """
 
     area: int
     mode: Mode
@@ -130,7 +136,8 @@ class ClosureSearch:
         :param compared: {known area: keyframes that were compared with it}.
         :param excluded: areas that are neither candidates nor part of a candidate's map.
         """  # fmt: skip
-        candidates = {c.place.area: c for c in self._candidates(hybrid_map, area, query, compared, excluded)}
+        within, elsewhere = self._divided(hybrid_map, area, query, excluded)
+        candidates = {c.place.area: c for c in self._candidates(hybrid_map, query, compared, within, excluded)}
         radius = self._options.place_radius
         entries = {
             known: entry_probability(c.place, c.prior, stacked(c.fresh), radius) for known, c in candidates.items()
@@ -144,21 +151,53 @@ class ClosureSearch:
             for known in examined
             for look, mode in self._fits(hybrid_map, candidates[known])
         ]
-        return Comparison(model, tuple(fits), tuple(examined), sum(model.known[known] for known in rest))
+        relative = self._relative_to_new(hybrid_map, candidates, fits, elsewhere, excluded)
+        return Comparison(model, relative, tuple(examined), sum(model.known[known] for known in rest))
+
+    def _relative_to_new(
+        self, hybrid_map: HybridMap, candidates: Mapping[int, _Candidate], fits: Sequence[Fit],
+        elsewhere: Sequence[int], excluded: Collection[int],
+    ) -> tuple[Fit, ...]:
+        """Weigh the fits against new ground, which may look like the building's other places."""
+        places = [self._elsewhere(hybrid_map, area, excluded) for area in (elsewhere if fits else ())]
+        fresh = {tuple(candidates[fit.area].fresh): candidates[fit.area].fresh for fit in fits}
+        new = {
+            keyframes: log_chance(self._views.grid(poses), places, self._options.alike_probability, self._settings)
+            for keyframes, poses in fresh.items()
+        }
+        return tuple(
+            fit._replace(log_weight=fit.log_weight - new[tuple(candidates[fit.area].fresh)]) for fit in fits
+        )
+
+    def _divided(
+        self, hybrid_map: HybridMap, area: int, query: Query, excluded: Collection[int]
+    ) -> tuple[dict[int, PoseGaussian], list[int]]:
+        """The priors of the known areas in which the query may lie, and some of those in which it surely does not."""
+        within, elsewhere = {}, []
+        for known, belief in reachable(hybrid_map, area, self._options.prior_limit**2, _MOST_AREAS).items():
+            prior = self._prior(belief, query)
+            if known in excluded:
+                continue
+            if self._within_reach(hybrid_map, known, prior, query.poses):
+                within[known] = prior
+            else:
+                elsewhere.append(known)
+        return within, sorted(elsewhere)[:: max(1, -(-len(elsewhere) // _ELSEWHERE))]
+
+    def _elsewhere(self, hybrid_map: HybridMap, area: int, excluded: Collection[int]) -> Elsewhere:
+        """An area's place, and one of its keyframes in the middle of the way through it."""
+        poses = stacked(hybrid_map.keyframes(area))
+        return Elsewhere(self._views.place(hybrid_map, area, excluded).grid, poses[len(poses) // 2])
 
     def _candidates(
-        self, hybrid_map: HybridMap, area: int, query: Query, compared: Mapping[int, Collection[int]],
-        excluded: Collection[int],
+        self, hybrid_map: HybridMap, query: Query, compared: Mapping[int, Collection[int]],
+        within: Mapping[int, PoseGaussian], excluded: Collection[int],
     ) -> Iterator[_Candidate]:
-        """The known areas whose keyframes the query can be near to under the arcs' belief."""
-        limit = self._options.prior_limit**2
-        for known, belief in reachable(hybrid_map, area, limit, _MOST_AREAS).items():
+        """The known areas within reach with which most of the query was not compared yet."""
+        for known, prior in within.items():
             fresh = {k: pose for k, pose in query.poses.items() if k not in compared.get(known, ())}
             # An area with which most of the keyframes were compared has had its chance.
-            if known in excluded or 2 * len(fresh) < len(query.poses):
-                continue
-            prior = self._prior(belief, query)
-            if self._within_reach(hybrid_map, known, prior, fresh):
+            if 2 * len(fresh) >= len(query.poses) and self._within_reach(hybrid_map, known, prior, fresh):
                 yield _Candidate(self._views.place(hybrid_map, known, excluded), prior, fresh)
 
     def _prior(self, belief: PoseGaussian, query: Query) -> PoseGaussian:
