@@ -119,9 +119,11 @@ def _end_points(
 
 def thinned(points: Points, spacing: float) -> Points:
     """The mean point of every occupied voxel, shape (n, 2), ordered by voxel."""
-    voxels = np.floor(points / spacing).astype(np.int64)
-    _, inverse, counts = np.unique(voxels, axis=0, return_inverse=True, return_counts=True)
-    inverse = inverse.reshape(-1)
+    if not len(points):
+        return points
+    column, row = np.floor(points / spacing).astype(np.int64).T
+    row -= row.min()
+    _, inverse, counts = np.unique(column * (row.max() + 1) + row, return_inverse=True, return_counts=True)
     sums = np.stack([np.bincount(inverse, weights=points[:, axis]) for axis in (0, 1)], axis=1)
     return sums / counts[:, None]
 
@@ -181,7 +183,11 @@ def _lower_distances(
     for k in range(points.shape[0]):
         x, y = (points[k, 0] - origin[0]) / cell - 0.5, (points[k, 1] - origin[1]) / cell - 0.5
         column, row = round(x), round(y)
+        first, last = max(0, column - span), min(columns, column + span + 1)
         for r in range(max(0, row - span), min(rows, row + span + 1)):
-            for c in range(max(0, column - span), min(columns, column + span + 1)):
-                d2 = ((c - x) ** 2 + (r - y) ** 2) * cell * cell
-                distance2[r, c] = min(distance2[r, c], d2)
+            up = (r - y) ** 2
+            # A part whose index begins at 0, and a choice instead of a branch: the compiler takes four cells at once.
+            part = distance2[r, first:last]
+            for c in range(last - first):
+                d2 = ((first + c - x) ** 2 + up) * cell * cell
+                part[c] = d2 if d2 < part[c] else part[c]
