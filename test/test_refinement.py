@@ -29,10 +29,14 @@ def surfaces(scans: list):
     return surfaces_of(scans, 30.0, OPTIONS.max_points)
 
 
-def equations(walls: np.ndarray, truth: np.ndarray, relative: np.ndarray, noise: float = 0.0, gate: float = 0.3):
+def equations(
+    walls: np.ndarray, truth: np.ndarray, relative: np.ndarray, noise: float = 0.0, gate: float = 0.3, every: int = 1
+):
     seen = surfaces(scans_at(truth, walls, noise))
     one, other = np.array([0]), np.array([1])
-    information, gradient, share = normal_equations(seen, one, seen, other, relative[None], gate, weighting(OPTIONS))
+    information, gradient, share = normal_equations(
+        seen, one, seen, other, relative[None], gate, weighting(OPTIONS), every
+    )
     return information[0], gradient[0], share[0]
 
 
@@ -79,6 +83,17 @@ def test_one_step_leads_to_the_true_pose(off: tuple[float, float, float]) -> Non
     np.testing.assert_allclose(step, -np.array(off), atol=0.2 * np.abs(off).max())
 
 
+def test_half_of_the_points_tell_as_much_as_all() -> None:
+    truth = np.array([[2.0, 2.0, 0.2], [2.4, 2.3, 0.5]])
+    start = se2.compose(se2.between(truth[1], truth[0]), se2.exp((0.03, 0.02, 0.01)))
+    all_of_them, half = (equations(two_rooms(), truth, start, every=every) for every in (1, 2))
+    steps = [-np.linalg.solve(information, gradient) for information, gradient, _ in (all_of_them, half)]
+    np.testing.assert_allclose(steps[1], steps[0], atol=0.003)
+    assert not np.array_equal(all_of_them[0], half[0])
+    np.testing.assert_allclose(half[0], all_of_them[0], atol=0.05 * np.abs(all_of_them[0]).max())
+    assert half[2] == pytest.approx(all_of_them[2], abs=0.03)
+
+
 def test_a_bare_corridor_tells_nothing_of_the_direction_along_it() -> None:
     truth = np.array([[0.0, 0.1, 0.0], [0.5, -0.1, 0.05]])
     information, _, share = equations(CORRIDOR, truth, se2.between(truth[1], truth[0]), noise=0.01)
@@ -101,7 +116,7 @@ def test_scans_of_other_resolution_and_mounting_register_with_each_other() -> No
     seen = surfaces([one, other])
     start = se2.compose(se2.between(truth[1], truth[0]), se2.exp([0.03, -0.03, 0.01]))
     pair = np.array([0]), seen, np.array([1])
-    information, gradient, share = normal_equations(seen, *pair, start[None], 0.3, weighting(OPTIONS))
+    information, gradient, share = normal_equations(seen, *pair, start[None], 0.3, weighting(OPTIONS), 1)
     assert share[0] > 0.2
     np.testing.assert_allclose(
         -np.linalg.solve(information[0], gradient[0]), [-0.03, 0.03, -0.01], atol=0.008

@@ -18,6 +18,8 @@ from hmt_slam_ros.topology.pose_graph import Edges, optimise
 
 # The graph changes with the next linearisation: it need not be solved to the last digit.
 _TOLERANCE = 1e-3
+# Before the last linearisation one out of so many points serves.
+_THINNED = 2
 # Keeps the information of a pair regular: 3 m and 3 rad.
 _VAGUE = 0.1 * np.eye(3)
 
@@ -40,20 +42,26 @@ def refine_jointly(
     :returns: shape (n, 3).
     """
     gates = np.geomspace(options.first_gate, options.last_gate, options.iterations)
-    for gate in gates.tolist():
-        edges = _with(motion, _registered(surfaces, poses, pairs, gate, options))
+    for k, gate in enumerate(gates.tolist(), start=1):
+        every = _THINNED if k < len(gates) else 1
+        edges = _with(motion, _registered(surfaces, poses, pairs, gate, every, options))
         poses = optimise(poses, edges, fixed, marginals=False, tolerance=_TOLERANCE).poses
     return poses
 
 
 def _registered(
-    surfaces: Surfaces, poses: NDArray[np.float64], pairs: NDArray[np.int64], gate: float, options: Refinement
+    surfaces: Surfaces,
+    poses: NDArray[np.float64],
+    pairs: NDArray[np.int64],
+    gate: float,
+    every: int,
+    options: Refinement,
 ) -> Edges:
     """One Gauss-Newton step of every pair on its own, as edges from the second scan to the first."""
     relative = se2.between(poses[pairs[:, 1]], poses[pairs[:, 0]])
     one, other = pairs.T
     information, gradient, share = normal_equations(
-        surfaces, one, surfaces, other, relative, gate, weighting(options)
+        surfaces, one, surfaces, other, relative, gate, weighting(options), every
     )
     meets = share >= options.min_share
     information = information[meets] + _VAGUE

@@ -41,7 +41,7 @@ def place(
     for _ in range(_STEPS):
         relative = se2.between(poses[keyframe_of], placed[scan_of])
         information, gradient, share = normal_equations(
-            scans, scan_of, surfaces, keyframe_of, relative, options.last_gate, weighting(options)
+            scans, scan_of, surfaces, keyframe_of, relative, options.last_gate, weighting(options), 1
         )
         meets = share >= options.min_share
         total, slope = np.broadcast_to(prior, (len(around), 3, 3)).copy(), se2.log(se2.between(initial, placed)) @ prior

@@ -47,6 +47,7 @@ def normal_equations(
     relative: Float64,
     gate: float,
     weights: Weighting,
+    every: int,
 ) -> tuple[Float64, Float64, Float64]:
     """Linearise the registration of pairs of scans at given relative poses.
 
@@ -54,6 +55,7 @@ def normal_equations(
     :param other_of: shape (m,), the scan of ``others`` with whose walls.
     :param relative: shape (m, 3), ``other_T_one``, m and rad.
     :param gate: points farther apart than this do not meet, m.
+    :param every: 1 for all points, k for one out of k, which counts for as many.
     :returns: information (m, 3, 3) and gradient (m, 3) of half the squared error in the right tangent of
         ``other_T_one``, and the share (m,) of the points that meet a wall.
     """
@@ -61,7 +63,7 @@ def normal_equations(
     information, gradient, share = np.zeros((m, 3, 3)), np.zeros((m, 3)), np.zeros(m)
     for e in range(m):
         share[e] = _add_points(
-            ones, one_of[e], others, other_of[e], relative[e], gate, weights, information[e], gradient[e]
+            ones, one_of[e], others, other_of[e], relative[e], gate, weights, every, information[e], gradient[e]
         )
     return information, gradient, share
 
@@ -75,6 +77,7 @@ def _add_points(
     pose: Float64,
     gate: float,
     weights: Weighting,
+    every: int,
     information: Float64,
     gradient: Float64,
 ) -> float:
@@ -84,12 +87,13 @@ def _add_points(
     :returns: the share of the points that meet a wall.
     """
     cos, sin = np.cos(pose[2]), np.sin(pose[2])
-    most, sharpness = weights.temper / weights.sigma**2, 1.0 / weights.robust
+    most, sharpness = every * weights.temper / weights.sigma**2, 1.0 / weights.robust
     # Sums in variables of their own stay in registers.
     xx = xy = xt = yy = yt = tt = gx = gy = gt = 0.0
-    met = 0
+    seen = met = 0
     first, last = ones.starts[one], ones.starts[one + 1]
-    for k in range(first, last):
+    for k in range(first, last, every):
+        seen += 1
         px, py = ones.points[k, 0], ones.points[k, 1]
         x = pose[0] + cos * px - sin * py
         y = pose[1] + sin * px + cos * py
@@ -119,7 +123,7 @@ def _add_points(
     information[0, 2] = information[2, 0] = xt
     information[1, 2] = information[2, 1] = yt
     gradient[0], gradient[1], gradient[2] = gx, gy, gt
-    return met / max(1, last - first)
+    return met / max(1, seen)
 
 
 @njit(cache=True, inline="always")
