@@ -21,8 +21,8 @@ Pose = NDArray[np.float64]
 
 # An area has few others around it; this bounds the work where hundreds are joined by tight arcs.
 _MOST_AROUND = 64
-# Grids are kept up to this size, bytes: some ten areas of a large building. Beyond that few are asked for again.
-_KEPT = 1 << 24
+# Grids are kept up to this size, bytes: those of some ten places of a large building.
+_KEPT = 3 << 23
 
 
 @dataclass(frozen=True)
