@@ -84,7 +84,7 @@ def test_a_regression_of_the_bundled_log_fails_the_command(tmp_path, monkeypatch
         (["short", "--write-expected"], "not all that is expected can be measured"),
         (["accuracy", "--logs", "mars"], "there is no log 'mars'"),
         (["accuracy", "--write-docs", "--logs", "malaga"], "leave --set and --logs away"),
-        (["accuracy", "--logs", "malaga", "--seeds", "1", "--set", "no.such=1"], "the run malaga-0 failed"),
+        (["accuracy", "--logs", "malaga", "--seeds", "1", "--set", "no.such=1"], "the run malaga-no.such_1-0 failed"),
     ],
 )
 def test_a_wrong_command_is_one_sentence_and_status_2(tmp_path, capsys, without_datasets, arguments, words):
