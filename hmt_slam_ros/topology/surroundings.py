@@ -116,9 +116,10 @@ class Views:
 
     def place_of(self, hybrid_map: HybridMap, area: int, poses: Mapping[int, Pose]) -> Place:
         """The place of ``area`` among the areas that stand at ``poses``, {other area: ``area_T_other``}."""
-        keyframes, owners = {}, []
+        keyframes: dict[int, Pose] = {}
+        owners: list[int] = []
         for other, pose in poses.items():
-            for keyframe, at in hybrid_map.keyframes(other).items():
-                keyframes[keyframe] = se2.compose(pose, at)
-                owners.append(other)
+            placed = hybrid_map.keyframes(other)
+            keyframes |= zip(placed, se2.compose(pose, stacked(placed)), strict=True)
+            owners += [other] * len(placed)
         return Place(area, np.array(owners, dtype=np.int64), stacked(keyframes)[:, :2], self.grid(keyframes))

@@ -118,12 +118,17 @@ def _nearest_in_sight(
 ) -> NDArray[np.int64]:
     """Index of the nearest keyframe within ``radius`` that can be seen from every position, or -1."""
     found = np.full(positions.shape[0], -1)
+    distance2 = np.empty(keyframes.shape[0])
     for n in range(positions.shape[0]):
-        closest = radius
         for k in range(keyframes.shape[0]):
-            distance = np.hypot(keyframes[k, 0] - positions[n, 0], keyframes[k, 1] - positions[n, 1])
-            if distance <= closest and _in_sight(positions[n], keyframes[k], log_ratio, free, origin, cell):
-                closest, found[n] = distance, k
+            distance2[k] = (keyframes[k, 0] - positions[n, 0]) ** 2 + (keyframes[k, 1] - positions[n, 1]) ** 2
+        while found[n] < 0:
+            nearest = distance2.argmin()
+            if distance2[nearest] > radius * radius:
+                break
+            if _in_sight(positions[n], keyframes[nearest], log_ratio, free, origin, cell):
+                found[n] = nearest
+            distance2[nearest] = np.inf
     return found
 
 
