@@ -47,10 +47,10 @@ def summary(facts: Mapping[str, str]) -> str:
 
 
 def commit() -> str:
-    """Short hash of the checked out commit, and whether files differ from it."""
+    """Short hash of the checked out commit, and whether files differ from it, documents aside."""
     try:
         head = _git("rev-parse", "--short=10", "HEAD")
-        return head + (" with changes" if _git("status", "--porcelain", "--untracked-files=no") else "")
+        return head + (" with changes" if _git("status", "--porcelain", "--untracked-files=no", "--", ":!docs") else "")
     except (OSError, subprocess.CalledProcessError):
         return "unknown"
 
