@@ -11,6 +11,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numba import njit
+from numba.extending import register_jitable
 from numpy.typing import ArrayLike, NDArray
 
 Pose = NDArray[np.float64]
@@ -37,6 +39,8 @@ def compose(a_T_b: ArrayLike, b_T_c: ArrayLike) -> Pose:
     a, b = np.asarray(a_T_b, dtype=np.float64), np.asarray(b_T_c, dtype=np.float64)
     if a.ndim == b.ndim == 1:
         return _compose_one(a.tolist(), b.tolist())
+    if a.ndim == 2 and b.ndim == 1:
+        return _compose_each(a, b)
     cos, sin = np.cos(a[..., 2]), np.sin(a[..., 2])
     x = a[..., 0] + cos * b[..., 0] - sin * b[..., 1]
     y = a[..., 1] + sin * b[..., 0] + cos * b[..., 1]
@@ -51,6 +55,17 @@ def _stacked(*parts: NDArray[np.float64]) -> NDArray[np.float64]:
     return stacked
 
 
+@njit(cache=True)
+def _compose_each(a: Pose, b: Pose) -> Pose:
+    found = np.empty((a.shape[0], 3))
+    for n in range(a.shape[0]):
+        cos, sin = np.cos(a[n, 2]), np.sin(a[n, 2])
+        found[n, 0] = a[n, 0] + cos * b[0] - sin * b[1]
+        found[n, 1] = a[n, 1] + sin * b[0] + cos * b[1]
+        found[n, 2] = _wrap_one(a[n, 2] + b[2])
+    return found
+
+
 def _compose_one(a: list[float], b: list[float]) -> Pose:
     cos, sin = math.cos(a[2]), math.sin(a[2])
     x = a[0] + cos * b[0] - sin * b[1]
@@ -58,6 +73,7 @@ def _compose_one(a: list[float], b: list[float]) -> Pose:
     return np.array((x, y, _wrap_one(a[2] + b[2])))
 
 
+@register_jitable
 def _wrap_one(angle: float) -> float:
     if -math.pi <= angle < math.pi:
         return angle
@@ -83,7 +99,16 @@ def _inverse_one(a: list[float]) -> Pose:
 
 def between(c_T_a: ArrayLike, c_T_b: ArrayLike) -> Pose:
     """``a_T_b``, from the poses of a and b in a common frame."""
-    return compose(inverse(c_T_a), c_T_b)
+    a, b = np.asarray(c_T_a, dtype=np.float64), np.asarray(c_T_b, dtype=np.float64)
+    if a.ndim == b.ndim == 1:
+        return _between_one(a.tolist(), b.tolist())
+    return compose(inverse(a), b)
+
+
+def _between_one(a: list[float], b: list[float]) -> Pose:
+    cos, sin = math.cos(a[2]), math.sin(a[2])
+    x, y = b[0] - a[0], b[1] - a[1]
+    return np.array((cos * x + sin * y, cos * y - sin * x, _wrap_one(b[2] - a[2])))
 
 
 def transform(a_T_b: ArrayLike, points: ArrayLike) -> NDArray[np.float64]:

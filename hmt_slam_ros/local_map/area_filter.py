@@ -13,10 +13,11 @@ import numpy as np
 
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.geometry.covariance import inverse, turned
 from hmt_slam_ros.local_map import batch
 from hmt_slam_ros.local_map.local_mapping import LocalMapping
 from hmt_slam_ros.local_map.patches import MapView
-from hmt_slam_ros.local_map.tracking import ScanMatcher, Tracked, in_body_frame, map_information
+from hmt_slam_ros.local_map.tracking import ScanMatcher, Tracked, map_information
 from hmt_slam_ros.random_streams import Purpose, stream
 from hmt_slam_ros.sensing import Scan
 from hmt_slam_ros.sensing.motion import NO_STEP, Prediction
@@ -65,6 +66,7 @@ class AreaFilter:
     :ivar keyframes: the local map's keyframes, ids.
     :ivar keyframe_areas: their areas.
     :ivar keyframe_poses: shape (M, K, 3), ``map_T_base`` of each under each particle.
+    :ivar leader: the particle whose pose is the filter's.
     """
 
     def __init__(self, mapping: LocalMapping, hypothesis: int, area: int) -> None:
@@ -81,19 +83,9 @@ class AreaFilter:
         self._priors = self.poses.copy()
         self._last_poses = self.poses.copy()
         self._since_update = NO_STEP
-        self._told_leader = 0
+        self.leader = 0
         self._matcher = ScanMatcher(mapping)
         self.tracking_covariance = np.zeros((3, 3))
-
-    @property
-    def leader(self) -> int:
-        """The particle of largest weight; where none is clearly more likely, the one that led at the last step.
-
-        Along a corridor nothing tells the particles apart, and the pose would jump from one to the other.
-        """
-        heaviest = int(np.argmax(self.log_weights))
-        lead = self.log_weights[heaviest] - self.log_weights[self._told_leader]
-        return heaviest if lead > _CLEARLY else self._told_leader
 
     @property
     def pose(self) -> Float64:
@@ -113,7 +105,7 @@ class AreaFilter:
         child._tables = np.stack([self.mapping.pool.share(table) for table in self._tables])
         child._priors, child._last_poses = self._priors.copy(), self._last_poses.copy()
         child._since_update = self._since_update
-        child._told_leader, child.tracking_covariance = self._told_leader, self.tracking_covariance
+        child.leader, child.tracking_covariance = self.leader, self.tracking_covariance
         return child
 
     def release(self) -> None:
@@ -162,7 +154,7 @@ class AreaFilter:
         log_evidence = _log_mean(drawn.evidences, weights)
         self.log_weights = self.log_weights + drawn.evidences
         self.log_weights -= self.log_weights.max()
-        leader = self.leader
+        leader = self._elected()
         random = stream(settings.seed, Purpose.PARTICLES, step).standard_normal(drawn.modes.shape)
         self.poses = drawn.modes + np.einsum("mij,mj->mi", np.linalg.cholesky(drawn.covariances), random)
         # The leader keeps the mode, so that the published path has no sampling noise.
@@ -171,16 +163,24 @@ class AreaFilter:
         heading = self.poses[leader, 2]
         # The beams are correlated, what odometry knows is not.
         told = drawn.hessians[leader] / settings.filter.covariance_inflation
-        covariance = in_body_frame(np.linalg.inv(prior + told), heading)
-        information = in_body_frame(settings.matching.temper * drawn.hessians[leader], heading)
+        covariance = turned(inverse(prior + told), -heading)
+        information = turned(settings.matching.temper * drawn.hessians[leader], -heading)
         effective = 1.0 / float(np.sum(_normalised(self.log_weights) ** 2))
         moved = se2.between(self._last_poses[leader], self.poses[leader])
-        changed = leader != self._told_leader
-        self._told_leader = leader
+        changed, self.leader = leader != self.leader, leader
         if effective < settings.filter.ess_fraction * len(self.poses):
             self._resample(step)
         self._restart()
         return FilterStep(moved, covariance, information, log_evidence, effective, changed)
+
+    def _elected(self) -> int:
+        """The particle of largest weight; where none is clearly more likely, the one that led before.
+
+        Along a corridor nothing tells the particles apart, and the pose would jump from one to the other.
+        """
+        heaviest = int(np.argmax(self.log_weights))
+        lead = self.log_weights[heaviest] - self.log_weights[self.leader]
+        return heaviest if lead > _CLEARLY else self.leader
 
     def _restart(self) -> None:
         """Predict from here."""
@@ -203,7 +203,7 @@ class AreaFilter:
         self._tables = tables
         self.poses, self.keyframe_poses = self.poses[ancestors], self.keyframe_poses[ancestors]
         self.log_weights = np.zeros(len(weights))
-        self._told_leader = 0
+        self.leader = 0
 
     def add_keyframe(self, keyframe: int, scan: Scan) -> None:
         """Enter the scan into every particle's map at that particle's pose."""

@@ -15,6 +15,7 @@ import numpy as np
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.chi_square import gate
+from hmt_slam_ros.geometry.covariance import inverse, turned
 from hmt_slam_ros.local_map import matching
 from hmt_slam_ros.local_map.local_mapping import LocalMapping
 from hmt_slam_ros.local_map.patches import MapView
@@ -52,7 +53,7 @@ class Match(NamedTuple):
     @property
     def covariance(self) -> Float64:
         """Of the pose, right tangent frame, shape (3, 3)."""
-        return np.linalg.inv(in_body_frame(self.hessian + self.prior.information, self.pose[2])).astype(np.float64)
+        return inverse(turned(self.hessian + self.prior.information, -self.pose[2]))
 
 
 class Tracked(NamedTuple):
@@ -98,8 +99,8 @@ class ScanMatcher:
     def _reconciled(self, points: Float64, before: Float64, odometry: Step, found: Match, view: MapView) -> Match:
         """The match with odometry widened along what the scan contradicts; along a corridor it still tells how far."""
         predicted = se2.compose(before, odometry.increment)
-        information = in_body_frame(self._settings.temper * found.hessian, predicted[2])
-        shown = np.linalg.solve(information + np.linalg.inv(odometry.covariance), information)
+        information = turned(self._settings.temper * found.hessian, -predicted[2])
+        shown = np.linalg.solve(information + inverse(odometry.covariance), information)
         difference = shown @ se2.log(se2.between(predicted, found.pose))
         step = Step(odometry.increment, odometry.covariance + np.outer(difference, difference))
         prior = matching.Prior(predicted, map_information(step.covariance, predicted[2]))
@@ -114,7 +115,7 @@ class ScanMatcher:
 
     def tempered(self, match: Match) -> Float64:
         """Information of the match alone, for correlated beams, in the frame of the pose, shape (3, 3)."""
-        return in_body_frame(self._settings.temper * match.hessian, match.pose[2])
+        return turned(self._settings.temper * match.hessian, -match.pose[2])
 
     def _agrees(self, points: Float64, match: Match, view: MapView) -> bool:
         far = -2.0 * matching.log_prior(match.pose, match.prior) > _GATE
@@ -129,9 +130,9 @@ class ScanMatcher:
         predicted = se2.compose(before, step.increment)
         prior = matching.Prior(predicted, map_information(step.covariance, predicted[2]))
         match = self._refined(points, predicted, prior, step, view)
-        lattice, wide = self._lattice(step.covariance, predicted[2])
-        if not wide and self._fits(points, match.pose, view):
+        if not _wide(step) and self._fits(points, match.pose, view):
             return match
+        lattice = self._lattice(step, predicted[2])
         starts = matching.correlative_search(
             points[:: max(1, len(points) // _SEARCH_POINTS)], prior, lattice, view, self._mapping.model,
             self._settings.temper, _PEAKS,
@@ -148,29 +149,24 @@ class ScanMatcher:
         )
         return Match(pose, hessian, prior, step, log_evidence)
 
-    def _lattice(self, covariance: Float64, theta: float) -> tuple[matching.Lattice, bool]:
-        """The poses to search for a prediction of this covariance, and whether they are beyond Gauss-Newton's basin."""
+    def _lattice(self, step: Step, theta: float) -> matching.Lattice:
+        """The poses to search for after a step to the heading ``theta``."""
         settings, cell = self._settings, self._mapping.pool.cell
-        reach = _REACH * np.sqrt(np.diag(in_map_frame(covariance, theta)))
-        wide = bool(reach[:2].max() > _BASIN_DISTANCE or reach[2] > _BASIN_ANGLE)
+        reach = _REACH * np.sqrt(np.diag(turned(step.covariance, theta)))
         reach[:2] = np.clip(reach[:2], settings.search_distance, settings.wide_distance)
         reach[2] = np.clip(reach[2], math.radians(settings.search_angle), math.radians(settings.wide_angle))
         turn = math.radians(settings.search_step)
         counts = np.ceil(reach / np.array([2.0 * cell, 2.0 * cell, turn])).astype(np.int64)
-        return matching.Lattice(2, turn, counts), wide
+        return matching.Lattice(2, turn, counts)
+
+
+def _wide(step: Step) -> bool:
+    """Whether a step may end beyond Gauss-Newton's basin."""
+    (xx, xy, _), (_, yy, _), (_, _, turn) = step.covariance.tolist()
+    largest = 0.5 * (xx + yy) + math.hypot(0.5 * (xx - yy), xy)
+    return largest > (_BASIN_DISTANCE / _REACH) ** 2 or turn > (_BASIN_ANGLE / _REACH) ** 2
 
 
 def map_information(covariance: Float64, theta: float) -> Float64:
     """Inverse, in the map frame, of a covariance in the body's tangent frame, both (3, 3)."""
-    return np.asarray(np.linalg.inv(in_map_frame(covariance, theta)), dtype=np.float64)
-
-
-def in_map_frame(covariance: Float64, theta: float) -> Float64:
-    """A covariance in the body's tangent frame as one of (x, y, theta) in the map frame, both (3, 3)."""
-    turn = se2.adjoint(np.array([0.0, 0.0, theta]))
-    return turn @ covariance @ turn.T
-
-
-def in_body_frame(covariance: Float64, theta: float) -> Float64:
-    """The inverse of :func:`in_map_frame`; a rotation, so that it serves information matrices as well."""
-    return in_map_frame(covariance, -theta)
+    return inverse(turned(covariance, theta))

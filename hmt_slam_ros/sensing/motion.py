@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from hmt_slam_ros.configuration.tree import Motion
 from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.geometry.covariance import carried, inverse
 from hmt_slam_ros.sensing.odometry import OdometryBuffer
 
 # Weight of the newest scan in the mean time between scans, and of the past when odometry is judged once more.
@@ -36,8 +37,8 @@ class Step(NamedTuple):
 
     def then(self, other: Step) -> Step:
         """Both motions, one after the other."""
-        ad = se2.adjoint(se2.inverse(other.increment))
-        return Step(se2.compose(self.increment, other.increment), ad @ self.covariance @ ad.T + other.covariance)
+        before = carried(self.covariance, other.increment)
+        return Step(se2.compose(self.increment, other.increment), before + other.covariance)
 
 
 NO_STEP = Step(np.zeros(3), np.zeros((3, 3)))
@@ -80,8 +81,8 @@ class Inertia:
         self._doubt = 0.5 * (seconds - self._period) * self._velocity
         changed = self._covariance + self._acceleration * self._seconds**2
         # However long it takes, the velocity stays within the usual.
-        self._certainty = np.linalg.inv(changed) + self._usual
-        self._covariance = np.asarray(np.linalg.inv(self._certainty), dtype=np.float64)
+        self._certainty = inverse(changed) + self._usual
+        self._covariance = inverse(self._certainty)
         lasting = -_MEMORY * np.expm1(-self._seconds / _MEMORY)
         spread = self._covariance * self._seconds**2 + np.outer(self._doubt, self._doubt) + self._floor
         return Step(se2.exp(self._velocity * lasting), spread)
@@ -97,7 +98,7 @@ class Inertia:
         doubted = information @ self._doubt
         certain = information - np.outer(doubted, doubted) / (1.0 + self._doubt @ doubted)
         measured = certain * self._seconds**2
-        self._covariance = np.asarray(np.linalg.inv(self._certainty + measured), dtype=np.float64)
+        self._covariance = inverse(self._certainty + measured)
         residual = se2.log(increment) / self._seconds - self._velocity
         self._velocity = self._velocity + self._covariance @ (measured @ residual)
 
@@ -132,7 +133,7 @@ class OdometryNoise:
         :param matched: ``start_T_end`` (3,).
         :param information: R^-1 in the frame of the end, shape (3, 3).
         """
-        prior = np.linalg.inv(odometry.covariance)
+        prior = inverse(odometry.covariance)
         expected = np.diag(np.linalg.solve(information + prior, information) @ odometry.covariance)
         squares = se2.log(se2.between(odometry.increment, matched)) ** 2
         shown = expected / np.diag(odometry.covariance)
