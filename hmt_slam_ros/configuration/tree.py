@@ -45,7 +45,7 @@ class Motion:
         high=50.0,
     )
     turn_acceleration: float = parameter(
-        60.0, "Deviation of the acceleration of a turn, likewise.", unit="deg/s^2", low=1.0, high=10000.0
+        200.0, "Deviation of the acceleration of a turn, likewise.", unit="deg/s^2", low=1.0, high=10000.0
     )
     fault_probability: float = parameter(
         0.01, "Probability that the odometry of a scan is wrong beyond its deviations.", low=1e-9, high=0.5
