@@ -6,7 +6,7 @@ import argparse
 
 from hmt_slam_ros.evaluation import truth_of, write_tum
 from hmt_slam_ros.logs import open_log, write_bag
-from hmt_slam_ros.logs.open_log import SIMULATED
+from hmt_slam_ros.logs.records import SIMULATED
 
 
 def run(options: argparse.Namespace) -> None:

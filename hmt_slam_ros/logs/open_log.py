@@ -13,10 +13,7 @@ from hmt_slam_ros.logs.carmen import looks_like_carmen, open_carmen
 from hmt_slam_ros.logs.entries import Window
 from hmt_slam_ros.logs.mrpt_objects import looks_like_rawlog
 from hmt_slam_ros.logs.rawlog import open_rawlog
-from hmt_slam_ros.logs.records import Log
-
-SIMULATED = "sim:"
-"""What the name of a log begins with that is made while it is read."""
+from hmt_slam_ros.logs.records import SIMULATED, Log
 
 _MCAP, _SQLITE, _GZIP, _XZ = b"\x89MCAP0\r\n", b"SQLite format 3\x00", b"\x1f\x8b", b"\xfd7zXZ\x00"
 

@@ -11,6 +11,9 @@ from numpy.typing import NDArray
 
 from hmt_slam_ros.sensing import Odometry, Scan
 
+SIMULATED = "sim:"
+"""What the name of a log begins with that is made while it is read."""
+
 
 @dataclass(frozen=True, slots=True)
 class LogRecord:

@@ -9,7 +9,7 @@ from pathlib import Path
 from hmt_slam_ros.configuration.flat import Value, changed_one_by_one
 from hmt_slam_ros.configuration.loading import parse_setting
 from hmt_slam_ros.configuration.parameter import parameter
-from hmt_slam_ros.logs.open_log import SIMULATED
+from hmt_slam_ros.logs.records import SIMULATED
 
 
 @dataclass(frozen=True)

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.logs.entries import Window, require_scans
-from hmt_slam_ros.logs.open_log import SIMULATED
-from hmt_slam_ros.logs.records import LogRecord
+from hmt_slam_ros.logs.records import SIMULATED, LogRecord
 from hmt_slam_ros.logs.stamps import NANOSECONDS
 from hmt_slam_ros.random_streams import Purpose, stream
 from hmt_slam_ros.sensing import Odometry
