@@ -73,7 +73,10 @@ class Listener:
         return future.result()
 
     def close(self):
+        from hmt_slam_ros.nodes.departure import await_departures  # noqa: PLC0415  only where there is ROS
+
         self.executor.shutdown()
+        await_departures(self.node, 2.0)
         self.node.destroy_node()
         self.context.try_shutdown()
 

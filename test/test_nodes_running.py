@@ -1,5 +1,6 @@
 """How a node ends when it is told to at an awkward moment."""
 
+import ctypes
 import multiprocessing
 import os
 import signal
@@ -10,6 +11,7 @@ import pytest
 import rclpy
 from rclpy.node import Node
 
+from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.nodes.outbox import RCLError
 from hmt_slam_ros.nodes.running import run
 
@@ -51,3 +53,26 @@ def test_what_takes_long_is_broken_off_after_a_while_without_a_fault():
     os.kill(process.pid, signal.SIGTERM)
     process.join(20)
     assert process.exitcode == 0
+
+
+class Clinging(Node):
+    """A node whose destruction never ends, as that of a participant of Fast DDS at times."""
+
+    def destroy_node(self):
+        ctypes.PyDLL(None).sleep(60)
+
+
+@pytest.mark.parametrize(("sentence", "status"), [(None, 0), ("nothing to do", 2)])
+def test_a_node_that_cannot_leave_ends_with_the_status_of_what_it_did(sentence, status):
+    process = multiprocessing.get_context("spawn").Process(target=cling, args=(sentence,))
+    process.start()
+    process.join(20)
+    assert process.exitcode == status
+
+
+def cling(sentence):
+    def spin(_node):
+        if sentence:
+            raise HmtSlamError(sentence)
+
+    raise SystemExit(run(partial(Clinging, "clinging"), spin))

@@ -20,6 +20,7 @@ from hmt_slam_ros.configuration.documents import ros_yaml, yaml_value
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.logs import Log, is_simulated, open_log
 from hmt_slam_ros.nodes.children import Children, Usage
+from hmt_slam_ros.nodes.departure import await_departures
 from hmt_slam_ros.nodes.domain import own_domain
 from hmt_slam_ros.nodes.recorder_node import RecorderNode
 from hmt_slam_ros.nodes.transforms import TFMessage
@@ -36,6 +37,7 @@ STALL = 180.0  # s
 _LISTENERS_PATIENCE = 60.0  # s
 _SPIN = 0.05  # s
 _LAST_FIGURES = 3.0  # s
+_DEPARTURES = 2.0  # s
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,6 +175,7 @@ class _Run:
                 yield executor
             finally:
                 executor.shutdown()
+                await_departures(self.node, _DEPARTURES)
                 self.node.destroy_node()
         finally:
             context.try_shutdown()

@@ -6,7 +6,6 @@ import ctypes
 import os
 import signal
 import sys
-import threading
 from collections.abc import Callable
 from typing import TypeVar
 
@@ -17,6 +16,7 @@ from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 
 from hmt_slam_ros.errors import HmtSlamError
+from hmt_slam_ros.nodes.departure import end_within
 
 # Names the process that started this one, which ends when that one does.
 PARENT_VARIABLE = "HMT_SLAM_PARENT"
@@ -25,6 +25,8 @@ FAULT = 2
 _PR_SET_PDEATHSIG = 1
 # How long what is being done may take to end, such as the compilation of a kernel, before it is broken off.
 _GRACE = 8.0  # s
+# How long taking leave of the other nodes may take.
+_DEPARTURE = 2.0  # s
 _CONTEXT_LOST = (NotInitializedException, rclpy_implementation.InvalidHandle, rclpy_implementation.RCLError)
 
 NodeType = TypeVar("NodeType", bound=Node)
@@ -40,12 +42,30 @@ def run(make: Callable[[], NodeType], spin: Callable[[NodeType], None] = rclpy.s
     stop = _Stop()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, stop)
+    nodes: list[NodeType] = []
+    try:
+        status = _live(make, spin, stop, nodes)
+        end_within(_DEPARTURE, status)
+    finally:
+        _ignore_signals()
+        for node in nodes:
+            node.destroy_node()
+        rclpy.try_shutdown()
+    return status
+
+
+def _live(
+    make: Callable[[], NodeType], spin: Callable[[NodeType], None], stop: _Stop, nodes: list[NodeType]
+) -> int:
+    """Make a node, which is also put into ``nodes``, and spin it; return the exit status."""
     try:
         _end_with_parent()
         rclpy.init()
         try:
             if not stop.told:
-                _live(make, spin)
+                nodes.append(make())
+                if rclpy.ok():
+                    spin(nodes[0])
         except _CONTEXT_LOST:
             # rclpy's own handler takes the context away at any moment, also from under a node that is being made.
             if rclpy.ok():
@@ -55,20 +75,7 @@ def run(make: Callable[[], NodeType], spin: Callable[[NodeType], None] = rclpy.s
     except HmtSlamError as error:
         print(f"{sys.argv[0].rsplit('/', 1)[-1]}: {error}", file=sys.stderr, flush=True)
         return FAULT
-    finally:
-        _ignore_signals()
-        rclpy.try_shutdown()
     return 0
-
-
-def _live(make: Callable[[], NodeType], spin: Callable[[NodeType], None]) -> None:
-    node = make()
-    try:
-        if rclpy.ok():
-            spin(node)
-    finally:
-        _ignore_signals()
-        node.destroy_node()
 
 
 class _Stop:
@@ -83,9 +90,7 @@ class _Stop:
     def __call__(self, _number: int, _frame: object) -> None:
         if not self.told:
             self.told = True
-            deadline = threading.Timer(_GRACE, os._exit, (0,))
-            deadline.daemon = True
-            deadline.start()
+            end_within(_GRACE, 0)
 
 
 def _ignore_signals() -> None:
