@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -40,11 +40,14 @@ class Tsbi:
     Consumes Keyframe, AreaEvents, Accepted; produces Hypotheses.
     """
 
-    def __init__(self, configuration: Configuration) -> None:
+    def __init__(
+        self, configuration: Configuration, branching: Callable[[Configuration, Replica], Branching] = Branching
+    ) -> None:
+        """:param branching: what makes the children of hypotheses, such as one that is watched."""
         self._options = configuration.tsbi
         self._seed = configuration.seed
         self._replica = Replica()
-        self._branching = Branching(configuration, self._replica)
+        self._branching = branching(configuration, self._replica)
         self._notes = {FIRST_HYPOTHESIS: LeafNotes()}
         self._keyframe: Keyframe | None = None
         self._estimates: dict[int, LeafEstimate] = {}

@@ -1,0 +1,91 @@
+"""Watched runs of simulated worlds, each in a process of its own, kept in a folder and made once."""
+
+from __future__ import annotations
+
+import gzip
+import hashlib
+import json
+import subprocess
+import sys
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from benchmark.logs import ROOT
+from benchmark.runs import PARAMETERS
+from benchmark.simulated.worlds import World
+from hmt_slam_ros.errors import HmtSlamError
+
+Record = dict[str, Any]
+
+_SUFFIX = ".json.gz"
+_TAIL = 3  # lines of a failed run that go into a message
+
+
+@cache
+def code() -> str:
+    """What the records of this code are known by: a hash of the program and its parameters."""
+    digest = hashlib.sha256(PARAMETERS.read_bytes())
+    for folder in ("hmt_slam_ros", "benchmark/simulated"):
+        for file in sorted((ROOT / folder).rglob("*.py")):
+            digest.update(file.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def read_record(path: Path) -> Record:
+    """A record as it was written."""
+    with gzip.open(path, "rt", encoding="utf-8") as source:
+        record: Record = json.load(source)
+    return record
+
+
+def read_records(folder: Path) -> Iterator[Record]:
+    """All records of a folder, in the order of their names.
+
+    :raises HmtSlamError: where there are none.
+    """
+    paths = sorted(folder.glob(f"*{_SUFFIX}"))
+    if not paths:
+        raise HmtSlamError(f"{folder} has no records: make them by `python -m benchmark calibration --runs {folder}`")
+    yield from map(read_record, paths)
+
+
+class Records:
+    """Makes records, each once.
+
+    :ivar folder: where they are kept; those in it that another program or other parameters made are made anew.
+    :ivar jobs: runs at the same time.
+    """
+
+    def __init__(self, folder: Path, jobs: int) -> None:
+        self.folder, self.jobs = folder, jobs
+
+    def of(self, worlds: Iterable[World], changes: Sequence[str]) -> list[Record]:
+        """The records of some worlds, in their order.
+
+        :param changes: parameters that differ from the file, as ``name=value``.
+        :raises HmtSlamError: where a run failed.
+        """
+        self.folder.mkdir(parents=True, exist_ok=True)
+        with ThreadPoolExecutor(self.jobs) as pool:
+            return list(pool.map(lambda world: self._record(world, list(changes)), worlds))
+
+    def _record(self, world: World, changes: list[str]) -> Record:
+        path = self.folder / f"{world.name}{_SUFFIX}"
+        if path.is_file():
+            record = read_record(path)
+            if (record["code"], record["world"], record["changes"]) == (code(), world.log, changes):
+                return record
+        module = "benchmark.simulated.watched_run"
+        command = [sys.executable, "-m", module, world.family, str(world.seed), str(path), *changes]
+        result = subprocess.run(
+            command, cwd=ROOT, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False
+        )
+        if result.returncode:
+            last_words = " | ".join(result.stderr.strip().splitlines()[-_TAIL:]) or "nothing"
+            raise HmtSlamError(f"the run {world.name} failed, it said: {last_words}")
+        record = read_record(path)
+        print(f"{world.name}: {record['cpu_s']:.1f} CPU s", file=sys.stderr, flush=True)
+        return record

@@ -1,0 +1,206 @@
+"""Watches the five processes on a simulated log: what they say, and what is true of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+
+from benchmark.simulated.closures import Closure, Paths, answers, by_arcs_alone
+from benchmark.simulated.examinations import Examination, WatchedBranching
+from benchmark.simulated.features import Row, rows
+from benchmark.simulated.loops import Loops
+from benchmark.simulated.truth import Pose, Truth, nees
+from hmt_slam_ros.configuration import Configuration
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.offline.runtime import LockStep
+from hmt_slam_ros.processes.aam import Aam
+from hmt_slam_ros.processes.messages import Accepted, EndOfLog, Hypotheses, Keyframe, Message, RealTimePose
+from hmt_slam_ros.processes.replica import FIRST_AREA, Replica
+from hmt_slam_ros.processes.routing import Process
+from hmt_slam_ros.processes.rtl import Rtl
+from hmt_slam_ros.processes.slam import MetricSlam
+from hmt_slam_ros.processes.tlca import Tlca
+from hmt_slam_ros.processes.tsbi import Tsbi
+from hmt_slam_ros.simulation import SimulatedLog
+
+Entry = dict[str, Any]
+
+_POSE_PERIOD = 2_000_000_000  # ns between two poses of RTL that are judged
+
+
+@dataclass(frozen=True)
+class _Tapped:
+    """A process of which somebody hears all that it says."""
+
+    process: Process
+    heard: Callable[[Message], None]
+
+    def handle(self, message: Message) -> list[Message]:
+        """As the process does."""
+        said = self.process.handle(message)
+        for word in said:
+            self.heard(word)
+        return said
+
+
+@dataclass
+class Watch:
+    """Judges a run while it goes on.
+
+    :ivar truth: about the keyframes.
+    :ivar rows: of all comparisons with known areas.
+    :ivar events: keyframe events at which there was a known area that the keyframes fit into.
+    :ivar accepted: the closures that became definite.
+    :ivar poses: of RTL.
+    :ivar loops: that there are to close.
+    """
+
+    log: SimulatedLog
+    configuration: Configuration
+    rows: list[Row] = field(default_factory=list)
+    events: list[Entry] = field(default_factory=list)
+    accepted: list[Entry] = field(default_factory=list)
+    poses: list[Entry] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.truth = Truth(self.log)
+        self.loops = Loops(self.truth)
+        self._replica = Replica()
+        self._paths = Paths(self.truth)
+        self._travelled: dict[int, float] = {}
+        self._asked: dict[int, Examination] = {}
+        self._area_poses: dict[int, PoseGaussian] = {}
+        self._next_pose = 0
+
+    def run(self) -> None:
+        """Map the whole log."""
+        configuration = self.configuration
+        processes: dict[str, Process] = {
+            "slam": MetricSlam(configuration),
+            "aam": Aam(configuration),
+            "tsbi": Tsbi(configuration, lambda c, r: WatchedBranching(c, r, self._examined)),
+            "tlca": Tlca(configuration),
+            "rtl": Rtl(configuration),
+        }
+        lock_step = LockStep({name: _Tapped(process, self._hear) for name, process in processes.items()})
+        for record in self.log.records():
+            lock_step.feed(record.measurement)
+        lock_step.feed(EndOfLog())
+        self.loops.finish()
+
+    def _hear(self, message: Message) -> None:
+        match message:
+            case Keyframe():
+                self._note(message)
+            case Hypotheses():
+                self._follow(message)
+            case Accepted():
+                self._accept(message)
+            case RealTimePose() if message.stamp >= self._next_pose:
+                self._next_pose = message.stamp + _POSE_PERIOD
+                self._judge_pose(message)
+
+    def _note(self, keyframe: Keyframe) -> None:
+        self.truth.note(keyframe)
+        self._travelled[keyframe.sequence] = keyframe.travelled
+        self._replica.add(keyframe)
+        best = self._replica.best
+        self.loops.note(keyframe.sequence, keyframe.travelled, self._replica.maps[best], self._replica.areas[best])
+        self._asked = {}
+
+    def _examined(self, examination: Examination) -> None:
+        self._asked[examination.parent.hypothesis] = examination
+        event = max(self._travelled)
+        self.rows += rows(examination, self.truth, self.configuration, event, self._travelled)
+
+    def _follow(self, hypotheses: Hypotheses) -> None:
+        before = tuple(self._replica.probabilities.items())
+        arcs = by_arcs_alone(before, self._asked, self._paths.paths, self.truth)
+        self._paths.follow(hypotheses, self._replica, self._asked)
+        if any(examination.found.fits for examination in self._asked.values()):
+            given = answers(hypotheses, self._replica, self._asked, self._paths.paths)
+            self.events.append(
+                {
+                    "event": hypotheses.sequence,
+                    "travelled": self._travelled[hypotheses.sequence],
+                    "unexamined": hypotheses.unexamined,
+                    "answers": [asdict(answer) for answer in given],
+                    "arcs_alone": [asdict(answer) | {"among": among} for answer, among in arcs],
+                }
+            )
+        self._replica.apply(hypotheses)
+
+    def _accept(self, accepted: Accepted) -> None:
+        probabilities = dict(self._replica.probabilities)
+        self._replica.accept(accepted)
+        if accepted.global_poses:
+            self._area_poses = {area.area: area.pose for area in accepted.global_poses}
+        if accepted.hypothesis is None:
+            return
+        chosen = self._replica.maps[accepted.hypothesis]
+        for closure in self._paths.accepted(accepted.hypothesis, chosen):
+            self.accepted.append(self._entry(closure, accepted.sequence, probabilities[accepted.hypothesis]))
+        self.loops.definite(accepted.sequence, chosen, self._replica.areas[accepted.hypothesis])
+
+    def _entry(self, closure: Closure, event: int, probability: float) -> Entry:
+        return {
+            "event": event,
+            "asked_at": closure.event,
+            "way": closure.way,
+            "areas": closure.areas,
+            "waited": self._travelled[event] - self._travelled[closure.event],
+            "probability": probability,
+            "right": closure.claim.true,
+            **closure.claim._asdict(),
+        }
+
+    def _judge_pose(self, pose: RealTimePose) -> None:
+        """Errors of the pose in the map and of that in the robot's area."""
+        best = self._replica.maps[self._replica.best]
+        if pose.area not in best.area_ids():
+            return
+        truth = self.log.true_poses(np.array([pose.stamp]))[0]
+        in_map = se2.between(self.truth.frame(best, FIRST_AREA), truth)
+        in_area = se2.between(self.truth.frame(best, pose.area), truth)
+        self.poses.append(
+            {
+                "stamp": pose.stamp,
+                "area": pose.area,
+                "map": _error(pose.map_pose, in_map),
+                "local": _error(pose.local, in_area),
+            }
+        )
+
+    def arcs(self) -> list[Entry]:
+        """Errors of the arcs of the most probable map as it is now."""
+        best = self._replica.maps[self._replica.best]
+        frames = {area: self.truth.frame(best, area) for area in best.area_ids()}
+        return [
+            {"areas": (a, b), "closure": arc.closure, **_error(arc.pose, se2.between(frames[a], frames[b]))}
+            for a, b, arc in best.all_arcs()
+        ]
+
+    def area_poses(self) -> list[Entry]:
+        """Errors of the areas' poses in the map as TLCA last gave them."""
+        best = self._replica.maps[self._replica.best]
+        origin = self.truth.frame(best, FIRST_AREA)
+        return [
+            {"area": area, **_error(pose, se2.between(origin, self.truth.frame(best, area)))}
+            for area, pose in self._area_poses.items()
+            if area != FIRST_AREA and area in best.area_ids()
+        ]
+
+
+def _error(belief: PoseGaussian, truth: Pose) -> Entry:
+    """Translation (m) and rotation (degrees) of an error, its NEES and the deviation that is stated (m)."""
+    error = se2.between(belief.mean, truth)
+    return {
+        "translation": float(np.hypot(error[0], error[1])),
+        "rotation": float(np.degrees(abs(error[2]))),
+        "nees": nees(belief, truth),
+        "sigma": float(np.sqrt(np.trace(belief.covariance[:2, :2]))),
+    }
