@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.offline.saved_map import SavedMap
-from hmt_slam_ros.topology.hybrid_map import ArcValue
+from hmt_slam_ros.topology.common_map import ArcValue
 
 
 @dataclass(frozen=True)

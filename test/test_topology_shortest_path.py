@@ -104,6 +104,34 @@ def test_the_tree_costs_what_the_best_of_all_paths_costs_in_a_random_graph():
         assert found[area].covariance[0, 0] == pytest.approx(variance, rel=1e-4)
 
 
+def test_the_search_ends_where_all_that_is_wanted_is_found():
+    hybrid_map = chain(*[arc(1.0, 0.0, 0.0)] * 6)
+    assert set(reachable(hybrid_map, 1, until=(0, 3))) == {0, 1, 2, 3}
+    assert set(reachable(hybrid_map, 1, until=(77,))) == set(range(7))
+
+
+def test_own_arcs_replace_common_ones_and_beliefs_are_those_of_composition():
+    rng = np.random.default_rng(1)
+    hybrid_map = HybridMap()
+    pairs = [(a, a + step) for a in range(40) for step in (1, 7) if a + step < 40]
+    for n, (a, b) in enumerate(pairs):
+        loose = 2.0 if n % 5 == 0 else 0.2
+        hybrid_map.set_arc(a, b, arc(*rng.normal(size=3), rng.uniform(0.1, loose), 0.05), closure=False)
+        if n == len(pairs) // 2:
+            hybrid_map.absorb()
+    for a, b in pairs[: len(pairs) // 4]:
+        hybrid_map.set_arc(a, b, arc(*rng.normal(size=3), rng.uniform(0.1, 0.3), 0.05), closure=False)
+    found = reachable(hybrid_map, 20)
+    assert len(found) == 40
+    for area, belief in list(found.items())[1:]:
+        # Every belief is that of a neighbour that was found before, carried on by the arc that counts.
+        before = [b for b in hybrid_map.neighbours(area) if list(found).index(b) < list(found).index(area)]
+        ways = [found[b].compose(hybrid_map.arc(b, area)) for b in before]
+        assert any(
+            np.allclose(way.mean, belief.mean) and np.allclose(way.covariance, belief.covariance) for way in ways
+        )
+
+
 def test_a_hypothesis_sees_its_own_arcs_and_the_common_ones():
     hybrid_map = chain(arc(1.0, 0.0, 0.0))
     hybrid_map.absorb()

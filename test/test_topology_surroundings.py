@@ -9,13 +9,18 @@ from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.topology.appearance import appearance_log_ratio, signature
 from hmt_slam_ros.topology.area_grid import GridModel
 from hmt_slam_ros.topology.hybrid_map import HybridMap
-from hmt_slam_ros.topology.surroundings import Nearness, Views, agreeing, areas_around
+from hmt_slam_ros.topology.shortest_path import Reached
+from hmt_slam_ros.topology.surroundings import Nearness, Views, agreeing, areas_around, may_be_near
 
 NEAR = Nearness(sigma=0.3, reach=6.0)
 
 
 def belief(x, sigma):
     return PoseGaussian(np.array([x, 0.0, 0.0]), np.diag([sigma, sigma, 0.01]) ** 2)
+
+
+def placed(*poses):
+    return {area: PoseGaussian(pose, np.eye(3)) for area, pose in enumerate(poses)}
 
 
 def chain(*sigmas, spacing=4.0):
@@ -47,13 +52,30 @@ def test_excluded_areas_are_left_out():
     assert list(areas_around(chain(0.05), 0, NEAR, without={1})) == [0]
 
 
+def test_the_quick_bound_lets_all_pass_that_are_near():
+    rng = np.random.default_rng(2)
+    square = rng.normal(size=(200, 3, 3)) * np.array([0.3, 0.3, 0.05])[:, None]
+    found = Reached(np.arange(200), rng.uniform(-8.0, 8.0, size=(200, 3)), square @ square.transpose(0, 2, 1))
+    query = PoseGaussian(np.array([1.0, 2.0, 0.3]), np.diag([0.1, 0.2, 0.05]) ** 2)
+    asked, keyframe = np.array([2.0, 0.5]), np.array([1.5, 0.0])
+    passed = may_be_near(found, query, float(np.hypot(*asked)), np.full(200, 1.5), 2.0, 4.0)
+    near = []
+    for mean, covariance in zip(found.means, found.covariances, strict=True):
+        prior = PoseGaussian(mean, covariance).inverse().compose(query)
+        spread = np.sqrt(np.linalg.eigvalsh(prior.covariance[:2, :2])[-1])
+        spread += np.hypot(*asked) * np.sqrt(prior.covariance[2, 2])
+        near.append(np.hypot(*(se2.transform(prior.mean, asked) - keyframe)) <= 2.0 + 4.0 * spread)
+    assert passed[near].all()
+    assert 20 < sum(near) <= passed.sum() < 195
+
+
 def test_a_global_pose_that_agrees_with_the_arcs_is_taken():
-    poses = {0: np.array([1.0, 1.0, 0.5]), 1: se2.compose([1.0, 1.0, 0.5], [4.05, 0.0, 0.0])}
+    poses = placed(np.array([1.0, 1.0, 0.5]), se2.compose([1.0, 1.0, 0.5], [4.05, 0.0, 0.0]))
     assert np.allclose(agreeing(belief(4.0, 0.1), 0, 1, poses, 16.0), [4.05, 0.0, 0.0])
 
 
 def test_a_global_pose_that_contradicts_the_arcs_is_not():
-    poses = {0: np.zeros(3), 1: np.array([6.0, 0.0, 0.0])}
+    poses = placed(np.zeros(3), np.array([6.0, 0.0, 0.0]))
     assert np.allclose(agreeing(belief(4.0, 0.1), 0, 1, poses, 16.0), [4.0, 0.0, 0.0])
     assert np.allclose(agreeing(belief(4.0, 0.1), 0, 7, poses, 16.0), [4.0, 0.0, 0.0])
 

@@ -44,6 +44,12 @@ def carried(covariance: Matrix, increment: NDArray[np.float64]) -> Matrix:
 
 
 @njit(cache=True)
+def of_inverse(covariance: Matrix, pose: NDArray[np.float64]) -> Matrix:
+    """The covariance of the inverse of ``pose`` (3,): Ad C Ad^T, right tangent frames."""
+    return _moved(covariance, pose[0], pose[1], pose[2])
+
+
+@njit(cache=True)
 def _moved(covariance: Matrix, x: float, y: float, theta: float) -> Matrix:
     """Ad C Ad^T for the pose (x, y, theta)."""
     cos, sin = np.cos(theta), np.sin(theta)

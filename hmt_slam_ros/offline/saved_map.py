@@ -23,7 +23,8 @@ from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.offline.recorder import Recording
 from hmt_slam_ros.processes.replica import Replica
 from hmt_slam_ros.sensing import Scan
-from hmt_slam_ros.topology.hybrid_map import ArcValue, HybridMap
+from hmt_slam_ros.topology.common_map import ArcValue
+from hmt_slam_ros.topology.hybrid_map import HybridMap
 
 FORMAT, VERSION = "hmt_map", 2
 MANIFEST = "manifest.json"

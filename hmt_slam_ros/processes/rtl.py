@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.processes.messages import Accepted, LocalEstimate, Message, Notice, RealTimePose
+from hmt_slam_ros.processes.global_poses import GlobalPoses
+from hmt_slam_ros.processes.messages import Accepted, AreaPose, LocalEstimate, Message, Notice, RealTimePose
 from hmt_slam_ros.processes.replica import FIRST_AREA
 from hmt_slam_ros.sensing import Odometry
 from hmt_slam_ros.sensing.motion import path_covariance
@@ -59,7 +60,9 @@ class Rtl:
         self._estimate: LocalEstimate | None = None
         self._start: _Reading | None = None
         # The map's frame is the first area's: known before TLCA has spoken.
-        self._areas = {FIRST_AREA: PoseGaussian(np.zeros(3), np.zeros((3, 3)))}
+        self._areas = GlobalPoses((AreaPose(FIRST_AREA, PoseGaussian(np.zeros(3), np.zeros((3, 3)))),))
+        # That of the estimate's area, kept where another hypothesis leads, which may not know it.
+        self._area_pose = self._areas[FIRST_AREA]
 
     def handle(self, message: Message) -> list[Message]:
         """Take in one message; an odometry reading is answered with the pose at its stamp, once one is known."""
@@ -70,15 +73,11 @@ class Rtl:
                 self._newest = message
                 self._correct()
         elif isinstance(message, Accepted) and message.global_poses:
-            self._place_areas({area.area: area.pose for area in message.global_poses})
+            self._areas = GlobalPoses(message.global_poses)
+            if self._estimate is not None:
+                self._area_pose = self._areas.get(self._estimate.area, self._area_pose)
             self._correct()
         return []
-
-    def _place_areas(self, areas: dict[int, PoseGaussian]) -> None:
-        """Take over where the areas are; where another hypothesis leads, the robot's area may not be among them."""
-        if self._estimate is not None:
-            areas.setdefault(self._estimate.area, self._areas[self._estimate.area])
-        self._areas = areas
 
     def _hear_odometry(self, reading: Odometry) -> list[Message]:
         """Carry the path on to a reading; one that is not newer than its predecessor is passed over."""
@@ -111,9 +110,13 @@ class Rtl:
 
         An area that is new has no place in the map before TLCA's answer is here: until then the former estimate holds.
         """
-        if self._newest is None or self._newest.area not in self._areas:
+        if self._newest is None:
             return
-        self._estimate, self._start = self._newest, None
+        same = self._estimate is not None and self._estimate.area == self._newest.area
+        pose = self._areas.get(self._newest.area, self._area_pose if same else None)
+        if pose is None:
+            return
+        self._estimate, self._area_pose, self._start = self._newest, pose, None
         while len(self._readings) > 1 and self._readings[1].stamp <= self._estimate.stamp:
             self._readings.popleft()
 
@@ -129,7 +132,7 @@ class Rtl:
             se2.between(start.smooth, now.smooth),
             path_covariance(now.distance - start.distance, min(now.angle - start.angle, math.pi), self._motion),
         )
-        return [RealTimePose(now.stamp, estimate.area, self._areas[estimate.area], estimate.pose, since, now.raw)]
+        return [RealTimePose(now.stamp, estimate.area, self._area_pose, estimate.pose, since, now.raw)]
 
 
 def _reset_notice(stamp: int, distance: float, angle: float) -> Notice:

@@ -243,7 +243,7 @@ class MetricSlam:
     def _surroundings(self, live: LiveHypothesis) -> list[PlacedKeyframe]:
         """The local map's areas as they are now known."""
         held = dict.fromkeys(live.filter.keyframe_areas)
-        reached = reachable(self._replica.maps[live.filter.hypothesis], live.filter.area)
+        reached = reachable(self._replica.maps[live.filter.hypothesis], live.filter.area, until=held)
         return self._content(live.filter.hypothesis, {area: reached[area].mean for area in held if area in reached})
 
     def _finish(self) -> list[Message]:

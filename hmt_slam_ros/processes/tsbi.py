@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.errors import HmtSlamError
+from hmt_slam_ros.processes.global_poses import GlobalPoses
 from hmt_slam_ros.processes.messages import (
     Accepted,
     AreaEvent,
@@ -53,7 +54,7 @@ class Tsbi:
         self._estimates: dict[int, LeafEstimate] = {}
         self._next_hypothesis = FIRST_HYPOTHESIS + 1
         self._unexamined = 0.0
-        self._global_poses: dict[int, NDArray[np.float64]] = {}
+        self._global_poses = GlobalPoses()
 
     def handle(self, message: Message) -> list[Message]:
         """Learn from ``Keyframe`` and ``Accepted``; answer ``AreaEvents`` with ``Hypotheses``."""
@@ -170,7 +171,7 @@ class Tsbi:
     def _accept(self, accepted: Accepted) -> None:
         """One hypothesis is definite: the others, and what was not examined, are gone."""
         if accepted.global_poses:
-            self._global_poses = {area.area: area.pose.mean for area in accepted.global_poses}
+            self._global_poses = GlobalPoses(accepted.global_poses)
         if accepted.hypothesis is None:
             return
         self._replica.accept(accepted)

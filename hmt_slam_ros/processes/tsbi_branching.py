@@ -46,8 +46,7 @@ class Parent:
 
     def around(self) -> dict[int, NDArray[np.float64]]:
         """{area: ``area_T_other``} of the local map's other areas."""
-        known = set(self.hybrid_map.area_ids())
-        return {area: pose for area, pose in self.notes.local.items() if area in known}
+        return {area: pose for area, pose in self.notes.local.items() if self.hybrid_map.has_area(area)}
 
     def covariance(self, keyframe: int) -> NDArray[np.float64]:
         """Of a keyframe's pose in the robot's area, shape (3, 3)."""
@@ -171,7 +170,8 @@ class Branching:
 
     def _belief(self, parent: Parent, area: int) -> PoseGaussian:
         """The belief over ``area_T_other``, its mean as the local map has it, so that the robot does not jump."""
-        found = parent.hybrid_map.arc(parent.area, area) or reachable(parent.hybrid_map, parent.area)[area]
+        arc = parent.hybrid_map.arc(parent.area, area)
+        found = arc or reachable(parent.hybrid_map, parent.area, until=(area,))[area]
         return PoseGaussian(parent.notes.local.get(area, found.mean), found.covariance)
 
     def _query(self, parent: Parent, keyframes: Sequence[int]) -> Query:
@@ -185,7 +185,7 @@ class Branching:
         """New ground: the reference keyframe becomes the frame of a new area."""
         keyframes = tuple(query.poses)
         if keyframes not in self._named:
-            self._areas = max(self._areas, *parent.hybrid_map.area_ids()) + 1
+            self._areas = max(self._areas, parent.hybrid_map.largest_area) + 1
             self._named[keyframes] = self._areas
         origin = PoseGaussian(np.zeros(3), self._floor)
         return self._entered(parent, query, self._named[keyframes], origin, query.belief, log_factor)
@@ -245,7 +245,7 @@ class Branching:
     def _arc(parent: Parent, area: int, belief: PoseGaussian) -> Arc:
         """The arc from the robot's area; it closes a loop where it joins two known areas that no arc joined."""
         known = parent.hybrid_map.arc_value(parent.area, area)
-        revisited = area in parent.hybrid_map.area_ids()
+        revisited = parent.hybrid_map.has_area(area)
         return Arc(parent.area, area, belief, closure=revisited if known is None else known.closure)
 
     @staticmethod

@@ -20,14 +20,12 @@ from hmt_slam_ros.topology.area_grid import GridModel, build_area_grid
 from hmt_slam_ros.topology.area_matching import MatchSettings, Mode, match
 from hmt_slam_ros.topology.chance import Elsewhere, log_chance
 from hmt_slam_ros.topology.hybrid_map import HybridMap
-from hmt_slam_ros.topology.shortest_path import reachable
-from hmt_slam_ros.topology.surroundings import Nearness, Views, gap, positions, stacked
+from hmt_slam_ros.topology.shortest_path import Reached, reached
+from hmt_slam_ros.topology.surroundings import Nearness, Views, gap, may_be_near, positions, stacked
 from hmt_slam_ros.topology.transition import Place, Transition, entry_probability, owner_at, transition
 
 Pose = NDArray[np.float64]
 
-# Bounds the search for candidates in maps with thousands of areas within the limit of certainty.
-_MOST_AREAS = 500
 # Areas in which the keyframes surely do not lie that they are compared with all the same.
 _ELSEWHERE = 6
 
@@ -173,16 +171,24 @@ class ClosureSearch:
         self, hybrid_map: HybridMap, area: int, query: Query, excluded: Collection[int]
     ) -> tuple[dict[int, PoseGaussian], list[int]]:
         """The priors of the known areas in which the query may lie, and some of those in which it surely does not."""
-        within, elsewhere = {}, []
-        for known, belief in reachable(hybrid_map, area, self._options.prior_limit**2, _MOST_AREAS).items():
-            prior = self._prior(belief, query)
-            if known in excluded:
-                continue
-            if self._within_reach(hybrid_map, known, prior, query.poses):
-                within[known] = prior
-            else:
-                elsewhere.append(known)
-        return within, sorted(elsewhere)[:: max(1, -(-len(elsewhere) // _ELSEWHERE))]
+        found = reached(hybrid_map, area, self._options.prior_limit**2)
+        known = ~np.isin(found.areas, list(excluded))
+        near = known & self._may_be_near(hybrid_map, found, query)
+        within = {}
+        for i in np.flatnonzero(near):
+            prior = self._prior(PoseGaussian(found.means[i], found.covariances[i]), query)
+            if self._within_reach(hybrid_map, int(found.areas[i]), prior, query.poses):
+                within[int(found.areas[i])] = prior
+        elsewhere = np.sort(found.areas[known & ~np.isin(found.areas, list(within))])
+        return within, elsewhere[:: max(1, -(-len(elsewhere) // _ELSEWHERE))].tolist()
+
+    def _may_be_near(self, hybrid_map: HybridMap, found: Reached, query: Query) -> NDArray[np.bool_]:
+        """Which areas, shape (n,), are worth a look at their keyframes for being within reach."""
+        lever = float(np.hypot(*stacked(query.poses)[:, :2].T).max())
+        return may_be_near(
+            found, query.belief, lever, hybrid_map.extents(found.areas), self._options.place_radius,
+            math.sqrt(self.gate) * self._options.prior_scale,
+        )  # fmt: skip
 
     def _elsewhere(self, hybrid_map: HybridMap, area: int, excluded: Collection[int]) -> Elsewhere:
         """An area's place, and one of its keyframes in the middle of the way through it."""

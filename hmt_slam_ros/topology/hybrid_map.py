@@ -1,28 +1,19 @@
 """The HMT map of one hypothesis: areas with their keyframes, and arcs, Eq. (2).
 
-What all hypotheses agree on stands once, in a shared networkx graph; a hypothesis holds only what it changed.
+What all hypotheses agree on stands once, in a shared common map; a hypothesis holds only what it changed.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 
-import networkx as nx
 import numpy as np
 from numpy.typing import NDArray
 
+from hmt_slam_ros.arrays import Float64, Int64
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-
-Keyframes = Mapping[int, NDArray[np.float64]]
-
-
-@dataclass(frozen=True, eq=False)
-class ArcValue:
-    """What the map stores of an arc: the belief over ``a_T_b`` (a < b) and whether it closed a loop."""
-
-    pose: PoseGaussian
-    closure: bool
+from hmt_slam_ros.topology.common_map import ArcValue, CommonMap, Keyframes, extent
 
 
 def _stored_direction(a: int, b: int) -> tuple[int, int]:
@@ -33,13 +24,12 @@ def _stored_direction(a: int, b: int) -> tuple[int, int]:
 class HybridMap:
     """Areas, keyframes and arcs under one topological hypothesis.
 
-    :ivar common: what every live hypothesis agrees on. Node attribute ``keyframes``: {keyframe: ``area_T_base`` (3,)};
-        edge attribute ``arc``: :class:`ArcValue`.
+    :ivar common: what every live hypothesis agrees on.
     :ivar areas: the areas in which this hypothesis differs from the common map, with all their keyframes.
     :ivar arcs: likewise the arcs, keyed by (smaller area, larger area).
     """
 
-    common: nx.Graph = field(default_factory=nx.Graph)
+    common: CommonMap = field(default_factory=CommonMap)
     areas: dict[int, dict[int, NDArray[np.float64]]] = field(default_factory=dict)
     arcs: dict[tuple[int, int], ArcValue] = field(default_factory=dict)
 
@@ -50,14 +40,23 @@ class HybridMap:
     def absorb(self) -> None:
         """Make this hypothesis's changes common; valid only when it is the one live hypothesis of ``common``."""
         for area, keyframes in self.areas.items():
-            self.common.add_node(area, keyframes=keyframes)
-        for (a, b), arc in self.arcs.items():
-            self.common.add_edge(a, b, arc=arc)
+            self.common.set_area(area, keyframes)
+        for pair, arc in self.arcs.items():
+            self.common.set_arc(pair, arc)
         self.areas, self.arcs = {}, {}
 
     def area_ids(self) -> list[int]:
         """All areas, ascending."""
-        return sorted(self.common.nodes | self.areas.keys())
+        return sorted(self.common.areas.keys() | self.areas.keys())
+
+    def has_area(self, area: int) -> bool:
+        """Whether there is such an area."""
+        return area in self.areas or area in self.common.areas
+
+    @property
+    def largest_area(self) -> int:
+        """The largest area, -1 where there is none."""
+        return max(self.common.largest, max(self.areas, default=-1))
 
     def keyframes(self, area: int) -> Keyframes:
         """{keyframe: ``area_T_base`` (3,)} of an area, in the order of insertion.
@@ -65,7 +64,16 @@ class HybridMap:
         :raises KeyError: where there is no such area.
         """
         own = self.areas.get(area)
-        return self.common.nodes[area]["keyframes"] if own is None else own
+        return self.common.areas[area] if own is None else own
+
+    def extents(self, areas: Int64) -> Float64:
+        """Largest distance of each area's keyframes from its origin, m, shape (n,) as ``areas``."""
+        common = areas < len(self.common.extents)
+        found = np.zeros(len(areas))
+        found[common] = self.common.extents[areas[common]]
+        own = np.isin(areas, list(self.areas))
+        found[own] = [extent(self.areas[area]) for area in areas[own].tolist()]
+        return found
 
     def place(self, keyframe: int, area: int, pose: NDArray[np.float64]) -> None:
         """Put a keyframe into an area, made where missing, at ``area_T_base``."""
@@ -77,7 +85,7 @@ class HybridMap:
 
     def _own(self, area: int) -> dict[int, NDArray[np.float64]]:
         if area not in self.areas:
-            self.areas[area] = dict(self.common.nodes[area]["keyframes"]) if area in self.common else {}
+            self.areas[area] = dict(self.common.areas.get(area, {}))
         return self.areas[area]
 
     def arc(self, a: int, b: int) -> PoseGaussian | None:
@@ -91,9 +99,7 @@ class HybridMap:
         """The arc as stored, from the smaller to the larger area, or None."""
         key = _stored_direction(a, b)
         own = self.arcs.get(key)
-        if own is None and self.common.has_edge(*key):
-            return self.common.edges[key]["arc"]
-        return own
+        return self.common.arcs.get(key) if own is None else own
 
     def set_arc(self, a: int, b: int, pose: PoseGaussian, *, closure: bool) -> None:
         """Set or replace the arc between a and b from the belief over ``a_T_b``."""
@@ -101,7 +107,7 @@ class HybridMap:
 
     def neighbours(self, area: int) -> list[int]:
         """The areas one arc away, ascending."""
-        found = set(self.common.adj[area]) if area in self.common else set()
+        found = set(self.common.neighbours(area))
         for a, b in self.arcs:
             if a == area:
                 found.add(b)
@@ -111,7 +117,7 @@ class HybridMap:
 
     def all_arcs(self) -> Iterator[tuple[int, int, ArcValue]]:
         """All arcs as (a, b, value) with a < b, ascending."""
-        keys = {_stored_direction(a, b) for a, b in self.common.edges} | self.arcs.keys()
+        keys = self.common.arcs.keys() | self.arcs.keys()
         for a, b in sorted(keys):
             value = self.arc_value(a, b)
             assert value is not None

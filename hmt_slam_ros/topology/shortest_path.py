@@ -3,18 +3,70 @@
 from __future__ import annotations
 
 import heapq
-import itertools
 import math
+from collections.abc import Collection
+from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 
+from hmt_slam_ros.arrays import Bool, Float64, Int64
+from hmt_slam_ros.geometry.covariance import carried, of_inverse
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.topology.common_map import ArcTable
 from hmt_slam_ros.topology.hybrid_map import HybridMap
 
 
+class Reached(NamedTuple):
+    """Areas in order of cost, of equals the smaller first; the start comes first, with zero covariance.
+
+    :ivar areas: shape (n,).
+    :ivar means: shape (n, 3), ``start_T_area``.
+    :ivar covariances: shape (n, 3, 3), right tangent frame.
+    """
+
+    areas: Int64
+    means: Float64
+    covariances: Float64
+
+
+class _OwnArcs(NamedTuple):
+    """Arcs of a hypothesis, each once from either side, sorted by the areas where they begin.
+
+    :ivar begin: shape (sides,), areas.
+    :ivar end: shape (sides,), areas.
+    :ivar backwards: shape (sides,), whether the arc is stored from ``end`` to ``begin``.
+    :ivar means: shape (sides, 3), as stored.
+    :ivar covariances: shape (sides, 3, 3), as stored.
+    """
+
+    begin: Int64
+    end: Int64
+    backwards: Bool
+    means: Float64
+    covariances: Float64
+
+
 def reachable(
-    hybrid_map: HybridMap, area: int, cost_limit: float = math.inf, max_areas: int | None = None
+    hybrid_map: HybridMap,
+    area: int,
+    cost_limit: float = math.inf,
+    max_areas: int | None = None,
+    until: Collection[int] = (),
 ) -> dict[int, PoseGaussian]:
+    """{area: belief over ``start_T_area``} as :func:`reached` finds them, in their order."""
+    found = reached(hybrid_map, area, cost_limit, max_areas, until)
+    beliefs = map(PoseGaussian, found.means, found.covariances)
+    return dict(zip(found.areas.tolist(), beliefs, strict=True))
+
+
+def reached(
+    hybrid_map: HybridMap,
+    area: int,
+    cost_limit: float = math.inf,
+    max_areas: int | None = None,
+    until: Collection[int] = (),
+) -> Reached:
     """Bounded Dijkstra over the arcs from ``area``.
 
     The cost of an area is the trace of the positional covariance of its composed belief, m^2. A step over an arc costs
@@ -25,27 +77,115 @@ def reachable(
     :param area: where the search starts; it need not be in the map.
     :param cost_limit: areas that cost more than this are left out, m^2.
     :param max_areas: at most this many areas, the start included; None for no bound.
-    :returns: {area: belief over ``start_T_area``} in order of cost, of equals the first found; the start comes first,
-        with zero covariance.
+    :param until: the search ends where all these are found; empty where it goes on.
     """
-    found: dict[int, PoseGaussian] = {}
-    ties = itertools.count()
-    queue = [(0.0, next(ties), area, PoseGaussian(np.zeros(3), np.zeros((3, 3))))]
-    while queue and (max_areas is None or len(found) < max_areas):
-        cost, _, here, belief = heapq.heappop(queue)
-        if here in found:
-            continue
-        found[here] = belief
-        for there in hybrid_map.neighbours(here):
-            arc = None if there in found else hybrid_map.arc(here, there)
-            if arc is None:
-                continue
-            beyond = belief.compose(arc)  # Eq. (15)
-            cost_beyond = max(cost, cost + _positional_trace(beyond) - _positional_trace(belief))
-            if cost_beyond <= cost_limit:
-                heapq.heappush(queue, (cost_beyond, next(ties), there, beyond))
-    return found
+    wanted = np.array(list(set(until)), dtype=np.int64)
+    size = max(hybrid_map.largest_area, area, *(b for _, b in hybrid_map.arcs), *until) + 1
+    most = size if max_areas is None else min(size, max_areas)
+    return Reached(*_search(area, size, hybrid_map.common.table, _own_arcs(hybrid_map), cost_limit, most, wanted))
 
 
-def _positional_trace(belief: PoseGaussian) -> float:
-    return float(belief.covariance[0, 0] + belief.covariance[1, 1])
+def _own_arcs(hybrid_map: HybridMap) -> _OwnArcs:
+    pairs = np.array(list(hybrid_map.arcs), dtype=np.int64).reshape(-1, 2)
+    poses = [arc.pose for arc in hybrid_map.arcs.values()]
+    means = np.array([pose.mean for pose in poses]).reshape(-1, 3)
+    covariances = np.array([pose.covariance for pose in poses]).reshape(-1, 3, 3)
+    begin, end = np.concatenate((pairs, pairs[:, ::-1])).T
+    order = np.lexsort((end, begin))
+    row = order % max(1, len(pairs))
+    return _OwnArcs(begin[order], end[order], order >= len(pairs), means[row], covariances[row])
+
+
+class _Frontier(NamedTuple):
+    """What a search knows of the areas that it has seen, each in a row of its own.
+
+    :ivar row: shape (size,), of every area, from 1 on; 0 for one that was not seen.
+    :ivar cost: shape (size + 1,), by rows, the least cost so far, -1 where it is final.
+    :ivar means: shape (size + 1, 3), by rows.
+    :ivar covariances: shape (size + 1, 3, 3), by rows.
+    """
+
+    row: Int64
+    cost: Float64
+    means: Float64
+    covariances: Float64
+
+
+@njit(cache=True)
+def _search(
+    start: int, size: int, table: ArcTable, own: _OwnArcs, limit: float, most: int, wanted: Int64
+) -> tuple[Int64, Float64, Float64]:
+    seen = _Frontier(np.zeros(size, np.int64), np.empty(size + 1), np.empty((size + 1, 3)), np.empty((size + 1, 3, 3)))
+    seen.row[start], seen.cost[1] = 1, 0.0
+    seen.means[1], seen.covariances[1] = 0.0, 0.0
+    rows, last = np.empty(most, np.int64), 1
+    areas, count, missing = np.empty(most, np.int64), 0, len(wanted)
+    queue = [(0.0, start)]
+    while len(queue) > 0 and count < len(rows):
+        cost, here = heapq.heappop(queue)
+        row = seen.row[here]
+        if seen.cost[row] != cost:
+            continue  # a cheaper path was found since, or this one twice
+        areas[count], rows[count], count = here, row, count + 1
+        for area in wanted:
+            missing -= area == here
+        if missing == 0 and len(wanted) > 0:
+            break
+        low, high = np.searchsorted(own.begin, here), np.searchsorted(own.begin, here, side="right")
+        for k in range(low, high):
+            last = _step(
+                row, own.end[k], own.means[k], own.covariances[k], own.backwards[k], cost, limit, seen, last, queue
+            )
+        side = np.int64(table.first[here]) if here < len(table.first) else np.int64(-1)
+        while side >= 0:
+            there, arc = np.int64(table.beyond[side]), side // 2
+            place = low + np.searchsorted(own.end[low:high], there)
+            if place == high or own.end[place] != there:
+                last = _step(
+                    row, there, table.means[arc], table.covariances[arc], side % 2 == 1, cost, limit, seen, last, queue
+                )
+            side = np.int64(table.following[side])
+        seen.cost[row] = -1.0
+    rows = rows[:count]
+    return areas[:count], seen.means[rows], seen.covariances[rows]
+
+
+@njit(cache=True)
+def _step(
+    row: int, there: int, mean: Float64, covariance: Float64, backwards: bool, cost: float, limit: float,
+    seen: _Frontier, last: int, queue: list[tuple[float, int]],
+) -> int:
+    """See an area over an arc from the area in ``row``; the last row that is in use."""
+    known = seen.row[there]
+    if known > 0 and seen.cost[known] <= cost:
+        return last
+    if backwards:
+        covariance = of_inverse(covariance, mean)
+        mean = _inverse(mean)
+    beyond = carried(seen.covariances[row], mean) + covariance  # Eq. (15)
+    growth = beyond[0, 0] + beyond[1, 1] - (seen.covariances[row, 0, 0] + seen.covariances[row, 1, 1])
+    new_cost = max(cost, cost + growth)
+    if new_cost > limit or (known > 0 and seen.cost[known] <= new_cost):
+        return last
+    if known == 0:
+        last += 1
+        known = seen.row[there] = last
+    seen.cost[known] = new_cost
+    seen.covariances[known] = beyond
+    _compose(seen.means[row], mean, seen.means[known])
+    heapq.heappush(queue, (new_cost, there))
+    return last
+
+
+@njit(cache=True)
+def _inverse(pose: Float64) -> Float64:
+    cos, sin = np.cos(pose[2]), np.sin(pose[2])
+    x, y = pose[0], pose[1]
+    return np.array((-cos * x - sin * y, sin * x - cos * y, -pose[2]))
+
+
+@njit(cache=True)
+def _compose(a: Float64, b: Float64, result: Float64) -> None:
+    cos, sin, angle = np.cos(a[2]), np.sin(a[2]), a[2] + b[2]
+    result[0], result[1] = a[0] + cos * b[0] - sin * b[1], a[1] + sin * b[0] + cos * b[1]
+    result[2] = angle - 2.0 * np.pi * np.floor((angle + np.pi) / (2.0 * np.pi))

@@ -7,14 +7,17 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
+from hmt_slam_ros.arrays import Bool, Float64
 from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.geometry.covariance import carried, of_inverse
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.sensing import Scan
 from hmt_slam_ros.topology.area_grid import AreaGrid, GridModel, build_area_grid
 from hmt_slam_ros.topology.hybrid_map import HybridMap
-from hmt_slam_ros.topology.shortest_path import reachable
+from hmt_slam_ros.topology.shortest_path import Reached, reachable
 from hmt_slam_ros.topology.transition import Place
 
 Pose = NDArray[np.float64]
@@ -23,6 +26,8 @@ Pose = NDArray[np.float64]
 _MOST_AROUND = 64
 # Grids are kept up to this size, bytes: those of some ten places of a large building.
 _KEPT = 3 << 23
+# What the bound on distances has in hand, m.
+_ROUNDING = 1e-6
 
 
 @dataclass(frozen=True)
@@ -67,14 +72,53 @@ def gap(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
     return float(np.hypot(between[..., 0], between[..., 1]).min(initial=np.inf))
 
 
-def agreeing(belief: PoseGaussian, area: int, other: int, global_poses: Mapping[int, Pose], gate: float) -> Pose:
+def may_be_near(
+    found: Reached, query: PoseGaussian, lever: float, extents: Float64, radius: float, deviations: float
+) -> Bool:
+    """Whether a keyframe of an area can lie within ``radius`` of a query, shape (n,), by a bound that is quick to tell.
+
+    :param found: areas seen from the query's area.
+    :param query: belief over ``area_T_reference`` of the query's reference.
+    :param lever: largest distance of the query's keyframes from their reference, m.
+    :param extents: shape (n,), largest distance of each area's keyframes from its origin, m.
+    :param deviations: how many deviations of the prior are admitted.
+    """
+    return _may_be_near(
+        found.means, found.covariances, query.mean, query.covariance, extents + lever + radius, lever, deviations
+    )
+
+
+@njit(cache=True)
+def _may_be_near(
+    means: Float64, covariances: Float64, mean: Float64, covariance: Float64, reach: Float64, lever: float,
+    deviations: float,
+) -> Bool:
+    near = np.empty(len(means), np.bool_)
+    for n in range(len(means)):
+        # area_T_other and area_T_reference make other_T_reference, of which the covariance stands in reference.
+        turn = mean[2] - means[n, 2]
+        dx, dy = mean[0] - means[n, 0], mean[1] - means[n, 1]
+        cos, sin = np.cos(means[n, 2]), np.sin(means[n, 2])
+        step = np.array((cos * dx + sin * dy, cos * dy - sin * dx, turn))
+        prior = carried(of_inverse(covariances[n], means[n]), step) + covariance
+        half, apart = 0.5 * (prior[0, 0] + prior[1, 1]), 0.5 * (prior[0, 0] - prior[1, 1])
+        widest = half + np.sqrt(apart * apart + prior[0, 1] * prior[0, 1])
+        spread = np.sqrt(max(0.0, widest)) + lever * np.sqrt(max(0.0, prior[2, 2]))
+        near[n] = np.sqrt(dx * dx + dy * dy) <= reach[n] + deviations * spread + _ROUNDING
+    return near
+
+
+def agreeing(
+    belief: PoseGaussian, area: int, other: int, global_poses: Mapping[int, PoseGaussian], gate: float
+) -> Pose:
     """``area_T_other`` as the globally consistent map has it, where that agrees with the belief, else its mean.
 
     A hypothesis with an arc that the global map does not know places areas elsewhere than that map does.
     """
-    if area not in global_poses or other not in global_poses:
+    one, two = global_poses.get(area), global_poses.get(other)
+    if one is None or two is None:
         return belief.mean
-    pose = se2.between(global_poses[area], global_poses[other])
+    pose = se2.between(one.mean, two.mean)
     away = se2.log(se2.between(belief.mean, pose))
     agrees = float(away @ np.linalg.solve(belief.covariance, away)) <= gate
     return pose if agrees else belief.mean
