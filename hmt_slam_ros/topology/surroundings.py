@@ -95,16 +95,12 @@ def _may_be_near(
 ) -> Bool:
     near = np.empty(len(means), np.bool_)
     for n in range(len(means)):
-        # area_T_other and area_T_reference make other_T_reference, of which the covariance stands in reference.
-        turn = mean[2] - means[n, 2]
-        dx, dy = mean[0] - means[n, 0], mean[1] - means[n, 1]
-        cos, sin = np.cos(means[n, 2]), np.sin(means[n, 2])
-        step = np.array((cos * dx + sin * dy, cos * dy - sin * dx, turn))
-        prior = carried(of_inverse(covariances[n], means[n]), step) + covariance
+        distance = np.hypot(mean[0] - means[n, 0], mean[1] - means[n, 1])
+        prior = carried(of_inverse(covariances[n], means[n]), mean) + covariance
         half, apart = 0.5 * (prior[0, 0] + prior[1, 1]), 0.5 * (prior[0, 0] - prior[1, 1])
         widest = half + np.sqrt(apart * apart + prior[0, 1] * prior[0, 1])
         spread = np.sqrt(max(0.0, widest)) + lever * np.sqrt(max(0.0, prior[2, 2]))
-        near[n] = np.sqrt(dx * dx + dy * dy) <= reach[n] + deviations * spread + _ROUNDING
+        near[n] = distance <= reach[n] + deviations * spread + _ROUNDING
     return near
 
 
