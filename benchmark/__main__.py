@@ -1,4 +1,5 @@
-"""The command line of the measurements: ``python -m benchmark accuracy steps robustness choices speed|all|short``.
+"""The command line of the measurements: ``python -m benchmark KIND [KIND ...]``, with ``all`` for those on real logs
+and ``validation`` for those on simulated worlds.
 
 Exit status: 0 where all that is asked for holds, 1 where something does not, 2 where nothing could be measured.
 """
@@ -13,11 +14,13 @@ from importlib import import_module
 from pathlib import Path
 
 from benchmark.circumstances import circumstances, summary
-from benchmark.documents import ACCURACY, write_between_marks
+from benchmark.documents import ACCURACY, VALIDATION, write_between_marks
 from benchmark.logs import LOGS, ROOT
 from benchmark.report import Report
 from benchmark.runs import Runner
 from benchmark.settings import Settings
+from benchmark.simulated.records import Records
+from benchmark.simulated.worlds import FAMILIES
 from hmt_slam_ros.cli.arguments import OneSentenceParser
 from hmt_slam_ros.errors import HmtSlamError
 
@@ -29,9 +32,16 @@ MEASUREMENTS = {
     "robustness": "the same with degraded odometry",
     "choices": "what each choice of the design is worth, one parameter changed at a time",
     "speed": "CPU time, memory, cost of a scan, start",
+    "calibration": "whether the probabilities of topological paths are right, on simulated worlds",
+    "loops": "precision and recall of loop closures, likewise",
+    "topology": "whether the world of nested loops ends with the exact topology",
+    "consistency": "whether covariances are as large as errors, on simulated worlds",
     "short": "for CI, whether accuracy became worse than benchmark/expected.toml beyond noise",
 }
-_ALL = ("accuracy", "steps", "robustness", "choices", "speed")
+_GROUPS = {
+    "all": ("accuracy", "steps", "robustness", "choices", "speed"),
+    "validation": ("calibration", "loops", "topology", "consistency"),
+}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -46,12 +56,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _measure(options: argparse.Namespace) -> list[Report]:
-    if options.write_docs and (options.set or options.logs):
-        raise HmtSlamError("--write-docs is for the whole measurement: leave --set and --logs away")
+    if options.write_docs and (options.set or options.logs or options.training):
+        raise HmtSlamError("--write-docs is for the whole measurement: leave --set, --logs and --training away")
     out = _folder(options)
     runner = Runner(out / "runs", options.jobs)
     changes, seeds = tuple(options.set), tuple(range(options.seeds))
-    settings = Settings(options.logs, seeds, changes, out, options.write_expected, runner)
+    records = Records(options.runs or out / "runs", options.jobs)
+    settings = Settings(options.logs, seeds, changes, out, options.write_expected, runner, records, options.training)
     reports = []
     for kind in _kinds(options):
         module = import_module(f"benchmark.{kind}")
@@ -59,14 +70,16 @@ def _measure(options: argparse.Namespace) -> list[Report]:
         facts = circumstances(report.seeds, options.jobs, options.set)
         report.write(out, facts)
         if options.write_docs:
-            write_between_marks(ACCURACY, kind, f"{summary(facts)}\n\n{report.text}")
+            document = VALIDATION if kind in _GROUPS["validation"] else ACCURACY
+            write_between_marks(document, kind, f"{summary(facts)}\n\n{report.text}")
         print(f"\n# {report.title}\n\n{report.text}\n\n{out / f'{kind}.md'}", flush=True)
         reports.append(report)
     return reports
 
 
 def _kinds(options: argparse.Namespace) -> tuple[str, ...]:
-    return _ALL if "all" in options.measurements else tuple(dict.fromkeys(options.measurements))
+    chosen = [kind for name in options.measurements for kind in _GROUPS.get(name, (name,))]
+    return tuple(dict.fromkeys(chosen))
 
 
 def _folder(options: argparse.Namespace) -> Path:
@@ -85,14 +98,16 @@ def _folder(options: argparse.Namespace) -> Path:
 def _parser() -> argparse.ArgumentParser:
     parser = OneSentenceParser(prog="python -m benchmark", description="Measurements of hmt_slam_ros on logs.")
     told = "; ".join(f"{name}: {text}" for name, text in MEASUREMENTS.items())
-    parser.add_argument("measurements", nargs="+", choices=(*MEASUREMENTS, "all"), metavar="KIND", help=told)
-    parser.add_argument("--logs", type=_names, default=(), metavar="A,B", help=f"of {', '.join(LOGS)}")
-    parser.add_argument("--seeds", type=_count, default=0, metavar="N", help="seeds 0 to N-1")
+    parser.add_argument("measurements", nargs="+", choices=(*MEASUREMENTS, *_GROUPS), metavar="KIND", help=told)
+    parser.add_argument("--logs", type=_names, default=(), metavar="A,B", help=f"of {', '.join((*LOGS, *FAMILIES))}")
+    parser.add_argument("--seeds", type=_count, default=0, metavar="N", help="seeds 0 to N-1; simulated: from 1000")
     parser.add_argument("--jobs", type=_count, default=2, metavar="N", help="runs at the same time; 1 for speed")
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder of the report")
+    parser.add_argument("--runs", type=Path, metavar="DIR", help="keeps the runs of simulated worlds, to go on from")
+    parser.add_argument("--training", action="store_true", help="simulated worlds of seeds 0 to N-1")
     parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help="set one parameter")
     parser.add_argument("--write-expected", action="store_true", help="put what short measures on record")
-    parser.add_argument("--write-docs", action="store_true", help="put the tables into docs/accuracy.md")
+    parser.add_argument("--write-docs", action="store_true", help="put the tables into docs/")
     return parser
 
 

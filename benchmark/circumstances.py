@@ -15,6 +15,7 @@ from benchmark.logs import ROOT
 from benchmark.runs import PARAMETERS
 
 _LIBRARIES = ("numpy", "scipy", "numba", "networkx", "rosbags")
+_MANY = 5  # seeds, more of which are not listed one by one
 # Both change what a run costs.
 _VARIABLES = ("OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
 
@@ -35,7 +36,7 @@ def circumstances(seeds: Sequence[int], jobs: int, changes: Sequence[str]) -> di
         ),
         "parameters": f"{PARAMETERS.name}, SHA-256 {hashlib.sha256(PARAMETERS.read_bytes()).hexdigest()[:16]}",
         "changed parameters": ", ".join(changes) or "none",
-        "seeds": ", ".join(map(str, seeds)),
+        "seeds": _listed(seeds),
         "runs at a time": str(jobs),
         "environment": ", ".join(f"{name}={os.environ.get(name, 'not set')}" for name in _VARIABLES),
     }
@@ -44,6 +45,13 @@ def circumstances(seeds: Sequence[int], jobs: int, changes: Sequence[str]) -> di
 def summary(facts: Mapping[str, str]) -> str:
     """The most important of them in one sentence."""
     return f"Measured {facts['date']} at commit {facts['commit']} on {facts['machine']}; seeds {facts['seeds']}."
+
+
+def _listed(seeds: Sequence[int]) -> str:
+    """The seeds, many in a row by the first and the last."""
+    if len(seeds) > _MANY and list(seeds) == list(range(seeds[0], seeds[-1] + 1)):
+        return f"{seeds[0]} to {seeds[-1]}"
+    return ", ".join(map(str, seeds))
 
 
 def commit() -> str:

@@ -8,6 +8,7 @@ from benchmark.logs import ROOT
 from hmt_slam_ros.errors import HmtSlamError
 
 ACCURACY = ROOT / "docs" / "accuracy.md"
+VALIDATION = ROOT / "docs" / "validation.md"
 
 
 def marks(kind: str) -> tuple[str, str]:

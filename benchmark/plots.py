@@ -8,7 +8,10 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from scipy.special import gammainc
 
+from benchmark.forecasts import Reliability
 from benchmark.scoring import FINAL, ONLINE
 from hmt_slam_ros.evaluation import PairErrors, RelationErrors
 
@@ -74,3 +77,55 @@ def plot_errors_by_span(path: Path, pairs: Mapping[str, Sequence[PairErrors]]) -
 def _panels(figure: Figure, count: int) -> Sequence[Axes]:
     panels: Sequence[Axes] = figure.subplots(1, count, squeeze=False)[0]
     return panels
+
+
+def plot_reliability(path: Path, curves: Mapping[str, Reliability]) -> None:
+    """Frequency against probability with Wilson's 95 % intervals, and how many answers are in each bin.
+
+    :param curves: {of what: its reliability}.
+    """
+    figure = Figure(figsize=(5.0 * len(curves), 6.0), layout="constrained")
+    grid = figure.subplots(2, len(curves), squeeze=False, height_ratios=(3.0, 1.0))
+    for column, (name, curve) in enumerate(curves.items()):
+        upper, lower = grid[0][column], grid[1][column]
+        filled = curve.counts > 0
+        said, came, counts = curve.said[filled], curve.came[filled], curve.counts[filled]
+        low, high = _wilson(came, counts)
+        upper.plot([0.0, 1.0], [0.0, 1.0], color="black", linewidth=0.8)
+        bars = np.maximum(0.0, np.stack((came - low, high - came)))
+        upper.errorbar(said, came, bars, fmt="o-", capsize=3)
+        upper.set_title(f"{name}: expected error {curve.error:.3f}")
+        upper.set_ylabel("share that is true")
+        lower.bar(said, counts, width=0.04)
+        lower.set_yscale("log")
+        lower.set_xlim(upper.get_xlim())
+        lower.set_xlabel("probability")
+        lower.set_ylabel("answers")
+    figure.savefig(path, dpi=_DPI)
+
+
+def _wilson(shares: NDArray[np.float64], counts: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The 95 % intervals of some shares of so many."""
+    z2 = 1.96**2
+    middle = (shares + z2 / (2.0 * counts)) / (1.0 + z2 / counts)
+    half = np.sqrt(z2 * (shares * (1.0 - shares) / counts + z2 / (4.0 * counts**2))) / (1.0 + z2 / counts)
+    return middle - half, middle + half
+
+
+def plot_nees(path: Path, samples: Mapping[str, Sequence[float]]) -> None:
+    """Cumulative distributions of normalised errors.
+
+    :param samples: {of what: NEES}.
+    """
+    figure = Figure(figsize=(6.0, 4.5), layout="constrained")
+    axes = figure.subplots()
+    errors = np.geomspace(0.01, 100.0, 200)
+    for name, own in samples.items():
+        axes.plot(np.sort(own), (np.arange(len(own)) + 1.0) / max(1, len(own)), label=name)
+    axes.plot(errors, gammainc(1.5, 0.5 * errors), color="black", linewidth=0.8, label="as it should be")
+    axes.set_xscale("log")
+    axes.set_xlim(0.01, 100.0)
+    axes.set_xlabel("NEES")
+    axes.set_ylabel("share of errors below")
+    axes.legend(fontsize=7)
+    figure.savefig(path, dpi=_DPI)

@@ -12,29 +12,37 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Requirement:
-    """A figure that may not be larger than a bound.
+    """A figure that may not be larger than a bound, nor smaller than another.
 
     :ivar name: what is asked for.
     :ivar value: as measured; NaN, which meets nothing, where it could not be.
     :ivar bound: largest value that is allowed.
     :ivar unit: of both.
+    :ivar least: smallest value that is allowed.
     """
 
     name: str
     value: float
     bound: float
     unit: str = ""
+    least: float = -math.inf
 
     @property
     def met(self) -> bool:
-        """Whether the figure is within its bound."""
-        return self.value <= self.bound
+        """Whether the figure is within its bounds."""
+        return self.least <= self.value <= self.bound
 
     @property
     def row(self) -> list[str]:
         """The cells of its line in the table."""
-        figures = [_number(number, self.unit) for number in (self.value, self.bound)]
-        return [self.name, *figures, "pass" if self.met else "FAIL"]
+        return [self.name, _number(self.value, self.unit), self._bounds, "pass" if self.met else "FAIL"]
+
+    @property
+    def _bounds(self) -> str:
+        least, bound = _number(self.least, self.unit), _number(self.bound, self.unit)
+        if math.isinf(self.least):
+            return bound
+        return f"at least {least}" if math.isinf(self.bound) else f"{least} to {bound}"
 
 
 @dataclass
@@ -67,7 +75,8 @@ class Report:
     def text(self) -> str:
         """Requirements and body as Markdown."""
         rows = [requirement.row for requirement in self.requirements]
-        asked = [table(["required", "measured", "at most", ""], rows)] if rows else []
+        bounds = "at most" if all(math.isinf(requirement.least) for requirement in self.requirements) else "allowed"
+        asked = [table(["required", "measured", bounds, ""], rows)] if rows else []
         return "\n\n".join([*asked, *self.body])
 
     def write(self, folder: Path, circumstances: Mapping[str, str]) -> None:

@@ -6,18 +6,21 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from benchmark.runs import Runner
+from benchmark.simulated.records import Records
 
 
 @dataclass(frozen=True)
 class Settings:
     """Settings of a measurement.
 
-    :ivar logs: names of the logs, empty for those that the measurement is meant for.
+    :ivar logs: names of the logs, or families of simulated worlds, empty for those that the measurement is meant for.
     :ivar seeds: of the runs, empty for as many as the measurement is meant for.
     :ivar changes: parameters that differ from the file, as ``name=value``.
     :ivar out: folder of the report.
     :ivar write_expected: whether the short form writes what it is to compare with.
     :ivar runner: runs what is asked for, each case once for all measurements.
+    :ivar records: the same for simulated worlds.
+    :ivar training: whether those are the worlds of the training seeds.
     """
 
     logs: tuple[str, ...]
@@ -26,6 +29,8 @@ class Settings:
     out: Path
     write_expected: bool
     runner: Runner
+    records: Records
+    training: bool
 
     def logs_or(self, names: tuple[str, ...]) -> tuple[str, ...]:
         """The logs asked for, or those of the measurement."""

@@ -146,6 +146,12 @@ class Watch:
             self.accepted.append(self._entry(closure, accepted.sequence, probabilities[accepted.hypothesis]))
         self.loops.definite(accepted.sequence, chosen, self._replica.areas[accepted.hypothesis])
 
+    def pending(self) -> list[Entry]:
+        """The closures of the most probable path that are not definite."""
+        best = self._replica.best
+        event, probability = max(self._travelled), self._replica.probabilities[best]
+        return [self._entry(closure, event, probability) for closure in self._paths.paths[best].closures]
+
     def _entry(self, closure: Closure, event: int, probability: float) -> Entry:
         return {
             "event": event,

@@ -41,6 +41,7 @@ def watched(world: World, changes: Sequence[str] = ()) -> dict[str, Any]:
         "rows": watch.rows,
         "events": watch.events,
         "accepted": watch.accepted,
+        "pending": watch.pending(),
         "loops": [_loop(loop) for loop in watch.loops.found],
         "arcs": watch.arcs(),
         "area_poses": watch.area_poses(),

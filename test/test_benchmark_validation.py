@@ -1,0 +1,165 @@
+"""The analyses of simulated runs, on made-up records of which the right figures are known."""
+
+import math
+
+import numpy as np
+import pytest
+
+from benchmark.__main__ import main
+from benchmark.consistency import KINDS, covered, mean_nees
+from benchmark.documents import VALIDATION, marks
+from benchmark.forecasts import (
+    Forecast,
+    forecast,
+    interval,
+    new_rate,
+    of_arcs,
+    of_base_rate,
+    of_each,
+    of_hypotheses,
+    of_top,
+    reliability,
+)
+from benchmark.loops import distances, missed_share
+from benchmark.report import Requirement
+from benchmark.simulated.closures import NEW, NOT_ASKED
+from benchmark.topology import faults
+
+
+def answer(area, probability, right):
+    return {"area": area, "probability": probability, "right": right}
+
+
+def test_true_answers_count_as_one_and_what_is_not_examined_is_false():
+    found = forecast([(3, 0.5, True), (4, 0.2, True), (3, 0.1, False), (5, 0.05, False), (5, 0.05, False)])
+    assert found.right == pytest.approx(0.7)
+    np.testing.assert_allclose(sorted(found.wrong), [0.1, 0.1, 0.1])
+    assert found.brier == pytest.approx(0.3**2 + 3 * 0.1**2)
+    assert found.surprise == pytest.approx(-math.log(0.7))
+    assert found.top == (pytest.approx(0.7), True)
+
+
+def test_a_forecast_without_the_true_answer_is_as_bad_as_can_be_but_finite():
+    found = forecast([(NEW, 1.0, False)])
+    assert found.brier == 2.0
+    assert found.surprise == pytest.approx(-math.log(1e-6))
+    assert found.top == (1.0, False)
+
+
+EVENT = {
+    "answers": [answer(2, 0.9, True), answer(NEW, 0.1, False)],
+    # Two hypotheses of 0.8 and 0.15, of which the first asked about two areas, and one of 0.05 that did not ask.
+    "arcs_alone": [
+        answer(NEW, 0.4, False),
+        answer(2, 0.3, True),
+        answer(3, 0.1, False),
+        answer(NEW, 0.15, False),
+        answer(NOT_ASKED, 0.05, True),
+    ],
+}
+
+
+def test_the_other_forecasters_see_no_scan():
+    assert of_hypotheses(EVENT).right == pytest.approx(0.9)
+    assert of_arcs(EVENT).right == pytest.approx(0.35)
+    base = of_base_rate(EVENT, 0.6)
+    assert base.right == pytest.approx(0.8 * 0.2 + 0.05)
+    assert sum(base.wrong) == pytest.approx(1.0 - base.right)
+    # New ground: 60 % of what asked about areas, and all of what had none to ask about.
+    assert max(base.wrong) == pytest.approx(0.8 * 0.6 + 0.15)
+    assert new_rate([EVENT]) == 0.0
+
+
+def calibrated(count, draw):
+    """Questions of two answers whose probabilities are right."""
+    for p in draw.uniform(0.5, 1.0, count):
+        yield Forecast(p, (1.0 - p,)) if draw.random() < p else Forecast(1.0 - p, (p,))
+
+
+def test_right_probabilities_have_no_calibration_error_and_too_certain_ones_have():
+    draw = np.random.default_rng(2)
+    right = list(calibrated(20_000, draw))
+    assert of_top(right).error < 0.01
+    assert of_each(right).error < 0.01
+    certain = [Forecast(float(each.right > 0.5), (float(each.right <= 0.5),)) for each in right]
+    # Right in three of four cases on average.
+    assert of_top(certain).error == pytest.approx(0.25, abs=0.01)
+    low, high = interval([right[k : k + 20] for k in range(0, 2000, 20)], lambda some: of_top(some).error)
+    assert low < of_top(right[:2000]).error < high
+
+
+def test_a_reliability_diagram_has_every_answer_in_one_bin():
+    found = reliability([(0.0, False), (0.05, False), (0.95, True), (1.0, True), (0.55, False)])
+    assert found.counts.tolist() == [2, 0, 0, 0, 0, 1, 0, 0, 0, 2]
+    assert found.error == pytest.approx((2 * 0.025 + 0.55 + 2 * 0.025) / 5)
+    assert math.isnan(reliability([]).error)
+
+
+def loop(closed_at, *, can_be_closed=True, end=50.0):
+    in_time = closed_at is not None and closed_at <= end + 10.0
+    return {"begin": 40.0, "end": end, "closed_at": closed_at, "can_be_closed": can_be_closed, "in_time": in_time}
+
+
+def record(loops=(), accepted=(), pending=(), arcs=(), poses=()):
+    return {
+        "world": "sim:nested,seed=1000",
+        "loops": list(loops),
+        "accepted": [{"right": right} for right in accepted],
+        "pending": [{"right": right} for right in pending],
+        "arcs": [{"nees": nees, "closure": False} for nees in arcs],
+        "area_poses": [],
+        "poses": [{"map": {"nees": nees}, "local": {"nees": nees}} for nees in poses],
+    }
+
+
+def test_a_loop_that_is_closed_late_or_never_is_missed():
+    records = [record([loop(44.0), loop(None, can_be_closed=False)]), record([loop(70.0), loop(None)])]
+    assert missed_share(records) == pytest.approx(2 / 3)
+    assert distances(records) == [4.0]
+    assert math.isnan(missed_share([record()]))
+
+
+def test_a_topology_is_exact_without_false_closures_and_with_every_loop_closed():
+    assert faults(record([loop(70.0), loop(None, can_be_closed=False)], [True], [True])) == []
+    assert faults(record([loop(None)])) == ["loops not closed: 1"]
+    assert faults(record([], [True, False])) == ["closures accepted falsely: 1"]
+    assert faults(record([], [], [False])) == ["false closures pending: 1"]
+
+
+def test_every_run_counts_the_same_for_the_mean_nees():
+    records = [record(arcs=[2.0, 4.0]), record(arcs=[9.0]), record()]
+    assert mean_nees(records, KINDS["arcs"]) == pytest.approx(6.0)
+    assert covered(records, KINDS["arcs"]) == pytest.approx(2 / 3)
+    assert math.isnan(mean_nees(records, KINDS["arcs that closed a loop"]))
+    assert math.isnan(covered(records, KINDS["poses of areas"]))
+
+
+def test_a_figure_may_be_too_small():
+    assert Requirement("NEES", 3.0, 4.5, least=2.0).row[2:] == ["2 to 4.5", "pass"]
+    assert not Requirement("NEES", 1.9, 4.5, least=2.0).met
+    assert not Requirement("NEES", math.nan, 4.5, least=2.0).met
+    assert Requirement("runs", 8, math.inf, least=300).row[2:] == ["at least 300", "FAIL"]
+    assert Requirement("error", 0.1, 1.0, "m").row[2:] == ["1 m", "pass"]
+
+
+@pytest.mark.parametrize("kind", ["calibration", "loops", "topology", "consistency"])
+def test_the_document_has_a_place_for_every_measurement(kind):
+    text = VALIDATION.read_text()
+    assert all(text.count(mark) == 1 for mark in marks(kind))
+
+
+def test_all_is_measured_on_a_world_of_the_training_seeds(tmp_path, capsys):
+    """Seed 0 of one family: far too few runs for what is asked for, and that is said."""
+    out, runs = tmp_path / "report", tmp_path / "runs"
+    options = ["--logs", "ring", "--seeds", "1", "--training", "--jobs", "1", "--out", str(out), "--runs", str(runs)]
+    assert main(["calibration", "loops", "consistency", *options]) == 1
+    assert [path.name for path in runs.iterdir()] == ["ring-0.json.gz"]
+    text = (out / "calibration.md").read_text()
+    assert "| runs | 1 | at least 300 | FAIL |" in text
+    assert "| ring | 1 |" in text
+    assert (out / "reliability.png").stat().st_size > 10_000
+    assert (out / "nees.png").stat().st_size > 10_000
+    assert "| ring | 1 |" in (out / "loops.md").read_text()
+    assert "NEES of arcs, mean over runs" in (out / "consistency.md").read_text()
+    assert main(["calibration", "--logs", "aces", "--seeds", "1", "--out", str(tmp_path / "other")]) == 2
+    assert "no family 'aces'" in capsys.readouterr().err
