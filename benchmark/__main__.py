@@ -57,7 +57,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _measure(options: argparse.Namespace) -> list[Report]:
     if options.write_docs and (options.set or options.logs or options.training):
-        raise HmtSlamError("--write-docs is for the whole measurement: leave --set, --logs and --training away")
+        raise HmtSlamError("--write-docs is for the whole measurement: leave --set and --logs away, and --training")
     out = _folder(options)
     runner = Runner(out / "runs", options.jobs)
     changes, seeds = tuple(options.set), tuple(range(options.seeds))

@@ -30,7 +30,7 @@ class Settings:
     write_expected: bool
     runner: Runner
     records: Records
-    training: bool
+    training: bool = False
 
     def logs_or(self, names: tuple[str, ...]) -> tuple[str, ...]:
         """The logs asked for, or those of the measurement."""

@@ -6,6 +6,7 @@ from benchmark.choices import AS_CONFIGURED, CHOICES, measure_choices
 from benchmark.logs import opened
 from benchmark.runs import Case, Runner
 from benchmark.settings import Settings
+from benchmark.simulated.records import Records
 from hmt_slam_ros.configuration import Configuration, with_changes
 
 
@@ -20,7 +21,8 @@ def test_every_choice_is_run_on_every_log_and_told(tmp_path, monkeypatch):
     two = {AS_CONFIGURED: (), "no refinement": ("refinement.iterations=0",)}
     monkeypatch.setattr("benchmark.choices.CHOICES", two)
     short = ("robot.duration=8",)
-    settings = Settings(("malaga",), (0,), short, tmp_path, False, Runner(tmp_path / "runs", 1))
+    folder = tmp_path / "runs"
+    settings = Settings(("malaga",), (0,), short, tmp_path, False, Runner(folder, 1), Records(folder, 1))
     report = measure_choices(settings)
     for name in two:
         assert any(line.startswith(f"| {name} | ") for line in report.text.splitlines())
