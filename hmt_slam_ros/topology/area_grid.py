@@ -80,22 +80,20 @@ def build_area_grid(scans: Sequence[Scan], poses: NDArray[np.float64], model: Gr
     :param scans: the keyframes' scans.
     :param poses: shape (len(scans), 3), ``area_T_base``.
     """
-    hits, lasers = _end_points(scans, poses, model.max_range)
-    if not hits:
+    hits, lasers, of = _end_points(scans, poses, model.max_range)
+    if not len(hits):
         return _blank(model.cell)
     reach = 5.0 * model.sigma
-    everything = np.concatenate((*hits, *lasers))
+    everything = np.concatenate((hits, lasers))
     # The corner is a multiple of the cell, so that grids of one area agree on where cells lie.
     origin = np.floor((everything.min(axis=0) - reach) / model.cell) * model.cell
     columns, rows = np.ceil((everything.max(axis=0) + reach - origin) / model.cell).astype(np.int64) + 1
     free = np.zeros((rows, columns), dtype=np.bool_)
-    for origins, points in zip(lasers, hits, strict=True):
-        _mark_free(free, origin, model.cell, origins, points)
+    _mark_free(free, origin, model.cell, lasers, hits)
     distance2 = np.full((2 * rows, 2 * columns), np.inf)
-    surfaces = np.concatenate([_joined(points, 0.5 * model.cell) for points in hits])
-    _lower_distances(distance2, origin, 0.5 * model.cell, surfaces, reach)
+    _lower_distances(distance2, origin, 0.5 * model.cell, _joined(hits, of, 0.5 * model.cell), reach)
     fine = _log_ratio(distance2, free, model.sigma, model.surface_ratio, model.free_ratio)
-    return AreaGrid(origin, model.cell, _halved(fine), fine, free, thinned(np.concatenate(hits), model.spacing))
+    return AreaGrid(origin, model.cell, _halved(fine), fine, free, thinned(hits, model.spacing))
 
 
 def _blank(cell: float) -> AreaGrid:
@@ -105,15 +103,16 @@ def _blank(cell: float) -> AreaGrid:
 
 def _end_points(
     scans: Sequence[Scan], poses: NDArray[np.float64], max_range: float
-) -> tuple[list[Points], list[Points]]:
-    """End points and where the laser was at each of them, of every scan that has any, area frame."""
-    hits, lasers = [], []
-    for scan, pose in zip(scans, poses, strict=True):
-        near = np.hypot(*scan.beams.T) <= max_range
-        if near.any():
-            hits.append(se2.transform(pose, scan.points[near]))
-            lasers.append(se2.transform(pose, scan.origins[near]))
-    return hits, lasers
+) -> tuple[Points, Points, NDArray[np.int64]]:
+    """End points and where the laser was at each of them, area frame, (n, 2), and the scan that each is of, (n,)."""
+    of = np.repeat(np.arange(len(scans)), [len(scan.points) for scan in scans])
+    points, origins = (
+        np.concatenate([np.zeros((0, 2)), *parts])
+        for parts in ([scan.points for scan in scans], [scan.origins for scan in scans])
+    )
+    near = np.hypot(*(points - origins).T) <= max_range
+    of = of[near]
+    return se2.transform(poses[of], points[near]), se2.transform(poses[of], origins[near]), of
 
 
 def thinned(points: Points, spacing: float) -> Points:
@@ -127,15 +126,23 @@ def thinned(points: Points, spacing: float) -> Points:
     return sums / counts[:, None]
 
 
-def _joined(points: Points, step: float) -> Points:
-    """Points of one scan in the order of the beams, with the gaps along surfaces filled."""
-    gaps = np.diff(points, axis=0)
-    lengths = np.hypot(gaps[:, 0], gaps[:, 1])
-    counts = np.where(lengths <= _JOIN, np.ceil(lengths / step), 1.0).astype(np.int64)
-    start = np.repeat(np.arange(counts.size), counts)
-    place = np.arange(start.size) - np.repeat(np.cumsum(counts) - counts, counts)
-    between = points[:-1][start] + gaps[start] * (place / counts[start])[:, None]
-    return np.concatenate((between, points[-1:]))
+@njit(cache=True)
+def _joined(points: Points, of: NDArray[np.int64], step: float) -> Points:
+    """Points in the order of the beams, with the gaps along the surfaces of each scan filled."""
+    counts = np.ones(points.shape[0], np.int64)
+    for k in range(points.shape[0] - 1):
+        length = np.hypot(points[k + 1, 0] - points[k, 0], points[k + 1, 1] - points[k, 1])
+        if of[k] == of[k + 1] and length <= _JOIN:
+            counts[k] = int(np.ceil(length / step))
+    joined = np.empty((counts.sum(), 2))
+    place = 0
+    for k in range(points.shape[0]):
+        for i in range(counts[k]):
+            joined[place] = points[k]
+            if i > 0:
+                joined[place] += (points[k + 1] - points[k]) * (i / counts[k])
+            place += 1
+    return joined
 
 
 @njit(cache=True)
