@@ -182,7 +182,8 @@ def test_a_wall_of_the_candidate_in_the_free_space_of_the_query_speaks_against_i
 
 def test_an_empty_query_says_nothing(known):
     blank = build_area_grid([], np.zeros((0, 3)), MODEL)
-    assert match(blank, known, prior_around(TRUTH, 0.2, 2.0), SETTINGS) == (-math.inf, ())
+    found = match(blank, known, prior_around(TRUTH, 0.2, 2.0), SETTINGS)
+    assert (found.log_evidence, found.modes) == (-math.inf, ())
 
 
 def test_peaks_apart_are_two_clusters_and_ripples_are_one():

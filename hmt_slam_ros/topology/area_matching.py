@@ -7,7 +7,9 @@ Blanco et al. leave it to an expectation over samples of the prior; a lattice do
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -62,16 +64,22 @@ class Mode(NamedTuple):
     log_mass: float
 
 
-class Match(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Match:
     """The fit of a query into a candidate.
 
     :ivar log_evidence: log of the integral of p(x) (p(z | x, candidate) / p(z | unknown))^temper over the gate, nats;
         -inf where nothing in the gate is worth mentioning.
-    :ivar modes: by falling mass.
     """
 
-    log_evidence: float
-    modes: tuple[Mode, ...]
+    log_evidence: float = -math.inf
+    _found: Callable[[], tuple[Mode, ...]] = tuple
+
+    # Some ask for the evidence alone.
+    @cached_property
+    def modes(self) -> tuple[Mode, ...]:
+        """By falling mass."""
+        return self._found()
 
 
 def match(query: AreaGrid, candidate: AreaGrid, prior: PoseGaussian, settings: MatchSettings) -> Match:
@@ -82,7 +90,7 @@ def match(query: AreaGrid, candidate: AreaGrid, prior: PoseGaussian, settings: M
     :param prior: belief over ``candidate_T_query``.
     """
     if not query.points.size or not candidate.points.size:
-        return Match(-math.inf, ())
+        return Match()
     # About the middle of the samples turns and shifts are least correlated, and the lattice of turns coarsest.
     middle = query.points.mean(axis=0)
     to_middle = PoseGaussian(np.array([*middle, 0.0]), np.zeros((3, 3)))
@@ -98,12 +106,15 @@ def match(query: AreaGrid, candidate: AreaGrid, prior: PoseGaussian, settings: M
         settings.margin,
     )  # fmt: skip
     if not cells.score.size:
-        return Match(-math.inf, ())
+        return Match()
     problem = _Problem(surface, centred.points, window, prior, settings)
     masses, poses = area_modes.quadrature(surface, centred.points, window, cells, settings.temper)
-    modes = _modes(problem, cells, masses + log_cell, poses)
-    evidence = float(np.logaddexp.reduce(masses + log_cell))
-    return Match(evidence, tuple(_carried(mode, to_middle) for mode in modes[: settings.max_modes]))
+    masses = masses + log_cell
+
+    def modes() -> tuple[Mode, ...]:
+        return tuple(_carried(mode, to_middle) for mode in _modes(problem, cells, masses, poses)[: settings.max_modes])
+
+    return Match(float(np.logaddexp.reduce(masses)), modes)
 
 
 @dataclass(frozen=True, eq=False)
