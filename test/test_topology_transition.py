@@ -8,7 +8,7 @@ from worlds import box, scan_in
 
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.topology.area_grid import GridModel, build_area_grid
-from hmt_slam_ros.topology.transition import Place, entry_probability, owner_at, transition
+from hmt_slam_ros.topology.transition import Place, entry_bound, entry_probability, owner_at, transition
 
 RADIUS = 2.0
 # Two corridors side by side, a wall between them.
@@ -64,6 +64,15 @@ def test_a_robot_tracked_within_a_place_is_there_for_sure(corridor):
 
 def test_without_overlap_the_probability_is_exactly_zero(corridor):
     assert entry_probability(corridor, belief(0.3), keyframes(14.0), RADIUS) == 0.0
+
+
+@pytest.mark.parametrize("x", [1.0, 4.0, 5.6, 9.0, 14.0, 18.0])
+@pytest.mark.parametrize("sigma", [0.05, 1.0, 4.0])
+def test_the_bound_from_positions_alone_is_a_bound_and_zero_where_nothing_is_near(corridor, x, sigma):
+    own = corridor.positions[corridor.owners == 3]
+    bound = entry_bound(own, belief(sigma), keyframes(x), RADIUS)
+    assert entry_probability(corridor, belief(sigma), keyframes(x), RADIUS) <= bound
+    assert bound == 0.0 or x < 9.0 or sigma > 0.05
 
 
 def test_a_loose_prior_spreads_over_the_place_and_what_lies_around(corridor):

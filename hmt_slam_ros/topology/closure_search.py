@@ -22,7 +22,7 @@ from hmt_slam_ros.topology.chance import Elsewhere, log_chance
 from hmt_slam_ros.topology.hybrid_map import HybridMap
 from hmt_slam_ros.topology.shortest_path import Reached, reached
 from hmt_slam_ros.topology.surroundings import Nearness, Views, gap, may_be_near, positions, stacked
-from hmt_slam_ros.topology.transition import Place, Transition, entry_probability, owner_at, transition
+from hmt_slam_ros.topology.transition import Place, Transition, entry_bound, entry_probability, owner_at, transition
 
 Pose = NDArray[np.float64]
 
@@ -74,11 +74,16 @@ class Comparison(NamedTuple):
 
 
 class _Candidate(NamedTuple):
-    """A known area, the belief over ``candidate_T_reference`` by the arcs, the keyframes not yet compared with it."""
+    """A known area in which the query may lie.
 
-    place: Place
+    :ivar prior: belief over ``candidate_T_reference`` by the arcs.
+    :ivar fresh: {keyframe: ``reference_T_base``} of those not yet compared with it.
+    :ivar most: a bound on the probability that they lie in its place, above 0.
+    """
+
     prior: PoseGaussian
     fresh: Mapping[int, Pose]
+    most: float
 
 
 class ClosureSearch:
@@ -135,22 +140,23 @@ class ClosureSearch:
         :param excluded: areas that are neither candidates nor part of a candidate's map.
         """  # fmt: skip
         within, elsewhere = self._divided(hybrid_map, area, query, excluded)
-        candidates = {c.place.area: c for c in self._candidates(hybrid_map, query, compared, within, excluded)}
-        radius = self._options.place_radius
-        entries = {
-            known: entry_probability(c.place, c.prior, stacked(c.fresh), radius) for known, c in candidates.items()
-        }
+        candidates = self._candidates(hybrid_map, query, compared, within)
+        ranked = sorted(candidates, key=lambda known: (-candidates[known].most, known))
+        looked_at, rest = ranked[: self._options.max_candidates], ranked[self._options.max_candidates :]
+        places = {known: self._views.place(hybrid_map, known, excluded) for known in looked_at}
+        entries = {known: self._entry(place, candidates[known]) for known, place in places.items()}
         shares = {known: share for known, share in entries.items() if share > 0.0}
-        model = transition(shares, self._options.new_probability)
-        ranked = sorted(shares, key=lambda known: (-shares[known], known))
-        examined, rest = ranked[: self._options.max_candidates], ranked[self._options.max_candidates :]
+        model = transition(shares | {known: candidates[known].most for known in rest}, self._options.new_probability)
         fits = [
             Fit(known, mode, math.log(model.known[known] / shares[known]) + look + mode.log_mass)
-            for known in examined
-            for look, mode in self._fits(hybrid_map, candidates[known])
+            for known in sorted(shares, key=lambda known: (-shares[known], known))
+            for look, mode in self._fits(hybrid_map, places[known], candidates[known])
         ]
         relative = self._relative_to_new(hybrid_map, candidates, fits, elsewhere, excluded)
-        return Comparison(model, relative, tuple(examined), sum(model.known[known] for known in rest))
+        return Comparison(model, relative, tuple(shares), sum(model.known[known] for known in rest))
+
+    def _entry(self, place: Place, candidate: _Candidate) -> float:
+        return entry_probability(place, candidate.prior, stacked(candidate.fresh), self._options.place_radius)
 
     def _relative_to_new(
         self, hybrid_map: HybridMap, candidates: Mapping[int, _Candidate], fits: Sequence[Fit],
@@ -197,14 +203,19 @@ class ClosureSearch:
 
     def _candidates(
         self, hybrid_map: HybridMap, query: Query, compared: Mapping[int, Collection[int]],
-        within: Mapping[int, PoseGaussian], excluded: Collection[int],
-    ) -> Iterator[_Candidate]:
+        within: Mapping[int, PoseGaussian],
+    ) -> dict[int, _Candidate]:
         """The known areas within reach with which most of the query was not compared yet."""
+        found = {}
         for known, prior in within.items():
             fresh = {k: pose for k, pose in query.poses.items() if k not in compared.get(known, ())}
             # An area with which most of the keyframes were compared has had its chance.
             if 2 * len(fresh) >= len(query.poses) and self._within_reach(hybrid_map, known, prior, fresh):
-                yield _Candidate(self._views.place(hybrid_map, known, excluded), prior, fresh)
+                at = positions(hybrid_map, known, np.zeros(3))
+                most = entry_bound(at, prior, stacked(fresh), self._options.place_radius)
+                if most > 0.0:
+                    found[known] = _Candidate(prior, fresh, most)
+        return found
 
     def _prior(self, belief: PoseGaussian, query: Query) -> PoseGaussian:
         """``candidate_T_reference`` from ``area_T_candidate`` and ``area_T_reference``, widened."""
@@ -221,14 +232,13 @@ class ClosureSearch:
         known = positions(hybrid_map, area, np.zeros(3))
         return gap(asked, known) <= self._options.place_radius + math.sqrt(self.gate) * spread
 
-    def _fits(self, hybrid_map: HybridMap, candidate: _Candidate) -> Iterator[tuple[float, Mode]]:
+    def _fits(self, hybrid_map: HybridMap, place: Place, candidate: _Candidate) -> Iterator[tuple[float, Mode]]:
         """Appearance ratio and modes of the query in the candidate's place.
 
         The mass of a mode is its part of the integral of p(x) p(z | x) over all poses. Of it counts what lies in the
         candidate's place; so p(x | gamma) is not computed and pi(gamma) cancels.
         """
-        place, fresh = candidate.place, candidate.fresh
-        known = hybrid_map.keyframes(place.area)
+        known, fresh = hybrid_map.keyframes(place.area), candidate.fresh
         look = appearance_log_ratio(self._signature(fresh), self._signature(known), self._options.appearance_weight)
         for mode in match(self._views.grid(fresh), place.grid, candidate.prior, self._settings).modes:
             poses = se2.compose(mode.pose.mean, stacked(fresh))

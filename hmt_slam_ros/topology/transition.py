@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -81,12 +82,45 @@ def entry_probability(place: Place, belief: PoseGaussian, poses: NDArray[np.floa
     :param poses: shape (m, 3), ``reference_T_base`` of the keyframes.
     :param radius: farthest distance to a keyframe of the place, m.
     """
+    return float(np.mean(_owners(place, _drawn_positions(belief, poses), radius) == place.area))
+
+
+def entry_bound(
+    known: NDArray[np.float64], belief: PoseGaussian, poses: NDArray[np.float64], radius: float
+) -> float:
+    """No less than :func:`entry_probability`, whatever is around the area, from its keyframes' positions (k, 2) alone.
+
+    One of the keyframes in question at least has to be near to one of the area's.
+    """
+    return float(np.mean(_any_near(_drawn_positions(belief, poses), known, radius)))
+
+
+def _drawn_positions(belief: PoseGaussian, poses: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Positions of keyframes (m, 3) under draws from the belief over their reference, shape (draws, m, 2)."""
     twists = _normal_points() @ np.linalg.cholesky(belief.covariance).T
     references = se2.compose(belief.mean, se2.exp(twists))
-    positions = se2.compose(references[:, None], poses[None])[..., :2]
-    return float(np.mean(_owners(place, positions, radius) == place.area))
+    return se2.compose(references[:, None], poses[None])[..., :2]
 
 
+@njit(cache=True)
+def _any_near(
+    positions: NDArray[np.float64], known: NDArray[np.float64], radius: float
+) -> NDArray[np.bool_]:
+    """Which of n draws of m positions (n, m, 2) have one within ``radius`` of one of (k, 2), shape (n,)."""
+    near = np.zeros(positions.shape[0], np.bool_)
+    for n in range(positions.shape[0]):
+        for m in range(positions.shape[1]):
+            for k in range(known.shape[0]):
+                dx, dy = positions[n, m, 0] - known[k, 0], positions[n, m, 1] - known[k, 1]
+                if dx * dx + dy * dy <= radius * radius:
+                    near[n] = True
+                    break
+            if near[n]:
+                break
+    return near
+
+
+@cache
 def _normal_points() -> NDArray[np.float64]:
     """Points of a low-discrepancy sequence made normal, shape (draws, 3), the first one 0; the same at every call.
 
