@@ -49,8 +49,8 @@ class Forecast(NamedTuple):
 
     @property
     def each(self) -> list[tuple[float, bool]]:
-        """The same of all answers."""
-        return [(self.right, True), *((p, False) for p in self.wrong)]
+        """The same of all answers, without false ones of which nothing is said."""
+        return [(self.right, True), *((p, False) for p in self.wrong if p >= LEAST)]
 
 
 def forecast(answers: Sequence[tuple[int, float, bool]]) -> Forecast:
