@@ -36,11 +36,12 @@ MEASUREMENTS = {
     "loops": "precision and recall of loop closures, likewise",
     "topology": "whether the world of nested loops ends with the exact topology",
     "consistency": "whether covariances are as large as errors, on simulated worlds",
+    "scale": "time and memory in maps of up to 100,000 areas",
     "short": "for CI, whether accuracy became worse than benchmark/expected.toml beyond noise",
 }
 _GROUPS = {
     "all": ("accuracy", "steps", "robustness", "choices", "speed"),
-    "validation": ("calibration", "loops", "topology", "consistency"),
+    "validation": ("calibration", "loops", "topology", "consistency", "scale"),
 }
 
 

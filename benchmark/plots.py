@@ -129,3 +129,32 @@ def plot_nees(path: Path, samples: Mapping[str, Sequence[float]]) -> None:
     axes.set_ylabel("share of errors below")
     axes.legend(fontsize=7)
     figure.savefig(path, dpi=_DPI)
+
+
+def plot_scale(
+    path: Path, cuts: Mapping[int, Sequence[float]], scans: Mapping[int, Mapping[str, float]],
+    bounds: Mapping[int, float],
+) -> None:  # fmt: skip
+    """Cost against the number of areas.
+
+    :param cuts: {number of areas: ms of each cut}.
+    :param scans: {number of areas: {process: ms a scan}}.
+    :param bounds: {number of areas: ms that a cut may take}.
+    """
+    figure = Figure(figsize=(10.0, 4.0), layout="constrained")
+    left, right = _panels(figure, 2)
+    for areas, own in cuts.items():
+        left.plot([areas] * len(own), own, ".", color="0.6")
+    for share, style in ((50, "o-"), (95, "^--")):
+        left.plot(list(cuts), [np.percentile(own, share) for own in cuts.values()], style, label=f"{share} %")
+    left.plot(list(bounds), list(bounds.values()), "_", color="black", markersize=20.0, label="bound")
+    left.set_ylabel("time of a cut [ms]")
+    for process in scans[min(scans)]:
+        right.plot(list(scans), [own[process] for own in scans.values()], "o-", label=process)
+    right.set_ylabel("time of a scan [ms]")
+    for axes in (left, right):
+        axes.set_xscale("log")
+        axes.set_yscale("log")
+        axes.set_xlabel("areas")
+        axes.legend(fontsize=7)
+    figure.savefig(path, dpi=_DPI)

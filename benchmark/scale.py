@@ -1,0 +1,119 @@
+"""What grows with the number of areas? Cuts, scans and memory in maps of up to a hundred thousand."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from benchmark.lattice import BEAMS, PER_AREA, Lattice
+from benchmark.plots import plot_scale
+from benchmark.report import Report, Requirement, table
+from benchmark.runs import PARAMETERS
+from benchmark.scale_cuts import Cut, measured_cuts
+from benchmark.scale_memory import BEAMS as STORED_BEAMS
+from benchmark.scale_memory import Stored, stored
+from benchmark.scale_scans import cost_of_scans
+from benchmark.settings import Settings
+from hmt_slam_ros.configuration import load_configuration
+
+SMALL = (Lattice(5, 2), Lattice(10, 10), Lattice(50, 20))
+LARGE = (Lattice(100, 100), Lattice(1000, 100))
+
+CUT_BOUNDS = {10_000: 100.0, 100_000: 1000.0}
+"""Largest time of a cut, ms, by the number of areas."""
+
+GROWTH = 0.1
+"""Largest growth of what a scan costs in SLAM and RTL, from the smallest to the largest of the small maps."""
+
+STORED = 20.0
+"""Largest memory of a stored area, kB."""
+
+POLICY = (
+    "Maps are lattices of corridors, all crossings alike, made as data: every crossing is an area of "
+    f"{PER_AREA} keyframes with arcs to the next ones, {BEAMS} beams to a scan. For the cuts a robot leaves the "
+    "lattice, goes along beside it for up to eight crossings with a new area at each, and comes back; its odometry "
+    "errs as its covariance says, and a stand-in for metric SLAM and acceptance hands TSBI its poses. A cut is timed "
+    "from the keyframe to the acceptance, CPU time of one process, under all hypotheses that are alive. For the scans "
+    "all five processes run in a loop through known ground; CPU time a scan, the median of the repetitions. Memory is "
+    "what Python allocates: poses and arcs in each process that keeps the map, and the ranges of its scans, here of "
+    f"{STORED_BEAMS} beams; what can be computed anew from them is told, and does not count."
+)
+
+
+def measure_scale(settings: Settings) -> Report:
+    """Time cuts and scans, weigh a stored area."""
+    configuration = load_configuration(PARAMETERS, list(settings.changes))
+    report = Report("scale", "Cost against the number of areas", seeds=(0,))
+    cuts = {lattice.areas: measured_cuts(lattice, configuration) for lattice in (*SMALL, *LARGE)}
+    report.requirements += [cut_requirement(areas, cuts[areas]) for areas in CUT_BOUNDS]
+    scans = cost_of_scans(SMALL, configuration)
+    report.requirements += [growth_requirement(process, scans) for process in ("slam", "rtl")]
+    area = stored(LARGE[0])
+    report.requirements.append(Requirement("memory of a stored area with its scans", area.whole, STORED, "kB"))
+    report.body += [_cut_table(cuts), _scan_table(scans), _stored_table(area), POLICY]
+    report.data |= {
+        "cuts": {areas: [cut._asdict() for cut in own] for areas, own in cuts.items()},
+        "ms_per_scan": scans,
+        "stored_kB": area._asdict(),
+    }
+    report.pictures["scale.png"] = "Time of a cut, and of a scan in every process, against the number of areas."
+    plot_scale(settings.out / "scale.png", {n: [cut.ms for cut in own] for n, own in cuts.items()}, scans, CUT_BOUNDS)
+    return report
+
+
+def cut_requirement(areas: int, cuts: Sequence[Cut]) -> Requirement:
+    """That no cut takes longer than is asked for."""
+    return Requirement(f"longest cut at {areas} areas", max(cut.ms for cut in cuts), CUT_BOUNDS[areas], "ms")
+
+
+def growth_requirement(process: str, scans: Mapping[int, Mapping[str, float]]) -> Requirement:
+    """That a scan costs the same in the largest map as in the smallest.
+
+    :param scans: {number of areas: {process: ms a scan}}.
+    """
+    least, most = scans[min(scans)][process], scans[max(scans)][process]
+    name = f"{process}: growth of a scan's cost from {min(scans)} to {max(scans)} areas"
+    return Requirement(name, most / least - 1.0, GROWTH)
+
+
+def _cut_table(cuts: Mapping[int, Sequence[Cut]]) -> str:
+    head = ["areas", "cuts", "median [ms]", "95 %", "max", "cuts near known areas", "median [ms]", "95 %", "max"]
+    head += ["areas compared at most", "hypotheses at most", "not examined at most"]
+    return table(head, [_cut_row(areas, own) for areas, own in cuts.items()])
+
+
+def _cut_row(areas: int, cuts: Sequence[Cut]) -> list[str]:
+    near = [cut for cut in cuts if cut.compared]
+    return [
+        str(areas),
+        str(len(cuts)),
+        *_quantiles(cuts),
+        str(len(near)),
+        *_quantiles(near),
+        str(max(cut.compared for cut in cuts)),
+        str(max(cut.hypotheses for cut in cuts)),
+        f"{max(cut.unexamined for cut in cuts):.3f}",
+    ]
+
+
+def _quantiles(cuts: Sequence[Cut]) -> list[str]:
+    if not cuts:
+        return ["-"] * 3
+    return [f"{value:.1f}" for value in np.percentile([cut.ms for cut in cuts], (50, 95, 100))]
+
+
+def _scan_table(scans: Mapping[int, Mapping[str, float]]) -> str:
+    processes = list(scans[min(scans)])
+    rows = [[str(areas), *(f"{own[process]:.3f}" for process in processes)] for areas, own in scans.items()]
+    return table(["areas", *(f"{process} [ms a scan]" for process in processes)], rows)
+
+
+def _stored_table(area: Stored) -> str:
+    rows: list[tuple[str, Any]] = [
+        ("poses of its keyframes and arcs", area.graph),
+        ("scans of its keyframes", area.scans),
+        ("their end points, kept where the area was compared", area.points),
+    ]
+    return table(["of a stored area", "memory [kB]"], [[name, f"{size:.2f}"] for name, size in rows])

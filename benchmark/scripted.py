@@ -1,0 +1,118 @@
+"""A stand-in for metric SLAM, area abstraction and acceptance around a TSBI: dead reckoning, and cuts by a script.
+
+TSBI gets what it would get from them, and nothing else decides on topologies.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from hmt_slam_ros.arrays import Float64
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.processes.messages import (
+    Accepted,
+    AreaEvent,
+    AreaEvents,
+    AreaPose,
+    Hypotheses,
+    Keyframe,
+    Leaf,
+    LeafEstimate,
+    Message,
+)
+from hmt_slam_ros.processes.replica import FIRST_AREA, FIRST_HYPOTHESIS
+from hmt_slam_ros.processes.routing import Process
+from hmt_slam_ros.sensing import Scan
+
+STEP = np.diag([0.02, 0.02, math.radians(0.5)]) ** 2
+"""Covariance of the odometry between two keyframes."""
+
+_START = np.diag([1e-8, 1e-8, 1e-8])
+
+
+@dataclass(frozen=True, eq=False)
+class Robot:
+    """What metric SLAM knows under one hypothesis.
+
+    :ivar area: the robot's.
+    :ivar pose: belief over ``area_T_base``.
+    """
+
+    area: int = FIRST_AREA
+    pose: PoseGaussian = field(default_factory=lambda: PoseGaussian(np.zeros(3), _START))
+
+    def moved(self, step: Float64) -> Robot:
+        """After a motion (3,) by the odometry."""
+        return Robot(self.area, self.pose.compose(PoseGaussian(step, STEP)))
+
+    def entered(self, area: int, rebase: PoseGaussian | None, keyframes: int) -> Robot:
+        """After TSBI's answer.
+
+        :param keyframes: how many came over into the area.
+        """
+        if rebase is None:
+            return self
+        return Robot(area, PoseGaussian(se2.compose(rebase.mean, self.pose.mean), max(1, keyframes) * STEP))
+
+
+class Script:
+    """Drives a TSBI.
+
+    :ivar sequence: number of the last keyframe event.
+    :ivar robots: {hypothesis: what metric SLAM would know}.
+    :ivar hypotheses: the last answer.
+    """
+
+    def __init__(self, tsbi: Process, first_keyframe: int = 0) -> None:
+        """:param first_keyframe: number of the first keyframe event."""
+        self._tsbi = tsbi
+        self.sequence = first_keyframe - 1
+        self.robots = {FIRST_HYPOTHESIS: Robot()}
+        self.hypotheses = Hypotheses(self.sequence, (Leaf(FIRST_HYPOTHESIS, FIRST_HYPOTHESIS, 1.0, FIRST_AREA),))
+
+    def keyframe(self, step: Float64, scan: Scan, cut: int = 0) -> Hypotheses:
+        """One keyframe event.
+
+        :param step: the motion (3,) since the last one as the odometry has it.
+        :param cut: how many of the newest keyframes leave the area, under every hypothesis; 0 for none.
+        """
+        self.robots = {hypothesis: robot.moved(step) for hypothesis, robot in self.robots.items()}
+        newest = tuple(range(self.sequence + 2 - cut, self.sequence + 2))
+        events = [AreaEvent(h, "cut", newest, robot.area, 0.0) for h, robot in sorted(self.robots.items()) if cut]
+        return self._event(scan, events)
+
+    def go_to(self, area: int, scan: Scan) -> None:
+        """Go to the origin of a known area, under the one hypothesis that there is."""
+        (hypothesis,) = self.robots
+        self._event(scan, [AreaEvent(hypothesis, "moved", (), area, 1.0)], stored=False)
+        self.robots = {hypothesis: Robot(area)}
+
+    def accept(self, hypothesis: int, global_poses: tuple[AreaPose, ...] = ()) -> None:
+        """Make a hypothesis definite."""
+        self._tell(Accepted(self.sequence, hypothesis, global_poses=global_poses))
+        self.robots = {hypothesis: self.robots[hypothesis]}
+
+    def _event(self, scan: Scan, events: Sequence[AreaEvent], *, stored: bool = True) -> Hypotheses:
+        self.sequence += 1
+        leaves = tuple(
+            LeafEstimate(hypothesis, robot.area, robot.pose, stored, 0.0, 1.0)
+            for hypothesis, robot in sorted(self.robots.items())
+        )
+        self._tell(Keyframe(self.sequence, scan, 0.0, leaves))
+        (answer,) = self._tell(AreaEvents(self.sequence, tuple(events)))
+        assert isinstance(answer, Hypotheses)
+        before = self.robots
+        self.robots = {
+            leaf.hypothesis: before[leaf.parent].entered(leaf.area, leaf.rebase, len(leaf.relabelled))
+            for leaf in answer.leaves
+        }
+        self.hypotheses = answer
+        return answer
+
+    def _tell(self, message: Message) -> list[Message]:
+        return self._tsbi.handle(message)

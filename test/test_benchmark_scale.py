@@ -1,0 +1,76 @@
+"""The lattices that scale is measured in, the robot that leaves them and comes back, and what is asked for."""
+
+import numpy as np
+import pytest
+
+from benchmark.documents import VALIDATION, marks
+from benchmark.lattice import FIRST_KEYFRAME, PER_AREA, SPACING, Lattice, LatticeScans, scan_at, stops
+from benchmark.scale import cut_requirement, growth_requirement
+from benchmark.scale_cuts import Cut, measured_cuts
+from benchmark.scale_memory import stored
+from benchmark.scale_scans import cost_of_scans
+from hmt_slam_ros.configuration import Configuration
+from hmt_slam_ros.topology.shortest_path import reachable
+
+
+def test_every_crossing_lies_where_the_arcs_place_it():
+    lattice = Lattice(4, 3)
+    hybrid_map = lattice.hybrid_map()
+    found = reachable(hybrid_map, 0)
+    assert sorted(found) == list(range(12))
+    for placed in lattice.poses():
+        assert np.allclose(found[placed.area].mean, placed.pose.mean)
+    assert sorted(hybrid_map.neighbours(5)) == [1, 4, 6, 9]
+    assert all(len(hybrid_map.keyframes(area)) == PER_AREA for area in found)
+
+
+def test_the_shared_scans_are_those_of_the_keyframes_poses():
+    hybrid_map, scans = Lattice(2, 2).hybrid_map(), LatticeScans()
+    for keyframe, pose in hybrid_map.keyframes(3).items():
+        assert keyframe >= FIRST_KEYFRAME
+        elsewhere = scan_at(pose + np.array([5 * SPACING, -2 * SPACING, 0.0]), 0, 7)
+        assert np.allclose(scans[keyframe].ranges, elsewhere.ranges, atol=0.1)
+
+
+def test_a_way_stops_at_even_distances_and_looks_ahead():
+    way = list(stops([(0, 0), (1, 0), (1, -1)]))
+    assert np.allclose(np.diff([stop.pose[0] for stop in way[:5]]), 1.6)
+    assert [stop.last for stop in way] == 2 * [False, False, False, False, True]
+    assert np.allclose(way[5].pose, [SPACING, -SPACING + 3.2, -0.5 * np.pi])
+
+
+def test_cuts_out_of_a_map_and_back_in_are_counted():
+    cuts = measured_cuts(Lattice(6, 2), Configuration(), excursions=1)
+    assert len(cuts) == 10
+    assert all(cut.ms > 0.0 for cut in cuts)
+    assert not any(cut.compared for cut in cuts[:4])
+    assert max(cut.compared for cut in cuts) > 0
+
+
+def test_a_scan_has_a_cost_in_every_process():
+    costs = cost_of_scans([Lattice(4, 2)], Configuration(), repeats=1)
+    assert list(costs) == [8]
+    assert set(costs[8]) == {"slam", "aam", "tsbi", "tlca", "rtl"}
+    assert all(0.0 < cost < 1000.0 for cost in costs[8].values())
+
+
+def test_what_a_stored_area_takes_is_poses_arcs_and_scans():
+    area = stored(Lattice(10, 10))
+    assert 1.0 < area.graph < 8.0
+    assert PER_AREA * 4 * 181 / 1e3 < area.scans < 20.0
+    assert area.whole == area.graph + area.scans
+
+
+def test_the_longest_cut_and_the_growth_of_a_scans_cost_are_judged():
+    cuts = [Cut(30.0, 0, 1, 0.0), Cut(101.0, 3, 2, 0.0)]
+    assert not cut_requirement(10_000, cuts).met
+    assert cut_requirement(100_000, cuts).met
+    scans = {10: {"slam": 1.0, "rtl": 1.0}, 1000: {"slam": 1.09, "rtl": 1.2}}
+    assert growth_requirement("slam", scans).met
+    assert not growth_requirement("rtl", scans).met
+
+
+@pytest.mark.parametrize("kind", ["scale"])
+def test_the_document_has_a_place_for_the_tables(kind):
+    text = VALIDATION.read_text()
+    assert all(text.count(mark) == 1 for mark in marks(kind))
