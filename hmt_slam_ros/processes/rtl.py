@@ -112,8 +112,9 @@ class Rtl:
         """
         if self._newest is None:
             return
-        same = self._estimate is not None and self._estimate.area == self._newest.area
-        pose = self._areas.get(self._newest.area, self._area_pose if same else None)
+        pose: PoseGaussian | None = self._area_pose
+        if self._estimate is None or self._newest.area != self._estimate.area:
+            pose = self._areas.get(self._newest.area)
         if pose is None:
             return
         self._estimate, self._area_pose, self._start = self._newest, pose, None

@@ -132,11 +132,13 @@ class Tlca:
             path = replace(path, parted=self._travelled, held=0)
         dominates = leaf.probability >= self._options.accept_probability
         path = replace(path, held=path.held + 1 if dominates else 0)
-        if not (leaf.arcs or leaf.relabelled or leaf.rebase):
-            return path
-        self._changes += 1
+        if leaf.arcs or leaf.relabelled:
+            self._changes += 1
+            path = replace(path, version=self._changes, definite=False)
+        elif leaf.rebase:
+            path = replace(path, definite=False)
         observations = tuple(self._observed(arc, leaf, sequence) for arc in leaf.arcs)
-        return replace(path, version=self._changes, definite=False, observations=path.observations + observations)
+        return replace(path, observations=path.observations + observations)
 
     def _observed(self, arc: Arc, leaf: Leaf, sequence: int) -> _Observation:
         inwards = arc.target == leaf.area
