@@ -24,7 +24,7 @@ from hmt_slam_ros.sensing.surfels import surfels
 
 CELL, RADIUS = 0.05, 0.5
 MODEL = beam_model(RADIUS, 0.1, 10.0, 0.1)
-ALIGNMENT = Alignment(0.1, 0.15, 30)
+ALIGNMENT = Alignment(0.1, 0.15, 1.0, 30)
 ROOM = np.concatenate((box(-4.02, -3.03, 5.03, 4.01), box(1.01, 1.02, 2.03, 2.52), box(-3.02, 2.03, -2.52, 4.01)))
 CORRIDOR = np.array([[-100.0, -1.22, 100.0, -1.22], [-100.0, 1.22, 100.0, 1.22]])
 

@@ -146,7 +146,11 @@ class Filter:
         20.0, "A keyframe is taken after this angle turned.", unit="deg", low=1.0, high=180.0
     )
     covariance_inflation: float = parameter(
-        4.0, "Factor on the covariance of the match of a keyframe, since its beams are correlated.", low=0.1, high=100.0
+        4.0,
+        "Factor on the covariance of a match, since its beams are correlated: for the arcs, and where the match is "
+        "weighed against the prediction.",
+        low=0.1,
+        high=100.0,
     )
     patience: int = parameter(
         15,

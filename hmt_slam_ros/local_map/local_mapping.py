@@ -29,7 +29,9 @@ class LocalMapping:
         self.model = matching.beam_model(
             local_map.field_radius, match.sigma_hit, match.unknown_range, match.random_returns
         )
-        self.alignment = matching.Alignment(match.sigma_match, match.robust_scale, match.iterations)
+        self.alignment = matching.Alignment(
+            match.sigma_match, match.robust_scale, configuration.filter.covariance_inflation, match.iterations
+        )
         self._inverse_model = InverseModel(
             round(local_map.log_odds_hit * _ODDS_PER_NAT),
             round(-local_map.log_odds_miss * _ODDS_PER_NAT),

@@ -43,11 +43,13 @@ class Alignment(NamedTuple):
 
     :ivar sigma: deviation of an end point from its surface, m.
     :ivar robust: scale of the Cauchy weight, m.
+    :ivar inflation: of how many beams only one tells something of its own; the prior outweighs the others.
     :ivar iterations: steps at most.
     """
 
     sigma: float
     robust: float
+    inflation: float
     iterations: int
 
 
@@ -255,7 +257,7 @@ def align(
 ) -> tuple[Float64, Float64]:
     """Gauss-Newton on the distance field with a Gaussian prior.
 
-    Minimises sum rho(d(T p)^2) / sigma^2 + (T - prior)' information (T - prior), rho being Cauchy's.
+    Minimises sum rho(d(T p)^2) / (inflation sigma^2) + (T - prior)' information (T - prior), rho being Cauchy's.
 
     :param points: surfels (n, 4).
     :param start: (3,) pose to start from.
@@ -265,11 +267,12 @@ def align(
         raise ValueError("points are aligned with their normals: give surfels (n, 4)")
     pose = start.copy()
     hessian = np.zeros((3, 3))
+    held = settings.inflation * prior.information
     for _ in range(settings.iterations):
         hessian, gradient = _linearise(points, pose, view, settings)
         difference = pose - prior.mean
         difference[2] = (difference[2] + np.pi) % (2.0 * np.pi) - np.pi
-        step = np.linalg.solve(hessian + prior.information, gradient + prior.information @ difference)
+        step = np.linalg.solve(hessian + held, gradient + held @ difference)
         pose -= step
         if abs(step[0]) + abs(step[1]) < 1e-4 and abs(step[2]) < 1e-4:
             break
