@@ -132,7 +132,7 @@ def _take(live: LiveHypothesis, motion: MotionModel, number: int, scan: Scan, po
     prediction = motion.predict(scan.stamp)
     if number:
         tracked = live.filter.track(points, prediction)
-        motion.observe(tracked.moved, tracked.information)
+        motion.observe(tracked.moved, tracked.information, tracked.contradicted)
     if not number or live.event_due():
         live.event(number, scan, points)
         motion.keyframe(live.moved, live.information)

@@ -21,7 +21,8 @@ INERTIA = Step(STEP, np.diag([0.03, 0.03, 0.04]) ** 2)
 
 
 def predicted(increment, covariance=COVARIANCE, inertia=INERTIA):
-    return Prediction(Step(np.asarray(increment), covariance), inertia)
+    odometry = Step(np.asarray(increment), covariance)
+    return Prediction(odometry, inertia, together=odometry)
 
 
 def driven(mapping, odometry_error=(0.0, 0.0, 0.0), steps=60, hypothesis=0):

@@ -34,9 +34,14 @@ def mapped(mapping, walls, poses, beams=361):
     return area_filter
 
 
+def predicted(odometry, inertia=STILL):
+    """A prediction where odometry is as good as its model."""
+    return Prediction(odometry, inertia, together=inertia if odometry is None else odometry)
+
+
 def track(area_filter, walls, truth, odometry, inertia=STILL):
     points = area_filter.mapping.matching_points(scan_in(walls, truth, noise=0.01))
-    return area_filter.track(points, Prediction(odometry, inertia))
+    return area_filter.track(points, predicted(odometry, inertia))
 
 
 def error_of(pose, truth):
@@ -82,7 +87,7 @@ def test_in_a_corridor_that_looks_the_same_all_along_odometry_tells_how_far(mapp
         scan = scan_in(CORRIDOR, truth, noise=0.01, seed=k)
         scan.ranges[60:120] = 0.9
         points = mapping.matching_points(scan)
-        tracked = area_filter.track(points, Prediction(Step(np.array([0.3, 0.0, 0.0]), SURE), STILL))
+        tracked = area_filter.track(points, predicted(Step(np.array([0.3, 0.0, 0.0]), SURE)))
         assert not tracked.contradicted
     assert area_filter.pose[0] == pytest.approx(3.0, abs=0.1)
 
@@ -92,7 +97,7 @@ def test_a_scan_that_shows_nothing_of_the_map_is_placed_by_odometry(mapping):
     elsewhere = box(-1.0, -0.6, 14.0, 0.9)
     area_filter.poses[:] = area_filter._priors[:] = (40.0, 0.0, 0.0)
     points = mapping.matching_points(scan_in(elsewhere, np.zeros(3)))
-    tracked = area_filter.track(points, Prediction(Step(np.array([0.3, 0.0, 0.1]), SURE), STILL))
+    tracked = area_filter.track(points, predicted(Step(np.array([0.3, 0.0, 0.1]), SURE)))
     np.testing.assert_allclose(area_filter.pose, [40.3, 0.0, 0.1], atol=1e-6)
     np.testing.assert_allclose(tracked.information, 0.0, atol=1e-9)
     assert not tracked.contradicted
@@ -113,5 +118,5 @@ def test_without_odometry_the_scan_is_searched_for_around_what_the_velocity_pred
 
 def test_a_certain_prediction_stands_where_there_is_nothing_to_match(mapping):
     area_filter = AreaFilter(mapping, 0, 0)
-    area_filter.track(np.empty((0, 4)), Prediction(Step(np.array([0.1, 0.0, 0.0]), SURE), STILL))
+    area_filter.track(np.empty((0, 4)), predicted(Step(np.array([0.1, 0.0, 0.0]), SURE)))
     np.testing.assert_allclose(area_filter.pose, [0.1, 0.0, 0.0], atol=1e-12)

@@ -129,8 +129,17 @@ def test_the_noise_of_odometry_is_learnt(factor):
 
 def test_odometry_better_than_its_model_is_taken_as_the_model_says():
     np.testing.assert_array_equal(learnt(0.3).factors, 1.0)
-    covariance = np.diag([1.0, 2.0, 3.0])
-    np.testing.assert_array_equal(learnt(0.3).scaled(covariance), covariance)
+    step, inertia = Step(TURNING, np.diag([1.0, 2.0, 3.0])), Step(np.zeros(3), 1e-6 * np.eye(3))
+    for said in (learnt(0.3).scaled(step), learnt(0.3).together(step, inertia)):
+        np.testing.assert_array_equal(said.increment, step.increment)
+        np.testing.assert_array_equal(said.covariance, step.covariance)
+
+
+def test_inertia_reduces_noise_beyond_twice_the_models_and_no_more():
+    step, inertia = Step(np.array([0.1, 0.0, 0.0]), 1e-4 * np.eye(3)), Step(np.zeros(3), 1e-12 * np.eye(3))
+    both = learnt(4.0).together(step, inertia)
+    np.testing.assert_allclose(both.increment, 0.0, atol=1e-3)
+    np.testing.assert_allclose(both.covariance, 4.0 * step.covariance, rtol=1e-3, atol=1e-9)
 
 
 def test_a_slip_is_not_taken_for_noise():
@@ -168,3 +177,40 @@ def test_where_odometry_is_silent_its_pose_is_carried_on_by_the_match():
         model.predict(k * SECOND // 10)
         model.observe(np.zeros(3) if k == 0 else np.array([0.1, 0.0, 0.0]), SHARP)
     np.testing.assert_allclose(model.odometry_pose, [3.3, 0.0, 0.0], atol=1e-9)
+
+
+def test_noisy_odometry_and_inertia_together_tell_the_motion_better_where_no_scan_does():
+    random = np.random.default_rng(0)
+    model, truth, noise = MotionModel(Motion()), se2.exp(0.1 * TURNING), np.array([0.06, 0.06, 0.06])
+    readings = [np.zeros(3)]
+    for _ in range(400):
+        readings.append(se2.compose(readings[-1], se2.compose(truth, se2.exp(noise * random.standard_normal(3)))))
+    off = []
+    for k, reading in enumerate(readings):
+        model.odometry.add(Odometry(k * SECOND // 10, reading))
+        step = model.predict(k * SECOND // 10).together
+        model.observe(step.increment, np.zeros((3, 3)))
+        # Scans show as much at keyframes, so that the noise is known.
+        model.keyframe(truth, SHARP)
+        off.append(se2.log(se2.between(truth, step.increment)))
+    late = np.array(off[200:])
+    assert (np.sqrt((late**2).mean(axis=0)) < 0.6 * noise).all()
+
+
+def test_odometry_that_the_scans_contradict_says_nothing_of_the_velocity():
+    models = [MotionModel(Motion()), MotionModel(Motion())]
+    for k in range(20):
+        for model in models:
+            model.odometry.add(Odometry(k * SECOND // 10, np.array([0.1 * k, 0.0, 0.0])))
+            model.predict(k * SECOND // 10)
+            model.observe(np.zeros(3), np.zeros((3, 3)), contradicted=model is models[0])
+    contradicted, believed = (model.predict(2 * SECOND).inertia.increment[0] for model in models)
+    assert contradicted == pytest.approx(0.0, abs=1e-9)
+    assert believed > 0.05
+
+
+def test_two_sources_tell_of_one_motion():
+    narrow, wide = Step(np.array([0.1, 0.0, 0.1]), 1e-4 * np.eye(3)), Step(np.zeros(3), 3e-4 * np.eye(3))
+    for both in (narrow.and_also(wide), wide.and_also(narrow)):
+        np.testing.assert_allclose(both.increment, [0.075, 0.0, 0.075], atol=2e-3)
+        np.testing.assert_allclose(both.covariance, 0.75e-4 * np.eye(3), atol=1e-12)

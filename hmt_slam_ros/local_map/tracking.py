@@ -86,23 +86,29 @@ class ScanMatcher:
         """
         if prediction.odometry is None:
             return self._match(points, before, prediction.inertia, view)
-        by_odometry = self._match(points, before, prediction.odometry, view)
+        by_odometry = self._match(points, before, prediction.together, view)
         if self._agrees(points, by_odometry, view):
             return by_odometry
         by_inertia = self._match(points, before, prediction.inertia, view)
         # Unknown space has evidence 0: what was found has to be part of the map as well.
         right = max(0.0, by_odometry.log_evidence + self._log_right)
         if by_inertia.log_evidence + self._log_fault > right:
-            return self._reconciled(points, before, prediction.odometry, by_inertia, view)
+            return self._reconciled(points, before, prediction, by_inertia, view)
         return by_odometry if by_odometry.hessian.any() else self._unproven(by_odometry, prediction.inertia)
 
-    def _reconciled(self, points: Float64, before: Float64, odometry: Step, found: Match, view: MapView) -> Match:
+    def _reconciled(
+        self, points: Float64, before: Float64, prediction: Prediction, found: Match, view: MapView
+    ) -> Match:
         """The match with odometry widened along what the scan contradicts; along a corridor it still tells how far."""
+        odometry = prediction.odometry
+        assert odometry is not None
         predicted = se2.compose(before, odometry.increment)
-        information = turned(self._settings.temper * found.hessian, -predicted[2])
+        information = turned(found.hessian, -predicted[2])
         shown = np.linalg.solve(information + inverse(odometry.covariance), information)
         difference = shown @ se2.log(se2.between(predicted, found.pose))
-        step = Step(odometry.increment, odometry.covariance + np.outer(difference, difference))
+        widened = Step(odometry.increment, odometry.covariance + np.outer(difference, difference))
+        step = widened.and_also(prediction.inertia)
+        predicted = se2.compose(before, step.increment)
         prior = matching.Prior(predicted, map_information(step.covariance, predicted[2]))
         return self._refined(points, found.pose, prior, step, view)._replace(contradicted=True)
 

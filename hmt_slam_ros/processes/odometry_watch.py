@@ -7,7 +7,7 @@ import math
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.local_map.tracking import Tracked
-from hmt_slam_ros.sensing.motion import NO_STEP, OdometryNoise, Step
+from hmt_slam_ros.sensing.motion import NO_STEP, NOISY, OdometryNoise, Step
 
 # An episode ends when for so long the scans contradicted no more, s.
 _QUIET = 1.0
@@ -17,8 +17,6 @@ _PAUSE = 60.0
 _DISTANCE, _ANGLE = 0.2, math.radians(10.0)
 # An episode goes on while the headings part by more than this from scan to scan.
 _GROWTH = math.radians(1.0)
-# Noise beyond this many times the model's is said.
-_NOISY = 2.0
 _SECOND = 1e-9
 
 
@@ -97,7 +95,7 @@ class OdometryWatch:
     def judge(self, noise: OdometryNoise) -> str | None:
         """The sentence about odometry that is much noisier than its model, once."""
         translation, rotation = noise.factors
-        if self._noise_told or max(translation, rotation) < _NOISY:
+        if self._noise_told or max(translation, rotation) < NOISY:
             return None
         self._noise_told = True
         return (

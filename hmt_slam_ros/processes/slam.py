@@ -170,7 +170,7 @@ class MetricSlam:
         """Move every hypothesis on to the scan, and learn from what the best one found."""
         tracked = {hypothesis: live.filter.track(points, prediction) for hypothesis, live in self._live.items()}
         best = tracked[self._replica.best]
-        self._motion.observe(best.moved, best.information)
+        self._motion.observe(best.moved, best.information, best.contradicted)
         self._travelled += math.hypot(best.moved[0], best.moved[1])
         return self._tell(self._watch.hear(stamp, prediction.odometry, best))
 

@@ -14,12 +14,14 @@ from hmt_slam_ros.geometry.covariance import carried, inverse
 from hmt_slam_ros.sensing.odometry import OdometryBuffer
 
 # Weight of the newest scan in the mean time between scans, and of the past when odometry is judged once more.
-_NEWEST = 0.1
+_NEWEST = 0.02
 _PAST = 0.95
 # For about this time, in s, a robot goes on as it went, forward and aside, and turning.
 _MEMORY = np.array([2.0, 2.0, 1.0])
 # A step beyond this many deviations says that something slipped, not how noisy the odometry is.
 _OUTLIER = 3.0
+# Odometry with more than this many times the noise of its model is called noisy.
+NOISY = 2.0
 _DEGREES, _RADIANS = 180.0 / math.pi, math.pi / 180.0
 
 Length = TypeVar("Length", float, NDArray[np.float64])
@@ -41,6 +43,14 @@ class Step(NamedTuple):
         return Step(se2.compose(self.increment, other.increment), before + other.covariance)
 
 
+    def and_also(self, other: Step) -> Step:
+        """The same motion, of which two sources tell independently: the product of both Gaussians."""
+        gain = self.covariance @ inverse(self.covariance + other.covariance)
+        difference = se2.log(se2.between(self.increment, other.increment))
+        increment = se2.compose(self.increment, se2.exp(gain @ difference))
+        return Step(increment, self.covariance - gain @ self.covariance)
+
+
 NO_STEP = Step(np.zeros(3), np.zeros((3, 3)))
 """The robot stood still, for certain."""
 
@@ -50,10 +60,12 @@ class Prediction(NamedTuple):
 
     :ivar odometry: what odometry says, None where it says nothing.
     :ivar inertia: what the velocity says.
+    :ivar together: what odometry says, and inertia as far as that is noisier than its model.
     """
 
     odometry: Step | None
     inertia: Step
+    together: Step
 
 
 class Inertia:
@@ -83,23 +95,31 @@ class Inertia:
         # However long it takes, the velocity stays within the usual.
         self._certainty = inverse(changed) + self._usual
         self._covariance = inverse(self._certainty)
-        lasting = -_MEMORY * np.expm1(-self._seconds / _MEMORY)
+        lasting = _MEMORY * np.tanh(self._seconds / _MEMORY)
         spread = self._covariance * self._seconds**2 + np.outer(self._doubt, self._doubt) + self._floor
         return Step(se2.exp(self._velocity * lasting), spread)
 
-    def observe(self, increment: NDArray[np.float64], information: NDArray[np.float64]) -> None:
+    def observe(
+        self, increment: NDArray[np.float64], information: NDArray[np.float64], odometry: Step | None = None
+    ) -> None:
         """Learn from the motion that was predicted last.
 
         :param increment: ``start_T_end`` (3,) as matched.
         :param information: of the match (3, 3), in the frame of its end; 0 along directions that scans do not show.
+        :param odometry: what odometry says of it.
         """
         if self._seconds <= 0.0:
             return
+        mean = se2.log(increment)
+        if odometry is not None:
+            matched, told = information, inverse(odometry.covariance)
+            information = matched + told
+            mean = inverse(information) @ (matched @ mean + told @ se2.log(odometry.increment))
         doubted = information @ self._doubt
         certain = information - np.outer(doubted, doubted) / (1.0 + self._doubt @ doubted)
         measured = certain * self._seconds**2
         self._covariance = inverse(self._certainty + measured)
-        residual = se2.log(increment) / self._seconds - self._velocity
+        residual = mean / self._seconds - self._velocity
         self._velocity = self._velocity + self._covariance @ (measured @ residual)
 
 
@@ -120,9 +140,23 @@ class OdometryNoise:
         """On the deviation of translation and of rotation, shape (2,)."""
         return np.sqrt(np.maximum(1.0, self._ratios / self._weights))
 
-    def scaled(self, covariance: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The model's covariance (3, 3) as it turned out to be."""
-        return covariance * self._scales
+    def scaled(self, odometry: Step) -> Step:
+        """A step with the model's covariance, with that which it turned out to have."""
+        return odometry._replace(covariance=odometry.covariance * self._scales)
+
+    def together(self, odometry: Step, inertia: Step) -> Step:
+        """The step as inertia and odometry tell it together.
+
+        Up to twice the noise of the model, errors are also due to what lasts, such as floors and wrong radii; what is
+        beyond is taken to be independent from step to step, and is what inertia reduces.
+
+        :param odometry: with the model's covariance.
+        """
+        usual = np.minimum(self.factors, NOISY)[[0, 0, 1]]
+        lasting = odometry.covariance * np.outer(usual, usual)
+        beyond = odometry._replace(covariance=odometry.covariance * self._scales - lasting)
+        both = beyond.and_also(inertia)
+        return both._replace(covariance=both.covariance + lasting)
 
     def learn(self, odometry: Step, matched: NDArray[np.float64], information: NDArray[np.float64]) -> None:
         """Compare a step by odometry, with the model's covariance P, with the matched one.
@@ -164,20 +198,21 @@ class MotionModel:
         self._stamp: int | None = None
         self._gap: float | None = None
         self._leg: Step | None = None
+        self._step: Step | None = None
 
     def predict(self, stamp: int) -> Prediction:
         """The motion from the last scan to the one at ``stamp``, ns; at the first scan, which sets the start, none."""
         step = self._by_odometry(stamp)
         if self._stamp is None:
             self._stamp = stamp
-            return Prediction(None, NO_STEP)
+            return Prediction(None, NO_STEP, NO_STEP)
         seconds = max(0.0, 1e-9 * (stamp - self._stamp))
         self._stamp = stamp
         if self._leg is not None:
             self._leg = None if step is None else self._leg.then(step)
-        if step is not None:
-            step = Step(step.increment, self.noise.scaled(step.covariance))
-        return Prediction(step, self._inertia.predict(seconds))
+        inertia = self._inertia.predict(seconds)
+        self._step = None if step is None else self.noise.scaled(step)
+        return Prediction(self._step, inertia, inertia if step is None else self.noise.together(step, inertia))
 
     def _by_odometry(self, stamp: int) -> Step | None:
         """What odometry says of the motion from the last scan, None where it is unknown at either end."""
@@ -192,13 +227,16 @@ class MotionModel:
         covariance = increment_covariance(increment, self._motion)
         return Step(increment, covariance + (gap**2 + self._gap**2) * self._bounds)
 
-    def observe(self, increment: NDArray[np.float64], information: NDArray[np.float64]) -> None:
+    def observe(
+        self, increment: NDArray[np.float64], information: NDArray[np.float64], contradicted: bool = False
+    ) -> None:
         """Learn the velocity from the motion that was predicted last.
 
         :param increment: ``start_T_end`` (3,) as matched.
         :param information: of the match (3, 3), in the frame of its end; 0 along directions that scans do not show.
+        :param contradicted: whether the scan contradicts odometry.
         """
-        self._inertia.observe(increment, information)
+        self._inertia.observe(increment, information, None if contradicted else self._step)
         if self._gap is None:
             self.odometry_pose = se2.compose(self.odometry_pose, increment)
 
