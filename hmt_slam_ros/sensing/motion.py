@@ -13,8 +13,11 @@ from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.covariance import carried, inverse
 from hmt_slam_ros.sensing.odometry import OdometryBuffer
 
-# Weight of the newest scan in the mean time between scans, and of the past when odometry is judged once more.
-_NEWEST = 0.02
+# Weight of the newest scan in the mean time between scans, of late and over a while that outlasts a burst.
+_NEWEST, _NEW = 0.1, 0.02
+# A time between two scans beyond this factor on the usual is one of stamps of arrival.
+_IRREGULAR = 3.0
+# Weight of the past when odometry is judged once more.
 _PAST = 0.95
 # For about this time, in s, a robot goes on as it went, forward and aside, and turning.
 _MEMORY = np.array([2.0, 2.0, 1.0])
@@ -82,13 +85,13 @@ class Inertia:
         self._covariance = self._acceleration * _MEMORY**2
         self._usual = np.linalg.inv(self._covariance)
         self._certainty = self._usual
-        self._period: float | None = None
+        self._usually = self._period = 0.0
         self._seconds = 0.0
         self._doubt = np.zeros(3)
 
     def predict(self, seconds: float) -> Step:
         """The motion of the next ``seconds`` since the last scan."""
-        self._period = seconds if self._period is None else self._period + _NEWEST * (seconds - self._period)
+        self._count(seconds)
         self._seconds = 0.5 * (seconds + self._period)
         self._doubt = 0.5 * (seconds - self._period) * self._velocity
         changed = self._covariance + self._acceleration * self._seconds**2
@@ -98,6 +101,13 @@ class Inertia:
         lasting = _MEMORY * np.tanh(self._seconds / _MEMORY)
         spread = self._covariance * self._seconds**2 + np.outer(self._doubt, self._doubt) + self._floor
         return Step(se2.exp(self._velocity * lasting), spread)
+
+    def _count(self, seconds: float) -> None:
+        """Take the time since the last scan into the means; the first one makes them."""
+        self._usually = self._usually + _NEW * (seconds - self._usually) if self._usually else seconds
+        regular = self._usually < _IRREGULAR * seconds < _IRREGULAR**2 * self._usually
+        newest = seconds if regular else self._usually
+        self._period = self._period + _NEWEST * (newest - self._period) if self._period else newest
 
     def observe(
         self, increment: NDArray[np.float64], information: NDArray[np.float64], odometry: Step | None = None
