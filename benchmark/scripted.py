@@ -46,18 +46,20 @@ class Robot:
     area: int = FIRST_AREA
     pose: PoseGaussian = field(default_factory=lambda: PoseGaussian(np.zeros(3), _START))
 
-    def moved(self, step: Float64) -> Robot:
-        """After a motion (3,) by the odometry."""
-        return Robot(self.area, self.pose.compose(PoseGaussian(step, STEP)))
+    def moved(self, step: Float64, noise: float) -> Robot:
+        """After a motion (3,) by the odometry, of which the deviations are those of ``STEP`` times ``noise``."""
+        return Robot(self.area, self.pose.compose(PoseGaussian(step, noise**2 * STEP)))
 
-    def entered(self, area: int, rebase: PoseGaussian | None, keyframes: int) -> Robot:
+    def entered(self, area: int, rebase: PoseGaussian | None, keyframes: int, noise: float) -> Robot:
         """After TSBI's answer.
 
         :param keyframes: how many came over into the area.
+        :param noise: as for :meth:`moved`.
         """
         if rebase is None:
             return self
-        return Robot(area, PoseGaussian(se2.compose(rebase.mean, self.pose.mean), max(1, keyframes) * STEP))
+        drift = max(1, keyframes) * noise**2 * STEP
+        return Robot(area, PoseGaussian(se2.compose(rebase.mean, self.pose.mean), drift))
 
 
 class Script:
@@ -68,10 +70,11 @@ class Script:
     :ivar hypotheses: the last answer.
     """
 
-    def __init__(self, tsbi: Process, first_keyframe: int = 0) -> None:
-        """:param first_keyframe: number of the first keyframe event."""
+    def __init__(self, tsbi: Process, noise: float = 1.0) -> None:
+        """:param noise: factor on the deviations of the odometry."""
         self._tsbi = tsbi
-        self.sequence = first_keyframe - 1
+        self._noise = noise
+        self.sequence = -1
         self.robots = {FIRST_HYPOTHESIS: Robot()}
         self.hypotheses = Hypotheses(self.sequence, (Leaf(FIRST_HYPOTHESIS, FIRST_HYPOTHESIS, 1.0, FIRST_AREA),))
 
@@ -81,7 +84,7 @@ class Script:
         :param step: the motion (3,) since the last one as the odometry has it.
         :param cut: how many of the newest keyframes leave the area, under every hypothesis; 0 for none.
         """
-        self.robots = {hypothesis: robot.moved(step) for hypothesis, robot in self.robots.items()}
+        self.robots = {hypothesis: robot.moved(step, self._noise) for hypothesis, robot in self.robots.items()}
         newest = tuple(range(self.sequence + 2 - cut, self.sequence + 2))
         events = [AreaEvent(h, "cut", newest, robot.area, 0.0) for h, robot in sorted(self.robots.items()) if cut]
         return self._event(scan, events)
@@ -108,7 +111,7 @@ class Script:
         assert isinstance(answer, Hypotheses)
         before = self.robots
         self.robots = {
-            leaf.hypothesis: before[leaf.parent].entered(leaf.area, leaf.rebase, len(leaf.relabelled))
+            leaf.hypothesis: before[leaf.parent].entered(leaf.area, leaf.rebase, len(leaf.relabelled), self._noise)
             for leaf in answer.leaves
         }
         self.hypotheses = answer

@@ -125,3 +125,20 @@ def test_a_keyframe_speaks_for_or_against_an_area_once():
     stay = replace(parent, notes=parent.notes.checked([0], newest))
     branches = branching.cut(stay, newest[1:])
     assert [child.area for child in branches.children] == [parent.area + 1]
+
+
+def test_further_ways_to_fit_into_an_area_count_as_not_examined():
+    pillars = [box(x, 3.0, x + 0.3, 3.4) for x in np.arange(-39.0, 45.0, 1.2)]
+    hall = np.concatenate((box(-80.0, 1.2, 80.0, 3.4), *pillars))
+    weights, skipped = {}, {}
+    for most in (1, 6):
+        settings = Configuration()
+        settings = replace(settings, tsbi=replace(settings.tsbi, max_modes=most, temper=0.03))
+        parent, branching, newest = rooms_apart((hall, hall), ((0.3, 0.1),), 0.8, settings)
+        branches = branching.cut(parent, newest[1:])
+        weights[most] = [math.exp(child.log_weight) for child in branches.children if child.area == 0]
+        skipped[most] = math.exp(branches.log_skipped)
+    assert (len(weights[1]), len(weights[6])) == (1, 5)
+    assert weights[1][0] == max(weights[6])
+    assert 0.0 < skipped[1] <= sum(weights[6]) - max(weights[6]) + 1e-9
+    assert skipped[6] == 0.0

@@ -107,10 +107,10 @@ class _WatchedSearch(ClosureSearch):
 
     def compare(
         self, hybrid_map: HybridMap, area: int, query: Query, compared: Mapping[int, Collection[int]],
-        excluded: Collection[int],
+        excluded: Collection[int], most: int,
     ) -> Comparison:  # fmt: skip
         """As always."""
-        found = super().compare(hybrid_map, area, query, compared, excluded)
+        found = super().compare(hybrid_map, area, query, compared, excluded, most)
         self._last = query, compared, frozenset(excluded), found
         return found
 

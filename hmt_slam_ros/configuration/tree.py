@@ -197,6 +197,10 @@ class TopologicalInference:
         1e-6, "Hypotheses below this probability are dropped at once.", low=0.0, high=0.1
     )
     max_candidates: int = parameter(16, "Known areas that a hypothesis is compared with at a cut.", low=1, high=1000)
+    max_comparisons: int = parameter(
+        64, "Comparisons with known areas at a cut, shared among hypotheses by probability; each has four at least.",
+        low=1, high=100000,
+    )
     max_modes: int = parameter(3, "Ways to fit one known area that become hypotheses of their own.", low=1, high=100)
     gate_probability: float = parameter(
         0.999,

@@ -36,7 +36,7 @@ class Replica:
         """Store a keyframe in the maps of the hypotheses that want it."""
         for leaf in keyframe.leaves:
             if leaf.hypothesis in self.maps:
-                self._change(self.maps[leaf.hypothesis], leaf.revised, ())
+                self.change(self.maps[leaf.hypothesis], leaf.revised, ())
             if leaf.stored and leaf.hypothesis in self.maps:
                 self.maps[leaf.hypothesis].place(keyframe.sequence, leaf.area, leaf.pose.mean)
                 self.scans[keyframe.sequence] = keyframe.scan
@@ -50,7 +50,7 @@ class Replica:
     def _child(self, leaf: Leaf) -> HybridMap:
         parent = self.maps[leaf.parent]
         child = parent if leaf.hypothesis == leaf.parent else parent.branch()
-        self._change(child, leaf.relabelled, leaf.arcs)
+        self.change(child, leaf.relabelled, leaf.arcs)
         return child
 
     def accept(self, accepted: Accepted) -> None:
@@ -58,14 +58,15 @@ class Replica:
         if accepted.hypothesis is None:
             return
         chosen = self.maps[accepted.hypothesis]
-        self._change(chosen, accepted.relabelled, accepted.arcs)
+        self.change(chosen, accepted.relabelled, accepted.arcs)
         chosen.absorb()
         self.maps = {accepted.hypothesis: chosen}
         self.probabilities = {accepted.hypothesis: 1.0}
         self.areas = {accepted.hypothesis: self.areas[accepted.hypothesis]}
 
     @staticmethod
-    def _change(hybrid_map: HybridMap, relabelled: tuple[Relabelled, ...], arcs: tuple[Arc, ...]) -> None:
+    def change(hybrid_map: HybridMap, relabelled: tuple[Relabelled, ...], arcs: tuple[Arc, ...]) -> None:
+        """Move keyframes and set arcs, as a message says."""
         for r in relabelled:
             if r.source != r.area:
                 hybrid_map.remove(r.keyframe, r.source)

@@ -100,9 +100,10 @@ class Tsbi:
     def _branch(self, hypothesis: int, event: AreaEvent | None, scan: Scan) -> Branches:
         """The continuations of one hypothesis, each with its weight."""
         estimate = self._estimates[hypothesis]
-        log_weight = math.log(max(self._replica.probabilities[hypothesis], 1e-300)) + estimate.log_evidence
+        probability = self._replica.probabilities[hypothesis]
+        log_weight = math.log(max(probability, 1e-300)) + estimate.log_evidence
         area, hybrid_map = self._replica.areas[hypothesis], self._replica.maps[hypothesis]
-        parent = Parent(hypothesis, area, hybrid_map, self._notes[hypothesis], log_weight)
+        parent = Parent(hypothesis, area, hybrid_map, self._notes[hypothesis], log_weight, probability)
         if event is not None and event.kind == "cut":
             return self._branching.cut(parent, event.keyframes)
         if event is not None:

@@ -8,7 +8,7 @@ candidates' grids, and no keyframe is compared with an area twice.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -21,12 +21,14 @@ from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.processes.messages import Arc, Relabelled
 from hmt_slam_ros.processes.replica import FIRST_AREA, Replica
 from hmt_slam_ros.sensing import Scan
-from hmt_slam_ros.topology.closure_search import ClosureSearch, Fit, Query
+from hmt_slam_ros.topology.closure_search import ClosureSearch, Comparison, Fit, Query
 from hmt_slam_ros.topology.hybrid_map import HybridMap
 from hmt_slam_ros.topology.hypothesis_tree import LeafNotes, relative_covariance
 from hmt_slam_ros.topology.shortest_path import reachable
 from hmt_slam_ros.topology.surroundings import gap, positions
 
+# Known areas that every hypothesis may examine, however improbable it is.
+_FEWEST = 4
 # Factor on the covariance of an arc along other arcs, where no match confirms it: it adds next to nothing to those.
 _UNCONFIRMED = 100.0
 
@@ -36,6 +38,7 @@ class Parent:
     """A hypothesis before the event.
 
     :ivar log_weight: log of its probability, the newest scan's evidence included.
+    :ivar share: its probability before, by which hypotheses share the areas that are examined at an event.
     """
 
     hypothesis: int
@@ -43,6 +46,7 @@ class Parent:
     hybrid_map: HybridMap
     notes: LeafNotes
     log_weight: float
+    share: float = 1.0
 
     def around(self) -> dict[int, NDArray[np.float64]]:
         """{area: ``area_T_other``} of the local map's other areas."""
@@ -92,6 +96,7 @@ class Branching:
 
     def __init__(self, configuration: Configuration, replica: Replica) -> None:
         self.search = ClosureSearch(configuration, replica.scans)
+        self._options = configuration.tsbi
         self._replica = replica
         sigma, angle = configuration.tlca.arc_sigma_floor, math.radians(configuration.tlca.arc_angle_floor)
         self._floor = np.diag([sigma**2, sigma**2, angle**2])
@@ -101,6 +106,7 @@ class Branching:
     def begin_event(self) -> None:
         """Forget which new areas were named; within one event hypotheses share the ids of the same new area."""
         self._named = {}
+        self.search.begin_event()
 
     def cut(self, parent: Parent, keyframes: Sequence[int]) -> Branches:
         """{new area} and every known area that the arcs admit, with one child a mode.
@@ -113,7 +119,7 @@ class Branching:
         if tracked is not None:
             return Branches([self._enter_tracked(parent, query, tracked)])
         excluded = {parent.area, *parent.around()}
-        found = self.search.compare(parent.hybrid_map, parent.area, query, parent.notes.compared, excluded)
+        found = self._compared(parent, query, excluded)
         noted = replace(parent, notes=parent.notes.checked(found.examined, keyframes))
         children = [self._enter_new(noted, query, math.log(found.transition.new))]
         children += [self._enter_known(noted, query, fit) for fit in found.fits]
@@ -124,12 +130,17 @@ class Branching:
         keyframes = [k for k in parent.notes.unchecked if k in parent.hybrid_map.keyframes(parent.area)]
         query = self._query(parent, keyframes)
         excluded = {parent.area, *parent.around(), *parent.hybrid_map.neighbours(parent.area)}
-        found = self.search.compare(parent.hybrid_map, parent.area, query, parent.notes.compared, excluded)
+        found = self._compared(parent, query, excluded)
         noted = replace(parent, notes=parent.notes.checked(found.examined, keyframes))
         stay = parent.log_weight + math.log(found.transition.new)
         children = [Child(parent.hypothesis, stay, parent.area, noted.notes)]
         children += [self._join(noted, query, fit) for fit in found.fits]
         return Branches(children, True, _log(found.skipped) + parent.log_weight)
+
+    def _compared(self, parent: Parent, query: Query, excluded: Collection[int]) -> Comparison:
+        """The comparison with known areas, of which a hypothesis may examine the more the more probable it is."""
+        most = min(self._options.max_candidates, max(_FEWEST, math.ceil(self._options.max_comparisons * parent.share)))
+        return self.search.compare(parent.hybrid_map, parent.area, query, parent.notes.compared, excluded, most)
 
     def move(self, parent: Parent, area: int) -> Branches:
         """The robot went into a known area; the keyframes stay where they are."""

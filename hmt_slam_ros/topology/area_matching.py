@@ -38,7 +38,7 @@ class MatchSettings:
     :ivar temper: exponent on the likelihood of the surface samples, which are not quite independent.
     :ivar gate: squared Mahalanobis distance from the prior up to which is searched, 3 degrees of freedom.
     :ivar margin: modes this far below the best, in nats, are still returned.
-    :ivar max_modes: at most this many modes are returned, the heaviest.
+    :ivar max_modes: at most this many modes are worked out, the heaviest; some may turn out to be the same.
     :ivar sigma_floor: smallest deviation of a mode's translation, m.
     :ivar angle_floor: smallest deviation of a mode's angle, rad.
     """
@@ -46,7 +46,7 @@ class MatchSettings:
     temper: float = 0.1
     gate: float = 16.27
     margin: float = 10.0
-    max_modes: int = 4
+    max_modes: int = 8
     sigma_floor: float = 0.01
     angle_floor: float = math.radians(0.2)
 
@@ -112,7 +112,7 @@ def match(query: AreaGrid, candidate: AreaGrid, prior: PoseGaussian, settings: M
     masses = masses + log_cell
 
     def modes() -> tuple[Mode, ...]:
-        return tuple(_carried(mode, to_middle) for mode in _modes(problem, cells, masses, poses)[: settings.max_modes])
+        return tuple(_carried(mode, to_middle) for mode in _modes(problem, cells, masses, poses))
 
     return Match(float(np.logaddexp.reduce(masses)), modes)
 
@@ -163,7 +163,7 @@ def _modes(problem: _Problem, cells: Cells, masses: Array, poses: Array) -> list
     np.logaddexp.at(totals, labels, masses)
     floor = totals.max() - problem.settings.margin
     modes: list[Mode] = []
-    for label in np.argsort(-totals, kind="stable")[: 2 * problem.settings.max_modes]:
+    for label in np.argsort(-totals, kind="stable")[: problem.settings.max_modes]:
         if totals[label] >= floor:
             inside = labels == label
             _add(modes, _mode(problem, masses[inside], poses[inside]))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -16,7 +17,7 @@ from hmt_slam_ros.geometry.chi_square import gate
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.sensing import Scan
 from hmt_slam_ros.topology.appearance import appearance_log_ratio, signature
-from hmt_slam_ros.topology.area_grid import GridModel, build_area_grid
+from hmt_slam_ros.topology.area_grid import AreaGrid, GridModel, build_area_grid
 from hmt_slam_ros.topology.area_matching import MatchSettings, Mode, match
 from hmt_slam_ros.topology.chance import Elsewhere, log_chance
 from hmt_slam_ros.topology.hybrid_map import HybridMap
@@ -26,6 +27,8 @@ from hmt_slam_ros.topology.transition import Place, Transition, entry_bound, ent
 
 Pose = NDArray[np.float64]
 
+# Modes this far below the best are looked at, nats: the best may lie in the place of another area.
+_MARGIN = 20.0
 # Areas in which the keyframes surely do not lie that they are compared with all the same.
 _ELSEWHERE = 6
 
@@ -62,9 +65,9 @@ class Comparison(NamedTuple):
     """What came of comparing keyframes with the known areas.
 
     :ivar transition: pi of the known areas and of new ground.
-    :ivar fits: all modes in all areas that were examined.
+    :ivar fits: the modes in all areas that were examined, the heaviest of each.
     :ivar examined: those areas.
-    :ivar skipped: probability of those that were not.
+    :ivar skipped: probability of those that were not, and of further modes, on the scale of ``exp(Fit.log_weight)``.
     """
 
     transition: Transition
@@ -95,12 +98,17 @@ class ClosureSearch:
         self._scans = scans
         self.gate = gate(options.gate_probability)
         self.nearness = Nearness(options.local_sigma, options.local_reach)
-        self._settings = MatchSettings(temper=options.temper, gate=self.gate, max_modes=options.max_modes)
+        self._settings = MatchSettings(options.temper, self.gate, _MARGIN, 2 * options.max_modes)
         self._model = GridModel(
             options.search_cell, options.surface_sigma, options.surface_ratio, options.free_ratio,
             configuration.local_map.max_range, options.sample_spacing,
         )  # fmt: skip
         self._views = Views(scans, self._model, self.nearness)
+        self._chances: dict[tuple[object, ...], tuple[AreaGrid, Sequence[Elsewhere], float]] = {}
+
+    def begin_event(self) -> None:
+        """Forget what was worked out for the last event alone."""
+        self._chances = {}
 
     def tracked_area(
         self, hybrid_map: HybridMap, area: int, around: Mapping[int, Pose], poses: NDArray[np.float64]
@@ -131,18 +139,19 @@ class ClosureSearch:
 
     def compare(
         self, hybrid_map: HybridMap, area: int, query: Query, compared: Mapping[int, Collection[int]],
-        excluded: Collection[int],
+        excluded: Collection[int], most: int,
     ) -> Comparison:
         """Prior, appearance and evidence of all admitted areas.
 
         :param area: the area that the keyframes are in.
         :param compared: {known area: keyframes that were compared with it}.
         :param excluded: areas that are neither candidates nor part of a candidate's map.
+        :param most: this many areas are examined at most, those that the keyframes are most probably in.
         """  # fmt: skip
         within, elsewhere = self._divided(hybrid_map, area, query, excluded)
         candidates = self._candidates(hybrid_map, query, compared, within)
         ranked = sorted(candidates, key=lambda known: (-candidates[known].most, known))
-        looked_at, rest = ranked[: self._options.max_candidates], ranked[self._options.max_candidates :]
+        looked_at, rest = ranked[:most], ranked[most:]
         places = {known: self._views.place(hybrid_map, known, excluded) for known in looked_at}
         entries = {known: self._entry(place, candidates[known]) for known, place in places.items()}
         shares = {known: share for known, share in entries.items() if share > 0.0}
@@ -153,7 +162,9 @@ class ClosureSearch:
             for look, mode in self._fits(hybrid_map, places[known], candidates[known])
         ]
         relative = self._relative_to_new(hybrid_map, candidates, fits, elsewhere, excluded)
-        return Comparison(model, relative, tuple(shares), sum(model.known[known] for known in rest))
+        kept, left_out = _parted(relative, self._options.max_modes)
+        skipped = sum(model.known[known] for known in rest) + sum(math.exp(fit.log_weight) for fit in left_out)
+        return Comparison(model, kept, tuple(shares), skipped)
 
     def _entry(self, place: Place, candidate: _Candidate) -> float:
         return entry_probability(place, candidate.prior, stacked(candidate.fresh), self._options.place_radius)
@@ -165,13 +176,19 @@ class ClosureSearch:
         """Weigh the fits against new ground, which may look like the building's other places."""
         places = [self._elsewhere(hybrid_map, area, excluded) for area in (elsewhere if fits else ())]
         fresh = {tuple(candidates[fit.area].fresh): candidates[fit.area].fresh for fit in fits}
-        new = {
-            keyframes: log_chance(self._views.grid(poses), places, self._options.alike_probability, self._settings)
-            for keyframes, poses in fresh.items()
-        }
+        new = {keyframes: self._chance(self._views.grid(poses), places) for keyframes, poses in fresh.items()}
         return tuple(
             fit._replace(log_weight=fit.log_weight - new[tuple(candidates[fit.area].fresh)]) for fit in fits
         )
+
+    def _chance(self, query: AreaGrid, places: Sequence[Elsewhere]) -> float:
+        """log p(z | new ground), worked out once for all hypotheses of an event that ask for the same."""
+        key = (id(query), *(part for place in places for part in (id(place.grid), place.pose.tobytes())))
+        if key not in self._chances:
+            value = log_chance(query, places, self._options.alike_probability, self._settings)
+            # What is kept with the value keeps its id.
+            self._chances[key] = (query, places, value)
+        return self._chances[key][2]
 
     def _divided(
         self, hybrid_map: HybridMap, area: int, query: Query, excluded: Collection[int]
@@ -247,3 +264,16 @@ class ClosureSearch:
 
     def _signature(self, keyframes: Collection[int]) -> NDArray[np.float64]:
         return signature([self._scans[keyframe] for keyframe in keyframes])
+
+
+def _parted(fits: Sequence[Fit], most: int) -> tuple[tuple[Fit, ...], tuple[Fit, ...]]:
+    """The heaviest fits in every area, ``most`` at most, in their order; and the others."""
+    heaviest = sorted(range(len(fits)), key=lambda n: (-fits[n].log_weight, n))
+    place = Counter[int]()
+    kept = set()
+    for n in heaviest:
+        place[fits[n].area] += 1
+        if place[fits[n].area] <= most:
+            kept.add(n)
+    parts = [tuple(fit for n, fit in enumerate(fits) if (n in kept) == inside) for inside in (True, False)]
+    return parts[0], parts[1]
