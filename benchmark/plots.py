@@ -158,3 +158,20 @@ def plot_scale(
         axes.set_xlabel("areas")
         axes.legend(fontsize=7)
     figure.savefig(path, dpi=_DPI)
+
+
+def plot_oracle(path: Path, distances: Mapping[str, Mapping[int, float]], bound: float) -> None:
+    """Total variation distance against the number of hypotheses.
+
+    :param distances: {under what: {number of hypotheses: mean distance}}.
+    """
+    figure = Figure(figsize=(6.0, 4.5), layout="constrained")
+    axes = figure.subplots()
+    for name, own in distances.items():
+        axes.plot(list(own), list(own.values()), "o-", label=name)
+    axes.axhline(bound, color="black", linewidth=0.8)
+    axes.set_xscale("log", base=2)
+    axes.set_xlabel("hypotheses")
+    axes.set_ylabel("mean total variation distance")
+    axes.legend(fontsize=7)
+    figure.savefig(path, dpi=_DPI)

@@ -1,0 +1,193 @@
+"""All topologies of a small world, weighed one by one: what a PMF of TSBI ought to be.
+
+Plainly enumerated: at a cut every known area is a candidate, however far it lies by the arcs, with every way in which
+the keyframes fit into it; no hypothesis is reduced away. Shared with TSBI are the model, which is the transition model
+and the likelihoods, and what a choice does to the map.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from benchmark.scripted import Robot
+from hmt_slam_ros.arrays import Float64
+from hmt_slam_ros.configuration import Configuration
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.geometry.chi_square import gate
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.processes.replica import FIRST_HYPOTHESIS, Replica
+from hmt_slam_ros.processes.tsbi_branching import Branching, Child, Parent
+from hmt_slam_ros.sensing import Scan
+from hmt_slam_ros.topology.appearance import appearance_log_ratio
+from hmt_slam_ros.topology.area_matching import Mode, match
+from hmt_slam_ros.topology.chance import log_chance
+from hmt_slam_ros.topology.closure_search import ClosureSearch, Comparison, Fit, Pose, Query
+from hmt_slam_ros.topology.hybrid_map import HybridMap
+from hmt_slam_ros.topology.hypothesis_tree import LeafNotes
+from hmt_slam_ros.topology.shortest_path import reachable
+from hmt_slam_ros.topology.surroundings import areas_around, stacked
+from hmt_slam_ros.topology.transition import Place, Transition, entry_probability, owner_at
+
+Path = tuple[int, ...]
+"""The area of every visit, named by the visit in which it was entered first."""
+
+NEGLIGIBLE = 1e-9
+"""Probability below which a topology is not followed any further."""
+
+_EVERYWHERE = 1.0 - 1e-9  # share of the prior in which poses are searched for
+
+
+class _EverywhereSearch(ClosureSearch):
+    """Compares with all areas, by the same likelihoods."""
+
+    def __init__(self, configuration: Configuration, scans: Mapping[int, Scan]) -> None:
+        super().__init__(configuration, scans)
+        self._wide = replace(self._settings, gate=gate(_EVERYWHERE), margin=25.0, max_modes=1000)
+
+    def compare(
+        self, hybrid_map: HybridMap, area: int, query: Query, compared: Mapping[int, Collection[int]],
+        excluded: Collection[int], most: int,
+    ) -> Comparison:  # fmt: skip
+        """As in the model, over all areas, however many they are."""
+        del most
+        options = self._options
+        fresh = {
+            known: {k: pose for k, pose in query.poses.items() if k not in compared.get(known, ())}
+            for known in hybrid_map.area_ids()
+            if known not in excluded
+        }
+        beliefs = reachable(hybrid_map, area)
+        asked = [known for known, own in fresh.items() if 2 * len(own) >= len(query.poses)]
+        priors = {known: self._prior(beliefs[known], query) for known in asked}
+        places = {known: self._views.place(hybrid_map, known, excluded) for known in priors}
+        shares = {
+            known: entry_probability(place, priors[known], stacked(fresh[known]), options.place_radius)
+            for known, place in places.items()
+        }
+        total = sum(shares.values())
+        new = max(1.0 - total, options.new_probability) if total else 1.0
+        others = self._divided(hybrid_map, area, query, excluded)[1]
+        fits = [
+            Fit(known, mode, math.log((1.0 - new) / total) + weight)
+            for known, share in shares.items()
+            if share
+            for mode, weight in self._ways(hybrid_map, places[known], priors[known], fresh[known])
+        ]
+        against = self._against(hybrid_map, {fit.area: fresh[fit.area] for fit in fits}, others, excluded)
+        weighed = tuple(fit._replace(log_weight=fit.log_weight - against[fit.area]) for fit in fits)
+        examined = tuple(known for known, share in shares.items() if share)
+        return Comparison(Transition({}, new), weighed, examined, 0.0)
+
+    def _ways(
+        self, hybrid_map: HybridMap, place: Place, prior: PoseGaussian, fresh: Mapping[int, Pose]
+    ) -> Iterator[tuple[Mode, float]]:
+        """All ways in which keyframes lie in an area's place, with log p(phi) p(z) relative to unknown space."""
+        signatures = self._signature(fresh), self._signature(hybrid_map.keyframes(place.area))
+        look = appearance_log_ratio(*signatures, self._options.appearance_weight)
+        for mode in match(self._views.grid(fresh), place.grid, prior, self._wide).modes:
+            if owner_at(place, se2.compose(mode.pose.mean, stacked(fresh)), self._options.place_radius) == place.area:
+                yield mode, look + mode.log_mass
+
+    def _against(
+        self, hybrid_map: HybridMap, fresh: Mapping[int, Mapping[int, Pose]], others: Sequence[int],
+        excluded: Collection[int],
+    ) -> dict[int, float]:
+        """{known area: log p(z | new ground) of the keyframes that were compared with it}."""
+        places = [self._elsewhere(hybrid_map, other, excluded) for other in (others if fresh else ())]
+        by_keyframes = {
+            tuple(own): log_chance(self._views.grid(own), places, self._options.alike_probability, self._settings)
+            for own in {tuple(own): own for own in fresh.values()}.values()
+        }
+        return {known: by_keyframes[tuple(own)] for known, own in fresh.items()}
+
+
+@dataclass(frozen=True, eq=False)
+class _Topology:
+    """One way in which it may have been.
+
+    :ivar path: its areas by visits.
+    :ivar named: {area: the visit in which it was entered first}.
+    :ivar log_weight: log of its probability.
+    """
+
+    path: Path
+    named: dict[int, int]
+    hybrid_map: HybridMap
+    notes: LeafNotes
+    robot: Robot
+    log_weight: float
+
+
+class Enumeration:
+    """All topologies of a drive.
+
+    :ivar lost: probability of the topologies that were not followed any further, at most.
+    :ivar asked: whether there was a known area so far that the robot could be in, by the arcs.
+    """
+
+    def __init__(self, configuration: Configuration, noise: float = 1.0) -> None:
+        """:param noise: factor on the deviations of the odometry."""
+        self._noise = noise
+        self._replica = Replica()
+        self._branching = Branching(configuration, self._replica)
+        self._branching.search = _EverywhereSearch(configuration, self._replica.scans)
+        self._topologies = [_Topology((0,), {0: 0}, HybridMap(), LeafNotes(), Robot(), 0.0)]
+        self._sequence = -1
+        self.lost = 0.0
+        self.asked = False
+
+    @property
+    def followed(self) -> int:
+        """How many topologies there are now."""
+        return len(self._topologies)
+
+    def keyframe(self, step: Float64, scan: Scan, cut: int = 0) -> dict[Path, float]:
+        """One keyframe event, as of :meth:`benchmark.scripted.Script.keyframe`; the probability of every path."""
+        self._sequence += 1
+        self._replica.scans[self._sequence] = scan
+        self._branching.begin_event()
+        noted = [self._noted(topology, step) for topology in self._topologies]
+        if cut:
+            newest = range(self._sequence + 1 - cut, self._sequence + 1)
+            noted = [child for topology in noted for child in self._children(topology, newest)]
+        self._topologies = self._normalised(noted)
+        pmf: dict[Path, float] = defaultdict(float)
+        for topology in self._topologies:
+            pmf[topology.path] += math.exp(topology.log_weight)
+        return dict(pmf)
+
+    def _noted(self, topology: _Topology, step: Float64) -> _Topology:
+        """After the robot stored the newest keyframe in its area."""
+        robot = topology.robot.moved(step, self._noise)
+        topology.hybrid_map.place(self._sequence, robot.area, robot.pose.mean)
+        return replace(topology, robot=robot, notes=topology.notes.stored(self._sequence, robot.pose.covariance))
+
+    def _children(self, topology: _Topology, newest: Sequence[int]) -> Iterator[_Topology]:
+        parent = Parent(
+            FIRST_HYPOTHESIS, topology.robot.area, topology.hybrid_map, topology.notes, topology.log_weight
+        )
+        branches = self._branching.cut(parent, newest)
+        self.asked |= any(child.notes.compared for child in branches.children)
+        for child in branches.children:
+            yield self._followed(topology, child)
+
+    def _followed(self, topology: _Topology, child: Child) -> _Topology:
+        hybrid_map = topology.hybrid_map.branch()
+        self._replica.change(hybrid_map, child.relabelled, child.arcs)
+        around = areas_around(hybrid_map, child.area, self._branching.search.nearness)
+        local = {area: belief.mean for area, belief in around.items() if area != child.area}
+        named = {child.area: len(topology.path), **topology.named}
+        robot = topology.robot.entered(child.area, child.rebase, len(child.relabelled), self._noise)
+        path = (*topology.path, named[child.area])
+        return _Topology(path, named, hybrid_map, replace(child.notes, local=local), robot, child.log_weight)
+
+    def _normalised(self, topologies: Sequence[_Topology]) -> list[_Topology]:
+        total = float(np.logaddexp.reduce([topology.log_weight for topology in topologies]))
+        kept = [topology for topology in topologies if topology.log_weight - total > math.log(NEGLIGIBLE)]
+        self.lost += NEGLIGIBLE * (len(topologies) - len(kept))
+        return [replace(topology, log_weight=topology.log_weight - total) for topology in kept]

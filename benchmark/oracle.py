@@ -1,0 +1,240 @@
+"""Is TSBI's PMF that of an exact enumeration of all topologies? On worlds small enough to enumerate."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+
+from benchmark.enumeration import Enumeration, Path
+from benchmark.plots import plot_oracle
+from benchmark.report import Report, Requirement, table
+from benchmark.runs import PARAMETERS
+from benchmark.scripted import STEP, Script
+from benchmark.settings import Settings
+from hmt_slam_ros.arrays import Float64
+from hmt_slam_ros.configuration import Configuration, load_configuration
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.processes.replica import FIRST_HYPOTHESIS
+from hmt_slam_ros.processes.tsbi import Tsbi
+from hmt_slam_ros.sensing import Scan
+from hmt_slam_ros.simulation import open_simulated
+
+WORLDS = {
+    "ring": "ring,size=0.7",
+    "ring, short sight": "ring,size=0.7,range=3,beams=61",
+    "four crossings": "grid,size=0.7,count=1",
+    "four crossings, short sight": "grid,size=0.7,count=1,range=3,beams=61",
+    "nine crossings": "grid,size=0.7,count=2",
+    "nine crossings, short sight": "grid,size=0.7,count=2,range=3,beams=61",
+    "office": "office,size=0.7",
+}
+"""{name: simulated world}."""
+
+class Regime(NamedTuple):
+    """Under what is compared.
+
+    :ivar name: for the tables.
+    :ivar worlds: names of ``WORLDS``.
+    :ivar noises: factors on the deviations of the odometry.
+    :ivar changes: parameters that differ from the file.
+    :ivar required: whether the distance has to be small.
+    """
+
+    name: str
+    worlds: tuple[str, ...]
+    noises: tuple[float, ...]
+    changes: tuple[str, ...] = ()
+    required: bool = True
+
+
+REGIMES = (
+    Regime("as it is", tuple(WORLDS), (1.0, 2.0, 3.0)),
+    Regime("scans tell little", ("ring", "four crossings", "nine crossings"), (2.0, 4.0), ("tsbi.temper=0.03",)),
+    Regime("odometry beyond use", tuple(WORLDS), (4.0,), required=False),
+)
+
+HYPOTHESES = (1, 2, 4, 8, 16, 32)
+"""Values of tsbi.max_hypotheses."""
+
+SEEDS, VISITS = 2, 8
+LIMIT = 0.05
+"""Largest mean distance at the number of hypotheses of the parameter file."""
+
+_KEYFRAMES = 6  # of a visit
+_EQUAL = 1e-6  # distances that differ by less are the same
+
+POLICY = (
+    f"Drives of {VISITS} area visits, each of {_KEYFRAMES} keyframes at equal distances along the whole route; between "
+    "keyframes dead reckoning errs by 2 cm and half a degree, times the noise. Nothing is accepted on the way, and "
+    "known ground is looked for at cuts only (tsbi.recheck_keyframes is out of reach). The enumeration compares the "
+    "keyframes with every known area that the arcs do not rule out altogether, looks for ways to fit in all but 1e-9 "
+    "of the prior, and follows all of them down to a probability of 1e-9. Shared with TSBI are the transition model, "
+    "the likelihoods, and what a choice does to the map. Total variation distance of the distributions over the areas "
+    "of all visits so far, after every cut from the first one on at which a known area was possible; what TSBI did not "
+    "examine or dropped counts as wrong. Where scans tell little (tsbi.temper 0.03), many topologies stay alive and "
+    "the reduction has to choose. With odometry that errs by 8 cm and 2 degrees in 1 to 3 m nothing is required: "
+    "corridors that are alike fit so well that the enumeration believes in poses five deviations off, which the gate "
+    "on the prior (tsbi.gate_probability) keeps out on purpose, and topologies of 1e-9 come back."
+)
+
+
+class Stop(NamedTuple):
+    """A keyframe event of a drive.
+
+    :ivar step: the motion since the last one as the odometry has it, shape (3,).
+    :ivar scan: the keyframe's.
+    :ivar cut: how many of the newest keyframes leave the area.
+    """
+
+    step: Float64
+    scan: Scan
+    cut: int
+
+
+class Drive(NamedTuple):
+    """What came of one drive.
+
+    :ivar regime: under what, its name.
+    :ivar world: where, its name.
+    :ivar distances: {number of hypotheses: total variation distance after every cut that counts}.
+    :ivar topologies: how many the enumeration followed at most.
+    :ivar lost: probability that it did not follow, at most.
+    """
+
+    regime: str
+    world: str
+    distances: dict[int, list[float]]
+    topologies: int
+    lost: float
+
+
+def measure_oracle(settings: Settings) -> Report:
+    """Enumerate and compare."""
+    seeds = settings.seeds_or(SEEDS)
+    report = Report("oracle", "TSBI against exact enumeration", seeds=seeds)
+    usual = load_configuration(PARAMETERS, list(settings.changes)).tsbi.max_hypotheses
+    rows, pictured = [], {}
+    for regime in REGIMES:
+        drives = [
+            compared(regime, world, seed, noise, settings.changes)
+            for world in regime.worlds
+            for noise in regime.noises
+            for seed in seeds
+        ]
+        means = pictured[regime.name] = mean_distances(drives)
+        if regime.required:
+            report.requirements += oracle_requirements(regime.name, means, usual)
+        rows += [_row(regime.name, world, [d for d in drives if d.world == world]) for world in regime.worlds]
+        rows.append(_row(regime.name, "all", drives))
+        report.data[regime.name] = [drive._asdict() for drive in drives]
+    head = ["scans and odometry", "world", "drives", "cuts", "topologies at most", *(f"N = {n}" for n in HYPOTHESES)]
+    report.body += [table(head, rows), POLICY]
+    report.pictures["oracle.png"] = "Mean distance to the exact distribution against the number of hypotheses."
+    plot_oracle(settings.out / "oracle.png", pictured, LIMIT)
+    return report
+
+
+def stops(world: str, seed: int, noise: float) -> list[Stop]:
+    """A drive along the whole route of a simulated world.
+
+    :param noise: factor on the deviations of the odometry.
+    """
+    log = open_simulated(world)
+    poses = log.true_poses(log.scenario.stamps[:: log.scenario.settings.readings])
+    driven = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T))))
+    at = np.searchsorted(driven, np.linspace(0.0, driven[-1], VISITS * _KEYFRAMES + 1)[:-1])
+    random = np.random.default_rng(seed)
+    errors = se2.exp(noise * random.multivariate_normal(np.zeros(3), STEP, size=len(at)))
+    steps = [np.zeros(3), *(se2.between(poses[a], poses[b]) for a, b in pairwise(at))]
+    return [
+        Stop(
+            se2.compose(step, error) if k else step,
+            log.scenario.scan(int(at[k])),
+            _KEYFRAMES if k >= _KEYFRAMES and k % _KEYFRAMES == _KEYFRAMES - 1 else 0,
+        )
+        for k, (step, error) in enumerate(zip(steps, errors, strict=True))
+    ]
+
+
+def compared(regime: Regime, world: str, seed: int, noise: float, changes: Sequence[str]) -> Drive:
+    """Enumerate a drive, and run TSBI on it with every number of hypotheses.
+
+    :param changes: parameters that differ from the file, beside those of the regime.
+    """
+    changes = (*regime.changes, *changes)
+    drive = stops(f"sim:{WORLDS[world]},seed={seed}", seed, noise)
+    enumeration = Enumeration(_configuration(changes), noise)
+    exact, counts, most = [], [], 1
+    for stop in drive:
+        pmf = enumeration.keyframe(*stop)
+        if stop.cut:
+            exact.append(pmf)
+            counts.append(enumeration.asked)
+            most = max(most, enumeration.followed)
+    distances = {}
+    for hypotheses in HYPOTHESES:
+        found = filtered(drive, _configuration((*changes, f"tsbi.max_hypotheses={hypotheses}")), noise)
+        distances[hypotheses] = [
+            total_variation(p, q) for p, q, asked in zip(exact, found, counts, strict=True) if asked
+        ]
+    return Drive(regime.name, world, distances, most, enumeration.lost)
+
+
+def _configuration(changes: Sequence[str]) -> Configuration:
+    return load_configuration(PARAMETERS, ["tsbi.recheck_keyframes=1000", *changes])
+
+
+def filtered(drive: Sequence[Stop], configuration: Configuration, noise: float) -> list[dict[Path, float]]:
+    """TSBI's PMF after every cut; the sum lacks what it did not examine or dropped."""
+    script = Script(Tsbi(configuration), noise=noise)
+    paths: dict[int, tuple[Path, dict[int, int]]] = {FIRST_HYPOTHESIS: ((0,), {0: 0})}
+    found = []
+    for stop in drive:
+        leaves = script.keyframe(*stop).leaves
+        before, paths = paths, {}
+        pmf: dict[Path, float] = defaultdict(float)
+        for leaf in leaves:
+            path, named = before[leaf.parent]
+            if stop.cut:
+                named = {leaf.area: len(path), **named}
+                path = (*path, named[leaf.area])
+            paths[leaf.hypothesis] = path, named
+            pmf[path] += leaf.probability
+        if stop.cut:
+            found.append(dict(pmf))
+    return found
+
+
+def total_variation(exact: Mapping[Path, float], found: Mapping[Path, float]) -> float:
+    """Total variation distance; what ``found`` lacks to 1 counts as probability of something else."""
+    lacking = max(0.0, 1.0 - sum(found.values()))
+    return 0.5 * (lacking + sum(abs(exact.get(path, 0.0) - found.get(path, 0.0)) for path in {**exact, **found}))
+
+
+def mean_distances(drives: Sequence[Drive]) -> dict[int, float]:
+    """{number of hypotheses: mean distance over all cuts that count}, NaN where there are none."""
+    pooled = {n: [distance for drive in drives for distance in drive.distances[n]] for n in HYPOTHESES}
+    return {n: float(np.mean(own)) if own else float("nan") for n, own in pooled.items()}
+
+
+def oracle_requirements(regime: str, means: Mapping[int, float], usual: int) -> list[Requirement]:
+    """That the distance is small, and that it falls with the number of hypotheses.
+
+    :param usual: number of hypotheses of the parameter file.
+    """
+    rises = max(b - a for a, b in pairwise(means.values()))
+    return [
+        Requirement(f"{regime}: mean total variation distance with {usual} hypotheses", means[usual], LIMIT),
+        Requirement(f"{regime}: largest rise of the mean where the hypotheses are doubled", rises, _EQUAL),
+    ]
+
+
+def _row(regime: str, world: str, drives: Sequence[Drive]) -> list[str]:
+    cuts = sum(len(drive.distances[HYPOTHESES[0]]) for drive in drives)
+    most = max(drive.topologies for drive in drives)
+    means = [f"{mean:.4f}" for mean in mean_distances(drives).values()]
+    return [regime, world, str(len(drives)), str(cuts), str(most), *means]
