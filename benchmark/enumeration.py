@@ -71,7 +71,7 @@ class _EverywhereSearch(ClosureSearch):
         }
         total = sum(shares.values())
         new = max(1.0 - total, options.new_probability) if total else 1.0
-        others = self._divided(hybrid_map, area, query, excluded)[1]
+        others = self._divided(hybrid_map, area, query, excluded)[2]
         fits = [
             Fit(known, mode, math.log((1.0 - new) / total) + weight)
             for known, share in shares.items()

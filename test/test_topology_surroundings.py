@@ -10,7 +10,8 @@ from hmt_slam_ros.topology.appearance import appearance_log_ratio, signature
 from hmt_slam_ros.topology.area_grid import GridModel
 from hmt_slam_ros.topology.hybrid_map import HybridMap
 from hmt_slam_ros.topology.shortest_path import Reached
-from hmt_slam_ros.topology.surroundings import Nearness, Views, agreeing, areas_around, may_be_near
+from hmt_slam_ros.topology.surroundings import Nearness, Views, agreeing, areas_around, entry_bounds
+from hmt_slam_ros.topology.transition import entry_bound
 
 NEAR = Nearness(sigma=0.3, reach=6.0)
 
@@ -59,7 +60,8 @@ def test_the_quick_bound_lets_all_pass_that_are_near_and_few_others(asked, keyfr
     found = Reached(np.arange(200), rng.uniform(-9.0, 9.0, size=(200, 3)), square @ square.transpose(0, 2, 1))
     query = PoseGaussian(np.array([1.0, 2.0, 0.3]), np.diag([0.1, 0.2, 0.05]) ** 2)
     lever, extent = np.hypot(*asked), np.hypot(*keyframe)
-    passed = may_be_near(found, query, lever, np.full(200, extent), 2.0, 4.0)
+    bounds = entry_bounds(found, query, lever, np.full(200, extent + lever + 2.0), 2.0, 2.0)
+    passed = bounds > 0.0
     near = []
     for mean, covariance in zip(found.means, found.covariances, strict=True):
         prior = PoseGaussian(mean, covariance).inverse().compose(query)
@@ -69,6 +71,18 @@ def test_the_quick_bound_lets_all_pass_that_are_near_and_few_others(asked, keyfr
     assert 20 < sum(near) < 180
     # Where the query and the area are points, the bound is the distance itself.
     assert passed.sum() == sum(near) if lever == 0.0 else sum(near) < passed.sum() < 200
+
+
+@pytest.mark.parametrize("away", [0.0, 6.0, 15.0, 30.0])
+def test_the_quick_bound_is_one_on_the_probability_of_an_area_far_from_certain(away):
+    spread = np.diag([6.0, 4.0, 0.1]) ** 2
+    found = Reached(np.array([3]), np.array([[away, 1.0, 0.5]]), spread[None])
+    query = PoseGaussian(np.array([0.0, 0.0, 1.0]), 0.01 * np.eye(3))
+    (bound,) = entry_bounds(found, query, 1.0, np.array([3.0]), 1.5, 4.0)
+    prior = PoseGaussian(found.means[0], spread).inverse().compose(query)
+    poses = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
+    exact = entry_bound(np.zeros((1, 2)), PoseGaussian(prior.mean, 1.5**2 * prior.covariance), poses, 2.0)
+    assert exact <= bound <= max(10.0 * exact, 0.01)
 
 
 def test_a_global_pose_that_agrees_with_the_arcs_is_taken():

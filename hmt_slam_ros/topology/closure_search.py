@@ -22,13 +22,15 @@ from hmt_slam_ros.topology.area_matching import MatchSettings, Mode, match
 from hmt_slam_ros.topology.chance import Elsewhere, log_chance
 from hmt_slam_ros.topology.hybrid_map import HybridMap
 from hmt_slam_ros.topology.shortest_path import Reached, reached
-from hmt_slam_ros.topology.surroundings import Nearness, Views, gap, may_be_near, positions, stacked
+from hmt_slam_ros.topology.surroundings import Nearness, Views, entry_bounds, gap, positions, stacked
 from hmt_slam_ros.topology.transition import Place, Transition, entry_bound, entry_probability, owner_at, transition
 
 Pose = NDArray[np.float64]
 
 # Modes this far below the best are looked at, nats: the best may lie in the place of another area.
 _MARGIN = 20.0
+# Areas within reach of which the keyframes are looked at, where the arcs admit many.
+_LOOKED_AT = 64
 # Areas in which the keyframes surely do not lie that they are compared with all the same.
 _ELSEWHERE = 6
 
@@ -148,14 +150,14 @@ class ClosureSearch:
         :param excluded: areas that are neither candidates nor part of a candidate's map.
         :param most: this many areas are examined at most, those that the keyframes are most probably in.
         """  # fmt: skip
-        within, elsewhere = self._divided(hybrid_map, area, query, excluded)
+        within, distant, elsewhere = self._divided(hybrid_map, area, query, excluded)
         candidates = self._candidates(hybrid_map, query, compared, within)
         ranked = sorted(candidates, key=lambda known: (-candidates[known].most, known))
-        looked_at, rest = ranked[:most], ranked[most:]
+        looked_at, rest = ranked[:most], {known: candidates[known].most for known in ranked[most:]} | distant
         places = {known: self._views.place(hybrid_map, known, excluded) for known in looked_at}
         entries = {known: self._entry(place, candidates[known]) for known, place in places.items()}
         shares = {known: share for known, share in entries.items() if share > 0.0}
-        model = transition(shares | {known: candidates[known].most for known in rest}, self._options.new_probability)
+        model = transition(shares | rest, self._options.new_probability)
         fits = [
             Fit(known, mode, math.log(model.known[known] / shares[known]) + look + mode.log_mass)
             for known in sorted(shares, key=lambda known: (-shares[known], known))
@@ -192,26 +194,30 @@ class ClosureSearch:
 
     def _divided(
         self, hybrid_map: HybridMap, area: int, query: Query, excluded: Collection[int]
-    ) -> tuple[dict[int, PoseGaussian], list[int]]:
-        """The priors of the known areas in which the query may lie, and some of those in which it surely does not."""
+    ) -> tuple[dict[int, PoseGaussian], dict[int, float], list[int]]:
+        """The known areas in which the query may lie, and some of those in which it surely does not.
+
+        :returns: the priors of those that are looked at; where they are too many, of the others a bound on the
+            probability that the query lies there; and areas elsewhere.
+        """
         found = reached(hybrid_map, area, self._options.prior_limit**2)
-        known = ~np.isin(found.areas, list(excluded))
-        near = known & self._may_be_near(hybrid_map, found, query)
+        bounds = np.where(np.isin(found.areas, list(excluded)), 0.0, self._entry_bounds(hybrid_map, found, query))
+        order = np.argsort(-bounds, kind="stable")[: np.count_nonzero(bounds)]
         within = {}
-        for i in np.flatnonzero(near):
+        for i in order[:_LOOKED_AT]:
             prior = self._prior(PoseGaussian(found.means[i], found.covariances[i]), query)
             if self._within_reach(hybrid_map, int(found.areas[i]), prior, query.poses):
                 within[int(found.areas[i])] = prior
-        elsewhere = np.sort(found.areas[known & ~np.isin(found.areas, list(within))])
-        return within, elsewhere[:: max(1, -(-len(elsewhere) // _ELSEWHERE))].tolist()
+        others = order[_LOOKED_AT:]
+        distant = dict(zip(found.areas[others].tolist(), bounds[others].tolist(), strict=True))
+        known = ~np.isin(found.areas, [*excluded, *within, *distant])
+        elsewhere = np.sort(found.areas[known])
+        return within, distant, elsewhere[:: max(1, -(-len(elsewhere) // _ELSEWHERE))].tolist()
 
-    def _may_be_near(self, hybrid_map: HybridMap, found: Reached, query: Query) -> NDArray[np.bool_]:
-        """Which areas, shape (n,), are worth a look at their keyframes for being within reach."""
+    def _entry_bounds(self, hybrid_map: HybridMap, found: Reached, query: Query) -> NDArray[np.float64]:
         lever = float(np.hypot(*stacked(query.poses)[:, :2].T).max())
-        return may_be_near(
-            found, query.belief, lever, hybrid_map.extents(found.areas), self._options.place_radius,
-            math.sqrt(self.gate) * self._options.prior_scale,
-        )  # fmt: skip
+        reach = hybrid_map.extents(found.areas) + lever + self._options.place_radius
+        return entry_bounds(found, query.belief, lever, reach, self._options.prior_scale, math.sqrt(self.gate))
 
     def _elsewhere(self, hybrid_map: HybridMap, area: int, excluded: Collection[int]) -> Elsewhere:
         """An area's place, and one of its keyframes in the middle of the way through it."""

@@ -10,7 +10,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from hmt_slam_ros.arrays import Bool, Float64
+from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.covariance import carried, of_inverse
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
@@ -26,8 +26,8 @@ Pose = NDArray[np.float64]
 _MOST_AROUND = 64
 # Grids are kept up to this size, bytes: those of some ten places of a large building.
 _KEPT = 3 << 23
-# What the bound on distances has in hand, m.
-_ROUNDING = 1e-6
+# What the bounds on distances have in hand, m, and the smallest that is not 0.
+_ROUNDING, _SMALLEST = 1e-6, 1e-300
 
 
 @dataclass(frozen=True)
@@ -72,36 +72,45 @@ def gap(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
     return float(np.hypot(between[..., 0], between[..., 1]).min(initial=np.inf))
 
 
-def may_be_near(
-    found: Reached, query: PoseGaussian, lever: float, extents: Float64, radius: float, deviations: float
-) -> Bool:
-    """Whether a keyframe of an area can lie within ``radius`` of a query, shape (n,), by a bound that is quick to tell.
+def entry_bounds(
+    found: Reached, query: PoseGaussian, lever: float, reach: Float64, scale: float, deviations: float
+) -> Float64:
+    """Bounds, quick to tell, on the probability that a query lies in the places of areas, shape (n,).
+
+    They are 0 where no keyframe of the area can be near enough to one of the query's.
 
     :param found: areas seen from the query's area.
     :param query: belief over ``area_T_reference`` of the query's reference.
     :param lever: largest distance of the query's keyframes from their reference, m.
-    :param extents: shape (n,), largest distance of each area's keyframes from its origin, m.
-    :param deviations: how many deviations of the prior are admitted.
+    :param reach: shape (n,), largest distance of the reference from an area's origin if the query is in its place, m.
+    :param scale: factor on the deviations of the prior.
+    :param deviations: how many deviations are admitted.
     """
-    return _may_be_near(
-        found.means, found.covariances, query.mean, query.covariance, extents + lever + radius, lever, deviations
+    return _entry_bounds(
+        found.means, found.covariances, query.mean, query.covariance, reach, lever, scale, deviations
     )
 
 
 @njit(cache=True)
-def _may_be_near(
+def _entry_bounds(
     means: Float64, covariances: Float64, mean: Float64, covariance: Float64, reach: Float64, lever: float,
-    deviations: float,
-) -> Bool:
-    near = np.empty(len(means), np.bool_)
+    scale: float, deviations: float,
+) -> Float64:
+    bounds = np.zeros(len(means))
     for n in range(len(means)):
         distance = np.hypot(mean[0] - means[n, 0], mean[1] - means[n, 1])
-        prior = carried(of_inverse(covariances[n], means[n]), mean) + covariance
+        prior = scale * scale * (carried(of_inverse(covariances[n], means[n]), mean) + covariance)
         half, apart = 0.5 * (prior[0, 0] + prior[1, 1]), 0.5 * (prior[0, 0] - prior[1, 1])
-        widest = half + np.sqrt(apart * apart + prior[0, 1] * prior[0, 1])
-        spread = np.sqrt(max(0.0, widest)) + lever * np.sqrt(max(0.0, prior[2, 2]))
-        near[n] = distance <= reach[n] + deviations * spread + _ROUNDING
-    return near
+        turn = np.sqrt(apart * apart + prior[0, 1] * prior[0, 1])
+        spread = np.sqrt(max(0.0, half + turn)) + lever * np.sqrt(max(0.0, prior[2, 2]))
+        if distance > reach[n] + deviations * spread + _ROUNDING:
+            continue
+        # The area of the disc around the origin times the largest density in it, at most that of a normal of this
+        # spread all round.
+        off = max(0.0, distance - reach[n]) / max(spread, _ROUNDING)
+        density = np.exp(-0.5 * off * off) / max(np.sqrt(max(0.0, half * half - turn * turn)), _ROUNDING)
+        bounds[n] = min(1.0, max(0.5 * reach[n] * reach[n] * density, _SMALLEST))
+    return bounds
 
 
 def agreeing(
