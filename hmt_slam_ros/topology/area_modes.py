@@ -37,12 +37,12 @@ def _flood(
         above[cell] = cell
         for dk in range(-1, 2):
             for di in range(-1, 2):
-                for dj in range(-1, 2):
-                    key = keys[cell] + (dk * sides[1] + di) * sides[2] + dj
-                    place = np.searchsorted(sorted_keys, key)
-                    if place == keys.size or sorted_keys[place] != key or above[by_key[place]] < 0:
-                        continue
-                    _join(above, cell, by_key[place], score, saddle)
+                beside = keys[cell] + (dk * sides[1] + di) * sides[2]
+                place = np.searchsorted(sorted_keys, beside - 1)
+                while place < keys.size and sorted_keys[place] <= beside + 1:
+                    if above[by_key[place]] >= 0:
+                        _join(above, cell, by_key[place], score, saddle)
+                    place += 1
     for cell in order:
         above[cell] = _peak(above, cell)
     return above
