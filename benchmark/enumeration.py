@@ -100,7 +100,7 @@ class _EverywhereSearch(ClosureSearch):
         """{known area: log p(z | new ground) of the keyframes that were compared with it}."""
         places = [self._elsewhere(hybrid_map, other, excluded) for other in (others if fresh else ())]
         by_keyframes = {
-            tuple(own): log_chance(self._views.grid(own), places, self._options.alike_probability, self._settings)
+            tuple(own): log_chance(self._views.grid(own), places, self._options.alike_probability, self._of_chance)
             for own in {tuple(own): own for own in fresh.values()}.values()
         }
         return {known: by_keyframes[tuple(own)] for known, own in fresh.items()}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -101,6 +101,8 @@ class ClosureSearch:
         self.gate = gate(options.gate_probability)
         self.nearness = Nearness(options.local_sigma, options.local_reach)
         self._settings = MatchSettings(options.temper, self.gate, _MARGIN, 2 * options.max_modes)
+        # For the evidence alone the weak modes are of no account.
+        self._of_chance = replace(self._settings, margin=MatchSettings.margin)
         self._model = GridModel(
             options.search_cell, options.surface_sigma, options.surface_ratio, options.free_ratio,
             configuration.local_map.max_range, options.sample_spacing,
@@ -187,7 +189,7 @@ class ClosureSearch:
         """log p(z | new ground), worked out once for all hypotheses of an event that ask for the same."""
         key = (id(query), *(part for place in places for part in (id(place.grid), place.pose.tobytes())))
         if key not in self._chances:
-            value = log_chance(query, places, self._options.alike_probability, self._settings)
+            value = log_chance(query, places, self._options.alike_probability, self._of_chance)
             # What is kept with the value keeps its id.
             self._chances[key] = (query, places, value)
         return self._chances[key][2]
