@@ -142,3 +142,14 @@ def test_further_ways_to_fit_into_an_area_count_as_not_examined():
     assert weights[1][0] == max(weights[6])
     assert 0.0 < skipped[1] <= sum(weights[6]) - max(weights[6]) + 1e-9
     assert skipped[6] == 0.0
+
+
+def test_an_improbable_hypothesis_examines_few_areas_and_counts_the_others():
+    offsets = [(0.5 * k - 1.2, 0.3 * (k % 3) - 0.3) for k in range(6)]
+    parent, branching, newest = rooms_apart((ROOM,) * 7, offsets, 1.0)
+    examined = {}
+    for share in (1.0, 1e-3):
+        branches = branching.cut(replace(parent, share=share), newest[1:])
+        examined[share] = {area for child in branches.children for area in child.notes.compared}
+        assert (branches.log_skipped > -math.inf) == (share < 1.0)
+    assert (len(examined[1.0]), len(examined[1e-3])) == (6, 4)
