@@ -16,7 +16,8 @@ from benchmark.scale_memory import BEAMS as STORED_BEAMS
 from benchmark.scale_memory import Stored, stored
 from benchmark.scale_scans import cost_of_scans
 from benchmark.settings import Settings
-from hmt_slam_ros.configuration import load_configuration
+from hmt_slam_ros.configuration import Configuration, load_configuration
+from hmt_slam_ros.processes.tsbi_branching import FEWEST
 
 SMALL = (Lattice(5, 2), Lattice(10, 10), Lattice(50, 20))
 LARGE = (Lattice(100, 100), Lattice(1000, 100))
@@ -25,7 +26,7 @@ CUT_BOUNDS = {10_000: 100.0, 100_000: 1000.0}
 """Largest time of a cut, ms, by the number of areas."""
 
 STRESS = ("tsbi.prior_scale=5", "tsbi.temper=0.03")
-"""Changes under which as many areas are compared, under as many hypotheses, as the parameters admit."""
+"""Changes under which arcs admit more areas than are looked at, and scans decide little."""
 
 GROWTH = 0.1
 """Largest growth of what a scan costs in SLAM and RTL, from the smallest to the largest of the small maps."""
@@ -41,8 +42,8 @@ POLICY = (
     "lattice, goes along beside it for up to eight crossings with a new area at each, and comes back; its odometry "
     "errs as its covariance says, and a stand-in for metric SLAM and acceptance hands TSBI its poses. A cut is timed "
     "from the keyframe to the acceptance, CPU time of one process, under all hypotheses that are alive. Under stress "
-    f"({', '.join(STRESS)}) arcs admit more areas than may be compared and scans decide little, so that the bounds of "
-    "docs/parameters.md are reached. For the scans all five processes run in a loop through known ground; CPU time a "
+    f"({', '.join(STRESS)}) arcs admit far more areas than are looked at, which counts as not examined, and scans "
+    "decide little. For the scans all five processes run in a loop through known ground; CPU time a "
     "scan, the median of the repetitions. Memory is what Python allocates: poses and arcs in each process that keeps "
     f"the map, and the ranges of its scans, here of {STORED_BEAMS} beams; what can be computed anew from them is told, "
     "and does not count."
@@ -61,7 +62,8 @@ def measure_scale(settings: Settings) -> Report:
     area = stored(LARGE[0])
     report.requirements.append(Requirement("memory of a stored area with its scans", area.whole, STORED, "kB"))
     named = {str(areas): own for areas, own in cuts.items()} | {f"{LARGE[0].areas}, stress": stressed}
-    report.body += [_cut_table(named), _scan_table(scans), _stored_table(area), POLICY]
+    bound = _bound(configuration, [cut for own in named.values() for cut in own])
+    report.body += [_cut_table(named), bound, _scan_table(scans), _stored_table(area), POLICY]
     report.data |= {
         "cuts": {name: [cut._asdict() for cut in own] for name, own in named.items()},
         "ms_per_scan": scans,
@@ -105,6 +107,18 @@ def _cut_row(name: str, cuts: Sequence[Cut]) -> list[str]:
         str(max(cut.hypotheses for cut in cuts)),
         f"{max(cut.unexamined for cut in cuts):.3f}",
     ]
+
+
+def _bound(configuration: Configuration, cuts: Sequence[Cut]) -> str:
+    """How long a cut can take."""
+    options = configuration.tsbi
+    most = options.max_comparisons + FEWEST * options.max_hypotheses
+    each = max(cut.ms / cut.compared for cut in cuts if cut.compared)
+    return (
+        f"At a cut at most {most} areas are compared, under at most {options.max_hypotheses} hypotheses of "
+        f"{configuration.filter.particles} particles. One comparison took {each:.0f} ms at most with all that belongs "
+        f"to it, so that no cut takes longer than {1e-3 * most * each:.0f} s on this machine."
+    )
 
 
 def _quantiles(cuts: Sequence[Cut]) -> list[str]:

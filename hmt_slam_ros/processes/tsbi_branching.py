@@ -27,8 +27,9 @@ from hmt_slam_ros.topology.hypothesis_tree import LeafNotes, relative_covariance
 from hmt_slam_ros.topology.shortest_path import reachable
 from hmt_slam_ros.topology.surroundings import gap, positions
 
-# Known areas that every hypothesis may examine, however improbable it is.
-_FEWEST = 4
+FEWEST = 4
+"""Known areas that every hypothesis may examine at a cut, however improbable it is."""
+
 # Factor on the covariance of an arc along other arcs, where no match confirms it: it adds next to nothing to those.
 _UNCONFIRMED = 100.0
 
@@ -139,7 +140,7 @@ class Branching:
 
     def _compared(self, parent: Parent, query: Query, excluded: Collection[int]) -> Comparison:
         """The comparison with known areas, of which a hypothesis may examine the more the more probable it is."""
-        most = min(self._options.max_candidates, max(_FEWEST, math.ceil(self._options.max_comparisons * parent.share)))
+        most = min(self._options.max_candidates, max(FEWEST, math.ceil(self._options.max_comparisons * parent.share)))
         return self.search.compare(parent.hybrid_map, parent.area, query, parent.notes.compared, excluded, most)
 
     def move(self, parent: Parent, area: int) -> Branches:
