@@ -22,7 +22,7 @@ from benchmark.logs import ROOT
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.local_map import batch, matching
+from hmt_slam_ros.local_map import batch, matching, movers
 from hmt_slam_ros.local_map.local_mapping import LocalMapping
 from hmt_slam_ros.logs import open_log
 from hmt_slam_ros.processes.messages import LocalEstimate
@@ -130,6 +130,9 @@ def _measure_matching(
         "Gauss-Newton, a scan", 1, lambda: matching.align(points, poses[0], prior, view, mapping.alignment)
     )
     figures.timed(
+        "things that moved, a scan", 1, lambda: movers.standing(points, prior, view, mapping.alignment)
+    )
+    figures.timed(
         "likelihood, a point",
         len(points),
         lambda: matching.log_ratio(points, *poses[0].tolist(), view, mapping.model),
@@ -138,8 +141,8 @@ def _measure_matching(
         "proposal, a scan and a particle",
         len(poses),
         lambda: batch.propose_all(
-            points, poses, poses, information, tables, view, mapping.alignment, mapping.model, settings.sharpness,
-            settings.temper,
+            points, points, poses, poses, information, tables, view, mapping.alignment, mapping.model,
+            settings.sharpness, settings.temper,
         ),
     )  # fmt: skip
 

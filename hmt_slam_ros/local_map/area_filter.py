@@ -16,6 +16,7 @@ from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.covariance import inverse, turned
 from hmt_slam_ros.local_map import batch
 from hmt_slam_ros.local_map.local_mapping import LocalMapping
+from hmt_slam_ros.local_map.matching import Prior
 from hmt_slam_ros.local_map.patches import MapView
 from hmt_slam_ros.local_map.tracking import ScanMatcher, Tracked, map_information
 from hmt_slam_ros.random_streams import Purpose, stream
@@ -138,13 +139,15 @@ class AreaFilter:
         """
         settings = self.mapping.configuration
         prior = map_information(self._since_update.covariance, self.pose[2])
+        view, predicted = self._leading_view(), Prior(self._priors[self.leader], prior)
         drawn = batch.propose_all(
             points,
+            self._matcher.still(points, predicted, self._since_update, view),
             self.poses,
             self._priors,
             prior,
             self._tables,
-            self._leading_view(),
+            view,
             self.mapping.alignment,
             self.mapping.model,
             settings.matching.sharpness,

@@ -30,6 +30,7 @@ class Proposals(NamedTuple):
 @njit(cache=True)
 def propose_all(
     points: Float64,
+    still: Float64,
     starts: Float64,
     priors: Float64,
     information: Float64,
@@ -45,7 +46,8 @@ def propose_all(
     Its covariance is that of Gauss-Newton, which asks of each beam only what the surface that it hit can tell. The
     likelihood itself would not do: along a corridor it varies with the cells of the map, and not with the pose.
 
-    :param points: surfels (n, 4).
+    :param points: surfels (n, 4), which all count as evidence.
+    :param still: surfels (k, 4), those of them that are matched.
     :param starts: (m, 3) poses to start matching from; ``priors``: (m, 3) poses that odometry predicts.
     :param tables: (m, T, T), the particles' maps; ``view`` is any view of the same pool.
     :param sharpness: exponent on the likelihood in the proposal.
@@ -57,7 +59,7 @@ def propose_all(
     for i in range(m):
         own = MapView(tables[i], view.odds, view.field, view.cell, view.radius)
         prior = Prior(priors[i], information)
-        modes[i], hessians[i] = align(points, starts[i], prior, own, settings)
+        modes[i], hessians[i] = align(still, starts[i], prior, own, settings)
         covariances[i] = np.linalg.inv(sharpness * hessians[i] + information)
         evidences[i] = evidence(points, modes[i], hessians[i], prior, own, model, temper)
     return Proposals(modes, hessians, covariances, evidences)

@@ -218,12 +218,14 @@ def _smooth_distance(view: MapView, u: float, v: float) -> tuple[float, float, f
 
 
 @njit(cache=True)
-def _linearise(points: Float64, pose: Float64, view: MapView, settings: Alignment) -> tuple[Float64, Float64]:
-    """Normal equations of the surfels (n, 4) at a pose: J' W J (3, 3) and J' W r (3,).
+def linearise(
+    points: Float64, pose: Float64, view: MapView, settings: Alignment
+) -> tuple[Float64, Float64, float]:
+    """Normal equations of the surfels (n, 4) at a pose: J' W J (3, 3) and J' W r (3,); and r' W r.
 
     Distance and gradient of a point on a surface count by what they have in the direction of its normal.
     """
-    hessian, gradient, row = np.zeros((3, 3)), np.zeros(3), np.empty(3)
+    hessian, gradient, square, row = np.zeros((3, 3)), np.zeros(3), 0.0, np.empty(3)
     half = 0.5 * view.table.shape[0] * PATCH - 0.5
     quantum = view.radius / FAR
     cos, sin = np.cos(pose[2]), np.sin(pose[2])
@@ -244,11 +246,12 @@ def _linearise(points: Float64, pose: Float64, view: MapView, settings: Alignmen
             row[0], row[1] = across * normal_x, across * normal_y
             distance *= abs(across)
         row[2] = row[1] * rx - row[0] * ry
+        square += weight * distance * distance
         for i in range(3):
             gradient[i] += weight * distance * row[i]
             for j in range(3):
                 hessian[i, j] += weight * row[i] * row[j]
-    return hessian, gradient
+    return hessian, gradient, square
 
 
 @njit(cache=True)
@@ -269,7 +272,7 @@ def align(
     hessian = np.zeros((3, 3))
     held = settings.inflation * prior.information
     for _ in range(settings.iterations):
-        hessian, gradient = _linearise(points, pose, view, settings)
+        hessian, gradient, _ = linearise(points, pose, view, settings)
         difference = pose - prior.mean
         difference[2] = (difference[2] + np.pi) % (2.0 * np.pi) - np.pi
         step = np.linalg.solve(hessian + held, gradient + held @ difference)

@@ -18,6 +18,7 @@ from hmt_slam_ros.geometry.chi_square import gate
 from hmt_slam_ros.geometry.covariance import inverse, turned
 from hmt_slam_ros.local_map import matching
 from hmt_slam_ros.local_map.local_mapping import LocalMapping
+from hmt_slam_ros.local_map.movers import standing
 from hmt_slam_ros.local_map.patches import MapView
 from hmt_slam_ros.sensing.motion import Prediction, Step
 
@@ -110,7 +111,7 @@ class ScanMatcher:
         step = widened.and_also(prediction.inertia)
         predicted = se2.compose(before, step.increment)
         prior = matching.Prior(predicted, map_information(step.covariance, predicted[2]))
-        return self._refined(points, found.pose, prior, step, view)._replace(contradicted=True)
+        return self._refined(points, points, found.pose, prior, step, view)._replace(contradicted=True)
 
     def _unproven(self, match: Match, inertia: Step) -> Match:
         """Odometry where no scan proves it: its covariance is that of both predictions, each by its probability."""
@@ -135,7 +136,7 @@ class ScanMatcher:
         """The pose under one prior; where that is wide, or the prediction leads to a poor fit, search around it."""
         predicted = se2.compose(before, step.increment)
         prior = matching.Prior(predicted, map_information(step.covariance, predicted[2]))
-        match = self._refined(points, predicted, prior, step, view)
+        match = self._refined(points, self.still(points, prior, step, view), predicted, prior, step, view)
         if not _wide(step) and self._fits(points, match.pose, view):
             return match
         lattice = self._lattice(step, predicted[2])
@@ -143,13 +144,19 @@ class ScanMatcher:
             points[:: max(1, len(points) // _SEARCH_POINTS)], prior, lattice, view, self._mapping.model,
             self._settings.temper, _PEAKS,
         )  # fmt: skip
-        found = [self._refined(points, start, prior, step, view) for start in starts]
+        found = [self._refined(points, points, start, prior, step, view) for start in starts]
         # Relative to unknown space: where nothing fits, the scan shows nothing of the map.
         unmatched = Match(predicted, np.zeros((3, 3)), prior, step, self._log_fault)
         return max([unmatched, match, *found], key=lambda one: one.log_evidence)
 
-    def _refined(self, points: Float64, start: Float64, prior: matching.Prior, step: Step, view: MapView) -> Match:
-        pose, hessian = matching.align(points, start, prior, view, self._mapping.alignment)
+    def still(self, points: Float64, prior: matching.Prior, step: Step, view: MapView) -> Float64:
+        """The points to be matched under a prior from a step: all where it is too wide to tell what moved."""
+        return points if _wide(step) else standing(points, prior, view, self._mapping.alignment)
+
+    def _refined(
+        self, points: Float64, still: Float64, start: Float64, prior: matching.Prior, step: Step, view: MapView
+    ) -> Match:
+        pose, hessian = matching.align(still, start, prior, view, self._mapping.alignment)
         log_evidence = matching.evidence(
             points, pose, hessian, prior, view, self._mapping.model, self._settings.temper
         )

@@ -1,0 +1,78 @@
+"""Movers: what walked on since it entered the map does not draw the robot after it."""
+
+import numpy as np
+import pytest
+from test_local_map_tracking import CORRIDOR, ROOM, mapped, predicted
+from worlds import box, scan_in
+
+from hmt_slam_ros.configuration.tree import Configuration
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.local_map.local_mapping import LocalMapping
+from hmt_slam_ros.local_map.matching import Prior
+from hmt_slam_ros.local_map.movers import standing
+from hmt_slam_ros.sensing.motion import Step, increment_covariance
+
+STEP = np.array([0.12, 0.0, 0.0])
+
+
+@pytest.fixture(scope="module")
+def mapping():
+    return LocalMapping(Configuration())
+
+
+def person(x, y=0.7):
+    return box(x - 0.2, y - 0.2, x + 0.2, y + 0.2)
+
+
+def left_out(mapping, area_filter, walls, truth, error):
+    """How many points of a scan are left out where the prediction is off by ``error`` deviations, and of how many."""
+    deviations = np.array([0.02, 0.02, 0.01])
+    points = mapping.matching_points(scan_in(walls, truth, noise=0.01))
+    prior = Prior(se2.compose(truth, se2.exp(error * deviations)), np.diag(deviations**-2.0))
+    return len(points) - len(standing(points, prior, area_filter._leading_view(), mapping.alignment)), len(points)
+
+
+@pytest.mark.parametrize("pace", [0.2, 0.28, -0.14])
+def test_in_a_corridor_the_robot_goes_where_odometry_leads_and_not_with_a_person(mapping, pace):
+    """Scans and keyframes at 5 Hz, the robot at 0.6 m/s, the person at 0.7 to 1.4 m/s."""
+    area_filter = mapped(mapping, np.concatenate((CORRIDOR, person(3.0))), [(-0.5, 0, 0), (0, 0, 0)], beams=721)
+    step = Step(STEP, increment_covariance(STEP, mapping.configuration.motion))
+    for k in range(1, 17):
+        truth = k * STEP
+        scan = scan_in(np.concatenate((CORRIDOR, person(3.0 + pace * k))), truth, beams=361, noise=0.01, seed=k)
+        points = mapping.matching_points(scan)
+        tracked = area_filter.track(points, predicted(step))
+        assert not tracked.contradicted
+        if k % 4 == 0:
+            area_filter.update(points, k)
+            area_filter.add_keyframe(k, scan)
+        np.testing.assert_allclose(area_filter.pose, truth, atol=0.08)
+
+
+def test_a_person_who_stays_tells_along_a_corridor_how_far_the_robot_went(mapping):
+    area_filter = mapped(mapping, np.concatenate((CORRIDOR, person(2.5))), [(0, 0, 0)], beams=721)
+    assert left_out(mapping, area_filter, np.concatenate((CORRIDOR, person(2.5))), STEP, np.zeros(3))[0] == 0
+
+
+def test_a_person_who_went_on_is_left_out_and_the_walls_are_not(mapping):
+    area_filter = mapped(mapping, np.concatenate((CORRIDOR, person(2.5))), [(0, 0, 0)], beams=721)
+    walls = np.concatenate((CORRIDOR, person(2.75)))
+    count, _ = left_out(mapping, area_filter, walls, STEP, np.zeros(3))
+    seen = mapping.matching_points(scan_in(walls, STEP, noise=0.01))
+    on_person = (np.abs(seen[:, 1]) < 0.95) & (seen[:, 0] < 3.0)
+    assert 0 < count <= on_person.sum() + 1
+
+
+@pytest.mark.parametrize("error", [(4.0, 4.0, 0.0), (-4.0, 4.0, 4.0), (0.0, 0.0, -5.0)])
+def test_what_many_things_say_together_stands_against_odometry(mapping, error):
+    posts = np.concatenate([person(x, y) for x, y in ((3.0, 4.0), (4.0, -2.0), (2.0, -3.0), (1.5, 2.5))])
+    world = np.concatenate((ROOM, posts))
+    area_filter = mapped(mapping, world, [(0, 0, 0)], beams=721)
+    count, total = left_out(mapping, area_filter, world, np.array([0.1, 0.05, 0.02]), np.array(error))
+    assert count < 0.1 * total
+
+
+def test_a_scan_without_points_has_nothing_to_leave_out(mapping):
+    area_filter = mapped(mapping, ROOM, [(0, 0, 0)])
+    prior = Prior(np.zeros(3), np.eye(3))
+    assert standing(np.empty((0, 4)), prior, area_filter._leading_view(), mapping.alignment).shape == (0, 4)
