@@ -62,3 +62,30 @@ def test_a_hypothesis_knows_its_own_areas_and_the_common_ones():
     child.place(1, 3, np.zeros(3))
     assert [child.has_area(area) for area in (1, 2, 3)] == [False, True, True]
     assert not hybrid_map.has_area(3)
+
+
+def test_an_arc_that_is_taken_out_leaves_the_others_as_they_are(star):
+    for area in (39, 0, 17):
+        star.remove_arc((area, 40))
+    star.remove_arc((0, 40))
+    assert sorted(star.neighbours(40)) == [area for area in range(40) if area not in (0, 17, 39)]
+    assert star.neighbours(0) == []
+    assert sorted(star.neighbours(3)) == [4, 40]
+    star.set_arc((17, 40), arc(5.0))
+    star.set_arc((0, 1), arc(6.0))
+    assert star.neighbours(17) == [40]
+    assert sorted(star.neighbours(1)) == [0, 40]
+
+
+def test_a_hypothesis_may_lack_a_common_arc_until_all_do(star):
+    whole = HybridMap(star)
+    hybrid_map = whole.branch()
+    hybrid_map.remove_arc(40, 7)
+    assert hybrid_map.arc(7, 40) is None
+    assert 7 not in hybrid_map.neighbours(40)
+    assert (7, 40) not in [(a, b) for a, b, _ in hybrid_map.all_arcs()]
+    assert 7 in whole.neighbours(40)
+    hybrid_map.absorb()
+    assert 7 not in whole.neighbours(40)
+    hybrid_map.set_arc(40, 7, arc(2.0).pose, closure=True)
+    assert 7 in hybrid_map.neighbours(40)

@@ -140,3 +140,24 @@ def test_a_hypothesis_sees_its_own_arcs_and_the_common_ones():
     assert list(reachable(child, 0)) == [0, 1, 2]
     assert list(reachable(hybrid_map, 0)) == [0, 1]
     np.testing.assert_allclose(reachable(child, 2)[0].mean, se2.inverse([2.0, 0.0, 0.0]), atol=1e-12)
+
+
+def test_an_arc_that_a_hypothesis_lacks_is_not_followed():
+    hybrid_map = chain(*[arc(1.0, 0.1 * a, 0.3, 0.1 + 0.01 * a) for a in range(6)])
+    hybrid_map.set_arc(0, 4, arc(2.0, 1.0, 0.2, 0.01), closure=True)
+    hybrid_map.set_arc(4, 6, arc(1.0, -1.0, 0.4, 0.01), closure=True)
+    alone = HybridMap()
+    for a, b, value in hybrid_map.all_arcs():
+        if (a, b) not in ((0, 4), (2, 3)):
+            alone.set_arc(a, b, value.pose, closure=value.closure)
+    hybrid_map.absorb()
+    hypothesis = hybrid_map.branch()
+    hypothesis.remove_arc(0, 4)
+    hypothesis.remove_arc(3, 2)
+    for start in range(7):
+        found, wanted = reachable(hypothesis, start), reachable(alone, start)
+        assert list(found) == list(wanted)
+        for area, belief in wanted.items():
+            np.testing.assert_array_equal(found[area].covariance, belief.covariance)
+    hypothesis.absorb()
+    assert list(reachable(hypothesis, 0)) == [0, 1, 2]

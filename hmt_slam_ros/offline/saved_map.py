@@ -26,7 +26,7 @@ from hmt_slam_ros.sensing import Scan
 from hmt_slam_ros.topology.common_map import ArcValue
 from hmt_slam_ros.topology.hybrid_map import HybridMap
 
-FORMAT, VERSION = "hmt_map", 2
+FORMAT, VERSION = "hmt_map", 3
 MANIFEST = "manifest.json"
 
 # Columns of scans/geometry.npy after which the laser's pose (x, y, theta) follows.
@@ -62,7 +62,8 @@ def write_saved_map(directory: Path, recording: Recording, configuration: Config
                 "robot_area": replica.areas[hypothesis],
                 "probability": replica.probabilities[hypothesis],
             }
-            | _map_content(hybrid_map.areas, hybrid_map.arcs)
+            | _map_content(hybrid_map.areas, {pair: arc for pair, arc in hybrid_map.arcs.items() if arc is not None})
+            | {"withdrawn": sorted([a, b] for (a, b), arc in hybrid_map.arcs.items() if arc is None)}
             for hypothesis, hybrid_map in sorted(replica.maps.items())
         ],
     )
@@ -201,7 +202,9 @@ def _read_replica(directory: Path) -> Replica:
     common.absorb()
     replica = Replica(_read_scans(directory / "scans"), {}, {}, {})
     for entry in read_json(directory / "hypotheses.json"):
-        replica.maps[entry["id"]] = _read_map(entry, HybridMap(common.common))
+        hybrid_map = replica.maps[entry["id"]] = _read_map(entry, HybridMap(common.common))
+        for a, b in entry["withdrawn"]:
+            hybrid_map.remove_arc(a, b)
         replica.probabilities[entry["id"]] = entry["probability"]
         replica.areas[entry["id"]] = entry["robot_area"]
     return replica

@@ -62,6 +62,7 @@ class CommonMap:
         self.arcs: dict[Pair, ArcValue] = {}
         self.largest = _NONE
         self._row: dict[Pair, int] = {}
+        self._rows = 0
         self._extents = np.zeros(_FIRST_ROOM)
         self._table = _empty_table(_FIRST_ROOM)
 
@@ -95,7 +96,8 @@ class CommonMap:
 
     def _link(self, pair: Pair) -> None:
         """Give a new arc a row, and its sides a place among those of its areas."""
-        row = self._row[pair] = len(self._row)
+        row = self._row[pair] = self._rows
+        self._rows += 1
         table = self._table
         if row >= len(table.means):
             table = self._table = ArcTable(
@@ -105,6 +107,21 @@ class CommonMap:
         for side, (area, other) in enumerate((pair, pair[::-1]), 2 * row):
             table.beyond[side], table.following[side] = other, table.first[area]
             table.first[area] = side
+
+    def remove_arc(self, pair: Pair) -> None:
+        """Take an arc out, if it is there; its row in the table is not used again."""
+        if self.arcs.pop(pair, None) is None:
+            return
+        row = self._row.pop(pair)
+        first, following = self._table.first, self._table.following
+        for side, area in enumerate(pair, 2 * row):
+            if first[area] == side:
+                first[area] = following[side]
+                continue
+            before = int(first[area])
+            while following[before] != side:
+                before = int(following[before])
+            following[before] = following[side]
 
     def neighbours(self, area: int) -> list[int]:
         """The areas one arc away, in no order."""

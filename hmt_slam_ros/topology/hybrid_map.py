@@ -26,12 +26,12 @@ class HybridMap:
 
     :ivar common: what every live hypothesis agrees on.
     :ivar areas: the areas in which this hypothesis differs from the common map, with all their keyframes.
-    :ivar arcs: likewise the arcs, keyed by (smaller area, larger area).
+    :ivar arcs: likewise the arcs, keyed by (smaller area, larger area); None for one that this hypothesis lacks.
     """
 
     common: CommonMap = field(default_factory=CommonMap)
     areas: dict[int, dict[int, NDArray[np.float64]]] = field(default_factory=dict)
-    arcs: dict[tuple[int, int], ArcValue] = field(default_factory=dict)
+    arcs: dict[tuple[int, int], ArcValue | None] = field(default_factory=dict)
 
     def branch(self) -> HybridMap:
         """A child that may change without its parent noticing."""
@@ -42,7 +42,10 @@ class HybridMap:
         for area, keyframes in self.areas.items():
             self.common.set_area(area, keyframes)
         for pair, arc in self.arcs.items():
-            self.common.set_arc(pair, arc)
+            if arc is None:
+                self.common.remove_arc(pair)
+            else:
+                self.common.set_arc(pair, arc)
         self.areas, self.arcs = {}, {}
 
     def area_ids(self) -> list[int]:
@@ -98,21 +101,22 @@ class HybridMap:
     def arc_value(self, a: int, b: int) -> ArcValue | None:
         """The arc as stored, from the smaller to the larger area, or None."""
         key = _stored_direction(a, b)
-        own = self.arcs.get(key)
-        return self.common.arcs.get(key) if own is None else own
+        return self.arcs[key] if key in self.arcs else self.common.arcs.get(key)
 
     def set_arc(self, a: int, b: int, pose: PoseGaussian, *, closure: bool) -> None:
         """Set or replace the arc between a and b from the belief over ``a_T_b``."""
         self.arcs[_stored_direction(a, b)] = ArcValue(pose if a < b else pose.inverse(), closure)
 
+    def remove_arc(self, a: int, b: int) -> None:
+        """Take the arc between a and b out, if there is one."""
+        self.arcs[_stored_direction(a, b)] = None
+
     def neighbours(self, area: int) -> list[int]:
         """The areas one arc away, ascending."""
         found = set(self.common.neighbours(area))
-        for a, b in self.arcs:
-            if a == area:
-                found.add(b)
-            elif b == area:
-                found.add(a)
+        for (a, b), arc in self.arcs.items():
+            if area in (a, b):
+                (found.discard if arc is None else found.add)(b if a == area else a)
         return sorted(found)
 
     def all_arcs(self) -> Iterator[tuple[int, int, ArcValue]]:
@@ -120,5 +124,5 @@ class HybridMap:
         keys = self.common.arcs.keys() | self.arcs.keys()
         for a, b in sorted(keys):
             value = self.arc_value(a, b)
-            assert value is not None
-            yield a, b, value
+            if value is not None:
+                yield a, b, value

@@ -31,11 +31,12 @@ class Reached(NamedTuple):
 
 
 class _OwnArcs(NamedTuple):
-    """Arcs of a hypothesis, each once from either side, sorted by the areas where they begin.
+    """Arcs in which a hypothesis differs, each once from either side, sorted by the areas where they begin.
 
     :ivar begin: shape (sides,), areas.
     :ivar end: shape (sides,), areas.
     :ivar backwards: shape (sides,), whether the arc is stored from ``end`` to ``begin``.
+    :ivar gone: shape (sides,), whether the hypothesis lacks the arc that is common.
     :ivar means: shape (sides, 3), as stored.
     :ivar covariances: shape (sides, 3, 3), as stored.
     """
@@ -43,6 +44,7 @@ class _OwnArcs(NamedTuple):
     begin: Int64
     end: Int64
     backwards: Bool
+    gone: Bool
     means: Float64
     covariances: Float64
 
@@ -87,13 +89,14 @@ def reached(
 
 def _own_arcs(hybrid_map: HybridMap) -> _OwnArcs:
     pairs = np.array(list(hybrid_map.arcs), dtype=np.int64).reshape(-1, 2)
-    poses = [arc.pose for arc in hybrid_map.arcs.values()]
-    means = np.array([pose.mean for pose in poses]).reshape(-1, 3)
-    covariances = np.array([pose.covariance for pose in poses]).reshape(-1, 3, 3)
+    arcs = list(hybrid_map.arcs.values())
+    gone = np.array([arc is None for arc in arcs], dtype=np.bool_)
+    means = np.array([np.zeros(3) if arc is None else arc.pose.mean for arc in arcs]).reshape(-1, 3)
+    covariances = np.array([np.zeros((3, 3)) if arc is None else arc.pose.covariance for arc in arcs]).reshape(-1, 3, 3)
     begin, end = np.concatenate((pairs, pairs[:, ::-1])).T
     order = np.lexsort((end, begin))
     row = order % max(1, len(pairs))
-    return _OwnArcs(begin[order], end[order], order >= len(pairs), means[row], covariances[row])
+    return _OwnArcs(begin[order], end[order], order >= len(pairs), gone[row], means[row], covariances[row])
 
 
 class _Frontier(NamedTuple):
@@ -133,9 +136,10 @@ def _search(
             break
         low, high = np.searchsorted(own.begin, here), np.searchsorted(own.begin, here, side="right")
         for k in range(low, high):
-            last = _step(
-                row, own.end[k], own.means[k], own.covariances[k], own.backwards[k], cost, limit, seen, last, queue
-            )
+            if not own.gone[k]:
+                last = _step(
+                    row, own.end[k], own.means[k], own.covariances[k], own.backwards[k], cost, limit, seen, last, queue
+                )
         side = np.int64(table.first[here]) if here < len(table.first) else np.int64(-1)
         while side >= 0:
             there, arc = np.int64(table.beyond[side]), side // 2
