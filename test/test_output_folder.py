@@ -17,10 +17,11 @@ from hmt_slam_ros.offline.map_image import read_map
 from hmt_slam_ros.offline.output_folder import replacing, write_output
 from hmt_slam_ros.offline.recorder import Recorder
 from hmt_slam_ros.offline.report import RunFigures, read_table
-from hmt_slam_ros.offline.saved_map import read_saved_map
+from hmt_slam_ros.offline.saved_map import read_saved_map, write_saved_map
 from hmt_slam_ros.processes.messages import (
     Accepted,
     Arc,
+    ArcEnds,
     AreaPose,
     Finished,
     Hypotheses,
@@ -311,6 +312,19 @@ def test_the_saved_map_keeps_every_live_hypothesis(tmp_path: Path) -> None:
     assert saved.replica.probabilities == {1: 0.6, 2: 0.4}
     assert {h: m.area_ids() for h, m in saved.replica.maps.items()} == {1: [0, 1], 2: [0]}
     assert saved.replica.areas == {1: 1, 2: 0}
+
+
+def test_the_saved_map_keeps_that_a_hypothesis_lacks_an_arc(tmp_path: Path) -> None:
+    recorder = recorded()
+    for k in range(VERDICT, SCANS // EVERY):
+        withdrawn = (ArcEnds(0, 1),) if k == VERDICT else ()
+        recorder.hypotheses[k] = Hypotheses(k, (Leaf(1, 1, 0.6, 1, withdrawn=withdrawn), Leaf(2, 2, 0.4, 0)))
+        recorder.accepted[k] = Accepted(k)
+    recording = recorder.finish(STAMPS)
+    write_saved_map(tmp_path / "hmt_map", recording, recorder.configuration)
+    saved = read_saved_map(tmp_path / "hmt_map")
+    assert list(saved.replica.maps[1].arcs) == [(0, 1)]
+    assert saved.replica.maps[1].arc(0, 1) is None
 
 
 @pytest.mark.parametrize("name", ["manifest.json", "common.json", "global.json", "scans/ranges.npy"])

@@ -398,3 +398,53 @@ def test_a_single_hypothesis_is_accepted_whatever_was_not_examined(unexamined):
     play = Play()
     play.start()
     assert play.step(new_area(0, 0, 1.0 - unexamined, 1, [4.0, 0.0, 0.0])).hypothesis == 0
+
+
+STRETCH = [4.0, 0.0, 0.0]
+
+
+def two_loops(play, false_closure):
+    """Areas 0 to 4 along a way, two loops closed from the last, after a false one from area 2 or without."""
+    play.start()
+    for area in (1, 2):
+        play.step(new_area(0, 0, 1.0, area, STRETCH, source=area - 1))
+    if false_closure:
+        found = belief([-8.0 + 0.35, 0.0, 0.0], 0.01 * SPREAD)
+        assert play.step(Leaf(0, 0, 1.0, 2, None, (), (Arc(2, 0, found, True),))).hypothesis == 0
+    for area in (3, 4):
+        play.step(new_area(0, 0, 1.0, area, STRETCH, source=area - 1))
+    true = Arc(4, 0, belief([-16.0, 0.0, 0.0], 0.01 * SPREAD), True)
+    other = Arc(4, 2, belief([-8.0, 0.0, 0.0], 0.01 * SPREAD), True)
+    play.step(Leaf(0, 0, 1.0, 4, None, (), (true,)))
+    return play.step(Leaf(0, 0, 1.0, 4, None, (), (other,)))
+
+
+def test_a_contradiction_is_told_to_tsbi_and_the_map_is_not_bent_by_it():
+    play = Play(arc_sigma_floor=1e-4, arc_angle_floor=1e-3)
+    before = two_loops(play, false_closure=True)
+    assert before.hypothesis == 0
+    assert before.global_poses == ()
+    best = before.reopened[0]
+    assert [(ends.source, ends.target) for ends in best.withdrawn] == [(0, 2)]
+    assert "of all closures 2-0 is taken for false" in play.notices[-1].text
+    verdict = play.step(replace(best, probability=1.0))
+    assert verdict.hypothesis == 0
+    assert verdict.reopened == ()
+    assert play.arc(0, 2) is None
+    truth = Play(arc_sigma_floor=1e-4, arc_angle_floor=1e-3)
+    last = two_loops(truth, false_closure=False)
+    assert last.reopened == ()
+    for area, pose in poses_of(last).items():
+        np.testing.assert_allclose(poses_of(verdict)[area].mean, pose.mean, atol=1e-6)
+        np.testing.assert_allclose(poses_of(verdict)[area].covariance, pose.covariance, atol=1e-8)
+
+
+def test_a_question_that_is_open_again_is_closed_as_any_other():
+    play = Play(arc_sigma_floor=1e-4, arc_angle_floor=1e-3, accept_distance=0.0, accept_probability=0.98)
+    best, second, *_ = two_loops(play, false_closure=True).reopened
+    assert [(ends.source, ends.target) for ends in second.withdrawn] == [(0, 4)]
+    leaves = replace(best, hypothesis=1, probability=0.99), replace(second, hypothesis=2, probability=0.01)
+    assert play.step(*leaves).hypothesis is None
+    both = Leaf(1, 1, 0.99, 4), Leaf(2, 2, 0.01, 4)
+    assert [play.step(*both).hypothesis for _ in range(2)] == [None, 1]
+    assert play.arc(0, 2, 1) is None

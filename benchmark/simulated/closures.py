@@ -115,6 +115,8 @@ def closing(leaf: Leaf, before: HybridMap, examination: Examination | None) -> I
 
     They close a loop that its parent had not closed, or are measured anew by keyframes that TSBI found in the area.
     """
+    if leaf.withdrawn:
+        return  # a question that TLCA opened again: nothing was observed
     found = examination is not None and bool(leaf.relabelled) and leaf.area in before.area_ids()
     for arc in leaf.arcs:
         value = before.arc_value(arc.source, arc.target)

@@ -282,6 +282,13 @@ class LoopClosureAcceptance:
         low=0.0,
         high=1000.0,
     )
+    contradiction_probability: float = parameter(
+        0.999,
+        "Share of true closures that fit the rest of the map by the chi-square test of their cycles (3 degrees of "
+        "freedom); one that does not opens the question again which of them is false.",
+        low=0.5,
+        high=0.999999,
+    )
     arc_sigma_floor: float = parameter(
         0.01, "Smallest deviation of an arc's translation.", unit="m", low=1e-4, high=1.0
     )

@@ -252,7 +252,7 @@ def _replay(
 
 def _size(replica: Replica, leaf: Leaf, sizes: dict[int, tuple[int, int]]) -> tuple[int, int]:
     """Areas and loop closures of a leaf, counted anew only where the leaf changed."""
-    if leaf.hypothesis in sizes and not leaf.arcs and not leaf.relabelled:
+    if leaf.hypothesis in sizes and not (leaf.arcs or leaf.relabelled or leaf.withdrawn):
         return sizes[leaf.hypothesis]
     hybrid_map = replica.maps[leaf.hypothesis]
     return len(hybrid_map.area_ids()), sum(arc.closure for _, _, arc in hybrid_map.all_arcs())

@@ -114,8 +114,8 @@ class RobotStatus:
 _DOCUMENTS: dict[type, tuple[str, int]] = {
     KeyframeHead: ("keyframe", 2),
     AreaEvents: ("area_events", 1),
-    Hypotheses: ("hypotheses", 1),
-    Accepted: ("accepted", 1),
+    Hypotheses: ("hypotheses", 2),
+    Accepted: ("accepted", 2),
     LocalEstimate: ("local_estimate", 1),
     Notice: ("notice", 1),
     Closing: ("finished", 1),

@@ -158,10 +158,11 @@ class LiveHypothesis:
 
         :param content: the keyframes of the areas that it names, in the frame of the robot's area.
         """
+        entered = leaf.area != self.filter.area
         area_T_previous = np.zeros(3) if leaf.rebase is None else leaf.rebase.mean
         self.filter.change_area(leaf.area, area_T_previous, content)
         self.event_pose = se2.compose(area_T_previous, self.event_pose)
-        if leaf.rebase is not None:
+        if entered:
             moved = {relabelled.keyframe for relabelled in leaf.relabelled}
             self.fresh = {keyframe: step for keyframe, step in self.fresh.items() if keyframe in moved}
             self.drift = self._drift_from_reference()

@@ -116,6 +116,14 @@ class Arc:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
+class ArcEnds:
+    """Two areas between which an arc is taken out; ``source`` is the smaller."""
+
+    source: int
+    target: int
+
+
+@dataclass(frozen=True, eq=False, slots=True)
 class LocalArea:
     """An area that the local map must hold: ``pose`` = ``current_T_area``, shape (3,)."""
 
@@ -137,6 +145,7 @@ class Leaf:
     :ivar relabelled: keyframes that change area.
     :ivar arcs: arcs that are new or replaced.
     :ivar local: the areas of the local map, the current one first; empty where the local map stays as it is.
+    :ivar withdrawn: arcs that this hypothesis does not believe any more.
     """
 
     hypothesis: int
@@ -147,6 +156,7 @@ class Leaf:
     relabelled: tuple[Relabelled, ...] = ()
     arcs: tuple[Arc, ...] = ()
     local: tuple[LocalArea, ...] = ()
+    withdrawn: tuple[ArcEnds, ...] = ()
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -182,6 +192,9 @@ class Accepted:
     :ivar relabelled: keyframes of that hypothesis whose pose in their area was refined.
     :ivar global_poses: ``map_T_area`` of all areas of the most probable hypothesis, ordered by id; empty where
         unchanged since the last message.
+    :ivar reopened: where accepted closures contradict each other, the explanations of that, the most probable first:
+        the children into which TSBI branches the hypothesis at the next event, with ids of its own and their local
+        maps. Each child withdraws what its explanation takes for false. Else empty.
     """
 
     sequence: int
@@ -189,6 +202,7 @@ class Accepted:
     arcs: tuple[Arc, ...] = ()
     relabelled: tuple[Relabelled, ...] = ()
     global_poses: tuple[AreaPose, ...] = ()
+    reopened: tuple[Leaf, ...] = ()
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from hmt_slam_ros.processes.messages import Accepted, Arc, Hypotheses, Keyframe, Leaf, Relabelled
+from hmt_slam_ros.processes.messages import Accepted, Arc, ArcEnds, Hypotheses, Keyframe, Leaf, Relabelled
 from hmt_slam_ros.sensing import Scan
 from hmt_slam_ros.topology.hybrid_map import HybridMap
 
@@ -36,7 +36,7 @@ class Replica:
         """Store a keyframe in the maps of the hypotheses that want it."""
         for leaf in keyframe.leaves:
             if leaf.hypothesis in self.maps:
-                self.change(self.maps[leaf.hypothesis], leaf.revised, ())
+                self.change(self.maps[leaf.hypothesis], leaf.revised)
             if leaf.stored and leaf.hypothesis in self.maps:
                 self.maps[leaf.hypothesis].place(keyframe.sequence, leaf.area, leaf.pose.mean)
                 self.scans[keyframe.sequence] = keyframe.scan
@@ -50,7 +50,7 @@ class Replica:
     def _child(self, leaf: Leaf) -> HybridMap:
         parent = self.maps[leaf.parent]
         child = parent if leaf.hypothesis == leaf.parent else parent.branch()
-        self.change(child, leaf.relabelled, leaf.arcs)
+        self.change(child, leaf.relabelled, leaf.arcs, leaf.withdrawn)
         return child
 
     def accept(self, accepted: Accepted) -> None:
@@ -65,11 +65,18 @@ class Replica:
         self.areas = {accepted.hypothesis: self.areas[accepted.hypothesis]}
 
     @staticmethod
-    def change(hybrid_map: HybridMap, relabelled: tuple[Relabelled, ...], arcs: tuple[Arc, ...]) -> None:
-        """Move keyframes and set arcs, as a message says."""
+    def change(
+        hybrid_map: HybridMap,
+        relabelled: tuple[Relabelled, ...],
+        arcs: tuple[Arc, ...] = (),
+        withdrawn: tuple[ArcEnds, ...] = (),
+    ) -> None:
+        """Move keyframes, take arcs out and set arcs, as a message says."""
         for r in relabelled:
             if r.source != r.area:
                 hybrid_map.remove(r.keyframe, r.source)
             hybrid_map.place(r.keyframe, r.area, r.pose)
+        for ends in withdrawn:
+            hybrid_map.remove_arc(ends.source, ends.target)
         for arc in arcs:
             hybrid_map.set_arc(arc.source, arc.target, arc.pose, closure=arc.closure)

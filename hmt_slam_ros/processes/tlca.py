@@ -12,6 +12,7 @@ from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.chi_square import gate
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.processes.closure_account import Account, Closure, History, Name, Step
 from hmt_slam_ros.processes.messages import (
     Accepted,
     Arc,
@@ -23,41 +24,19 @@ from hmt_slam_ros.processes.messages import (
     Notice,
     Relabelled,
 )
+from hmt_slam_ros.processes.observation import Observation, observed
+from hmt_slam_ros.processes.reopening import Question, Reopening
 from hmt_slam_ros.processes.replica import FIRST_HYPOTHESIS, Replica
+from hmt_slam_ros.processes.undo import Undo
 from hmt_slam_ros.refinement.closure import ClosureRefinement
 from hmt_slam_ros.topology.arc_fusion import floored, fused
+from hmt_slam_ros.topology.common_map import ArcValue, Pair
 from hmt_slam_ros.topology.fine_alignment import FineAlignment
 from hmt_slam_ros.topology.global_map import consistent_map, shortest_path_map
 from hmt_slam_ros.topology.hybrid_map import HybridMap
 
-Pair = tuple[int, int]
-
-
-@dataclass(frozen=True, eq=False)
-class _Observation:
-    """An arc that TSBI set and that is not definite yet.
-
-    :ivar source: area a.
-    :ivar target: area b, the one that the robot entered.
-    :ivar pose: belief over ``a_T_b`` as observed.
-    :ivar closure: whether it closed a loop.
-    :ivar before: the definite arc ``a_T_b`` that it replaced, or None.
-    :ivar joined: the keyframes that moved into area b.
-    :ivar witnesses: the keyframes by which it was observed.
-    """
-
-    source: int
-    target: int
-    pose: PoseGaussian
-    closure: bool
-    before: Arc | None
-    joined: tuple[int, ...]
-    witnesses: frozenset[int]
-
-    @property
-    def pair(self) -> Pair:
-        """The arc, whatever its direction."""
-        return min(self.source, self.target), max(self.source, self.target)
+# Closures are never taken for more certain than this, whatever tlca.accept_probability is.
+_LEAST_DOUBT = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,14 +49,18 @@ class _Path:
     :ivar definite: whether nothing happened since it was accepted.
     :ivar observations: arcs that wait for acceptance, in order.
     :ivar witnesses: {arc: the keyframes by which it was observed}, of the definite arcs.
+    :ivar history: where the robot was.
+    :ivar closures: those that were accepted, in order.
     """
 
     version: int = 0
     parted: float = 0.0
     held: int = 0
     definite: bool = False
-    observations: tuple[_Observation, ...] = ()
+    observations: tuple[Observation, ...] = ()
     witnesses: dict[Pair, frozenset[int]] = field(default_factory=dict)
+    history: History = None
+    closures: tuple[Closure, ...] = ()
 
 
 class Tlca:
@@ -85,7 +68,8 @@ class Tlca:
 
     A path is accepted when it has dominated for some keyframes and metres since it parted from the last other one, and
     at once when no other is left. Then the others are dropped, the areas that it joined are finely aligned, and arcs
-    that were travelled before are fused with what was known of them.
+    that were travelled before are fused with what was known of them. Where accepted closures contradict each other,
+    TSBI is asked anew instead.
     """
 
     def __init__(self, configuration: Configuration) -> None:
@@ -95,16 +79,22 @@ class Tlca:
         self._replica = Replica()
         self._paths = {FIRST_HYPOTHESIS: _Path()}
         self._travelled = 0.0
+        self._poses = {FIRST_HYPOTHESIS: np.zeros(3)}
         self._changes = 0
         self._published = -1
         self._gate = gate(configuration.tsbi.gate_probability)
         self._doubted: set[Pair] = set()
+        self._reopening = Reopening(self._options)
+        # The stated risk: beyond it, TSBI's probabilities are not taken at their word.
+        self._least_doubt = max(1.0 - self._options.accept_probability, _LEAST_DOUBT)
+        self._accepted_now: frozenset[Name] = frozenset()
 
     def handle(self, message: Message) -> list[Message]:
         """Learn from a ``Keyframe``; answer ``Hypotheses``."""
         if isinstance(message, Keyframe):
             self._replica.add(message)
             self._travelled = message.travelled
+            self._poses |= {leaf.hypothesis: leaf.pose.mean for leaf in message.leaves}
         elif isinstance(message, Hypotheses):
             return self._judge(message)
         return []
@@ -115,41 +105,49 @@ class Tlca:
 
     def _judge(self, hypotheses: Hypotheses) -> list[Message]:
         paths = {leaf.hypothesis: self._followed(leaf, hypotheses.sequence) for leaf in hypotheses.leaves}
+        self._poses = {leaf.hypothesis: _rebased(self._poses[leaf.parent], leaf) for leaf in hypotheses.leaves}
         self._replica.apply(hypotheses)
-        self._paths = paths
+        self._paths, self._accepted_now = paths, frozenset()
         chosen = self._dominant()
         arcs, relabelled = ((), ()) if chosen is None else self._refined(chosen)
         accepted = Accepted(hypotheses.sequence, chosen, arcs, relabelled)
         self._replica.accept(accepted)
         self._paths = {hypothesis: self._paths[hypothesis] for hypothesis in self._replica.maps}
+        question = None if chosen is None else self._contradicted(chosen, hypotheses.sequence)
+        if question is not None:
+            # No pose is told: the map is not bent to what does not fit.
+            return [question.notice, replace(accepted, reopened=question.leaves)]
         poses, notices = self._global_poses()
         return [*notices, replace(accepted, global_poses=poses)]
 
+    def _contradicted(self, hypothesis: int, event: int) -> Question | None:
+        """The contradiction that the closures bring that have just been accepted, if any."""
+        path, area = self._paths[hypothesis], self._replica.areas[hypothesis]
+        account = Account(self._replica.maps[hypothesis], path.history, path.closures, area, self._poses[hypothesis])
+        return self._reopening.asked(event, account, self._accepted_now, hypothesis)
+
     def _followed(self, leaf: Leaf, sequence: int) -> _Path:
         """The path after TSBI's answer, which is not applied yet: the arcs that it replaces are still there."""
-        path = self._paths[leaf.parent]
+        path, before = self._paths[leaf.parent], self._replica.areas[leaf.parent]
         if leaf.hypothesis != leaf.parent:
             path = replace(path, parted=self._travelled, held=0)
         dominates = leaf.probability >= self._options.accept_probability
         path = replace(path, held=path.held + 1 if dominates else 0)
-        if leaf.arcs or leaf.relabelled:
+        if leaf.arcs or leaf.relabelled or leaf.withdrawn:
             self._changes += 1
             path = replace(path, version=self._changes, definite=False)
         elif leaf.rebase:
             path = replace(path, definite=False)
-        observations = tuple(self._observed(arc, leaf, sequence) for arc in leaf.arcs)
+        account = self._reopening.followed(leaf, sequence)
+        if account is not None:
+            return replace(path, definite=False, history=account.history, closures=account.closures)
+        parent = self._replica.maps[leaf.parent]
+        observations = tuple(observed(arc, leaf, sequence, before, parent) for arc in leaf.arcs)
+        new = tuple(seen.pair for seen in observations if seen.before is None)
+        if new or leaf.area != before:
+            joined = frozenset(r.keyframe for r in leaf.relabelled if r.area == leaf.area)
+            path = replace(path, history=(path.history, Step(sequence, before, leaf.area, new, joined)))
         return replace(path, observations=path.observations + observations)
-
-    def _observed(self, arc: Arc, leaf: Leaf, sequence: int) -> _Observation:
-        inwards = arc.target == leaf.area
-        source, target, pose = (
-            (arc.source, arc.target, arc.pose) if inwards else (arc.target, arc.source, arc.pose.inverse())
-        )
-        hybrid_map = self._replica.maps[leaf.parent]
-        value, before = hybrid_map.arc_value(source, target), hybrid_map.arc(source, target)
-        old = None if value is None or before is None else Arc(source, target, before, value.closure)
-        joined = tuple(sorted(r.keyframe for r in leaf.relabelled if r.area == target))
-        return _Observation(source, target, pose, arc.closure, old, joined, frozenset(joined or [sequence]))
 
     def _dominant(self) -> int | None:
         """The hypothesis that becomes definite now, if any."""
@@ -165,6 +163,11 @@ class Tlca:
         path, hybrid_map = self._paths[hypothesis], self._replica.maps[hypothesis]
         arcs: dict[Pair, Arc] = {}
         relabelled: list[Relabelled] = []
+        found = [seen.pair for seen in path.observations if seen.closure]
+        found += [closure.pair for closure in path.closures if closure.undo is None]
+        closed = {area for pair in found for area in pair}
+        poses = {k: (area, pose) for area in sorted(closed) for k, pose in hybrid_map.keyframes(area).items()}
+        values: dict[Pair, ArcValue] = {}
         witnesses = dict(path.witnesses)
         for seen in path.observations:
             aligned, moved = self._aligned(hybrid_map, seen)
@@ -172,40 +175,56 @@ class Tlca:
             old = arcs.get(seen.pair, seen.before)
             arcs[seen.pair] = self._fused(aligned, old, witnesses.get(seen.pair, frozenset()))
             witnesses[seen.pair] = witnesses.get(seen.pair, frozenset()) | seen.witnesses
-        closed = {area for seen in path.observations if seen.closure for area in seen.pair}
         if closed:
-            relabelled = self._refined_around(hybrid_map, closed, arcs, relabelled)
+            relabelled, values = self._refined_around(hybrid_map, closed, arcs, relabelled)
         if arcs:
             self._changes += 1
         version = self._changes if arcs else path.version
-        self._paths[hypothesis] = replace(path, version=version, definite=True, observations=(), witnesses=witnesses)
+        closures = self._closures(path, self._replica.probabilities[hypothesis], Undo(poses, values))
+        self._paths[hypothesis] = replace(
+            path, version=version, definite=True, observations=(), witnesses=witnesses, closures=closures
+        )
         return tuple(arcs.values()), tuple(relabelled)
+
+    def _closures(self, path: _Path, probability: float, undo: Undo) -> tuple[Closure, ...]:
+        """Those of a path that is now accepted; what was observed again since is not to be undone."""
+        again = {seen.pair for seen in path.observations if seen.before is not None}
+        closures = {c.pair: replace(c, undo=undo) if c.undo is None else c.but_for(again) for c in path.closures}
+        doubt = min(max(1.0 - probability, self._least_doubt), 0.5)
+        for seen in path.observations:
+            if seen.closure and seen.pair not in closures:
+                closures[seen.pair] = seen.accepted(math.log((1.0 - doubt) / doubt), undo)
+        self._accepted_now = frozenset(c.name for c in list(closures.values())[len(path.closures) :])
+        return tuple(closures.values())
 
     def _refined_around(
         self, hybrid_map: HybridMap, closed: set[int], arcs: dict[Pair, Arc], relabelled: list[Relabelled]
-    ) -> list[Relabelled]:
-        """Refine the areas that closures joined; the arcs around them follow, with the covariances they have."""
+    ) -> tuple[list[Relabelled], dict[Pair, ArcValue]]:
+        """Refine the areas that closures joined; the arcs around them follow, with the covariances they have.
+
+        Returns the keyframes that moved, and the arcs as they were before.
+        """
         for arc in arcs.values():
             hybrid_map.set_arc(arc.source, arc.target, arc.pose, closure=arc.closure)
         found = self._refinement.refined(hybrid_map, self._replica.scans, closed)
-        for (a, b), pose in found.arcs.items():
-            value = hybrid_map.arc_value(a, b)
-            assert value is not None
+        before = {(a, b): value for a, b, value in hybrid_map.all_arcs() if (a, b) in found.arcs}
+        for (a, b), value in before.items():
+            pose = found.arcs[a, b]
             arcs[a, b] = Arc(a, b, PoseGaussian(pose, value.pose.covariance), value.closure)
         moved = {
             keyframe: Relabelled(keyframe, area, area, pose)
             for area, keyframes in found.keyframes.items()
             for keyframe, pose in keyframes.items()
         }
-        return list(({r.keyframe: r for r in relabelled} | moved).values())
+        return list(({r.keyframe: r for r in relabelled} | moved).values()), before
 
-    def _aligned(self, hybrid_map: HybridMap, seen: _Observation) -> tuple[_Observation, list[Relabelled]]:
+    def _aligned(self, hybrid_map: HybridMap, seen: Observation) -> tuple[Observation, list[Relabelled]]:
         """A closure that was found by matching areas, finely aligned."""
         if not seen.closure:
             return seen, []
         return self._joined(hybrid_map, seen) if seen.joined else (self._linked(hybrid_map, seen), [])
 
-    def _joined(self, hybrid_map: HybridMap, seen: _Observation) -> tuple[_Observation, list[Relabelled]]:
+    def _joined(self, hybrid_map: HybridMap, seen: Observation) -> tuple[Observation, list[Relabelled]]:
         """The keyframes that joined a known area, moved to where their scans fit the area's own, and the arc likewise.
 
         Keyframes that the robot stored in the area since then are on neither side: they were matched against both.
@@ -228,7 +247,7 @@ class Tlca:
             hybrid_map.place(r.keyframe, r.area, r.pose)
         return replace(seen, pose=seen.pose.compose(_exactly(se2.inverse(motion)))), moved
 
-    def _linked(self, hybrid_map: HybridMap, seen: _Observation) -> _Observation:
+    def _linked(self, hybrid_map: HybridMap, seen: Observation) -> Observation:
         """An arc between areas that keep their keyframes, moved to where the scans of both fit."""
         known, others, scans = hybrid_map.keyframes(seen.source), hybrid_map.keyframes(seen.target), self._replica.scans
         motion = self._alignment.offset(
@@ -238,7 +257,7 @@ class Tlca:
         )
         return seen if motion is None else replace(seen, pose=_exactly(motion).compose(seen.pose))
 
-    def _fused(self, seen: _Observation, old: Arc | None, witnesses: frozenset[int]) -> Arc:
+    def _fused(self, seen: Observation, old: Arc | None, witnesses: frozenset[int]) -> Arc:
         """The definite arc from an observation and what was known before, which tells whether it closed a loop."""
         belief, closure = seen.pose, seen.closure
         if old is not None:
@@ -273,6 +292,10 @@ class Tlca:
             )
             for a, b in wrong
         ]
+
+
+def _rebased(pose: NDArray[np.float64], leaf: Leaf) -> NDArray[np.float64]:
+    return pose if leaf.rebase is None else se2.compose(leaf.rebase.mean, pose)
 
 
 def _exactly(pose: NDArray[np.float64]) -> PoseGaussian:

@@ -26,6 +26,7 @@ from hmt_slam_ros.processes.messages import (
 )
 from hmt_slam_ros.processes.replica import FIRST_HYPOTHESIS, Replica
 from hmt_slam_ros.processes.tsbi_branching import Branches, Branching, Child, Parent
+from hmt_slam_ros.processes.tsbi_reopening import reopened
 from hmt_slam_ros.random_streams import Purpose, stream
 from hmt_slam_ros.sensing import Scan
 from hmt_slam_ros.topology.hypothesis_tree import LeafNotes, Settled, settle
@@ -55,6 +56,7 @@ class Tsbi:
         self._next_hypothesis = FIRST_HYPOTHESIS + 1
         self._unexamined = 0.0
         self._global_poses = GlobalPoses()
+        self._reopened: tuple[Leaf, ...] = ()
 
     def handle(self, message: Message) -> list[Message]:
         """Learn from ``Keyframe`` and ``Accepted``; answer ``AreaEvents`` with ``Hypotheses``."""
@@ -85,30 +87,32 @@ class Tsbi:
             )
         self._branching.begin_event()
         by_hypothesis = {event.hypothesis: event for event in events.events}
-        scan = self._keyframe.scan
-        branches = [self._branch(hypothesis, by_hypothesis.get(hypothesis), scan) for hypothesis in sorted(self._notes)]
+        keyframe = self._keyframe
+        branches = [self._branch(known, by_hypothesis.get(known), keyframe) for known in sorted(self._notes)]
         children = [child for branch in branches for child in branch.children]
         settled = self._settle(events.sequence, children, branches)
         chosen = [children[k] for k in settled.kept]
         changed = self._leaves(children, chosen, settled.probabilities)
         self._replica.apply(Hypotheses(events.sequence, tuple(changed), settled.unexamined))
         loaded = [self._loaded(changed[n], child) for n, child in enumerate(chosen)]
-        self._unexamined = settled.unexamined
+        self._unexamined, self._reopened = settled.unexamined, ()
         leaves = tuple(sorted(loaded, key=lambda leaf: leaf.hypothesis))
         return Hypotheses(events.sequence, leaves, settled.unexamined)
 
-    def _branch(self, hypothesis: int, event: AreaEvent | None, scan: Scan) -> Branches:
+    def _branch(self, hypothesis: int, event: AreaEvent | None, keyframe: Keyframe) -> Branches:
         """The continuations of one hypothesis, each with its weight."""
         estimate = self._estimates[hypothesis]
         probability = self._replica.probabilities[hypothesis]
         log_weight = math.log(max(probability, 1e-300)) + estimate.log_evidence
         area, hybrid_map = self._replica.areas[hypothesis], self._replica.maps[hypothesis]
         parent = Parent(hypothesis, area, hybrid_map, self._notes[hypothesis], log_weight, probability)
+        if self._reopened:
+            return Branches([reopened(parent, leaf, keyframe.sequence) for leaf in self._reopened])
         if event is not None and event.kind == "cut":
             return self._branching.cut(parent, event.keyframes)
         if event is not None:
             return self._branching.move(parent, event.area)
-        return self._go_on(parent, estimate, scan)
+        return self._go_on(parent, estimate, keyframe.scan)
 
     def _go_on(self, parent: Parent, estimate: LeafEstimate, scan: Scan) -> Branches:
         """No area was left; but the robot may be in known ground that area abstraction does not know to be near."""
@@ -152,8 +156,9 @@ class Tsbi:
             hypothesis = self._next_hypothesis
             self._next_hypothesis += 1
         return Leaf(
-            hypothesis, child.parent, probability, child.area, child.rebase, child.relabelled, child.arcs
-        )
+            hypothesis, child.parent, probability, child.area, child.rebase, child.relabelled, child.arcs,
+            withdrawn=child.withdrawn,
+        )  # fmt: skip
 
     def _loaded(self, leaf: Leaf, child: Child) -> Leaf:
         """The leaf with the areas that its local map must hold, where that is to be loaded anew."""
@@ -176,5 +181,6 @@ class Tsbi:
         if accepted.hypothesis is None:
             return
         self._replica.accept(accepted)
+        self._reopened = accepted.reopened
         self._notes = {accepted.hypothesis: self._notes[accepted.hypothesis]}
         self._unexamined = 0.0

@@ -8,7 +8,7 @@ import numpy as np
 
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.topology.hybrid_map import HybridMap
-from hmt_slam_ros.topology.pose_graph import Edges, optimise
+from hmt_slam_ros.topology.pose_graph import Edges, Solution, optimise
 from hmt_slam_ros.topology.shortest_path import reachable
 
 # The reference area defines the frame; 0.1 mm and 0.006 degrees keep its covariance regular.
@@ -41,6 +41,23 @@ def consistent_map(hybrid_map: HybridMap) -> GlobalMap:
 
     Only areas that arcs join with the reference have a place.
     """
+    areas, arcs, solution = _solved(hybrid_map, marginals=True)
+    assert solution.covariances is not None
+    beliefs = map(PoseGaussian, solution.poses, solution.covariances)
+    poses = {area: _regular(belief) for area, belief in zip(areas, beliefs, strict=True)}
+    chi2 = {(a, b): float(value) for (a, b, _), value in zip(arcs, solution.edge_chi2, strict=True)}
+    return GlobalMap(poses, chi2)
+
+
+def contradiction(hybrid_map: HybridMap) -> float:
+    """The chi-square of all arcs against the poses that agree best with them; 3 degrees of freedom a cycle."""
+    return _solved(hybrid_map, marginals=False)[2].chi2
+
+
+def _solved(
+    hybrid_map: HybridMap, *, marginals: bool
+) -> tuple[list[int], list[tuple[int, int, PoseGaussian]], Solution]:
+    """Areas, arcs among them, and what agrees best with these."""
     tree = reachable(hybrid_map, _reference(hybrid_map))
     areas = sorted(tree)
     arcs = [(a, b, value.pose) for a, b, value in hybrid_map.all_arcs() if a in tree]
@@ -51,12 +68,7 @@ def consistent_map(hybrid_map: HybridMap) -> GlobalMap:
         np.array([pose.mean for _, _, pose in arcs]).reshape(-1, 3),
         np.array([pose.covariance for _, _, pose in arcs]).reshape(-1, 3, 3),
     )
-    solution = optimise(np.array([tree[area].mean for area in areas]), edges)
-    assert solution.covariances is not None
-    beliefs = map(PoseGaussian, solution.poses, solution.covariances)
-    poses = {area: _regular(belief) for area, belief in zip(areas, beliefs, strict=True)}
-    chi2 = {(a, b): float(value) for (a, b, _), value in zip(arcs, solution.edge_chi2, strict=True)}
-    return GlobalMap(poses, chi2)
+    return areas, arcs, optimise(np.array([tree[area].mean for area in areas]), edges, marginals=marginals)
 
 
 def _reference(hybrid_map: HybridMap) -> int:

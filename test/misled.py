@@ -1,0 +1,76 @@
+"""A TSBI that closes a loop falsely once, in lock-step with the rest, the documents through JSON as between nodes."""
+
+
+import numpy as np
+
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.offline.recorder import Recorder
+from hmt_slam_ros.offline.runtime import LockStep
+from hmt_slam_ros.processes.aam import Aam
+from hmt_slam_ros.processes.documents import decode, encode
+from hmt_slam_ros.processes.messages import Accepted, Arc, EndOfLog, Hypotheses
+from hmt_slam_ros.processes.rtl import Rtl
+from hmt_slam_ros.processes.slam import MetricSlam
+from hmt_slam_ros.processes.tlca import Tlca
+from hmt_slam_ros.processes.tsbi import Tsbi
+from hmt_slam_ros.processes.tsbi_branching import Branches, Branching, Child
+from hmt_slam_ros.sensing import Scan
+from hmt_slam_ros.topology.shortest_path import reachable
+
+SIGMA = np.diag([0.05, 0.05, np.radians(0.5)]) ** 2
+
+
+def misled(area, known, deviations):
+    """What makes the children of hypotheses, once falsely: from ``area`` a loop is closed to ``known``.
+
+    :param deviations: by how many deviations of what the arcs say of it the place is wrong, in its worst direction.
+    """
+
+    class Misled(Branching):
+        done = False
+
+        def recheck(self, parent):
+            if self.done or parent.area != area:
+                return super().recheck(parent)
+            Misled.done = True
+            belief = reachable(parent.hybrid_map, area, until=(known,))[known]
+            values, vectors = np.linalg.eigh(belief.covariance)
+            wrong = se2.compose(belief.mean, se2.exp(deviations * np.sqrt(values[-1]) * vectors[:, -1]))
+            arc = Arc(area, known, PoseGaussian(wrong, SIGMA), closure=True)
+            notes = parent.notes.checked((), ())
+            return Branches([Child(parent.hypothesis, parent.log_weight, area, notes, arcs=(arc,), reload=True)])
+
+    return Misled
+
+
+class OverJson:
+    """A process whose documents go through JSON, as they do between the nodes."""
+
+    def __init__(self, process):
+        self.process = process
+
+    def handle(self, message):
+        kind = type(message)
+        return self.process.handle(decode(encode(message), kind) if kind in (Hypotheses, Accepted) else message)
+
+
+def run(log, configuration, branching=Branching):
+    """A whole log in lock-step; what was recorded."""
+    recorder = Recorder(configuration)
+    processes = {
+        "slam": MetricSlam(configuration),
+        "aam": Aam(configuration),
+        "tsbi": Tsbi(configuration, branching),
+        "tlca": Tlca(configuration),
+        "rtl": Rtl(configuration),
+    }
+    lock_step = LockStep({name: OverJson(process) for name, process in processes.items()} | {"recorder": recorder})
+    stamps = []
+    for record in log.records():
+        lock_step.feed(record.measurement)
+        if isinstance(record.measurement, Scan):
+            stamps.append(record.measurement.stamp)
+    lock_step.feed(EndOfLog())
+    replicas = [process._replica for name, process in processes.items() if name != "rtl"]
+    return recorder.finish(np.array(stamps)), replicas

@@ -1,0 +1,293 @@
+"""An accepted closure that later contradicts others is withdrawn, with all that hangs on it; the map is not bent."""
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from misled import misled, run
+from ring_for_tsbi import RING, Run, ring_drive
+
+from hmt_slam_ros.configuration import Configuration
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.geometry.chi_square import gate
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.logs import open_log
+from hmt_slam_ros.offline.final_map import final_map
+from hmt_slam_ros.processes.closure_account import Account, Closure, Step, unrefined, without
+from hmt_slam_ros.processes.doubts import Doubts
+from hmt_slam_ros.processes.messages import Arc, ArcEnds, Leaf, Relabelled
+from hmt_slam_ros.processes.undo import Undo
+from hmt_slam_ros.sensing import Scan
+from hmt_slam_ros.topology.common_map import ArcValue
+from hmt_slam_ros.topology.hybrid_map import HybridMap
+
+BOUND = gate(Configuration().tlca.contradiction_probability)
+ODOMETRY, MATCH = np.diag([0.3, 0.3, 0.02]) ** 2, np.diag([0.05, 0.05, 0.01]) ** 2
+NEXT = np.array([4.0, 0.0, 0.0])  # from the frame of an area to that of the next
+
+
+def around(a, b):
+    """Truth: ``a_T_b`` of areas along a straight corridor."""
+    return (b - a) * NEXT
+
+
+def corridor(areas):
+    """Areas 0, 1, ... along a corridor, each with keyframes 10 a and 10 a + 1, joined by odometry; its history."""
+    hybrid_map, history = HybridMap(), None
+    for area in range(areas):
+        hybrid_map.place(10 * area, area, np.zeros(3))
+        hybrid_map.place(10 * area + 1, area, np.array([1.0, 0.0, 0.0]))
+        if area:
+            hybrid_map.set_arc(area - 1, area, PoseGaussian(NEXT, ODOMETRY), closure=False)
+            history = history, Step(10 * area, area - 1, area, ((area - 1, area),), frozenset({10 * area}))
+    return hybrid_map, history
+
+
+def closed(hybrid_map, event, near, far, error=(0.0, 0.0, 0.0), log_odds=4.6):
+    belief = PoseGaussian(se2.compose(around(near, far), np.array(error)), MATCH)
+    hybrid_map.set_arc(near, far, belief, closure=True)
+    return Closure((event, (min(near, far), max(near, far))), near, far, belief, log_odds, Undo({}, {}))
+
+
+def account_of(hybrid_map, history, closures, area):
+    hybrid_map.absorb()
+    return Account(hybrid_map, history, tuple(closures), area, np.zeros(3))
+
+
+TRUE, FALSE = (0.0, 0.0, 0.0), (2.2, 0.0, 0.0)
+
+
+def drive_with(*found, areas=8, area=7):
+    """The corridor with closures (event, near, far, error)."""
+    hybrid_map, history = corridor(areas)
+    closures = []
+    for event, near, far, error in found:
+        closures.append(closed(hybrid_map, event, near, far, error))
+        history = history, Step(event, near, near, (closures[-1].pair,))
+    return account_of(hybrid_map, history, closures, area)
+
+
+def doubt_of(account, event):
+    return Doubts(account, BOUND, 100).raised([c.name for c in account.closures if c.name[0] == event], 0.01)
+
+
+def test_closures_that_agree_raise_no_doubt():
+    account = drive_with((80, 7, 0, (0.05, 0.0, 0.0)), (81, 6, 1, (0.0, -0.05, 0.0)), (82, 7, 2, (0.0, 0.0, 0.0)))
+    assert doubt_of(account, 82) is None
+
+
+def test_a_false_closure_is_found_when_true_ones_contradict_it():
+    """It fits the odometry alone."""
+    account = drive_with((80, 6, 0, FALSE))
+    assert doubt_of(account, 80) is None
+    account = drive_with((80, 6, 0, FALSE), (81, 7, 1, TRUE))
+    doubt = doubt_of(account, 81)
+    assert doubt.closure.name[0] == 81
+    assert doubt.excess > BOUND
+    assert [c.name[0] for c in doubt.explanations[0].false] == [80]
+    assert doubt.explanations[0].probability > 0.9
+
+
+def test_where_two_closures_contradict_each_other_both_may_be_false():
+    account = drive_with((80, 6, 0, FALSE), (81, 7, 1, (-2.2, 0.0, 0.0)))
+    doubt = doubt_of(account, 81)
+    assert sorted(c.name[0] for e in doubt.explanations for c in e.false) == [80, 81]
+    assert [e.probability for e in doubt.explanations] == pytest.approx([0.5, 0.5], abs=0.01)
+
+
+def test_the_odds_at_which_a_closure_was_accepted_speak_for_it():
+    account = drive_with((80, 6, 0, FALSE), (81, 7, 1, (-2.2, 0.0, 0.0)))
+    closures = (account.closures[0], replace(account.closures[1], log_odds=10.0))
+    doubt = doubt_of(replace(account, closures=closures), 81)
+    assert [[c.name[0] for c in e.false] for e in doubt.explanations] == [[80]]
+
+
+def test_closures_that_were_accepted_because_of_a_false_one_go_with_it_and_true_ones_stay():
+    shifted = (80, 6, 0, FALSE), (81, 6, 1, FALSE), (82, 7, 2, FALSE)
+    account = drive_with((79, 3, 0, TRUE), *shifted, (90, 5, 3, TRUE), (91, 7, 4, TRUE))
+    doubt = doubt_of(account, 91)
+    best = doubt.explanations[0]
+    assert [c.name[0] for c in best.false] == [80, 81, 82]
+    assert best.probability > 0.99
+    assert [c.name[0] for c in best.account.closures] == [79, 90, 91]
+
+
+def joined():
+    """From area 3 the robot falsely enters area 0: it stores keyframes 41, 42 there, goes on to area 1, stores 45, and
+    leaves it for area 4, which is new."""
+    hybrid_map, history = corridor(4)
+    closure = closed(hybrid_map, 40, 3, 0)
+    hybrid_map.place(39, 0, np.array([0.2, 0.1, 0.0]))
+    hybrid_map.place(41, 0, np.array([0.5, 0.1, 0.0]))
+    hybrid_map.place(42, 0, np.array([1.0, 0.1, 0.0]))
+    hybrid_map.place(45, 1, np.array([0.5, 0.1, 0.0]))
+    hybrid_map.place(50, 4, np.zeros(3))
+    hybrid_map.set_arc(1, 4, PoseGaussian(np.array([0.0, 3.0, 1.5]), ODOMETRY), closure=False)
+    for step in (
+        Step(40, 3, 0, ((0, 3),), frozenset({39})),
+        Step(43, 0, 1, ()),
+        Step(50, 1, 4, ((1, 4),), frozenset({50})),
+    ):
+        history = history, step
+    return account_of(hybrid_map, history, [closure], 4)
+
+
+def in_frame_of(hybrid_map, *areas):
+    """``first_T_last`` along arcs."""
+    pose = np.zeros(3)
+    for a, b in pairwise(areas):
+        pose = se2.compose(pose, hybrid_map.arc(a, b).mean)
+    return pose
+
+
+def test_what_was_stored_in_areas_that_were_entered_falsely_becomes_an_area_of_its_own():
+    before = joined()
+    found = without(before, before.closures[0].name, 9)
+    hybrid_map = found.hybrid_map
+    assert {a: sorted(hybrid_map.keyframes(a)) for a in hybrid_map.area_ids()} == {
+        0: [0, 1], 1: [10, 11], 2: [20, 21], 3: [30, 31], 4: [50], 9: [39, 41, 42, 45],
+    }  # fmt: skip
+    assert [(a, b, arc.closure) for a, b, arc in hybrid_map.all_arcs()] == [
+        (0, 1, False), (1, 2, False), (2, 3, False), (3, 9, False), (4, 9, False),
+    ]  # fmt: skip
+    assert found.closures == ()
+    # The robot's own path is as it was, seen from where it came.
+    was = in_frame_of(before.hybrid_map, 3, 0, 1, 4)
+    np.testing.assert_allclose(in_frame_of(hybrid_map, 3, 9, 4), was, atol=1e-12)
+    at = se2.compose(in_frame_of(before.hybrid_map, 3, 0, 1), before.hybrid_map.keyframes(1)[45])
+    np.testing.assert_allclose(se2.compose(hybrid_map.arc(3, 9).mean, hybrid_map.keyframes(9)[45]), at, atol=1e-12)
+    assert (found.area, found.rebase) == (4, None)
+    np.testing.assert_array_equal(list(before.hybrid_map.keyframes(0)), [0, 1, 39, 41, 42])
+
+
+def test_a_robot_that_is_in_an_area_falsely_is_then_in_the_new_one():
+    before = joined()
+    earlier, _ = before.history
+    hybrid_map = before.hybrid_map.branch()
+    hybrid_map.remove_arc(1, 4)
+    found = without(replace(before, hybrid_map=hybrid_map, history=earlier, area=1), before.closures[0].name, 9)
+    assert found.area == 9
+    np.testing.assert_allclose(found.rebase, NEXT, atol=1e-12)
+    assert found.history[1].after == 9
+
+
+def test_a_link_that_the_robot_never_crossed_is_only_taken_out():
+    before = drive_with((80, 6, 0, FALSE))
+    found = without(before, before.closures[0].name, 100)
+    assert 100 not in found.hybrid_map.area_ids()
+    assert found.hybrid_map.arc(0, 6) is None
+    assert (found.area, found.rebase) == (7, None)
+    assert before.hybrid_map.arc(0, 6) is not None
+
+
+def test_what_a_refinement_moved_goes_back_and_what_was_stored_since_goes_with_it():
+    hybrid_map, history = corridor(4)
+    bent = np.array([0.3, 0.2, 0.05])
+    closure = closed(hybrid_map, 40, 3, 0)
+    former = {k: (3, hybrid_map.keyframes(3)[k].copy()) for k in (30, 31)}
+    undo = Undo(former, {(2, 3): ArcValue(PoseGaussian(NEXT, ODOMETRY), closure=False)})
+    for k in (30, 31):
+        hybrid_map.place(k, 3, se2.compose(bent, former[k][1]))
+    hybrid_map.set_arc(2, 3, PoseGaussian(NEXT + 0.1, ODOMETRY), closure=False)
+    stored, reached = np.array([1.5, 0.0, 0.0]), np.array([3.0, 0.0, 0.2])
+    hybrid_map.place(41, 3, se2.compose(bent, stored))
+    hybrid_map.place(45, 4, np.zeros(3))
+    hybrid_map.set_arc(3, 4, PoseGaussian(se2.compose(bent, reached), ODOMETRY), closure=False)
+    history = history, Step(40, 3, 3, ((0, 3),))
+    history = history, Step(45, 3, 4, ((3, 4),), frozenset({45}))
+    account = account_of(hybrid_map, history, [replace(closure, undo=undo)], 4)
+    found = unrefined(account, closure.name)
+    placed = found.hybrid_map.keyframes(3)
+    for k in (30, 31):
+        np.testing.assert_array_equal(placed[k], former[k][1])
+    np.testing.assert_allclose(placed[41], stored, atol=1e-12)
+    np.testing.assert_allclose(found.hybrid_map.arc(3, 4).mean, reached, atol=1e-12)
+    np.testing.assert_array_equal(found.hybrid_map.arc(2, 3).mean, NEXT)
+    assert found.closures[0].undo is None
+    at_home = unrefined(replace(account, area=3, pose=se2.compose(bent, stored)), closure.name)
+    np.testing.assert_allclose(at_home.pose, stored, atol=1e-12)
+    np.testing.assert_allclose(at_home.rebase, se2.inverse(bent), atol=1e-12)
+
+
+def test_tsbi_goes_on_with_the_explanations_as_live_hypotheses():
+    run = Run(RING)
+    for k, pose in enumerate(ring_drive(8)):
+        run.keyframe(pose, cut=3 if k == 7 else 0)
+    link = PoseGaussian(np.array([2.5, 0.0, 0.0]), MATCH)
+    back = PoseGaussian(np.array([2.5, 0.0, 0.0]), np.zeros((3, 3)))
+    keyframes = run.replica.maps[0].keyframes(1)
+    moved = tuple(Relabelled(k, 1, 0, se2.compose(back.mean, pose)) for k, pose in keyframes.items())
+    explanations = (
+        Leaf(0, 0, 0.7, 0, back, moved, (), withdrawn=(ArcEnds(0, 1),)),
+        Leaf(0, 0, 0.3, 1, None, (), (Arc(0, 1, link, closure=True),)),
+    )
+    run.accept(0, reopened=explanations)
+    one, two = run.keyframe(ring_drive(9)[8]).leaves
+    assert (one.parent, two.parent, one.hypothesis == two.hypothesis) == (0, 0, False)
+    assert (one.probability, two.probability) == pytest.approx((0.7, 0.3))
+    assert run.replica.maps[one.hypothesis].arc(0, 1) is None
+    np.testing.assert_array_equal(run.replica.maps[two.hypothesis].arc(0, 1).mean, link.mean)
+    # The keyframe that came since goes with the robot.
+    assert sorted(r.keyframe for r in one.relabelled) == [5, 6, 7, 8]
+    assert sorted(run.replica.maps[one.hypothesis].keyframes(0)) == list(range(9))
+    assert one.local[0].area == 0
+    assert [leaf.withdrawn for leaf in run.keyframe(ring_drive(10)[9]).leaves] == [(), ()]
+
+
+LOG = "sim:ring,seed=3,size=1.5"
+
+
+@pytest.fixture(scope="module")
+def drives():
+    """Two laps of a ring of corridors, and the same with a loop falsely closed after a third of the first lap."""
+    return run(open_log(LOG), Configuration()), run(open_log(LOG), Configuration(), misled(2, 0, 3.0))
+
+
+def arcs(recording):
+    return [(a, b, arc.closure) for a, b, arc in recording.hybrid_map.all_arcs()]
+
+
+def test_a_closure_that_was_accepted_falsely_is_withdrawn_when_the_true_one_comes(drives):
+    (without_it, _), (with_it, _) = drives
+    accepted = {row.keyframe: row for row in with_it.probabilities if row.accepted}
+    assert min(k for k, row in accepted.items() if row.closures) < 80  # definite, long before the true one
+    (told,) = [notice.text for notice in with_it.notices if notice.process == "tlca"]
+    assert "closure between areas 0 and 4 contradicts" in told
+    assert "of all closures 2-0 is taken for false" in told
+    assert arcs(with_it) == arcs(without_it)
+    assert with_it.hybrid_map.arc(0, 2) is None
+    assert with_it.replica.probabilities[with_it.replica.best] == 1.0
+
+
+def test_afterwards_the_map_is_as_if_it_had_never_been_there(drives):
+    (one, _), (two, _) = drives
+    assert list(one.area_poses) == list(two.area_poses)
+    for area, pose in one.area_poses.items():
+        assert np.hypot(*(two.area_poses[area].mean - pose.mean)[:2]) < 0.1
+    scans = [r.measurement for r in open_log(LOG).records() if isinstance(r.measurement, Scan)]
+    final = [final_map(drive, iter(scans), Configuration()).recording.trajectory for drive in (one, two)]
+    apart = np.hypot(*se2.between(*final)[:, :2].T)
+    assert apart.mean() < 0.05
+    assert apart.max() < 0.15
+
+
+def test_every_process_has_the_same_map_from_messages_alone(drives):
+    for recording, replicas in drives:
+        for replica in replicas:
+            assert list(replica.maps) == [recording.replica.best]
+            found = replica.maps[recording.replica.best]
+            assert found.area_ids() == recording.hybrid_map.area_ids()
+            for area in found.area_ids():
+                here, there = found.keyframes(area), recording.hybrid_map.keyframes(area)
+                assert list(here) == list(there)
+                np.testing.assert_array_equal(list(here.values()), list(there.values()))
+            for (a, b, arc), (c, d, other) in zip(found.all_arcs(), recording.hybrid_map.all_arcs(), strict=True):
+                assert (a, b, arc.closure) == (c, d, other.closure)
+                np.testing.assert_array_equal(arc.pose.mean, other.pose.mean)
+
+
+def test_a_true_closure_is_not_doubted(drives):
+    recording, _ = drives[0]
+    assert [notice for notice in recording.notices if notice.process == "tlca"] == []
+    assert any(arc.closure for _, _, arc in recording.hybrid_map.all_arcs())
