@@ -106,15 +106,15 @@ def test_ground_tracked_by_way_of_another_area_is_joined_by_a_measured_arc():
     assert answers[-1].leaves[0].probability == 1.0
 
 
-def ring_with_two_leaves():
-    """Two live hypotheses: the children of a cut, as TSBI would have made them."""
+def ring_with_two_leaves(apart=1.0):
+    """Two live hypotheses that have the robot ``apart``, m, as TSBI would have made them."""
     run = Run(RING)
     run.keyframe(np.array([3.0, 1.0, 0.0]))
     split = Hypotheses(0, (Leaf(1, 0, 0.6, 0), Leaf(2, 0, 0.4, 0)))
     for replica in (run.replica, run.tsbi._replica):
         replica.apply(split)
     run.tsbi._notes = dict.fromkeys((1, 2), run.tsbi._notes[0])
-    run.poses = {1: np.zeros(3), 2: np.zeros(3)}
+    run.poses = {1: np.zeros(3), 2: np.array([apart, 0.0, 0.0])}
     run.covariances = {1: STEP, 2: STEP}
     return run, split
 
@@ -127,6 +127,14 @@ def test_the_evidence_of_the_scans_shifts_the_weights():
     answer = run.keyframe(run.true_pose)
     after = {leaf.hypothesis: leaf.probability for leaf in answer.leaves}
     assert after[second] / after[first] == pytest.approx(math.exp(1.5) * before[second] / before[first])
+
+
+def test_hypotheses_that_say_the_same_become_one_with_the_weight_of_both():
+    run, _ = ring_with_two_leaves(apart=0.2)
+    run.evidence = {1: 0.0, 2: 1.5}
+    (leaf,) = run.keyframe(run.true_pose).leaves
+    assert leaf.hypothesis == 2
+    assert leaf.probability == pytest.approx(1.0)
 
 
 def test_acceptance_leaves_one_hypothesis():

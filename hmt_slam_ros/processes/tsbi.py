@@ -30,6 +30,7 @@ from hmt_slam_ros.processes.tsbi_reopening import reopened
 from hmt_slam_ros.random_streams import Purpose, stream
 from hmt_slam_ros.sensing import Scan
 from hmt_slam_ros.topology.hypothesis_tree import LeafNotes, Settled, settle
+from hmt_slam_ros.topology.same_claim import Claim, merged
 from hmt_slam_ros.topology.surroundings import agreeing, areas_around
 
 # Keyframe events in a row that the robot has to spend in an area of the local map before an arc joins it.
@@ -88,7 +89,7 @@ class Tsbi:
         self._branching.begin_event()
         by_hypothesis = {event.hypothesis: event for event in events.events}
         keyframe = self._keyframe
-        branches = [self._branch(known, by_hypothesis.get(known), keyframe) for known in sorted(self._notes)]
+        branches = [self._branch(parent, by_hypothesis.get(parent.hypothesis), keyframe) for parent in self._parents()]
         children = [child for branch in branches for child in branch.children]
         settled = self._settle(events.sequence, children, branches)
         chosen = [children[k] for k in settled.kept]
@@ -99,20 +100,33 @@ class Tsbi:
         leaves = tuple(sorted(loaded, key=lambda leaf: leaf.hypothesis))
         return Hypotheses(events.sequence, leaves, settled.unexamined)
 
-    def _branch(self, hypothesis: int, event: AreaEvent | None, keyframe: Keyframe) -> Branches:
-        """The continuations of one hypothesis, each with its weight."""
+    def _parents(self) -> list[Parent]:
+        """The live hypotheses with their weights; of those that say the same, the heaviest, with the weight of all."""
+        parents = [self._parent(hypothesis) for hypothesis in sorted(self._notes)]
+        if len(parents) == 1:
+            return parents
+        claims = [
+            Claim(p.hybrid_map, p.area, self._estimates[p.hypothesis].pose.mean, {p.area, *p.around()}) for p in parents
+        ]
+        weights = merged(claims, [parent.log_weight for parent in parents])
+        return [replace(parents[n], log_weight=weight) for n, weight in sorted(weights.items())]
+
+    def _parent(self, hypothesis: int) -> Parent:
         estimate = self._estimates[hypothesis]
         probability = self._replica.probabilities[hypothesis]
         log_weight = math.log(max(probability, 1e-300)) + estimate.log_evidence
         area, hybrid_map = self._replica.areas[hypothesis], self._replica.maps[hypothesis]
-        parent = Parent(hypothesis, area, hybrid_map, self._notes[hypothesis], log_weight, probability)
+        return Parent(hypothesis, area, hybrid_map, self._notes[hypothesis], log_weight, probability)
+
+    def _branch(self, parent: Parent, event: AreaEvent | None, keyframe: Keyframe) -> Branches:
+        """The continuations of one hypothesis, each with its weight."""
         if self._reopened:
             return Branches([reopened(parent, leaf, keyframe.sequence) for leaf in self._reopened])
         if event is not None and event.kind == "cut":
             return self._branching.cut(parent, event.keyframes)
         if event is not None:
             return self._branching.move(parent, event.area)
-        return self._go_on(parent, estimate, keyframe.scan)
+        return self._go_on(parent, self._estimates[parent.hypothesis], keyframe.scan)
 
     def _go_on(self, parent: Parent, estimate: LeafEstimate, scan: Scan) -> Branches:
         """No area was left; but the robot may be in known ground that area abstraction does not know to be near."""

@@ -27,7 +27,7 @@ class FineAlignment:
 
     def __init__(self, configuration: Configuration) -> None:
         self._mapping = LocalMapping(configuration)
-        self._temper = configuration.matching.temper
+        self._alignment = self._mapping.alignment._replace(inflation=1.0 / configuration.matching.temper)
         self._gate = gate(configuration.tsbi.gate_probability)
 
     def offset(
@@ -59,9 +59,7 @@ class FineAlignment:
     ) -> NDArray[np.float64] | None:
         stay = np.zeros(3)
         information = np.linalg.inv(covariance).astype(np.float64, copy=False)
-        # Neighbouring beams are correlated: tempering their likelihood is the same as sharpening the prior.
-        prior = matching.Prior(stay, information / self._temper)
-        found, _ = matching.align(points, stay, prior, view, self._mapping.alignment)
+        found, _ = matching.align(points, stay, matching.Prior(stay, information), view, self._alignment)
         if found @ information @ found > self._gate:
             return None
         before, after = (matching.log_ratio(points, *pose, view, self._mapping.model) for pose in (stay, found))

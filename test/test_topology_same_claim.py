@@ -1,0 +1,71 @@
+"""Hypotheses that say the same are told from those that do not."""
+
+import numpy as np
+import pytest
+
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.topology.hybrid_map import HybridMap
+from hmt_slam_ros.topology.same_claim import Claim, merged
+
+SHARP, VAGUE = np.diag([0.05, 0.05, 0.01]) ** 2, np.diag([2.0, 2.0, 0.2]) ** 2
+STEP = np.array([10.0, 0.0, 0.0])
+POSE = np.array([1.0, 0.5, 0.3])
+
+
+def chain(covariance=SHARP):
+    """Areas 0 to 3, definite, 10 m apart along x."""
+    hybrid_map = HybridMap()
+    for area in range(4):
+        hybrid_map.place(area, area, np.zeros(3))
+    for area in range(3):
+        hybrid_map.set_arc(area, area + 1, PoseGaussian(STEP, covariance), closure=False)
+    hybrid_map.absorb()
+    return hybrid_map
+
+
+def entered(area, pose, covariance=SHARP):
+    """From area 3 the robot came into a known one, where it is at ``area_T_base``."""
+    hybrid_map = chain(VAGUE)
+    hybrid_map.set_arc(3, area, PoseGaussian(np.array([-5.0, 0.0, 0.0]), covariance), closure=True)
+    return Claim(hybrid_map, area, pose, {area})
+
+
+def in_next_area(pose):
+    """``1_T_base`` where ``pose`` is ``0_T_base``."""
+    return se2.between(STEP, pose)
+
+
+def with_sharp_arc(claim):
+    claim.hybrid_map.set_arc(0, 1, PoseGaussian(STEP, SHARP), closure=False)
+    return claim
+
+
+def test_the_same_place_entered_by_one_area_or_by_the_next_is_one_claim():
+    one, other = with_sharp_arc(entered(0, POSE)), with_sharp_arc(entered(1, in_next_area(POSE)))
+    assert one.equals(other)
+    assert other.equals(one)
+
+
+@pytest.mark.parametrize(("offset", "same"), [([0.3, 0.2, 0.05], True), ([0.7, 0.0, 0.0], False), ([0.0, 0.0, 0.2], False)])
+def test_modes_that_part_by_less_than_is_mended_are_one_claim(offset, same):
+    assert entered(0, POSE).equals(entered(0, se2.compose(POSE, np.array(offset)))) == same
+
+
+def test_known_ground_is_a_claim_of_its_own():
+    tracked = Claim(chain(), 0, POSE, {0})
+    recognised = entered(0, POSE)
+    assert not tracked.equals(recognised)
+    assert not recognised.equals(tracked)
+
+
+def test_what_a_hypothesis_is_uncertain_of_it_does_not_claim():
+    assert not entered(0, POSE).equals(entered(1, in_next_area(POSE)))
+
+
+def test_the_heaviest_stands_for_all_that_say_the_same():
+    claims = [entered(0, POSE), entered(1, POSE), entered(0, POSE + 0.01)]
+    weights = np.log([0.2, 0.3, 0.5])
+    found = merged(claims, weights)
+    assert list(found) == [2, 1]
+    np.testing.assert_allclose(np.exp(list(found.values())), [0.7, 0.3])
