@@ -47,7 +47,9 @@ def test_the_same_place_entered_by_one_area_or_by_the_next_is_one_claim():
     assert other.equals(one)
 
 
-@pytest.mark.parametrize(("offset", "same"), [([0.3, 0.2, 0.05], True), ([0.7, 0.0, 0.0], False), ([0.0, 0.0, 0.2], False)])
+@pytest.mark.parametrize(
+    ("offset", "same"), [([0.3, 0.2, 0.05], True), ([0.7, 0.0, 0.0], False), ([0.0, 0.0, 0.2], False)]
+)
 def test_modes_that_part_by_less_than_is_mended_are_one_claim(offset, same):
     assert entered(0, POSE).equals(entered(0, se2.compose(POSE, np.array(offset)))) == same
 
