@@ -44,17 +44,18 @@ class Claim:
         return {area: se2.between(belief.mean, self.pose) for area, belief in found.items()}
 
     @cached_property
-    def closes(self) -> bool:
-        """Whether an arc closed a loop that the definite map leaves open."""
+    def loops(self) -> tuple[bool, frozenset[tuple[int, int]]]:
+        """Whether an arc closed a loop that the definite map leaves open, and which definite arcs are withdrawn."""
         own, definite = self.hybrid_map.arcs, self.hybrid_map.common.arcs
-        return any(value.closure and pair not in definite for pair, value in own.items())
+        closes = any(value is not None and value.closure and pair not in definite for pair, value in own.items())
+        return closes, frozenset(pair for pair, value in own.items() if value is None)
 
     def equals(self, other: Claim) -> bool:
         """Whether both have the robot at the same place of all areas around that both have.
 
         That it is in known ground is a claim of its own, even where the arcs alone would have it there.
         """
-        if self.closes != other.closes:
+        if self.loops != other.loops:
             return False
         both = {
             area
