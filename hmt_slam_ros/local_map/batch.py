@@ -61,5 +61,9 @@ def propose_all(
         prior = Prior(priors[i], information)
         modes[i], hessians[i] = align(still, starts[i], prior, own, settings)
         covariances[i] = np.linalg.inv(sharpness * hessians[i] + information)
+    # In a loop of its own: together with two arrays of points the compiler makes the alignment half as fast.
+    for i in range(m):
+        own = MapView(tables[i], view.odds, view.field, view.cell, view.radius)
+        prior = Prior(priors[i], information)
         evidences[i] = evidence(points, modes[i], hessians[i], prior, own, model, temper)
     return Proposals(modes, hessians, covariances, evidences)
