@@ -8,6 +8,7 @@ from benchmark.enumeration import Enumeration
 from benchmark.oracle import Regime, compared, filtered, mean_distances, oracle_requirements, stops, total_variation
 from benchmark.runs import PARAMETERS
 from hmt_slam_ros.configuration import load_configuration
+from hmt_slam_ros.processes import tsbi
 
 WORLD, SEED, NOISE = "four crossings", 1, 2.0
 VAGUE = Regime("vague", (WORLD,), (NOISE,), ("tsbi.temper=0.03",))
@@ -46,11 +47,18 @@ def test_the_enumeration_gives_every_way_its_share(drive):
 
 
 def test_with_enough_hypotheses_tsbi_says_what_the_enumeration_says(monkeypatch):
+    """Where hypotheses that say the same stay apart, as they do in the enumeration."""
+    monkeypatch.setattr(tsbi, "merged", lambda _, log_weights: dict(enumerate(log_weights)))
     monkeypatch.setattr(oracle, "HYPOTHESES", (1, 2, 32))
     distances = compared(VAGUE, WORLD, SEED, NOISE, ()).distances
     assert len(distances[1]) >= 4
     assert max(distances[32]) < 0.01
     assert 0.0 < sum(distances[2]) < sum(distances[1])
+
+
+def test_making_one_of_hypotheses_that_say_the_same_moves_little_probability(monkeypatch):
+    monkeypatch.setattr(oracle, "HYPOTHESES", (32,))
+    assert 0.0 < max(compared(VAGUE, WORLD, SEED, NOISE, ()).distances[32]) < 0.05
 
 
 def test_what_is_dropped_is_lacking(drive):
