@@ -1,0 +1,81 @@
+"""For tests of TLCA: slam and TSBI played by hand."""
+
+from dataclasses import replace
+
+import numpy as np
+import worlds
+
+from hmt_slam_ros.configuration import Configuration, with_changes
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.processes.messages import (
+    Accepted,
+    Arc,
+    Hypotheses,
+    Keyframe,
+    Leaf,
+    LeafEstimate,
+    Notice,
+    Relabelled,
+)
+from hmt_slam_ros.processes.tlca import Tlca
+
+WORLD = worlds.two_rooms()
+SPREAD = np.diag([0.1**2, 0.1**2, 0.02**2])
+HOME = np.array([1.0, 2.0, 0.0])  # where the map's frame lies in the world
+
+
+def belief(pose, spread=SPREAD):
+    return PoseGaussian(np.asarray(pose, dtype=np.float64), np.asarray(spread))
+
+
+class Play:
+    """TLCA with slam and TSBI played: keyframes are stored where the leaves say, one after another."""
+
+    def __init__(self, refinement=0, **changes):
+        options = {"accept_keyframes": 3, "accept_distance": 1.0, "accept_probability": 0.9} | changes
+        named = {f"tlca.{name}": value for name, value in options.items()}
+        self.process = Tlca(with_changes(Configuration(), named | {"refinement.iterations": refinement}))
+        self.k = -1
+        self.notices = []
+
+    def step(self, *leaves, places=None, world=HOME, travelled=None):
+        """One keyframe event: ``places`` are (hypothesis, area, area_T_base) before it, ``leaves`` TSBI's answer.
+
+        Without places the keyframe is at the origin of the robot's area, and is the first of an area that is new.
+        """
+        self.k += 1
+        if places is None:
+            replica = self.process._replica
+            places = [(h, area, np.zeros(3)) for h, area in replica.areas.items()]
+            leaves = [self._with_first_keyframe(leaf, replica) for leaf in leaves]
+        estimates = tuple(LeafEstimate(h, area, belief(pose), True, 0.0, 12.0) for h, area, pose in places)
+        travelled = 0.5 * self.k if travelled is None else travelled
+        assert self.process.handle(Keyframe(self.k, worlds.scan_at(WORLD, world), travelled, estimates)) == []
+        said = self.process.handle(Hypotheses(self.k, tuple(leaves) or (Leaf(0, 0, 1.0, 0),)))
+        verdicts = [message for message in said if isinstance(message, Accepted)]
+        self.notices += [message for message in said if isinstance(message, Notice)]
+        assert len(verdicts) == 1
+        assert verdicts[0].sequence == self.k
+        return verdicts[0]
+
+    def _with_first_keyframe(self, leaf, replica):
+        if leaf.relabelled or leaf.area in (0, *replica.maps[leaf.parent].area_ids()):
+            return leaf
+        return replace(leaf, relabelled=(Relabelled(self.k, replica.areas[leaf.parent], leaf.area, np.zeros(3)),))
+
+    def start(self):
+        return self.step(places=[(0, 0, np.zeros(3))])
+
+    def arc(self, a, b, hypothesis=0):
+        return self.process._replica.maps[hypothesis].arc(a, b)
+
+
+def new_area(hypothesis, parent, probability, area, pose, source=0):
+    """A leaf whose newest keyframe leaves ``source`` for the new ``area`` at ``source_T_area``."""
+    arc = Arc(source, area, belief(pose))
+    return Leaf(hypothesis, parent, probability, area, belief(se2.inverse(pose)), (), (arc,))
+
+
+def poses_of(verdict):
+    return {given.area: given.pose for given in verdict.global_poses}
