@@ -24,7 +24,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from hmt_slam_ros.configuration.tree import Motion
+from hmt_slam_ros.configuration.metric import Motion
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.logs.records import Log, LogRecord
 from hmt_slam_ros.logs.stamps import NANOSECONDS

@@ -7,7 +7,7 @@ from logs_for_nodes import START, Corridor
 
 pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
 
-from hmt_slam_ros.configuration.tree import Robot
+from hmt_slam_ros.configuration.live import Robot
 from hmt_slam_ros.nodes.player import Player
 from hmt_slam_ros.sensing import Odometry, Scan
 

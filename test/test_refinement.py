@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from worlds import drive, scan_in, two_rooms
 
-from hmt_slam_ros.configuration.tree import Refinement
+from hmt_slam_ros.configuration.topological import Refinement
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.refinement.joint import refine_jointly

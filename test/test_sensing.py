@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from worlds import box, scan_in
 
-from hmt_slam_ros.configuration.tree import Motion
+from hmt_slam_ros.configuration.metric import Motion
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.sensing import Scan
 from hmt_slam_ros.sensing.motion import increment_covariance

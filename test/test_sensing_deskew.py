@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from worlds import box, scan_in
 
-from hmt_slam_ros.configuration.tree import RealTimeLocalization
+from hmt_slam_ros.configuration.live import RealTimeLocalization
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.sensing import Odometry, Scan
 from hmt_slam_ros.sensing.deskew import SweepCheck, deskewed

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hmt_slam_ros.configuration.tree import Motion
+from hmt_slam_ros.configuration.metric import Motion
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.sensing import Odometry
 from hmt_slam_ros.sensing.motion import (

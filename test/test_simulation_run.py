@@ -6,7 +6,7 @@ import sys
 import numpy as np
 import pytest
 
-from hmt_slam_ros.configuration.tree import Motion
+from hmt_slam_ros.configuration.metric import Motion
 from hmt_slam_ros.evaluation import evaluate_relations, read_tum, true_relations, truth_of
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.logs import open_log

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from hmt_slam_ros.configuration.tree import Motion
+from hmt_slam_ros.configuration.metric import Motion
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.sensing.motion import NO_STEP, Step, increment_covariance
 from hmt_slam_ros.simulation import open_simulated

@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Iterator
 from dataclasses import replace
 
-from hmt_slam_ros.configuration.tree import Robot
+from hmt_slam_ros.configuration.live import Robot
 from hmt_slam_ros.logs import Log
 from hmt_slam_ros.sensing import Odometry, Scan
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmt_slam_ros.configuration import Configuration
-from hmt_slam_ros.configuration.tree import Motion
+from hmt_slam_ros.configuration.metric import Motion
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.offline.recorder import Recording, keyframe_poses

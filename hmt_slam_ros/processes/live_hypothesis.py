@@ -10,7 +10,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from hmt_slam_ros.configuration.tree import Filter
+from hmt_slam_ros.configuration.metric import Filter
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.local_map.area_filter import AreaFilter, FilterStep, PlacedKeyframe

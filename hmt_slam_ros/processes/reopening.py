@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hmt_slam_ros.configuration.tree import LoopClosureAcceptance
+from hmt_slam_ros.configuration.topological import LoopClosureAcceptance
 from hmt_slam_ros.geometry.chi_square import gate
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.processes.closure_account import Account, Name

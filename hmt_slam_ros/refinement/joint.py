@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from hmt_slam_ros.configuration.tree import Refinement
+from hmt_slam_ros.configuration.topological import Refinement
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.refinement.registration import normal_equations, weighting
 from hmt_slam_ros.refinement.surfaces import Surfaces

@@ -12,7 +12,7 @@ import numpy as np
 from numba import njit
 
 from hmt_slam_ros.arrays import Float64, Int64
-from hmt_slam_ros.configuration.tree import Refinement
+from hmt_slam_ros.configuration.topological import Refinement
 from hmt_slam_ros.refinement.surfaces import Surfaces, bin_of
 
 # Bins of bearing searched to each side at most, and the cosine of the angle between walls that are the same at least.

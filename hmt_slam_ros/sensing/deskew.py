@@ -13,7 +13,7 @@ from collections import deque
 from dataclasses import replace
 from statistics import median
 
-from hmt_slam_ros.configuration.tree import RealTimeLocalization
+from hmt_slam_ros.configuration.live import RealTimeLocalization
 from hmt_slam_ros.sensing.odometry import OdometryBuffer
 from hmt_slam_ros.sensing.scan import Scan
 

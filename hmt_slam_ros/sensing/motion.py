@@ -8,7 +8,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from hmt_slam_ros.configuration.tree import Motion
+from hmt_slam_ros.configuration.metric import Motion
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.covariance import carried, inverse
 from hmt_slam_ros.sensing.odometry import OdometryBuffer

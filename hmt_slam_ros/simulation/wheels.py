@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from hmt_slam_ros.configuration.tree import Motion
+from hmt_slam_ros.configuration.metric import Motion
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.sensing.motion import path_deviations
 
