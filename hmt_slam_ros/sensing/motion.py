@@ -105,7 +105,7 @@ class Inertia:
     def _count(self, seconds: float) -> None:
         """Take the time since the last scan into the means; the first one makes them."""
         self._usually = self._usually + _NEW * (seconds - self._usually) if self._usually else seconds
-        regular = self._usually < _IRREGULAR * seconds < _IRREGULAR**2 * self._usually
+        regular = self._usually / _IRREGULAR < seconds < self._usually * _IRREGULAR
         newest = seconds if regular else self._usually
         self._period = self._period + _NEWEST * (newest - self._period) if self._period else newest
 
@@ -162,6 +162,8 @@ class OdometryNoise:
 
         :param odometry: with the model's covariance.
         """
+        if (self.factors <= NOISY).all():
+            return self.scaled(odometry)
         usual = np.minimum(self.factors, NOISY)[[0, 0, 1]]
         lasting = odometry.covariance * np.outer(usual, usual)
         beyond = odometry._replace(covariance=odometry.covariance * self._scales - lasting)
