@@ -78,7 +78,7 @@ def moved(x, turn=0.0):
 def test_a_map_of_the_right_topology_is_told_from_wrong_ones():
     assert Verdict(scores(0.3), moved(0.1)).right
     assert Verdict(scores(0.3)).right
-    assert not Verdict(scores(2.1), moved(0.1)).right
+    assert not Verdict(scores(1.1), moved(0.1)).right
     assert not Verdict(scores(0.3), moved(0.6)).right
     assert not Verdict(scores(0.3), moved(0.0, np.radians(11.0))).right
     assert not Verdict(scores(0.3), (*moved(0.0), *moved(3.0))).right
