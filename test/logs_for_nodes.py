@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 from worlds import box, scan_in
 
-from hmt_slam_ros.logs import LogRecord, write_bag
+from hmt_slam_ros.logs import LogRecord
+from hmt_slam_ros.logs.writer import write_bag
 from hmt_slam_ros.sensing import Odometry
 
 SECOND = 1_000_000_000

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from hmt_slam_ros.logs import convert
+from hmt_slam_ros.logs.writer import convert
 
 
 def run(options: argparse.Namespace) -> None:

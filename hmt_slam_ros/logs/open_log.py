@@ -8,7 +8,6 @@ import zlib
 from pathlib import Path
 
 from hmt_slam_ros.errors import HmtSlamError
-from hmt_slam_ros.logs.bag import BagLog
 from hmt_slam_ros.logs.carmen import looks_like_carmen, open_carmen
 from hmt_slam_ros.logs.entries import Window
 from hmt_slam_ros.logs.mrpt_objects import looks_like_rawlog
@@ -45,11 +44,11 @@ def open_log(
     path = Path(path)
     try:
         if path.is_dir():
-            return BagLog(_bag_folder(path), window, scan_topic, odom_topic)
+            return _open_bag(_bag_folder(path), window, scan_topic, odom_topic)
         head = _head(path)
         for magic, suffix in ((_MCAP, ".mcap"), (_SQLITE, ".db3")):
             if head.startswith(magic):
-                return BagLog(_with_suffix(path, suffix), window, scan_topic, odom_topic)
+                return _open_bag(_with_suffix(path, suffix), window, scan_topic, odom_topic)
     except OSError as error:
         raise HmtSlamError(f"{path} cannot be read ({error.strerror}): give an existing log.") from error
     return _open_file(path, head, window)
@@ -58,6 +57,13 @@ def open_log(
 def is_simulated(path: str | Path) -> bool:
     """Whether a log is made while it is read, and no file."""
     return str(path).startswith(SIMULATED)
+
+
+def _open_bag(path: Path, window: Window, scan_topic: str, odom_topic: str) -> Log:
+    # Its library takes memory that the other formats need not pay for.
+    from hmt_slam_ros.logs.bag import BagLog  # noqa: PLC0415
+
+    return BagLog(path, window, scan_topic, odom_topic)
 
 
 def _open_file(path: Path, head: bytes, window: Window) -> Log:

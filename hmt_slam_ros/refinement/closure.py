@@ -6,9 +6,10 @@ from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 
-import networkx as nx
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csc_matrix
+from scipy.sparse.csgraph import connected_components
 
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
@@ -110,9 +111,11 @@ class ClosureRefinement:
 
 def _surroundings(hybrid_map: HybridMap, closed: Collection[int]) -> list[list[int]]:
     """The areas joined and those one arc away, in groups that arcs join, each ascending."""
-    graph = nx.Graph()
-    graph.add_edges_from((area, beside) for area in closed for beside in (area, *hybrid_map.neighbours(area)))
-    return sorted(sorted(group) for group in nx.connected_components(graph))
+    arcs = np.array([(area, beside) for area in closed for beside in (area, *hybrid_map.neighbours(area))])
+    areas, rows = np.unique(arcs, return_inverse=True)
+    graph = csc_matrix((np.ones(len(arcs)), rows.reshape(-1, 2).T), shape=(areas.size, areas.size))
+    groups, labels = connected_components(graph, directed=False)
+    return [areas[labels == group].tolist() for group in range(groups)]
 
 
 def _reference(hybrid_map: HybridMap, area: int) -> int:
