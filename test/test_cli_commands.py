@@ -15,6 +15,7 @@ from hmt_slam_ros.configuration import Configuration, as_nested
 
 ROOT = Path(__file__).resolve().parents[1]
 BAG = ROOT / "data" / "malaga_one_loop"
+COMMANDS = ("map", "replay", "convert", "simulate", "evaluate", "plot", "export", "parameters")
 SCAN_LINE = "FLASER 3 1.0 1.1 1.2 {x} 0 0 {x} 0 0 {t} robot {t}\n"
 
 
@@ -40,7 +41,7 @@ def carmen(tmp_path: Path) -> Path:
     return log
 
 
-@pytest.mark.parametrize("command", ["", "map", "replay", "convert", "simulate", "evaluate", "plot", "parameters"])
+@pytest.mark.parametrize("command", ["", *COMMANDS])
 def test_help_is_there_for_every_command_and_comes_at_once(command: str) -> None:
     fastest = float("inf")
     for _ in range(3):
@@ -56,6 +57,15 @@ def test_help_imports_nothing_heavy() -> None:
     code = (
         "import sys; from hmt_slam_ros.cli.arguments import parser; parser();"
         "print(sorted({'numpy', 'numba', 'matplotlib', 'scipy', 'rosbags', 'rclpy', 'yaml'} & set(sys.modules)))"
+    )
+    result = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert result.stdout == "[]\n"
+
+
+def test_mapping_loads_no_library_that_it_does_not_use() -> None:
+    code = (
+        "import sys; import hmt_slam_ros.cli.map_command;"
+        "print(sorted({'networkx', 'rosbags', 'matplotlib', 'rclpy'} & set(sys.modules)))"
     )
     result = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     assert result.stdout == "[]\n"
@@ -167,6 +177,8 @@ def test_map_makes_the_folder_and_replaces_it_and_plot_draws_from_it(tmp_path: P
     drawn = hmt_slam("plot", out)
     assert drawn.returncode == 0, drawn.stderr
     assert [Path(line).name for line in drawn.stdout.split()] == ["map.png", "pmf.png", "cost.png"]
+    exported = hmt_slam("export", out)
+    assert (exported.returncode, exported.stdout) == (0, f"{out / 'topology.graphml'}\n"), exported.stderr
 
 
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
@@ -201,8 +213,9 @@ def test_evaluate_prints_the_errors_of_a_trajectory(tmp_path: Path) -> None:
     refused(hmt_slam("evaluate", tmp_path, "--relations", tmp_path / "missing"))
 
 
-def test_plot_of_something_else_is_refused(tmp_path: Path) -> None:
-    refused(hmt_slam("plot", tmp_path))
+@pytest.mark.parametrize("command", ["plot", "export"])
+def test_plot_and_export_of_something_else_are_refused(tmp_path: Path, command: str) -> None:
+    refused(hmt_slam(command, tmp_path))
 
 
 def test_parameters_prints_a_file_that_config_reads_back(tmp_path: Path) -> None:

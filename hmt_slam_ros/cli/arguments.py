@@ -31,6 +31,7 @@ def parser() -> argparse.ArgumentParser:
     _simulate(commands.add_parser("simulate", help="write a drive through a simulated world as a rosbag2"))
     _evaluate(commands.add_parser("evaluate", help="errors of an output folder against true relations"))
     _plot(commands.add_parser("plot", help="draw map, probabilities and cost of an output folder"))
+    _export(commands.add_parser("export", help="write the topology of an output folder as GraphML"))
     _parameters(commands.add_parser("parameters", help="print every parameter as a YAML file"))
     return top
 
@@ -111,6 +112,10 @@ def _evaluate(command: argparse.ArgumentParser) -> None:
 
 def _plot(command: argparse.ArgumentParser) -> None:
     command.add_argument("directory", type=Path, metavar="DIR", help="output folder, in which the pictures are put")
+
+
+def _export(command: argparse.ArgumentParser) -> None:
+    command.add_argument("directory", type=Path, metavar="DIR", help="output folder, in which the file is put")
 
 
 def _parameters(command: argparse.ArgumentParser) -> None:

@@ -20,6 +20,7 @@ from hmt_slam_ros.offline.map_image import occupancy_image, write_map
 from hmt_slam_ros.offline.recorder import Recording, keyframe_poses
 from hmt_slam_ros.offline.report import RunFigures, report, write_cost, write_probabilities
 from hmt_slam_ros.offline.saved_map import MANIFEST, write_json, write_saved_map
+from hmt_slam_ros.offline.topology_file import TOPOLOGY
 
 # Everything that ever stands in an output folder; a folder with anything else in it is not ours to replace.
 OWN_NAMES = frozenset(
@@ -32,6 +33,7 @@ OWN_NAMES = frozenset(
         "map.png",
         "hmt_map",
         "graph.g2o",
+        TOPOLOGY,
         "report.json",
         "pmf.csv",
         "pmf.png",
