@@ -11,15 +11,14 @@ from hmt_slam_ros.local_map.batch import propose_all
 from hmt_slam_ros.local_map.insertion import InverseModel
 from hmt_slam_ros.local_map.matching import (
     Alignment,
-    Lattice,
     Prior,
     align,
     beam_model,
-    correlative_search,
     log_ratio,
 )
 from hmt_slam_ros.local_map.patch_pool import Beams, PatchPool
 from hmt_slam_ros.local_map.patches import FAR, PATCH, field_at, odds_at
+from hmt_slam_ros.local_map.search import Lattice, correlative_search
 from hmt_slam_ros.sensing.surfels import surfels
 
 CELL, RADIUS = 0.05, 0.5

@@ -9,23 +9,16 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from hmt_slam_ros.geometry import symmetric
+
 Matrix = NDArray[np.float64]
 
 
 @njit(cache=True)
 def inverse(matrix: Matrix) -> Matrix:
     """The inverse of a positive definite matrix, by cofactors."""
-    a = matrix[1, 1] * matrix[2, 2] - matrix[1, 2] * matrix[2, 1]
-    b = matrix[1, 2] * matrix[2, 0] - matrix[1, 0] * matrix[2, 2]
-    c = matrix[1, 0] * matrix[2, 1] - matrix[1, 1] * matrix[2, 0]
-    scale = 1.0 / (matrix[0, 0] * a + matrix[0, 1] * b + matrix[0, 2] * c)
     found = np.empty((3, 3))
-    found[0, 0] = scale * a
-    found[0, 1] = found[1, 0] = scale * b
-    found[0, 2] = found[2, 0] = scale * c
-    found[1, 1] = scale * (matrix[0, 0] * matrix[2, 2] - matrix[0, 2] * matrix[2, 0])
-    found[1, 2] = found[2, 1] = scale * (matrix[0, 1] * matrix[2, 0] - matrix[0, 0] * matrix[2, 1])
-    found[2, 2] = scale * (matrix[0, 0] * matrix[1, 1] - matrix[0, 1] * matrix[1, 0])
+    symmetric.into_array(symmetric.inverse(symmetric.of_array(matrix)), found)
     return found
 
 

@@ -1,4 +1,4 @@
-"""Scan matching against a map of patches: likelihood, correlative search, Gauss-Newton on the distance field.
+"""Scan matching against a map of patches: likelihood, and Gauss-Newton on the distance field.
 
 Poses are ``map_T_base`` (x, y, theta); points are (n, 2) in m in the base frame, surfels (n, 4) points with normals
 (``sensing/surfels.py``), which serve wherever points do. The likelihood of a beam is taken
@@ -12,7 +12,18 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from hmt_slam_ros.arrays import Float64, Int64
+from hmt_slam_ros.arrays import Float64
+from hmt_slam_ros.geometry.symmetric import (
+    Symmetric,
+    Vector,
+    determinant,
+    dot,
+    into_array,
+    of_array,
+    solved,
+    times,
+    total,
+)
 from hmt_slam_ros.local_map.patches import FAR, PATCH, MapView, field_at, odds_at
 
 
@@ -101,9 +112,13 @@ def matched_fraction(points: Float64, pose: Float64, view: MapView, near: int) -
 @njit(cache=True)
 def log_prior(pose: Float64, prior: Prior) -> float:
     """-1/2 of the squared Mahalanobis distance, without the normaliser."""
-    difference = pose - prior.mean
-    difference[2] = (difference[2] + np.pi) % (2.0 * np.pi) - np.pi
-    return -0.5 * np.dot(difference, prior.information @ difference)
+    difference = _difference(pose[0], pose[1], pose[2], prior.mean)
+    return -0.5 * dot(difference, times(of_array(prior.information), difference))
+
+
+@njit(cache=True)
+def _difference(x: float, y: float, theta: float, mean: Float64) -> Vector:
+    return x - mean[0], y - mean[1], (theta - mean[2] + np.pi) % (2.0 * np.pi) - np.pi
 
 
 @njit(cache=True)
@@ -115,92 +130,9 @@ def evidence(
     :param hessian: (3, 3) information of the points at the mode.
     """
     ratio = log_ratio(points, mode[0], mode[1], mode[2], view, model)
-    occam = np.linalg.det(prior.information) / np.linalg.det(prior.information + temper * hessian)
+    known = of_array(prior.information)
+    occam = determinant(known) / determinant(total(known, of_array(hessian), temper))
     return log_prior(mode, prior) + temper * ratio + 0.5 * np.log(occam)
-
-
-class Lattice(NamedTuple):
-    """The poses that a search tries: around a centre, along the axes of the map and in heading.
-
-    :ivar stride: from one pose to the next, cells.
-    :ivar turn: from one heading to the next, rad.
-    :ivar counts: (3,), int64, steps to each side in x, y and heading.
-    """
-
-    stride: int
-    turn: float
-    counts: Int64
-
-
-@njit(cache=True)
-def correlative_search(
-    points: Float64, prior: Prior, lattice: Lattice, view: MapView, model: BeamModel, temper: float, most: int
-) -> Float64:
-    """The highest peaks of tempered likelihood ratio times prior on a lattice around the prior's mean (Olson 2009).
-
-    :param most: how many peaks at most.
-    :returns: (k, 3) poses, the best first; no two are neighbours or neighbours' neighbours on the lattice.
-    """
-    counts = lattice.counts
-    sizes = (2 * counts[0] + 1, 2 * counts[1] + 1, 2 * counts[2] + 1)
-    scores = np.empty(sizes)
-    pose = np.empty(3)
-    for k in range(sizes[2]):
-        pose[2] = prior.mean[2] + (k - counts[2]) * lattice.turn
-        columns, rows = _cells_at(points, prior.mean[0], prior.mean[1], pose[2], view)
-        for i in range(sizes[0]):
-            right = (i - counts[0]) * lattice.stride
-            pose[0] = prior.mean[0] + right * view.cell
-            for j in range(sizes[1]):
-                up = (j - counts[1]) * lattice.stride
-                pose[1] = prior.mean[1] + up * view.cell
-                ratio = _log_ratio_of_cells(columns, rows, right, up, view, model)
-                scores[i, j, k] = log_prior(pose, prior) + temper * ratio
-    return _peaks(scores, prior.mean, lattice, view.cell, most)
-
-
-@njit(cache=True)
-def _cells_at(points: Float64, x: float, y: float, theta: float, view: MapView) -> tuple[Int64, Int64]:
-    """Columns and rows of the points at the pose (x, y, theta), each (n,)."""
-    cos, sin = np.cos(theta) / view.cell, np.sin(theta) / view.cell
-    half = 0.5 * view.table.shape[0] * PATCH
-    columns, rows = np.empty(points.shape[0], dtype=np.int64), np.empty(points.shape[0], dtype=np.int64)
-    for n in range(points.shape[0]):
-        columns[n] = int(x / view.cell + half + cos * points[n, 0] - sin * points[n, 1])
-        rows[n] = int(y / view.cell + half + sin * points[n, 0] + cos * points[n, 1])
-    return columns, rows
-
-
-@njit(cache=True)
-def _log_ratio_of_cells(
-    columns: Int64, rows: Int64, right: int, up: int, view: MapView, model: BeamModel
-) -> float:
-    """Sum of the log-likelihood ratios of end points in these cells, all shifted, nats."""
-    total = 0.0
-    for n in range(columns.size):
-        distance = field_at(view, columns[n] + right, rows[n] + up)
-        if odds_at(view, columns[n] + right, rows[n] + up) == 0:
-            total += model.in_unknown[distance]
-        else:
-            total += model.in_known[distance]
-    return total
-
-
-@njit(cache=True)
-def _peaks(scores: Float64, centre: Float64, lattice: Lattice, cell: float, most: int) -> Float64:
-    """The poses (k, 3) of the highest scores, each at least three steps from those before it; empties ``scores``."""
-    found = np.empty((most, 3))
-    counts = lattice.counts
-    step = np.array([lattice.stride * cell, lattice.stride * cell, lattice.turn])
-    for n in range(most):
-        best = np.argmax(scores)
-        i, rest = divmod(best, scores.shape[1] * scores.shape[2])
-        j, k = divmod(rest, scores.shape[2])
-        if scores[i, j, k] == -np.inf:
-            return found[:n]
-        found[n] = centre + step * (np.array([i, j, k]) - counts)
-        scores[max(0, i - 2) : i + 3, max(0, j - 2) : j + 3, max(0, k - 2) : k + 3] = -np.inf
-    return found
 
 
 @njit(cache=True)
@@ -219,39 +151,44 @@ def _smooth_distance(view: MapView, u: float, v: float) -> tuple[float, float, f
 
 @njit(cache=True)
 def linearise(
-    points: Float64, pose: Float64, view: MapView, settings: Alignment
-) -> tuple[Float64, Float64, float]:
-    """Normal equations of the surfels (n, 4) at a pose: J' W J (3, 3) and J' W r (3,); and r' W r.
+    points: Float64, x: float, y: float, theta: float, view: MapView, settings: Alignment
+) -> tuple[Symmetric, Vector, float]:
+    """Normal equations of the surfels (n, 4) at the pose (x, y, theta): J' W J and J' W r; and r' W r.
 
     Distance and gradient of a point on a surface count by what they have in the direction of its normal.
     """
-    hessian, gradient, square, row = np.zeros((3, 3)), np.zeros(3), 0.0, np.empty(3)
     half = 0.5 * view.table.shape[0] * PATCH - 0.5
     quantum = view.radius / FAR
-    cos, sin = np.cos(pose[2]), np.sin(pose[2])
+    cos, sin = np.cos(theta), np.sin(theta)
+    # Sums in variables of their own stay in registers.
+    xx = xy = xt = yy = yt = tt = gx = gy = gt = square = 0.0
     for n in range(points.shape[0]):
         rx = cos * points[n, 0] - sin * points[n, 1]
         ry = sin * points[n, 0] + cos * points[n, 1]
-        distance, gu, gv = _smooth_distance(
-            view, (pose[0] + rx) / view.cell + half, (pose[1] + ry) / view.cell + half
-        )
+        distance, gu, gv = _smooth_distance(view, (x + rx) / view.cell + half, (y + ry) / view.cell + half)
         if distance >= FAR - 1:
             continue
         distance *= quantum
-        row[0], row[1] = gu * quantum / view.cell, gv * quantum / view.cell
+        jx, jy = gu * quantum / view.cell, gv * quantum / view.cell
         weight = 1.0 / ((1.0 + (distance / settings.robust) ** 2) * settings.sigma**2)
         if points[n, 2] != 0.0 or points[n, 3] != 0.0:
             normal_x, normal_y = cos * points[n, 2] - sin * points[n, 3], sin * points[n, 2] + cos * points[n, 3]
-            across = row[0] * normal_x + row[1] * normal_y
-            row[0], row[1] = across * normal_x, across * normal_y
+            across = jx * normal_x + jy * normal_y
+            jx, jy = across * normal_x, across * normal_y
             distance *= abs(across)
-        row[2] = row[1] * rx - row[0] * ry
-        square += weight * distance * distance
-        for i in range(3):
-            gradient[i] += weight * distance * row[i]
-            for j in range(3):
-                hessian[i, j] += weight * row[i] * row[j]
-    return hessian, gradient, square
+        jt = jy * rx - jx * ry
+        wx, wy, wt, error = weight * jx, weight * jy, weight * jt, weight * distance
+        xx += wx * jx
+        xy += wx * jy
+        xt += wx * jt
+        yy += wy * jy
+        yt += wy * jt
+        tt += wt * jt
+        gx += error * jx
+        gy += error * jy
+        gt += error * jt
+        square += error * distance
+    return Symmetric(xx, xy, xt, yy, yt, tt), (gx, gy, gt), square
 
 
 @njit(cache=True)
@@ -266,17 +203,31 @@ def align(
     :param start: (3,) pose to start from.
     :returns: the mode (3,), and the information (3, 3) of the points alone, map coordinates.
     """
+    mode, hessian = np.empty(3), np.empty((3, 3))
+    align_into(points, start, prior, view, settings, mode, hessian)
+    return mode, hessian
+
+
+@njit(cache=True)
+def align_into(
+    points: Float64, start: Float64, prior: Prior, view: MapView, settings: Alignment, mode: Float64, hessian: Float64
+) -> None:
+    """:func:`align` with its results written into ``mode`` and ``hessian``."""
     if points.shape[1] != 4:
         raise ValueError("points are aligned with their normals: give surfels (n, 4)")
-    pose = start.copy()
-    hessian = np.zeros((3, 3))
-    held = settings.inflation * prior.information
+    x, y, theta = start[0], start[1], start[2]
+    known, information = of_array(prior.information), Symmetric(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     for _ in range(settings.iterations):
-        hessian, gradient, _ = linearise(points, pose, view, settings)
-        difference = pose - prior.mean
-        difference[2] = (difference[2] + np.pi) % (2.0 * np.pi) - np.pi
-        step = np.linalg.solve(hessian + held, gradient + held @ difference)
-        pose -= step
+        information, gradient, _ = linearise(points, x, y, theta, view, settings)
+        held = times(known, _difference(x, y, theta, prior.mean))
+        slope = (
+            gradient[0] + settings.inflation * held[0],
+            gradient[1] + settings.inflation * held[1],
+            gradient[2] + settings.inflation * held[2],
+        )
+        step = solved(total(information, known, settings.inflation), slope)
+        x, y, theta = x - step[0], y - step[1], theta - step[2]
         if abs(step[0]) + abs(step[1]) < 1e-4 and abs(step[2]) < 1e-4:
             break
-    return pose, hessian
+    mode[0], mode[1], mode[2] = x, y, theta
+    into_array(information, hessian)

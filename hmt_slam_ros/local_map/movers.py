@@ -13,7 +13,18 @@ from numba import njit
 
 from hmt_slam_ros.arrays import Bool, Float64, Int64
 from hmt_slam_ros.geometry.chi_square import gate
-from hmt_slam_ros.geometry.covariance import inverse
+from hmt_slam_ros.geometry.symmetric import (
+    Symmetric,
+    Vector,
+    dot,
+    into_array,
+    inverse,
+    of_array,
+    sandwiched,
+    solved,
+    times,
+    total,
+)
 from hmt_slam_ros.local_map.matching import Alignment, Prior, linearise
 from hmt_slam_ros.local_map.patches import MapView
 
@@ -67,25 +78,32 @@ def _told(
     count = begins.size - 1
     informations, gradients, contradicts = np.empty((count, 3, 3)), np.empty((count, 3)), np.zeros(count, np.bool_)
     plain = Alignment(settings.sigma * np.sqrt(settings.inflation), np.inf, 1.0, 1)
-    covariance, unmoved = inverse(prior.information), np.zeros(3)
+    covariance, unmoved = inverse(of_array(prior.information)), (0.0, 0.0, 0.0)
     for k in range(count):
         own = points[begins[k] : begins[k + 1]]
-        informations[k], gradients[k], square = linearise(own, prior.mean, view, plain)
+        information, gradient, square = linearise(own, prior.mean[0], prior.mean[1], prior.mean[2], view, plain)
         # No chi-square exceeds that of a prior that is certain.
         if square > _GATE:
-            contradicts[k] = _surprise(informations[k], gradients[k], covariance, unmoved) > _GATE
+            contradicts[k] = _surprise(information, gradient, covariance, unmoved) > _GATE
+        into_array(information, informations[k])
+        gradients[k, 0], gradients[k, 1], gradients[k, 2] = gradient
     return informations, gradients, contradicts
 
 
 @njit(cache=True)
-def _surprise(information: Float64, gradient: Float64, covariance: Float64, shift: Float64) -> float:
+def _surprise(information: Symmetric, gradient: Vector, covariance: Symmetric, shift: Vector) -> float:
     """Chi-square of what a thing tells, where all else tells that the pose is off by ``shift``."""
-    expected = information @ covariance @ information + information
-    ridge = _RIDGE * (1.0 + np.trace(expected))
-    for i in range(3):
-        expected[i, i] += ridge
-    told = gradient + information @ shift
-    return np.dot(told, np.linalg.solve(expected, told))
+    expected = total(sandwiched(information, covariance), information, 1.0)
+    ridge = _RIDGE * (1.0 + expected.xx + expected.yy + expected.tt)
+    expected = total(expected, Symmetric(1.0, 0.0, 0.0, 1.0, 0.0, 1.0), ridge)
+    told = _sum(gradient, times(information, shift), 1.0)
+    return dot(told, solved(expected, told))
+
+
+@njit(cache=True)
+def _sum(a: Vector, b: Vector, factor: float) -> Vector:
+    """a + factor b."""
+    return a[0] + factor * b[0], a[1] + factor * b[1], a[2] + factor * b[2]
 
 
 @njit(cache=True)
@@ -95,18 +113,26 @@ def _moved(suspects: Int64, informations: Float64, gradients: Float64, prior: Fl
     :param prior: information of the prediction.
     """
     moved = np.zeros(gradients.shape[0], np.bool_)
-    information, gradient = prior + informations.sum(axis=0), gradients.sum(axis=0)
+    information, gradient = of_array(prior), (0.0, 0.0, 0.0)
+    for k in range(gradients.shape[0]):
+        information = total(information, of_array(informations[k]), 1.0)
+        gradient = _sum(gradient, _row(gradients, k), 1.0)
     while True:
         worst, largest = -1, _GATE
         for k in suspects:
             if not moved[k]:
-                covariance = inverse(information - informations[k])
-                shift = np.dot(covariance, gradients[k] - gradient)
-                surprise = _surprise(informations[k], gradients[k], covariance, shift)
+                own, told = of_array(informations[k]), _row(gradients, k)
+                covariance = inverse(total(information, own, -1.0))
+                surprise = _surprise(own, told, covariance, times(covariance, _sum(told, gradient, -1.0)))
                 if surprise > largest:
                     worst, largest = k, surprise
         if worst < 0:
             return moved
         moved[worst] = True
-        information = information - informations[worst]
-        gradient = gradient - gradients[worst]
+        information = total(information, of_array(informations[worst]), -1.0)
+        gradient = _sum(gradient, _row(gradients, worst), -1.0)
+
+
+@njit(cache=True)
+def _row(vectors: Float64, k: int) -> Vector:
+    return vectors[k, 0], vectors[k, 1], vectors[k, 2]

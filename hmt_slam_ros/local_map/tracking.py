@@ -16,7 +16,7 @@ from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.chi_square import gate
 from hmt_slam_ros.geometry.covariance import inverse, turned
-from hmt_slam_ros.local_map import matching
+from hmt_slam_ros.local_map import matching, search
 from hmt_slam_ros.local_map.local_mapping import LocalMapping
 from hmt_slam_ros.local_map.movers import standing
 from hmt_slam_ros.local_map.patches import MapView
@@ -140,7 +140,7 @@ class ScanMatcher:
         if not _wide(step) and self._fits(points, match.pose, view):
             return match
         lattice = self._lattice(step, predicted[2])
-        starts = matching.correlative_search(
+        starts = search.correlative_search(
             points[:: max(1, len(points) // _SEARCH_POINTS)], prior, lattice, view, self._mapping.model,
             self._settings.temper, _PEAKS,
         )  # fmt: skip
@@ -162,7 +162,7 @@ class ScanMatcher:
         )
         return Match(pose, hessian, prior, step, log_evidence)
 
-    def _lattice(self, step: Step, theta: float) -> matching.Lattice:
+    def _lattice(self, step: Step, theta: float) -> search.Lattice:
         """The poses to search for after a step to the heading ``theta``."""
         settings, cell = self._settings, self._mapping.pool.cell
         reach = _REACH * np.sqrt(np.diag(turned(step.covariance, theta)))
@@ -170,7 +170,7 @@ class ScanMatcher:
         reach[2] = np.clip(reach[2], math.radians(settings.search_angle), math.radians(settings.wide_angle))
         turn = math.radians(settings.search_step)
         counts = np.ceil(reach / np.array([2.0 * cell, 2.0 * cell, turn])).astype(np.int64)
-        return matching.Lattice(2, turn, counts)
+        return search.Lattice(2, turn, counts)
 
 
 def _wide(step: Step) -> bool:

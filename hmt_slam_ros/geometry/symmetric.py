@@ -1,0 +1,106 @@
+"""Symmetric matrices (3, 3) as six numbers, for kernels that may not take memory for each that they compute."""
+
+from __future__ import annotations
+
+from typing import NamedTuple, TypeAlias
+
+from numba import njit
+
+from hmt_slam_ros.arrays import Float64
+
+Vector: TypeAlias = tuple[float, float, float]
+
+
+class Symmetric(NamedTuple):
+    """The upper triangle of a symmetric matrix (3, 3) over (x, y, theta)."""
+
+    xx: float
+    xy: float
+    xt: float
+    yy: float
+    yt: float
+    tt: float
+
+
+@njit(cache=True)
+def of_array(matrix: Float64) -> Symmetric:
+    """The upper triangle of an array (3, 3)."""
+    return Symmetric(matrix[0, 0], matrix[0, 1], matrix[0, 2], matrix[1, 1], matrix[1, 2], matrix[2, 2])
+
+
+@njit(cache=True)
+def into_array(a: Symmetric, matrix: Float64) -> None:
+    """Write the whole matrix into an array (3, 3)."""
+    matrix[0, 0], matrix[1, 1], matrix[2, 2] = a.xx, a.yy, a.tt
+    matrix[0, 1] = matrix[1, 0] = a.xy
+    matrix[0, 2] = matrix[2, 0] = a.xt
+    matrix[1, 2] = matrix[2, 1] = a.yt
+
+
+@njit(cache=True)
+def total(a: Symmetric, b: Symmetric, factor: float) -> Symmetric:
+    """a + factor b."""
+    return Symmetric(
+        a.xx + factor * b.xx,
+        a.xy + factor * b.xy,
+        a.xt + factor * b.xt,
+        a.yy + factor * b.yy,
+        a.yt + factor * b.yt,
+        a.tt + factor * b.tt,
+    )
+
+
+@njit(cache=True)
+def times(a: Symmetric, v: Vector) -> Vector:
+    """a v."""
+    x, y, t = v
+    return a.xx * x + a.xy * y + a.xt * t, a.xy * x + a.yy * y + a.yt * t, a.xt * x + a.yt * y + a.tt * t
+
+
+@njit(cache=True)
+def dot(v: Vector, w: Vector) -> float:
+    """v' w."""
+    return v[0] * w[0] + v[1] * w[1] + v[2] * w[2]
+
+
+@njit(cache=True)
+def sandwiched(a: Symmetric, b: Symmetric) -> Symmetric:
+    """a b a."""
+    x, y, t = (a.xx, a.xy, a.xt), (a.xy, a.yy, a.yt), (a.xt, a.yt, a.tt)
+    bx, by, bt = times(b, x), times(b, y), times(b, t)
+    return Symmetric(dot(x, bx), dot(x, by), dot(x, bt), dot(y, by), dot(y, bt), dot(t, bt))
+
+
+@njit(cache=True)
+def inverse(a: Symmetric) -> Symmetric:
+    """The inverse of a positive definite matrix, by cofactors."""
+    xx, xy, xt = a.yy * a.tt - a.yt * a.yt, a.yt * a.xt - a.xy * a.tt, a.xy * a.yt - a.yy * a.xt
+    scale = 1.0 / (a.xx * xx + a.xy * xy + a.xt * xt)
+    yy, yt, tt = a.xx * a.tt - a.xt * a.xt, a.xy * a.xt - a.xx * a.yt, a.xx * a.yy - a.xy * a.xy
+    return Symmetric(scale * xx, scale * xy, scale * xt, scale * yy, scale * yt, scale * tt)
+
+
+@njit(cache=True)
+def _decomposed(a: Symmetric) -> tuple[Vector, Vector]:
+    """L D L' of a positive definite matrix: the diagonal of D, and of L what is at xy, xt and yt."""
+    xy, xt = a.xy / a.xx, a.xt / a.xx
+    yy = a.yy - xy * a.xy
+    yt = (a.yt - xt * a.xy) / yy
+    return (a.xx, yy, a.tt - xt * a.xt - yt * yt * yy), (xy, xt, yt)
+
+
+@njit(cache=True)
+def solved(a: Symmetric, v: Vector) -> Vector:
+    """a^-1 v for a positive definite matrix, as exact as it is where cofactors would cancel."""
+    (xx, yy, tt), (xy, xt, yt) = _decomposed(a)
+    y = v[1] - xy * v[0]
+    t = (v[2] - xt * v[0] - yt * y) / tt
+    y = y / yy - yt * t
+    return v[0] / xx - xy * y - xt * t, y, t
+
+
+@njit(cache=True)
+def determinant(a: Symmetric) -> float:
+    """Of a positive definite matrix."""
+    diagonal, _ = _decomposed(a)
+    return diagonal[0] * diagonal[1] * diagonal[2]
