@@ -32,6 +32,7 @@ MEASUREMENTS = {
     "robustness": "the same with degraded odometry",
     "choices": "what each choice of the design is worth, one parameter changed at a time",
     "speed": "CPU time, memory, cost of a scan, start",
+    "kernels": "CPU time of the inner loops, and that they take no memory",
     "calibration": "whether the probabilities of topological paths are right, on simulated worlds",
     "loops": "precision and recall of loop closures, likewise",
     "topology": "whether the world of nested loops ends with the exact topology",

@@ -1,30 +1,26 @@
-"""What the inner loops cost: ``python -m benchmark.kernels [LOG]``, in CPU time of this machine, kernels compiled.
-
-A keyframe every half metre or twenty degrees of the log's odometry is entered into the maps of the particles, which
-stand beside each other a few centimetres apart; every forty keyframes the maps are forgotten, as at a change of area.
-The bundled log serves where none is named. Scans are simulated in an office with people in it, 361 beams each, by ray
-casting alone and with all that belongs to a scan; a laser of 10 Hz takes 100 000 us for one.
-"""
+"""What the inner loops cost, in CPU time and in memory taken from the heap."""
 
 from __future__ import annotations
 
-import argparse
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmark.logs import ROOT
-from hmt_slam_ros.configuration import Configuration
+from benchmark.allocations import counted, requirements_on, told
+from benchmark.logs import BUNDLED, opened
+from benchmark.report import Report, table
+from benchmark.settings import Settings
+from hmt_slam_ros.configuration import Configuration, load_configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.local_map import batch, matching, movers
 from hmt_slam_ros.local_map.local_mapping import LocalMapping
-from hmt_slam_ros.logs import open_log
+from hmt_slam_ros.logs import Log, open_log
+from hmt_slam_ros.offline.runtime import run_log
 from hmt_slam_ros.processes.messages import LocalEstimate
 from hmt_slam_ros.processes.rtl import Rtl
 from hmt_slam_ros.sensing import Odometry, Scan
@@ -34,7 +30,22 @@ from hmt_slam_ros.topology.overlap import overlaps, sensed_points
 _KEYFRAMES, _PER_AREA = 400, 40
 _APART = 0.03  # m
 _REPEATS = 3
-_CONFIGURATION = Configuration()
+
+Keyframes = list[tuple[Scan, NDArray[np.float64]]]
+
+TIMES = (
+    "CPU time, the least of three repetitions with kernels compiled. A keyframe every half metre or twenty degrees of "
+    "the log's odometry is entered into the maps of the particles, which stand beside each other a few centimetres "
+    "apart; every forty keyframes the maps are forgotten, as at a change of area. Scans are simulated in an office "
+    "with people in it, 361 beams each, by ray casting alone and with all that belongs to a scan; a laser of 10 Hz "
+    "takes 100 000 us for one."
+)
+ALLOCATIONS = (
+    "The same log mapped whole: how many arrays numba's runtime takes from the heap in a call of each kernel that "
+    "Python calls, with all kernels that it calls itself. Their number is the same for any number of beams, particles "
+    "and steps, so that the loops over them take none: the log-likelihood of a point, a step of Gauss-Newton, the "
+    "proposal of a particle and the beams that enter its map."
+)
 
 
 class Figures:
@@ -59,47 +70,65 @@ class Figures:
         return {name: 1e6 * seconds / self._amounts[name] for name, seconds in self._seconds.items()}
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Measure and print."""
-    parser = argparse.ArgumentParser(prog="python -m benchmark.kernels", description="What the inner loops cost.")
-    parser.add_argument("log", nargs="?", type=Path, default=ROOT / "data" / "malaga_one_loop", metavar="LOG")
-    keyframes, readings = _keyframes(parser.parse_args(arguments).log)
+def measure_kernels(settings: Settings) -> Report:
+    """Time the loops on a log, the bundled one if none is named, and count what they take from the heap."""
+    report = Report("kernels", "What the inner loops cost", seeds=(0,))
+    configuration = load_configuration(settings=settings.changes)
+    with opened(settings.logs_or((BUNDLED,))) as logs:
+        for log in logs:
+            _tell_times(report, log.name, open_log(log.path), configuration)
+            _tell_allocations(report, log.name, open_log(log.path), configuration)
+    return report
+
+
+def _tell_times(report: Report, name: str, log: Log, configuration: Configuration) -> None:
+    keyframes, readings = _keyframes(log, configuration)
     rounds = []
     for _ in range(1 + _REPEATS):
         figures = Figures()
-        _measure_maps(keyframes, figures)
-        _measure_overlaps(keyframes, figures)
-        _measure_rtl(readings, figures)
+        _measure_maps(keyframes, configuration, figures)
+        _measure_overlaps(keyframes, configuration, figures)
+        _measure_rtl(readings, configuration, figures)
         _measure_simulation(figures)
         rounds.append(figures.microseconds())
     # The first round compiles, or loads what was compiled.
-    for name in rounds[0]:
-        print(f"{min(taken[name] for taken in rounds[1:]):10.2f} us {name}")
+    least = {work: min(taken[work] for taken in rounds[1:]) for work in rounds[0]}
+    report.body += [TIMES, table([name, "[us]"], [[work, f"{taken:.2f}"] for work, taken in least.items()])]
+    report.data[f"{name}_us"] = least
 
 
-def _keyframes(path: Path) -> tuple[list[tuple[Scan, NDArray[np.float64]]], list[Odometry]]:
+def _tell_allocations(report: Report, name: str, log: Log, configuration: Configuration) -> None:
+    run_log(log, configuration)
+    with counted() as counts:
+        run_log(log, configuration)
+    report.requirements += requirements_on(counts)
+    text, report.data[f"{name}_arrays"] = told(counts, log.scan_count)
+    report.body += [ALLOCATIONS, text]
+
+
+def _keyframes(log: Log, configuration: Configuration) -> tuple[Keyframes, list[Odometry]]:
     """Keyframes with ``odom_T_base`` (3,), and all odometry readings."""
-    keyframes: list[tuple[Scan, NDArray[np.float64]]] = []
+    keyframes: Keyframes = []
     readings: list[Odometry] = []
-    for record in open_log(path).records():
+    for record in log.records():
         if isinstance(record.measurement, Odometry):
             readings.append(record.measurement)
-        elif readings and _is_due(keyframes, readings[-1].pose) and len(keyframes) < _KEYFRAMES:
+        elif readings and len(keyframes) < _KEYFRAMES and _is_due(keyframes, readings[-1].pose, configuration):
             keyframes.append((record.measurement, readings[-1].pose))
     return keyframes, readings
 
 
-def _is_due(keyframes: list[tuple[Scan, NDArray[np.float64]]], pose: NDArray[np.float64]) -> bool:
+def _is_due(keyframes: Keyframes, pose: NDArray[np.float64], configuration: Configuration) -> bool:
     if not keyframes:
         return True
-    moved, settings = se2.between(keyframes[-1][1], pose), _CONFIGURATION.filter
+    moved, settings = se2.between(keyframes[-1][1], pose), configuration.filter
     far = math.hypot(moved[0], moved[1]) >= settings.keyframe_distance
     return far or abs(moved[2]) >= math.radians(settings.keyframe_angle)
 
 
-def _measure_maps(keyframes: list[tuple[Scan, NDArray[np.float64]]], figures: Figures) -> None:
+def _measure_maps(keyframes: Keyframes, configuration: Configuration, figures: Figures) -> None:
     """Insertion into the maps of all particles, and matching with them."""
-    mapping, count = LocalMapping(_CONFIGURATION), _CONFIGURATION.filter.particles
+    mapping, count = LocalMapping(configuration), configuration.filter.particles
     beside = np.zeros((count, 3))
     beside[:, 1] = _APART * np.arange(count)
     tables = np.stack([mapping.pool.empty_table()] * count)
@@ -124,7 +153,7 @@ def _measure_matching(
     figures: Figures,
 ) -> None:
     information = np.linalg.inv(np.diag([0.05, 0.05, 0.03]) ** 2)
-    view, settings = mapping.pool.view(tables[0]), _CONFIGURATION.matching
+    view, settings = mapping.pool.view(tables[0]), mapping.configuration.matching
     prior = matching.Prior(poses[0], information)
     figures.timed(
         "Gauss-Newton, a scan", 1, lambda: matching.align(points, poses[0], prior, view, mapping.alignment)
@@ -147,9 +176,9 @@ def _measure_matching(
     )  # fmt: skip
 
 
-def _measure_overlaps(keyframes: list[tuple[Scan, NDArray[np.float64]]], figures: Figures) -> None:
+def _measure_overlaps(keyframes: Keyframes, configuration: Configuration, figures: Figures) -> None:
     """Overlap of each keyframe with those of its area before it."""
-    options, reach = _CONFIGURATION.aam, _CONFIGURATION.local_map.max_range
+    options, reach = configuration.aam, configuration.local_map.max_range
     points = [sensed_points(scan, reach, options.overlap_points) for scan, _ in keyframes]
     poses = np.array([pose for _, pose in keyframes])
     for k in range(1, len(keyframes)):
@@ -161,9 +190,9 @@ def _measure_overlaps(keyframes: list[tuple[Scan, NDArray[np.float64]]], figures
         )
 
 
-def _measure_rtl(readings: list[Odometry], figures: Figures) -> None:
+def _measure_rtl(readings: list[Odometry], configuration: Configuration, figures: Figures) -> None:
     """A pose for every reading, where every third brings a new estimate."""
-    process, belief = Rtl(_CONFIGURATION), np.diag([1e-4, 1e-4, 1e-5])
+    process, belief = Rtl(configuration), np.diag([1e-4, 1e-4, 1e-5])
 
     def play() -> None:
         for k, reading in enumerate(readings):
@@ -187,7 +216,3 @@ def _measure_simulation(figures: Figures) -> None:
 
     figures.timed("ray casting, a scan of 361 beams", len(numbers), cast_all)
     figures.timed("simulation, a scan of 361 beams", len(numbers), lambda: [scenario.scan(k) for k in numbers])
-
-
-if __name__ == "__main__":
-    main()

@@ -1,0 +1,115 @@
+"""How often compiled kernels take memory from the heap while a log is mapped, as numba's runtime counts it."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+from numba.core.dispatcher import Dispatcher
+from numba.core.runtime import _nrt_python, rtsys
+
+from benchmark.report import Requirement, table
+
+PACKAGES = ("geometry", "sensing", "local_map")
+"""Whose kernels run for every scan, for every particle and for every beam."""
+
+ARRAYS = {
+    "geometry.covariance.carried": (2, "the result, half of the product"),
+    "geometry.covariance.inverse": (1, "the result"),
+    "geometry.covariance.of_inverse": (2, "the result, half of the product"),
+    "geometry.covariance.turned": (2, "the result, half of the product"),
+    "geometry.se2._compose_each": (1, "the results"),
+    "sensing.surfels._find_normals": (2, "the result, running sums"),
+    "local_map.batch.propose_all": (4, "the results for all particles"),
+    "local_map.insertion.in_cells": (1, "the results for all particles"),
+    "local_map.matching.align": (2, "the results"),
+    "local_map.movers.standing": (9, "the result, what each thing tells, those in doubt"),
+    "local_map.search.correlative_search": (5, "the result, scores, a pose, the cells of the points"),
+}
+"""{kernel: (arrays that a call makes at most, what they are)}; all others make none."""
+
+Counts = dict[str, list[int]]
+
+
+@contextmanager
+def counted(packages: Sequence[str] = PACKAGES) -> Iterator[Counts]:
+    """Count what every call of a kernel from outside of kernels takes, with all that it calls itself.
+
+    numba's own count has one block for every array that is handed over; that is not the kernel's doing, and left out.
+    What is called has to be compiled before, for a kernel that counts cannot be compiled into another one.
+
+    :param packages: of ``hmt_slam_ros``, whose kernels are meant.
+    :returns: {kernel: allocations of each call}, which grows while the context is open.
+    """
+    counts: Counts = {}
+    replaced = []
+    for module in [module for name, module in sys.modules.items() if name.startswith("hmt_slam_ros.")]:
+        for name, value in list(vars(module).items()):
+            kernel = _name(value)
+            if kernel.startswith(tuple(f"{package}." for package in packages)):
+                replaced.append((module, name, value))
+                setattr(module, name, _counting(value, counts.setdefault(kernel, [])))
+    enabled = _nrt_python.memsys_stats_enabled()
+    _nrt_python.memsys_enable_stats()
+    try:
+        yield counts
+    finally:
+        if not enabled:
+            _nrt_python.memsys_disable_stats()
+        _put_back(replaced)
+
+
+def _put_back(replaced: Sequence[tuple[ModuleType, str, object]]) -> None:
+    for module, name, value in replaced:
+        setattr(module, name, value)
+
+
+def _name(value: object) -> str:
+    """Module and name of a kernel, without the package; nothing for what is none."""
+    if not isinstance(value, Dispatcher):
+        return ""
+    return f"{value.py_func.__module__}.{value.py_func.__name__}".removeprefix("hmt_slam_ros.")
+
+
+def _counting(kernel: Callable[..., object], counts: list[int]) -> Callable[..., object]:
+    def call(*arguments: object) -> object:
+        begin = rtsys.get_allocation_stats().alloc
+        result = kernel(*arguments)
+        counts.append(rtsys.get_allocation_stats().alloc - begin - _arrays(arguments))
+        return result
+
+    return call
+
+
+def _arrays(value: object) -> int:
+    """How many arrays there are in what is handed to a kernel."""
+    if isinstance(value, tuple):
+        return sum(map(_arrays, value))
+    return int(isinstance(value, np.ndarray))
+
+
+def requirements_on(counts: Mapping[str, Sequence[int]]) -> list[Requirement]:
+    """That no kernel takes more than its arrays, whatever the number of beams, particles and steps."""
+    return [
+        Requirement(f"{kernel}: arrays of a call", max(taken), ARRAYS.get(kernel, (0, ""))[0])
+        for kernel, taken in sorted(counts.items())
+        if taken
+    ]
+
+
+def told(counts: Mapping[str, Sequence[int]], scans: int) -> tuple[str, dict[str, Any]]:
+    """The counts as a table and for programs.
+
+    :param scans: number of scans that they are from.
+    """
+    rows, data = [], {}
+    for kernel, taken in sorted(counts.items()):
+        if taken:
+            calls, mean, most = len(taken) / scans, float(np.mean(taken)), max(taken)
+            data[kernel] = {"calls_per_scan": calls, "mean": mean, "most": most}
+            rows.append([f"`{kernel}`", f"{calls:.2f}", f"{mean:.1f}", str(most), ARRAYS.get(kernel, (0, "none"))[1]])
+    return table(["kernel", "calls a scan", "arrays a call", "at most", "which"], rows), data

@@ -1,0 +1,60 @@
+"""That the loops over beams, particles and steps take no memory, and that the count of it would tell."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numba import njit
+from test_local_map_matching import ALIGNMENT, MODEL, ROOM, mapped, seen
+
+from benchmark.allocations import ARRAYS, counted, requirements_on
+from hmt_slam_ros.configuration import Configuration
+from hmt_slam_ros.local_map import batch, matching
+from hmt_slam_ros.logs import open_log
+from hmt_slam_ros.offline.runtime import run_log
+
+BAG = Path(__file__).resolve().parents[1] / "data" / "malaga_one_loop"
+FREE = {"insertion.insert", "insertion.patches_needed", "matching.evidence", "matching.log_prior"}
+
+
+def test_mapping_takes_no_memory_but_for_the_arrays_that_kernels_are_said_to_make():
+    log = open_log(BAG, duration=10.0)
+    run_log(log, Configuration())
+    with counted() as counts:
+        run_log(log, Configuration())
+    called = {kernel for kernel, taken in counts.items() if taken}
+    assert called >= {f"local_map.{kernel}" for kernel in FREE} | {"local_map.batch.propose_all"}
+    assert not ARRAYS.keys() & {f"local_map.{kernel}" for kernel in FREE}
+    assert not [requirement.row for requirement in requirements_on(counts) if not requirement.met]
+
+
+@pytest.mark.parametrize("particles", [1, 60])
+@pytest.mark.parametrize("beams", [11, 361])
+def test_proposals_take_their_results_alone_for_any_number_of_particles_and_beams(particles, beams):
+    pool, table = mapped(ROOM, [(0, 0, 0)])
+    points, poses = seen(ROOM, (0.1, 0, 0), beams=beams), np.zeros((particles, 3))
+    arguments = (
+        points, points, poses, poses, np.diag([100.0, 100.0, 400.0]), np.stack([table] * particles), pool.view(table),
+        ALIGNMENT, MODEL, 1.0, 0.05,
+    )  # fmt: skip
+    batch.propose_all(*arguments)
+    with counted() as counts:
+        batch.propose_all(*arguments)
+    assert counts["local_map.batch.propose_all"] == [4]
+
+
+def test_a_kernel_that_takes_memory_is_found_out(monkeypatch):
+    @njit
+    def log_prior(pose, prior):
+        difference = pose - prior.mean
+        return -0.5 * np.dot(difference, prior.information @ difference)
+
+    log_prior.py_func.__module__ = matching.__name__
+    monkeypatch.setattr(matching, "log_prior", log_prior)
+    prior = matching.Prior(np.zeros(3), np.eye(3))
+    log_prior(np.ones(3), prior)
+    with counted() as counts:
+        assert matching.log_prior(np.ones(3), prior) == -1.5
+    assert counts["local_map.matching.log_prior"] == [2]
+    assert [requirement.met for requirement in requirements_on(counts)] == [False]
+    assert matching.log_prior is log_prior
