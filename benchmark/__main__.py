@@ -14,7 +14,7 @@ from importlib import import_module
 from pathlib import Path
 
 from benchmark.circumstances import circumstances, summary
-from benchmark.documents import ACCURACY, VALIDATION, write_between_marks
+from benchmark.documents import ACCURACY, VALIDATION, shown, write_between_marks
 from benchmark.logs import LOGS, ROOT
 from benchmark.report import Report
 from benchmark.runs import Runner
@@ -37,13 +37,15 @@ MEASUREMENTS = {
     "loops": "precision and recall of loop closures, likewise",
     "topology": "whether the world of nested loops ends with the exact topology",
     "consistency": "whether covariances are as large as errors, on simulated worlds",
+    "table": "time and memory against a global metric RBPF at equal accuracy, the paper's Table II",
+    "ambiguity": "whether both answers stay alive where places are identical, until the evidence",
     "oracle": "TSBI's PMF against an exact enumeration of all topologies",
     "scale": "time and memory in maps of up to 100,000 areas",
     "short": "for CI, whether accuracy became worse than benchmark/expected.toml beyond noise",
 }
 _GROUPS = {
     "all": ("accuracy", "steps", "robustness", "choices", "speed"),
-    "validation": ("calibration", "loops", "topology", "consistency", "oracle", "scale"),
+    "validation": ("calibration", "loops", "topology", "consistency", "ambiguity", "table", "oracle", "scale"),
 }
 
 
@@ -74,7 +76,7 @@ def _measure(options: argparse.Namespace) -> list[Report]:
         report.write(out, facts)
         if options.write_docs:
             document = VALIDATION if kind in _GROUPS["validation"] else ACCURACY
-            write_between_marks(document, kind, f"{summary(facts)}\n\n{report.text}")
+            write_between_marks(document, kind, f"{summary(facts)}\n\n{report.text}{shown(report, out)}")
         print(f"\n# {report.title}\n\n{report.text}\n\n{out / f'{kind}.md'}", flush=True)
         reports.append(report)
     return reports

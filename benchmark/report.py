@@ -56,6 +56,7 @@ class Report:
     :ivar body: Markdown under the requirements.
     :ivar data: everything, for programs; what JSON knows.
     :ivar pictures: {file name: caption}, of pictures in the report's folder.
+    :ivar illustrations: file names of those that the documents show too.
     """
 
     kind: str
@@ -65,6 +66,7 @@ class Report:
     body: list[str] = field(default_factory=list)
     data: dict[str, Any] = field(default_factory=dict)
     pictures: dict[str, str] = field(default_factory=dict)
+    illustrations: tuple[str, ...] = ()
 
     @property
     def met(self) -> bool:

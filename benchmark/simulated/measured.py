@@ -11,13 +11,15 @@ SEEDS = 40
 """Worlds of every family: 320 runs in all."""
 
 
-def chosen_seeds(settings: Settings) -> tuple[int, ...]:
-    """Those for training or for validation, as many as are asked for."""
-    return seeds(len(settings.seeds_or(SEEDS)), training=settings.training)
+def chosen_seeds(settings: Settings, count: int = SEEDS) -> tuple[int, ...]:
+    """Those for training or for validation, as many as are asked for, else ``count``."""
+    return seeds(len(settings.seeds_or(count)), training=settings.training)
 
 
-def records_of(settings: Settings, families: tuple[str, ...] = FAMILIES) -> list[Record]:
+def records_of(settings: Settings, families: tuple[str, ...] = FAMILIES, count: int = SEEDS) -> list[Record]:
     """The records of some families, those of one family one after the other.
+
+    :param count: of the seeds where none are asked for.
 
     :raises HmtSlamError: for a name that is no family, or a run that failed.
     """
@@ -25,7 +27,7 @@ def records_of(settings: Settings, families: tuple[str, ...] = FAMILIES) -> list
     for name in chosen:
         if name not in FAMILIES:
             raise HmtSlamError(f"there is no family {name!r}: choose from {', '.join(FAMILIES)}")
-    worlds = [World(family, seed) for family in families if family in chosen for seed in chosen_seeds(settings)]
+    worlds = [World(family, seed) for family in families if family in chosen for seed in chosen_seeds(settings, count)]
     return settings.records.of(worlds, settings.changes)
 
 

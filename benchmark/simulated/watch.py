@@ -56,6 +56,7 @@ class Watch:
     :ivar events: keyframe events at which there was a known area that the keyframes fit into.
     :ivar accepted: the closures that became definite.
     :ivar poses: of RTL.
+    :ivar pmf: the live hypotheses after every keyframe event.
     :ivar loops: that there are to close.
     """
 
@@ -65,13 +66,15 @@ class Watch:
     events: list[Entry] = field(default_factory=list)
     accepted: list[Entry] = field(default_factory=list)
     poses: list[Entry] = field(default_factory=list)
+    pmf: list[Entry] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         self.truth = Truth(self.log)
         self.loops = Loops(self.truth)
         self._replica = Replica()
         self._paths = Paths(self.truth)
-        self._travelled: dict[int, float] = {}
+        self.travelled: dict[int, float] = {}
+        self._samples: dict[int, float] = {}
         self._asked: dict[int, Examination] = {}
         self._area_poses: dict[int, PoseGaussian] = {}
         self._next_pose = 0
@@ -106,7 +109,8 @@ class Watch:
 
     def _note(self, keyframe: Keyframe) -> None:
         self.truth.note(keyframe)
-        self._travelled[keyframe.sequence] = keyframe.travelled
+        self.travelled[keyframe.sequence] = keyframe.travelled
+        self._samples = {leaf.hypothesis: leaf.effective_samples for leaf in keyframe.leaves}
         self._replica.add(keyframe)
         best = self._replica.best
         self.loops.note(keyframe.sequence, keyframe.travelled, self._replica.maps[best], self._replica.areas[best])
@@ -114,25 +118,38 @@ class Watch:
 
     def _examined(self, examination: Examination) -> None:
         self._asked[examination.parent.hypothesis] = examination
-        event = max(self._travelled)
-        self.rows += rows(examination, self.truth, self.configuration, event, self._travelled)
+        event = max(self.travelled)
+        self.rows += rows(examination, self.truth, self.configuration, event, self.travelled)
 
     def _follow(self, hypotheses: Hypotheses) -> None:
         before = tuple(self._replica.probabilities.items())
         arcs = by_arcs_alone(before, self._asked, self._paths.paths, self.truth)
         self._paths.follow(hypotheses, self._replica, self._asked)
+        self._tell(hypotheses)
         if any(examination.found.fits for examination in self._asked.values()):
             given = answers(hypotheses, self._replica, self._asked, self._paths.paths)
             self.events.append(
                 {
                     "event": hypotheses.sequence,
-                    "travelled": self._travelled[hypotheses.sequence],
+                    "travelled": self.travelled[hypotheses.sequence],
                     "unexamined": hypotheses.unexamined,
                     "answers": [asdict(answer) for answer in given],
                     "arcs_alone": [asdict(answer) | {"among": among} for answer, among in arcs],
                 }
             )
         self._replica.apply(hypotheses)
+
+    def _tell(self, hypotheses: Hypotheses) -> None:
+        """Keep the PMF, and the loops that every hypothesis closes now: those that there are, and those that not."""
+        leaves = []
+        for leaf in hypotheses.leaves:
+            closures = self._paths.paths[leaf.hypothesis].closures
+            now = [closure.claim.true for closure in closures if closure.event == hypotheses.sequence]
+            told = {"hypothesis": leaf.hypothesis, "parent": leaf.parent, "probability": leaf.probability}
+            leaves.append(told | {"samples": self._samples[leaf.parent], "right": sum(now), "wrong": now.count(False)})
+        event = hypotheses.sequence
+        where = {"event": event, "stamp": self.truth.stamps[event], "travelled": self.travelled[event]}
+        self.pmf.append(where | {"unexamined": hypotheses.unexamined, "leaves": leaves})
 
     def _accept(self, accepted: Accepted) -> None:
         probabilities = dict(self._replica.probabilities)
@@ -149,7 +166,7 @@ class Watch:
     def pending(self) -> list[Entry]:
         """The closures of the most probable path that are not definite."""
         best = self._replica.best
-        event, probability = max(self._travelled), self._replica.probabilities[best]
+        event, probability = max(self.travelled), self._replica.probabilities[best]
         return [self._entry(closure, event, probability) for closure in self._paths.paths[best].closures]
 
     def _entry(self, closure: Closure, event: int, probability: float) -> Entry:
@@ -158,7 +175,7 @@ class Watch:
             "asked_at": closure.event,
             "way": closure.way,
             "areas": closure.areas,
-            "waited": self._travelled[event] - self._travelled[closure.event],
+            "waited": self.travelled[event] - self.travelled[closure.event],
             "probability": probability,
             "right": closure.claim.true,
             **closure.claim._asdict(),

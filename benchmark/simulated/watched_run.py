@@ -18,6 +18,7 @@ from benchmark.runs import PARAMETERS
 from benchmark.simulated.features import Row
 from benchmark.simulated.loops import Loop
 from benchmark.simulated.records import code
+from benchmark.simulated.rivals import rivalries
 from benchmark.simulated.watch import Watch
 from benchmark.simulated.worlds import World
 from hmt_slam_ros.configuration import load_configuration
@@ -46,6 +47,10 @@ def watched(world: World, changes: Sequence[str] = ()) -> dict[str, Any]:
         "arcs": watch.arcs(),
         "area_poses": watch.area_poses(),
         "poses": watch.poses,
+        "pmf": watch.pmf,
+        "rivalries": [
+            vars(found) for found in rivalries(watch.log, watch.truth, watch.loops.found, watch.travelled)
+        ],
         "cpu_s": time.process_time() - begin,
     }
 

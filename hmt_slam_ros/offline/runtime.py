@@ -74,17 +74,23 @@ class RunResult:
     map_bytes: int
 
 
-def run_log(log: Log, configuration: Configuration, progress: Callable[[int], None] | None = None) -> RunResult:
+def run_log(
+    log: Log,
+    configuration: Configuration,
+    progress: Callable[[int], None] | None = None,
+    abstraction: Callable[[Configuration], Process] = Aam,
+) -> RunResult:
     """Map a whole log.
 
     :param progress: called with the number of scans read, after each.
+    :param abstraction: what makes areas of keyframes, such as nothing.
     :raises HmtSlamError: where the log is faulty.
     """
     recorder, slam = Recorder(configuration), MetricSlam(configuration)
     lock_step = LockStep(
         {
             "slam": slam,
-            "aam": Aam(configuration),
+            "aam": abstraction(configuration),
             "tsbi": Tsbi(configuration),
             "tlca": Tlca(configuration),
             "rtl": Rtl(configuration),

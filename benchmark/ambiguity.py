@@ -1,0 +1,173 @@
+"""Identical places: do both hypotheses stay alive until something tells them apart, and does the true one win then?"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from benchmark.charts import Panel, plot_ambiguity
+from benchmark.logs import BUNDLED, opened
+from benchmark.report import Report, Requirement, table
+from benchmark.runs import PARAMETERS
+from benchmark.settings import Settings
+from benchmark.simulated.measured import chosen_seeds, records_of
+from benchmark.simulated.records import Record
+from benchmark.simulated.rivals import BEAMS, RADIUS, VIEW
+from benchmark.stories import DECIDED, HIGH, LOW, SOON, SURE, Moment, Verdict, story, told, verdict
+from hmt_slam_ros.configuration import load_configuration
+from hmt_slam_ros.logs import open_log
+from hmt_slam_ros.offline.runtime import run_log
+
+WORLDS = ("twins", "ring")
+
+SEEDS = 10
+
+_SHOWN = 15  # keyframe events before the question that are drawn, and after
+
+POLICY = (
+    "A re-entry is the first keyframe event at which the robot, after new ground, is in a known place again that looks "
+    f"the same as another known one: a laser without noise sees the same from the robot's true pose and from its image "
+    f"in the other place, but for {100.0 * BEAMS:.0f} % of the beams or {VIEW:g} m, and an old keyframe is within "
+    f"{RADIUS:g} m of the image. *By odometry* is the probability of the true place among all that look the same which "
+    "follows from the readings since the robot last saw anything (in the ring, where it always does, since it was "
+    "there a lap ago), under the covariance that their errors truly have. Where that is "
+    f"{DECIDED:g} or more, odometry tells the places apart, and the evidence is there before the question; so it is in "
+    "the ring, all of whose sides look alike for ever, but a quarter turn is more than odometry ever errs by in a lap. "
+    "Elsewhere the evidence is the first keyframe at which the views differ. From the event at which TSBI asks, until "
+    f"the evidence, both the true and the other place should have between {LOW:g} and {HIGH:g} (and do not where "
+    f"nothing is asked before); {SOON:g} m after the evidence, or after the question if that comes later, the true one "
+    f"should have more than {SURE:g}. New ground and what is not examined have the rest. An inference that weighs "
+    f"odometry rightly stays between {LOW:g} and {HIGH:g} only where odometry alone does."
+)
+
+
+class Reentry(NamedTuple):
+    """A re-entry, and how the hypotheses fared."""
+
+    record: Record
+    rivalry: Record
+    moments: list[Moment]
+    verdict: Verdict
+
+
+def measure_ambiguity(settings: Settings) -> Report:
+    """Map the worlds, and the bundled log, and follow the hypotheses."""
+    records = records_of(settings, WORLDS, SEEDS)
+    found = [_judged(record, rivalry) for record in records for rivalry in record["rivalries"]]
+    report = Report("ambiguity", "Identical places", seeds=chosen_seeds(settings, SEEDS))
+    for family in dict.fromkeys(record["family"] for record in records):
+        report.requirements += requirements(family, [entry for entry in found if entry.record["family"] == family])
+    report.body += [reentry_table(found), POLICY]
+    report.data["reentries"] = [
+        {"world": e.record["world"], **e.rivalry, **vars(e.verdict), "decided": is_decided(e.rivalry)} for e in found
+    ]
+    panels = _panels(found) | _bundled(settings)
+    caption = "ESS of the best hypothesis's particles, and the probabilities of where the robot is, over time."
+    report.pictures["ambiguity.png"] = caption
+    report.illustrations = ("ambiguity.png",)
+    particles = load_configuration(PARAMETERS, list(settings.changes)).filter.particles
+    plot_ambiguity(settings.out / "ambiguity.png", panels, particles)
+    return report
+
+
+def _judged(record: Record, rivalry: Record) -> Reentry:
+    evidence = rivalry["event"] if is_decided(rivalry) or rivalry["evidence"] is None else rivalry["evidence"]
+    moments = story(record["pmf"], rivalry["event"])
+    return Reentry(record, rivalry, moments, verdict(moments, evidence))
+
+
+def is_decided(rivalry: Record) -> bool:
+    """Whether odometry tells the places apart."""
+    return bool(max(rivalry["by_odometry"], 1.0 - rivalry["by_odometry"]) >= DECIDED)
+
+
+def requirements(family: str, found: Sequence[Reentry]) -> list[Requirement]:
+    """What is asked for of the re-entries of a family."""
+    open_ones, asked = undecided(found), [e for e in found if e.verdict.asked or not is_decided(e.rivalry)]
+    alive = sum(entry.verdict.both_alive for entry in open_ones)
+    settled = sum(entry.verdict.settled for entry in asked)
+    count, all_of = len(open_ones), f"of {len(asked)}"
+    return [
+        Requirement(f"{family}: re-entries that odometry does not decide", count, math.inf, least=1),
+        Requirement(f"{family}: of these {count}, both alive until the evidence", alive, math.inf, least=count),
+        Requirement(f"{family}: {all_of}, the true one sure after the evidence", settled, math.inf, least=len(asked)),
+    ]
+
+
+def undecided(found: Sequence[Reentry]) -> list[Reentry]:
+    """Those that odometry alone does not decide."""
+    return [entry for entry in found if not is_decided(entry.rivalry)]
+
+
+def reentry_table(found: Sequence[Reentry]) -> str:
+    """One line for every re-entry that odometry does not decide, and one for all others of a family."""
+    head = ["re-entry in", "path since it knew where it was [m]", "by odometry", "evidence after [m]"]
+    head += ["true or other place, lowest", "highest", "true one before the evidence", "alive", "sure after [m]"]
+    head += [f"true one after {SOON:g} m", "sure"]
+    rows = [_row(entry) for entry in undecided(found)]
+    for family in dict.fromkeys(entry.record["family"] for entry in found):
+        own = [e for e in found if e.record["family"] == family and is_decided(e.rivalry) and e.verdict.asked]
+        least = min((e.rivalry["by_odometry"] for e in own), default=math.nan)
+        sure = f"{sum(e.verdict.settled for e in own)} of {len(own)}"
+        final = min((e.verdict.final for e in own), default=math.nan)
+        name = f"{family}, decided by odometry"
+        rows.append([name, "", f"at least {least:.4f}", *[""] * 6, f"at least {final:.3f}", sure])
+    return table(head, rows)
+
+
+def _row(entry: Reentry) -> list[str]:
+    rivalry, judged = entry.rivalry, entry.verdict
+    ways = {moment["event"]: moment["travelled"] for moment in entry.record["pmf"]}
+    evidence = None if rivalry["evidence"] is None else ways[rivalry["evidence"]] - ways[rivalry["event"]]
+    return [
+        entry.record["world"],
+        f"{ways[rivalry['event']] - ways[rivalry['since']]:.0f}",
+        f"{rivalry['by_odometry']:.3f}",
+        _figure(evidence, 1),
+        *(_figure(value, 3) for value in (judged.lowest, judged.highest, judged.at_evidence)),
+        _passed(judged.both_alive),
+        _figure(judged.waited, 1),
+        _figure(judged.final, 3),
+        _passed(judged.settled),
+    ]
+
+
+def _figure(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"
+
+
+def _passed(met: bool) -> str:
+    return "pass" if met else "FAIL"
+
+
+def _panels(found: Sequence[Reentry]) -> dict[str, Panel]:
+    """One re-entry of each family: the first that odometry does not decide, else the first that was asked about."""
+    panels = {}
+    for family in dict.fromkeys(entry.record["family"] for entry in found):
+        own = [entry for entry in found if entry.record["family"] == family and entry.verdict.asked]
+        if own:
+            entry = (undecided(own) or own)[0]
+            marks = {"in the known place again": entry.rivalry["event"]}
+            if entry.rivalry["evidence"] is not None:
+                marks["evidence"] = entry.rivalry["evidence"]
+            panels[entry.record["world"]] = _panel(entry.record["pmf"], entry.moments, marks)
+    return panels
+
+
+def _panel(pmf: Sequence[Record], moments: Sequence[Moment], marks: dict[str, int]) -> Panel:
+    asked = next(moment.event for moment in moments if moment.asked)
+    begin, end = min(asked, *marks.values()) - _SHOWN, max(asked, *marks.values()) + _SHOWN
+    seconds = {moment.event: moment.seconds for moment in story(pmf, 0)}
+    shown = [moment for moment in story(pmf, begin) if moment.event <= end]
+    return Panel(shown, {name: seconds[event] for name, event in marks.items()})
+
+
+def _bundled(settings: Settings) -> dict[str, Panel]:
+    """The first loop of the bundled log; where a hypothesis closes none, nothing is drawn."""
+    with opened([BUNDLED]) as (log,):
+        recorder = run_log(open_log(log.path), load_configuration(PARAMETERS, list(settings.changes))).recorder
+    pmf = told(recorder)
+    moments = story(pmf, 0)
+    asked = [moment.event for moment in moments if moment.asked]
+    return {f"{BUNDLED}, the bundled log": _panel(pmf, moments, {"loop closed": asked[0]})} if asked else {}

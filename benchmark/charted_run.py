@@ -1,0 +1,156 @@
+"""Map a log and tell what that costs as it goes on: ``python -m benchmark.charted_run WAY LOG --out DIR ...``.
+
+WAY is ``areas``, as ``hmt_slam map`` does it, or ``metric``: the same program with one area for everything, which is a
+Rao-Blackwellized particle filter over one global map. The other arguments are those of ``hmt_slam map``. DIR gets the
+trajectory and a report.
+"""
+
+from __future__ import annotations
+
+import gc
+import json
+import os
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hmt_slam_ros.cli.arguments import chosen_configuration, parser
+from hmt_slam_ros.configuration import Configuration
+from hmt_slam_ros.errors import HmtSlamError
+from hmt_slam_ros.evaluation import StampedPoses, write_tum
+from hmt_slam_ros.logs import Log, LogRecord, open_log
+from hmt_slam_ros.offline.corrected_scans import corrected_scans
+from hmt_slam_ros.offline.final_map import FinalMap, final_map
+from hmt_slam_ros.offline.runtime import RunResult, run_log
+from hmt_slam_ros.processes.aam import Aam
+from hmt_slam_ros.processes.messages import AreaEvents, Keyframe, Message
+from hmt_slam_ros.processes.routing import Process
+
+SAMPLES = 200
+"""Points of the curve of memory over time, at least, where the log has as many scans."""
+
+AREAS, METRIC = "areas", "metric"
+
+
+class OneArea:
+    """In the place of area abstraction: no keyframe ever leaves the first area."""
+
+    def __init__(self, _configuration: Configuration) -> None:
+        pass
+
+    def handle(self, message: Message) -> list[Message]:
+        """Answer a ``Keyframe``: nothing was left."""
+        return [AreaEvents(message.sequence, ())] if isinstance(message, Keyframe) else []
+
+
+WAYS: dict[str, Callable[[Configuration], Process]] = {AREAS: Aam, METRIC: OneArea}
+
+
+class TimedLog:
+    """A log, and the CPU time that reading or simulating it takes.
+
+    :ivar seconds: spent so far.
+    """
+
+    def __init__(self, log: Log) -> None:
+        self._log = log
+        self.seconds = 0.0
+
+    @property
+    def name(self) -> str:
+        """Of the log."""
+        return self._log.name
+
+    @property
+    def scan_count(self) -> int:
+        """Number of scans."""
+        return self._log.scan_count
+
+    @property
+    def duration(self) -> float:
+        """Seconds from the first to the last record."""
+        return self._log.duration
+
+    def records(self) -> Iterator[LogRecord]:
+        """As those of the log."""
+        records = self._log.records()
+        while True:
+            begin = time.process_time()
+            record = next(records, None)
+            self.seconds += time.process_time() - begin
+            if record is None:
+                return
+            yield record
+
+
+def resident_bytes() -> int:
+    """Memory of this OS process that is in use now."""
+    return int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+
+def charted(way: str, log: TimedLog, configuration: Configuration) -> tuple[RunResult, FinalMap, dict[str, Any]]:
+    """Map a log; what came of it, and what it cost."""
+    gc.freeze()
+    every = max(1, log.scan_count // SAMPLES)
+    memory = [(0, resident_bytes())]
+
+    def sample(scans: int) -> None:
+        if scans % every == 0:
+            memory.append((scans, resident_bytes()))
+
+    result = run_log(log, configuration, sample, WAYS[way])
+    memory.append((len(result.stamps), resident_bytes()))
+    begin, log_seconds = time.process_time(), log.seconds
+    final = final_map(result.recorder.finish(result.stamps), corrected_scans(log, configuration), configuration)
+    hybrid_map = final.recording.hybrid_map
+    refinement = time.process_time() - begin - (log.seconds - log_seconds)
+    facts = {
+        "particles": configuration.filter.particles,
+        "scans": len(result.stamps),
+        "travelled_m": final.recording.probabilities[-1].travelled,
+        "areas": len(hybrid_map.area_ids()),
+        "loop_closures": sum(arc.closure for _, _, arc in hybrid_map.all_arcs()),
+        "log_s": log.seconds,
+        "refinement_s": refinement,
+        "particle_map_bytes": result.map_bytes,
+        "memory": [{"s": _seconds(result, scans), "bytes": size} for scans, size in memory],
+        "ms_per_scan": {name: float(1e3 * np.mean(spent)) for name, spent in result.seconds_per_scan.items()},
+        "cost": _cost(result, every),
+    }
+    return result, final, facts
+
+
+def _seconds(result: RunResult, scans: int) -> float:
+    """Time of the log after so many scans, s."""
+    return float(result.stamps[max(0, scans - 1)] - result.stamps[0]) / 1e9
+
+
+def _cost(result: RunResult, every: int) -> list[dict[str, float]]:
+    """Mean time of all processes for a scan over the log, ms."""
+    spent = 1e3 * np.sum(list(result.seconds_per_scan.values()), axis=0)
+    begins = range(0, len(spent), every)
+    return [{"s": _seconds(result, k + 1), "ms": float(spent[k : k + every].mean())} for k in begins]
+
+
+def main(arguments: list[str]) -> int:
+    """Run; return the exit status."""
+    way, *rest = arguments
+    options = parser().parse_args(["map", *rest])
+    try:
+        configuration = chosen_configuration(options)
+        result, final, facts = charted(way, TimedLog(open_log(options.log)), configuration)
+    except HmtSlamError as fault:
+        print(f"charted_run: {fault}", file=sys.stderr)
+        return 2
+    options.out.mkdir(parents=True)
+    write_tum(options.out / "trajectory.tum", StampedPoses(result.source_stamps, final.recording.trajectory))
+    (options.out / "report.json").write_text(json.dumps(facts), encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,160 @@
+"""The analysis of what becomes of hypotheses in identical places: on made-up stories, and the truth of small worlds."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from benchmark.ambiguity import Reentry, requirements
+from benchmark.simulated.loops import Loop
+from benchmark.simulated.rivals import by_odometry, looks_alike, rivalries
+from benchmark.simulated.truth import Truth
+from benchmark.stories import NEW, RIGHT, WRONG, Verdict, story, verdict
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.simulation import open_simulated
+
+
+def leaf(hypothesis, parent, probability, right=0, wrong=0):
+    told = {"hypothesis": hypothesis, "parent": parent, "probability": probability}
+    return told | {"samples": 10.0 * probability, "right": right, "wrong": wrong}
+
+
+def entry(event, *leaves):
+    return {"event": event, "stamp": 10**9 * event, "travelled": 0.5 * event, "unexamined": 0.0, "leaves": list(leaves)}
+
+
+PMF = [
+    entry(0, leaf(0, 0, 1.0)),
+    entry(1, leaf(1, 0, 0.1), leaf(2, 0, 0.5, right=1), leaf(3, 0, 0.4, wrong=1)),
+    entry(2, leaf(2, 2, 0.7), leaf(3, 3, 0.3)),
+    # A right closure does not mend what went wrong before.
+    entry(3, leaf(2, 2, 0.97), leaf(3, 3, 0.03, right=1)),
+    entry(4, leaf(2, 2, 1.0)),
+]
+
+
+def test_hypotheses_are_told_by_the_loops_that_they_and_their_parents_closed():
+    moments = story(PMF, 0)
+    assert [moment.probabilities[RIGHT] for moment in moments] == [0.0, 0.5, 0.7, 0.97, 1.0]
+    assert [moment.probabilities[WRONG] for moment in moments] == [0.0, 0.4, 0.3, 0.03, 0.0]
+    assert [moment.probabilities[NEW] for moment in moments] == [1.0, 0.1, 0.0, 0.0, 0.0]
+    assert [moment.asked for moment in moments] == [False, True, True, True, True]
+    assert moments[1].samples == 5.0
+
+
+def test_what_closed_before_the_story_begins_does_not_count():
+    assert not any(moment.asked for moment in story(PMF, 2)[:1])
+
+
+def test_both_are_alive_until_the_evidence_and_the_true_one_is_sure_soon_after():
+    judged = verdict(story(PMF, 0), evidence=3)
+    assert (judged.lowest, judged.highest, judged.at_evidence) == (0.3, 0.7, 0.7)
+    assert judged.both_alive
+    assert judged.waited == 0.0
+    assert judged.settled
+
+
+def test_a_hypothesis_that_is_ruled_out_before_the_evidence_is_not_alive():
+    judged = verdict(story(PMF, 0), evidence=4)
+    assert not judged.both_alive
+    assert judged.lowest == 0.03
+
+
+def test_the_wrong_place_is_never_sure():
+    swapped = [entry(e["event"], *(leaf(**swap(one)) for one in e["leaves"])) for e in PMF]
+    judged = verdict(story(swapped, 0), evidence=3)
+    assert judged.both_alive
+    assert judged.waited is None
+    assert not judged.settled
+
+
+def swap(one):
+    return {
+        "hypothesis": one["hypothesis"],
+        "parent": one["parent"],
+        "probability": one["probability"],
+        "right": one["wrong"],
+        "wrong": one["right"],
+    }
+
+
+def test_a_question_after_the_evidence_shows_nothing_alive_but_can_settle():
+    judged = verdict(story(PMF, 0), evidence=0)
+    assert judged.asked
+    assert not judged.both_alive
+    assert judged.waited == pytest.approx(1.0)
+
+
+def test_nothing_asked_is_nothing_settled():
+    judged = verdict(story([entry(k, leaf(0, 0, 1.0)) for k in range(3)], 0), evidence=1)
+    assert not judged.asked
+    assert not judged.settled
+
+
+def reentry(by, judged):
+    return Reentry({}, {"by_odometry": by}, [], judged)
+
+
+def test_requirements_hold_only_where_all_that_is_undecided_was_alive_and_all_is_settled():
+    good = Verdict(True, 0.3, 0.7, 0.7, 0.5, 1.0)
+    late = Verdict(True, None, None, None, 0.0, 1.0)
+    decided_unasked = reentry(1.0, Verdict(False, None, None, None, None, 0.0))
+    assert all(asked.met for asked in requirements("twins", [reentry(0.4, good), decided_unasked]))
+    assert [a.met for a in requirements("twins", [reentry(0.4, good), reentry(0.9, late)])] == [True, False, True]
+    assert [asked.met for asked in requirements("ring", [reentry(1.0, late)])] == [False, True, True]
+
+
+@pytest.fixture(scope="module")
+def twins():
+    return open_simulated("sim:twins,seed=0,size=0.7")
+
+
+def in_room(log, name, x, y, turn=-0.5 * np.pi):
+    """A pose by its place in front of a room: ``x`` m to the side of the door, ``y`` m before it."""
+    place = log.scenario.building.places[name]
+    return se2.compose(place, np.array([-y, x, turn + 0.5 * np.pi]))
+
+
+def test_twin_rooms_look_alike_from_within_and_not_from_the_passage(twins):
+    for x, y, turn, alike in ((0.0, 3.0, -0.5, True), (0.0, -2.0, -0.5, True), (0.0, -5.5, -0.5, False)):
+        pose, image = (in_room(twins, name, x, y, turn * np.pi) for name in ("first", "second"))
+        assert looks_alike(twins, pose, image) == alike
+
+
+def test_nothing_to_be_seen_is_not_alike(twins):
+    pose, image = (in_room(twins, name, 0.0, 12.0, 0.5 * np.pi) for name in ("first", "second"))
+    assert not looks_alike(twins, pose, image)
+
+
+def noted(log, count):
+    """The truth about keyframes at equal times."""
+    truth = Truth(log)
+    stamps = log.scenario.scan_stamps[np.linspace(0, log.scan_count - 1, count).astype(int)]
+    for k, (stamp, pose) in enumerate(zip(stamps, log.true_poses(stamps), strict=True)):
+        truth.stamps[k], truth.poses[k] = int(stamp), pose
+    return truth
+
+
+def test_odometry_rules_out_what_is_many_deviations_off_and_not_what_is_none_off(twins):
+    truth = noted(twins, 60)
+    here = truth.poses[30]
+    near, far = se2.compose(here, np.array([0.05, 0.0, 0.0])), se2.compose(here, np.array([0.0, 0.0, np.pi]))
+    weights = by_odometry(twins, truth, 20, 30, [here, near, far])
+    assert weights.sum() == pytest.approx(1.0)
+    assert weights[1] == pytest.approx(weights[0], rel=0.5)
+    assert weights[2] < 1e-3
+
+
+def test_in_the_ring_odometry_decides_and_views_never_do():
+    log = open_simulated("sim:ring,seed=0")
+    truth = noted(log, 201)
+    travelled = {k: 0.55 * k for k in truth.poses}
+    loop = Loop(100, 55.0, 60.0, 55.0, {100: (0,), 101: (1,)})
+    (found,) = rivalries(log, truth, [loop], travelled)
+    assert (found.event, found.since, found.evidence) == (100, 0, None)
+    assert found.by_odometry > 0.99
+
+
+def test_a_world_without_identical_places_has_no_rivalry():
+    log = SimpleNamespace(scenario=SimpleNamespace(building=SimpleNamespace(places={})))
+    assert rivalries(log, None, [Loop(1, 0.0, 0.0, 1.0, {1: (0,)})], {}) == []
