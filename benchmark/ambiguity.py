@@ -58,7 +58,7 @@ def measure_ambiguity(settings: Settings) -> Report:
     report = Report("ambiguity", "Identical places", seeds=chosen_seeds(settings, SEEDS))
     for family in dict.fromkeys(record["family"] for record in records):
         report.requirements += requirements(family, [entry for entry in found if entry.record["family"] == family])
-    report.body += [reentry_table(found), POLICY]
+    report.body += [reentry_table(found), _by_odometry(found), POLICY]
     report.data["reentries"] = [
         {"world": e.record["world"], **e.rivalry, **vars(e.verdict), "decided": is_decided(e.rivalry)} for e in found
     ]
@@ -103,7 +103,7 @@ def undecided(found: Sequence[Reentry]) -> list[Reentry]:
 def reentry_table(found: Sequence[Reentry]) -> str:
     """One line for every re-entry that odometry does not decide, and one for all others of a family."""
     head = ["re-entry in", "path since it knew where it was [m]", "by odometry", "evidence after [m]"]
-    head += ["true or other place, lowest", "highest", "true one before the evidence", "alive", "sure after [m]"]
+    head += ["true one when asked", "before the evidence", "either, lowest", "highest", "alive", "sure after [m]"]
     head += [f"true one after {SOON:g} m", "sure"]
     rows = [_row(entry) for entry in undecided(found)]
     for family in dict.fromkeys(entry.record["family"] for entry in found):
@@ -112,8 +112,18 @@ def reentry_table(found: Sequence[Reentry]) -> str:
         sure = f"{sum(e.verdict.settled for e in own)} of {len(own)}"
         final = min((e.verdict.final for e in own), default=math.nan)
         name = f"{family}, decided by odometry"
-        rows.append([name, "", f"at least {least:.4f}", *[""] * 6, f"at least {final:.3f}", sure])
+        rows.append([name, "", f"at least {least:.4f}", *[""] * 7, f"at least {final:.3f}", sure])
     return table(head, rows)
+
+
+def _by_odometry(found: Sequence[Reentry]) -> str:
+    """How many of the re-entries odometry alone leaves as open as is asked for."""
+    open_ones = undecided(found)
+    left = sum(LOW <= entry.rivalry["by_odometry"] <= HIGH for entry in open_ones)
+    return (
+        f"Of the {len(open_ones)} re-entries that odometry does not decide, it alone leaves both places between "
+        f"{LOW:g} and {HIGH:g} in {left}."
+    )
 
 
 def _row(entry: Reentry) -> list[str]:
@@ -125,7 +135,7 @@ def _row(entry: Reentry) -> list[str]:
         f"{ways[rivalry['event']] - ways[rivalry['since']]:.0f}",
         f"{rivalry['by_odometry']:.3f}",
         _figure(evidence, 1),
-        *(_figure(value, 3) for value in (judged.lowest, judged.highest, judged.at_evidence)),
+        *(_figure(value, 3) for value in (judged.when_asked, judged.at_evidence, judged.lowest, judged.highest)),
         _passed(judged.both_alive),
         _figure(judged.waited, 1),
         _figure(judged.final, 3),

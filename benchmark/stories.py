@@ -82,7 +82,8 @@ class Verdict:
     :ivar asked: whether any hypothesis said that the robot is in a known place.
     :ivar lowest: the smallest probability of the true and of another place, from the question to the evidence.
     :ivar highest: the largest of the two; both None where nothing was asked before the evidence.
-    :ivar at_evidence: probability of the true place just before the evidence; None likewise.
+    :ivar when_asked: probability of the true place at the question; ``at_evidence``, just before the evidence; None
+        likewise.
     :ivar waited: path from the evidence, or the question if that comes later, until the true one is sure, m; None where
         it never is within ``SOON``.
     :ivar final: probability of the true place ``SOON`` after the evidence, or the question.
@@ -91,6 +92,7 @@ class Verdict:
     asked: bool
     lowest: float | None
     highest: float | None
+    when_asked: float | None
     at_evidence: float | None
     waited: float | None
     final: float
@@ -113,7 +115,7 @@ def verdict(moments: Sequence[Moment], evidence: int) -> Verdict:
     """
     asked = next((moment for moment in moments if moment.asked), None)
     if asked is None:
-        return Verdict(False, None, None, None, None, 0.0)
+        return Verdict(False, None, None, None, None, None, 0.0)
     open_ones = [moment for moment in moments if asked.event <= moment.event < evidence]
     shares = [moment.probabilities[kind] for moment in open_ones for kind in (RIGHT, WRONG)]
     begin = next((m.travelled for m in moments if m.event >= max(evidence, asked.event)), moments[-1].travelled)
@@ -123,6 +125,7 @@ def verdict(moments: Sequence[Moment], evidence: int) -> Verdict:
         True,
         min(shares, default=None),
         max(shares, default=None),
+        open_ones[0].probabilities[RIGHT] if open_ones else None,
         open_ones[-1].probabilities[RIGHT] if open_ones else None,
         sure,
         after[-1].probabilities[RIGHT] if after else 0.0,

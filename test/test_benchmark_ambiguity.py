@@ -48,7 +48,7 @@ def test_what_closed_before_the_story_begins_does_not_count():
 
 def test_both_are_alive_until_the_evidence_and_the_true_one_is_sure_soon_after():
     judged = verdict(story(PMF, 0), evidence=3)
-    assert (judged.lowest, judged.highest, judged.at_evidence) == (0.3, 0.7, 0.7)
+    assert (judged.lowest, judged.highest, judged.when_asked, judged.at_evidence) == (0.3, 0.7, 0.5, 0.7)
     assert judged.both_alive
     assert judged.waited == 0.0
     assert judged.settled
@@ -96,9 +96,9 @@ def reentry(by, judged):
 
 
 def test_requirements_hold_only_where_all_that_is_undecided_was_alive_and_all_is_settled():
-    good = Verdict(True, 0.3, 0.7, 0.7, 0.5, 1.0)
-    late = Verdict(True, None, None, None, 0.0, 1.0)
-    decided_unasked = reentry(1.0, Verdict(False, None, None, None, None, 0.0))
+    good = Verdict(True, 0.3, 0.7, 0.5, 0.7, 0.5, 1.0)
+    late = Verdict(True, None, None, None, None, 0.0, 1.0)
+    decided_unasked = reentry(1.0, Verdict(False, None, None, None, None, None, 0.0))
     assert all(asked.met for asked in requirements("twins", [reentry(0.4, good), decided_unasked]))
     assert [a.met for a in requirements("twins", [reentry(0.4, good), reentry(0.9, late)])] == [True, False, True]
     assert [asked.met for asked in requirements("ring", [reentry(1.0, late)])] == [False, True, True]
