@@ -41,8 +41,6 @@ CHOICES: dict[str, tuple[str, ...]] = {
     "likelihood to the power of 0.1": ("refinement.temper=0.1",),
     "likelihood to the power of 1": ("refinement.temper=1",),
     "robust beyond 0.1 m": ("refinement.robust_scale=0.1",),
-    "pairs keep their weight": ("refinement.patience=1000000",),
-    "motions keep their weight": ("refinement.motion_patience=1000000",),
 }
 """{what differs: the parameters}."""
 

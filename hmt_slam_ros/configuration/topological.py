@@ -173,12 +173,6 @@ class Refinement:
     temper: float = parameter(
         0.3, "Exponent on the likelihood, since beams and overlapping pairs are correlated.", low=1e-4, high=1.0
     )
-    patience: float = parameter(
-        50.0, "A pair of scans whose chi-square exceeds this loses weight.", low=1.0, high=1e6
-    )
-    motion_patience: float = parameter(
-        10.0, "A motion between two keyframes whose chi-square exceeds this loses weight.", low=1.0, high=1e6
-    )
     scan_sigma: float = parameter(
         0.1, "Deviation of a scan's place relative to its keyframe before it is registered.", unit="m",
         low=0.001, high=5.0,

@@ -105,7 +105,6 @@ class _Keyframes:
             np.arange(1, count + 1),
             se2.between(poses[:-1], poses[1:]),
             _path_covariances(recording.odometry, rows, self._configuration.motion),
-            np.full(count, self._options.motion_patience),
         )
 
     def placed(self, recording: Recording, scans: Iterable[Scan]) -> Trajectory:

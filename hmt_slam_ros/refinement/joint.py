@@ -2,7 +2,7 @@
 
 Iterates between two steps: every overlapping pair of scans is linearised at the present poses (point-to-line, so that
 a pair in a bare corridor says nothing about the direction along it), which makes it an edge of a pose graph; the graph,
-with the edges of the motion, is solved (Lu and Milios 1997). Edges that contradict the others lose their weight.
+with the edges of the motion, is solved (Lu and Milios 1997).
 """
 
 from __future__ import annotations
@@ -71,17 +71,13 @@ def _registered(
         pairs[meets, 0],
         se2.compose(relative[meets], se2.exp(step)),
         np.linalg.inv(information),
-        np.full(int(meets.sum()), options.patience),
     )
 
 
 def _with(motion: Edges, registered: Edges) -> Edges:
-    patience = np.full(len(motion.sources), np.inf) if motion.patience is None else motion.patience
-    assert registered.patience is not None
     return Edges(
         np.concatenate((motion.sources, registered.sources)),
         np.concatenate((motion.targets, registered.targets)),
         np.concatenate((motion.poses, registered.poses)),
         np.concatenate((motion.covariances, registered.covariances)),
-        np.concatenate((patience, registered.patience)),
     )

@@ -119,7 +119,7 @@ def pattern(rows: Int64, columns: Int64, nodes: int) -> Pattern:
 def normal_matrix(where: Pattern, of_source: Float64, of_target: Float64, information: Float64) -> csc_matrix:
     """The sum of J^T Omega J over all edges.
 
-    :param information: shape (m, 3, 3), weighted.
+    :param information: shape (m, 3, 3), of the edges.
     """
     size = len(where.starts) - 1
     entries = _entries(where.first, where.stride, len(where.indices), of_source, of_target, information)

@@ -34,15 +34,12 @@ class Edges:
     :ivar targets: shape (m,), int64, node j.
     :ivar poses: shape (m, 3), measured ``i_T_j``, m and rad.
     :ivar covariances: shape (m, 3, 3), right tangent frame, regular.
-    :ivar patience: shape (m,), an edge whose chi2 exceeds this is given less weight (dynamic covariance scaling,
-        Agarwal et al. 2013); inf trusts it whatever happens; None trusts all.
     """
 
     sources: NDArray[np.int64]
     targets: NDArray[np.int64]
     poses: NDArray[np.float64]
     covariances: NDArray[np.float64]
-    patience: NDArray[np.float64] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,8 +50,7 @@ class Solution:
     :ivar covariances: shape (n, 3, 3), marginals in the right tangent frame, relative to the fixed node, whose own is
         zero; None where they were not asked for.
     :ivar chi2: sum of ``edge_chi2``; 3 (m - n + 1) degrees of freedom.
-    :ivar edge_chi2: shape (m,), before weighting.
-    :ivar weights: shape (m,), in (0, 1], the factor on each edge's information; 1 where nothing was doubted.
+    :ivar edge_chi2: shape (m,).
     :ivar steps: steps taken.
     """
 
@@ -62,7 +58,6 @@ class Solution:
     covariances: NDArray[np.float64] | None
     chi2: float
     edge_chi2: NDArray[np.float64]
-    weights: NDArray[np.float64]
     steps: int
 
 
@@ -104,18 +99,17 @@ def optimise(
         if gain <= tolerance * state.cost:
             break
     covariances = system.marginals(state) if marginals else None
-    return Solution(poses, covariances, float(state.chi2.sum()), state.chi2, state.weights, steps)
+    return Solution(poses, covariances, state.cost, state.chi2, steps)
 
 
 @dataclass(frozen=True, eq=False)
 class _State:
-    """The problem at given poses: residuals (m, 3), Jacobians (m, 3, 3), chi2 and weights (m,), and the cost."""
+    """The problem at given poses: residuals (m, 3), Jacobians (m, 3, 3), chi2 (m,), and the cost, which is its sum."""
 
     residuals: NDArray[np.float64]
     of_source: NDArray[np.float64]
     of_target: NDArray[np.float64]
     chi2: NDArray[np.float64]
-    weights: NDArray[np.float64]
     cost: float
 
 
@@ -124,7 +118,7 @@ class _System:
 
     def __init__(self, nodes: int, edges: Edges, fixed: int) -> None:
         self._edges = edges
-        self._information = np.linalg.inv(edges.covariances)
+        self._information = np.linalg.inv(edges.covariances).astype(np.float64, copy=False)
         self._free = np.delete(np.arange(nodes), fixed)
         self._nodes = nodes
         self._require_connected(fixed)
@@ -147,22 +141,11 @@ class _System:
             poses, self._edges.sources, self._edges.targets, self._edges.poses
         )
         chi2 = np.einsum("mi,mij,mj->m", residuals, self._information, residuals)
-        scale, penalty = self._doubt(chi2)
-        cost = float((scale**2 * chi2 + penalty).sum())
-        return _State(residuals, of_source, of_target, chi2, scale**2, cost)
-
-    def _doubt(self, chi2: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Dynamic covariance scaling: the scale s = min(1, 2 p / (p + chi2)) and the price p (1 - s)^2 of doubting."""
-        if self._edges.patience is None:
-            return np.ones_like(chi2), np.zeros_like(chi2)
-        # 2 / (1 + chi2 / p) holds for infinite patience p too, and there the price is nought.
-        scale = np.minimum(1.0, 2.0 / (1.0 + chi2 / self._edges.patience))
-        finite = np.where(np.isfinite(self._edges.patience), self._edges.patience, 0.0)
-        return scale, finite * (1.0 - scale) ** 2
+        return _State(residuals, of_source, of_target, chi2, float(chi2.sum()))
 
     def step(self, state: _State, damping: float) -> NDArray[np.float64]:
         """The change of every pose in its right tangent space, shape (n, 3)."""
-        weighted = state.weights[:, None] * np.einsum("mij,mj->mi", self._information, state.residuals)
+        weighted = np.einsum("mij,mj->mi", self._information, state.residuals)
         gradient = np.zeros((self._nodes, 3))
         np.add.at(gradient, self._edges.sources, np.einsum("mij,mi->mj", state.of_source, weighted))
         np.add.at(gradient, self._edges.targets, np.einsum("mij,mi->mj", state.of_target, weighted))
@@ -172,8 +155,7 @@ class _System:
         return change
 
     def _factor(self, state: _State, damping: float) -> SuperLU:
-        information = state.weights[:, None, None] * self._information
-        hessian = normal_matrix(self._pattern, state.of_source, state.of_target, information)
+        hessian = normal_matrix(self._pattern, state.of_source, state.of_target, self._information)
         if damping > 0.0:
             hessian = (hessian + diags(damping * hessian.diagonal())).tocsc()
         # Symmetric and positive definite: no pivoting, so that the fill follows the graph.
