@@ -12,6 +12,7 @@ from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.chi_square import gate
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.processes.acceptance import Acceptance
 from hmt_slam_ros.processes.closure_account import Account, Closure, History, Name, Step
 from hmt_slam_ros.processes.messages import (
     Accepted,
@@ -28,12 +29,8 @@ from hmt_slam_ros.processes.observation import Observation, observed
 from hmt_slam_ros.processes.reopening import Question, Reopening
 from hmt_slam_ros.processes.replica import FIRST_HYPOTHESIS, Replica
 from hmt_slam_ros.processes.undo import Undo
-from hmt_slam_ros.refinement.closure import ClosureRefinement
-from hmt_slam_ros.topology.arc_fusion import floored, fused
-from hmt_slam_ros.topology.common_map import ArcValue, Pair
-from hmt_slam_ros.topology.fine_alignment import FineAlignment
+from hmt_slam_ros.topology.common_map import Pair
 from hmt_slam_ros.topology.global_map import consistent_map, shortest_path_map
-from hmt_slam_ros.topology.hybrid_map import HybridMap
 
 # Closures are never taken for more certain than this, whatever tlca.accept_probability is.
 _LEAST_DOUBT = 1e-6
@@ -74,8 +71,7 @@ class Tlca:
 
     def __init__(self, configuration: Configuration) -> None:
         self._options = configuration.tlca
-        self._alignment = FineAlignment(configuration)
-        self._refinement = ClosureRefinement(configuration)
+        self._acceptance = Acceptance(configuration)
         self._replica = Replica()
         self._paths = {FIRST_HYPOTHESIS: _Path()}
         self._travelled = 0.0
@@ -161,30 +157,19 @@ class Tlca:
     def _refined(self, hypothesis: int) -> tuple[tuple[Arc, ...], tuple[Relabelled, ...]]:
         """Align and fuse what the accepted path observed, changing its map."""
         path, hybrid_map = self._paths[hypothesis], self._replica.maps[hypothesis]
-        arcs: dict[Pair, Arc] = {}
-        relabelled: list[Relabelled] = []
         found = [seen.pair for seen in path.observations if seen.closure]
         found += [closure.pair for closure in path.closures if closure.undo is None]
         closed = {area for pair in found for area in pair}
         poses = {k: (area, pose) for area in sorted(closed) for k, pose in hybrid_map.keyframes(area).items()}
-        values: dict[Pair, ArcValue] = {}
-        witnesses = dict(path.witnesses)
-        for seen in path.observations:
-            aligned, moved = self._aligned(hybrid_map, seen)
-            relabelled += moved
-            old = arcs.get(seen.pair, seen.before)
-            arcs[seen.pair] = self._fused(aligned, old, witnesses.get(seen.pair, frozenset()))
-            witnesses[seen.pair] = witnesses.get(seen.pair, frozenset()) | seen.witnesses
-        if closed:
-            relabelled, values = self._refined_around(hybrid_map, closed, arcs, relabelled)
-        if arcs:
+        made = self._acceptance.of(hybrid_map, self._replica.scans, path.observations, path.witnesses, closed)
+        if made.arcs:
             self._changes += 1
-        version = self._changes if arcs else path.version
-        closures = self._closures(path, self._replica.probabilities[hypothesis], Undo(poses, values))
+        version = self._changes if made.arcs else path.version
+        closures = self._closures(path, self._replica.probabilities[hypothesis], Undo(poses, made.before))
         self._paths[hypothesis] = replace(
-            path, version=version, definite=True, observations=(), witnesses=witnesses, closures=closures
+            path, version=version, definite=True, observations=(), witnesses=made.witnesses, closures=closures
         )
-        return tuple(arcs.values()), tuple(relabelled)
+        return tuple(made.arcs.values()), tuple(made.relabelled)
 
     def _closures(self, path: _Path, probability: float, undo: Undo) -> tuple[Closure, ...]:
         """Those of a path that is now accepted; what was observed again since is not to be undone."""
@@ -196,76 +181,6 @@ class Tlca:
                 closures[seen.pair] = seen.accepted(math.log((1.0 - doubt) / doubt), undo)
         self._accepted_now = frozenset(c.name for c in list(closures.values())[len(path.closures) :])
         return tuple(closures.values())
-
-    def _refined_around(
-        self, hybrid_map: HybridMap, closed: set[int], arcs: dict[Pair, Arc], relabelled: list[Relabelled]
-    ) -> tuple[list[Relabelled], dict[Pair, ArcValue]]:
-        """Refine the areas that closures joined; the arcs around them follow, with the covariances they have.
-
-        Returns the keyframes that moved, and the arcs as they were before.
-        """
-        for arc in arcs.values():
-            hybrid_map.set_arc(arc.source, arc.target, arc.pose, closure=arc.closure)
-        found = self._refinement.refined(hybrid_map, self._replica.scans, closed)
-        before = {(a, b): value for a, b, value in hybrid_map.all_arcs() if (a, b) in found.arcs}
-        for (a, b), value in before.items():
-            pose = found.arcs[a, b]
-            arcs[a, b] = Arc(a, b, PoseGaussian(pose, value.pose.covariance), value.closure)
-        moved = {
-            keyframe: Relabelled(keyframe, area, area, pose)
-            for area, keyframes in found.keyframes.items()
-            for keyframe, pose in keyframes.items()
-        }
-        return list(({r.keyframe: r for r in relabelled} | moved).values()), before
-
-    def _aligned(self, hybrid_map: HybridMap, seen: Observation) -> tuple[Observation, list[Relabelled]]:
-        """A closure that was found by matching areas, finely aligned."""
-        if not seen.closure:
-            return seen, []
-        return self._joined(hybrid_map, seen) if seen.joined else (self._linked(hybrid_map, seen), [])
-
-    def _joined(self, hybrid_map: HybridMap, seen: Observation) -> tuple[Observation, list[Relabelled]]:
-        """The keyframes that joined a known area, moved to where their scans fit the area's own, and the arc likewise.
-
-        Keyframes that the robot stored in the area since then are on neither side: they were matched against both.
-        """
-        placed = hybrid_map.keyframes(seen.target)
-        joined = [keyframe for keyframe in seen.joined if keyframe in placed]
-        known = [keyframe for keyframe in placed if keyframe < seen.joined[0]]
-        scans = self._replica.scans
-        motion = self._alignment.offset(
-            [(scans[keyframe], placed[keyframe]) for keyframe in known],
-            [(scans[keyframe], placed[keyframe]) for keyframe in joined],
-            seen.pose.covariance,
-        )
-        if motion is None:
-            return seen, []
-        moved = [
-            Relabelled(keyframe, seen.target, seen.target, se2.compose(motion, placed[keyframe])) for keyframe in joined
-        ]
-        for r in moved:
-            hybrid_map.place(r.keyframe, r.area, r.pose)
-        return replace(seen, pose=seen.pose.compose(_exactly(se2.inverse(motion)))), moved
-
-    def _linked(self, hybrid_map: HybridMap, seen: Observation) -> Observation:
-        """An arc between areas that keep their keyframes, moved to where the scans of both fit."""
-        known, others, scans = hybrid_map.keyframes(seen.source), hybrid_map.keyframes(seen.target), self._replica.scans
-        motion = self._alignment.offset(
-            [(scans[keyframe], pose) for keyframe, pose in known.items()],
-            [(scans[keyframe], se2.compose(seen.pose.mean, pose)) for keyframe, pose in others.items()],
-            seen.pose.inverse().covariance,
-        )
-        return seen if motion is None else replace(seen, pose=_exactly(motion).compose(seen.pose))
-
-    def _fused(self, seen: Observation, old: Arc | None, witnesses: frozenset[int]) -> Arc:
-        """The definite arc from an observation and what was known before, which tells whether it closed a loop."""
-        belief, closure = seen.pose, seen.closure
-        if old is not None:
-            shared = len(seen.witnesses & witnesses) / len(seen.witnesses)
-            known = old.pose if old.source == seen.source else old.pose.inverse()
-            belief, closure = fused(known, belief, shared), old.closure
-        belief = floored(belief, self._options.arc_sigma_floor, math.radians(self._options.arc_angle_floor))
-        return Arc(seen.source, seen.target, belief, closure)
 
     def _global_poses(self) -> tuple[tuple[AreaPose, ...], list[Message]]:
         """The poses of all areas under the most probable hypothesis, where they changed; arcs that refuse to fit."""
@@ -296,7 +211,3 @@ class Tlca:
 
 def _rebased(pose: NDArray[np.float64], leaf: Leaf) -> NDArray[np.float64]:
     return pose if leaf.rebase is None else se2.compose(leaf.rebase.mean, pose)
-
-
-def _exactly(pose: NDArray[np.float64]) -> PoseGaussian:
-    return PoseGaussian(pose, np.zeros((3, 3)))

@@ -1,0 +1,166 @@
+"""What acceptance makes of a path's observations: definite arcs, and keyframes that lie where their scans fit."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass, replace
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hmt_slam_ros.configuration import Configuration
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.processes.messages import Arc, Relabelled
+from hmt_slam_ros.processes.observation import Observation
+from hmt_slam_ros.refinement.closure import ClosureRefinement
+from hmt_slam_ros.sensing import Scan
+from hmt_slam_ros.topology.arc_fusion import floored, fused
+from hmt_slam_ros.topology.common_map import ArcValue, Pair
+from hmt_slam_ros.topology.fine_alignment import FineAlignment
+from hmt_slam_ros.topology.hybrid_map import HybridMap
+
+Scans: TypeAlias = Mapping[int, Scan]
+Witnesses: TypeAlias = dict[Pair, frozenset[int]]
+
+
+@dataclass(frozen=True, eq=False)
+class Definite:
+    """What became definite.
+
+    :ivar arcs: those observed, and those around the areas that closures joined.
+    :ivar relabelled: the keyframes that moved.
+    :ivar witnesses: {arc: the keyframes by which it was observed}, of all definite arcs.
+    :ivar before: the arcs around the areas that closures joined as they were before these were refined.
+    """
+
+    arcs: dict[Pair, Arc]
+    relabelled: list[Relabelled]
+    witnesses: Witnesses
+    before: dict[Pair, ArcValue]
+
+
+class Acceptance:
+    """Closures are finely aligned, arcs that were travelled before are fused with what was known of them, and the
+    areas refined that closures joined.
+    """
+
+    def __init__(self, configuration: Configuration) -> None:
+        self._options = configuration.tlca
+        self._alignment = FineAlignment(configuration)
+        self._refinement = ClosureRefinement(configuration)
+
+    def of(
+        self,
+        hybrid_map: HybridMap,
+        scans: Scans,
+        observations: Iterable[Observation],
+        witnesses: Witnesses,
+        closed: Collection[int],
+    ) -> Definite:
+        """What becomes of a path that is accepted, changing its map.
+
+        :param scans: of all keyframes.
+        :param observations: that wait for it, in order.
+        :param witnesses: {arc: the keyframes by which it was observed}, of the arcs that are definite already.
+        :param closed: the areas that closures joined.
+        """
+        arcs: dict[Pair, Arc] = {}
+        relabelled: list[Relabelled] = []
+        before: dict[Pair, ArcValue] = {}
+        witnesses = dict(witnesses)
+        for seen in observations:
+            aligned, moved = self._aligned(hybrid_map, scans, seen)
+            relabelled += moved
+            old = arcs.get(seen.pair, seen.before)
+            arcs[seen.pair] = self._fused(aligned, old, witnesses.get(seen.pair, frozenset()))
+            witnesses[seen.pair] = witnesses.get(seen.pair, frozenset()) | seen.witnesses
+        if closed:
+            relabelled, before = self._refined_around(hybrid_map, scans, closed, arcs, relabelled)
+        return Definite(arcs, relabelled, witnesses, before)
+
+    def _refined_around(
+        self,
+        hybrid_map: HybridMap,
+        scans: Scans,
+        closed: Collection[int],
+        arcs: dict[Pair, Arc],
+        relabelled: list[Relabelled],
+    ) -> tuple[list[Relabelled], dict[Pair, ArcValue]]:
+        """Refine the areas that closures joined; the arcs around them follow, with the covariances they have.
+
+        Returns the keyframes that moved, and the arcs as they were before.
+        """
+        for arc in arcs.values():
+            hybrid_map.set_arc(arc.source, arc.target, arc.pose, closure=arc.closure)
+        found = self._refinement.refined(hybrid_map, scans, closed)
+        before = {(a, b): value for a, b, value in hybrid_map.all_arcs() if (a, b) in found.arcs}
+        for (a, b), value in before.items():
+            pose = found.arcs[a, b]
+            arcs[a, b] = Arc(a, b, PoseGaussian(pose, value.pose.covariance), value.closure)
+        moved = {
+            keyframe: Relabelled(keyframe, area, area, pose)
+            for area, keyframes in found.keyframes.items()
+            for keyframe, pose in keyframes.items()
+        }
+        return list(({r.keyframe: r for r in relabelled} | moved).values()), before
+
+    def _aligned(
+        self, hybrid_map: HybridMap, scans: Scans, seen: Observation
+    ) -> tuple[Observation, list[Relabelled]]:
+        """A closure that was found by matching areas, finely aligned."""
+        if not seen.closure:
+            return seen, []
+        if seen.joined:
+            return self._joined(hybrid_map, scans, seen)
+        return self._linked(hybrid_map, scans, seen), []
+
+    def _joined(
+        self, hybrid_map: HybridMap, scans: Scans, seen: Observation
+    ) -> tuple[Observation, list[Relabelled]]:
+        """The keyframes that joined a known area, moved to where their scans fit the area's own, and the arc likewise.
+
+        Keyframes that the robot stored in the area since then are on neither side: they were matched against both.
+        """
+        placed = hybrid_map.keyframes(seen.target)
+        joined = [keyframe for keyframe in seen.joined if keyframe in placed]
+        known = [keyframe for keyframe in placed if keyframe < seen.joined[0]]
+        motion = self._alignment.offset(
+            [(scans[keyframe], placed[keyframe]) for keyframe in known],
+            [(scans[keyframe], placed[keyframe]) for keyframe in joined],
+            seen.pose.covariance,
+        )
+        if motion is None:
+            return seen, []
+        moved = [
+            Relabelled(keyframe, seen.target, seen.target, se2.compose(motion, placed[keyframe])) for keyframe in joined
+        ]
+        for r in moved:
+            hybrid_map.place(r.keyframe, r.area, r.pose)
+        return replace(seen, pose=seen.pose.compose(_exactly(se2.inverse(motion)))), moved
+
+    def _linked(self, hybrid_map: HybridMap, scans: Scans, seen: Observation) -> Observation:
+        """An arc between areas that keep their keyframes, moved to where the scans of both fit."""
+        known, others = hybrid_map.keyframes(seen.source), hybrid_map.keyframes(seen.target)
+        motion = self._alignment.offset(
+            [(scans[keyframe], pose) for keyframe, pose in known.items()],
+            [(scans[keyframe], se2.compose(seen.pose.mean, pose)) for keyframe, pose in others.items()],
+            seen.pose.inverse().covariance,
+        )
+        return seen if motion is None else replace(seen, pose=_exactly(motion).compose(seen.pose))
+
+    def _fused(self, seen: Observation, old: Arc | None, witnesses: frozenset[int]) -> Arc:
+        """The definite arc from an observation and what was known before, which tells whether it closed a loop."""
+        belief, closure = seen.pose, seen.closure
+        if old is not None:
+            shared = len(seen.witnesses & witnesses) / len(seen.witnesses)
+            known = old.pose if old.source == seen.source else old.pose.inverse()
+            belief, closure = fused(known, belief, shared), old.closure
+        belief = floored(belief, self._options.arc_sigma_floor, math.radians(self._options.arc_angle_floor))
+        return Arc(seen.source, seen.target, belief, closure)
+
+
+def _exactly(pose: NDArray[np.float64]) -> PoseGaussian:
+    return PoseGaussian(pose, np.zeros((3, 3)))
