@@ -34,11 +34,12 @@ POLICY = (
     "there a lap ago), under the covariance that their errors truly have. Where that is "
     f"{DECIDED:g} or more, odometry tells the places apart, and the evidence is there before the question; so it is in "
     "the ring, all of whose sides look alike for ever, but a quarter turn is more than odometry ever errs by in a lap. "
-    "Elsewhere the evidence is the first keyframe at which the views differ. From the event at which TSBI asks, until "
-    f"the evidence, both the true and the other place should have between {LOW:g} and {HIGH:g} (and do not where "
-    f"nothing is asked before); {SOON:g} m after the evidence, or after the question if that comes later, the true one "
-    f"should have more than {SURE:g}. New ground and what is not examined have the rest. An inference that weighs "
-    f"odometry rightly stays between {LOW:g} and {HIGH:g} only where odometry alone does."
+    "Elsewhere the evidence is the first keyframe at which the views differ. The question is the first event at which "
+    f"known places together have {LOW:g}. From it until the evidence, both the true and the other place should have "
+    f"between {LOW:g} and {HIGH:g} (and do not where there is no question before); {SOON:g} m after the evidence, or "
+    f"after the question if that comes later, the true one should have more than {SURE:g}. New ground and what is not "
+    f"examined have the rest. An inference that weighs odometry rightly stays between {LOW:g} and {HIGH:g} only where "
+    "odometry alone does."
 )
 
 

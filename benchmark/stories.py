@@ -41,8 +41,8 @@ class Moment:
 
     @property
     def asked(self) -> bool:
-        """Whether any hypothesis is in a known place."""
-        return self.probabilities[RIGHT] + self.probabilities[WRONG] > 0.0
+        """Whether it may be that the robot is in a known place."""
+        return self.probabilities[RIGHT] + self.probabilities[WRONG] >= LOW
 
 
 def story(pmf: Sequence[Mapping[str, Any]], begin: int) -> list[Moment]:
@@ -79,7 +79,7 @@ def _kind(before: str, leaf: Mapping[str, Any]) -> str:
 class Verdict:
     """Whether the hypotheses fared as they should.
 
-    :ivar asked: whether any hypothesis said that the robot is in a known place.
+    :ivar asked: whether it ever may be that the robot is in a known place: with probability ``LOW``.
     :ivar lowest: the smallest probability of the true and of another place, from the question to the evidence.
     :ivar highest: the largest of the two; both None where nothing was asked before the evidence.
     :ivar when_asked: probability of the true place at the question; ``at_evidence``, just before the evidence; None

@@ -42,6 +42,13 @@ def test_hypotheses_are_told_by_the_loops_that_they_and_their_parents_closed():
     assert moments[1].samples == 5.0
 
 
+def test_the_question_is_open_once_known_places_have_a_fifth():
+    shares = [[], [0.19], [0.1, 0.1]]
+    known = [[leaf(1 + n, 0, share, 1) for n, share in enumerate(own)] for own in shares]
+    pmf = [entry(k, leaf(0, 0, 1.0 - sum(own)), *known[k]) for k, own in enumerate(shares)]
+    assert [moment.asked for moment in story(pmf, 0)] == [False, False, True]
+
+
 def test_what_closed_before_the_story_begins_does_not_count():
     assert not any(moment.asked for moment in story(PMF, 2)[:1])
 
