@@ -20,7 +20,8 @@ from benchmark.report import Report
 from benchmark.runs import Runner
 from benchmark.settings import Settings
 from benchmark.simulated.records import Records
-from benchmark.simulated.worlds import FAMILIES
+from benchmark.simulated.worlds import FAMILIES, LONG
+from benchmark.table_runs import CAMPUS
 from hmt_slam_ros.cli.arguments import OneSentenceParser
 from hmt_slam_ros.errors import HmtSlamError
 
@@ -104,7 +105,8 @@ def _parser() -> argparse.ArgumentParser:
     parser = OneSentenceParser(prog="python -m benchmark", description="Measurements of hmt_slam_ros on logs.")
     told = "; ".join(f"{name}: {text}" for name, text in MEASUREMENTS.items())
     parser.add_argument("measurements", nargs="+", choices=(*MEASUREMENTS, *_GROUPS), metavar="KIND", help=told)
-    parser.add_argument("--logs", type=_names, default=(), metavar="A,B", help=f"of {', '.join((*LOGS, *FAMILIES))}")
+    names = ", ".join((*LOGS, *FAMILIES, LONG, CAMPUS))
+    parser.add_argument("--logs", type=_names, default=(), metavar="A,B", help=f"of {names}")
     parser.add_argument("--seeds", type=_count, default=0, metavar="N", help="seeds 0 to N-1; simulated: from 1000")
     parser.add_argument("--jobs", type=_count, default=2, metavar="N", help="runs at the same time; 1 for speed")
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder of the report")

@@ -7,6 +7,7 @@ from benchmark.report import Report, Requirement, table
 from benchmark.settings import Settings
 from benchmark.simulated.measured import chosen_seeds, records_of
 from benchmark.simulated.records import Record
+from benchmark.simulated.worlds import LONG
 
 WORLDS = ("nested",)
 
@@ -21,7 +22,7 @@ POLICY = (
 
 def measure_topology(settings: Settings) -> Report:
     """Map the worlds and judge how they end."""
-    records = records_of(settings, WORLDS)
+    records = records_of(settings, WORLDS, others=(LONG,))
     report = Report("topology", "Exact topology of nested loops", seeds=chosen_seeds(settings))
     inexact = [record for record in records if faults(record)]
     share = len(inexact) / len(records)

@@ -9,7 +9,7 @@ from benchmark.simulated.comparisons import write_comparisons
 from benchmark.simulated.loops import Loops
 from benchmark.simulated.records import Records, code, read_record
 from benchmark.simulated.truth import Truth, nees
-from benchmark.simulated.worlds import FAMILIES, SETTINGS, World, seeds
+from benchmark.simulated.worlds import FAMILIES, LONG, SETTINGS, World, seeds
 from hmt_slam_ros.configuration import load_configuration
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry import se2
@@ -68,6 +68,12 @@ def claim_with_error(truth, known, asked, error, covariance=TIGHT):
     """The claim that joins the frames of two keyframes, moved by an error."""
     pose = se2.compose(se2.between(truth.poses[known], truth.poses[asked]), np.array(error))
     return truth.claim({known: np.zeros(3)}, {asked: pose}, covariance, pose)
+
+
+def test_the_long_world_is_2_km_of_nested_loops_and_no_family():
+    log = open_simulated(World(LONG, 1000).log)
+    assert 1900 < np.hypot(*np.diff(log.scenario.poses[:, :2], axis=0).T).sum() < 2100
+    assert LONG not in FAMILIES
 
 
 def test_a_claim_is_true_where_the_places_meet_as_it_says(drive):

@@ -16,18 +16,22 @@ def chosen_seeds(settings: Settings, count: int = SEEDS) -> tuple[int, ...]:
     return seeds(len(settings.seeds_or(count)), training=settings.training)
 
 
-def records_of(settings: Settings, families: tuple[str, ...] = FAMILIES, count: int = SEEDS) -> list[Record]:
+def records_of(
+    settings: Settings, families: tuple[str, ...] = FAMILIES, count: int = SEEDS, others: tuple[str, ...] = ()
+) -> list[Record]:
     """The records of some families, those of one family one after the other.
 
     :param count: of the seeds where none are asked for.
+    :param others: worlds that are no families, and mapped only where they are asked for by their names.
 
     :raises HmtSlamError: for a name that is no family, or a run that failed.
     """
-    chosen = settings.logs_or(families)
+    chosen, known = settings.logs_or(families), (*FAMILIES, *others)
     for name in chosen:
-        if name not in FAMILIES:
-            raise HmtSlamError(f"there is no family {name!r}: choose from {', '.join(FAMILIES)}")
-    worlds = [World(family, seed) for family in families if family in chosen for seed in chosen_seeds(settings, count)]
+        if name not in known:
+            raise HmtSlamError(f"there is no family {name!r}: choose from {', '.join(known)}")
+    mapped, numbers = (family for family in (*families, *others) if family in chosen), chosen_seeds(settings, count)
+    worlds = [World(family, seed) for family in mapped for seed in numbers]
     return settings.records.of(worlds, settings.changes)
 
 
