@@ -89,9 +89,11 @@ def requirements(family: str, found: Sequence[Reentry]) -> list[Requirement]:
     alive = sum(entry.verdict.both_alive for entry in open_ones)
     settled = sum(entry.verdict.settled for entry in asked)
     count, all_of = len(open_ones), f"of {len(asked)}"
+    # Of none, all are alive: that would say nothing.
+    living = [Requirement(f"{family}: of these {count}, both alive until the evidence", alive, math.inf, least=count)]
     return [
         Requirement(f"{family}: re-entries that odometry does not decide", count, math.inf, least=1),
-        Requirement(f"{family}: of these {count}, both alive until the evidence", alive, math.inf, least=count),
+        *(living if open_ones else []),
         Requirement(f"{family}: {all_of}, the true one sure after the evidence", settled, math.inf, least=len(asked)),
     ]
 

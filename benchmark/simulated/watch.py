@@ -52,6 +52,7 @@ class Watch:
     """Judges a run while it goes on.
 
     :ivar truth: about the keyframes.
+    :ivar travelled: {keyframe event: path length since the start, m}.
     :ivar rows: of all comparisons with known areas.
     :ivar events: keyframe events at which there was a known area that the keyframes fit into.
     :ivar accepted: the closures that became definite.
