@@ -1,6 +1,7 @@
 """The command line as a user meets it: processes with arguments, exit status, one sentence, nothing left behind."""
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -192,6 +193,36 @@ def test_a_run_that_is_stopped_leaves_nothing_behind(tmp_path: Path, number: sig
     _, stderr = run.communicate(timeout=60)
     assert run.returncode == status, stderr
     assert "Traceback" not in stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+STOPPED_WHILE_KERNELS_ARE_LOADED = """
+import os, sys
+from llvmlite.binding.executionengine import ExecutionEngine
+from hmt_slam_ros.cli.main import main
+find = ExecutionEngine._find_module_ptr
+def told(self, pointer):
+    # LLVM called back; the handler runs before this returns.
+    os.kill(os.getpid(), {number})
+    return find(self, pointer)
+ExecutionEngine._find_module_ptr = told
+sys.exit(main({arguments!r}))
+"""
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_run_that_is_stopped_while_llvm_loads_a_kernel_ends_in_good_order(
+    tmp_path: Path, number: signal.Signals, status: int
+) -> None:
+    """What is raised in a function that LLVM calls is lost, and the kernel with it: a crash, or a run that goes on."""
+    assert hmt_slam("map", BAG, "--out", tmp_path / "out", "--duration", 4).returncode == 0
+    shutil.rmtree(tmp_path / "out")
+    arguments = ["map", str(BAG), "--out", str(tmp_path / "out"), "--duration", "4"]
+    code = STOPPED_WHILE_KERNELS_ARE_LOADED.format(number=int(number), arguments=arguments)
+    command = [sys.executable, "-c", code]
+    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120.0, check=False)
+    assert result.returncode == status, result.stderr
+    assert "Exception ignored" not in result.stderr
     assert list(tmp_path.iterdir()) == []
 
 

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import os
-import signal
 import sys
 from collections.abc import Sequence
 from importlib import import_module
-from types import FrameType
 
 from hmt_slam_ros.cli.arguments import parser
+from hmt_slam_ros.cli.stopping import heed_signals
 from hmt_slam_ros.compilation import tell_of_compilation
 from hmt_slam_ros.errors import HmtSlamError
 
-FAULT, INTERRUPTED, TERMINATED = 2, 130, 143
+FAULT, INTERRUPTED = 2, 130
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -22,7 +21,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     :param arguments: those of the process where None.
     :returns: exit status: 0 for a complete result, 2 where the input is at fault, 130 where the user stopped it.
     """
-    signal.signal(signal.SIGTERM, _terminate)
+    heed_signals()
     options = parser().parse_args(arguments)
     try:
         # Each subcommand loads what it needs itself, so that --help does not wait for numba and matplotlib.
@@ -39,11 +38,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"hmt_slam {options.command}: stopped, nothing was written", file=sys.stderr)
         return INTERRUPTED
     return 0
-
-
-def _terminate(_signal: int, _frame: FrameType | None) -> None:
-    """Leave by an exception, so that half-written output is removed on the way out."""
-    raise SystemExit(TERMINATED)
 
 
 if __name__ == "__main__":
