@@ -6,12 +6,18 @@ is the kernel that was being loaded, whose address is then taken from nowhere.
 
 from __future__ import annotations
 
+import math
 import signal
+import time
+from collections.abc import Collection
 from types import FrameType
 
 TERMINATED = 143
 
-_UNSTOPPABLE = frozenset({"numba", "llvmlite"})
+# Who is between LLVM and the program. Loading a kernel takes no longer than this; what takes longer compiles one, and
+# can be broken off but for the calls of LLVM themselves.
+_LLVM, _NUMBA = frozenset({"llvmlite"}), frozenset({"llvmlite", "numba"})
+_LONGEST = 2.0  # s
 _LATER = 0.02  # s
 
 
@@ -20,11 +26,12 @@ class _Stop:
 
     def __init__(self) -> None:
         self._told = signal.SIGTERM
+        self._since = math.inf
 
     def __call__(self, number: int, frame: FrameType | None) -> None:
         if number != signal.SIGALRM:
-            self._told = signal.Signals(number)
-        if _loads_kernels(frame):
+            self._told, self._since = signal.Signals(number), min(self._since, time.monotonic())
+        if _is_inside(frame, _NUMBA if time.monotonic() - self._since < _LONGEST else _LLVM):
             signal.setitimer(signal.ITIMER_REAL, _LATER)
         elif self._told == signal.SIGINT:
             raise KeyboardInterrupt
@@ -35,7 +42,7 @@ class _Stop:
 def heed_signals() -> None:
     """Raise ``KeyboardInterrupt`` on SIGINT and ``SystemExit`` on SIGTERM from now on, once no kernel is being loaded.
 
-    A kernel that has to be compiled takes seconds. A SIGINT that was to be ignored stays so.
+    A SIGINT that was to be ignored stays so.
     """
     stop = _Stop()
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGALRM):
@@ -43,9 +50,9 @@ def heed_signals() -> None:
             signal.signal(number, stop)
 
 
-def _loads_kernels(frame: FrameType | None) -> bool:
+def _is_inside(frame: FrameType | None, packages: Collection[str]) -> bool:
     while frame is not None:
-        if frame.f_globals.get("__name__", "").partition(".")[0] in _UNSTOPPABLE:
+        if frame.f_globals.get("__name__", "").partition(".")[0] in packages:
             return True
         frame = frame.f_back
     return False
