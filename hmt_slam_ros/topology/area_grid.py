@@ -9,6 +9,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from hmt_slam_ros.agreement import Agreement
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.sensing import Scan
 
@@ -16,6 +17,8 @@ Points = NDArray[np.float64]
 
 # Neighbouring end points of one scan at most this far apart (m) lie on one surface, which is filled in between them.
 _JOIN = 0.3
+# Log-ratio above which a sample is on a known surface, and below which in free space: 0.25 m from a surface and more.
+_ON, _OFF = 0.3, -0.5
 
 
 @dataclass(frozen=True)
@@ -72,6 +75,15 @@ class AreaGrid:
     def moved(self, shift: Points) -> AreaGrid:
         """The same grid in a frame whose origin lies at ``shift``, shape (2,), of this one and is not turned."""
         return replace(self, origin=self.origin - shift, points=self.points - shift)
+
+    def agreement(self, points: Points, pose: NDArray[np.float64]) -> Agreement:
+        """How surface samples of another map lie in this one.
+
+        :param points: shape (n, 2), m.
+        :param pose: ``grid_T_points``, shape (3,).
+        """
+        on, free = _agreeing(se2.transform(pose, points), self.fine, self.origin, 0.5 * self.cell)
+        return Agreement(len(points), on, free)
 
 
 def build_area_grid(scans: Sequence[Scan], poses: NDArray[np.float64], model: GridModel) -> AreaGrid:
@@ -209,3 +221,14 @@ def _lower_distances(
             for c in range(last - first):
                 d2 = ((first + c - x) ** 2 + up) * cell * cell
                 part[c] = d2 if d2 < part[c] else part[c]
+
+
+@njit(cache=True)
+def _agreeing(points: Points, fine: NDArray[np.float32], origin: Points, cell: float) -> tuple[int, int]:
+    on, free = 0, 0
+    for n in range(points.shape[0]):
+        column, row = int(np.floor((points[n, 0] - origin[0]) / cell)), int(np.floor((points[n, 1] - origin[1]) / cell))
+        if 0 <= column < fine.shape[1] and 0 <= row < fine.shape[0]:
+            on += fine[row, column] > _ON
+            free += fine[row, column] < _OFF
+    return on, free
