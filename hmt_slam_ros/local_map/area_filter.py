@@ -11,10 +11,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hmt_slam_ros.agreement import SCAN, Agreement, Usual
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.covariance import inverse, turned
-from hmt_slam_ros.local_map import batch
+from hmt_slam_ros.local_map import batch, matching
 from hmt_slam_ros.local_map.local_mapping import LocalMapping
 from hmt_slam_ros.local_map.matching import Prior
 from hmt_slam_ros.local_map.patches import MapView
@@ -44,7 +45,7 @@ class FilterStep:
     :ivar moved: the leading particle's motion since the last step, ``start_T_end``, shape (3,).
     :ivar covariance: of that motion, shape (3, 3), in the frame of its end: odometry's, but where the scan tells more.
     :ivar information: of the match alone, for correlated beams, in the frame of the pose, shape (3, 3).
-    :ivar log_evidence: log p(z_t | past), tempered, relative to unknown space, nats.
+    :ivar log_evidence: log p(z_t | past), relative to a place that looks alike, nats.
     :ivar effective_samples: ESS before resampling.
     :ivar history_changed: whether another particle leads than before, so that keyframe poses differ from those told.
     """
@@ -87,6 +88,7 @@ class AreaFilter:
         self.leader = 0
         self._matcher = ScanMatcher(mapping)
         self.tracking_covariance = np.zeros((3, 3))
+        self._usual = Usual()
 
     @property
     def pose(self) -> Float64:
@@ -107,6 +109,7 @@ class AreaFilter:
         child._priors, child._last_poses = self._priors.copy(), self._last_poses.copy()
         child._since_update = self._since_update
         child.leader, child.tracking_covariance = self.leader, self.tracking_covariance
+        child._usual = self._usual
         return child
 
     def release(self) -> None:
@@ -153,8 +156,6 @@ class AreaFilter:
             settings.matching.sharpness,
             settings.matching.temper,
         )
-        weights = _normalised(self.log_weights)
-        log_evidence = _log_mean(drawn.evidences, weights)
         self.log_weights = self.log_weights + drawn.evidences
         self.log_weights -= self.log_weights.max()
         leader = self._elected()
@@ -163,6 +164,7 @@ class AreaFilter:
         # The leader keeps the mode, so that the published path has no sampling noise.
         self.poses[leader] = drawn.modes[leader]
         self.poses[:, 2] = se2.wrap(self.poses[:, 2])
+        log_evidence = self._log_same(points, leader)
         heading = self.poses[leader, 2]
         # The beams are correlated, what odometry knows is not.
         told = drawn.hessians[leader] / settings.filter.covariance_inflation
@@ -175,6 +177,18 @@ class AreaFilter:
             self._resample(step)
         self._restart()
         return FilterStep(moved, covariance, information, log_evidence, effective, changed)
+
+    def _log_same(self, points: Float64, particle: int) -> float:
+        """log p(scan | this is the place) / p(scan | a place that looks alike) in the map of a particle, nats.
+
+        Learns how much contradicts usually.
+        """
+        view = self.mapping.pool.view(self._tables[particle])
+        near, far = self.mapping.near, 2 * self.mapping.near
+        found = Agreement(len(points), *matching.agreement(points, self.poses[particle], view, near, far))
+        log_ratio = SCAN.log_ratio(found, self._usual.share)
+        self._usual = self._usual.after(found, SCAN.stretch)
+        return log_ratio
 
     def _elected(self) -> int:
         """The particle of largest weight; where none is clearly more likely, the one that led before.
@@ -256,8 +270,3 @@ class AreaFilter:
 def _normalised(log_weights: Float64) -> Float64:
     weights = np.exp(log_weights - log_weights.max())
     return weights / weights.sum()
-
-
-def _log_mean(log_values: Float64, weights: Float64) -> float:
-    top = log_values.max()
-    return float(top + np.log(np.sum(weights * np.exp(log_values - top))))

@@ -110,6 +110,24 @@ def matched_fraction(points: Float64, pose: Float64, view: MapView, near: int) -
 
 
 @njit(cache=True)
+def agreement(points: Float64, pose: Float64, view: MapView, near: int, far: int) -> tuple[int, int]:
+    """How many of the points are on a known surface, and how many in space that is known to be free.
+
+    :param near: quantised distance to a surface below which a point is on it; ``far``: from which it is off.
+    """
+    cos, sin = np.cos(pose[2]), np.sin(pose[2])
+    half = 0.5 * view.table.shape[0] * PATCH
+    on, free = 0, 0
+    for i in range(points.shape[0]):
+        column = int((pose[0] + cos * points[i, 0] - sin * points[i, 1]) / view.cell + half)
+        row = int((pose[1] + sin * points[i, 0] + cos * points[i, 1]) / view.cell + half)
+        distance = field_at(view, column, row)
+        on += distance < near
+        free += distance >= far and odds_at(view, column, row) < 0
+    return on, free
+
+
+@njit(cache=True)
 def log_prior(pose: Float64, prior: Prior) -> float:
     """-1/2 of the squared Mahalanobis distance, without the normaliser."""
     difference = _difference(pose[0], pose[1], pose[2], prior.mean)

@@ -40,8 +40,8 @@ class LeafEstimate:
     :ivar pose: belief over ``area_T_base`` at the keyframe. Its covariance is the drift since the area's origin, or
         the uncertainty of localisation where the robot moves over ground that is already mapped.
     :ivar stored: whether the keyframe enters this hypothesis's map; False where it would add nothing new.
-    :ivar log_evidence: tempered log-likelihood of the keyframe's scan, given this hypothesis's map, relative to
-        unknown space; nats, not accumulated over keyframes.
+    :ivar log_evidence: log-likelihood of the keyframe's scan where it is in the place that this hypothesis has it in,
+        relative to a place that looks alike; nats, not accumulated over keyframes.
     :ivar effective_samples: ESS of the hypothesis's particles, in [1, number of particles].
     :ivar revised: earlier keyframes of the area whose pose changed because another particle leads now; ``source`` and
         ``area`` are equal.
