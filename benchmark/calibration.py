@@ -82,11 +82,16 @@ def _requirements(runs: int, sayings: dict[str, list[Forecast]]) -> list[Require
         Requirement("expected calibration error, most probable answer", of_top(ours).error, LIMIT),
         Requirement("expected calibration error, all answers", of_each(ours).error, LIMIT),
         *(
-            Requirement(f"Brier score / that of the {name}", score / float(np.mean([f.brier for f in own])), 1.0)
+            Requirement(f"Brier score / that of the {name}", _ratio(score, float(np.mean([f.brier for f in own]))), 1.0)
             for name, own in sayings.items()
             if own is not ours and own
         ),
     ]
+
+
+def _ratio(score: float, other: float) -> float:
+    """Of two scores; 1 where nobody ever erred."""
+    return score / other if other else (1.0 if score == 0.0 else math.inf)
 
 
 def _scores_table(sayings: dict[str, list[Forecast]]) -> str:

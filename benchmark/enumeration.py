@@ -17,21 +17,16 @@ import numpy as np
 from benchmark.scripted import Robot
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration import Configuration
-from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.chi_square import gate
-from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.processes.replica import FIRST_HYPOTHESIS, Replica
 from hmt_slam_ros.processes.tsbi_branching import Branching, Child, Parent
 from hmt_slam_ros.sensing import Scan
-from hmt_slam_ros.topology.appearance import appearance_log_ratio
-from hmt_slam_ros.topology.area_matching import Mode, match
-from hmt_slam_ros.topology.chance import log_chance
-from hmt_slam_ros.topology.closure_search import ClosureSearch, Comparison, Fit, Pose, Query
+from hmt_slam_ros.topology.closure_search import Candidate, ClosureSearch, Comparison, Query
 from hmt_slam_ros.topology.hybrid_map import HybridMap
 from hmt_slam_ros.topology.hypothesis_tree import LeafNotes
 from hmt_slam_ros.topology.shortest_path import reachable
-from hmt_slam_ros.topology.surroundings import areas_around, stacked
-from hmt_slam_ros.topology.transition import Place, Transition, entry_probability, owner_at
+from hmt_slam_ros.topology.surroundings import areas_around
+from hmt_slam_ros.topology.transition import Transition
 
 Path = tuple[int, ...]
 """The area of every visit, named by the visit in which it was entered first."""
@@ -47,7 +42,7 @@ class _EverywhereSearch(ClosureSearch):
 
     def __init__(self, configuration: Configuration, scans: Mapping[int, Scan]) -> None:
         super().__init__(configuration, scans)
-        self._wide = replace(self._settings, gate=gate(_EVERYWHERE), margin=25.0, max_modes=1000)
+        self._settings = replace(self._settings, gate=gate(_EVERYWHERE), margin=25.0, max_modes=1000)
 
     def compare(
         self, hybrid_map: HybridMap, area: int, query: Query, compared: Mapping[int, Collection[int]],
@@ -63,47 +58,20 @@ class _EverywhereSearch(ClosureSearch):
         }
         beliefs = reachable(hybrid_map, area)
         asked = [known for known, own in fresh.items() if 2 * len(own) >= len(query.poses)]
-        priors = {known: self._prior(beliefs[known], query) for known in asked}
-        places = {known: self._views.place(hybrid_map, known, excluded) for known in priors}
-        shares = {
-            known: entry_probability(place, priors[known], stacked(fresh[known]), options.place_radius)
-            for known, place in places.items()
-        }
+        candidates = {known: Candidate(self._prior(beliefs[known], query), fresh[known], 1.0) for known in asked}
+        places = {known: self._views.place(hybrid_map, known, excluded) for known in candidates}
+        entries = {known: self._entry(place, candidates[known]) for known, place in places.items()}
+        shares = {known: share for known, share in entries.items() if share}
         total = sum(shares.values())
         new = max(1.0 - total, options.new_probability) if total else 1.0
-        others = self._divided(hybrid_map, area, query, excluded)[2]
+        if shares:
+            self._count_likeness(hybrid_map, query, self._divided(hybrid_map, area, query, excluded)[2], excluded)
         fits = [
-            Fit(known, mode, math.log((1.0 - new) / total) + weight)
+            fit
             for known, share in shares.items()
-            if share
-            for mode, weight in self._ways(hybrid_map, places[known], priors[known], fresh[known])
+            for fit in self._fits(hybrid_map, places[known], candidates[known], (1.0 - new) * share / total)
         ]
-        against = self._against(hybrid_map, {fit.area: fresh[fit.area] for fit in fits}, others, excluded)
-        weighed = tuple(fit._replace(log_weight=fit.log_weight - against[fit.area]) for fit in fits)
-        examined = tuple(known for known, share in shares.items() if share)
-        return Comparison(Transition({}, new), weighed, examined, 0.0)
-
-    def _ways(
-        self, hybrid_map: HybridMap, place: Place, prior: PoseGaussian, fresh: Mapping[int, Pose]
-    ) -> Iterator[tuple[Mode, float]]:
-        """All ways in which keyframes lie in an area's place, with log p(phi) p(z) relative to unknown space."""
-        signatures = self._signature(fresh), self._signature(hybrid_map.keyframes(place.area))
-        look = appearance_log_ratio(*signatures, self._options.appearance_weight)
-        for mode in match(self._views.grid(fresh), place.grid, prior, self._wide).modes:
-            if owner_at(place, se2.compose(mode.pose.mean, stacked(fresh)), self._options.place_radius) == place.area:
-                yield mode, look + mode.log_mass
-
-    def _against(
-        self, hybrid_map: HybridMap, fresh: Mapping[int, Mapping[int, Pose]], others: Sequence[int],
-        excluded: Collection[int],
-    ) -> dict[int, float]:
-        """{known area: log p(z | new ground) of the keyframes that were compared with it}."""
-        places = [self._elsewhere(hybrid_map, other, excluded) for other in (others if fresh else ())]
-        by_keyframes = {
-            tuple(own): log_chance(self._views.grid(own), places, self._options.alike_probability, self._of_chance)
-            for own in {tuple(own): own for own in fresh.values()}.values()
-        }
-        return {known: by_keyframes[tuple(own)] for known, own in fresh.items()}
+        return Comparison(Transition({}, new), tuple(fits), tuple(shares), 0.0)
 
 
 @dataclass(frozen=True, eq=False)

@@ -264,12 +264,12 @@ def test_afterwards_the_map_is_as_if_it_had_never_been_there(drives):
     (one, _), (two, _) = drives
     assert list(one.area_poses) == list(two.area_poses)
     for area, pose in one.area_poses.items():
-        assert np.hypot(*(two.area_poses[area].mean - pose.mean)[:2]) < 0.1
+        assert np.hypot(*(two.area_poses[area].mean - pose.mean)[:2]) < 0.2
     scans = [r.measurement for r in open_log(LOG).records() if isinstance(r.measurement, Scan)]
     final = [final_map(drive, iter(scans), Configuration()).recording.trajectory for drive in (one, two)]
     apart = np.hypot(*se2.between(*final)[:, :2].T)
-    assert apart.mean() < 0.05
-    assert apart.max() < 0.15
+    assert apart.mean() < 0.1
+    assert apart.max() < 0.2
 
 
 def test_every_process_has_the_same_map_from_messages_alone(drives):

@@ -58,7 +58,6 @@ class Row(NamedTuple):
     :ivar look: log p(phi), nats.
     :ivar log_mass: log of the mode's part of the evidence integral, nats.
     :ivar log_weight: of the fit, relative to new ground.
-    :ivar log_chance: log p(z | new ground), as it follows from the others.
     :ivar prior_x: deviation of the prior by the arcs along its axes, widened; likewise ``prior_y`` (m), ``prior_turn``
         (rad).
     :ivar log_prior: log density of the prior at the mode.
@@ -92,7 +91,6 @@ class Row(NamedTuple):
     look: float
     log_mass: float
     log_weight: float
-    log_chance: float
     prior_x: float
     prior_y: float
     prior_turn: float
@@ -183,11 +181,9 @@ class _Candidate:
             self._signature(self.fresh), self._signature(self.known), self._options.appearance_weight
         )
         if fit is None:
-            nothing = [_NAN] * 3
+            nothing = [_NAN] * 2
             shapes = [_NAN] * 6
             return (look, *nothing, *deviations, *shapes, *_NO_MATCH, *_NO_MATCH, *self._at_truth(), 0, *[_NAN] * 3)
-        share, pi, _ = self.transition()
-        chance = math.log(pi / share) + look + fit.mode.log_mass - fit.log_weight
         at = fit.mode.pose.mean
         away = se2.log(se2.between(self._prior.mean, at))
         mahalanobis2 = float(away @ np.linalg.solve(self._prior.covariance, away))
@@ -195,7 +191,7 @@ class _Candidate:
         log_prior = -0.5 * (mahalanobis2 + log_determinant) - 1.5 * math.log(2.0 * math.pi)
         measured = fit.mode.measured.covariance
         return (
-            look, fit.mode.log_mass, fit.log_weight, chance, *deviations, log_prior, mahalanobis2,
+            look, fit.mode.log_mass, fit.log_weight, *deviations, log_prior, mahalanobis2,
             *np.sqrt(np.diag(measured)), 0.5 * float(np.linalg.slogdet(measured)[1]),
             *_match(self._grid.points, at, self._place.grid),
             *_match(self._place.grid.points, se2.inverse(at), self._grid),

@@ -69,8 +69,11 @@ class TopologicalInference:
         0.05, "Probability of new ground at least, where the arcs point into known areas.", low=0.0, high=1.0
     )
     alike_probability: float = parameter(
-        0.5, "Probability that new ground looks like another known place, such as one more corridor.", low=0.0,
-        high=0.999,
+        0.25,
+        "Probability that keyframes fit into a place of the building where they do not lie, before any was tried; what "
+        "is found where they surely do not lie is counted from then on.",
+        low=0.001,
+        high=1.0,
     )
     place_radius: float = parameter(
         2.0, "A robot this close to a keyframe of an area, and in its sight, is in the area's place.", unit="m",

@@ -108,7 +108,6 @@ class Branching:
     def begin_event(self) -> None:
         """Forget which new areas were named; within one event hypotheses share the ids of the same new area."""
         self._named = {}
-        self.search.begin_event()
 
     def cut(self, parent: Parent, keyframes: Sequence[int]) -> Branches:
         """{new area} and every known area that the arcs admit, with one child a mode.

@@ -5,22 +5,23 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hmt_slam_ros.agreement import MAPS, MAPS_USUAL
 from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.chi_square import gate
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.sensing import Scan
 from hmt_slam_ros.topology.appearance import appearance_log_ratio, signature
-from hmt_slam_ros.topology.area_grid import AreaGrid, GridModel, build_area_grid
+from hmt_slam_ros.topology.area_grid import GridModel, build_area_grid
 from hmt_slam_ros.topology.area_matching import MatchSettings, Mode, match
-from hmt_slam_ros.topology.chance import Elsewhere, log_chance
 from hmt_slam_ros.topology.hybrid_map import HybridMap
+from hmt_slam_ros.topology.likeness import Elsewhere, Likeness, best_shares
 from hmt_slam_ros.topology.shortest_path import Reached, reached
 from hmt_slam_ros.topology.surroundings import Nearness, Views, entry_bounds, gap, positions, stacked
 from hmt_slam_ros.topology.transition import Place, Transition, entry_bound, entry_probability, owner_at, transition
@@ -78,7 +79,7 @@ class Comparison(NamedTuple):
     skipped: float
 
 
-class _Candidate(NamedTuple):
+class Candidate(NamedTuple):
     """A known area in which the query may lie.
 
     :ivar prior: belief over ``candidate_T_reference`` by the arcs.
@@ -100,19 +101,16 @@ class ClosureSearch:
         self._scans = scans
         self.gate = gate(options.gate_probability)
         self.nearness = Nearness(options.local_sigma, options.local_reach)
-        self._settings = MatchSettings(options.temper, self.gate, _MARGIN, 2 * options.max_modes)
-        # For the evidence alone the weak modes are of no account.
-        self._of_chance = replace(self._settings, margin=MatchSettings.margin)
+        self._settings = MatchSettings(
+            options.temper, self.gate, _MARGIN, max(MatchSettings.max_modes, 2 * options.max_modes)
+        )
         self._model = GridModel(
             options.search_cell, options.surface_sigma, options.surface_ratio, options.free_ratio,
             configuration.local_map.max_range, options.sample_spacing,
         )  # fmt: skip
         self._views = Views(scans, self._model, self.nearness)
-        self._chances: dict[tuple[object, ...], tuple[AreaGrid, Sequence[Elsewhere], float]] = {}
-
-    def begin_event(self) -> None:
-        """Forget what was worked out for the last event alone."""
-        self._chances = {}
+        self._likeness = Likeness(options.alike_probability)
+        self._counted: tuple[int, ...] = ()
 
     def tracked_area(
         self, hybrid_map: HybridMap, area: int, around: Mapping[int, Pose], poses: NDArray[np.float64]
@@ -160,47 +158,42 @@ class ClosureSearch:
         entries = {known: self._entry(place, candidates[known]) for known, place in places.items()}
         shares = {known: share for known, share in entries.items() if share > 0.0}
         model = transition(shares | rest, self._options.new_probability)
+        if shares:
+            self._count_likeness(hybrid_map, query, elsewhere, excluded)
         fits = [
-            Fit(known, mode, math.log(model.known[known] / shares[known]) + look + mode.log_mass)
+            fit
             for known in sorted(shares, key=lambda known: (-shares[known], known))
-            for look, mode in self._fits(hybrid_map, places[known], candidates[known])
+            for fit in self._fits(hybrid_map, places[known], candidates[known], model.known[known])
         ]
-        relative = self._relative_to_new(hybrid_map, candidates, fits, elsewhere, excluded)
-        kept, left_out = _parted(relative, self._options.max_modes)
+        kept, left_out = _parted(fits, self._options.max_modes)
         skipped = sum(model.known[known] for known in rest) + sum(math.exp(fit.log_weight) for fit in left_out)
         return Comparison(model, kept, tuple(shares), skipped)
 
-    def _entry(self, place: Place, candidate: _Candidate) -> float:
+    def _entry(self, place: Place, candidate: Candidate) -> float:
         return entry_probability(place, candidate.prior, stacked(candidate.fresh), self._options.place_radius)
 
-    def _relative_to_new(
-        self, hybrid_map: HybridMap, candidates: Mapping[int, _Candidate], fits: Sequence[Fit],
-        elsewhere: Sequence[int], excluded: Collection[int],
-    ) -> tuple[Fit, ...]:
-        """Weigh the fits against new ground, which may look like the building's other places."""
-        places = [self._elsewhere(hybrid_map, area, excluded) for area in (elsewhere if fits else ())]
-        fresh = {tuple(candidates[fit.area].fresh): candidates[fit.area].fresh for fit in fits}
-        new = {keyframes: self._chance(self._views.grid(poses), places) for keyframes, poses in fresh.items()}
-        return tuple(
-            fit._replace(log_weight=fit.log_weight - new[tuple(candidates[fit.area].fresh)]) for fit in fits
-        )
+    def _count_likeness(
+        self, hybrid_map: HybridMap, query: Query, elsewhere: Sequence[int], excluded: Collection[int]
+    ) -> None:
+        """Compare the keyframes with areas in which they do not lie, once for all hypotheses."""
+        keyframes = tuple(query.poses)
+        if keyframes != self._counted:
+            self._counted = keyframes
+            places = [self._elsewhere(hybrid_map, area, excluded) for area in elsewhere]
+            self._likeness.count(best_shares(self._views.grid(query.poses), places, self._settings))
 
-    def _chance(self, query: AreaGrid, places: Sequence[Elsewhere]) -> float:
-        """log p(z | new ground), worked out once for all hypotheses of an event that ask for the same."""
-        key = (id(query), *(part for place in places for part in (id(place.grid), place.pose.tobytes())))
-        if key not in self._chances:
-            value = log_chance(query, places, self._options.alike_probability, self._of_chance)
-            # What is kept with the value keeps its id.
-            self._chances[key] = (query, places, value)
-        return self._chances[key][2]
+    def _elsewhere(self, hybrid_map: HybridMap, area: int, excluded: Collection[int]) -> Elsewhere:
+        """An area's place, and one of its keyframes in the middle of the way through it."""
+        poses = stacked(hybrid_map.keyframes(area))
+        return Elsewhere(self._views.place(hybrid_map, area, excluded).grid, poses[len(poses) // 2])
 
     def _divided(
         self, hybrid_map: HybridMap, area: int, query: Query, excluded: Collection[int]
     ) -> tuple[dict[int, PoseGaussian], dict[int, float], list[int]]:
-        """The known areas in which the query may lie, and some of those in which it surely does not.
+        """The known areas in which the query may lie.
 
-        :returns: the priors of those that are looked at; where they are too many, of the others a bound on the
-            probability that the query lies there; and areas elsewhere.
+        :returns: the priors of those that are looked at; and where they are too many, of the others a bound on the
+            probability that the query lies there.
         """
         found = reached(hybrid_map, area, self._options.prior_limit**2)
         bounds = np.where(np.isin(found.areas, list(excluded)), 0.0, self._entry_bounds(hybrid_map, found, query))
@@ -221,15 +214,10 @@ class ClosureSearch:
         reach = hybrid_map.extents(found.areas) + lever + self._options.place_radius
         return entry_bounds(found, query.belief, lever, reach, self._options.prior_scale, math.sqrt(self.gate))
 
-    def _elsewhere(self, hybrid_map: HybridMap, area: int, excluded: Collection[int]) -> Elsewhere:
-        """An area's place, and one of its keyframes in the middle of the way through it."""
-        poses = stacked(hybrid_map.keyframes(area))
-        return Elsewhere(self._views.place(hybrid_map, area, excluded).grid, poses[len(poses) // 2])
-
     def _candidates(
         self, hybrid_map: HybridMap, query: Query, compared: Mapping[int, Collection[int]],
         within: Mapping[int, PoseGaussian],
-    ) -> dict[int, _Candidate]:
+    ) -> dict[int, Candidate]:
         """The known areas within reach with which most of the query was not compared yet."""
         found = {}
         for known, prior in within.items():
@@ -239,7 +227,7 @@ class ClosureSearch:
                 at = positions(hybrid_map, known, np.zeros(3))
                 most = entry_bound(at, prior, stacked(fresh), self._options.place_radius)
                 if most > 0.0:
-                    found[known] = _Candidate(prior, fresh, most)
+                    found[known] = Candidate(prior, fresh, most)
         return found
 
     def _prior(self, belief: PoseGaussian, query: Query) -> PoseGaussian:
@@ -257,18 +245,21 @@ class ClosureSearch:
         known = positions(hybrid_map, area, np.zeros(3))
         return gap(asked, known) <= self._options.place_radius + math.sqrt(self.gate) * spread
 
-    def _fits(self, hybrid_map: HybridMap, place: Place, candidate: _Candidate) -> Iterator[tuple[float, Mode]]:
-        """Appearance ratio and modes of the query in the candidate's place.
-
-        The mass of a mode is its part of the integral of p(x) p(z | x) over all poses. Of it counts what lies in the
-        candidate's place; so p(x | gamma) is not computed and pi(gamma) cancels.
-        """
+    def _fits(self, hybrid_map: HybridMap, place: Place, candidate: Candidate, pi: float) -> Iterator[Fit]:
+        """The modes of the query in the candidate's place, which share its probability by their masses."""
         known, fresh = hybrid_map.keyframes(place.area), candidate.fresh
         look = appearance_log_ratio(self._signature(fresh), self._signature(known), self._options.appearance_weight)
-        for mode in match(self._views.grid(fresh), place.grid, candidate.prior, self._settings).modes:
-            poses = se2.compose(mode.pose.mean, stacked(fresh))
-            if owner_at(place, poses, self._options.place_radius) == place.area:
-                yield look, mode
+        query = self._views.grid(fresh)
+        modes = [
+            mode
+            for mode in match(query, place.grid, candidate.prior, self._settings).modes
+            if owner_at(place, se2.compose(mode.pose.mean, stacked(fresh)), self._options.place_radius) == place.area
+        ]
+        whole = np.logaddexp.reduce([mode.log_mass for mode in modes]) if modes else 0.0
+        for mode in modes:
+            found = place.grid.agreement(query.points, mode.pose.mean)
+            same = MAPS.log_ratio(found, MAPS_USUAL) + self._likeness.log_rarity(found.share)
+            yield Fit(place.area, mode, math.log(pi) + mode.log_mass - float(whole) + look + same)
 
     def _signature(self, keyframes: Collection[int]) -> NDArray[np.float64]:
         return signature([self._scans[keyframe] for keyframe in keyframes])

@@ -1,0 +1,83 @@
+"""How often a building looks like itself: what fits into places where it surely is not."""
+
+import math
+
+import numpy as np
+import pytest
+from worlds import box, drive, scan_in
+
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.topology.area_grid import GridModel, build_area_grid
+from hmt_slam_ros.topology.area_matching import MatchSettings
+from hmt_slam_ros.topology.likeness import Elsewhere, Likeness, best_shares
+
+MODEL, SETTINGS = GridModel(), MatchSettings(temper=0.3)
+PATH = drive((-4.0, 0.0), (4.0, 0.0))
+ROOM = np.concatenate((box(-6.0, -3.0, 6.0, 4.0), box(1.0, 1.0, 2.5, 2.0), box(-5.0, -2.5, -4.0, -1.0)))
+
+
+def corridor(seed):
+    """A corridor of 40 m with a niche every few metres, each 0.2 m deep and 1 m wide, on both sides."""
+    walls = []
+    for side in (-1.0, 1.0):
+        at, steps = -20.0, np.random.default_rng([seed, int(side) + 1]).uniform(2.0, 5.0, 30)
+        for step in steps:
+            y, deep = side, 1.2 * side
+            walls += [[at, y, at + step, y], [at + step, y, at + step, deep]]
+            walls += [[at + step, deep, at + step + 1.0, deep], [at + step + 1.0, deep, at + step + 1.0, y]]
+            at += step + 1.0
+    return np.array(walls)
+
+
+def seen(walls, poses, seed):
+    scans = [scan_in(walls, pose, noise=0.01, seed=seed + k) for k, pose in enumerate(poses)]
+    return build_area_grid(scans, se2.between(poses[0], poses), MODEL)
+
+
+def elsewhere(walls, seed):
+    return Elsewhere(seen(walls, PATH, seed), se2.between(PATH[0], PATH[len(PATH) // 2]))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_corridor_fits_into_the_same_one_better_than_into_others_and_there_better_than_a_room(seed):
+    query, places = seen(corridor(seed), PATH[6:11], 50), [elsewhere(corridor(100 + seed), 200)]
+    (same,) = best_shares(query, [elsewhere(corridor(seed), 300)], SETTINGS)
+    (other,) = best_shares(query, places, SETTINGS)
+    (room,) = best_shares(seen(ROOM, PATH[6:11], 50), places, SETTINGS)
+    assert same > 0.95
+    assert room < 0.6 < other < same
+
+
+def test_both_ways_through_a_corridor_are_tried():
+    there, back = corridor(1), drive((4.0, 0.0), (1.5, 0.0))
+    (forth,) = best_shares(seen(there, PATH[6:11], 50), [elsewhere(there, 200)], SETTINGS)
+    (turned,) = best_shares(seen(there, back, 50), [elsewhere(there, 200)], SETTINGS)
+    assert min(forth, turned) > 0.7
+
+
+def test_where_nothing_is_seen_nothing_fits():
+    nothing = build_area_grid([], np.zeros((0, 3)), MODEL)
+    assert best_shares(nothing, [elsewhere(corridor(0), 200)], SETTINGS) == [0.0]
+
+
+def test_a_fit_tells_the_more_the_rarer_it_is():
+    likeness = Likeness(0.25)
+    assert likeness.log_rarity(0.9) == pytest.approx(math.log(4.0))
+    likeness.count([0.2] * 38)
+    assert likeness.log_rarity(0.9) == pytest.approx(math.log(40.0 / 0.5))
+    assert likeness.log_rarity(0.2) == pytest.approx(math.log(40.0 / 38.5))
+    likeness.count([0.95] * 20)
+    assert likeness.log_rarity(0.9) == pytest.approx(math.log(60.0 / 20.5))
+
+
+def test_a_fit_that_is_hardly_better_is_not_better():
+    likeness = Likeness(0.25)
+    likeness.count([0.96] * 8)
+    assert likeness.log_rarity(0.97) == pytest.approx(math.log(10.0 / 8.5))
+    assert likeness.log_rarity(0.99) == pytest.approx(math.log(10.0 / 0.5))
+
+
+def test_that_a_building_looks_alike_everywhere_is_learnt():
+    likeness = Likeness(0.25)
+    likeness.count([1.0] * 64)
+    assert 0.0 < likeness.log_rarity(1.0) < 0.03
