@@ -32,8 +32,8 @@ Pose = NDArray[np.float64]
 _MARGIN = 20.0
 # Areas within reach of which the keyframes are looked at, where the arcs admit many.
 _LOOKED_AT = 64
-# Areas in which the keyframes surely do not lie that they are compared with all the same.
-_ELSEWHERE = 6
+# Areas in which the keyframes surely do not lie that they are compared with all the same: at first, and from then on.
+_ELSEWHERE, _ELSEWHERE_LATER = 6, 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +110,7 @@ class ClosureSearch:
         )  # fmt: skip
         self._views = Views(scans, self._model, self.nearness)
         self._likeness = Likeness(options.alike_probability)
-        self._counted: tuple[int, ...] = ()
+        self._counted, self._counts = -1, -1
 
     def tracked_area(
         self, hybrid_map: HybridMap, area: int, around: Mapping[int, Pose], poses: NDArray[np.float64]
@@ -175,11 +175,15 @@ class ClosureSearch:
     def _count_likeness(
         self, hybrid_map: HybridMap, query: Query, elsewhere: Sequence[int], excluded: Collection[int]
     ) -> None:
-        """Compare the keyframes with areas in which they do not lie, once for all hypotheses."""
-        keyframes = tuple(query.poses)
-        if keyframes != self._counted:
-            self._counted = keyframes
-            places = [self._elsewhere(hybrid_map, area, excluded) for area in elsewhere]
+        """Compare the keyframes with areas in which they do not lie, once for all hypotheses of an event."""
+        newest = max(query.poses)
+        if newest != self._counted:
+            self._counted, self._counts = newest, self._counts + 1
+            few = _ELSEWHERE_LATER if self._likeness.settled else _ELSEWHERE
+            step = max(1, -(-len(elsewhere) // few))
+            places = [
+                self._elsewhere(hybrid_map, area, excluded) for area in elsewhere[self._counts % step :: step]
+            ]
             self._likeness.count(best_shares(self._views.grid(query.poses), places, self._settings))
 
     def _elsewhere(self, hybrid_map: HybridMap, area: int, excluded: Collection[int]) -> Elsewhere:
@@ -206,8 +210,7 @@ class ClosureSearch:
         others = order[_LOOKED_AT:]
         distant = dict(zip(found.areas[others].tolist(), bounds[others].tolist(), strict=True))
         known = ~np.isin(found.areas, [*excluded, *within, *distant])
-        elsewhere = np.sort(found.areas[known])
-        return within, distant, elsewhere[:: max(1, -(-len(elsewhere) // _ELSEWHERE))].tolist()
+        return within, distant, np.sort(found.areas[known]).tolist()
 
     def _entry_bounds(self, hybrid_map: HybridMap, found: Reached, query: Query) -> NDArray[np.float64]:
         lever = float(np.hypot(*stacked(query.poses)[:, :2].T).max())

@@ -68,6 +68,11 @@ class Likeness:
     alike: float
     shares: deque[float] = field(default_factory=partial(deque, maxlen=_KEPT))
 
+    @property
+    def settled(self) -> bool:
+        """Whether as many places were tried as are kept."""
+        return len(self.shares) == _KEPT
+
     def count(self, shares: Iterable[float]) -> None:
         """Keep what keyframes found in places where they do not lie."""
         self.shares.extend(shares)
