@@ -63,8 +63,8 @@ def brute_force(window, surface, samples, back, back_samples, temper):
         return np.minimum(values, 0.0).sum() if only_negative else values.sum()
 
     scores = {}
-    across, along_y = window.reach
-    spans = range(window.turns.size), range(-across, across + 1), range(-along_y, along_y + 1)
+    (left, low), (right, high) = window.first, window.last
+    spans = range(window.turns.size), range(left, right + 1), range(low, high + 1)
     for k, i, j in itertools.product(*spans):
         pose = window.mean + np.array([i * window.cell, j * window.cell, window.turns[k]])
         twist = se2.log(se2.between(window.mean, pose))
@@ -76,14 +76,16 @@ def brute_force(window, surface, samples, back, back_samples, temper):
     return scores
 
 
+@pytest.mark.parametrize("bounded", [False, True])
 @pytest.mark.parametrize("seed", range(12))
-def test_the_search_finds_exactly_the_cells_that_brute_force_finds(seed):
+def test_the_search_finds_exactly_the_cells_that_brute_force_finds(seed, bounded):
     rng = np.random.default_rng(seed)
     grids = [rng.normal(size=(rng.integers(8, 40), rng.integers(8, 40))).astype(np.float32) for _ in range(2)]
     surface, back = (Surface(g, rng.uniform(-2.5, -1.0, 2), cell) for g, cell in zip(grids, (0.1, 0.13), strict=True))
     samples, back_samples = rng.uniform(-1.5, 1.5, (25, 2)), rng.uniform(-1.5, 1.5, (20, 2))
     root = rng.normal(size=(3, 3)) * [[0.25], [0.25], [0.15]]
-    window = make_window(rng.uniform(-1.0, 1.0, 3), root @ root.T + 1e-4 * np.eye(3), 0.1, 0.05, 9.0)
+    mean, bounds = rng.uniform(-1.0, 1.0, 3), np.array([[-0.6, -1.2], [0.9, 0.5]])
+    window = make_window(mean, root @ root.T + 1e-4 * np.eye(3), 0.1, 0.05, 9.0, bounds if bounded else None)
     expected = brute_force(window, surface, samples, back, back_samples, 0.5)
     best = max(expected.values())
     expected = {cell: score for cell, score in expected.items() if score >= best - 4.0}
@@ -94,6 +96,15 @@ def test_the_search_finds_exactly_the_cells_that_brute_force_finds(seed):
     assert len(shared) >= 0.97 * max(len(scores), len(expected))
     differences = np.array([abs(scores[cell] - expected[cell]) for cell in shared])
     assert np.mean(differences < 1e-5) > 0.97
+
+
+def test_poses_beyond_the_bounds_are_not_searched(known, visit):
+    prior, middle = prior_around(TRUTH, 1.0, 6.0), se2.transform(TRUTH, visit.points.mean(axis=0))
+    inside = match(visit, known, prior, SETTINGS, np.array([middle - 0.5, middle + 0.5]))
+    assert np.hypot(*se2.between(inside.modes[0].pose.mean, TRUTH)[:2]) < 0.03
+    beside = match(visit, known, prior, SETTINGS, np.array([middle + 0.5, middle + 1.0]))
+    assert all(np.hypot(*se2.between(mode.pose.mean, TRUTH)[:2]) > 0.3 for mode in beside.modes)
+    assert match(visit, known, prior, SETTINGS, np.array([middle + 50.0, middle + 51.0])).modes == ()
 
 
 def test_a_visit_is_found_from_a_prior_of_metres(known, visit):

@@ -82,12 +82,16 @@ class Match:
         return self._found()
 
 
-def match(query: AreaGrid, candidate: AreaGrid, prior: PoseGaussian, settings: MatchSettings) -> Match:
+def match(
+    query: AreaGrid, candidate: AreaGrid, prior: PoseGaussian, settings: MatchSettings, bounds: Array | None = None
+) -> Match:
     """Find all poses of the query in the candidate that the prior admits.
 
     :param query: the map of the keyframes in question, in the frame of their reference keyframe.
     :param candidate: the map of the candidate and its surroundings.
     :param prior: belief over ``candidate_T_query``.
+    :param bounds: shape (2, 2), the smallest and the largest (x, y) in the candidate where the middle of the query's
+        points may be, m; what lies beyond is not searched.
     """
     if not query.points.size or not candidate.points.size:
         return Match()
@@ -97,7 +101,7 @@ def match(query: AreaGrid, candidate: AreaGrid, prior: PoseGaussian, settings: M
     centred = query.moved(middle)
     prior = prior.compose(to_middle)
     turn = _turn(candidate.cell, centred.points)
-    window = make_window(prior.mean, prior.covariance, candidate.cell, turn, settings.gate)
+    window = make_window(prior.mean, prior.covariance, candidate.cell, turn, settings.gate, bounds)
     surface, log_cell = _fine(candidate), _log_cell_mass(prior, candidate.cell, turn)
     back_points = _within_reach(candidate.points, window, centred)
     threshold = math.log(_NEGLIGIBLE) - min(0.0, log_cell)
@@ -151,7 +155,8 @@ def _within_reach(points: Array, window: Window, query: AreaGrid) -> Array:
     """The candidate's points that can meet the query's grid at a pose of the window."""
     rows, columns = query.log_ratio.shape
     corners = query.origin + query.cell * np.array([[0, 0], [columns, 0], [0, rows], [columns, rows]])
-    radius = np.hypot(corners[:, 0], corners[:, 1]).max() + np.hypot(*window.reach) * window.cell
+    farthest = np.hypot(*np.maximum(-window.first, window.last)) * window.cell
+    radius = np.hypot(corners[:, 0], corners[:, 1]).max() + farthest
     near = np.hypot(points[:, 0] - window.mean[0], points[:, 1] - window.mean[1]) <= radius
     return points[near]
 

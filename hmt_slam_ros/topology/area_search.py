@@ -30,7 +30,7 @@ class Window(NamedTuple):
     :ivar mean: shape (3,), the prior's mean.
     :ivar cell: edge of a cell, m.
     :ivar turns: shape (t,), rad, ascending, equally spaced.
-    :ivar reach: shape (2,), int64, largest shift along x and y, cells.
+    :ivar first: shape (2,), int64, smallest shift along x and y, cells; ``last``, the largest.
     :ivar root: shape (3, 3), the square root of the prior's information, ``root.T @ root``.
     :ivar whitening: shape (t, 3, 2), 1/m.
     :ivar offsets: shape (t, 3).
@@ -40,7 +40,8 @@ class Window(NamedTuple):
     mean: Array
     cell: float
     turns: Array
-    reach: Indices
+    first: Indices
+    last: Indices
     root: Array
     whitening: Array
     offsets: Array
@@ -68,14 +69,17 @@ class Surface(NamedTuple):
     cell: float
 
 
-def make_window(mean: Array, covariance: Array, cell: float, turn: float, gate: float) -> Window:
-    """The smallest lattice that holds the gate's ellipsoid.
+def make_window(
+    mean: Array, covariance: Array, cell: float, turn: float, gate: float, bounds: Array | None = None
+) -> Window:
+    """The smallest lattice that holds the gate's ellipsoid, as far as it lies within bounds.
 
     :param mean: shape (3,), ``candidate_T_query``.
     :param covariance: shape (3, 3), right tangent frame.
     :param cell: edge of a cell, m.
     :param turn: angle between turns, rad.
     :param gate: squared Mahalanobis distance at the gate, 3 degrees of freedom.
+    :param bounds: shape (2, 2), the smallest and the largest (x, y) of the poses, m.
     """
     cos, sin = np.cos(mean[2]), np.sin(mean[2])
     rotation = np.array([[cos, -sin], [sin, cos]])
@@ -90,7 +94,12 @@ def make_window(mean: Array, covariance: Array, cell: float, turn: float, gate: 
     inverse_v[:, 0, 1], inverse_v[:, 1, 0] = 0.5 * turns, -0.5 * turns
     whitening: Array = root[:, :2] @ inverse_v @ rotation.T
     offsets: Array = turns[:, None] * root[:, 2]
-    return Window(mean, cell, turns, np.ceil(half / cell).astype(np.int64), root, whitening, offsets, gate)
+    reach = np.ceil(half / cell)
+    first, last = -reach, reach
+    if bounds is not None:
+        first = np.maximum(first, np.floor((bounds[0] - mean[:2]) / cell))
+        last = np.minimum(last, np.ceil((bounds[1] - mean[:2]) / cell))
+    return Window(mean, cell, turns, first.astype(np.int64), last.astype(np.int64), root, whitening, offsets, gate)
 
 
 def search(
@@ -106,7 +115,9 @@ def search(
     :param back_samples: shape (m, 2), the candidate's surface points, m, candidate frame.
     :param temper: factor on the summed log-ratios.
     """
-    levels = min(5, max(1, int(np.ceil(np.log2(max(2, int(window.reach.max()) // 2))))))
+    if (window.first > window.last).any():
+        return Cells(np.empty((0, 3), dtype=np.int64), np.empty(0), np.empty(0))
+    levels = min(5, max(1, int(np.ceil(np.log2(max(2, int((window.last - window.first).max()) // 4))))))
     found = _search(
         pyramid(surface.log_ratio, levels), _sample_cells(window, surface, samples, 2**levels), window, temper,
         back, back_samples, threshold, margin,
@@ -198,14 +209,14 @@ def _coarse_nodes(levels: Pyramid, cells: Samples, window: Window, temper: float
     """The coarsest nodes of all turns: (k, i, j) and their bounds."""
     height = levels.shape[0] - 1
     side = 2**height
-    across, along = (2 * window.reach[0]) // side + 1, (2 * window.reach[1]) // side + 1
+    across, along = (window.last - window.first) // side + 1
     nodes = np.empty((cells.shape[0] * across * along, 3), dtype=np.int64)
     bounds = np.empty(nodes.shape[0])
     n = 0
     for k in range(cells.shape[0]):
         for a in range(across):
             for b in range(along):
-                nodes[n, 0], nodes[n, 1], nodes[n, 2] = k, a * side - window.reach[0], b * side - window.reach[1]
+                nodes[n, 0], nodes[n, 1], nodes[n, 2] = k, window.first[0] + a * side, window.first[1] + b * side
                 bounds[n] = _bound(levels[height], cells[k], nodes[n], side, window, temper)
                 n += 1
     return nodes, bounds
@@ -225,7 +236,7 @@ def _push_children(
         child[0] = node[0]
         child[1] = node[1] + side * (quarter % 2)
         child[2] = node[2] + side * (quarter // 2)
-        if child[1] > window.reach[0] or child[2] > window.reach[1]:
+        if child[1] > window.last[0] or child[2] > window.last[1]:
             continue
         bound = _bound(levels[height], cells[child[0]], child, side, window, temper)
         if bound < least:

@@ -18,7 +18,7 @@ from hmt_slam_ros.geometry.chi_square import gate
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.sensing import Scan
 from hmt_slam_ros.topology.appearance import appearance_log_ratio, signature
-from hmt_slam_ros.topology.area_grid import GridModel, build_area_grid
+from hmt_slam_ros.topology.area_grid import AreaGrid, GridModel, build_area_grid
 from hmt_slam_ros.topology.area_matching import MatchSettings, Mode, match
 from hmt_slam_ros.topology.hybrid_map import HybridMap
 from hmt_slam_ros.topology.likeness import Elsewhere, Likeness, best_shares
@@ -32,8 +32,8 @@ Pose = NDArray[np.float64]
 _MARGIN = 20.0
 # Areas within reach of which the keyframes are looked at, where the arcs admit many.
 _LOOKED_AT = 64
-# Areas in which the keyframes surely do not lie that they are compared with all the same: at first, and from then on.
-_ELSEWHERE, _ELSEWHERE_LATER = 6, 2
+# Areas in which the keyframes surely do not lie that they are compared with all the same.
+_ELSEWHERE = 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +110,7 @@ class ClosureSearch:
         )  # fmt: skip
         self._views = Views(scans, self._model, self.nearness)
         self._likeness = Likeness(options.alike_probability)
-        self._counted, self._counts = -1, -1
+        self._counted = -1
 
     def tracked_area(
         self, hybrid_map: HybridMap, area: int, around: Mapping[int, Pose], poses: NDArray[np.float64]
@@ -178,12 +178,8 @@ class ClosureSearch:
         """Compare the keyframes with areas in which they do not lie, once for all hypotheses of an event."""
         newest = max(query.poses)
         if newest != self._counted:
-            self._counted, self._counts = newest, self._counts + 1
-            few = _ELSEWHERE_LATER if self._likeness.settled else _ELSEWHERE
-            step = max(1, -(-len(elsewhere) // few))
-            places = [
-                self._elsewhere(hybrid_map, area, excluded) for area in elsewhere[self._counts % step :: step]
-            ]
+            self._counted = newest
+            places = [self._elsewhere(hybrid_map, area, excluded) for area in elsewhere]
             self._likeness.count(best_shares(self._views.grid(query.poses), places, self._settings))
 
     def _elsewhere(self, hybrid_map: HybridMap, area: int, excluded: Collection[int]) -> Elsewhere:
@@ -210,7 +206,8 @@ class ClosureSearch:
         others = order[_LOOKED_AT:]
         distant = dict(zip(found.areas[others].tolist(), bounds[others].tolist(), strict=True))
         known = ~np.isin(found.areas, [*excluded, *within, *distant])
-        return within, distant, np.sort(found.areas[known]).tolist()
+        elsewhere = np.sort(found.areas[known])
+        return within, distant, elsewhere[:: max(1, -(-len(elsewhere) // _ELSEWHERE))].tolist()
 
     def _entry_bounds(self, hybrid_map: HybridMap, found: Reached, query: Query) -> NDArray[np.float64]:
         lever = float(np.hypot(*stacked(query.poses)[:, :2].T).max())
@@ -253,9 +250,10 @@ class ClosureSearch:
         known, fresh = hybrid_map.keyframes(place.area), candidate.fresh
         look = appearance_log_ratio(self._signature(fresh), self._signature(known), self._options.appearance_weight)
         query = self._views.grid(fresh)
+        bounds = self._bounds(place, query, fresh)
         modes = [
             mode
-            for mode in match(query, place.grid, candidate.prior, self._settings).modes
+            for mode in match(query, place.grid, candidate.prior, self._settings, bounds).modes
             if owner_at(place, se2.compose(mode.pose.mean, stacked(fresh)), self._options.place_radius) == place.area
         ]
         whole = np.logaddexp.reduce([mode.log_mass for mode in modes]) if modes else 0.0
@@ -263,6 +261,15 @@ class ClosureSearch:
             found = place.grid.agreement(query.points, mode.pose.mean)
             same = MAPS.log_ratio(found, MAPS_USUAL) + self._likeness.log_rarity(found.share)
             yield Fit(place.area, mode, math.log(pi) + mode.log_mass - float(whole) + look + same)
+
+    def _bounds(self, place: Place, query: AreaGrid, fresh: Mapping[int, Pose]) -> NDArray[np.float64]:
+        """The smallest and the largest (x, y) of the middle of the query's points where a keyframe of it is in the
+        area's place or in one beside it, shape (2, 2).
+        """
+        middle = query.points.mean(axis=0) if len(query.points) else np.zeros(2)
+        lever = float(np.hypot(*(stacked(fresh)[:, :2] - middle).T).max())
+        reach = self._options.place_radius + lever
+        return np.array([place.positions.min(axis=0) - reach, place.positions.max(axis=0) + reach])
 
     def _signature(self, keyframes: Collection[int]) -> NDArray[np.float64]:
         return signature([self._scans[keyframe] for keyframe in keyframes])
