@@ -61,7 +61,7 @@ class _EverywhereSearch(ClosureSearch):
         candidates = {known: Candidate(self._prior(beliefs[known], query), fresh[known], 1.0) for known in asked}
         places = {known: self._views.place(hybrid_map, known, excluded) for known in candidates}
         entries = {known: self._entry(place, candidates[known]) for known, place in places.items()}
-        shares = {known: share for known, share in entries.items() if share}
+        shares = {known: found.share for known, found in entries.items() if found.share}
         total = sum(shares.values())
         new = max(1.0 - total, options.new_probability) if total else 1.0
         if shares:
@@ -69,7 +69,9 @@ class _EverywhereSearch(ClosureSearch):
         fits = [
             fit
             for known, share in shares.items()
-            for fit in self._fits(hybrid_map, places[known], candidates[known], (1.0 - new) * share / total)
+            for fit in self._fits(
+                hybrid_map, places[known], candidates[known], (1.0 - new) * share / total, entries[known]
+            )
         ]
         return Comparison(Transition({}, new), tuple(fits), tuple(shares), 0.0)
 

@@ -8,7 +8,7 @@ from worlds import box, scan_in
 
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.topology.area_grid import GridModel, build_area_grid
-from hmt_slam_ros.topology.transition import Place, entry_bound, entry_probability, owner_at, transition
+from hmt_slam_ros.topology.transition import Place, entry, entry_bound, owner_at, transition
 
 RADIUS = 2.0
 # Two corridors side by side, a wall between them.
@@ -59,11 +59,11 @@ def test_where_most_keyframes_lie_decides(corridor):
 
 
 def test_a_robot_tracked_within_a_place_is_there_for_sure(corridor):
-    assert entry_probability(corridor, belief(0.05), keyframes(1.0), RADIUS) == 1.0
+    assert entry(corridor, belief(0.05), keyframes(1.0), RADIUS).share == 1.0
 
 
 def test_without_overlap_the_probability_is_exactly_zero(corridor):
-    assert entry_probability(corridor, belief(0.3), keyframes(14.0), RADIUS) == 0.0
+    assert entry(corridor, belief(0.3), keyframes(14.0), RADIUS).share == 0.0
 
 
 @pytest.mark.parametrize("x", [1.0, 4.0, 5.6, 9.0, 14.0, 18.0])
@@ -71,26 +71,26 @@ def test_without_overlap_the_probability_is_exactly_zero(corridor):
 def test_the_bound_from_positions_alone_is_a_bound_and_zero_where_nothing_is_near(corridor, x, sigma):
     own = corridor.positions[corridor.owners == 3]
     bound = entry_bound(own, belief(sigma), keyframes(x), RADIUS)
-    assert entry_probability(corridor, belief(sigma), keyframes(x), RADIUS) <= bound
+    assert entry(corridor, belief(sigma), keyframes(x), RADIUS).share <= bound
     assert bound == 0.0 or x < 9.0 or sigma > 0.05
 
 
 def test_a_loose_prior_spreads_over_the_place_and_what_lies_around(corridor):
-    share = entry_probability(corridor, belief(3.0, 10.0), keyframes(1.0), RADIUS)
+    share = entry(corridor, belief(3.0, 10.0), keyframes(1.0), RADIUS).share
     assert 0.02 < share < 0.6
 
 
 def test_the_probability_is_that_of_the_gaussian():
     """Lengthwise uncertainty alone: in the place up to 2 m beyond its last keyframe, normal cumulative distribution."""
     prior = PoseGaussian(np.array([9.0, 0.0, 0.0]), np.diag([0.8, 1e-3, 1e-4]) ** 2)
-    share = entry_probability(place(border=50.0), prior, np.zeros((1, 3)), RADIUS)
+    share = entry(place(border=50.0), prior, np.zeros((1, 3)), RADIUS).share
     assert share == pytest.approx(0.5 * (1.0 + math.erf((10.0 - 9.0) / 0.8 / math.sqrt(2.0))), abs=0.02)
 
 
 def test_neighbouring_areas_share_the_probability(corridor):
     other = Place(7, corridor.owners, corridor.positions, corridor.grid)
     prior = PoseGaussian(np.array([4.0, 0.0, 0.0]), np.diag([0.5, 0.1, 0.003]) ** 2)
-    shares = [entry_probability(p, prior, keyframes(0.5), RADIUS) for p in (corridor, other)]
+    shares = [entry(p, prior, keyframes(0.5), RADIUS).share for p in (corridor, other)]
     assert min(shares) > 0.1
     assert sum(shares) <= 1.0
     assert sum(shares) == pytest.approx(1.0, abs=0.02)
@@ -114,3 +114,14 @@ def test_new_ground_keeps_its_floor():
 
 def test_without_a_candidate_all_is_new():
     assert transition({}, 0.05) == ({}, 1.0)
+
+
+def test_a_place_that_the_belief_is_all_in_is_made_of_poses_as_near_as_the_belief_is_wide(corridor):
+    found = entry(corridor, belief(0.05), keyframes(1.0), RADIUS)
+    assert found.typical == pytest.approx(2.37, abs=0.1)  # the median of chi-square with 3 degrees of freedom
+
+
+def test_a_place_at_the_edge_of_the_belief_is_made_of_poses_that_are_far_off(corridor):
+    near, far = (entry(corridor, belief(1.0), keyframes(x), RADIUS) for x in (1.0, -3.5))
+    assert near.share > 5.0 * far.share > 0.0
+    assert far.typical > near.typical + 1.0

@@ -18,7 +18,7 @@ from hmt_slam_ros.topology.appearance import appearance_log_ratio, signature
 from hmt_slam_ros.topology.area_grid import AreaGrid
 from hmt_slam_ros.topology.closure_search import Fit
 from hmt_slam_ros.topology.shortest_path import reachable
-from hmt_slam_ros.topology.transition import entry_probability
+from hmt_slam_ros.topology.transition import entry
 
 # Log-ratio above which a sample lies on a known surface, and below minus which in free space.
 _TOLD = 0.3
@@ -170,7 +170,7 @@ class _Candidate:
     def transition(self) -> tuple[float, float, float]:
         """Share, pi and the probability of new ground."""
         poses = np.array(list(self.fresh.values()))
-        share = entry_probability(self._place, self._prior, poses, self._options.place_radius)
+        share = entry(self._place, self._prior, poses, self._options.place_radius).share
         model = self._asked.found.transition
         return share, model.known[self._area], model.new
 

@@ -24,7 +24,7 @@ from hmt_slam_ros.topology.hybrid_map import HybridMap
 from hmt_slam_ros.topology.likeness import Elsewhere, Likeness, best_shares
 from hmt_slam_ros.topology.shortest_path import Reached, reached
 from hmt_slam_ros.topology.surroundings import Nearness, Views, entry_bounds, gap, positions, stacked
-from hmt_slam_ros.topology.transition import Place, Transition, entry_bound, entry_probability, owner_at, transition
+from hmt_slam_ros.topology.transition import Entry, Place, Transition, entry, entry_bound, owner_at, transition
 
 Pose = NDArray[np.float64]
 
@@ -156,21 +156,21 @@ class ClosureSearch:
         looked_at, rest = ranked[:most], {known: candidates[known].most for known in ranked[most:]} | distant
         places = {known: self._views.place(hybrid_map, known, excluded) for known in looked_at}
         entries = {known: self._entry(place, candidates[known]) for known, place in places.items()}
-        shares = {known: share for known, share in entries.items() if share > 0.0}
+        shares = {known: found.share for known, found in entries.items() if found.share > 0.0}
         model = transition(shares | rest, self._options.new_probability)
         if shares:
             self._count_likeness(hybrid_map, query, elsewhere, excluded)
         fits = [
             fit
             for known in sorted(shares, key=lambda known: (-shares[known], known))
-            for fit in self._fits(hybrid_map, places[known], candidates[known], model.known[known])
+            for fit in self._fits(hybrid_map, places[known], candidates[known], model.known[known], entries[known])
         ]
         kept, left_out = _parted(fits, self._options.max_modes)
         skipped = sum(model.known[known] for known in rest) + sum(math.exp(fit.log_weight) for fit in left_out)
         return Comparison(model, kept, tuple(shares), skipped)
 
-    def _entry(self, place: Place, candidate: Candidate) -> float:
-        return entry_probability(place, candidate.prior, stacked(candidate.fresh), self._options.place_radius)
+    def _entry(self, place: Place, candidate: Candidate) -> Entry:
+        return entry(place, candidate.prior, stacked(candidate.fresh), self._options.place_radius)
 
     def _count_likeness(
         self, hybrid_map: HybridMap, query: Query, elsewhere: Sequence[int], excluded: Collection[int]
@@ -245,8 +245,14 @@ class ClosureSearch:
         known = positions(hybrid_map, area, np.zeros(3))
         return gap(asked, known) <= self._options.place_radius + math.sqrt(self.gate) * spread
 
-    def _fits(self, hybrid_map: HybridMap, place: Place, candidate: Candidate, pi: float) -> Iterator[Fit]:
-        """The modes of the query in the candidate's place, which share its probability by their masses."""
+    def _fits(
+        self, hybrid_map: HybridMap, place: Place, candidate: Candidate, pi: float, entered: Entry
+    ) -> Iterator[Fit]:
+        """The modes of the query in the candidate's place, which share its probability by their masses.
+
+        The probability of the place is that of all poses in it. A mode that is farther off than these usually are has
+        less, as the prior has there.
+        """
         known, fresh = hybrid_map.keyframes(place.area), candidate.fresh
         look = appearance_log_ratio(self._signature(fresh), self._signature(known), self._options.appearance_weight)
         query = self._views.grid(fresh)
@@ -260,7 +266,10 @@ class ClosureSearch:
         for mode in modes:
             found = place.grid.agreement(query.points, mode.pose.mean)
             same = MAPS.log_ratio(found, MAPS_USUAL) + self._likeness.log_rarity(found.share)
-            yield Fit(place.area, mode, math.log(pi) + mode.log_mass - float(whole) + look + same)
+            away = se2.log(se2.between(candidate.prior.mean, mode.pose.mean))
+            distance = float(away @ np.linalg.solve(candidate.prior.covariance, away))
+            off = -0.5 * max(0.0, distance - entered.typical)
+            yield Fit(place.area, mode, math.log(pi) + mode.log_mass - float(whole) + look + same + off)
 
     def _bounds(self, place: Place, query: AreaGrid, fresh: Mapping[int, Pose]) -> NDArray[np.float64]:
         """The smallest and the largest (x, y) of the middle of the query's points where a keyframe of it is in the

@@ -75,20 +75,33 @@ def owner_at(place: Place, poses: NDArray[np.float64], radius: float) -> int | N
     return None if owner == _NOWHERE else owner
 
 
-def entry_probability(place: Place, belief: PoseGaussian, poses: NDArray[np.float64], radius: float) -> float:
-    """pi(gamma): the probability that the keyframes lie in the area's place, exactly 0 where no draw says so.
+class Entry(NamedTuple):
+    """How the keyframes come to lie in an area's place, by the arcs.
+
+    :ivar share: pi(gamma), the probability that they do, exactly 0 where no draw says so.
+    :ivar typical: squared Mahalanobis distance from the belief's mean of half of the poses in which they do.
+    """
+
+    share: float
+    typical: float
+
+
+def entry(place: Place, belief: PoseGaussian, poses: NDArray[np.float64], radius: float) -> Entry:
+    """The probability of a place, and what poses it is made of.
 
     :param belief: over ``area_T_reference``.
     :param poses: shape (m, 3), ``reference_T_base`` of the keyframes.
     :param radius: farthest distance to a keyframe of the place, m.
     """
-    return float(np.mean(_owners(place, _drawn_positions(belief, poses), radius) == place.area))
+    inside = _owners(place, _drawn_positions(belief, poses), radius) == place.area
+    distances = np.sum(_normal_points()[inside] ** 2, axis=1)
+    return Entry(float(np.mean(inside)), float(np.median(distances)) if inside.any() else 0.0)
 
 
 def entry_bound(
     known: NDArray[np.float64], belief: PoseGaussian, poses: NDArray[np.float64], radius: float
 ) -> float:
-    """No less than :func:`entry_probability`, whatever is around the area, from its keyframes' positions (k, 2) alone.
+    """No less than the share of :func:`entry`, whatever is around the area, from its keyframes' positions (k, 2) alone.
 
     One of the keyframes in question at least has to be near to one of the area's.
     """
