@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -105,6 +106,13 @@ def test_poses_beyond_the_bounds_are_not_searched(known, visit):
     beside = match(visit, known, prior, SETTINGS, np.array([middle + 0.5, middle + 1.0]))
     assert all(np.hypot(*se2.between(mode.pose.mean, TRUTH)[:2]) > 0.3 for mode in beside.modes)
     assert match(visit, known, prior, SETTINGS, np.array([middle + 50.0, middle + 51.0])).modes == ()
+
+
+def test_poses_at_which_the_samples_fit_less_than_asked_for_are_not_searched(known, visit):
+    prior = prior_around(TRUTH, 1.0, 6.0)
+    fits = match(visit, known, prior, replace(SETTINGS, least=0.5)).modes
+    assert np.hypot(*se2.between(fits[0].pose.mean, TRUTH)[:2]) < 0.03
+    assert match(visit, known, prior, replace(SETTINGS, least=1.2)).modes == ()
 
 
 def test_a_visit_is_found_from_a_prior_of_metres(known, visit):

@@ -41,6 +41,7 @@ class MatchSettings:
     :ivar max_modes: at most this many modes are worked out, the heaviest; some may turn out to be the same.
     :ivar sigma_floor: smallest deviation of a mode's translation, m.
     :ivar angle_floor: smallest deviation of a mode's angle, rad.
+    :ivar least: poses at which the samples' log-ratio is less than this on average are not looked for, nats.
     """
 
     temper: float = 0.1
@@ -49,6 +50,7 @@ class MatchSettings:
     max_modes: int = 8
     sigma_floor: float = 0.01
     angle_floor: float = math.radians(0.2)
+    least: float = -math.inf
 
 
 class Mode(NamedTuple):
@@ -104,7 +106,9 @@ def match(
     window = make_window(prior.mean, prior.covariance, candidate.cell, turn, settings.gate, bounds)
     surface, log_cell = _fine(candidate), _log_cell_mass(prior, candidate.cell, turn)
     back_points = _within_reach(candidate.points, window, centred)
-    threshold = math.log(_NEGLIGIBLE) - min(0.0, log_cell)
+    threshold = max(
+        math.log(_NEGLIGIBLE) - min(0.0, log_cell), settings.temper * settings.least * len(query.points)
+    )
     cells = search(
         window, _coarse(candidate), centred.points, _coarse(centred), back_points, settings.temper, threshold,
         settings.margin,

@@ -26,8 +26,8 @@ _ALIKE = np.diag([1.5, 0.7, math.radians(6.0)]) ** 2
 _HEADINGS = (np.zeros(3), np.array([0.0, 0.0, math.pi]))
 # Squared Mahalanobis distance up to which is searched: 90 % of 3 degrees of freedom.
 _GATE = 6.25
-# Only the best is asked for.
-_MARGIN = 1.0  # nat
+# Only the best is asked for, and that not where a quarter of the samples at most is on surfaces: so much fits anywhere.
+_MARGIN, _LEAST = 1.0, 0.25 * math.log(3.0)  # nat
 # As much as so many places counts what is believed before any was tried; so many are kept.
 _TRIED, _KEPT = 2.0, 64
 # How far the share of one and the same place varies.
@@ -46,7 +46,7 @@ def best_shares(query: AreaGrid, elsewhere: Iterable[Elsewhere], settings: Match
 
     :param query: map of the keyframes, in the frame of the first of them.
     """
-    near = replace(settings, gate=_GATE, margin=_MARGIN)
+    near = replace(settings, gate=_GATE, margin=_MARGIN, least=_LEAST)
     found = []
     for place in elsewhere:
         modes = [
