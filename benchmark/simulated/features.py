@@ -16,12 +16,12 @@ from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.topology.appearance import appearance_log_ratio, signature
 from hmt_slam_ros.topology.area_grid import AreaGrid
+from hmt_slam_ros.topology.area_modes import log_ratio_at
+from hmt_slam_ros.topology.area_search import Surface
 from hmt_slam_ros.topology.closure_search import Fit
 from hmt_slam_ros.topology.shortest_path import reachable
 from hmt_slam_ros.topology.transition import entry
 
-# Log-ratio above which a sample lies on a known surface, and below minus which in free space.
-_TOLD = 0.3
 _VIEWS = 3
 _NAN = math.nan
 
@@ -239,8 +239,6 @@ _NO_MATCH = (0, _NAN, 0, 0)
 
 def _match(points: NDArray[np.float64], pose: Pose, grid: AreaGrid) -> Match:
     """How samples that stand at ``grid_T_points`` lie in a grid."""
-    found = np.floor((se2.transform(pose, points) - grid.origin) / (0.5 * grid.cell)).astype(np.int64)
-    rows_of, columns = grid.fine.shape
-    inside = (found >= 0).all(axis=1) & (found[:, 0] < columns) & (found[:, 1] < rows_of)
-    ratio = grid.fine[found[inside, 1], found[inside, 0]]
-    return Match(len(points), float(ratio.sum()), int((ratio > _TOLD).sum()), int((ratio < -_TOLD).sum()))
+    found = grid.agreement(points, pose)
+    score = log_ratio_at(Surface(grid.fine, grid.origin, 0.5 * grid.cell), points, pose)
+    return Match(found.samples, score, found.on, found.free)
