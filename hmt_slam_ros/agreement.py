@@ -70,7 +70,9 @@ SCAN = Contradiction(extra=0.03, strength=500.0, stretch=20.0)
 
 
 class Usual(NamedTuple):
-    """What contradicted so far where the robot surely was in the same place: some buildings are full of clutter.
+    """What contradicted so far where a hypothesis has the robot: some buildings are full of clutter.
+
+    One that is wrong learns from its own contradictions too, but a few scans weigh little against all before.
 
     :ivar on: stretches on known surfaces.
     :ivar free: stretches in space that is known to be free.

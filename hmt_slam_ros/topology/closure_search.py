@@ -190,10 +190,10 @@ class ClosureSearch:
     def _divided(
         self, hybrid_map: HybridMap, area: int, query: Query, excluded: Collection[int]
     ) -> tuple[dict[int, PoseGaussian], dict[int, float], list[int]]:
-        """The known areas in which the query may lie.
+        """The known areas in which the query may lie, and some of those in which it surely does not.
 
-        :returns: the priors of those that are looked at; and where they are too many, of the others a bound on the
-            probability that the query lies there.
+        :returns: the priors of those that are looked at; where they are too many, of the others a bound on the
+            probability that the query lies there; and areas elsewhere.
         """
         found = reached(hybrid_map, area, self._options.prior_limit**2)
         bounds = np.where(np.isin(found.areas, list(excluded)), 0.0, self._entry_bounds(hybrid_map, found, query))
