@@ -11,9 +11,11 @@ from worlds import box, scan_in
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.topology import area_modes
+from hmt_slam_ros.topology.area_bounds import Surface
 from hmt_slam_ros.topology.area_grid import GridModel, build_area_grid
 from hmt_slam_ros.topology.area_matching import MatchSettings, match
-from hmt_slam_ros.topology.area_search import Cells, Surface, make_window, search
+from hmt_slam_ros.topology.area_search import Cells, search
+from hmt_slam_ros.topology.area_window import make_window
 
 MODEL = GridModel()
 SETTINGS = MatchSettings()

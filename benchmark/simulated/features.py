@@ -15,9 +15,9 @@ from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.topology.appearance import appearance_log_ratio, signature
+from hmt_slam_ros.topology.area_bounds import Surface
 from hmt_slam_ros.topology.area_grid import AreaGrid
 from hmt_slam_ros.topology.area_modes import log_ratio_at
-from hmt_slam_ros.topology.area_search import Surface
 from hmt_slam_ros.topology.closure_search import Fit
 from hmt_slam_ros.topology.shortest_path import reachable
 from hmt_slam_ros.topology.transition import entry

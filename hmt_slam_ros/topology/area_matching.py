@@ -13,13 +13,15 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.topology import area_modes
+from hmt_slam_ros.topology.area_bounds import Surface
 from hmt_slam_ros.topology.area_grid import AreaGrid
-from hmt_slam_ros.topology.area_search import Array, Cells, Surface, Window, make_window, search
+from hmt_slam_ros.topology.area_search import Cells, search
+from hmt_slam_ros.topology.area_window import Window, make_window
 
 # Peaks of one cluster have passes at most this deep, nats.
 _SADDLE = 3.0
@@ -85,7 +87,7 @@ class Match:
 
 
 def match(
-    query: AreaGrid, candidate: AreaGrid, prior: PoseGaussian, settings: MatchSettings, bounds: Array | None = None
+    query: AreaGrid, candidate: AreaGrid, prior: PoseGaussian, settings: MatchSettings, bounds: Float64 | None = None
 ) -> Match:
     """Find all poses of the query in the candidate that the prior admits.
 
@@ -128,7 +130,7 @@ def match(
 @dataclass(frozen=True, eq=False)
 class _Problem:
     surface: Surface
-    samples: Array
+    samples: Float64
     window: Window
     prior: PoseGaussian
     settings: MatchSettings
@@ -142,7 +144,7 @@ def _fine(grid: AreaGrid) -> Surface:
     return Surface(grid.fine, grid.origin, 0.5 * grid.cell)
 
 
-def _turn(cell: float, samples: Array) -> float:
+def _turn(cell: float, samples: Float64) -> float:
     """The turn that moves nine samples of ten by less than a cell (the pixel rule of Hess et al. 2016)."""
     radius = max(cell, float(np.quantile(np.hypot(samples[:, 0], samples[:, 1]), 0.9)))
     turn = math.acos(max(-1.0, 1.0 - cell**2 / (2.0 * radius**2)))
@@ -155,7 +157,7 @@ def _log_cell_mass(prior: PoseGaussian, cell: float, turn: float) -> float:
     return math.log(cell * cell * turn) - 1.5 * math.log(2.0 * math.pi) - 0.5 * log_determinant
 
 
-def _within_reach(points: Array, window: Window, query: AreaGrid) -> Array:
+def _within_reach(points: Float64, window: Window, query: AreaGrid) -> Float64:
     """The candidate's points that can meet the query's grid at a pose of the window."""
     rows, columns = query.log_ratio.shape
     corners = query.origin + query.cell * np.array([[0, 0], [columns, 0], [0, rows], [columns, rows]])
@@ -165,7 +167,7 @@ def _within_reach(points: Array, window: Window, query: AreaGrid) -> Array:
     return points[near]
 
 
-def _modes(problem: _Problem, cells: Cells, masses: Array, poses: Array) -> list[Mode]:
+def _modes(problem: _Problem, cells: Cells, masses: Float64, poses: Float64) -> list[Mode]:
     """The modes by falling mass, coinciding ones merged."""
     labels = area_modes.clusters(cells, _SADDLE)
     totals = np.full(labels.max() + 1, -np.inf)
@@ -198,7 +200,7 @@ def _merged(kept: PoseGaussian, other: PoseGaussian, share: float) -> PoseGaussi
     return PoseGaussian(kept.mean, (1.0 - share) * kept.covariance + share * second)
 
 
-def _mode(problem: _Problem, masses: Array, poses: Array) -> Mode:
+def _mode(problem: _Problem, masses: Float64, poses: Float64) -> Mode:
     """Peak, covariances and mass of a cluster of cells.
 
     The curvature at the peak gives the covariance of a sharp mode; cells that lie farther away than that explains, as
@@ -232,8 +234,8 @@ def _radian_step(problem: _Problem, distance: float) -> float:
 
 
 def _spread(
-    problem: _Problem, peak: Array, masses: Array, poses: Array, explained: NDArray[np.float64]
-) -> NDArray[np.float64]:
+    problem: _Problem, peak: Float64, masses: Float64, poses: Float64, explained: Float64
+) -> Float64:
     """How much wider the cells of a cluster lie around the peak than ``explained`` and the lattice account for."""
     away = se2.log(se2.between(peak, poses))
     weights = np.exp(masses - np.logaddexp.reduce(masses))
@@ -243,7 +245,7 @@ def _spread(
     return _positive_part(second - explained - lattice)
 
 
-def _positive_part(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
+def _positive_part(matrix: Float64) -> Float64:
     """The nearest positive semidefinite matrix to a symmetric one, both (3, 3) over (m, m, rad).
 
     Angles are scaled to the metres that they move a point ten metres away, so that the axes compare.

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-from hmt_slam_ros.topology.area_search import Array, Cells, Indices, Surface, Window
+from hmt_slam_ros.arrays import Float64, Int64
+from hmt_slam_ros.topology.area_bounds import Surface
+from hmt_slam_ros.topology.area_search import Cells
+from hmt_slam_ros.topology.area_window import Window
 
 # Of a search's cells, at most this many are divided for the quadrature; the others count with their centre alone.
 _DIVIDED = 400
 
 
-def clusters(cells: Cells, saddle: float) -> Indices:
+def clusters(cells: Cells, saddle: float) -> Int64:
     """The cluster of every cell, shape (n,), numbered from 0 by falling height of the peaks.
 
     Two peaks stay apart where the lower one rises by more than ``saddle`` nats above the pass between them.
@@ -29,8 +31,8 @@ def clusters(cells: Cells, saddle: float) -> Indices:
 
 @njit(cache=True)
 def _flood(
-    order: Indices, keys: Indices, sorted_keys: Indices, by_key: Indices, sides: Indices, score: Array, saddle: float
-) -> Indices:
+    order: Int64, keys: Int64, sorted_keys: Int64, by_key: Int64, sides: Int64, score: Float64, saddle: float
+) -> Int64:
     """Flood from the top: the peak (a cell) that every cell belongs to."""
     above = np.full(order.size, -1)
     for cell in order:
@@ -49,14 +51,14 @@ def _flood(
 
 
 @njit(cache=True)
-def _peak(above: Indices, cell: int) -> int:
+def _peak(above: Int64, cell: int) -> int:
     while above[cell] != cell:
         cell = above[cell]
     return cell
 
 
 @njit(cache=True)
-def _join(above: Indices, cell: int, other: int, score: Array, saddle: float) -> None:
+def _join(above: Int64, cell: int, other: int, score: Float64, saddle: float) -> None:
     """Give the lower of two peaks that meet at ``cell`` to the higher, unless it stands out."""
     a, b = _peak(above, cell), _peak(above, other)
     if score[a] < score[b] or (score[a] == score[b] and a > b):
@@ -66,7 +68,7 @@ def _join(above: Indices, cell: int, other: int, score: Array, saddle: float) ->
 
 
 @njit(cache=True)
-def log_ratio_at(surface: Surface, samples: Array, pose: Array) -> float:
+def log_ratio_at(surface: Surface, samples: Float64, pose: Float64) -> float:
     """Sum over the samples of the bilinearly interpolated log-ratio, nats, untempered.
 
     :param pose: shape (3,), ``candidate_T_query``.
@@ -88,7 +90,7 @@ def log_ratio_at(surface: Surface, samples: Array, pose: Array) -> float:
 
 
 @njit(cache=True)
-def _score_at(surface: Surface, samples: Array, window: Window, temper: float, pose: Array) -> float:
+def _score_at(surface: Surface, samples: Float64, window: Window, temper: float, pose: Float64) -> float:
     """Tempered log-ratio plus the prior's exponent, without the reverse check."""
     dx, dy = pose[0] - window.mean[0], pose[1] - window.mean[1]
     turn = pose[2] - window.mean[2]
@@ -103,8 +105,8 @@ def _score_at(surface: Surface, samples: Array, window: Window, temper: float, p
 
 
 def quadrature(
-    surface: Surface, samples: Array, window: Window, cells: Cells, temper: float
-) -> tuple[Array, NDArray[np.float64]]:
+    surface: Surface, samples: Float64, window: Window, cells: Cells, temper: float
+) -> tuple[Float64, Float64]:
     """log of the mean of exp(score) over every cell, shape (n,), and the best pose found in it, shape (n, 3).
 
     The cells are divided as finely as the narrower of prior and likelihood asks for.
@@ -128,7 +130,7 @@ def _odd(ratio: float) -> int:
     return 3 if ratio <= 4.5 else (5 if ratio <= 7.5 else 7)
 
 
-def _centres(window: Window, cells: Cells) -> Array:
+def _centres(window: Window, cells: Cells) -> Float64:
     poses = np.empty((cells.score.size, 3))
     poses[:, :2] = window.mean[:2] + cells.at[:, 1:] * window.cell
     poses[:, 2] = window.mean[2] + window.turns[cells.at[:, 0]]
@@ -137,8 +139,8 @@ def _centres(window: Window, cells: Cells) -> Array:
 
 @njit(cache=True)
 def _divide(
-    surface: Surface, samples: Array, window: Window, temper: float, centres: Array, divisions: Indices, turn: float
-) -> tuple[Array, Array]:
+    surface: Surface, samples: Float64, window: Window, temper: float, centres: Float64, divisions: Int64, turn: float
+) -> tuple[Float64, Float64]:
     count, turns = divisions
     means, best = np.empty(centres.shape[0]), centres.copy()
     scores = np.empty(count * count * turns)
@@ -159,8 +161,8 @@ def _divide(
 
 @njit(cache=True)
 def climb(
-    surface: Surface, samples: Array, window: Window, temper: float, start: Array, step: Array, finest: float
-) -> Array:
+    surface: Surface, samples: Float64, window: Window, temper: float, start: Float64, step: Float64, finest: float
+) -> Float64:
     """The highest pose near ``start``, by a pattern search over the 26 neighbours with halving steps.
 
     :param step: shape (3,), first steps in m, m and rad.
@@ -182,7 +184,7 @@ def climb(
 
 
 @njit(cache=True)
-def curvature(surface: Surface, samples: Array, pose: Array, step: Array) -> Array:
+def curvature(surface: Surface, samples: Float64, pose: Float64, step: Float64) -> Float64:
     """Minus the Hessian of the untempered log-ratio in the right tangent space of ``pose``, shape (3, 3).
 
     :param step: shape (3,), finite differences in m, m and rad.
@@ -204,7 +206,7 @@ def curvature(surface: Surface, samples: Array, pose: Array, step: Array) -> Arr
 
 
 @njit(cache=True)
-def _beside(pose: Array, twist: Array) -> Array:
+def _beside(pose: Float64, twist: Float64) -> Float64:
     """``pose * exp(twist)`` for a small twist, to second order."""
     cos, sin = np.cos(pose[2]), np.sin(pose[2])
     x, y = twist[0] - 0.5 * twist[2] * twist[1], twist[1] + 0.5 * twist[2] * twist[0]

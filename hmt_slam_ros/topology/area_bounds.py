@@ -1,0 +1,150 @@
+"""What surface samples read at most in squares of shifts: a pyramid of running maxima (Olson 2009, Hess et al. 2016).
+
+The pyramid is of bytes, rounded up, so that a level of a large map stays in the processor's cache; and neighbouring
+squares are read together, sample by sample, which costs hardly more than one of them.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from hmt_slam_ros.arrays import Float32, Float64, Int8, Int32
+from hmt_slam_ros.topology.area_window import Window
+
+BLOCK = 4
+"""Edge of a block of cells, a power of 2."""
+
+_TOP = 64  # the largest log-ratio in steps; what is below -128 steps is counted as that
+
+
+class Surface(NamedTuple):
+    """A log-ratio grid: ``log_ratio`` (rows, columns) float32, indexed [y, x], its corner ``origin`` (2,), ``cell``."""
+
+    log_ratio: Float32
+    origin: Float64
+    cell: float
+
+
+class Pyramid(NamedTuple):
+    """Running maxima of log-ratios.
+
+    :ivar levels: shape (h + 1, rows + 2 margin, columns + 2 margin), int8, steps. Element [l, y, x] is no less than the
+        log-ratios in the square of 2^l x 2^l cells that begins at cell (x, y) - margin; beyond the grid they are 0.
+    :ivar margin: 2^h.
+    :ivar step: nats.
+    """
+
+    levels: Int8
+    margin: int
+    step: float
+
+
+def pyramid(log_ratio: Float32, height: int) -> Pyramid:
+    """The pyramid of a grid, with levels 0 to ``height``."""
+    margin = 2**height
+    step = max(float(log_ratio.max()), 1e-6) / _TOP
+    rows, columns = log_ratio.shape
+    levels = np.zeros((height + 1, rows + 2 * margin, columns + 2 * margin), dtype=np.int8)
+    _round_up(log_ratio, 1.0 / step, levels[0, margin:, margin:])
+    for level in range(height):
+        _widen(levels[level], levels[level + 1], 2**level)
+    return Pyramid(levels, margin, step)
+
+
+@njit(cache=True)
+def _round_up(log_ratio: Float32, scale: float, steps: Int8) -> None:
+    for r in range(log_ratio.shape[0]):
+        for c in range(log_ratio.shape[1]):
+            steps[r, c] = np.int8(max(-128.0, np.ceil(log_ratio[r, c] * scale)))
+
+
+@njit(cache=True)
+def _widen(below: Int8, above: Int8, side: int) -> None:
+    """Maxima over squares twice as large; the last rows and columns are beyond the grid and stay 0."""
+    rows, columns = below.shape[0] - side, below.shape[1] - side
+    for r in range(rows):
+        first, right = below[r, :columns], below[r, side:]
+        second, both = below[r + side, :columns], below[r + side, side:]
+        for c in range(columns):
+            above[r, c] = max(first[c], right[c], second[c], both[c])
+
+
+@njit(cache=True)
+def sample_cells(window: Window, surface: Surface, samples: Float64) -> Int32:
+    """Column and row of every sample at every turn without a shift, shape (turns, samples, 2)."""
+    cells = np.empty((window.turns.size, samples.shape[0], 2), np.int32)
+    x0, y0 = window.mean[0] - surface.origin[0], window.mean[1] - surface.origin[1]
+    for k in range(window.turns.size):
+        angle = window.mean[2] + window.turns[k]
+        cos, sin = np.cos(angle), np.sin(angle)
+        for n in range(samples.shape[0]):
+            cells[k, n, 0] = np.floor((cos * samples[n, 0] - sin * samples[n, 1] + x0) / surface.cell)
+            cells[k, n, 1] = np.floor((sin * samples[n, 0] + cos * samples[n, 1] + y0) / surface.cell)
+    return cells
+
+
+# Unsigned, a negative index is a large one: one comparison tells whether it lies in the grid.
+
+
+@njit(cache=True)
+def log_ratio_of(log_ratio: Float32, cells: Int32, i: int, j: int) -> float:
+    """Sum of the log-ratios that the samples (n, 2) read at one shift, nats."""
+    rows, columns = np.uint32(log_ratio.shape[0]), np.uint32(log_ratio.shape[1])
+    total = 0.0
+    for n in range(cells.shape[0]):
+        x, y = np.uint32(cells[n, 0] + i), np.uint32(cells[n, 1] + j)
+        if x < columns and y < rows:
+            total += log_ratio[y, x]
+    return total
+
+
+@njit(cache=True)
+def bound_of_square(level: Int8, margin: int, cells: Int32, i: int, j: int) -> int:
+    """What the samples (n, 2) read at most in the square of shifts that begins at (i, j), steps.
+
+    :param level: of the pyramid, for squares of this size.
+    """
+    rows, columns = np.uint32(level.shape[0]), np.uint32(level.shape[1])
+    total = 0
+    for n in range(cells.shape[0]):
+        x, y = np.uint32(cells[n, 0] + i + margin), np.uint32(cells[n, 1] + j + margin)
+        if x < columns and y < rows:
+            total += level[y, x]
+    return total
+
+
+@njit(cache=True)
+def bounds_of_quarters(
+    level: Int8, margin: int, cells: Int32, i: int, j: int, side: int
+) -> tuple[tuple[int, int], tuple[int, int]]:
+    """:func:`bound_of_square` of the squares of edge ``side`` that begin at (i, j), right of it, and below both."""
+    rows, columns = np.uint32(level.shape[0] - side), np.uint32(level.shape[1] - side)
+    beside = np.uint32(side)
+    first, right, below, both = 0, 0, 0, 0
+    for n in range(cells.shape[0]):
+        x, y = np.uint32(cells[n, 0] + i + margin), np.uint32(cells[n, 1] + j + margin)
+        if x < columns and y < rows:
+            first += level[y, x]
+            right += level[y, x + beside]
+            below += level[y + beside, x]
+            both += level[y + beside, x + beside]
+    return (first, right), (below, both)
+
+
+@njit(cache=True)
+def add_block(level: Int8, margin: int, cells: Int32, i: int, j: int, totals: Int32) -> None:
+    """Add what the samples (n, 2) read at most at every shift of the block that begins at (i, j), steps.
+
+    :param level: the lowest of the pyramid.
+    :param totals: shape (BLOCK, BLOCK), [j, i].
+    """
+    rows, columns = np.uint32(level.shape[0] - BLOCK), np.uint32(level.shape[1] - BLOCK)
+    for n in range(cells.shape[0]):
+        x, y = np.uint32(cells[n, 0] + i + margin), np.uint32(cells[n, 1] + j + margin)
+        if x < columns and y < rows:
+            for r in range(BLOCK):
+                for c in range(BLOCK):
+                    totals[r, c] += level[y + np.uint32(r), x + np.uint32(c)]
