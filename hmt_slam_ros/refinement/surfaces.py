@@ -10,12 +10,12 @@ from numba import njit
 
 from hmt_slam_ros.arrays import Bool, Float64, Int32, Int64
 from hmt_slam_ros.sensing import Scan
+from hmt_slam_ros.sensing.surfels import Wall, fit, running_sums
 
 # A wall piece is fitted to the points within this reach of a point, or within three beams at one degree where that is
 # more, on at most so many beams to each side.
 _REACH, _REACH_PER_METRE, _BEAMS = 0.25, 0.045, 8
-# Deviation of the points from the fitted piece at most, and its length in deviations at least.
-_FLAT, _ELONGATED = 0.03, 2.0
+_WALL = Wall(0.05, 0.35)
 _EMPTY = -1
 
 
@@ -79,20 +79,18 @@ def _running(counts: Sequence[int]) -> Int64:
 
 @njit(cache=True)
 def _fit_normals(points: Float64, laser: Float64) -> tuple[Float64, Bool]:
-    """Normals (n, 2) of the wall pieces around the points, by total least squares, and whether there is one (n,)."""
-    normals, flat = np.zeros_like(points), np.zeros(len(points), np.bool_)
+    """Normals (n, 2) of the wall pieces around the points, and whether there is one (n,)."""
+    normals, flat, normal = np.zeros_like(points), np.zeros(len(points), np.bool_), np.empty(2)
+    beams = points - laser
+    ranges = np.hypot(beams[:, 0], beams[:, 1])
+    sums = running_sums(beams, ranges)
     for i in range(len(points)):
-        dx, dy = points[i, 0] - laser[0], points[i, 1] - laser[1]
-        reach = max(_REACH, _REACH_PER_METRE * np.hypot(dx, dy))
+        reach = max(_REACH, _REACH_PER_METRE * ranges[i])
         low, high = _piece(points, i, -1, reach), _piece(points, i, 1, reach)
-        if high - low < 2:
+        if high - low < 2 or not fit(beams, sums, low, i, high, _WALL, normal):
             continue
-        angle, minor, major = _principal_axis(points[low : high + 1])
-        if minor > _FLAT or major < _ELONGATED * minor:
-            continue
-        x, y = -np.sin(angle), np.cos(angle)
-        towards = -1.0 if x * dx + y * dy > 0.0 else 1.0
-        normals[i, 0], normals[i, 1] = towards * x, towards * y
+        towards = -1.0 if normal[0] * beams[i, 0] + normal[1] * beams[i, 1] > 0.0 else 1.0
+        normals[i, 0], normals[i, 1] = towards * normal[0], towards * normal[1]
         flat[i] = True
     return normals, flat
 
@@ -106,22 +104,6 @@ def _piece(points: Float64, i: int, step: int, reach: float) -> int:
             break
         last = k
     return last
-
-
-@njit(cache=True)
-def _principal_axis(points: Float64) -> tuple[float, float, float]:
-    """Direction in which points (n, 2) spread most, rad, and their deviations across and along it, m."""
-    n = len(points)
-    mx, my = points[:, 0].sum() / n, points[:, 1].sum() / n
-    xx = xy = yy = 0.0
-    for k in range(n):
-        dx, dy = points[k, 0] - mx, points[k, 1] - my
-        xx += dx * dx
-        xy += dx * dy
-        yy += dy * dy
-    angle = 0.5 * np.arctan2(2.0 * xy, xx - yy)
-    middle, half = 0.5 * (xx + yy), np.hypot(0.5 * (xx - yy), xy)
-    return angle, np.sqrt(max(0.0, middle - half) / n), np.sqrt((middle + half) / n)
 
 
 @njit(cache=True)

@@ -8,6 +8,8 @@ shows. Points that lie on no surface, such as posts and corners, may say everyth
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
 
@@ -18,12 +20,26 @@ from hmt_slam_ros.geometry import se2
 _REACH = 0.5
 # Neighbouring points farther apart than this share of their range lie on different surfaces.
 _GAP = 0.4
-# Deviation of the points along a surface at least, and across it at most, m, and as a share of that along it.
-_SHORT, _FLAT, _ROUND = 0.1, 0.03, 0.2
+# Deviation of the points across a surface at most, m.
+_FLAT = 0.03
 # A point lies on the surface of those around it within so much, m, and within so many of their deviations across it.
 _OFF, _DEVIATIONS = 0.03, 3.0
 # A point and one in front of it show two things if they are farther apart than this, in m and as a share of the range.
 _APART, _APART_SHARE = 0.1, 0.05
+
+
+class Wall(NamedTuple):
+    """What points are taken for a wall.
+
+    :ivar least_along: deviation of the points along it at least, m.
+    :ivar most_across: that across it at most, as a share of that along it.
+    """
+
+    least_along: float
+    most_across: float
+
+
+_WALL = Wall(0.1, 0.2)
 
 
 def surfels(points: Float64, origins: Float64, stride: int = 1) -> Float64:
@@ -54,16 +70,16 @@ def _find_normals(beams: Float64, ranges: Float64, stride: int, found: Float64) 
     :param beams: shape (n, 2), m, from the laser to the points.
     :returns: which of the points show more than a shadow.
     """
-    sums, shown = _running_sums(beams, ranges), np.ones(len(found), np.bool_)
+    sums, shown = running_sums(beams, ranges), np.ones(len(found), np.bool_)
     for k in range(len(found)):
         i, normal = k * stride, found[k, 2:]
         low, high = _last_within(beams, ranges, i, -1, 1), _last_within(beams, ranges, i, 1, 1)
-        if low < i < high and _fit(beams, sums, low, i, high, normal):
+        if low < i < high and fit(beams, sums, low, i, high, _WALL, normal):
             continue
         low, high = _last_within(beams, ranges, i, -1, 2), _last_within(beams, ranges, i, 1, 2)
-        if i - low >= 2 and _fit(beams, sums, low, i, i, normal):
+        if i - low >= 2 and fit(beams, sums, low, i, i, _WALL, normal):
             continue
-        if high - i >= 2 and _fit(beams, sums, i, i, high, normal):
+        if high - i >= 2 and fit(beams, sums, i, i, high, _WALL, normal):
             continue
         shown[k] = not _shadowed(beams, ranges, i)
     return shown
@@ -85,7 +101,7 @@ def _last_within(beams: Float64, ranges: Float64, i: int, step: int, fewest: int
 
 
 @njit(cache=True)
-def _running_sums(beams: Float64, ranges: Float64) -> Float64:
+def running_sums(beams: Float64, ranges: Float64) -> Float64:
     """Sums over the beams before each, shape (n + 1, 10).
 
     They are of cos^2, cos sin, sin^2, cos / r, sin / r over the directions, and of x, y, x^2, x y, y^2 over the points.
@@ -101,7 +117,7 @@ def _running_sums(beams: Float64, ranges: Float64) -> Float64:
 
 
 @njit(cache=True)
-def _fit(beams: Float64, sums: Float64, low: int, own: int, high: int, normal: Float64) -> bool:
+def fit(beams: Float64, sums: Float64, low: int, own: int, high: int, wall: Wall, normal: Float64) -> bool:
     """Fit a line to the points from ``low`` to ``high``; False where they, or the point itself, do not lie on one.
 
     On a line the inverse of the range is linear in the direction of the beam. The fit takes the ranges for uncertain
@@ -109,7 +125,9 @@ def _fit(beams: Float64, sums: Float64, low: int, own: int, high: int, normal: F
     seen ahead would draw the robot back. The point itself is left out of it, or its own error would turn its normal,
     and the two together push along the wall.
 
-    :param sums: of :func:`_running_sums`.
+    :param beams: shape (n, 2), m, from the laser to the points.
+    :param sums: of :func:`running_sums`.
+    :param normal: (2,), written to.
     """
     xx, xy, yy = _total(sums, 0, low, own, high), _total(sums, 1, low, own, high), _total(sums, 2, low, own, high)
     x, y = _total(sums, 3, low, own, high), _total(sums, 4, low, own, high)
@@ -127,7 +145,7 @@ def _fit(beams: Float64, sums: Float64, low: int, own: int, high: int, normal: F
     square = across_x * across_x * yy - 2.0 * across_x * across_y * xy + across_y * across_y * xx
     spread = np.sqrt(max(0.0, square - (across_x * y - across_y * x) ** 2))
     own_off = abs(across_x * beams[own, 0] + across_y * beams[own, 1] - distance)
-    if spread < _SHORT or off > min(_FLAT, _ROUND * spread) or own_off > _OFF + _DEVIATIONS * off:
+    if spread < wall.least_along or off > min(_FLAT, wall.most_across * spread) or own_off > _OFF + _DEVIATIONS * off:
         return False
     normal[0], normal[1] = across_x, across_y
     return True
