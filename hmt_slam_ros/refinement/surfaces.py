@@ -15,7 +15,7 @@ from hmt_slam_ros.sensing.surfels import Wall, fit, running_sums
 # A wall piece is fitted to the points within this reach of a point, or within three beams at one degree where that is
 # more, on at most so many beams to each side.
 _REACH, _REACH_PER_METRE, _BEAMS = 0.25, 0.045, 8
-_WALL = Wall(0.05, 0.35)
+_WALL = Wall(0.04, 0.5)
 _EMPTY = -1
 
 
