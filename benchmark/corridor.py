@@ -40,14 +40,16 @@ class Drive(NamedTuple):
 
     :ivar truths: of the keyframes, x along the corridor, shape (k, 3).
     :ivar poses: as estimated, map frame, shape (k, 3).
-    :ivar covariances: of the step that led to each, in its own frame, shape (k, 3, 3).
+    :ivar covariances: what the step that led to each adds to the drift, in its own frame, shape (k, 3, 3).
     :ivar odometry_errors: of the odometry along the corridor from the start to each, shape (k,), m.
+    :ivar floor: deviations that every arc has at least, m and degrees.
     """
 
     truths: NDArray[np.float64]
     poses: NDArray[np.float64]
     covariances: NDArray[np.float64]
     odometry_errors: NDArray[np.float64]
+    floor: tuple[float, float] = (0.0, 0.0)
 
 
 class Errors(NamedTuple):
@@ -107,7 +109,8 @@ def drive(seed: int, length: float = _LENGTH) -> Drive:
         _take(live, motion, k, scan, mapping.matching_points(scan))
     kept = live.filter.keyframes
     covariances = np.array([live.fresh[keyframe] for keyframe in kept])
-    return Drive(truths[kept], live.filter.leading_keyframe_poses(), covariances, odometry_errors[kept])
+    floor = configuration.tlca.arc_sigma_floor, configuration.tlca.arc_angle_floor
+    return Drive(truths[kept], live.filter.leading_keyframe_poses(), covariances, odometry_errors[kept], floor)
 
 
 def _path(length: float, random: np.random.Generator) -> NDArray[np.float64]:
@@ -149,11 +152,13 @@ def errors_of(drives: Sequence[Drive], stride: int) -> Errors:
 
 def _error(one: Drive, first: int, last: int) -> tuple[NDArray[np.float64], NDArray[np.float64], float, float]:
     """Error (2,) and variance (2,) of a motion along and across the corridor, odometry's error and true length."""
+    sigma, angle = one.floor
     covariance = np.zeros((3, 3))
     for k in range(first + 1, last + 1):
         ad = se2.adjoint(se2.between(one.poses[k], one.poses[k - 1]))
         covariance = ad @ covariance @ ad.T + one.covariances[k]
     true, found = (se2.between(poses[first], poses[last]) for poses in (one.truths, one.poses))
+    covariance = covariance + np.diag([sigma, sigma, np.radians(angle)]) ** 2
     turn = se2.adjoint(np.array([0.0, 0.0, one.truths[last, 2]]))
     error = turn @ se2.log(se2.between(true, found))
     odometry_error = float(one.odometry_errors[last] - one.odometry_errors[first])

@@ -16,7 +16,7 @@ def test_the_covariance_along_a_bare_corridor_covers_the_truth(drives):
         found = errors_of(drives, stride)
         assert low < found.nees[0] < high
         assert found.covered[0] >= covered
-        # Across, the walls tell more than is stated: beams are taken to be correlated.
+        # Across, what is no drift is within the floor that arcs have.
         assert found.nees[1] < 1.0
         assert found.covered[1] >= 0.95
 

@@ -147,23 +147,6 @@ def test_the_motion_of_a_step_is_that_of_one_particle_also_where_the_lead_change
     np.testing.assert_allclose(step.moved, STEP, atol=1e-9)
 
 
-def test_what_the_scan_tells_of_a_step_is_inflated_and_what_odometry_tells_is_not():
-    configuration = Configuration()
-    deviations = np.array([0.1, 0.1, 0.1])
-    by_scan, by_odometry = [], []
-    for inflation in (1.0, 4.0):
-        settings = replace(configuration.filter, covariance_inflation=inflation)
-        area_filter, truth = driven(LocalMapping(replace(configuration, filter=settings)), steps=8)
-        scan = scan_in(ROOM, se2.compose(truth, STEP), noise=0.01)
-        for points, found in ((area_filter.mapping.matching_points(scan), by_scan), (np.empty((0, 4)), by_odometry)):
-            area_filter._restart()
-            area_filter.track(points, predicted(STEP, np.diag(deviations**2)))
-            found.append(np.sqrt(np.diag(area_filter.update(points, 60).covariance)))
-    np.testing.assert_allclose(by_odometry, [deviations, deviations], rtol=1e-6)
-    assert (by_scan[0] < 0.1 * deviations).all()
-    np.testing.assert_allclose(by_scan[1], 2.0 * by_scan[0], rtol=0.03)
-
-
 def test_effective_samples_equal_the_particles_where_all_weigh_the_same():
     mapping = LocalMapping(Configuration())
     area_filter = AreaFilter(mapping, 0, 0)

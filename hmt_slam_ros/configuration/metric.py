@@ -100,6 +100,20 @@ class Matching:
         0.05, "Exponent on a scan's likelihood in the weights, since neighbouring beams are correlated.",
         low=1e-4, high=1.0,
     )
+    beam_noise: float = parameter(
+        0.5, "Variance of single beams in the covariance of a match, in units of ``sigma_match`` squared.",
+        low=0.0, high=100.0,
+    )
+    block_noise: float = parameter(
+        1.5, "Factor on the variance that neighbouring beams, taken together, show in a match.", low=0.0, high=100.0
+    )
+    map_age: float = parameter(
+        2.0,
+        "Mean age of the local map in keyframes: what a keyframe adds to the drift is less than its own error by this "
+        "factor, along directions that the map determines.",
+        low=1.0,
+        high=100.0,
+    )
     matched_distance: float = parameter(
         0.15, "A beam whose end point is this close to a wall counts as matched.", unit="m", low=0.01, high=5.0
     )
@@ -140,8 +154,8 @@ class Filter:
     )
     covariance_inflation: float = parameter(
         4.0,
-        "Factor on the covariance of a match, since its beams are correlated: for the arcs, and where the match is "
-        "weighed against the prediction.",
+        "Factor on the covariance of a match where it is weighed against the prediction, since its beams are "
+        "correlated.",
         low=0.1,
         high=100.0,
     )

@@ -17,6 +17,7 @@ from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.covariance import inverse, turned
 from hmt_slam_ros.local_map import batch, matching
 from hmt_slam_ros.local_map.local_mapping import LocalMapping
+from hmt_slam_ros.local_map.match_error import MatchError, match_error
 from hmt_slam_ros.local_map.matching import Prior
 from hmt_slam_ros.local_map.patches import MapView
 from hmt_slam_ros.local_map.tracking import ScanMatcher, Tracked, map_information
@@ -43,7 +44,7 @@ class FilterStep:
     """What a filter step found.
 
     :ivar moved: the leading particle's motion since the last step, ``start_T_end``, shape (3,).
-    :ivar covariance: of that motion, shape (3, 3), in the frame of its end: odometry's, but where the scan tells more.
+    :ivar error: of that motion.
     :ivar information: of the match alone, for correlated beams, in the frame of the pose, shape (3, 3).
     :ivar log_evidence: log p(z_t | past), relative to a place that looks alike, nats.
     :ivar effective_samples: ESS before resampling.
@@ -51,7 +52,7 @@ class FilterStep:
     """
 
     moved: Float64
-    covariance: Float64
+    error: MatchError
     information: Float64
     log_evidence: float
     effective_samples: float
@@ -128,7 +129,9 @@ class AreaFilter:
         self._priors = se2.compose(self._priors, match.step.increment)
         self._since_update = self._since_update.then(match.step)
         self.poses = se2.compose(self.poses, moved)
-        self.tracking_covariance = match.covariance
+        information = map_information(self._since_update.covariance, match.pose[2])
+        information = information + match.hessian / self.mapping.alignment.inflation
+        self.tracking_covariance = turned(inverse(information), -match.pose[2])
         return Tracked(moved, self._matcher.tempered(match), match.contradicted)
 
     def _leading_view(self) -> MapView:
@@ -143,9 +146,10 @@ class AreaFilter:
         settings = self.mapping.configuration
         prior = map_information(self._since_update.covariance, self.pose[2])
         view, predicted = self._leading_view(), Prior(self._priors[self.leader], prior)
+        still = self._matcher.still(points, predicted, self._since_update, view)
         drawn = batch.propose_all(
             points,
-            self._matcher.still(points, predicted, self._since_update, view),
+            still,
             self.poses,
             self._priors,
             prior,
@@ -165,18 +169,18 @@ class AreaFilter:
         self.poses[leader] = drawn.modes[leader]
         self.poses[:, 2] = se2.wrap(self.poses[:, 2])
         log_evidence = self._log_same(points, leader)
-        heading = self.poses[leader, 2]
-        # The beams are correlated, what odometry knows is not.
-        told = drawn.hessians[leader] / settings.filter.covariance_inflation
-        covariance = turned(inverse(prior + told), -heading)
-        information = turned(settings.matching.temper * drawn.hessians[leader], -heading)
+        error = match_error(
+            still, self.poses[leader], drawn.hessians[leader], prior, self.mapping.pool.view(self._tables[leader]),
+            self.mapping.alignment, self.mapping.noise,
+        )  # fmt: skip
+        information = turned(settings.matching.temper * drawn.hessians[leader], -self.poses[leader, 2])
         effective = 1.0 / float(np.sum(_normalised(self.log_weights) ** 2))
         moved = se2.between(self._last_poses[leader], self.poses[leader])
         changed, self.leader = leader != self.leader, leader
         if effective < settings.filter.ess_fraction * len(self.poses):
             self._resample(step)
         self._restart()
-        return FilterStep(moved, covariance, information, log_evidence, effective, changed)
+        return FilterStep(moved, error, information, log_evidence, effective, changed)
 
     def _log_same(self, points: Float64, particle: int) -> float:
         """log p(scan | this is the place) / p(scan | a place that looks alike) in the map of a particle, nats.

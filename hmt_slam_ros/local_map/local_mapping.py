@@ -10,6 +10,7 @@ from hmt_slam_ros.arrays import Float64, Int32
 from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.local_map import matching
 from hmt_slam_ros.local_map.insertion import InverseModel
+from hmt_slam_ros.local_map.match_error import MatchNoise
 from hmt_slam_ros.local_map.patch_pool import Beams, PatchPool
 from hmt_slam_ros.local_map.patches import FAR, PATCH
 from hmt_slam_ros.sensing import Scan
@@ -32,6 +33,7 @@ class LocalMapping:
         self.alignment = matching.Alignment(
             match.sigma_match, match.robust_scale, configuration.filter.covariance_inflation, match.iterations
         )
+        self.noise = MatchNoise(match.beam_noise, match.block_noise, match.map_age)
         self._inverse_model = InverseModel(
             round(local_map.log_odds_hit * _ODDS_PER_NAT),
             round(-local_map.log_odds_miss * _ODDS_PER_NAT),

@@ -14,10 +14,13 @@ from hmt_slam_ros.configuration.metric import Filter
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.local_map.area_filter import AreaFilter, FilterStep, PlacedKeyframe
+from hmt_slam_ros.local_map.match_error import MatchError
 from hmt_slam_ros.processes.messages import Leaf, LeafEstimate, Relabelled, Trail
 from hmt_slam_ros.sensing import Scan
 
 _FIRST_COVARIANCE = np.diag([1e-8, 1e-8, 1e-8])
+_STAY = PoseGaussian(np.zeros(3), np.zeros((3, 3)))
+_NO_ERROR = MatchError(_FIRST_COVARIANCE, _FIRST_COVARIANCE, np.zeros((3, 3)))
 # Below 1, since the filter step at a keyframe may move the robot a little back towards the last one.
 _SAME_PLACE = 0.8
 
@@ -31,8 +34,11 @@ class LiveHypothesis:
     :ivar information: of the last keyframe event's match alone, in the frame of its pose, shape (3, 3).
     :ivar event_pose: ``area_T_base`` at the last keyframe event, shape (3,).
     :ivar anchor: the stored keyframe to which scans are now related.
-    :ivar fresh: {keyframe: covariance (3, 3) of the step that led to it}, of those stored since the area was entered.
-    :ivar drift: covariance of the last keyframe's pose in the area's frame, right tangent.
+    :ivar error: of that motion.
+    :ivar fresh: {keyframe: covariance (3, 3) that the step which led to it adds to the drift}, of those stored since
+        the area was entered.
+    :ivar placed: {keyframe: covariance (3, 3) of its pose in its area's frame, right tangent}, of all that are known.
+    :ivar drift: covariance of the pose at the last keyframe event in the area's frame, right tangent.
     :ivar trail: (stamp, anchor, ``anchor_T_base``) of the scans since the last keyframe event.
     """
 
@@ -41,8 +47,10 @@ class LiveHypothesis:
     event_pose: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
     moved: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
     information: NDArray[np.float64] = field(default_factory=lambda: np.zeros((3, 3)))
+    error: MatchError = _NO_ERROR
     anchor: int = 0
     fresh: dict[int, NDArray[np.float64]] = field(default_factory=dict)
+    placed: dict[int, NDArray[np.float64]] = field(default_factory=dict)
     drift: NDArray[np.float64] = field(default_factory=_FIRST_COVARIANCE.copy)
     trail: list[tuple[int, int, NDArray[np.float64]]] = field(default_factory=list)
 
@@ -54,8 +62,10 @@ class LiveHypothesis:
             self.event_pose,
             self.moved,
             self.information,
+            self.error,
             self.anchor,
             dict(self.fresh),
+            dict(self.placed),
             self.drift,
             list(self.trail),
         )
@@ -74,11 +84,12 @@ class LiveHypothesis:
         """
         if sequence == 0:
             unmoved, nothing = np.zeros(3), np.zeros((3, 3))
-            step = FilterStep(unmoved, _FIRST_COVARIANCE, nothing, 0.0, float(len(self.filter.poses)), False)
+            step = FilterStep(unmoved, _NO_ERROR, nothing, 0.0, float(len(self.filter.poses)), False)
         else:
             step = self.filter.update(points, sequence)
         stored = self._is_new()
-        self._drift_on(step.covariance, sequence if stored else None)
+        self.error = step.error
+        self._drift_on(sequence if stored else None)
         if stored:
             self.filter.add_keyframe(sequence, scan)
         self.moved, self.information = step.moved, step.information
@@ -103,14 +114,34 @@ class LiveHypothesis:
         alike = np.abs(relative[:, 2]) < _SAME_PLACE * math.radians(self.settings.keyframe_angle)
         return not bool(np.any(near & alike))
 
-    def _drift_on(self, step: NDArray[np.float64], keyframe: int | None) -> None:
-        """Add a step's covariance (3, 3) to the drift; over ground that is mapped the map bounds it."""
-        if keyframe is None:
-            self.drift = step
-            return
+    def _drift_on(self, keyframe: int | None) -> None:
+        """Carry the drift on to the pose now, of a keyframe that is stored, or of none over ground that is mapped."""
         ad = se2.adjoint(se2.between(self.filter.pose, self.event_pose))
-        self.drift = ad @ self.drift @ ad.T + step
-        self.fresh[keyframe] = step
+        carried = ad @ self.drift @ ad.T
+        if keyframe is None:
+            self.drift = self._bounded(carried)
+            return
+        self.drift = carried + self.error.lasting
+        self.fresh[keyframe] = self.error.lasting
+        self.placed[keyframe] = self.drift
+
+    def _bounded(self, carried: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The drift where the map bounds it, as far as the match tells: the pose is as far off as the map is there."""
+        gain = self.error.gain
+        free = np.eye(3) - gain
+        return gain @ self._mapped() @ gain.T + free @ carried @ free.T + self.error.matched
+
+    def _mapped(self) -> NDArray[np.float64]:
+        """How far off the map is here: covariance of the area's nearest keyframe, carried here; 0 where unknown."""
+        kept = self.filter.keyframes, self.filter.keyframe_areas, self.filter.leading_keyframe_poses()
+        own = [(k, pose) for k, area, pose in zip(*kept, strict=True) if area == self.filter.area and k in self.placed]
+        if not own:
+            return np.zeros((3, 3))
+        relative = se2.between(self.filter.pose, np.array([pose for _, pose in own]))
+        nearest = int(np.argmin(np.hypot(relative[:, 0], relative[:, 1])))
+        ad = se2.adjoint(relative[nearest])
+        covariance: NDArray[np.float64] = ad @ self.placed[own[nearest][0]] @ ad.T
+        return covariance
 
     def _relate(self) -> None:
         """Relate the scans to come to the nearest keyframe."""
@@ -165,17 +196,23 @@ class LiveHypothesis:
         if entered:
             moved = {relabelled.keyframe for relabelled in leaf.relabelled}
             self.fresh = {keyframe: step for keyframe, step in self.fresh.items() if keyframe in moved}
-            self.drift = self._drift_from_reference()
+            self._drift_into(leaf.rebase or _STAY)
         self._relate()
 
-    def _drift_from_reference(self) -> NDArray[np.float64]:
-        """Covariance of the last keyframe relative to the area's reference keyframe, the first that moved with it."""
-        drift = _FIRST_COVARIANCE
+    def _drift_into(self, rebase: PoseGaussian) -> None:
+        """The drift in the area that was entered: along the keyframes that moved with the robot, or else by the map.
+
+        :param rebase: belief over ``area_T_previous``.
+        """
+        moved = sorted(self.fresh)
+        if not moved:
+            self.drift = self._bounded(self.drift + _carried(rebase, self.event_pose))
+            return
         poses = dict(zip(self.filter.keyframes, self.filter.leading_keyframe_poses(), strict=True))
-        for previous, keyframe in pairwise(sorted(self.fresh)):
+        self.drift = self.placed[moved[0]] = _carried(rebase, poses[moved[0]]) + _FIRST_COVARIANCE
+        for previous, keyframe in pairwise(moved):
             ad = se2.adjoint(se2.between(poses[keyframe], poses[previous]))
-            drift = ad @ drift @ ad.T + self.fresh[keyframe]
-        return drift
+            self.drift = self.placed[keyframe] = ad @ self.drift @ ad.T + self.fresh[keyframe]
 
     def reload(self, content: Sequence[PlacedKeyframe]) -> None:
         """Build the local map anew after TLCA refined its keyframes; the robot stays where it is from its anchor.
@@ -185,3 +222,9 @@ class LiveHypothesis:
         before = self.filter.pose
         self.filter.reload(content, self.anchor)
         self.event_pose = se2.compose(self.filter.pose, se2.between(before, self.event_pose))
+
+
+def _carried(rebase: PoseGaussian, pose: NDArray[np.float64]) -> NDArray[np.float64]:
+    """What the uncertainty of ``area_T_previous`` adds to the covariance (3, 3) of a pose in the area, (3,)."""
+    known = PoseGaussian(se2.between(rebase.mean, pose), np.zeros((3, 3)))
+    return rebase.compose(known).covariance

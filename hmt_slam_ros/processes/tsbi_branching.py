@@ -199,7 +199,7 @@ class Branching:
         if keyframes not in self._named:
             self._areas = max(self._areas, parent.hybrid_map.largest_area) + 1
             self._named[keyframes] = self._areas
-        origin = PoseGaussian(np.zeros(3), self._floor)
+        origin = _exactly(np.zeros(3))
         return self._entered(parent, query, self._named[keyframes], origin, query.belief, log_factor)
 
     def _enter_tracked(self, parent: Parent, query: Query, area: int) -> Child:
@@ -242,7 +242,7 @@ class Branching:
             parent.log_weight + log_factor,
             area,
             parent.notes.entered(covariances),
-            entry.compose(query.belief.inverse()),
+            entry.compose(_exactly(se2.inverse(query.belief.mean))),
             relabelled,
             () if arc is None else (self._arc(parent, area, arc),),
             reload=True,
@@ -266,6 +266,10 @@ class Branching:
         arc = Arc(parent.area, fit.area, query.belief.compose(fit.mode.measured.inverse()), closure=True)
         log_weight = parent.log_weight + fit.log_weight
         return Child(parent.hypothesis, log_weight, parent.area, parent.notes, arcs=(arc,), reload=True)
+
+
+def _exactly(pose: NDArray[np.float64]) -> PoseGaussian:
+    return PoseGaussian(pose, np.zeros((3, 3)))
 
 
 def _log(value: float) -> float:

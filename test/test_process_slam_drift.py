@@ -1,0 +1,107 @@
+"""How far off a live hypothesis takes its pose to be in its area's frame."""
+
+import numpy as np
+import pytest
+from worlds import drive, scan_in
+
+from hmt_slam_ros.configuration import Configuration
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.local_map.area_filter import AreaFilter, PlacedKeyframe
+from hmt_slam_ros.local_map.local_mapping import LocalMapping
+from hmt_slam_ros.processes.live_hypothesis import LiveHypothesis
+from hmt_slam_ros.processes.messages import Leaf, Relabelled
+from hmt_slam_ros.sensing.motion import Prediction, Step
+
+CORRIDOR = np.array([[-200.0, -1.0, 200.0, -1.0], [-200.0, 1.0, 200.0, 1.0]])
+ODOMETRY = np.diag([0.05, 0.05, 0.025]) ** 2
+THERE = drive((0.0, 0.1), (8.0, 0.1))
+AGAIN = drive((0.1, 0.1), (8.1, 0.1))
+
+
+class Drive:
+    """A hypothesis that is driven in a corridor."""
+
+    def __init__(self):
+        configuration = Configuration()
+        self.mapping = LocalMapping(configuration)
+        self.live = LiveHypothesis(AreaFilter(self.mapping, 0, 0), configuration.filter)
+        self.truth, self.scans = THERE[0], {}
+        self.to(THERE[0])
+
+    def to(self, pose):
+        """Drive to a pose and take a keyframe there; what it says."""
+        step = Step(se2.between(self.truth, pose), ODOMETRY)
+        sequence, self.truth = len(self.scans), pose
+        scan = self.scans[sequence] = scan_in(CORRIDOR, pose, noise=0.01, seed=sequence)
+        points = self.mapping.matching_points(scan)
+        if sequence:
+            self.live.filter.track(points, Prediction(step, step, step))
+        return self.live.event(sequence, scan, points)
+
+    def along(self, poses):
+        return [self.to(pose) for pose in poses]
+
+
+def deviations(estimate):
+    return np.sqrt(np.diag(estimate.pose.covariance))
+
+
+@pytest.fixture(scope="module")
+def driven():
+    """There by 15 steps, and after a leap back once more over the same ground."""
+    drive_ = Drive()
+    return drive_.along(THERE[1:]), drive_.along(AGAIN)
+
+
+def test_over_ground_that_is_mapped_a_bare_corridor_bounds_the_drift_across_alone(driven):
+    there, again = driven
+    assert all(estimate.stored for estimate in there)
+    assert not any(estimate.stored for estimate in again)
+    first, last = deviations(there[-1]), deviations(again[-1])
+    assert first[0] == pytest.approx(0.05 * np.sqrt(15), rel=0.15)
+    assert last[0] == pytest.approx(0.05 * np.sqrt(31), rel=0.15)
+    assert last[1] < 0.5 * 0.05 * np.sqrt(31)
+
+
+def test_where_the_map_is_as_far_off_as_its_keyframes_so_is_a_pose_in_it(driven):
+    there, again = driven
+    near, far = deviations(again[1]), deviations(again[-1])
+    assert near[2] < far[2]
+    assert far[2] == pytest.approx(deviations(there[-1])[2], rel=0.5)
+
+
+def entered(live, moved, rebase):
+    """After TSBI sent the robot into area 1, with some keyframes."""
+    poses = dict(zip(live.filter.keyframes, live.filter.leading_keyframe_poses(), strict=True))
+    relabelled = tuple(Relabelled(k, 0, 1, se2.compose(rebase.mean, poses[k])) for k in moved)
+    return Leaf(0, 0, 1.0, 1, rebase, relabelled), poses
+
+
+@pytest.mark.parametrize("sigma", [0.0, 0.3])
+def test_a_robot_that_enters_an_area_is_as_uncertain_in_it_as_its_keyframes_that_came_over(sigma):
+    driven = Drive()
+    driven.along(THERE[1:])
+    live = driven.live
+    reference = live.filter.leading_keyframe_poses()[12]
+    entry = PoseGaussian(np.array([1.0, 2.0, 0.5]), np.diag([sigma, sigma, 0.0]) ** 2)
+    rebase = entry.compose(PoseGaussian(se2.inverse(reference), np.zeros((3, 3))))
+    leaf, poses = entered(live, (12, 13, 14, 15), rebase)
+    content = [PlacedKeyframe(k, 1, driven.scans[k], se2.compose(rebase.mean, poses[k])) for k in range(16)]
+    live.change_area(leaf, content)
+    np.testing.assert_allclose(se2.compose(entry.mean, se2.between(reference, poses[15])), live.filter.pose, atol=1e-9)
+    expected = sigma**2 + 3 * 0.05**2
+    assert live.drift[0, 0] == pytest.approx(expected, rel=0.1)
+    assert live.belief().covariance[0, 0] >= expected * 0.9
+
+
+def test_a_robot_that_goes_back_into_an_area_is_as_far_off_as_the_map_there_and_along_it_as_the_arc():
+    drive_ = Drive()
+    drive_.along(THERE[1:])
+    live, rebase = drive_.live, PoseGaussian(np.array([-1.0, 0.0, 0.0]), np.diag([0.4, 0.4, 0.0]) ** 2)
+    before = live.drift
+    leaf, poses = entered(live, (), rebase)
+    content = [PlacedKeyframe(k, 1, drive_.scans[k], se2.compose(rebase.mean, poses[k])) for k in range(16)]
+    live.change_area(leaf, content)
+    assert live.drift[0, 0] == pytest.approx(before[0, 0] + 0.16, rel=0.2)
+    assert live.drift[1, 1] < 0.05
