@@ -27,7 +27,7 @@ def chain(covariance=SHARP):
 def entered(area, pose, covariance=SHARP):
     """From area 3 the robot came into a known one, where it is at ``area_T_base``."""
     hybrid_map = chain(VAGUE)
-    hybrid_map.set_arc(3, area, PoseGaussian(np.array([-5.0, 0.0, 0.0]), covariance), closure=True)
+    hybrid_map.set_arc(3, area, PoseGaussian(area * STEP - np.array([5.0, 0.0, 0.0]), covariance), closure=True)
     return Claim(hybrid_map, area, pose, {area})
 
 
@@ -59,6 +59,28 @@ def test_known_ground_is_a_claim_of_its_own():
     recognised = entered(0, POSE)
     assert not tracked.equals(recognised)
     assert not recognised.equals(tracked)
+
+
+def with_another_loop(claim, covariance=SHARP):
+    """The same, and the robot's area is said to lie beside area 2 as well."""
+    claim.hybrid_map.set_arc(claim.area, 2, PoseGaussian(2.0 * STEP, covariance), closure=True)
+    return claim
+
+
+@pytest.mark.parametrize("covariance", [SHARP, 100.0 * SHARP])
+def test_a_further_loop_is_a_claim_of_its_own(covariance):
+    open_still, closed = entered(0, POSE), with_another_loop(entered(0, POSE), covariance)
+    assert not open_still.equals(closed)
+    assert not closed.equals(open_still)
+
+
+def test_a_loop_that_one_hypothesis_closes_by_two_arcs_and_one_by_the_second_is_one_claim():
+    direct, around = entered(0, POSE), with_another_loop(entered(0, POSE))
+    for claim in (direct, around):
+        claim.hybrid_map.set_arc(0, 1, PoseGaussian(STEP, SHARP), closure=False)
+        claim.hybrid_map.set_arc(1, 2, PoseGaussian(STEP, SHARP), closure=False)
+    assert direct.equals(around)
+    assert around.equals(direct)
 
 
 def test_what_a_hypothesis_is_uncertain_of_it_does_not_claim():

@@ -103,6 +103,15 @@ class HybridMap:
         key = _stored_direction(a, b)
         return self.arcs[key] if key in self.arcs else self.common.arcs.get(key)
 
+    @property
+    def claimed_closures(self) -> dict[tuple[int, int], ArcValue]:
+        """The arcs by which this hypothesis closed loops that the common map leaves open."""
+        return {
+            pair: arc
+            for pair, arc in self.arcs.items()
+            if arc is not None and arc.closure and pair not in self.common.arcs
+        }
+
     def set_arc(self, a: int, b: int, pose: PoseGaussian, *, closure: bool) -> None:
         """Set or replace the arc between a and b from the belief over ``a_T_b``."""
         self.arcs[_stored_direction(a, b)] = ArcValue(pose if a < b else pose.inverse(), closure)

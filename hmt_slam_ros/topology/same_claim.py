@@ -15,11 +15,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.topology.common_map import ArcValue, Pair
 from hmt_slam_ros.topology.hybrid_map import HybridMap
 from hmt_slam_ros.topology.shortest_path import reachable
 
-# Fine alignment brings together what lies so far apart. Where a hypothesis is less certain than this, it says nothing.
+# Fine alignment brings together what lies so far apart.
 _DISTANCE, _ANGLE = 0.5, math.radians(5.0)
+_ALIGNED = np.diag([0.5 * _DISTANCE, 0.5 * _DISTANCE, 0.5 * _ANGLE]) ** 2
+# Variance of a position, m^2, above which a hypothesis says nothing of it.
+_CERTAIN = 1.0
+_SAME = 7.81  # chi-square with 3 degrees of freedom at 95 %
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,36 +46,69 @@ class Claim:
     @cached_property
     def seen_from(self) -> Mapping[int, NDArray[np.float64]]:
         """{area: ``area_T_base``} of the areas relative to which the hypothesis is certain of the robot's place."""
-        found = reachable(self.hybrid_map, self.area, cost_limit=_DISTANCE**2)
+        found = reachable(self.hybrid_map, self.area, cost_limit=_CERTAIN)
         return {area: se2.between(belief.mean, self.pose) for area, belief in found.items()}
 
     @cached_property
-    def loops(self) -> tuple[bool, frozenset[tuple[int, int]]]:
-        """Whether an arc closed a loop that the definite map leaves open, and which definite arcs are withdrawn."""
-        own, definite = self.hybrid_map.arcs, self.hybrid_map.common.arcs
-        closes = any(value is not None and value.closure and pair not in definite for pair, value in own.items())
-        return closes, frozenset(pair for pair, value in own.items() if value is None)
+    def closures(self) -> Mapping[Pair, ArcValue]:
+        """The arcs that closed loops which the definite map leaves open."""
+        return self.hybrid_map.claimed_closures
+
+    @cached_property
+    def withdrawn(self) -> frozenset[Pair]:
+        """The definite arcs that the hypothesis lacks."""
+        return frozenset(pair for pair, arc in self.hybrid_map.arcs.items() if arc is None)
 
     def equals(self, other: Claim) -> bool:
-        """Whether both have the robot at the same place of all areas around that both have.
+        """Whether both have the robot at the same place of all areas around that both have, and close the same loops.
 
         That it is in known ground is a claim of its own, even where the arcs alone would have it there.
         """
-        if self.loops != other.loops:
+        if bool(self.closures) != bool(other.closures) or self.withdrawn != other.withdrawn:
             return False
-        both = {
-            area
-            for area in {*self.around, *other.around}
-            if self.hybrid_map.has_area(area) and other.hybrid_map.has_area(area)
-        }
-        return bool(both) and all(self._agrees(other, area) for area in both)
+        both = {area for area in {*self.around, *other.around} if self._has(area) and other._has(area)}
+        return (
+            bool(both)
+            and all(self._agrees(other, area) for area in both)
+            and all(other._joins(pair, arc) for pair, arc in self.closures.items())
+            and all(self._joins(pair, arc) for pair, arc in other.closures.items())
+        )
+
+    def _has(self, *areas: int) -> bool:
+        return all(map(self.hybrid_map.has_area, areas))
+
+    def _joins(self, pair: Pair, arc: ArcValue) -> bool:
+        """Whether an arc of another hypothesis is no news: this one has the two areas there, and is certain of it or
+        closed that loop itself.
+
+        Areas that only the other has are not asked for.
+        """
+        if not self._has(*pair):
+            return True
+        own = self.closures.get(pair)
+        known = self._certain(pair, arc) if own is None else own.pose
+        return known is not None and _admits(arc.pose, known.mean)
+
+    def _certain(self, pair: Pair, arc: ArcValue) -> PoseGaussian | None:
+        """Where the hypothesis has the second of two areas seen from the first, if it is not much less certain of that
+        than an arc is.
+        """
+        limit = max(_CERTAIN, 4.0 * float(np.trace(arc.pose.covariance[:2, :2])))
+        return reachable(self.hybrid_map, pair[0], limit, until=pair[1:]).get(pair[1])
 
     def _agrees(self, other: Claim, area: int) -> bool:
         here, there = self.seen_from.get(area), other.seen_from.get(area)
-        if here is None or there is None:
-            return False
-        apart = se2.between(here, there)
-        return math.hypot(apart[0], apart[1]) <= _DISTANCE and abs(float(apart[2])) <= _ANGLE
+        return here is not None and there is not None and _close(here, there)
+
+
+def _close(one: NDArray[np.float64], other: NDArray[np.float64]) -> bool:
+    apart = se2.between(one, other)
+    return math.hypot(apart[0], apart[1]) <= _DISTANCE and abs(float(apart[2])) <= _ANGLE
+
+
+def _admits(belief: PoseGaussian, pose: NDArray[np.float64]) -> bool:
+    """Whether a belief, after fine alignment, may come to be at a pose."""
+    return belief.mahalanobis2(PoseGaussian(pose, _ALIGNED)) <= _SAME
 
 
 def merged(claims: Sequence[Claim], log_weights: Sequence[float]) -> dict[int, float]:
