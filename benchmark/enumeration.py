@@ -21,7 +21,8 @@ from hmt_slam_ros.geometry.chi_square import gate
 from hmt_slam_ros.processes.replica import FIRST_HYPOTHESIS, Replica
 from hmt_slam_ros.processes.tsbi_branching import Branching, Child, Parent
 from hmt_slam_ros.sensing import Scan
-from hmt_slam_ros.topology.closure_search import Candidate, ClosureSearch, Comparison, Query
+from hmt_slam_ros.topology.admission import Candidate, Query
+from hmt_slam_ros.topology.closure_search import ClosureSearch, Comparison
 from hmt_slam_ros.topology.hybrid_map import HybridMap
 from hmt_slam_ros.topology.hypothesis_tree import LeafNotes
 from hmt_slam_ros.topology.shortest_path import reachable
@@ -58,14 +59,16 @@ class _EverywhereSearch(ClosureSearch):
         }
         beliefs = reachable(hybrid_map, area)
         asked = [known for known, own in fresh.items() if 2 * len(own) >= len(query.poses)]
-        candidates = {known: Candidate(self._prior(beliefs[known], query), fresh[known], 1.0) for known in asked}
+        priors = {known: self.admission.prior(beliefs[known], query) for known in asked}
+        candidates = {known: Candidate(prior, fresh[known], 1.0) for known, prior in priors.items()}
         places = {known: self._views.place(hybrid_map, known, excluded) for known in candidates}
         entries = {known: self._entry(place, candidates[known]) for known, place in places.items()}
         shares = {known: found.share for known, found in entries.items() if found.share}
         total = sum(shares.values())
         new = max(1.0 - total, options.new_probability) if total else 1.0
         if shares:
-            self._count_likeness(hybrid_map, query, self._divided(hybrid_map, area, query, excluded)[2], excluded)
+            elsewhere = self.admission.divided(hybrid_map, area, query, excluded)[2]
+            self._count_likeness(hybrid_map, query, elsewhere, excluded)
         fits = [
             fit
             for known, share in shares.items()
@@ -91,6 +94,11 @@ class _Topology:
     notes: LeafNotes
     robot: Robot
     log_weight: float
+
+    @property
+    def parent(self) -> Parent:
+        """The hypothesis that it is at the next event."""
+        return Parent(FIRST_HYPOTHESIS, self.robot.area, self.hybrid_map, self.notes, self.log_weight)
 
 
 class Enumeration:
@@ -121,7 +129,7 @@ class Enumeration:
         self._sequence += 1
         self._replica.scans[self._sequence] = scan
         self._branching.begin_event()
-        noted = [self._noted(topology, step) for topology in self._topologies]
+        noted = [self._recognized(self._noted(topology, step), scan) for topology in self._topologies]
         if cut:
             newest = range(self._sequence + 1 - cut, self._sequence + 1)
             noted = [child for topology in noted for child in self._children(topology, newest)]
@@ -137,11 +145,14 @@ class Enumeration:
         topology.hybrid_map.place(self._sequence, robot.area, robot.pose.mean)
         return replace(topology, robot=robot, notes=topology.notes.stored(self._sequence, robot.pose.covariance))
 
+    def _recognized(self, topology: _Topology, scan: Scan) -> _Topology:
+        """Weighed by what the newest scan says for the known ground that the robot is in."""
+        pose = topology.robot.pose.mean
+        found = self._branching.recognized(topology.parent, pose, scan, self._sequence)
+        return replace(topology, log_weight=found.log_weight)
+
     def _children(self, topology: _Topology, newest: Sequence[int]) -> Iterator[_Topology]:
-        parent = Parent(
-            FIRST_HYPOTHESIS, topology.robot.area, topology.hybrid_map, topology.notes, topology.log_weight
-        )
-        branches = self._branching.cut(parent, newest)
+        branches = self._branching.cut(topology.parent, newest)
         self.asked |= any(child.notes.compared for child in branches.children)
         for child in branches.children:
             yield self._followed(topology, child)

@@ -65,6 +65,9 @@ MAPS = Contradiction(extra=0.03, strength=500.0, stretch=5.0)
 MAPS_USUAL = 0.0074
 """Share of a map's surfaces that contradict another map of the same place."""
 
+KNOWN = Contradiction(extra=0.03, strength=500.0, stretch=10.0)
+"""The surfaces of one scan, one sample every 0.2 m, in a map of long before; the next scan sees half of them again."""
+
 SCAN = Contradiction(extra=0.03, strength=500.0, stretch=20.0)
 """The beams of one scan in the map of what the robot saw around: the scans before and after see the same."""
 

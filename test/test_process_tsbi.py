@@ -110,17 +110,22 @@ def ring_with_two_leaves(apart=1.0):
     """Two live hypotheses that have the robot ``apart``, m, as TSBI would have made them."""
     run = Run(RING)
     run.keyframe(np.array([3.0, 1.0, 0.0]))
-    split = Hypotheses(0, (Leaf(1, 0, 0.6, 0), Leaf(2, 0, 0.4, 0)))
+    split_in_two(run, np.array([apart, 0.0, 0.0]))
+    return run
+
+
+def split_in_two(run, apart):
+    """Leaf 1 where the robot is, leaf 2 at the pose ``apart`` from there."""
+    split = Hypotheses(len(run.answers) - 1, (Leaf(1, 0, 0.6, 0), Leaf(2, 0, 0.4, 0)))
     for replica in (run.replica, run.tsbi._replica):
         replica.apply(split)
     run.tsbi._notes = dict.fromkeys((1, 2), run.tsbi._notes[0])
-    run.poses = {1: np.zeros(3), 2: np.array([apart, 0.0, 0.0])}
+    run.poses = {1: run.poses[0], 2: se2.compose(run.poses[0], apart)}
     run.covariances = {1: STEP, 2: STEP}
-    return run, split
 
 
 def test_the_evidence_of_the_scans_shifts_the_weights():
-    run, _ = ring_with_two_leaves()
+    run = ring_with_two_leaves()
     first, second = sorted(run.poses)
     before = dict(run.replica.probabilities)
     run.evidence = {first: 0.0, second: 1.5}
@@ -130,15 +135,38 @@ def test_the_evidence_of_the_scans_shifts_the_weights():
 
 
 def test_hypotheses_that_say_the_same_become_one_with_the_weight_of_both():
-    run, _ = ring_with_two_leaves(apart=0.2)
+    run = ring_with_two_leaves(apart=0.2)
     run.evidence = {1: 0.0, 2: 1.5}
     (leaf,) = run.keyframe(run.true_pose).leaves
     assert leaf.hypothesis == 2
     assert leaf.probability == pytest.approx(1.0)
 
 
+def odds_after_return(keyframes, apart):
+    """p(hypothesis 1) / p(hypothesis 2), which is ``apart`` from it, of a robot that is back after so many keyframes,
+    relative to what it was before.
+    """
+    run, poses = Run(RING), ring_drive(keyframes)
+    for pose in poses:
+        run.keyframe(pose)
+    run.keyframe(poses[4])
+    split_in_two(run, np.array(apart))
+    first, second = (leaf.probability for leaf in run.keyframe(poses[5]).leaves)
+    return first / second / 1.5
+
+
+def test_a_scan_speaks_for_known_ground_where_it_agrees_and_against_it_where_it_does_not():
+    in_the_wall, in_new_ground = odds_after_return(60, [0.0, 0.8, 0.0]), odds_after_return(60, [50.0, 0.0, 0.0])
+    assert 1.05 < in_new_ground < 2.0
+    assert in_the_wall > 2.0 * in_new_ground
+
+
+def test_what_was_seen_just_before_is_no_known_ground():
+    assert odds_after_return(12, [50.0, 0.0, 0.0]) == pytest.approx(1.0)
+
+
 def test_acceptance_leaves_one_hypothesis():
-    run, _ = ring_with_two_leaves()
+    run = ring_with_two_leaves()
     run.accept(2)
     (leaf,) = run.keyframe(run.true_pose).leaves
     assert (leaf.hypothesis, leaf.parent, leaf.probability) == (2, 2, 1.0)

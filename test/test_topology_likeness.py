@@ -62,22 +62,29 @@ def test_where_nothing_is_seen_nothing_fits():
 
 def test_a_fit_tells_the_more_the_rarer_it_is():
     likeness = Likeness(0.25)
-    assert likeness.log_rarity(0.9) == pytest.approx(math.log(4.0))
+    assert likeness.log_rarity(0.9, foretold=False) == pytest.approx(math.log(4.0))
     likeness.count([0.2] * 38)
-    assert likeness.log_rarity(0.9) == pytest.approx(math.log(40.0 / 0.5))
-    assert likeness.log_rarity(0.2) == pytest.approx(math.log(40.0 / 38.5))
+    assert likeness.log_rarity(0.9, foretold=False) == pytest.approx(math.log(40.0 / 0.5))
+    assert likeness.log_rarity(0.2, foretold=False) == pytest.approx(math.log(40.0 / 38.5))
     likeness.count([0.95] * 20)
-    assert likeness.log_rarity(0.9) == pytest.approx(math.log(60.0 / 20.5))
+    assert likeness.log_rarity(0.9, foretold=False) == pytest.approx(math.log(60.0 / 20.5))
 
 
 def test_a_fit_that_is_hardly_better_is_not_better():
     likeness = Likeness(0.25)
     likeness.count([0.96] * 8)
-    assert likeness.log_rarity(0.97) == pytest.approx(math.log(10.0 / 8.5))
-    assert likeness.log_rarity(0.99) == pytest.approx(math.log(10.0 / 0.5))
+    assert likeness.log_rarity(0.97, foretold=False) == pytest.approx(math.log(10.0 / 8.5))
+    assert likeness.log_rarity(0.99, foretold=False) == pytest.approx(math.log(10.0 / 0.5))
+
+
+def test_a_fit_that_was_to_be_expected_tells_little():
+    likeness = Likeness(0.25)
+    likeness.count([0.2] * 38)
+    assert likeness.log_rarity(0.9, foretold=True) == pytest.approx(math.log(2.5))
+    assert likeness.log_rarity(0.2, foretold=True) == likeness.log_rarity(0.2, foretold=False)
 
 
 def test_that_a_building_looks_alike_everywhere_is_learnt():
     likeness = Likeness(0.25)
     likeness.count([1.0] * 64)
-    assert 0.0 < likeness.log_rarity(1.0) < 0.03
+    assert 0.0 < likeness.log_rarity(1.0, foretold=False) < 0.03

@@ -9,8 +9,9 @@ from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.processes.replica import Replica
 from hmt_slam_ros.processes.tsbi_branching import Branches, Branching, Parent
 from hmt_slam_ros.sensing import Scan
+from hmt_slam_ros.topology.admission import Query
 from hmt_slam_ros.topology.area_grid import AreaGrid
-from hmt_slam_ros.topology.closure_search import ClosureSearch, Comparison, Pose, Query
+from hmt_slam_ros.topology.closure_search import ClosureSearch, Comparison, Pose
 from hmt_slam_ros.topology.hybrid_map import HybridMap
 from hmt_slam_ros.topology.surroundings import Views
 

@@ -89,7 +89,8 @@ class Tsbi:
         self._branching.begin_event()
         by_hypothesis = {event.hypothesis: event for event in events.events}
         keyframe = self._keyframe
-        branches = [self._branch(parent, by_hypothesis.get(parent.hypothesis), keyframe) for parent in self._parents()]
+        parents = self._parents(keyframe)
+        branches = [self._branch(parent, by_hypothesis.get(parent.hypothesis), keyframe) for parent in parents]
         children = [child for branch in branches for child in branch.children]
         settled = self._settle(events.sequence, children, branches)
         chosen = [children[k] for k in settled.kept]
@@ -100,13 +101,18 @@ class Tsbi:
         leaves = tuple(sorted(loaded, key=lambda leaf: leaf.hypothesis))
         return Hypotheses(events.sequence, leaves, settled.unexamined)
 
-    def _parents(self) -> list[Parent]:
+    def _parents(self, keyframe: Keyframe) -> list[Parent]:
         """The live hypotheses with their weights; of those that say the same, the heaviest, with the weight of all."""
         parents = [self._parent(hypothesis) for hypothesis in sorted(self._notes)]
         if len(parents) == 1:
             return parents
+        poses = [self._estimates[parent.hypothesis].pose.mean for parent in parents]
+        parents = [
+            self._branching.recognized(parent, pose, keyframe.scan, keyframe.sequence)
+            for parent, pose in zip(parents, poses, strict=True)
+        ]
         claims = [
-            Claim(p.hybrid_map, p.area, self._estimates[p.hypothesis].pose.mean, {p.area, *p.around()}) for p in parents
+            Claim(p.hybrid_map, p.area, pose, {p.area, *p.around()}) for p, pose in zip(parents, poses, strict=True)
         ]
         weights = merged(claims, [parent.log_weight for parent in parents])
         return [replace(parents[n], log_weight=weight) for n, weight in sorted(weights.items())]
@@ -180,7 +186,7 @@ class Tsbi:
             return leaf
         around = areas_around(self._replica.maps[leaf.hypothesis], leaf.area, self._branching.search.nearness)
         poses = {
-            area: agreeing(belief, leaf.area, area, self._global_poses, self._branching.search.gate)
+            area: agreeing(belief, leaf.area, area, self._global_poses, self._branching.search.admission.gate)
             for area, belief in around.items()
             if area != leaf.area
         }

@@ -21,7 +21,8 @@ from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.processes.messages import Arc, ArcEnds, Relabelled
 from hmt_slam_ros.processes.replica import FIRST_AREA, Replica
 from hmt_slam_ros.sensing import Scan
-from hmt_slam_ros.topology.closure_search import ClosureSearch, Comparison, Fit, Query
+from hmt_slam_ros.topology.admission import Query
+from hmt_slam_ros.topology.closure_search import ClosureSearch, Comparison, Fit
 from hmt_slam_ros.topology.hybrid_map import HybridMap
 from hmt_slam_ros.topology.hypothesis_tree import LeafNotes, relative_covariance
 from hmt_slam_ros.topology.shortest_path import reachable
@@ -108,6 +109,16 @@ class Branching:
     def begin_event(self) -> None:
         """Forget which new areas were named; within one event hypotheses share the ids of the same new area."""
         self._named = {}
+
+    def recognized(self, parent: Parent, pose: NDArray[np.float64], scan: Scan, keyframe: int) -> Parent:
+        """The hypothesis weighed by what the newest scan says for the known ground that it has the robot in.
+
+        :param pose: ``area_T_base`` of the scan.
+        :param keyframe: its number.
+        """
+        poses = {parent.area: np.zeros(3), **parent.around()}
+        log_ratio = self.search.recognized(parent.hybrid_map, poses, scan, pose, keyframe)
+        return replace(parent, log_weight=parent.log_weight + log_ratio)
 
     def cut(self, parent: Parent, keyframes: Sequence[int]) -> Branches:
         """{new area} and every known area that the arcs admit, with one child a mode.

@@ -5,52 +5,31 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hmt_slam_ros.agreement import MAPS, MAPS_USUAL
+from hmt_slam_ros.agreement import KNOWN, MAPS, MAPS_USUAL
 from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.geometry.chi_square import gate
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.sensing import Scan
+from hmt_slam_ros.topology.admission import Admission, Candidate, Query
 from hmt_slam_ros.topology.appearance import appearance_log_ratio, signature
 from hmt_slam_ros.topology.area_grid import AreaGrid, GridModel, build_area_grid
 from hmt_slam_ros.topology.area_matching import MatchSettings, Mode, match
 from hmt_slam_ros.topology.hybrid_map import HybridMap
 from hmt_slam_ros.topology.likeness import Elsewhere, Likeness, best_shares
-from hmt_slam_ros.topology.shortest_path import Reached, reached
-from hmt_slam_ros.topology.surroundings import Nearness, Views, entry_bounds, gap, positions, stacked
-from hmt_slam_ros.topology.transition import Entry, Place, Transition, entry, entry_bound, owner_at, transition
+from hmt_slam_ros.topology.surroundings import Nearness, Views, gap, positions, stacked
+from hmt_slam_ros.topology.transition import Entry, Place, Transition, entry, owner_at, transition
 
 Pose = NDArray[np.float64]
 
 # Modes this far below the best are looked at, nats: the best may lie in the place of another area.
 _MARGIN = 20.0
-# Areas within reach of which the keyframes are looked at, where the arcs admit many.
-_LOOKED_AT = 64
-# Areas in which the keyframes surely do not lie that they are compared with all the same.
-_ELSEWHERE = 6
-
-
-@dataclass(frozen=True, eq=False)
-class Query:
-    """Keyframes in question.
-
-    :ivar belief: over ``area_T_reference``, of the area that they are in; the reference is the first keyframe.
-    :ivar poses: {keyframe: ``reference_T_base``}.
-    """
-
-    belief: PoseGaussian
-    poses: Mapping[int, Pose]
-
-    @property
-    def in_area(self) -> NDArray[np.float64]:
-        """``area_T_base`` of the keyframes, shape (n, 3)."""
-        return se2.compose(self.belief.mean, stacked(self.poses))
+# Keyframe events after which what was seen is known ground, and in steps of how many.
+_LONG_AGO, _RENEWED = 30, 20
 
 
 class Fit(NamedTuple):
@@ -79,30 +58,21 @@ class Comparison(NamedTuple):
     skipped: float
 
 
-class Candidate(NamedTuple):
-    """A known area in which the query may lie.
-
-    :ivar prior: belief over ``candidate_T_reference`` by the arcs.
-    :ivar fresh: {keyframe: ``reference_T_base``} of those not yet compared with it.
-    :ivar most: a bound on the probability that they lie in its place, above 0.
-    """
-
-    prior: PoseGaussian
-    fresh: Mapping[int, Pose]
-    most: float
-
-
 class ClosureSearch:
-    """Compares keyframes with the areas of a hybrid map."""
+    """Compares keyframes with the areas of a hybrid map.
+
+    :ivar admission: which areas come into question.
+    :ivar nearness: which areas count as around another.
+    """
 
     def __init__(self, configuration: Configuration, scans: Mapping[int, Scan]) -> None:
         """:param scans: {keyframe: scan}, which may grow."""
         self._options = options = configuration.tsbi
         self._scans = scans
-        self.gate = gate(options.gate_probability)
+        self.admission = Admission(options)
         self.nearness = Nearness(options.local_sigma, options.local_reach)
         self._settings = MatchSettings(
-            options.temper, self.gate, _MARGIN, max(MatchSettings.max_modes, 2 * options.max_modes)
+            options.temper, self.admission.gate, _MARGIN, max(MatchSettings.max_modes, 2 * options.max_modes)
         )
         self._model = GridModel(
             options.search_cell, options.surface_sigma, options.surface_ratio, options.free_ratio,
@@ -139,6 +109,20 @@ class ClosureSearch:
         found = match(query, place.grid, prior, self._settings).modes
         return found[0].measured if found else None
 
+    def recognized(
+        self, hybrid_map: HybridMap, poses: Mapping[int, Pose], scan: Scan, pose: Pose, keyframe: int
+    ) -> float:
+        """log p(scan | the robot is there) / p(scan | it is in a place that looks alike), by what was seen long before.
+
+        :param poses: {area: ``area_T_other``} of the areas that the robot is in or beside.
+        :param pose: ``area_T_base`` of the scan.
+        :param keyframe: the newest.
+        """
+        before = (keyframe - _LONG_AGO) // _RENEWED * _RENEWED
+        grid = self._views.seen_before(hybrid_map, poses, before)
+        points = build_area_grid([scan], np.zeros((1, 3)), self._model).points
+        return KNOWN.log_ratio(grid.agreement(points, pose), MAPS_USUAL)
+
     def compare(
         self, hybrid_map: HybridMap, area: int, query: Query, compared: Mapping[int, Collection[int]],
         excluded: Collection[int], most: int,
@@ -150,8 +134,8 @@ class ClosureSearch:
         :param excluded: areas that are neither candidates nor part of a candidate's map.
         :param most: this many areas are examined at most, those that the keyframes are most probably in.
         """  # fmt: skip
-        within, distant, elsewhere = self._divided(hybrid_map, area, query, excluded)
-        candidates = self._candidates(hybrid_map, query, compared, within)
+        within, distant, elsewhere = self.admission.divided(hybrid_map, area, query, excluded)
+        candidates = self.admission.candidates(hybrid_map, query, compared, within)
         ranked = sorted(candidates, key=lambda known: (-candidates[known].most, known))
         looked_at, rest = ranked[:most], {known: candidates[known].most for known in ranked[most:]} | distant
         places = {known: self._views.place(hybrid_map, known, excluded) for known in looked_at}
@@ -187,73 +171,17 @@ class ClosureSearch:
         poses = stacked(hybrid_map.keyframes(area))
         return Elsewhere(self._views.place(hybrid_map, area, excluded).grid, poses[len(poses) // 2])
 
-    def _divided(
-        self, hybrid_map: HybridMap, area: int, query: Query, excluded: Collection[int]
-    ) -> tuple[dict[int, PoseGaussian], dict[int, float], list[int]]:
-        """The known areas in which the query may lie, and some of those in which it surely does not.
-
-        :returns: the priors of those that are looked at; where they are too many, of the others a bound on the
-            probability that the query lies there; and areas elsewhere.
-        """
-        found = reached(hybrid_map, area, self._options.prior_limit**2)
-        bounds = np.where(np.isin(found.areas, list(excluded)), 0.0, self._entry_bounds(hybrid_map, found, query))
-        order = np.argsort(-bounds, kind="stable")[: np.count_nonzero(bounds)]
-        within = {}
-        for i in order[:_LOOKED_AT]:
-            prior = self._prior(PoseGaussian(found.means[i], found.covariances[i]), query)
-            if self._within_reach(hybrid_map, int(found.areas[i]), prior, query.poses):
-                within[int(found.areas[i])] = prior
-        others = order[_LOOKED_AT:]
-        distant = dict(zip(found.areas[others].tolist(), bounds[others].tolist(), strict=True))
-        known = ~np.isin(found.areas, [*excluded, *within, *distant])
-        elsewhere = np.sort(found.areas[known])
-        return within, distant, elsewhere[:: max(1, -(-len(elsewhere) // _ELSEWHERE))].tolist()
-
-    def _entry_bounds(self, hybrid_map: HybridMap, found: Reached, query: Query) -> NDArray[np.float64]:
-        lever = float(np.hypot(*stacked(query.poses)[:, :2].T).max())
-        reach = hybrid_map.extents(found.areas) + lever + self._options.place_radius
-        return entry_bounds(found, query.belief, lever, reach, self._options.prior_scale, math.sqrt(self.gate))
-
-    def _candidates(
-        self, hybrid_map: HybridMap, query: Query, compared: Mapping[int, Collection[int]],
-        within: Mapping[int, PoseGaussian],
-    ) -> dict[int, Candidate]:
-        """The known areas within reach with which most of the query was not compared yet."""
-        found = {}
-        for known, prior in within.items():
-            fresh = {k: pose for k, pose in query.poses.items() if k not in compared.get(known, ())}
-            # An area with which most of the keyframes were compared has had its chance.
-            if 2 * len(fresh) >= len(query.poses) and self._within_reach(hybrid_map, known, prior, fresh):
-                at = positions(hybrid_map, known, np.zeros(3))
-                most = entry_bound(at, prior, stacked(fresh), self._options.place_radius)
-                if most > 0.0:
-                    found[known] = Candidate(prior, fresh, most)
-        return found
-
-    def _prior(self, belief: PoseGaussian, query: Query) -> PoseGaussian:
-        """``candidate_T_reference`` from ``area_T_candidate`` and ``area_T_reference``, widened."""
-        prior = belief.inverse().compose(query.belief)
-        return PoseGaussian(prior.mean, self._options.prior_scale**2 * prior.covariance)
-
-    def _within_reach(
-        self, hybrid_map: HybridMap, area: int, prior: PoseGaussian, poses: Mapping[int, Pose]
-    ) -> bool:
-        """Whether a keyframe of the area is near enough to one of the query's, somewhere within the gate."""
-        asked = se2.compose(prior.mean, stacked(poses))[:, :2]
-        lever = float(np.hypot(*(asked - prior.mean[:2]).T).max())
-        spread = math.sqrt(np.linalg.eigvalsh(prior.covariance[:2, :2])[-1]) + lever * math.sqrt(prior.covariance[2, 2])
-        known = positions(hybrid_map, area, np.zeros(3))
-        return gap(asked, known) <= self._options.place_radius + math.sqrt(self.gate) * spread
-
     def _fits(
         self, hybrid_map: HybridMap, place: Place, candidate: Candidate, pi: float, entered: Entry
     ) -> Iterator[Fit]:
         """The modes of the query in the candidate's place, which share its probability by their masses.
 
         The probability of the place is that of all poses in it. A mode that is farther off than these usually are has
-        less, as the prior has there.
+        less, as the prior has there. Where a loop that the hypothesis closed has the robot in that place anyway, the
+        fit was to be expected even if that loop is none.
         """
         known, fresh = hybrid_map.keyframes(place.area), candidate.fresh
+        foretold = entered.share > 0.5 and bool(hybrid_map.claimed_closures)
         look = appearance_log_ratio(self._signature(fresh), self._signature(known), self._options.appearance_weight)
         query = self._views.grid(fresh)
         bounds = self._bounds(place, query, fresh)
@@ -265,7 +193,7 @@ class ClosureSearch:
         whole = np.logaddexp.reduce([mode.log_mass for mode in modes]) if modes else 0.0
         for mode in modes:
             found = place.grid.agreement(query.points, mode.pose.mean)
-            same = MAPS.log_ratio(found, MAPS_USUAL) + self._likeness.log_rarity(found.share)
+            same = MAPS.log_ratio(found, MAPS_USUAL) + self._likeness.log_rarity(found.share, foretold=foretold)
             away = se2.log(se2.between(candidate.prior.mean, mode.pose.mean))
             distance = float(away @ np.linalg.solve(candidate.prior.covariance, away))
             off = -0.5 * max(0.0, distance - entered.typical)

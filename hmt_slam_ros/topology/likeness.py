@@ -30,6 +30,8 @@ _GATE = 6.25
 _MARGIN, _LEAST = 1.0, 0.25 * math.log(3.0)  # nat
 # As much as so many places counts what is believed before any was tried; so many are kept.
 _TRIED, _KEPT = 2.0, 64
+# What looks like another place at one spot does so in so many cases, at most, at the next.
+_ALIKE_NEXT = 0.4
 # How far the share of one and the same place varies.
 _SAME_SHARE = 0.02
 
@@ -74,7 +76,11 @@ class Likeness:
         """Keep what keyframes found in places where they do not lie."""
         self.shares.extend(shares)
 
-    def log_rarity(self, share: float) -> float:
-        """-log of the probability that keyframes elsewhere fit as well or better, nats."""
+    def log_rarity(self, share: float, *, foretold: bool) -> float:
+        """-log of the probability that keyframes elsewhere fit as well or better, nats.
+
+        :param foretold: whether earlier keyframes fitted, from which it follows that these lie in the place.
+        """
         as_well = sum(other > share - _SAME_SHARE for other in self.shares)
-        return math.log((_TRIED + len(self.shares)) / (_TRIED * self.alike + as_well))
+        rarity = math.log((_TRIED + len(self.shares)) / (_TRIED * self.alike + as_well))
+        return min(rarity, -math.log(_ALIKE_NEXT)) if foretold else rarity

@@ -155,6 +155,14 @@ class Views:
         while size > _KEPT and len(self._grids) > 1:
             size -= self._grids.popitem(last=False)[1].nbytes
 
+    def seen_before(self, hybrid_map: HybridMap, poses: Mapping[int, Pose], keyframe: int) -> AreaGrid:
+        """What keyframes before a given one saw, of the areas that stand at ``poses``, {area: pose}."""
+        old: dict[int, Pose] = {}
+        for area, pose in poses.items():
+            placed = {k: at for k, at in hybrid_map.keyframes(area).items() if k < keyframe}
+            old |= zip(placed, se2.compose(pose, stacked(placed)), strict=True)
+        return self.grid(old)
+
     def place(self, hybrid_map: HybridMap, area: int, without: Collection[int]) -> Place:
         """An area with those around it, so that an overlap is not cut off at the area's edge.
 
