@@ -25,7 +25,7 @@ Pose = NDArray[np.float64]
 # An area has few others around it; this bounds the work where hundreds are joined by tight arcs.
 _MOST_AROUND = 64
 # Grids are kept up to this size, bytes: those of some ten places of a large building.
-_KEPT = 3 << 23
+_KEPT = 4 << 23
 # What the bounds on distances have in hand, m, and the smallest that is not 0.
 _ROUNDING, _SMALLEST = 1e-6, 1e-300
 
