@@ -33,20 +33,27 @@ class Cut(NamedTuple):
     value: float
 
 
+@njit(cache=True)
 def ncut(similarity: NDArray[np.float64], side: NDArray[np.bool_]) -> float:
     """NCut of a given bipartition.
 
     :param similarity: shape (n, n), symmetric, not negative.
     :param side: shape (n,), True for one part.
     """
-    between = float(similarity[np.ix_(side, ~side)].sum())
-    degree = similarity.sum(axis=1)
-    return float(_value(np.array(between), np.array(degree[side].sum()), np.array(degree[~side].sum())))
+    between, one, other = 0.0, 0.0, 0.0
+    for i in range(len(side)):
+        for j in range(len(side)):
+            if side[i]:
+                one += similarity[i, j]
+                between += 0.0 if side[j] else similarity[i, j]
+            else:
+                other += similarity[i, j]
+    return _value(between, one, other)
 
 
-def _value(between: NDArray[np.float64], one: NDArray[np.float64], other: NDArray[np.float64]) -> NDArray[np.float64]:
-    shares = [np.divide(between, part, out=np.zeros_like(between), where=part > 0.0) for part in (one, other)]
-    return shares[0] + shares[1]
+@njit(cache=True)
+def _value(between: float, one: float, other: float) -> float:
+    return (between / one if one > 0.0 else 0.0) + (between / other if other > 0.0 else 0.0)
 
 
 def normalized_cut(
@@ -111,14 +118,12 @@ def _sweep(
     similarity: NDArray[np.float64], order: NDArray[np.intp], min_size: int, sizes: NDArray[np.int64]
 ) -> Cut | None:
     """The best of the bipartitions that divide ``order`` in two, or None where each has too small a part."""
-    within = _within_prefixes(similarity, order)[:-1]
-    assoc = np.cumsum(similarity.sum(axis=1)[order])
-    values = _value(np.maximum(assoc[:-1] - within, 0.0), assoc[:-1], assoc[-1] - assoc[:-1])
     size = np.cumsum(sizes[order])
     allowed = (size[:-1] >= min_size) & (size[-1] - size[:-1] >= min_size)
     if not allowed.any():
         return None
-    prefix = order[: int(np.argmin(np.where(allowed, values, np.inf))) + 1]
+    values = np.where(allowed, _values_of_prefixes(similarity, order), np.inf)
+    prefix = order[: int(np.argmin(values)) + 1]
     side = np.zeros(len(order), np.bool_)
     side[prefix] = True
     side ^= side[0]
@@ -126,15 +131,17 @@ def _sweep(
 
 
 @njit(cache=True)
-def _within_prefixes(similarity: NDArray[np.float64], order: NDArray[np.intp]) -> NDArray[np.float64]:
-    """The sums of the similarities within the first 1, 2, ... n nodes of an order, shape (n,)."""
-    to_prefix, within = np.zeros(len(order)), np.zeros(len(order))
-    for k in range(len(order)):
-        for j in range(len(order)):
-            to_prefix[j] += similarity[order[k], order[j]]
-        for j in range(k + 1):
-            within[k] += to_prefix[j]
-    return within
+def _values_of_prefixes(similarity: NDArray[np.float64], order: NDArray[np.intp]) -> NDArray[np.float64]:
+    """NCut of the first 1, 2, ... n - 1 nodes of an order and the others, shape (n - 1,)."""
+    values, to_prefix = np.empty(len(order) - 1), np.zeros(len(order))
+    total, assoc, within = similarity.sum(), 0.0, 0.0
+    for k in range(len(order) - 1):
+        node = order[k]
+        within += 2.0 * to_prefix[node] + similarity[node, node]
+        to_prefix += similarity[node]
+        assoc += similarity[node].sum()
+        values[k] = _value(max(assoc - within, 0.0), assoc, total - assoc)
+    return values
 
 
 def recursive_cut(
