@@ -108,6 +108,11 @@ def build_area_grid(scans: Sequence[Scan], poses: NDArray[np.float64], model: Gr
     return AreaGrid(origin, model.cell, _halved(fine), fine, free, thinned(hits, model.spacing))
 
 
+def surface_points(scan: Scan, model: GridModel) -> Points:
+    """The surface points of one scan, one a voxel, m, base frame, shape (n, 2)."""
+    return thinned(_end_points([scan], np.zeros((1, 3)), model.max_range)[0], model.spacing)
+
+
 def _blank(cell: float) -> AreaGrid:
     nothing = np.zeros((2, 2), dtype=np.float32)
     return AreaGrid(np.zeros(2), cell, nothing[:1, :1], nothing, np.zeros((1, 1), np.bool_), np.zeros((0, 2)))

@@ -17,7 +17,7 @@ from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.sensing import Scan
 from hmt_slam_ros.topology.admission import Admission, Candidate, Query
 from hmt_slam_ros.topology.appearance import appearance_log_ratio, signature
-from hmt_slam_ros.topology.area_grid import AreaGrid, GridModel, build_area_grid
+from hmt_slam_ros.topology.area_grid import AreaGrid, GridModel, build_area_grid, surface_points
 from hmt_slam_ros.topology.area_matching import MatchSettings, Mode, match
 from hmt_slam_ros.topology.hybrid_map import HybridMap
 from hmt_slam_ros.topology.likeness import Elsewhere, Likeness, best_shares
@@ -120,8 +120,7 @@ class ClosureSearch:
         """
         before = (keyframe - _LONG_AGO) // _RENEWED * _RENEWED
         grid = self._views.seen_before(hybrid_map, poses, before)
-        points = build_area_grid([scan], np.zeros((1, 3)), self._model).points
-        return KNOWN.log_ratio(grid.agreement(points, pose), MAPS_USUAL)
+        return KNOWN.log_ratio(grid.agreement(surface_points(scan, self._model), pose), MAPS_USUAL)
 
     def compare(
         self, hybrid_map: HybridMap, area: int, query: Query, compared: Mapping[int, Collection[int]],
