@@ -244,7 +244,7 @@ def drives():
 
     By itself the false closure is within what is admitted of a cycle.
     """
-    return run(open_log(LOG), Configuration()), run(open_log(LOG), Configuration(), misled(2, 0, 3.5))
+    return run(open_log(LOG), Configuration()), run(open_log(LOG), Configuration(), misled(2, 0, 3.8))
 
 
 def arcs(recording):

@@ -8,7 +8,7 @@ from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian, fuse
 from hmt_slam_ros.topology.global_map import consistent_map, shortest_path_map
 from hmt_slam_ros.topology.hybrid_map import HybridMap
-from hmt_slam_ros.topology.pose_graph import Edges, optimise
+from hmt_slam_ros.topology.pose_graph import Edges, optimise, relative_covariances
 
 SPREAD = np.diag([0.05**2, 0.03**2, 0.01**2])
 
@@ -254,3 +254,20 @@ def test_one_area_without_arcs_lies_at_the_origin():
         assert list(found.poses) == [0]
         np.testing.assert_array_equal(found.poses[0].mean, np.zeros(3))
         assert 0.0 < found.poses[0].covariance[0, 0] < 1e-6
+
+
+def test_covariances_of_nodes_relative_to_each_other_are_those_of_the_whole_system():
+    graph = simulated(12, 6, seed=3)[1]
+    poses = optimise(chain_of(graph, 12), graph).poses
+    whole = dense_solution(poses, graph)[1]
+    between = np.array([[2, 7], [7, 2], [0, 5], [9, 9]])
+    found = relative_covariances(poses, graph, between)
+    for (i, j), covariance in zip(between[:3], found[:3], strict=True):
+        ad = se2.adjoint(se2.between(poses[j], poses[i]))
+        apart = np.zeros((3, whole.shape[0] + 3))
+        apart[:, 3 * i : 3 * i + 3], apart[:, 3 * j : 3 * j + 3] = -ad, np.eye(3)
+        apart = apart[:, 3:]
+        np.testing.assert_allclose(covariance, apart @ whole @ apart.T, rtol=1e-3, atol=1e-9)
+    np.testing.assert_allclose(found[3], 0.0, atol=1e-12)
+    seen_back = PoseGaussian(se2.between(poses[2], poses[7]), found[0]).inverse().covariance
+    np.testing.assert_allclose(found[1], seen_back, rtol=1e-9)

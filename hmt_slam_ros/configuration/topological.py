@@ -176,6 +176,10 @@ class Refinement:
     temper: float = parameter(
         0.3, "Exponent on the likelihood, since beams and overlapping pairs are correlated.", low=1e-4, high=1.0
     )
+    certainty: float = parameter(
+        0.1, "Share of the registrations' information that counts in the covariances of refined arcs.",
+        low=1e-4, high=1.0,
+    )
     scan_sigma: float = parameter(
         0.1, "Deviation of a scan's place relative to its keyframe before it is registered.", unit="m",
         low=0.001, high=5.0,

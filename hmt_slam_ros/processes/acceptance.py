@@ -89,7 +89,7 @@ class Acceptance:
         arcs: dict[Pair, Arc],
         relabelled: list[Relabelled],
     ) -> tuple[list[Relabelled], dict[Pair, ArcValue]]:
-        """Refine the areas that closures joined; the arcs around them follow, with the covariances they have.
+        """Refine the areas that closures joined; the arcs around them follow.
 
         Returns the keyframes that moved, and the arcs as they were before.
         """
@@ -98,8 +98,7 @@ class Acceptance:
         found = self._refinement.refined(hybrid_map, scans, closed)
         before = {(a, b): value for a, b, value in hybrid_map.all_arcs() if (a, b) in found.arcs}
         for (a, b), value in before.items():
-            pose = found.arcs[a, b]
-            arcs[a, b] = Arc(a, b, PoseGaussian(pose, value.pose.covariance), value.closure)
+            arcs[a, b] = Arc(a, b, self._floored(found.arcs[a, b]), value.closure)
         moved = {
             keyframe: Relabelled(keyframe, area, area, pose)
             for area, keyframes in found.keyframes.items()
@@ -158,8 +157,10 @@ class Acceptance:
             shared = len(seen.witnesses & witnesses) / len(seen.witnesses)
             known = old.pose if old.source == seen.source else old.pose.inverse()
             belief, closure = fused(known, belief, shared), old.closure
-        belief = floored(belief, self._options.arc_sigma_floor, math.radians(self._options.arc_angle_floor))
-        return Arc(seen.source, seen.target, belief, closure)
+        return Arc(seen.source, seen.target, self._floored(belief), closure)
+
+    def _floored(self, belief: PoseGaussian) -> PoseGaussian:
+        return floored(belief, self._options.arc_sigma_floor, math.radians(self._options.arc_angle_floor))
 
 
 def _exactly(pose: NDArray[np.float64]) -> PoseGaussian:

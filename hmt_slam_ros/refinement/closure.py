@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -14,9 +14,9 @@ from scipy.sparse.csgraph import connected_components
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.refinement.joint import refine_jointly
+from hmt_slam_ros.refinement.joint import refine_jointly, relative_beliefs
 from hmt_slam_ros.refinement.neighbours import neighbours, pairs_of
-from hmt_slam_ros.refinement.surfaces import surfaces_of
+from hmt_slam_ros.refinement.surfaces import Surfaces, surfaces_of
 from hmt_slam_ros.sensing import Scan
 from hmt_slam_ros.sensing.motion import path_covariance
 from hmt_slam_ros.topology.global_map import consistent_map
@@ -36,11 +36,12 @@ class RefinedClosure:
     """What changed.
 
     :ivar keyframes: {area: {keyframe: ``area_T_base``, shape (3,)}} of the areas that the closure joined.
-    :ivar arcs: {(a, b): ``a_T_b``, shape (3,)} between these areas and those around them.
+    :ivar arcs: {(a, b): belief over ``a_T_b``} between these areas and those around them. The covariance is new between
+        areas that both were refined, and elsewhere the one that the arc had.
     """
 
     keyframes: dict[int, dict[int, NDArray[np.float64]]]
-    arcs: dict[tuple[int, int], NDArray[np.float64]]
+    arcs: dict[tuple[int, int], PoseGaussian]
 
 
 class ClosureRefinement:
@@ -78,7 +79,32 @@ class ClosureRefinement:
         edges = _as_edges(self._edges(hybrid_map, areas, closed), ids)
         fixed = ids.index(_reference(hybrid_map, closed[0]))
         found = refine_jointly(surfaces, poses, pairs, edges, self._options, fixed)
-        return _taken_apart(hybrid_map, dict(zip(ids, found, strict=True)), areas, closed)
+        taken = _taken_apart(hybrid_map, dict(zip(ids, found, strict=True)), areas, closed)
+        soft = _as_edges(self._edges(hybrid_map, areas, areas), ids)
+        return self._with_beliefs(taken, surfaces, found, pairs, soft, ids)
+
+    def _with_beliefs(
+        self,
+        taken: RefinedClosure,
+        surfaces: Surfaces,
+        poses: NDArray[np.float64],
+        pairs: NDArray[np.int64],
+        motion: Edges,
+        ids: list[int],
+    ) -> RefinedClosure:
+        """The same with the covariances of arcs between areas that were refined, by a keyframe near to each origin."""
+        origins = {area: min(kept, key=lambda k: _from_origin(kept[k])) for area, kept in taken.keyframes.items()}
+        between = [pair for pair in taken.arcs if pair[0] in origins and pair[1] in origins]
+        if not between:
+            return taken
+        rows = np.array([[ids.index(origins[area]) for area in pair] for pair in between])
+        beliefs = relative_beliefs(surfaces, poses, pairs, motion, self._options, rows)
+        arcs = {}
+        for (a, b), belief in zip(between, beliefs, strict=True):
+            a_T_one, b_T_other = taken.keyframes[a][origins[a]], taken.keyframes[b][origins[b]]
+            known = _exactly(a_T_one).compose(belief).compose(_exactly(se2.inverse(b_T_other)))
+            arcs[a, b] = PoseGaussian(taken.arcs[a, b].mean, known.covariance)
+        return replace(taken, arcs=taken.arcs | arcs)
 
     def _pairs(self, poses: NDArray[np.float64], areas: NDArray[np.int64]) -> NDArray[np.int64]:
         """The keyframes that may overlap; all these areas are at most two arcs apart."""
@@ -122,6 +148,10 @@ def _reference(hybrid_map: HybridMap, area: int) -> int:
     return next(iter(hybrid_map.keyframes(area)))
 
 
+def _from_origin(pose: NDArray[np.float64]) -> float:
+    return float(np.hypot(pose[0], pose[1]) + abs(pose[2]))
+
+
 def _exactly(pose: NDArray[np.float64]) -> PoseGaussian:
     return PoseGaussian(pose, np.zeros((3, 3)))
 
@@ -159,8 +189,8 @@ def _taken_apart(
             for area in sorted(closed)
         },
         {
-            (a, b): se2.between(frames[a], frames[b])
-            for a, b, _ in hybrid_map.all_arcs()
+            (a, b): PoseGaussian(se2.between(frames[a], frames[b]), arc.pose.covariance)
+            for a, b, arc in hybrid_map.all_arcs()
             if a in frames and b in frames
         },
     )

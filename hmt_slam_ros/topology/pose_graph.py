@@ -102,6 +102,27 @@ def optimise(
     return Solution(poses, covariances, state.cost, state.chi2, steps)
 
 
+def relative_covariances(
+    poses: NDArray[np.float64], edges: Edges, between: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """Covariances of the poses of nodes j seen from nodes i, right tangent frame, shape (k, 3, 3).
+
+    :param poses: shape (n, 3), that agree best with the edges.
+    :param between: shape (k, 2), i and j.
+    :raises ValueError: where a node is not joined with all others.
+    """
+    system = _System(len(poses), edges, fixed=0)
+    nodes, row = np.unique(between, return_inverse=True)
+    joint = system.joint_covariance(system.evaluate(poses), nodes)
+    found = np.empty((len(between), 3, 3))
+    for k, (i, j) in enumerate(row.reshape(-1, 2)):
+        ad = se2.adjoint(se2.between(poses[nodes[j]], poses[nodes[i]]))
+        apart = np.concatenate((-ad, np.eye(3)), axis=1)
+        both = [joint[3 * m : 3 * m + 3, 3 * n : 3 * n + 3] for m in (i, j) for n in (i, j)]
+        found[k] = apart @ np.block([both[:2], both[2:]]) @ apart.T
+    return found
+
+
 @dataclass(frozen=True, eq=False)
 class _State:
     """The problem at given poses: residuals (m, 3), Jacobians (m, 3, 3), chi2 (m,), and the cost, which is its sum."""
@@ -177,3 +198,15 @@ class _System:
             blocks[columns] = solved[own, columns - start].T
         covariances[self._free] = blocks.reshape(-1, 3, 3)
         return 0.5 * (covariances + covariances.transpose(0, 2, 1))
+
+    def joint_covariance(self, state: _State, nodes: NDArray[np.int64]) -> NDArray[np.float64]:
+        """The covariance of some nodes, ascending, together, shape (3 k, 3 k); zero for the fixed node."""
+        row = np.full(self._nodes, -1)
+        row[self._free] = np.arange(self._free.size)
+        own = (3 * row[nodes][:, None] + np.arange(3)).ravel()
+        free = np.repeat(row[nodes] >= 0, 3)
+        unit = np.zeros((3 * self._free.size, own.size))
+        unit[own[free], np.flatnonzero(free)] = 1.0
+        solved = self._factor(state, 0.0).solve(unit)
+        covariance = np.where(np.outer(free, free), solved[np.where(free, own, 0)], 0.0)
+        return 0.5 * (covariance + covariance.T)
