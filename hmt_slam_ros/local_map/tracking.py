@@ -51,11 +51,6 @@ class Match(NamedTuple):
     log_evidence: float
     contradicted: bool = False
 
-    @property
-    def covariance(self) -> Float64:
-        """Of the pose, right tangent frame, shape (3, 3)."""
-        return inverse(turned(self.hessian + self.prior.information, -self.pose[2]))
-
 
 class Tracked(NamedTuple):
     """What tracking made of a prediction.
