@@ -3,6 +3,8 @@
 A cell that becomes occupied lowers the field around it. Where one becomes free, the rows of a patch in which it was the
 nearest are measured anew from all occupied cells in reach, by the separable transform of squared distances: along the
 rows first, then across (Felzenszwalb and Huttenlocher 2012).
+
+What is called for every cell is inlined: a call with arrays counts references to them, which costs as much as the work.
 """
 
 from __future__ import annotations
@@ -106,7 +108,7 @@ def _between(begin: int, end: int) -> np.uint32:
     return (np.uint32(0xFFFFFFFF) >> np.uint32(PATCH - end + begin)) << np.uint32(begin)
 
 
-@njit(cache=True)
+@njit(cache=True, inline="always")
 def _covered(stamp: UInt8, row: int, column: int) -> tuple[int, int, UInt8]:
     """The rows of a patch, from ... to, that the stamp around a cell in reach covers, and the stamp's part on them."""
     reach = stamp.shape[0] // 2
@@ -153,7 +155,7 @@ def _take_lower(field: UInt8, stamp: UInt8, cells: UInt32, row: int, column: int
             _take_minimum(field[top:bottom], values)
 
 
-@njit(cache=True)
+@njit(cache=True, inline="always")
 def _take_minimum(kept: UInt8 | Float32, values: UInt8 | Float32) -> None:
     for r in range(kept.shape[0]):
         for c in range(kept.shape[1]):
@@ -176,7 +178,7 @@ def _rows_alike(field: UInt8, stamp: UInt8, cells: UInt32, row: int, column: int
     return alike
 
 
-@njit(cache=True)
+@njit(cache=True, inline="always")
 def _alike(field: UInt8, values: UInt8) -> np.uint32:
     """The rows, as bits, in which both have a value below FAR in common."""
     rows = np.uint32(0)

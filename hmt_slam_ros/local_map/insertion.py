@@ -206,7 +206,7 @@ def _count(odds: Int8, occupied: UInt32, hit: UInt32, passed: UInt32, model: Inv
             passed[r] = before & ~occupied[r]
 
 
-@njit(cache=True)
+@njit(cache=True, inline="always")
 def _add(odds: Int8, row: int, columns: np.uint32, change: int, limit: int) -> None:
     while columns:
         c = lowest(columns)
