@@ -93,6 +93,20 @@ def test_a_recognised_area_is_entered_at_the_pose_of_the_match():
     assert np.sqrt(arc.pose.covariance[0, 0]) < 0.2
 
 
+def test_the_robot_is_told_to_be_as_uncertain_in_the_area_as_its_newest_keyframe():
+    parent, branching, newest = rooms_apart((ROOM, ROOM), ((0.4, 0.3),), 0.7)
+    grown = {k: (1.0 + k - newest[0]) * np.diag([1e-3, 2e-3, 1e-4]) for k in newest}
+    parent = replace(parent, notes=replace(parent.notes, covariances=grown))
+    exact = PoseGaussian(parent.hybrid_map.keyframes(parent.area)[newest[-1]], np.zeros((3, 3)))
+    children = branching.cut(parent, newest[1:]).children
+    assert {child.area for child in children} == {0, 2}
+    for child in children:
+        carried = child.rebase.compose(exact)
+        np.testing.assert_allclose(carried.covariance, child.notes.covariances[newest[-1]], atol=1e-12)
+        (moved,) = [r.pose for r in child.relabelled if r.keyframe == newest[-1]]
+        np.testing.assert_allclose(carried.mean, moved, atol=1e-9)
+
+
 def test_candidates_beyond_the_number_that_is_examined_keep_their_prior_mass():
     settings = Configuration()
     settings = replace(settings, tsbi=replace(settings.tsbi, max_candidates=1))

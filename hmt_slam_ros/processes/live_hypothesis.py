@@ -209,10 +209,12 @@ class LiveHypothesis:
             self.drift = self._bounded(self.drift + _carried(rebase, self.event_pose))
             return
         poses = dict(zip(self.filter.keyframes, self.filter.leading_keyframe_poses(), strict=True))
-        self.drift = self.placed[moved[0]] = _carried(rebase, poses[moved[0]]) + _FIRST_COVARIANCE
+        self.placed[moved[0]] = _FIRST_COVARIANCE
         for previous, keyframe in pairwise(moved):
             ad = se2.adjoint(se2.between(poses[keyframe], poses[previous]))
-            self.drift = self.placed[keyframe] = ad @ self.drift @ ad.T + self.fresh[keyframe]
+            self.placed[keyframe] = ad @ self.placed[previous] @ ad.T + self.fresh[keyframe]
+        # TSBI knows how they lie in the area, and takes the drift from there on for what is added to it.
+        self.drift = _carried(rebase, self.event_pose) + _FIRST_COVARIANCE
 
     def reload(self, content: Sequence[PlacedKeyframe]) -> None:
         """Build the local map anew after TLCA refined its keyframes; the robot stays where it is from its anchor.

@@ -141,8 +141,8 @@ class Leaf:
     :ivar probability: P(gamma^t | d), Eq. (14).
     :ivar area: the robot's area now.
     :ivar rebase: belief over ``area_T_previous``: the frame of the robot's area before the event in that of ``area``,
-        as uncertain as the entry, by the keyframes that came over or by the arc; None where the area did not change
-        and the robot's pose stands.
+        as uncertain as the newest keyframe that came over is in the area, or as the arc; None where the area did not
+        change and the robot's pose stands.
     :ivar relabelled: keyframes that change area.
     :ivar arcs: arcs that are new or replaced.
     :ivar local: the areas of the local map, the current one first; empty where the local map stays as it is.

@@ -8,7 +8,7 @@ candidates' grids, and no keyframe is compared with an area twice.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -253,7 +253,7 @@ class Branching:
             parent.log_weight + log_factor,
             area,
             parent.notes.entered(covariances),
-            entry.compose(_exactly(se2.inverse(query.belief.mean))),
+            _rebase(query, entry, covariances),
             relabelled,
             () if arc is None else (self._arc(parent, area, arc),),
             reload=True,
@@ -277,6 +277,13 @@ class Branching:
         arc = Arc(parent.area, fit.area, query.belief.compose(fit.mode.measured.inverse()), closure=True)
         log_weight = parent.log_weight + fit.log_weight
         return Child(parent.hypothesis, log_weight, parent.area, parent.notes, arcs=(arc,), reload=True)
+
+
+def _rebase(query: Query, entry: PoseGaussian, covariances: Mapping[int, NDArray[np.float64]]) -> PoseGaussian:
+    """``area_T_previous``, as uncertain as the newest of the keyframes is in the area, so that its drift goes on."""
+    newest, pose = list(query.poses.items())[-1]
+    belief = PoseGaussian(se2.compose(entry.mean, pose), covariances[newest])
+    return belief.compose(_exactly(se2.inverse(se2.compose(query.belief.mean, pose))))
 
 
 def _exactly(pose: NDArray[np.float64]) -> PoseGaussian:
