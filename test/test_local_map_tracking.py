@@ -120,3 +120,45 @@ def test_a_certain_prediction_stands_where_there_is_nothing_to_match(mapping):
     area_filter = AreaFilter(mapping, 0, 0)
     area_filter.track(np.empty((0, 4)), predicted(Step(np.array([0.1, 0.0, 0.0]), SURE)))
     np.testing.assert_allclose(area_filter.pose, [0.1, 0.0, 0.0], atol=1e-12)
+
+
+def with_niches(seed=0, length=60.0):
+    """A corridor 2.4 m wide along x with doors on both sides, 0.9 m wide and 12 cm deep, every 1.3 to 2.9 m."""
+    random = np.random.default_rng(seed)
+    walls = []
+    for y, behind in ((-1.22, -1.34), (1.22, 1.34)):
+        x = -length
+        while x < length:
+            door = x + random.uniform(0.4, 2.0)
+            walls += [[x, y, door, y], [door, y, door, behind], [door, behind, door + 0.9, behind]]
+            x = door + 0.9
+            walls.append([x, behind, x, y])
+    return np.array(walls)
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("ahead", [0.35, 0.6])
+def test_along_a_corridor_the_best_of_many_fits_is_taken(mapping, seed, ahead):
+    walls = with_niches(seed)
+    area_filter = mapped(mapping, walls, [(x, 0, 0) for x in np.arange(-6.0, 0.1, 0.5)])
+    truth = np.array([ahead, 0.05, 0.02])
+    track(area_filter, walls, truth, None, Step(np.zeros(3), np.diag([0.3, 0.05, 0.05]) ** 2))
+    distance, angle = error_of(area_filter.pose, truth)
+    assert distance < 0.15
+    assert angle < 1.0
+
+
+def test_what_the_scans_leave_open_is_carried_on_until_the_next_keyframe(mapping):
+    area_filter = mapped(mapping, CORRIDOR, [(x, 0, 0) for x in range(-6, 7)])
+    along = []
+    for k in range(1, 9):
+        truth = np.array([0.1 * k, 0.0, 0.0])
+        track(area_filter, CORRIDOR, truth, Step(np.array([0.1, 0.0, 0.0]), SURE))
+        deviations = np.sqrt(np.diag(area_filter.left_open))
+        along.append(deviations[0])
+        assert deviations[1] < 0.02
+        assert deviations[2] < 0.01
+    assert (np.diff(along) > 0).all()
+    assert along[-1] == pytest.approx(np.sqrt(8) * 0.02, rel=0.2)
+    area_filter.update(mapping.matching_points(scan_in(CORRIDOR, truth)), 1)
+    np.testing.assert_array_equal(area_filter.left_open, 0.0)

@@ -4,6 +4,7 @@ import re
 
 import numpy as np
 import pytest
+from test_local_map_tracking import with_niches
 from test_process_slam import WALLS, Dialogue
 from worlds import scan_in
 
@@ -119,3 +120,16 @@ def test_noise_beyond_the_model_is_learnt_and_said_once():
     assert distance < 0.1
     assert angle < 2.0
     assert len([notice for notice in dialogue.of(Notice) if "noise model" in notice.text]) == 1
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_without_odometry_a_robot_that_sets_off_along_a_corridor_is_followed(seed):
+    walls, dialogue, truths = with_niches(seed), Dialogue(), []
+    speeds = np.concatenate((np.zeros(15), np.arange(0.0, 0.6, 0.15), np.full(60, 0.6)))
+    for k, x in enumerate(0.2 * np.cumsum(speeds)):
+        truths.append(np.array([x, 0.0, 0.0]))
+        dialogue.tell(scan_in(walls, truths[-1], stamp=SECOND + k * SECOND // 5, noise=0.01, seed=k))
+    dialogue.tell(EndOfLog())
+    distance, angle = errors(dialogue, truths)
+    assert distance < 0.3
+    assert angle < 1.5

@@ -77,7 +77,7 @@ def test_a_steady_velocity_is_learnt():
 def test_scans_whose_stamps_come_in_bursts_are_predicted_as_evenly_taken_within_the_deviation():
     times = 0.2 * np.arange(60)
     bursts = 0.8 * np.ceil(times / 0.8) + 1e-5 * np.arange(60)
-    inertia = Inertia(Motion())
+    inertia = Inertia(Motion(acceleration=0.5))
     for k in range(1, 60):
         step = inertia.predict(bursts[k] - bursts[k - 1])
         truth = se2.exp(0.2 * TURNING)

@@ -30,7 +30,7 @@ class Motion:
         0.2, "Smallest deviation of an increment's heading.", unit="deg", low=1e-3, high=45.0
     )
     acceleration: float = parameter(
-        0.5,
+        1.0,
         "Deviation of the robot's acceleration. Without odometry, and where the scans contradict it, the next pose is "
         "predicted from the velocity.",
         unit="m/s^2",

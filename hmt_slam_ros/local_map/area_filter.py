@@ -15,6 +15,7 @@ from hmt_slam_ros.agreement import SCAN, Agreement, Usual
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.covariance import inverse, turned
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.local_map import batch, matching
 from hmt_slam_ros.local_map.local_mapping import LocalMapping
 from hmt_slam_ros.local_map.match_error import MatchError, match_error
@@ -70,6 +71,8 @@ class AreaFilter:
     :ivar keyframe_areas: their areas.
     :ivar keyframe_poses: shape (M, K, 3), ``map_T_base`` of each under each particle.
     :ivar leader: the particle whose pose is the filter's.
+    :ivar tracking_covariance: of the leader's motion since the last filter step, shape (3, 3), right tangent frame.
+    :ivar left_open: covariance of the leader's pose that the scans since the last filter step leave, likewise.
     """
 
     def __init__(self, mapping: LocalMapping, hypothesis: int, area: int) -> None:
@@ -89,6 +92,7 @@ class AreaFilter:
         self.leader = 0
         self._matcher = ScanMatcher(mapping)
         self.tracking_covariance = np.zeros((3, 3))
+        self.left_open = NO_STEP.covariance
         self._usual = Usual()
 
     @property
@@ -110,6 +114,7 @@ class AreaFilter:
         child._priors, child._last_poses = self._priors.copy(), self._last_poses.copy()
         child._since_update = self._since_update
         child.leader, child.tracking_covariance = self.leader, self.tracking_covariance
+        child.left_open = self.left_open
         child._usual = self._usual
         return child
 
@@ -123,16 +128,17 @@ class AreaFilter:
 
         :param points: surfels of the scan, shape (n, 4), base frame.
         """
-        before = self.pose
+        before = PoseGaussian(self.pose, self.left_open)
         match = self._matcher.match(points, before, prediction, self._leading_view())
-        moved = se2.between(before, match.pose)
+        moved = se2.between(before.mean, match.pose)
         self._priors = se2.compose(self._priors, match.step.increment)
         self._since_update = self._since_update.then(match.step)
         self.poses = se2.compose(self.poses, moved)
         information = map_information(self._since_update.covariance, match.pose[2])
         information = information + match.hessian / self.mapping.alignment.inflation
+        self.left_open = self._matcher.covariance(match)
         self.tracking_covariance = turned(inverse(information), -match.pose[2])
-        return Tracked(moved, self._matcher.tempered(match), match.contradicted)
+        return Tracked(moved, self._matcher.information(match), match.contradicted)
 
     def _leading_view(self) -> MapView:
         return self.mapping.pool.view(self._tables[self.leader])
@@ -146,7 +152,7 @@ class AreaFilter:
         settings = self.mapping.configuration
         prior = map_information(self._since_update.covariance, self.pose[2])
         view, predicted = self._leading_view(), Prior(self._priors[self.leader], prior)
-        still = self._matcher.still(points, predicted, self._since_update, view)
+        still = self._matcher.still(points, predicted, self._since_update.covariance, view)
         drawn = batch.propose_all(
             points,
             still,
@@ -208,6 +214,7 @@ class AreaFilter:
         self._priors = self.poses.copy()
         self._last_poses = self.poses.copy()
         self._since_update = NO_STEP
+        self.left_open = NO_STEP.covariance
 
     def _resample(self, step: int) -> None:
         """Systematic resampling; the leader is kept, and stands first afterwards."""

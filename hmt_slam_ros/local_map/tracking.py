@@ -3,6 +3,10 @@
 Odometry is right or, with a small probability, says nothing about the motion (wheels slip, readings are lost); then
 inertia predicts it. Each of the two is a prior; the one under which scan and map have the larger evidence is believed.
 In a corridor that looks the same all along, both fit, and odometry as the sharper prior wins.
+
+Where a corridor tells little, a scan fits in many places a little, and a pose that were certain after each scan would
+stay in the first of them while the robot drives on. So what the scans leave open is carried on to the next one, and
+where that is much, the best of all fits around is looked for.
 """
 
 from __future__ import annotations
@@ -15,7 +19,8 @@ import numpy as np
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.chi_square import gate
-from hmt_slam_ros.geometry.covariance import inverse, turned
+from hmt_slam_ros.geometry.covariance import carried, inverse, turned
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.local_map import matching, search
 from hmt_slam_ros.local_map.local_mapping import LocalMapping
 from hmt_slam_ros.local_map.movers import standing
@@ -29,6 +34,8 @@ _PEAKS = 4
 _BASIN_DISTANCE, _BASIN_ANGLE = 0.2, math.radians(6.0)
 # Deviations of the prediction to which a search reaches.
 _REACH = 2.5
+# Matches whose evidence differs by less than this, nats, may as well be each other.
+_UNCLEAR = 3.0
 # Odometry whose distance from the match is within this share of all is not doubted.
 _GATE = gate(0.999)
 
@@ -74,11 +81,11 @@ class ScanMatcher:
         self._fault = mapping.configuration.motion.fault_probability
         self._log_fault, self._log_right = math.log(self._fault), math.log1p(-self._fault)
 
-    def match(self, points: Float64, before: Float64, prediction: Prediction, view: MapView) -> Match:
+    def match(self, points: Float64, before: PoseGaussian, prediction: Prediction, view: MapView) -> Match:
         """The scan's pose.
 
         :param points: surfels of the scan, shape (n, 4), base frame.
-        :param before: ``map_T_base`` at the last scan, shape (3,).
+        :param before: ``map_T_base`` at the last scan.
         """
         if prediction.odometry is None:
             return self._match(points, before, prediction.inertia, view)
@@ -93,19 +100,18 @@ class ScanMatcher:
         return by_odometry if by_odometry.hessian.any() else self._unproven(by_odometry, prediction.inertia)
 
     def _reconciled(
-        self, points: Float64, before: Float64, prediction: Prediction, found: Match, view: MapView
+        self, points: Float64, before: PoseGaussian, prediction: Prediction, found: Match, view: MapView
     ) -> Match:
         """The match with odometry widened along what the scan contradicts; along a corridor it still tells how far."""
         odometry = prediction.odometry
         assert odometry is not None
-        predicted = se2.compose(before, odometry.increment)
+        predicted = se2.compose(before.mean, odometry.increment)
         information = turned(found.hessian, -predicted[2])
         shown = np.linalg.solve(information + inverse(odometry.covariance), information)
         difference = shown @ se2.log(se2.between(predicted, found.pose))
         widened = Step(odometry.increment, odometry.covariance + np.outer(difference, difference))
         step = widened.and_also(prediction.inertia)
-        predicted = se2.compose(before, step.increment)
-        prior = matching.Prior(predicted, map_information(step.covariance, predicted[2]))
+        prior = _prior(_after(before, step))
         return self._refined(points, points, found.pose, prior, step, view)._replace(contradicted=True)
 
     def _unproven(self, match: Match, inertia: Step) -> Match:
@@ -115,9 +121,19 @@ class ScanMatcher:
         otherwise = inertia.covariance + np.outer(difference, difference)
         return match._replace(step=Step(step.increment, step.covariance + self._fault * otherwise))
 
-    def tempered(self, match: Match) -> Float64:
-        """Information of the match alone, for correlated beams, in the frame of the pose, shape (3, 3)."""
-        return turned(self._settings.temper * match.hessian, -match.pose[2])
+    def covariance(self, match: Match) -> Float64:
+        """Of the pose, shape (3, 3), right tangent frame.
+
+        Tempered: one scan after the other is matched with the same map, and errs as the one before.
+        """
+        return inverse(turned(self._settings.temper * match.hessian + match.prior.information, -match.pose[2]))
+
+    def information(self, match: Match) -> Float64:
+        """What the match alone tells of the motion since the scan before, in the frame of the pose, shape (3, 3).
+
+        For correlated beams, but not tempered: where two scans err alike, their difference does not.
+        """
+        return turned(match.hessian / self._mapping.alignment.inflation, -match.pose[2])
 
     def _agrees(self, points: Float64, match: Match, view: MapView) -> bool:
         far = -2.0 * matching.log_prior(match.pose, match.prior) > _GATE
@@ -127,26 +143,36 @@ class ScanMatcher:
         share = matching.matched_fraction(points, pose, view, self._mapping.near)
         return not len(points) or share >= self._settings.matched_fraction
 
-    def _match(self, points: Float64, before: Float64, step: Step, view: MapView) -> Match:
+    def _match(self, points: Float64, before: PoseGaussian, step: Step, view: MapView) -> Match:
         """The pose under one prior; where that is wide, or the prediction leads to a poor fit, search around it."""
-        predicted = se2.compose(before, step.increment)
-        prior = matching.Prior(predicted, map_information(step.covariance, predicted[2]))
-        match = self._refined(points, self.still(points, prior, step, view), predicted, prior, step, view)
-        if not _wide(step) and self._fits(points, match.pose, view):
+        predicted = _after(before, step)
+        prior, covariance = _prior(predicted), predicted.covariance
+        match = self._refined(points, self.still(points, prior, covariance, view), prior.mean, prior, step, view)
+        if not _wide(covariance) and self._fits(points, match.pose, view):
             return match
-        lattice = self._lattice(step, predicted[2])
+        lattice = self._lattice(predicted)
         starts = search.correlative_search(
             points[:: max(1, len(points) // _SEARCH_POINTS)], prior, lattice, view, self._mapping.model,
             self._settings.temper, _PEAKS,
         )  # fmt: skip
         found = [self._refined(points, points, start, prior, step, view) for start in starts]
+        best = self._best(points, [match, *found], view)
         # Relative to unknown space: where nothing fits, the scan shows nothing of the map.
-        unmatched = Match(predicted, np.zeros((3, 3)), prior, step, self._log_fault)
-        return max([unmatched, match, *found], key=lambda one: one.log_evidence)
+        unmatched = Match(prior.mean, np.zeros((3, 3)), prior, step, self._log_fault)
+        return max([unmatched, best], key=lambda one: one.log_evidence)
 
-    def still(self, points: Float64, prior: matching.Prior, step: Step, view: MapView) -> Float64:
-        """The points to be matched under a prior from a step: all where it is too wide to tell what moved."""
-        return points if _wide(step) else standing(points, prior, view, self._mapping.alignment)
+    def _best(self, points: Float64, found: list[Match], view: MapView) -> Match:
+        """The match of the least misfit among those that the evidence, which forgives much, does not tell apart."""
+        least = max(match.log_evidence for match in found) - _UNCLEAR
+        alike = [match for match in found if match.log_evidence >= least]
+        if len(alike) == 1:
+            return alike[0]
+        alignment = self._mapping.alignment
+        return min(alike, key=lambda one: matching.misfit(points, one.pose, one.prior, view, alignment))
+
+    def still(self, points: Float64, prior: matching.Prior, covariance: Float64, view: MapView) -> Float64:
+        """The points to be matched under a prior: all where its covariance is too wide to tell what moved."""
+        return points if _wide(covariance) else standing(points, prior, view, self._mapping.alignment)
 
     def _refined(
         self, points: Float64, still: Float64, start: Float64, prior: matching.Prior, step: Step, view: MapView
@@ -157,10 +183,10 @@ class ScanMatcher:
         )
         return Match(pose, hessian, prior, step, log_evidence)
 
-    def _lattice(self, step: Step, theta: float) -> search.Lattice:
-        """The poses to search for after a step to the heading ``theta``."""
+    def _lattice(self, predicted: PoseGaussian) -> search.Lattice:
+        """The poses to search for around the one that is predicted."""
         settings, cell = self._settings, self._mapping.pool.cell
-        reach = _REACH * np.sqrt(np.diag(turned(step.covariance, theta)))
+        reach = _REACH * np.sqrt(np.diag(turned(predicted.covariance, predicted.mean[2])))
         reach[:2] = np.clip(reach[:2], settings.search_distance, settings.wide_distance)
         reach[2] = np.clip(reach[2], math.radians(settings.search_angle), math.radians(settings.wide_angle))
         turn = math.radians(settings.search_step)
@@ -168,9 +194,18 @@ class ScanMatcher:
         return search.Lattice(2, turn, counts)
 
 
-def _wide(step: Step) -> bool:
-    """Whether a step may end beyond Gauss-Newton's basin."""
-    (xx, xy, _), (_, yy, _), (_, _, turn) = step.covariance.tolist()
+def _after(before: PoseGaussian, step: Step) -> PoseGaussian:
+    covariance = carried(before.covariance, step.increment) + step.covariance
+    return PoseGaussian(se2.compose(before.mean, step.increment), covariance)
+
+
+def _prior(predicted: PoseGaussian) -> matching.Prior:
+    return matching.Prior(predicted.mean, map_information(predicted.covariance, predicted.mean[2]))
+
+
+def _wide(covariance: Float64) -> bool:
+    """Whether a pose of this covariance, in its own frame, may be beyond Gauss-Newton's basin."""
+    (xx, xy, _), (_, yy, _), (_, _, turn) = covariance.tolist()
     largest = 0.5 * (xx + yy) + math.hypot(0.5 * (xx - yy), xy)
     return largest > (_BASIN_DISTANCE / _REACH) ** 2 or turn > (_BASIN_ANGLE / _REACH) ** 2
 
