@@ -211,25 +211,25 @@ def linearise(
 
 @njit(cache=True)
 def misfit(points: Float64, pose: Float64, prior: Prior, view: MapView, settings: Alignment) -> float:
-    """What :func:`align` minimises, at a pose, nats; but a point in unknown space counts as the others do on average.
+    """What :func:`align` minimises, at a pose, nats; but a point counts by its distance in any direction.
+
+    One in unknown space counts as if its surface were at the robust scale: were it worse, new space ahead would draw
+    the robot back, were it better, nothing would keep it in the map.
 
     :param points: (n, 2) or surfels (n, 4).
     """
     half = 0.5 * view.table.shape[0] * PATCH - 0.5
     cos, sin = np.cos(pose[2]), np.sin(pose[2])
-    quantum, count, cost = view.radius / FAR, 0, 0.0
+    quantum, cost = view.radius / FAR, 0.0
     for n in range(points.shape[0]):
         u = (pose[0] + cos * points[n, 0] - sin * points[n, 1]) / view.cell + half
         v = (pose[1] + sin * points[n, 0] + cos * points[n, 1]) / view.cell + half
         distance, _, _ = _smooth_distance(view, u, v)
-        if distance >= FAR - 1 and odds_at(view, int(u + 0.5), int(v + 0.5)) == 0:
-            continue
-        cost += np.log(1.0 + (distance * quantum / settings.robust) ** 2)
-        count += 1
-    if count:
-        cost *= points.shape[0] / count
-    scale = settings.robust**2 / (settings.inflation * settings.sigma**2)
-    return 0.5 * scale * cost - log_prior(pose, prior)
+        distance *= quantum
+        if distance > settings.robust and odds_at(view, int(u + 0.5), int(v + 0.5)) == 0:
+            distance = settings.robust
+        cost += np.log(1.0 + (distance / settings.robust) ** 2)
+    return 0.5 * settings.robust**2 / (settings.inflation * settings.sigma**2) * cost - log_prior(pose, prior)
 
 
 @njit(cache=True)
