@@ -8,7 +8,7 @@ from benchmark.corridor import Drive, drive, errors_of, report
 
 @pytest.fixture(scope="module")
 def drives():
-    return [drive(seed) for seed in range(24)]
+    return [drive(seed) for seed in range(72)]
 
 
 def test_the_covariance_along_a_bare_corridor_covers_the_truth(drives):
