@@ -212,7 +212,9 @@ def test_the_map_that_a_run_leaves_can_be_driven_through(tmp_path):
     subprocess.run([*command, "map", MALAGA, "--out", tmp_path / "out", "--duration", "10"], check=True, timeout=300)
     path = read_tum(tmp_path / "out" / "trajectory.tum").poses
     world = yaml.safe_load((tmp_path / "out" / "map.yaml").read_text())
-    world["route"] = path[:: len(path) // 6, :2].tolist()
+    # The robot stands for a while first, and millimetres of a route would turn it anywhere.
+    way = path[np.hypot(path[:, 0], path[:, 1]) > 0.05]
+    world["route"] = way[:: len(way) // 6, :2].tolist()
     (tmp_path / "out" / "world.yaml").write_text(yaml.safe_dump(world))
     log = open_log(f"sim:{tmp_path / 'out' / 'world.yaml'},radius=0.1")
     assert log.scan_count > 20
