@@ -129,7 +129,8 @@ class Enumeration:
         self._sequence += 1
         self._replica.scans[self._sequence] = scan
         self._branching.begin_event()
-        noted = [self._recognized(self._noted(topology, step), scan) for topology in self._topologies]
+        points = self._branching.search.surface_points(scan)
+        noted = [self._recognized(self._noted(topology, step), points) for topology in self._topologies]
         if cut:
             newest = range(self._sequence + 1 - cut, self._sequence + 1)
             noted = [child for topology in noted for child in self._children(topology, newest)]
@@ -145,10 +146,10 @@ class Enumeration:
         topology.hybrid_map.place(self._sequence, robot.area, robot.pose.mean)
         return replace(topology, robot=robot, notes=topology.notes.stored(self._sequence, robot.pose.covariance))
 
-    def _recognized(self, topology: _Topology, scan: Scan) -> _Topology:
+    def _recognized(self, topology: _Topology, points: Float64) -> _Topology:
         """Weighed by what the newest scan says for the known ground that the robot is in."""
         pose = topology.robot.pose.mean
-        found = self._branching.recognized(topology.parent, pose, scan, self._sequence)
+        found = self._branching.recognized(topology.parent, pose, points, self._sequence)
         return replace(topology, log_weight=found.log_weight)
 
     def _children(self, topology: _Topology, newest: Sequence[int]) -> Iterator[_Topology]:

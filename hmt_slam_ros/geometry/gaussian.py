@@ -25,6 +25,11 @@ class PoseGaussian:
     mean: NDArray[np.float64]
     covariance: NDArray[np.float64]
 
+    @classmethod
+    def exactly(cls, pose: NDArray[np.float64]) -> PoseGaussian:
+        """The certainty that it is this pose, (3,)."""
+        return cls(pose, np.zeros((3, 3)))
+
     def inverse(self) -> PoseGaussian:
         """The belief over ``b_T_a``."""
         ad = se2.adjoint(self.mean)

@@ -7,9 +7,6 @@ from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import TypeAlias
 
-import numpy as np
-from numpy.typing import NDArray
-
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
@@ -138,7 +135,7 @@ class Acceptance:
         ]
         for r in moved:
             hybrid_map.place(r.keyframe, r.area, r.pose)
-        return replace(seen, pose=seen.pose.compose(_exactly(se2.inverse(motion)))), moved
+        return replace(seen, pose=seen.pose.compose(PoseGaussian.exactly(se2.inverse(motion)))), moved
 
     def _linked(self, hybrid_map: HybridMap, scans: Scans, seen: Observation) -> Observation:
         """An arc between areas that keep their keyframes, moved to where the scans of both fit."""
@@ -148,7 +145,7 @@ class Acceptance:
             [(scans[keyframe], se2.compose(seen.pose.mean, pose)) for keyframe, pose in others.items()],
             seen.pose.inverse().covariance,
         )
-        return seen if motion is None else replace(seen, pose=_exactly(motion).compose(seen.pose))
+        return seen if motion is None else replace(seen, pose=PoseGaussian.exactly(motion).compose(seen.pose))
 
     def _fused(self, seen: Observation, old: Arc | None, witnesses: frozenset[int]) -> Arc:
         """The definite arc from an observation and what was known before, which tells whether it closed a loop."""
@@ -161,7 +158,3 @@ class Acceptance:
 
     def _floored(self, belief: PoseGaussian) -> PoseGaussian:
         return floored(belief, self._options.arc_sigma_floor, math.radians(self._options.arc_angle_floor))
-
-
-def _exactly(pose: NDArray[np.float64]) -> PoseGaussian:
-    return PoseGaussian(pose, np.zeros((3, 3)))

@@ -246,7 +246,7 @@ def _moved(hybrid_map: HybridMap, pair: Pair, area: int, own: int, own_T_area: P
         return
     hybrid_map.remove_arc(*pair)
     if other != own and hybrid_map.arc(own, other) is None:
-        hybrid_map.set_arc(own, other, _exactly(own_T_area).compose(arc), closure=value.closure)
+        hybrid_map.set_arc(own, other, PoseGaussian.exactly(own_T_area).compose(arc), closure=value.closure)
 
 
 def _renamed(step: Step, before: bool, after: bool, layer: _Layer, own: int) -> Step:
@@ -269,13 +269,9 @@ def _kept(
     kept = []
     for closure in closures:
         moved = closure.pair in layer.arcs and closure.near == layer.arcs[closure.pair]
-        pose = _exactly(frames[closure.near]).compose(closure.pose) if moved else closure.pose
+        pose = PoseGaussian.exactly(frames[closure.near]).compose(closure.pose) if moved else closure.pose
         found = replace(closure, near=own, pose=pose) if moved else closure
         value = hybrid_map.arc_value(*found.pair)
         if value is not None and value.closure:
             kept.append(found)
     return kept
-
-
-def _exactly(pose: Pose) -> PoseGaussian:
-    return PoseGaussian(pose, np.zeros((3, 3)))

@@ -19,7 +19,7 @@ from hmt_slam_ros.processes.messages import Leaf, LeafEstimate, Relabelled, Trai
 from hmt_slam_ros.sensing import Scan
 
 _FIRST_COVARIANCE = np.diag([1e-8, 1e-8, 1e-8])
-_STAY = PoseGaussian(np.zeros(3), np.zeros((3, 3)))
+_STAY = PoseGaussian.exactly(np.zeros(3))
 _NO_ERROR = MatchError(_FIRST_COVARIANCE, _FIRST_COVARIANCE, np.zeros((3, 3)))
 # Below 1, since the filter step at a keyframe may move the robot a little back towards the last one.
 _SAME_PLACE = 0.8
@@ -228,5 +228,5 @@ class LiveHypothesis:
 
 def _carried(rebase: PoseGaussian, pose: NDArray[np.float64]) -> NDArray[np.float64]:
     """What the uncertainty of ``area_T_previous`` adds to the covariance (3, 3) of a pose in the area, (3,)."""
-    known = PoseGaussian(se2.between(rebase.mean, pose), np.zeros((3, 3)))
+    known = PoseGaussian.exactly(se2.between(rebase.mean, pose))
     return rebase.compose(known).covariance

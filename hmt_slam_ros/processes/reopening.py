@@ -83,7 +83,7 @@ def _as_leaf(explanation: Explanation, hypothesis: int, hybrid_map: HybridMap) -
         for k, pose in keyframes.items()
         if former[k] != area or not np.array_equal(pose, hybrid_map.keyframes(area)[k])
     )
-    rebase = None if account.rebase is None else PoseGaussian(account.rebase, np.zeros((3, 3)))
+    rebase = None if account.rebase is None else PoseGaussian.exactly(account.rebase)
     return Leaf(
         hypothesis,
         hypothesis,

@@ -107,8 +107,9 @@ class Tsbi:
         if len(parents) == 1:
             return parents
         poses = [self._estimates[parent.hypothesis].pose.mean for parent in parents]
+        points = self._branching.search.surface_points(keyframe.scan)
         parents = [
-            self._branching.recognized(parent, pose, keyframe.scan, keyframe.sequence)
+            self._branching.recognized(parent, pose, points, keyframe.sequence)
             for parent, pose in zip(parents, poses, strict=True)
         ]
         claims = [

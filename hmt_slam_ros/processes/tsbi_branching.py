@@ -110,14 +110,17 @@ class Branching:
         """Forget which new areas were named; within one event hypotheses share the ids of the same new area."""
         self._named = {}
 
-    def recognized(self, parent: Parent, pose: NDArray[np.float64], scan: Scan, keyframe: int) -> Parent:
+    def recognized(
+        self, parent: Parent, pose: NDArray[np.float64], points: NDArray[np.float64], keyframe: int
+    ) -> Parent:
         """The hypothesis weighed by what the newest scan says for the known ground that it has the robot in.
 
+        :param points: its surface points, shape (n, 2), m, base frame.
         :param pose: ``area_T_base`` of the scan.
         :param keyframe: its number.
         """
         poses = {parent.area: np.zeros(3), **parent.around()}
-        log_ratio = self.search.recognized(parent.hybrid_map, poses, scan, pose, keyframe)
+        log_ratio = self.search.recognized(parent.hybrid_map, poses, points, pose, keyframe)
         return replace(parent, log_weight=parent.log_weight + log_ratio)
 
     def cut(self, parent: Parent, keyframes: Sequence[int]) -> Branches:
@@ -210,7 +213,7 @@ class Branching:
         if keyframes not in self._named:
             self._areas = max(self._areas, parent.hybrid_map.largest_area) + 1
             self._named[keyframes] = self._areas
-        origin = _exactly(np.zeros(3))
+        origin = PoseGaussian.exactly(np.zeros(3))
         return self._entered(parent, query, self._named[keyframes], origin, query.belief, log_factor)
 
     def _enter_tracked(self, parent: Parent, query: Query, area: int) -> Child:
@@ -283,11 +286,7 @@ def _rebase(query: Query, entry: PoseGaussian, covariances: Mapping[int, NDArray
     """``area_T_previous``, as uncertain as the newest of the keyframes is in the area, so that its drift goes on."""
     newest, pose = list(query.poses.items())[-1]
     belief = PoseGaussian(se2.compose(entry.mean, pose), covariances[newest])
-    return belief.compose(_exactly(se2.inverse(se2.compose(query.belief.mean, pose))))
-
-
-def _exactly(pose: NDArray[np.float64]) -> PoseGaussian:
-    return PoseGaussian(pose, np.zeros((3, 3)))
+    return belief.compose(PoseGaussian.exactly(se2.inverse(se2.compose(query.belief.mean, pose))))
 
 
 def _log(value: float) -> float:

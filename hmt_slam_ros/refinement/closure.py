@@ -102,7 +102,7 @@ class ClosureRefinement:
         arcs = {}
         for (a, b), belief in zip(between, beliefs, strict=True):
             a_T_one, b_T_other = taken.keyframes[a][origins[a]], taken.keyframes[b][origins[b]]
-            known = _exactly(a_T_one).compose(belief).compose(_exactly(se2.inverse(b_T_other)))
+            known = PoseGaussian.exactly(a_T_one).compose(belief).compose(PoseGaussian.exactly(se2.inverse(b_T_other)))
             arcs[a, b] = PoseGaussian(taken.arcs[a, b].mean, known.covariance)
         return replace(taken, arcs=taken.arcs | arcs)
 
@@ -120,7 +120,8 @@ class ClosureRefinement:
             if a in areas and b in areas:
                 one, other = _reference(hybrid_map, a), _reference(hybrid_map, b)
                 a_T_one, b_T_other = hybrid_map.keyframes(a)[one], hybrid_map.keyframes(b)[other]
-                yield one, other, _exactly(se2.inverse(a_T_one)).compose(arc.pose).compose(_exactly(b_T_other))
+                one_T_b = PoseGaussian.exactly(se2.inverse(a_T_one)).compose(arc.pose)
+                yield one, other, one_T_b.compose(PoseGaussian.exactly(b_T_other))
 
     def _within(self, hybrid_map: HybridMap, area: int) -> Iterable[Edge]:
         """The keyframes of one way through an area by the motion between them, a later way by its first to the area."""
@@ -150,10 +151,6 @@ def _reference(hybrid_map: HybridMap, area: int) -> int:
 
 def _from_origin(pose: NDArray[np.float64]) -> float:
     return float(np.hypot(pose[0], pose[1]) + abs(pose[2]))
-
-
-def _exactly(pose: NDArray[np.float64]) -> PoseGaussian:
-    return PoseGaussian(pose, np.zeros((3, 3)))
 
 
 def _as_body(hybrid_map: HybridMap, area: int) -> Iterable[Edge]:

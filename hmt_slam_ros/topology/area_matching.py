@@ -16,6 +16,7 @@ import numpy as np
 
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.geometry.chi_square import gate
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.topology import area_modes
 from hmt_slam_ros.topology.area_bounds import Surface
@@ -30,7 +31,7 @@ _NEGLIGIBLE = 1e-5
 _TURN_LIMITS = (math.radians(0.2), math.radians(2.0))
 # Share of the prior's information in what matching alone says of a direction of which it says nothing.
 _WEAK = 0.01
-_SAME_MODE = 7.81  # chi-square with 3 degrees of freedom at 95 %
+_SAME_MODE = gate(0.95)
 
 
 @dataclass(frozen=True)
@@ -101,7 +102,7 @@ def match(
         return Match()
     # About the middle of the samples turns and shifts are least correlated, and the lattice of turns coarsest.
     middle = query.points.mean(axis=0)
-    to_middle = PoseGaussian(np.array([*middle, 0.0]), np.zeros((3, 3)))
+    to_middle = PoseGaussian.exactly(np.array([*middle, 0.0]))
     centred = query.moved(middle)
     prior = prior.compose(to_middle)
     turn = _turn(candidate.cell, centred.points)

@@ -109,18 +109,23 @@ class ClosureSearch:
         found = match(query, place.grid, prior, self._settings).modes
         return found[0].measured if found else None
 
+    def surface_points(self, scan: Scan) -> NDArray[np.float64]:
+        """What a scan is recognized by, shape (n, 2), m, base frame."""
+        return surface_points(scan, self._model)
+
     def recognized(
-        self, hybrid_map: HybridMap, poses: Mapping[int, Pose], scan: Scan, pose: Pose, keyframe: int
+        self, hybrid_map: HybridMap, poses: Mapping[int, Pose], points: NDArray[np.float64], pose: Pose, keyframe: int
     ) -> float:
         """log p(scan | the robot is there) / p(scan | it is in a place that looks alike), by what was seen long before.
 
         :param poses: {area: ``area_T_other``} of the areas that the robot is in or beside.
+        :param points: of :meth:`surface_points`.
         :param pose: ``area_T_base`` of the scan.
         :param keyframe: the newest.
         """
         before = (keyframe - _LONG_AGO) // _RENEWED * _RENEWED
         grid = self._views.seen_before(hybrid_map, poses, before)
-        return KNOWN.log_ratio(grid.agreement(surface_points(scan, self._model), pose), MAPS_USUAL)
+        return KNOWN.log_ratio(grid.agreement(points, pose), MAPS_USUAL)
 
     def compare(
         self, hybrid_map: HybridMap, area: int, query: Query, compared: Mapping[int, Collection[int]],

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.geometry.chi_square import gate
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.topology.common_map import ArcValue, Pair
 from hmt_slam_ros.topology.hybrid_map import HybridMap
@@ -25,7 +26,7 @@ _DISTANCE, _ANGLE = 0.5, math.radians(5.0)
 _ALIGNED = np.diag([0.5 * _DISTANCE, 0.5 * _DISTANCE, 0.5 * _ANGLE]) ** 2
 # Variance of a position, m^2, above which a hypothesis says nothing of it.
 _CERTAIN = 1.0
-_SAME = 7.81  # chi-square with 3 degrees of freedom at 95 %
+_SAME = gate(0.95)
 
 
 @dataclass(frozen=True, eq=False)
