@@ -90,18 +90,6 @@ def sample_cells(window: Window, surface: Surface, samples: Float64) -> Int32:
 
 
 @njit(cache=True)
-def log_ratio_of(log_ratio: Float32, cells: Int32, i: int, j: int) -> float:
-    """Sum of the log-ratios that the samples (n, 2) read at one shift, nats."""
-    rows, columns = np.uint32(log_ratio.shape[0]), np.uint32(log_ratio.shape[1])
-    total = 0.0
-    for n in range(cells.shape[0]):
-        x, y = np.uint32(cells[n, 0] + i), np.uint32(cells[n, 1] + j)
-        if x < columns and y < rows:
-            total += log_ratio[y, x]
-    return total
-
-
-@njit(cache=True)
 def bound_of_square(level: Int8, margin: int, cells: Int32, i: int, j: int) -> int:
     """What the samples (n, 2) read at most in the square of shifts that begins at (i, j), steps.
 
@@ -135,16 +123,19 @@ def bounds_of_quarters(
 
 
 @njit(cache=True)
-def add_block(level: Int8, margin: int, cells: Int32, i: int, j: int, totals: Int32) -> None:
-    """Add what the samples (n, 2) read at most at every shift of the block that begins at (i, j), steps.
+def add_block(log_ratio: Float32, cells: Int32, i: int, j: int, totals: Float64) -> None:
+    """Add the log-ratios that the samples (n, 2) read at every shift of the block that begins at (i, j), nats.
 
-    :param level: the lowest of the pyramid.
     :param totals: shape (BLOCK, BLOCK), [j, i].
     """
-    rows, columns = np.uint32(level.shape[0] - BLOCK), np.uint32(level.shape[1] - BLOCK)
+    rows, columns = log_ratio.shape
     for n in range(cells.shape[0]):
-        x, y = np.uint32(cells[n, 0] + i + margin), np.uint32(cells[n, 1] + j + margin)
-        if x < columns and y < rows:
+        x, y = cells[n, 0] + i, cells[n, 1] + j
+        if 0 <= x <= columns - BLOCK and 0 <= y <= rows - BLOCK:
             for r in range(BLOCK):
                 for c in range(BLOCK):
-                    totals[r, c] += level[y + np.uint32(r), x + np.uint32(c)]
+                    totals[r, c] += log_ratio[y + r, x + c]
+        elif -BLOCK < x < columns and -BLOCK < y < rows:
+            for r in range(max(0, -y), min(BLOCK, rows - y)):
+                for c in range(max(0, -x), min(BLOCK, columns - x)):
+                    totals[r, c] += log_ratio[y + r, x + c]

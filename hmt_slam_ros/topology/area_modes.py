@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
 
-from hmt_slam_ros.arrays import Float64, Int64
+from hmt_slam_ros.arrays import Float64, Int32, Int64
 from hmt_slam_ros.topology.area_bounds import Surface
 from hmt_slam_ros.topology.area_search import Cells
 from hmt_slam_ros.topology.area_window import Window
@@ -24,35 +26,51 @@ def clusters(cells: Cells, saddle: float) -> Int64:
     sides = at.max(axis=0) + 2
     keys = (at[:, 0] * sides[1] + at[:, 1]) * sides[2] + at[:, 2]
     by_key = np.argsort(keys, kind="stable")
-    peaks = _flood(order, keys, keys[by_key], by_key, sides, cells.score, saddle)
+    peaks = _flood(order, by_key, keys[by_key], sides, cells.score, saddle)
     _, labels = np.unique(np.argsort(order, kind="stable")[peaks], return_inverse=True)
     return labels.reshape(-1).astype(np.int64)
 
 
 @njit(cache=True)
-def _flood(
-    order: Int64, keys: Int64, sorted_keys: Int64, by_key: Int64, sides: Int64, score: Float64, saddle: float
-) -> Int64:
-    """Flood from the top: the peak (a cell) that every cell belongs to."""
-    above = np.full(order.size, -1)
+def _flood(order: Int64, by_key: Int64, keys: Int64, sides: Int64, score: Float64, saddle: float) -> Int64:
+    """Flood from the top: the peak (a cell) that every cell belongs to.
+
+    :param keys: ascending, of the cells ``by_key``.
+    """
+    above, rank = np.full(order.size, -1), np.empty(order.size, np.int64)
+    rank[by_key] = np.arange(order.size)
+    rows = _rows_around(keys, sides)
     for cell in order:
         above[cell] = cell
-        for dk in range(-1, 2):
-            for di in range(-1, 2):
-                beside = keys[cell] + (dk * sides[1] + di) * sides[2]
-                place = np.searchsorted(sorted_keys, beside - 1)
-                while place < keys.size and sorted_keys[place] <= beside + 1:
-                    if above[by_key[place]] >= 0:
-                        _join(above, cell, by_key[place], score, saddle)
-                    place += 1
+        for row in range(9):
+            for place in range(rows[rank[cell], row, 0], rows[rank[cell], row, 1]):
+                if above[by_key[place]] >= 0:
+                    _join(above, cell, by_key[place], score, saddle)
     for cell in order:
         above[cell] = _peak(above, cell)
     return above
 
 
 @njit(cache=True)
+def _rows_around(keys: Int64, sides: Int64) -> Int32:
+    """The cells around every cell, by key: first and last + 1 in each of nine rows of three, shape (n, 9, 2)."""
+    found = np.empty((keys.size, 9, 2), np.int32)
+    for row in range(9):
+        middle = ((row // 3 - 1) * sides[1] + row % 3 - 1) * sides[2]
+        first, last = 0, 0
+        for n in range(keys.size):
+            while first < keys.size and keys[first] < keys[n] + middle - 1:
+                first += 1
+            while last < keys.size and keys[last] <= keys[n] + middle + 1:
+                last += 1
+            found[n, row, 0], found[n, row, 1] = first, last
+    return found
+
+
+@njit(cache=True)
 def _peak(above: Int64, cell: int) -> int:
     while above[cell] != cell:
+        above[cell] = above[above[cell]]
         cell = above[cell]
     return cell
 
@@ -67,30 +85,66 @@ def _join(above: Int64, cell: int, other: int, score: Float64, saddle: float) ->
         above[b] = a
 
 
+class _Points(NamedTuple):
+    """Samples, and where they lie in a grid of cells (n,).
+
+    :ivar x: shape (n,), m, as ``y``.
+    :ivar column: shape (n,), of the cell whose centre is to the left; ``row``, of that which is above.
+    :ivar right: shape (n,), distance from that centre, cells; ``down``, the same.
+    """
+
+    x: Float64
+    y: Float64
+    column: Int32
+    row: Int32
+    right: Float64
+    down: Float64
+
+
+@njit(cache=True)
+def _points(samples: Float64) -> _Points:
+    n = samples.shape[0]
+    return _Points(
+        samples[:, 0].copy(), samples[:, 1].copy(), np.empty(n, np.int32), np.empty(n, np.int32), np.empty(n),
+        np.empty(n),
+    )  # fmt: skip
+
+
 @njit(cache=True)
 def log_ratio_at(surface: Surface, samples: Float64, pose: Float64) -> float:
     """Sum over the samples of the bilinearly interpolated log-ratio, nats, untempered.
 
+    :param samples: shape (n, 2), m, query frame.
     :param pose: shape (3,), ``candidate_T_query``.
     """
+    return _log_ratio_at(surface, _points(samples), pose)
+
+
+@njit(cache=True)
+def _log_ratio_at(surface: Surface, points: _Points, pose: Float64) -> float:
+    """In two loops, as the compiler takes several samples at once in the first."""
     cos, sin = np.cos(pose[2]), np.sin(pose[2])
     x0, y0 = pose[0] - surface.origin[0], pose[1] - surface.origin[1]
-    rows, columns = surface.log_ratio.shape
-    total = 0.0
-    for n in range(samples.shape[0]):
-        u = (x0 + cos * samples[n, 0] - sin * samples[n, 1]) / surface.cell - 0.5
-        v = (y0 + sin * samples[n, 0] + cos * samples[n, 1]) / surface.cell - 0.5
-        c, r = int(np.floor(u)), int(np.floor(v))
-        if 0 <= c < columns - 1 and 0 <= r < rows - 1:
-            a, b = u - c, v - r
-            low = (1.0 - a) * surface.log_ratio[r, c] + a * surface.log_ratio[r, c + 1]
-            high = (1.0 - a) * surface.log_ratio[r + 1, c] + a * surface.log_ratio[r + 1, c + 1]
+    for n in range(points.x.size):
+        u = (x0 + cos * points.x[n] - sin * points.y[n]) / surface.cell - 0.5
+        v = (y0 + sin * points.x[n] + cos * points.y[n]) / surface.cell - 0.5
+        left, above = np.floor(u), np.floor(v)
+        points.column[n], points.row[n] = np.int32(left), np.int32(above)
+        points.right[n], points.down[n] = u - left, v - above
+    rows, columns = np.uint32(surface.log_ratio.shape[0] - 1), np.uint32(surface.log_ratio.shape[1] - 1)
+    one, total = np.uint32(1), 0.0
+    for n in range(points.x.size):
+        c, r = np.uint32(points.column[n]), np.uint32(points.row[n])
+        if c < columns and r < rows:
+            a, b = points.right[n], points.down[n]
+            low = (1.0 - a) * surface.log_ratio[r, c] + a * surface.log_ratio[r, c + one]
+            high = (1.0 - a) * surface.log_ratio[r + one, c] + a * surface.log_ratio[r + one, c + one]
             total += (1.0 - b) * low + b * high
     return total
 
 
 @njit(cache=True)
-def _score_at(surface: Surface, samples: Float64, window: Window, temper: float, pose: Float64) -> float:
+def _score_at(surface: Surface, points: _Points, window: Window, temper: float, pose: Float64) -> float:
     """Tempered log-ratio plus the prior's exponent, without the reverse check."""
     dx, dy = pose[0] - window.mean[0], pose[1] - window.mean[1]
     turn = pose[2] - window.mean[2]
@@ -101,7 +155,7 @@ def _score_at(surface: Surface, samples: Float64, window: Window, temper: float,
     exponent = 0.0
     for r in range(3):
         exponent += (window.root[r, 0] * twist[0] + window.root[r, 1] * twist[1] + window.root[r, 2] * twist[2]) ** 2
-    return temper * log_ratio_at(surface, samples, pose) - 0.5 * exponent
+    return temper * _log_ratio_at(surface, points, pose) - 0.5 * exponent
 
 
 def quadrature(
@@ -143,7 +197,7 @@ def _divide(
 ) -> tuple[Float64, Float64]:
     count, turns = divisions
     means, best = np.empty(centres.shape[0]), centres.copy()
-    scores = np.empty(count * count * turns)
+    points, scores = _points(samples), np.empty(count * count * turns)
     pose = np.empty(3)
     for n in range(centres.shape[0]):
         top = -np.inf
@@ -151,7 +205,7 @@ def _divide(
             pose[0] = centres[n, 0] + window.cell * ((s % count + 0.5) / count - 0.5)
             pose[1] = centres[n, 1] + window.cell * ((s // count % count + 0.5) / count - 0.5)
             pose[2] = centres[n, 2] + turn * ((s // (count * count) + 0.5) / turns - 0.5)
-            scores[s] = _score_at(surface, samples, window, temper, pose)
+            scores[s] = _score_at(surface, points, window, temper, pose)
             if scores[s] > top:
                 top = scores[s]
                 best[n] = pose
@@ -168,14 +222,15 @@ def climb(
     :param step: shape (3,), first steps in m, m and rad.
     :param finest: smallest share of the first steps.
     """
-    best, height = start.copy(), _score_at(surface, samples, window, temper, start)
+    points = _points(samples)
+    best, height = start.copy(), _score_at(surface, points, window, temper, start)
     share = 1.0
     while share >= finest:
         centre = best.copy()
         moved = False
         for s in range(27):
             pose = centre + share * step * np.array((s % 3 - 1.0, s // 3 % 3 - 1.0, s // 9 - 1.0))
-            score = _score_at(surface, samples, window, temper, pose)
+            score = _score_at(surface, points, window, temper, pose)
             if score > height:
                 best, height, moved = pose, score, True
         if not moved:
@@ -189,7 +244,7 @@ def curvature(surface: Surface, samples: Float64, pose: Float64, step: Float64) 
 
     :param step: shape (3,), finite differences in m, m and rad.
     """
-    corner = np.empty((3, 3))
+    points, corner = _points(samples), np.empty((3, 3))
     hessian = np.empty((3, 3))
     for a in range(3):
         for b in range(a, 3):
@@ -198,7 +253,7 @@ def curvature(surface: Surface, samples: Float64, pose: Float64, step: Float64) 
                     twist = np.zeros(3)
                     twist[a] += p * step[a]
                     twist[b] += q * step[b]
-                    corner[p + 1, q + 1] = log_ratio_at(surface, samples, _beside(pose, twist))
+                    corner[p + 1, q + 1] = _log_ratio_at(surface, points, _beside(pose, twist))
             mixed = corner[2, 2] - corner[2, 0] - corner[0, 2] + corner[0, 0]
             hessian[a, b] = -mixed / (4.0 * step[a] * step[b])
             hessian[b, a] = hessian[a, b]

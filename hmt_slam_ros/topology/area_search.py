@@ -21,10 +21,10 @@ from hmt_slam_ros.topology.area_bounds import (
     add_block,
     bound_of_square,
     bounds_of_quarters,
-    log_ratio_of,
     pyramid,
     sample_cells,
 )  # fmt: skip
+from hmt_slam_ros.topology.area_reverse import Reverse, contradiction, points_of_block, reverse_check
 from hmt_slam_ros.topology.area_window import Window, prior_bound
 
 _LOWEST, _HIGHEST = 2, 5  # heights of the coarsest nodes; of the lowest, the squares are blocks
@@ -53,8 +53,7 @@ class _Task(NamedTuple):
     surface: Surface
     bounds: Pyramid
     cells: Int32
-    back: Surface
-    back_samples: Float64
+    reverse: Reverse
     temper: float
     margin: float
 
@@ -77,8 +76,8 @@ def search(
     edge = max(1, int((window.last - window.first).max()))
     height = min(_HIGHEST, max(_LOWEST, int(np.ceil(np.log2(edge))) - 2))
     task = _Task(
-        window, surface, pyramid(surface.log_ratio, height), sample_cells(window, surface, samples), back, back_samples,
-        temper, margin,
+        window, surface, pyramid(surface.log_ratio, height), sample_cells(window, surface, samples),
+        reverse_check(window, back, back_samples), temper, margin,
     )  # fmt: skip
     found = _search(task, height, threshold)
     kept = found[found[:, 3] >= max(threshold, found[:, 3].max(initial=-np.inf) - margin)]
@@ -91,6 +90,7 @@ def _search(task: _Task, height: int, threshold: float) -> Float64:
     nodes, coarse = _coarse_nodes(task, height)
     stack, bounds = np.empty((4 * height + 8, 4), dtype=np.int64), np.empty(4 * height + 8)
     found, count = np.empty((1024, 5)), 0
+    points = np.empty_like(task.reverse.points)
     least = threshold
     for n in np.argsort(-coarse, kind="mergesort"):
         stack[0, :3], stack[0, 3], bounds[0] = nodes[n], height, coarse[n]
@@ -105,7 +105,7 @@ def _search(task: _Task, height: int, threshold: float) -> Float64:
                 continue
             if count + BLOCK * BLOCK > len(found):
                 found = np.concatenate((found, np.empty_like(found)))
-            count, least = _take_cells(task, (k, i, j), found, count, least)
+            count, least = _take_cells(task, (k, i, j), points, found, count, least)
     return found[:count]
 
 
@@ -160,23 +160,29 @@ def _push_quarters(
 
 @njit(cache=True)
 def _take_cells(
-    task: _Task, node: tuple[int, int, int], found: Float64, count: int, least: float
+    task: _Task, node: tuple[int, int, int], points: Float64, found: Float64, count: int, least: float
 ) -> tuple[int, float]:
-    """Append the cells of a block that reach ``least``: how many are found then, and what the next have to reach."""
+    """Append the cells of a block that reach ``least``: how many are found then, and what the next have to reach.
+
+    :param points: where the block's points are put, no shorter than ``task.reverse.points``.
+    """
     window = task.window
+    near = -1
     k, i, j = node
-    steps = np.zeros((BLOCK, BLOCK), np.int32)
-    add_block(task.bounds.levels[0], task.bounds.margin, task.cells[k], i, j, steps)
+    totals = np.zeros((BLOCK, BLOCK))
+    add_block(task.surface.log_ratio, task.cells[k], i, j, totals)
     for y in range(j, min(j + BLOCK, window.last[1] + 1)):
         for x in range(i, min(i + BLOCK, window.last[0] + 1)):
-            bound = task.temper * task.bounds.step * steps[y - j, x - i]
-            if bound < least:
+            score = task.temper * totals[y - j, x - i]
+            if score < least:
                 continue
-            prior = prior_bound(window, k, x, y, 1)
-            if bound + prior < least:
+            score += prior_bound(window, k, x, y, 1)
+            if score < least:
                 continue
-            score = task.temper * log_ratio_of(task.surface.log_ratio, task.cells[k], x, y) + prior
-            taken = task.temper * _contradiction(task, (k, x, y), (least - score) / task.temper)
+            if near < 0:
+                near = points_of_block(task.reverse, window, node, points)
+            against = contradiction(task.reverse.grid, window, (k, x, y), points[:near], (least - score) / task.temper)
+            taken = task.temper * against
             score += taken
             if score >= least:
                 found[count, 0], found[count, 1], found[count, 2] = k, x, y
@@ -184,23 +190,3 @@ def _take_cells(
                 count += 1
                 least = max(least, score - task.margin)
     return count, least
-
-
-@njit(cache=True)
-def _contradiction(task: _Task, node: tuple[int, int, int], least: float) -> float:
-    """Sum of the negative log-ratios that the candidate's points meet in the query's grid, as far as to ``least``."""
-    window, back, points = task.window, task.back, task.back_samples
-    angle = window.mean[2] + window.turns[node[0]]
-    cos, sin = np.cos(angle), np.sin(angle)
-    x, y = window.mean[0] + node[1] * window.cell, window.mean[1] + node[2] * window.cell
-    rows, columns = back.log_ratio.shape
-    total = 0.0
-    for n in range(points.shape[0]):
-        if total < least:
-            break
-        dx, dy = points[n, 0] - x, points[n, 1] - y
-        c = int(np.floor((cos * dx + sin * dy - back.origin[0]) / back.cell))
-        r = int(np.floor((cos * dy - sin * dx - back.origin[1]) / back.cell))
-        if 0 <= c < columns and 0 <= r < rows:
-            total += min(np.float32(0.0), back.log_ratio[r, c])
-    return total
