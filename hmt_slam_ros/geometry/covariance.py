@@ -47,11 +47,20 @@ def _moved(covariance: Matrix, x: float, y: float, theta: float) -> Matrix:
     """Ad C Ad^T for the pose (x, y, theta)."""
     cos, sin = np.cos(theta), np.sin(theta)
     ad = ((cos, -sin, y), (sin, cos, -x), (0.0, 0.0, 1.0))
-    half, found = np.empty((3, 3)), np.empty((3, 3))
+    half = (_times(ad[0], covariance), _times(ad[1], covariance), _times(ad[2], covariance))
+    found = np.empty((3, 3))
     for i in range(3):
         for j in range(3):
-            half[i, j] = ad[i][0] * covariance[0, j] + ad[i][1] * covariance[1, j] + ad[i][2] * covariance[2, j]
-    for i in range(3):
-        for j in range(3):
-            found[i, j] = half[i, 0] * ad[j][0] + half[i, 1] * ad[j][1] + half[i, 2] * ad[j][2]
+            found[i, j] = half[i][0] * ad[j][0] + half[i][1] * ad[j][1] + half[i][2] * ad[j][2]
     return found
+
+
+@njit(cache=True)
+def _times(row: tuple[float, float, float], matrix: Matrix) -> tuple[float, float, float]:
+    """A row (3,) times a matrix."""
+    x, y, z = row
+    return (
+        x * matrix[0, 0] + y * matrix[1, 0] + z * matrix[2, 0],
+        x * matrix[0, 1] + y * matrix[1, 1] + z * matrix[2, 1],
+        x * matrix[0, 2] + y * matrix[1, 2] + z * matrix[2, 2],
+    )

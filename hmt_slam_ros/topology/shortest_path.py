@@ -136,22 +136,31 @@ def _search(
             break
         low, high = np.searchsorted(own.begin, here), np.searchsorted(own.begin, here, side="right")
         for k in range(low, high):
-            if not own.gone[k]:
+            if not (own.gone[k] or _cheaper(seen, own.end[k], cost)):
                 last = _step(
                     row, own.end[k], own.means[k], own.covariances[k], own.backwards[k], cost, limit, seen, last, queue
                 )
         side = np.int64(table.first[here]) if here < len(table.first) else np.int64(-1)
         while side >= 0:
             there, arc = np.int64(table.beyond[side]), side // 2
-            place = low + np.searchsorted(own.end[low:high], there)
-            if place == high or own.end[place] != there:
-                last = _step(
-                    row, there, table.means[arc], table.covariances[arc], side % 2 == 1, cost, limit, seen, last, queue
-                )
+            if not _cheaper(seen, there, cost):
+                place = low + np.searchsorted(own.end[low:high], there)
+                if place == high or own.end[place] != there:
+                    last = _step(
+                        row, there, table.means[arc], table.covariances[arc], side % 2 == 1, cost, limit, seen, last,
+                        queue,
+                    )  # fmt: skip
             side = np.int64(table.following[side])
         seen.cost[row] = -1.0
     rows = rows[:count]
     return areas[:count], seen.means[rows], seen.covariances[rows]
+
+
+@njit(cache=True)
+def _cheaper(seen: _Frontier, area: int, cost: float) -> bool:
+    """Whether an area was reached at a cost, or a smaller one."""
+    known = seen.row[area]
+    return known > 0 and seen.cost[known] <= cost
 
 
 @njit(cache=True)
@@ -160,13 +169,11 @@ def _step(
     seen: _Frontier, last: int, queue: list[tuple[float, int]],
 ) -> int:
     """See an area over an arc from the area in ``row``; the last row that is in use."""
-    known = seen.row[there]
-    if known > 0 and seen.cost[known] <= cost:
-        return last
     if backwards:
         covariance = of_inverse(covariance, mean)
         mean = _inverse(mean)
     beyond = carried(seen.covariances[row], mean) + covariance  # Eq. (15)
+    known = seen.row[there]
     growth = beyond[0, 0] + beyond[1, 1] - (seen.covariances[row, 0, 0] + seen.covariances[row, 1, 1])
     new_cost = max(cost, cost + growth)
     if new_cost > limit or (known > 0 and seen.cost[known] <= new_cost):
