@@ -92,6 +92,8 @@ class Tsbi:
         parents = self._parents(keyframe)
         branches = [self._branch(parent, by_hypothesis.get(parent.hypothesis), keyframe) for parent in parents]
         children = [child for branch in branches for child in branch.children]
+        if not any(branch.looked for branch in branches):
+            self._branching.search.look_ahead(max(parents, key=lambda parent: parent.log_weight).hybrid_map)
         settled = self._settle(events.sequence, children, branches)
         chosen = [children[k] for k in settled.kept]
         changed = self._leaves(children, chosen, settled.probabilities)

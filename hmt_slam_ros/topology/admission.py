@@ -86,8 +86,7 @@ class Admission:
         others = order[_LOOKED_AT:]
         distant = dict(zip(found.areas[others].tolist(), bounds[others].tolist(), strict=True))
         known = ~np.isin(found.areas, [*excluded, *within, *distant])
-        elsewhere = np.sort(found.areas[known])
-        return within, distant, elsewhere[:: max(1, -(-len(elsewhere) // _ELSEWHERE))].tolist()
+        return within, distant, _spread_out(found.areas[known], _ELSEWHERE).tolist()
 
     def _entry_bounds(self, hybrid_map: HybridMap, found: Reached, query: Query) -> NDArray[np.float64]:
         lever = float(np.hypot(*stacked(query.poses)[:, :2].T).max())
@@ -124,3 +123,12 @@ class Admission:
         spread = math.sqrt(np.linalg.eigvalsh(prior.covariance[:2, :2])[-1]) + lever * math.sqrt(prior.covariance[2, 2])
         known = positions(hybrid_map, area, np.zeros(3))
         return gap(asked, known) <= self._options.place_radius + math.sqrt(self.gate) * spread
+
+
+def _spread_out(areas: NDArray[np.int64], count: int) -> NDArray[np.int64]:
+    """Some of the areas from all over the map, those whose numbers are divisible by the largest powers of two.
+
+    They stay the same from cut to cut, so that the maps made of them serve for many: where one more area is known, or
+    one less is elsewhere, at most one of them changes.
+    """
+    return areas[np.lexsort((areas, -(areas & -areas)))][:count]

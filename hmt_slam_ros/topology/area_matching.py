@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hmt_slam_ros.arrays import Float64
+from hmt_slam_ros.arrays import Float64, Int64
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.chi_square import gate
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
@@ -98,8 +98,33 @@ def match(
     :param bounds: shape (2, 2), the smallest and the largest (x, y) in the candidate where the middle of the query's
         points may be, m; what lies beyond is not searched.
     """
-    if not query.points.size or not candidate.points.size:
+    searched = _searched(query, candidate, prior, settings, bounds)
+    if searched is None:
         return Match()
+    return Match(float(np.logaddexp.reduce(searched.masses)), lambda: tuple(_modes(searched)))
+
+
+def best_pose(
+    query: AreaGrid, candidate: AreaGrid, prior: PoseGaussian, settings: MatchSettings
+) -> tuple[Float64, float] | None:
+    """Where the heaviest mode of :func:`match` peaks, ``candidate_T_query``, and the log of its mass; None without one.
+
+    That costs a fraction of the mode with its covariance.
+    """
+    searched = _searched(query, candidate, prior, settings)
+    if searched is None:
+        return None
+    labels, totals = _clustered(searched)
+    inside = labels == totals.argmax()
+    peak = _peak(searched.problem, searched.masses[inside], searched.poses[inside])
+    return se2.compose(peak, se2.inverse(searched.problem.to_middle.mean)), float(totals.max())
+
+
+def _searched(
+    query: AreaGrid, candidate: AreaGrid, prior: PoseGaussian, settings: MatchSettings, bounds: Float64 | None = None
+) -> _Searched | None:
+    if not query.points.size or not candidate.points.size:
+        return None
     # About the middle of the samples turns and shifts are least correlated, and the lattice of turns coarsest.
     middle = query.points.mean(axis=0)
     to_middle = PoseGaussian.exactly(np.array([*middle, 0.0]))
@@ -117,15 +142,10 @@ def match(
         settings.margin,
     )  # fmt: skip
     if not cells.score.size:
-        return Match()
-    problem = _Problem(surface, centred.points, window, prior, settings)
+        return None
+    problem = _Problem(surface, centred.points, window, prior, settings, to_middle)
     masses, poses = area_modes.quadrature(surface, centred.points, window, cells, settings.temper)
-    masses = masses + log_cell
-
-    def modes() -> tuple[Mode, ...]:
-        return tuple(_carried(mode, to_middle) for mode in _modes(problem, cells, masses, poses))
-
-    return Match(float(np.logaddexp.reduce(masses)), modes)
+    return _Searched(problem, cells, masses + log_cell, poses)
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,6 +155,16 @@ class _Problem:
     window: Window
     prior: PoseGaussian
     settings: MatchSettings
+    to_middle: PoseGaussian
+
+
+class _Searched(NamedTuple):
+    """Where the query may lie: cells, the log of the mass of each, (n,), and the best pose found in it, (n, 3)."""
+
+    problem: _Problem
+    cells: Cells
+    masses: Float64
+    poses: Float64
 
 
 def _coarse(grid: AreaGrid) -> Surface:
@@ -168,18 +198,25 @@ def _within_reach(points: Float64, window: Window, query: AreaGrid) -> Float64:
     return points[near]
 
 
-def _modes(problem: _Problem, cells: Cells, masses: Float64, poses: Float64) -> list[Mode]:
-    """The modes by falling mass, coinciding ones merged."""
-    labels = area_modes.clusters(cells, _SADDLE)
+def _clustered(searched: _Searched) -> tuple[Int64, Float64]:
+    """The cluster of every cell, and the log of the mass of every cluster."""
+    labels = area_modes.clusters(searched.cells, _SADDLE)
     totals = np.full(labels.max() + 1, -np.inf)
-    np.logaddexp.at(totals, labels, masses)
+    np.logaddexp.at(totals, labels, searched.masses)
+    return labels, totals
+
+
+def _modes(searched: _Searched) -> list[Mode]:
+    """The modes by falling mass, coinciding ones merged."""
+    problem, _, masses, poses = searched
+    labels, totals = _clustered(searched)
     floor = totals.max() - problem.settings.margin
     modes: list[Mode] = []
     for label in np.argsort(-totals, kind="stable")[: problem.settings.max_modes]:
         if totals[label] >= floor:
             inside = labels == label
             _add(modes, _mode(problem, masses[inside], poses[inside]))
-    return sorted(modes, key=lambda mode: -mode.log_mass)
+    return [_carried(mode, problem.to_middle) for mode in sorted(modes, key=lambda mode: -mode.log_mass)]
 
 
 def _add(modes: list[Mode], mode: Mode) -> None:
@@ -208,9 +245,7 @@ def _mode(problem: _Problem, masses: Float64, poses: Float64) -> Mode:
     those along a corridor do, widen it.
     """
     settings, window = problem.settings, problem.window
-    heaviest = poses[int(np.argmax(masses))]
-    step = np.array([window.cell / 6.0, window.cell / 6.0, _radian_step(problem, window.cell / 6.0)])
-    peak = area_modes.climb(problem.surface, problem.samples, window, settings.temper, heaviest, step, 1.0 / 8.0)
+    peak = _peak(problem, masses, poses)
     span = 0.3 * window.cell
     bend = area_modes.curvature(
         problem.surface, problem.samples, peak, np.array([span, span, _radian_step(problem, span)])
@@ -225,6 +260,15 @@ def _mode(problem: _Problem, masses: Float64, poses: Float64) -> Mode:
         PoseGaussian(peak, posterior + spread + floor),
         PoseGaussian(peak, np.linalg.inv(matched + _WEAK * held) + spread + floor),
         float(np.logaddexp.reduce(masses)),
+    )
+
+
+def _peak(problem: _Problem, masses: Float64, poses: Float64) -> Float64:
+    """Where a cluster of cells is highest."""
+    window, heaviest = problem.window, poses[int(np.argmax(masses))]
+    step = np.array([window.cell / 6.0, window.cell / 6.0, _radian_step(problem, window.cell / 6.0)])
+    return area_modes.climb(
+        problem.surface, problem.samples, window, problem.settings.temper, heaviest, step, 1.0 / 8.0
     )
 
 

@@ -81,6 +81,7 @@ class ClosureSearch:
         self._views = Views(scans, self._model, self.nearness)
         self._likeness = Likeness(options.alike_probability)
         self._counted = -1
+        self._ahead: list[tuple[int, Collection[int]]] = []
 
     def tracked_area(
         self, hybrid_map: HybridMap, area: int, around: Mapping[int, Pose], poses: NDArray[np.float64]
@@ -139,6 +140,7 @@ class ClosureSearch:
         :param most: this many areas are examined at most, those that the keyframes are most probably in.
         """  # fmt: skip
         within, distant, elsewhere = self.admission.divided(hybrid_map, area, query, excluded)
+        self._ahead = [(other, excluded) for other in elsewhere]
         candidates = self.admission.candidates(hybrid_map, query, compared, within)
         ranked = sorted(candidates, key=lambda known: (-candidates[known].most, known))
         looked_at, rest = ranked[:most], {known: candidates[known].most for known in ranked[most:]} | distant
@@ -156,6 +158,14 @@ class ClosureSearch:
         kept, left_out = _parted(fits, self._options.max_modes)
         skipped = sum(model.known[known] for known in rest) + sum(math.exp(fit.log_weight) for fit in left_out)
         return Comparison(model, kept, tuple(shares), skipped)
+
+    def look_ahead(self, hybrid_map: HybridMap) -> None:
+        """Make the map of one of the areas that the next keyframes will be laid into, while there is time for it."""
+        while self._ahead:
+            area, excluded = self._ahead.pop()
+            if hybrid_map.has_area(area):
+                self._elsewhere(hybrid_map, area, excluded)
+                return
 
     def _entry(self, place: Place, candidate: Candidate) -> Entry:
         return entry(place, candidate.prior, stacked(candidate.fresh), self._options.place_radius)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.topology.area_grid import AreaGrid
-from hmt_slam_ros.topology.area_matching import MatchSettings, match
+from hmt_slam_ros.topology.area_matching import MatchSettings, best_pose
 
 # Where a robot would be that drives where another drove before, or the other way: 1.5 m along, 0.7 m across, 6 degrees.
 _ALIKE = np.diag([1.5, 0.7, math.radians(6.0)]) ** 2
@@ -51,13 +51,9 @@ def best_shares(query: AreaGrid, elsewhere: Iterable[Elsewhere], settings: Match
     near = replace(settings, gate=_GATE, margin=_MARGIN, least=_LEAST)
     found = []
     for place in elsewhere:
-        modes = [
-            mode
-            for heading in _HEADINGS
-            for mode in match(query, place.grid, PoseGaussian(place.pose + heading, _ALIKE), near).modes[:1]
-        ]
-        best = max(modes, key=lambda mode: mode.log_mass, default=None)
-        found.append(0.0 if best is None else place.grid.agreement(query.points, best.pose.mean).share)
+        poses = [best_pose(query, place.grid, PoseGaussian(place.pose + turn, _ALIKE), near) for turn in _HEADINGS]
+        best = max((pose for pose in poses if pose is not None), key=lambda pose: pose[1], default=None)
+        found.append(0.0 if best is None else place.grid.agreement(query.points, best[0]).share)
     return found
 
 
