@@ -171,11 +171,14 @@ def _into_log_ratio(
     Free space counts in full only from two or three sigma on: beams that graze a wall see free space right up to it,
     and unlike flanks would draw a match away from the wall.
     """
-    log_free = np.log(free_ratio)
+    log_free, far = np.log(free_ratio), np.float32(14.0 * sigma**2)
     for r in range(fine.shape[0]):
         for c in range(fine.shape[1]):
+            if fine[r, c] > far and not free[r // 2, c // 2]:
+                fine[r, c] = 0.0
+                continue
             if fine[r, c] == np.inf:
-                fine[r, c] = log_free if free[r // 2, c // 2] else 0.0
+                fine[r, c] = log_free
                 continue
             near = np.exp(-0.5 * fine[r, c] / sigma**2)
             away = 1.0 + (free_ratio - 1.0) * (1.0 - np.sqrt(np.sqrt(near))) if free[r // 2, c // 2] else 1.0

@@ -27,8 +27,12 @@ def clusters(cells: Cells, saddle: float) -> Int64:
     keys = (at[:, 0] * sides[1] + at[:, 1]) * sides[2] + at[:, 2]
     by_key = np.argsort(keys, kind="stable")
     peaks = _flood(order, by_key, keys[by_key], sides, cells.score, saddle)
-    _, labels = np.unique(np.argsort(order, kind="stable")[peaks], return_inverse=True)
-    return labels.reshape(-1).astype(np.int64)
+    rank = np.empty_like(order)
+    rank[order] = np.arange(order.size)
+    is_peak = np.zeros(order.size, dtype=np.bool_)
+    is_peak[rank[peaks]] = True
+    labels: Int64 = (np.cumsum(is_peak) - 1)[rank[peaks]]
+    return labels
 
 
 @njit(cache=True)
