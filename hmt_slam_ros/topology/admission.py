@@ -131,4 +131,8 @@ def _spread_out(areas: NDArray[np.int64], count: int) -> NDArray[np.int64]:
     They stay the same from cut to cut, so that the maps made of them serve for many: where one more area is known, or
     one less is elsewhere, at most one of them changes.
     """
-    return areas[np.lexsort((areas, -(areas & -areas)))][:count]
+    power = 1 << int(areas.max(initial=1)).bit_length()
+    while power > 1 and np.count_nonzero(areas & (power - 1) == 0) <= count:
+        power //= 2
+    some = areas[areas & (power - 1) == 0]
+    return some[np.lexsort((some, -(some & -some)))][:count]

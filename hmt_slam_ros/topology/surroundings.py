@@ -97,8 +97,15 @@ def _entry_bounds(
     scale: float, deviations: float,
 ) -> Float64:
     bounds = np.zeros(len(means))
+    own = np.sqrt(covariance[0, 0] + covariance[1, 1])
     for n in range(len(means)):
         distance = np.hypot(mean[0] - means[n, 0], mean[1] - means[n, 1])
+        # No direction is less certain than all together, and most areas are too far off even so.
+        turn = np.sqrt(covariances[n, 2, 2])
+        widest = np.sqrt(covariances[n, 0, 0] + covariances[n, 1, 1]) + distance * turn + own
+        widest += lever * (turn + np.sqrt(covariance[2, 2]))
+        if distance > reach[n] + deviations * scale * widest + 2.0 * _ROUNDING:
+            continue
         prior = scale * scale * (carried(of_inverse(covariances[n], means[n]), mean) + covariance)
         half, apart = 0.5 * (prior[0, 0] + prior[1, 1]), 0.5 * (prior[0, 0] - prior[1, 1])
         turn = np.sqrt(apart * apart + prior[0, 1] * prior[0, 1])
