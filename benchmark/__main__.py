@@ -39,6 +39,7 @@ MEASUREMENTS = {
     "topology": "whether the world of nested loops ends with the exact topology",
     "consistency": "whether covariances are as large as errors, on simulated worlds",
     "evidence": "how far the evidence for a closure is to be believed, on simulated worlds of training seeds",
+    "appearance": "how well the look of a place tells it from others, on simulated worlds of training seeds",
     "table": "time and memory against a global metric RBPF at equal accuracy, the paper's Table II",
     "ambiguity": "whether both answers stay alive where places are identical, until the evidence",
     "oracle": "TSBI's PMF against an exact enumeration of all topologies",
@@ -48,7 +49,8 @@ MEASUREMENTS = {
 _GROUPS = {
     "all": ("accuracy", "steps", "robustness", "choices", "speed"),
     "validation": (
-        "calibration", "loops", "topology", "consistency", "evidence", "ambiguity", "table", "oracle", "scale",
+        "calibration", "loops", "topology", "consistency", "evidence", "appearance", "ambiguity", "table", "oracle",
+        "scale",
     ),
 }  # fmt: skip
 

@@ -45,7 +45,7 @@ class Comparison(NamedTuple):
     :ivar run: the world.
     :ivar right: whether they are there.
     :ivar found: their surfaces in the area's map.
-    :ivar look: log p(phi), nats.
+    :ivar look: log p(phi), nats, which the fit is not weighed by.
     :ivar rest: what else the fit is weighed by, rarity above all, nats.
     :ivar prior: log of the probability by the arcs relative to that of new ground.
     """
@@ -75,17 +75,20 @@ def contradictions(comparisons: Sequence[Comparison], model: Contradiction) -> N
     return np.array([model.log_ratio(each.found, MAPS_USUAL) for each in comparisons])
 
 
-def fitted(evidence: NDArray[np.float64], right: NDArray[np.bool_]) -> tuple[NDArray[np.float64], float]:
+def fitted(
+    evidence: NDArray[np.float64], right: NDArray[np.bool_], counted: NDArray[np.float64] | None = None
+) -> tuple[NDArray[np.float64], float]:
     """Intercept and weights of a logistic regression, and its log score.
 
     :param evidence: shape (n, parts), nats.
     :param right: shape (n,).
+    :param counted: how much every one counts, shape (n,); None where all count the same.
     """
     design = np.column_stack((np.ones(len(right)), evidence))
     sign = np.where(right, 1.0, -1.0)
 
     def surprise(weights: NDArray[np.float64]) -> float:
-        return -float(np.mean(log_expit(sign * (design @ weights))))
+        return -float(np.average(log_expit(sign * (design @ weights)), weights=counted))
 
     found = minimize(surprise, np.zeros(design.shape[1]))
     return np.asarray(found.x), float(found.fun)
@@ -101,7 +104,7 @@ def _comparisons(records: Sequence[Record]) -> Iterator[Comparison]:
                 continue
             seen.add(name)
             found = Agreement(int(row["samples"]), int(row["on"]), int(row["free"]))
-            rest = row["log_weight"] - math.log(row["pi"]) - row["look"] - MAPS.log_ratio(found, MAPS_USUAL)
+            rest = row["log_weight"] - math.log(row["pi"]) - MAPS.log_ratio(found, MAPS_USUAL)
             prior = math.log(row["pi"] / row["new"])
             yield Comparison(record["world"], bool(row["right"]), found, row["look"], rest, prior)
 
@@ -112,13 +115,13 @@ def _weights_table(comparisons: Sequence[Comparison], right: NDArray[np.bool_]) 
     ))  # fmt: skip
     together = {"what contradicts": 0, "look": 1, "rarity and distance": 2, "the arcs": 3}
     alone = {name: fitted(parts[:, [k]], right)[0][1] for name, k in together.items()}
-    joint, whole = fitted(parts, right)[0][1:], fitted(parts.sum(axis=1)[:, None], right)[0][1]
+    joint, whole = fitted(parts, right)[0][1:], fitted(parts[:, [0, 2, 3]].sum(axis=1)[:, None], right)[0][1]
     intervals = _intervals(comparisons, parts, right)
     rows = [
         [name, f"{alone[name]:.2f}", f"{joint[k]:.2f}", "{:.2f} to {:.2f}".format(*intervals[k])]
         for name, k in together.items()
     ]
-    rows.append(["all of it", f"{whole:.2f}", "", ""])
+    rows.append(["all of it but the look", f"{whole:.2f}", "", ""])
     return table(["evidence", "weight, alone", "together with the others", "95 % interval"], rows)
 
 

@@ -6,7 +6,6 @@ from worlds import box, scan_in
 
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.topology.appearance import appearance_log_ratio, signature
 from hmt_slam_ros.topology.area_grid import GridModel
 from hmt_slam_ros.topology.hybrid_map import HybridMap
 from hmt_slam_ros.topology.shortest_path import Reached
@@ -123,13 +122,3 @@ def test_the_grids_that_are_kept_take_bounded_memory(views, monkeypatch):
         views.grid({0: np.array([0.0, 0.0, 0.05 * k])})
     assert sum(grid.nbytes for grid in views._grids.values()) <= max(100_000, 2 * first.nbytes)
     assert views.grid({0: np.zeros(3)}) is not first
-
-
-def test_places_that_look_alike_have_a_positive_ratio_whatever_the_heading():
-    small, large = box(-1.0, -1.0, 1.0, 1.0), box(-8.0, -8.0, 8.0, 8.0)
-    seen = [
-        signature([scan_in(walls, np.array([0.1, 0.0, heading]), field_of_view=2 * np.pi)])
-        for walls, heading in ((small, 0.0), (small, 2.0), (large, 0.0))
-    ]
-    assert 0.3 < appearance_log_ratio(seen[0], seen[1], 0.5) <= 0.5
-    assert appearance_log_ratio(seen[0], seen[2], 0.5) == -0.5

@@ -10,6 +10,7 @@ from hmt_slam_ros.processes.replica import Replica
 from hmt_slam_ros.processes.tsbi_branching import Branches, Branching, Parent
 from hmt_slam_ros.sensing import Scan
 from hmt_slam_ros.topology.admission import Query
+from hmt_slam_ros.topology.appearance import Looks
 from hmt_slam_ros.topology.area_grid import AreaGrid
 from hmt_slam_ros.topology.closure_search import ClosureSearch, Comparison, Pose
 from hmt_slam_ros.topology.hybrid_map import HybridMap
@@ -27,7 +28,7 @@ class Examination:
     :ivar excluded: areas that were neither candidates nor part of a candidate's map.
     :ivar found: what came of it.
     :ivar views: grids of keyframes and areas, as the search builds them.
-    :ivar scans: {keyframe: scan}.
+    :ivar looks: of keyframes.
     """
 
     kind: str
@@ -37,7 +38,7 @@ class Examination:
     excluded: frozenset[int]
     found: Comparison
     views: Views
-    scans: Mapping[int, Scan]
+    looks: Looks
 
     @property
     def hybrid_map(self) -> HybridMap:
@@ -72,7 +73,7 @@ class WatchedBranching(Branching):
     def __init__(self, configuration: Configuration, replica: Replica, heard: Heard) -> None:
         super().__init__(configuration, replica)
         self.search = self._watched = _WatchedSearch(configuration, replica.scans)
-        self._scans = replica.scans
+        self._looks = Looks(replica.scans)
         self._heard = heard
 
     def cut(self, parent: Parent, keyframes: Sequence[int]) -> Branches:
@@ -87,7 +88,7 @@ class WatchedBranching(Branching):
         if (asked := self._watched.take()) is not None:
             query, compared, excluded, found = asked
             views = self._watched.views
-            self._heard(Examination(kind, parent, query, compared, excluded, found, views, self._scans))
+            self._heard(Examination(kind, parent, query, compared, excluded, found, views, self._looks))
         return branches
 
 

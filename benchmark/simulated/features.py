@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -14,7 +14,7 @@ from benchmark.simulated.truth import GREY, RADIUS, Pose, Truth
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.topology.appearance import appearance_log_ratio, signature
+from hmt_slam_ros.topology.appearance import log_ratio
 from hmt_slam_ros.topology.area_bounds import Surface
 from hmt_slam_ros.topology.area_grid import AreaGrid
 from hmt_slam_ros.topology.area_modes import log_ratio_at
@@ -55,7 +55,7 @@ class Row(NamedTuple):
     :ivar asked: number of the keyframes in question, those not compared with the area before.
     :ivar keyframes: number of the known area's own.
     :ivar share: pi of the area by itself; ``pi``, in the transition model; ``new``, of new ground there.
-    :ivar look: log p(phi), nats.
+    :ivar look: log p(phi), nats, which is no part of the weight.
     :ivar log_mass: log of the mode's part of the evidence integral, nats.
     :ivar log_weight: of the fit, relative to new ground.
     :ivar prior_x: deviation of the prior by the arcs along its axes, widened; likewise ``prior_y`` (m), ``prior_turn``
@@ -177,9 +177,7 @@ class _Candidate:
     def of(self, fit: Fit | None) -> tuple[float, ...]:
         """All that there is to say of a mode."""
         deviations = np.sqrt(np.diag(self._prior.covariance))
-        look = appearance_log_ratio(
-            self._signature(self.fresh), self._signature(self.known), self._options.appearance_weight
-        )
+        look = self._look()
         if fit is None:
             nothing = [_NAN] * 2
             shapes = [_NAN] * 6
@@ -230,8 +228,11 @@ class _Candidate:
         near = sorted(self.known, key=lambda k: float(np.hypot(*(self._truth.poses[k] - here)[:2])))[:_VIEWS]
         return float(self._truth.shared_view(middle, near).max())
 
-    def _signature(self, keyframes: Iterable[int]) -> NDArray[np.float64]:
-        return signature([self._asked.scans[k] for k in keyframes])
+    def _look(self) -> float:
+        """log p(phi), nats, relative to the other known areas."""
+        areas = [self._area, *(area for area in self._asked.known_areas if area != self._area)]
+        keyframes = [self._asked.hybrid_map.keyframes(area) for area in areas]
+        return float(log_ratio(self._asked.looks.likeness(self.fresh, keyframes)[0]))
 
 
 _NO_MATCH = (0, _NAN, 0, 0)

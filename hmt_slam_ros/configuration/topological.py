@@ -98,9 +98,6 @@ class TopologicalInference:
     free_ratio: float = parameter(
         0.1, "How much likelier a surface is measured in free space than in unknown space.", low=1e-4, high=0.99
     )
-    appearance_weight: float = parameter(
-        0.5, "Bound of the evidence that the look of a place gives.", unit="nat", low=0.0, high=20.0
-    )
     recheck_keyframes: int = parameter(
         5, "Keyframes stored without a cut after which known ground is looked for.", low=1, high=1000
     )

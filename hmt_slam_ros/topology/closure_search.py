@@ -1,4 +1,4 @@
-"""In which known areas may some keyframes lie, and how do they fit there? Prior, appearance and evidence of Eq. (6)."""
+"""In which known areas may some keyframes lie, and how do they fit there? Prior and evidence of Eq. (6)."""
 
 from __future__ import annotations
 
@@ -16,7 +16,6 @@ from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.sensing import Scan
 from hmt_slam_ros.topology.admission import Admission, Candidate, Query
-from hmt_slam_ros.topology.appearance import appearance_log_ratio, signature
 from hmt_slam_ros.topology.area_grid import AreaGrid, GridModel, build_area_grid, surface_points
 from hmt_slam_ros.topology.area_matching import MatchSettings, Mode, match
 from hmt_slam_ros.topology.hybrid_map import HybridMap
@@ -35,7 +34,8 @@ _LONG_AGO, _RENEWED = 30, 20
 class Fit(NamedTuple):
     """One way in which the keyframes lie in a known area.
 
-    :ivar log_weight: log pi p(phi) p(z), p(z) relative to new ground.
+    :ivar log_weight: log pi p(z), p(z) relative to new ground. Where surfaces are compared, the look of the place
+        has nothing to add (`python -m benchmark evidence`).
     """
 
     area: int
@@ -68,7 +68,6 @@ class ClosureSearch:
     def __init__(self, configuration: Configuration, scans: Mapping[int, Scan]) -> None:
         """:param scans: {keyframe: scan}, which may grow."""
         self._options = options = configuration.tsbi
-        self._scans = scans
         self.admission = Admission(options)
         self.nearness = Nearness(options.local_sigma, options.local_reach)
         self._settings = MatchSettings(
@@ -132,7 +131,7 @@ class ClosureSearch:
         self, hybrid_map: HybridMap, area: int, query: Query, compared: Mapping[int, Collection[int]],
         excluded: Collection[int], most: int,
     ) -> Comparison:
-        """Prior, appearance and evidence of all admitted areas.
+        """Prior and evidence of all admitted areas.
 
         :param area: the area that the keyframes are in.
         :param compared: {known area: keyframes that were compared with it}.
@@ -194,9 +193,8 @@ class ClosureSearch:
         less, as the prior has there. Where a loop that the hypothesis closed has the robot in that place anyway, the
         fit was to be expected even if that loop is none.
         """
-        known, fresh = hybrid_map.keyframes(place.area), candidate.fresh
+        fresh = candidate.fresh
         foretold = entered.share > 0.5 and bool(hybrid_map.claimed_closures)
-        look = appearance_log_ratio(self._signature(fresh), self._signature(known), self._options.appearance_weight)
         query = self._views.grid(fresh)
         bounds = self._bounds(place, query, fresh)
         modes = [
@@ -211,7 +209,7 @@ class ClosureSearch:
             away = se2.log(se2.between(candidate.prior.mean, mode.pose.mean))
             distance = float(away @ np.linalg.solve(candidate.prior.covariance, away))
             off = -0.5 * max(0.0, distance - entered.typical)
-            yield Fit(place.area, mode, math.log(pi) + mode.log_mass - float(whole) + look + same + off)
+            yield Fit(place.area, mode, math.log(pi) + mode.log_mass - float(whole) + same + off)
 
     def _bounds(self, place: Place, query: AreaGrid, fresh: Mapping[int, Pose]) -> NDArray[np.float64]:
         """The smallest and the largest (x, y) of the middle of the query's points where a keyframe of it is in the
@@ -221,9 +219,6 @@ class ClosureSearch:
         lever = float(np.hypot(*(stacked(fresh)[:, :2] - middle).T).max())
         reach = self._options.place_radius + lever
         return np.array([place.positions.min(axis=0) - reach, place.positions.max(axis=0) + reach])
-
-    def _signature(self, keyframes: Collection[int]) -> NDArray[np.float64]:
-        return signature([self._scans[keyframe] for keyframe in keyframes])
 
 
 def _parted(fits: Sequence[Fit], most: int) -> tuple[tuple[Fit, ...], tuple[Fit, ...]]:
