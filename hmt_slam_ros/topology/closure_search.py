@@ -139,7 +139,7 @@ class ClosureSearch:
         :param most: this many areas are examined at most, those that the keyframes are most probably in.
         """  # fmt: skip
         within, distant, elsewhere = self.admission.divided(hybrid_map, area, query, excluded)
-        self._ahead = [(other, excluded) for other in elsewhere]
+        self._ahead = [(other, excluded) for other in elsewhere if within]
         candidates = self.admission.candidates(hybrid_map, query, compared, within)
         ranked = sorted(candidates, key=lambda known: (-candidates[known].most, known))
         looked_at, rest = ranked[:most], {known: candidates[known].most for known in ranked[most:]} | distant
