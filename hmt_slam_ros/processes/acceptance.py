@@ -7,6 +7,8 @@ from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import TypeAlias
 
+import numpy as np
+
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
@@ -15,8 +17,8 @@ from hmt_slam_ros.processes.observation import Observation
 from hmt_slam_ros.refinement.closure import ClosureRefinement
 from hmt_slam_ros.sensing import Scan
 from hmt_slam_ros.topology.arc_fusion import floored, fused
+from hmt_slam_ros.topology.area_alignment import AreaAlignment
 from hmt_slam_ros.topology.common_map import ArcValue, Pair
-from hmt_slam_ros.topology.fine_alignment import FineAlignment
 from hmt_slam_ros.topology.hybrid_map import HybridMap
 
 Scans: TypeAlias = Mapping[int, Scan]
@@ -46,7 +48,7 @@ class Acceptance:
 
     def __init__(self, configuration: Configuration) -> None:
         self._options = configuration.tlca
-        self._alignment = FineAlignment(configuration)
+        self._alignment = AreaAlignment(configuration)
         self._refinement = ClosureRefinement(configuration)
 
     def of(
@@ -123,29 +125,29 @@ class Acceptance:
         placed = hybrid_map.keyframes(seen.target)
         joined = [keyframe for keyframe in seen.joined if keyframe in placed]
         known = [keyframe for keyframe in placed if keyframe < seen.joined[0]]
-        motion = self._alignment.offset(
+        motion = self._alignment.measured(
             [(scans[keyframe], placed[keyframe]) for keyframe in known],
             [(scans[keyframe], placed[keyframe]) for keyframe in joined],
-            seen.pose.covariance,
+            PoseGaussian(np.zeros(3), seen.pose.covariance),
         )
         if motion is None:
             return seen, []
         moved = [
-            Relabelled(keyframe, seen.target, seen.target, se2.compose(motion, placed[keyframe])) for keyframe in joined
+            Relabelled(keyframe, seen.target, seen.target, se2.compose(motion.mean, placed[keyframe]))
+            for keyframe in joined
         ]
         for r in moved:
             hybrid_map.place(r.keyframe, r.area, r.pose)
-        return replace(seen, pose=seen.pose.compose(PoseGaussian.exactly(se2.inverse(motion)))), moved
+        return replace(seen, pose=PoseGaussian.exactly(seen.pose.mean).compose(motion.inverse())), moved
 
     def _linked(self, hybrid_map: HybridMap, scans: Scans, seen: Observation) -> Observation:
-        """An arc between areas that keep their keyframes, moved to where the scans of both fit."""
-        known, others = hybrid_map.keyframes(seen.source), hybrid_map.keyframes(seen.target)
-        motion = self._alignment.offset(
-            [(scans[keyframe], pose) for keyframe, pose in known.items()],
-            [(scans[keyframe], se2.compose(seen.pose.mean, pose)) for keyframe, pose in others.items()],
-            seen.pose.inverse().covariance,
+        """An arc between areas that keep their keyframes, as the scans of both measure it."""
+        known, others = (
+            [(scans[keyframe], pose) for keyframe, pose in hybrid_map.keyframes(area).items()]
+            for area in (seen.source, seen.target)
         )
-        return seen if motion is None else replace(seen, pose=PoseGaussian.exactly(motion).compose(seen.pose))
+        found = self._alignment.measured(known, others, seen.pose)
+        return seen if found is None else replace(seen, pose=found)
 
     def _fused(self, seen: Observation, old: Arc | None, witnesses: frozenset[int]) -> Arc:
         """The definite arc from an observation and what was known before, which tells whether it closed a loop."""

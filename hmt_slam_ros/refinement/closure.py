@@ -27,6 +27,9 @@ from hmt_slam_ros.topology.pose_graph import Edges
 _ONE_WAY = 3
 # An area that only lies beside the closure moves as a whole: 1 mm and 0.06 degrees.
 _RIGID = np.diag([1e-6, 1e-6, 1e-6])
+# The scans that measured an arc that closed a loop are registered with each other, which places them better: the factor
+# on its covariance meanwhile.
+_TOLD_AGAIN = 10.0
 
 Edge = tuple[int, int, PoseGaussian]
 
@@ -76,7 +79,7 @@ class ClosureRefinement:
         poses = np.array([se2.compose(frames[area_of[k]].mean, hybrid_map.keyframes(area_of[k])[k]) for k in ids])
         surfaces = surfaces_of([scans[keyframe] for keyframe in ids], self._max_range, self._options.max_points)
         pairs = self._pairs(poses, np.array([area_of[keyframe] for keyframe in ids], dtype=np.int64))
-        edges = _as_edges(self._edges(hybrid_map, areas, closed), ids)
+        edges = _as_edges(self._edges(hybrid_map, areas, closed, _TOLD_AGAIN), ids)
         fixed = ids.index(_reference(hybrid_map, closed[0]))
         found = refine_jointly(surfaces, poses, pairs, edges, self._options, fixed)
         taken = _taken_apart(hybrid_map, dict(zip(ids, found, strict=True)), areas, closed)
@@ -112,15 +115,21 @@ class ClosureRefinement:
         count = self._options.neighbours + 1
         return pairs_of(neighbours(poses, areas, poses, areas, linked, self._options.reach, count))
 
-    def _edges(self, hybrid_map: HybridMap, areas: list[int], closed: Collection[int]) -> Iterable[Edge]:
-        """What holds the keyframes together besides their scans."""
+    def _edges(
+        self, hybrid_map: HybridMap, areas: list[int], closed: Collection[int], loosened: float = 1.0
+    ) -> Iterable[Edge]:
+        """What holds the keyframes together besides their scans.
+
+        :param loosened: factor on the covariances of arcs that closed a loop.
+        """
         for area in areas:
             yield from self._within(hybrid_map, area) if area in closed else _as_body(hybrid_map, area)
         for a, b, arc in hybrid_map.all_arcs():
             if a in areas and b in areas:
                 one, other = _reference(hybrid_map, a), _reference(hybrid_map, b)
                 a_T_one, b_T_other = hybrid_map.keyframes(a)[one], hybrid_map.keyframes(b)[other]
-                one_T_b = PoseGaussian.exactly(se2.inverse(a_T_one)).compose(arc.pose)
+                covariance = (loosened if arc.closure else 1.0) * arc.pose.covariance
+                one_T_b = PoseGaussian.exactly(se2.inverse(a_T_one)).compose(PoseGaussian(arc.pose.mean, covariance))
                 yield one, other, one_T_b.compose(PoseGaussian.exactly(b_T_other))
 
     def _within(self, hybrid_map: HybridMap, area: int) -> Iterable[Edge]:

@@ -10,6 +10,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from hmt_slam_ros.agreement import Agreement
+from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.sensing import Scan
 
@@ -43,6 +44,15 @@ class GridModel:
     free_ratio: float = 0.1
     max_range: float = 30.0
     spacing: float = 0.2
+
+    @classmethod
+    def of(cls, configuration: Configuration) -> GridModel:
+        """As configured."""
+        options = configuration.tsbi
+        return cls(
+            options.search_cell, options.surface_sigma, options.surface_ratio, options.free_ratio,
+            configuration.local_map.max_range, options.sample_spacing,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)

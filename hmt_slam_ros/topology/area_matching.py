@@ -7,7 +7,7 @@ Blanco et al. leave it to an expectation over samples of the prior; a lattice do
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hmt_slam_ros.arrays import Float64, Int64
+from hmt_slam_ros.configuration.topological import TopologicalInference
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.chi_square import gate
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
@@ -32,6 +33,8 @@ _TURN_LIMITS = (math.radians(0.2), math.radians(2.0))
 # Share of the prior's information in what matching alone says of a direction of which it says nothing.
 _WEAK = 0.01
 _SAME_MODE = gate(0.95)
+# Modes this far below the best are looked at, nats: the best may lie in the place of another area.
+_MARGIN = 20.0
 
 
 @dataclass(frozen=True)
@@ -54,6 +57,11 @@ class MatchSettings:
     sigma_floor: float = 0.01
     angle_floor: float = math.radians(0.2)
     least: float = -math.inf
+
+    @classmethod
+    def of(cls, options: TopologicalInference) -> MatchSettings:
+        """As configured."""
+        return cls(options.temper, gate(options.gate_probability), _MARGIN, max(cls.max_modes, 2 * options.max_modes))
 
 
 class Mode(NamedTuple):
@@ -219,23 +227,32 @@ def _modes(searched: _Searched) -> list[Mode]:
     return [_carried(mode, problem.to_middle) for mode in sorted(modes, key=lambda mode: -mode.log_mass)]
 
 
+def moments(weighed: Sequence[tuple[PoseGaussian, float]]) -> PoseGaussian:
+    """The second moment of several beliefs about the mean of the heaviest.
+
+    :param weighed: every belief with the log of its weight, at least one.
+    """
+    total = np.logaddexp.reduce([log_weight for _, log_weight in weighed])
+    mean = max(weighed, key=lambda each: each[1])[0].mean
+    covariance = np.zeros((3, 3))
+    for belief, log_weight in weighed:
+        away = se2.log(se2.between(mean, belief.mean))
+        covariance += math.exp(log_weight - total) * (belief.covariance_at(mean) + np.outer(away, away))
+    return PoseGaussian(mean, covariance)
+
+
 def _add(modes: list[Mode], mode: Mode) -> None:
     """Append a mode, or merge it with one that says the same; the heavier one, which is there first, keeps its mean."""
     for place, other in enumerate(modes):
         if other.pose.mahalanobis2(mode.pose) < _SAME_MODE:
-            total = float(np.logaddexp(other.log_mass, mode.log_mass))
-            share = math.exp(mode.log_mass - total)
-            pose, measured = _merged(other.pose, mode.pose, share), _merged(other.measured, mode.measured, share)
-            modes[place] = Mode(pose, measured, total)
+            both = (other, mode)
+            modes[place] = Mode(
+                moments([(each.pose, each.log_mass) for each in both]),
+                moments([(each.measured, each.log_mass) for each in both]),
+                float(np.logaddexp(other.log_mass, mode.log_mass)),
+            )
             return
     modes.append(mode)
-
-
-def _merged(kept: PoseGaussian, other: PoseGaussian, share: float) -> PoseGaussian:
-    """The second moment of two beliefs about the mean of the first; ``share`` is the weight of the second."""
-    away = se2.log(se2.between(kept.mean, other.mean))
-    second = other.covariance_at(kept.mean) + np.outer(away, away)
-    return PoseGaussian(kept.mean, (1.0 - share) * kept.covariance + share * second)
 
 
 def _mode(problem: _Problem, masses: Float64, poses: Float64) -> Mode:

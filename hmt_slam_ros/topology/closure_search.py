@@ -25,8 +25,6 @@ from hmt_slam_ros.topology.transition import Entry, Place, Transition, entry, ow
 
 Pose = NDArray[np.float64]
 
-# Modes this far below the best are looked at, nats: the best may lie in the place of another area.
-_MARGIN = 20.0
 # Keyframe events after which what was seen is known ground, and in steps of how many.
 _LONG_AGO, _RENEWED = 30, 20
 
@@ -70,13 +68,8 @@ class ClosureSearch:
         self._options = options = configuration.tsbi
         self.admission = Admission(options)
         self.nearness = Nearness(options.local_sigma, options.local_reach)
-        self._settings = MatchSettings(
-            options.temper, self.admission.gate, _MARGIN, max(MatchSettings.max_modes, 2 * options.max_modes)
-        )
-        self._model = GridModel(
-            options.search_cell, options.surface_sigma, options.surface_ratio, options.free_ratio,
-            configuration.local_map.max_range, options.sample_spacing,
-        )  # fmt: skip
+        self._settings = MatchSettings.of(options)
+        self._model = GridModel.of(configuration)
         self._views = Views(scans, self._model, self.nearness)
         self._likeness = Likeness(options.alike_probability)
         self._counted = -1
