@@ -26,6 +26,9 @@ from hmt_slam_ros.geometry.symmetric import (
 )
 from hmt_slam_ros.local_map.patches import FAR, PATCH, MapView, field_at, odds_at
 
+# Distance from its surface at which a point in unknown space counts, as a share of the robust scale.
+_UNSEEN = 0.6
+
 
 class BeamModel(NamedTuple):
     """Log-likelihood ratio of an end point, tabulated over the quantised distance to the nearest surface.
@@ -213,21 +216,21 @@ def linearise(
 def misfit(points: Float64, pose: Float64, prior: Prior, view: MapView, settings: Alignment) -> float:
     """What :func:`align` minimises, at a pose, nats; but a point counts by its distance in any direction.
 
-    One in unknown space counts as if its surface were at the robust scale: were it worse, new space ahead would draw
-    the robot back, were it better, nothing would keep it in the map.
+    One in unknown space counts as if its surface were at ``_UNSEEN``: were it worse, new space ahead would draw the
+    robot back, were it better, nothing would keep it in the map.
 
     :param points: (n, 2) or surfels (n, 4).
     """
     half = 0.5 * view.table.shape[0] * PATCH - 0.5
     cos, sin = np.cos(pose[2]), np.sin(pose[2])
-    quantum, cost = view.radius / FAR, 0.0
+    quantum, unseen, cost = view.radius / FAR, _UNSEEN * settings.robust, 0.0
     for n in range(points.shape[0]):
         u = (pose[0] + cos * points[n, 0] - sin * points[n, 1]) / view.cell + half
         v = (pose[1] + sin * points[n, 0] + cos * points[n, 1]) / view.cell + half
         distance, _, _ = _smooth_distance(view, u, v)
         distance *= quantum
-        if distance > settings.robust and odds_at(view, int(u + 0.5), int(v + 0.5)) == 0:
-            distance = settings.robust
+        if distance > unseen and odds_at(view, int(u + 0.5), int(v + 0.5)) == 0:
+            distance = unseen
         cost += np.log(1.0 + (distance / settings.robust) ** 2)
     return 0.5 * settings.robust**2 / (settings.inflation * settings.sigma**2) * cost - log_prior(pose, prior)
 
