@@ -10,7 +10,7 @@ from hmt_slam_ros.configuration.topological import Refinement
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.refinement.joint import refine_jointly
-from hmt_slam_ros.refinement.neighbours import linked_areas, neighbours, pairs_of
+from hmt_slam_ros.refinement.neighbours import linked_areas, neighbours, pairs_of, with_other_ways
 from hmt_slam_ros.refinement.placement import place
 from hmt_slam_ros.refinement.registration import normal_equations, weighting
 from hmt_slam_ros.refinement.surfaces import surfaces_of
@@ -208,6 +208,21 @@ def test_the_nearest_in_place_and_heading_come_first() -> None:
     areas = np.zeros(4, dtype=np.int64)
     found = neighbours(poses, areas, poses[:1], areas[:1], {0: frozenset({0})}, 4.0, 2)
     assert found[0].tolist() == [0, 2]
+
+
+def test_where_ways_keep_apart_the_nearest_of_the_other_way_are_paired_and_elsewhere_not() -> None:
+    # Out along y = 0, back along y = 8 first and then along y = 1.
+    x = np.arange(0.0, 40.0)
+    back = np.where(x < 20.0, 8.0, 1.0)
+    poses = np.concatenate([np.column_stack((x, 0.0 * x, 0.0 * x)), np.column_stack((x, back, 0.0 * x))[::-1]])
+    areas, linked = np.zeros(80, dtype=np.int64), {0: frozenset({0})}
+    near = neighbours(poses, areas, poses, areas, linked, 4.0, 9)
+    found = with_other_ways(near, poses, areas, linked, 4.0)
+    assert {79 - 6, 79 - 5, 79 - 7} <= set(found[6].tolist()) - set(near[6].tolist())
+    assert len(found[6]) == len(near[6]) + 5
+    assert found[24].tolist() == near[24].tolist()
+    apart = with_other_ways(near, poses, np.repeat([0, 1], 40), {0: frozenset({0}), 1: frozenset({1})}, 4.0)
+    assert apart[6].tolist() == near[6].tolist()
 
 
 def test_of_many_keyframes_the_nearest_are_found_also_where_headings_lie_on_both_sides_of_half_a_turn() -> None:

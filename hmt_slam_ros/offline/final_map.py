@@ -16,7 +16,7 @@ from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.offline.recorder import Recording, keyframe_poses
 from hmt_slam_ros.offline.trajectories import Trajectory, carried
 from hmt_slam_ros.refinement.joint import refine_jointly
-from hmt_slam_ros.refinement.neighbours import linked_areas, neighbours, pairs_of
+from hmt_slam_ros.refinement.neighbours import linked_areas, neighbours, pairs_of, with_other_ways
 from hmt_slam_ros.refinement.placement import place
 from hmt_slam_ros.refinement.surfaces import Surfaces, surfaces_of
 from hmt_slam_ros.sensing import Scan
@@ -90,8 +90,10 @@ class _Keyframes:
         """{keyframe: ``map_T_base``} by joint refinement; the first keyframe stays."""
         poses = self._poses(recording)
         # Each keyframe is the nearest to itself.
-        pairs = pairs_of(self._around(poses, poses, self.areas, self._options.neighbours + 1))
-        refined = refine_jointly(self._surfaces, poses, pairs, self._motion(recording, poses), self._options)
+        around = self._around(poses, poses, self.areas, self._options.neighbours + 1)
+        around = with_other_ways(around, poses, self.areas, self._linked, self._options.reach)
+        motion = self._motion(recording, poses)
+        refined = refine_jointly(self._surfaces, poses, pairs_of(around), motion, self._options)
         return dict(zip(self.ids, refined, strict=True))
 
     def _motion(self, recording: Recording, poses: NDArray[np.float64]) -> Edges:
