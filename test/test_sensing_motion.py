@@ -101,6 +101,19 @@ def test_where_scans_do_not_show_the_motion_the_velocity_becomes_uncertain():
     assert across[-1] < 1.2 * across[0]
 
 
+def test_a_jump_says_nothing_of_the_velocity_and_a_velocity_that_lasts_is_learnt_at_once():
+    inertia = Inertia(Motion())
+    driven(inertia, np.array([0.3, 0.0, 0.0]), 0.2 * np.arange(20))
+    inertia.predict(0.2)
+    inertia.observe(se2.exp([0.3, -0.9, -1.0]), SHARP)
+    after = inertia.predict(0.2)
+    np.testing.assert_allclose(after.increment, np.zeros(3), atol=1e-12)
+    assert np.sqrt(after.covariance[0, 0]) > 0.2
+    fast = se2.exp(0.2 * np.array([1.5, 0.0, 0.5]))
+    inertia.observe(fast, SHARP)
+    np.testing.assert_allclose(inertia.predict(0.2).increment, fast, atol=0.03)
+
+
 def test_after_a_long_pause_the_robot_is_not_believed_to_have_turned_on_and_on():
     inertia = Inertia(Motion())
     driven(inertia, np.array([0.0, 0.0, np.radians(-60.0)]), 0.2 * np.arange(20))

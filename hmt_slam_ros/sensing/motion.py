@@ -21,6 +21,8 @@ _IRREGULAR = 3.0
 _PAST = 0.95
 # For about this time, in s, a robot goes on as it went, forward and aside, and turning.
 _MEMORY = np.array([2.0, 2.0, 1.0])
+# A velocity that is so many deviations from the one before was none.
+_JUMP = 10.0
 # A step beyond this many deviations says that something slipped, not how noisy the odometry is.
 _OUTLIER = 3.0
 # Odometry with more than this many times the noise of its model is called noisy.
@@ -130,7 +132,12 @@ class Inertia:
         measured = certain * self._seconds**2
         self._covariance = inverse(self._certainty + measured)
         residual = mean / self._seconds - self._velocity
-        self._velocity = self._velocity + self._covariance @ (measured @ residual)
+        told = measured @ residual
+        if float(residual @ told - told @ self._covariance @ told) > _JUMP**2:
+            # One of the two poses was wrong, or the robot was carried: nothing is known of its velocity.
+            self._velocity, self._covariance = np.zeros(3), inverse(self._usual)
+        else:
+            self._velocity = self._velocity + self._covariance @ told
 
 
 class OdometryNoise:
