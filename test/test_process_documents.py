@@ -34,7 +34,7 @@ def values(kind, name=""):
     """Any value that a field of this type may have."""
     origin, arguments = get_origin(kind), get_args(kind)
     if origin is np.ndarray:
-        shape = (3, 3) if name == "covariance" else (3,)
+        shape = (3, 3) if name in ("covariance", "ambiguity") else (3,)
         count = int(np.prod(shape))
         return st.lists(NUMBERS, min_size=count, max_size=count).map(lambda flat: np.array(flat).reshape(shape))
     if origin is Literal:

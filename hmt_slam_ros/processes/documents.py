@@ -115,7 +115,7 @@ _DOCUMENTS: dict[type, tuple[str, int]] = {
     KeyframeHead: ("keyframe", 2),
     AreaEvents: ("area_events", 1),
     Hypotheses: ("hypotheses", 2),
-    Accepted: ("accepted", 2),
+    Accepted: ("accepted", 3),
     LocalEstimate: ("local_estimate", 1),
     Notice: ("notice", 1),
     Closing: ("finished", 1),
@@ -200,9 +200,9 @@ def _object(kind: Callable[..., object]) -> _Decoder:
 
 
 def _field_decoder(name: str, kind: Hashable) -> _Decoder:
-    """Arrays are poses (3,), but for the one field that is a covariance (3, 3)."""
+    """Arrays are poses (3,), but for the fields that are second moments (3, 3)."""
     if get_origin(kind) is np.ndarray:
-        return _array((3, 3) if name == "covariance" else (3,))
+        return _array((3, 3) if name in ("covariance", "ambiguity") else (3,))
     return _decoder(kind)
 
 

@@ -7,8 +7,8 @@ SLAM takes up the scans that waited.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, field
+from functools import cached_property, partial
 from typing import Literal
 
 import numpy as np
@@ -196,6 +196,8 @@ class Accepted:
     :ivar reopened: where accepted closures contradict each other, the explanations of that, the most probable first:
         the children into which TSBI branches the hypothesis at the next event, with ids of its own and their local
         maps. Each child withdraws what its explanation takes for false. Else empty.
+    :ivar ambiguity: shape (3, 3), the second moment of the robot's pose under the other live hypotheses about that
+        under the most probable one: x, y along the axes of the map, m, and heading, rad; 0 where there is no other.
     """
 
     sequence: int
@@ -204,6 +206,7 @@ class Accepted:
     relabelled: tuple[Relabelled, ...] = ()
     global_poses: tuple[AreaPose, ...] = ()
     reopened: tuple[Leaf, ...] = ()
+    ambiguity: NDArray[np.float64] = field(default_factory=partial(np.zeros, (3, 3)))
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -254,6 +257,7 @@ class RealTimePose:
     :ivar estimate: belief over ``area_T_base`` at the last estimate.
     :ivar since: belief over the motion of the base since then, from the odometry.
     :ivar odometry: the reading, ``odom_T_base``, shape (3,).
+    :ivar ambiguity: of the newest ``Accepted``, shape (3, 3).
     """
 
     stamp: int
@@ -262,6 +266,7 @@ class RealTimePose:
     estimate: PoseGaussian
     since: PoseGaussian
     odometry: Pose
+    ambiguity: NDArray[np.float64]
 
     # In an offline run nobody asks for the poses, and they take longer than all else that rtl does.
     @cached_property
@@ -271,8 +276,10 @@ class RealTimePose:
 
     @cached_property
     def map_pose(self) -> PoseGaussian:
-        """Belief over ``map_T_base``."""
-        return self.area_pose.compose(self.local)
+        """Belief over ``map_T_base``: its mean under the most probable hypothesis, its covariance over all of them."""
+        pose = self.area_pose.compose(self.local)
+        turn = se2.adjoint((0.0, 0.0, -pose.mean[2]))
+        return PoseGaussian(pose.mean, pose.covariance + turn @ self.ambiguity @ turn.T)
 
     @property
     def map_T_odom(self) -> Pose:  # noqa: N802  named as every transform is

@@ -63,6 +63,7 @@ class Rtl:
         self._areas = GlobalPoses((AreaPose(FIRST_AREA, PoseGaussian(np.zeros(3), np.zeros((3, 3)))),))
         # That of the estimate's area, kept where another hypothesis leads, which may not know it.
         self._area_pose = self._areas[FIRST_AREA]
+        self._ambiguity = np.zeros((3, 3))
 
     def handle(self, message: Message) -> list[Message]:
         """Take in one message; an odometry reading is answered with the pose at its stamp, once one is known."""
@@ -72,12 +73,17 @@ class Rtl:
             if self._newest is None or message.stamp > self._newest.stamp:
                 self._newest = message
                 self._correct()
-        elif isinstance(message, Accepted) and message.global_poses:
-            self._areas = GlobalPoses(message.global_poses)
+        elif isinstance(message, Accepted):
+            self._hear_accepted(message)
+        return []
+
+    def _hear_accepted(self, accepted: Accepted) -> None:
+        self._ambiguity = accepted.ambiguity
+        if accepted.global_poses:
+            self._areas = GlobalPoses(accepted.global_poses)
             if self._estimate is not None:
                 self._area_pose = self._areas.get(self._estimate.area, self._area_pose)
             self._correct()
-        return []
 
     def _hear_odometry(self, reading: Odometry) -> list[Message]:
         """Carry the path on to a reading; one that is not newer than its predecessor is passed over."""
@@ -133,7 +139,9 @@ class Rtl:
             se2.between(start.smooth, now.smooth),
             path_covariance(now.distance - start.distance, min(now.angle - start.angle, math.pi), self._motion),
         )
-        return [RealTimePose(now.stamp, estimate.area, self._area_pose, estimate.pose, since, now.raw)]
+        return [
+            RealTimePose(now.stamp, estimate.area, self._area_pose, estimate.pose, since, now.raw, self._ambiguity)
+        ]
 
 
 def _reset_notice(stamp: int, distance: float, angle: float) -> Notice:

@@ -13,6 +13,7 @@ from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.chi_square import gate
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.processes.acceptance import Acceptance
+from hmt_slam_ros.processes.ambiguity import ambiguity
 from hmt_slam_ros.processes.closure_account import Account, Closure, History, Name, Step
 from hmt_slam_ros.processes.messages import (
     Accepted,
@@ -108,6 +109,7 @@ class Tlca:
         arcs, relabelled = ((), ()) if chosen is None else self._refined(chosen)
         accepted = Accepted(hypotheses.sequence, chosen, arcs, relabelled)
         self._replica.accept(accepted)
+        accepted = replace(accepted, ambiguity=ambiguity(self._replica, self._poses))
         self._paths = {hypothesis: self._paths[hypothesis] for hypothesis in self._replica.maps}
         question = None if chosen is None else self._contradicted(chosen, hypotheses.sequence)
         if question is not None:

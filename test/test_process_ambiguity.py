@@ -1,0 +1,49 @@
+"""Where several hypotheses live, the robot's pose in the map is as uncertain as they are apart."""
+
+import numpy as np
+import pytest
+from play_for_tlca import Play, belief
+
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.processes.messages import Arc, Leaf, RealTimePose
+
+THERE = np.array([4.0, 1.0, 0.5])
+ELSEWHERE = np.array([4.5, 4.0, 0.7])
+
+
+def verdict_of(probability):
+    """The robot is in area 2, at the end of one of two arcs."""
+    play = Play()
+    play.start()
+    leaves = [
+        Leaf(h, 0, p, 2, belief(se2.inverse(THERE)), (), (Arc(0, 2, belief(arc)),))
+        for h, p, arc in ((1, probability, THERE), (2, 1.0 - probability, ELSEWHERE))
+    ]
+    return play.step(*leaves)
+
+
+def test_one_hypothesis_is_not_ambiguous():
+    play = Play()
+    verdict = play.start()
+    np.testing.assert_array_equal(verdict.ambiguity, np.zeros((3, 3)))
+
+
+@pytest.mark.parametrize("probability", [0.7, 0.9])
+def test_it_is_what_the_others_are_away_by_their_probability(probability):
+    away = se2.compose(ELSEWHERE, se2.inverse(THERE))
+    np.testing.assert_allclose(verdict_of(probability).ambiguity, (1.0 - probability) * np.outer(away, away))
+
+
+def test_the_pose_in_the_map_is_as_uncertain_as_the_hypotheses_are_apart_whatever_the_heading():
+    exact = PoseGaussian.exactly
+    apart = np.diag([4.0, 0.0, 0.0])
+    said = [
+        RealTimePose(
+            0, 0, exact(np.zeros(3)), exact(np.array([1.0, 2.0, turn])), exact(np.zeros(3)), np.zeros(3), apart
+        )
+        for turn in (0.0, 0.5 * np.pi)
+    ]
+    np.testing.assert_allclose(said[0].map_pose.covariance, np.diag([4.0, 0.0, 0.0]), atol=1e-12)
+    np.testing.assert_allclose(said[1].map_pose.covariance, np.diag([0.0, 4.0, 0.0]), atol=1e-12)
+    np.testing.assert_allclose(said[1].local.covariance, 0.0, atol=1e-12)
