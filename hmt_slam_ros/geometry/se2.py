@@ -137,11 +137,17 @@ def exp(xi: ArrayLike) -> Pose:
 
 
 def _exp_one(x: float, y: float, omega: float) -> Pose:
+    return np.array((*exp_shift(x, y, omega), _wrap_one(omega)))
+
+
+@register_jitable
+def exp_shift(x: float, y: float, omega: float) -> tuple[float, float]:
+    """The translation of :func:`exp`, for kernels."""
     if abs(omega) < _SMALL_ANGLE:
         a, b = 1.0 - omega**2 / 6.0, 0.5 * omega
     else:
         a, b = math.sin(omega) / omega, 2.0 * math.sin(0.5 * omega) ** 2 / omega
-    return np.array((a * x - b * y, b * x + a * y, _wrap_one(omega)))
+    return a * x - b * y, b * x + a * y
 
 
 def log(pose: ArrayLike) -> NDArray[np.float64]:

@@ -110,9 +110,25 @@ def entry_bound(
 
 def _drawn_positions(belief: PoseGaussian, poses: NDArray[np.float64]) -> NDArray[np.float64]:
     """Positions of keyframes (m, 3) under draws from the belief over their reference, shape (draws, m, 2)."""
-    twists = _normal_points() @ np.linalg.cholesky(belief.covariance).T
-    references = se2.compose(belief.mean, se2.exp(twists))
-    return se2.compose(references[:, None], poses[None])[..., :2]
+    return _placed(_normal_points(), belief.mean, np.linalg.cholesky(belief.covariance), poses)
+
+
+@njit(cache=True)
+def _placed(
+    normal: NDArray[np.float64], mean: NDArray[np.float64], root: NDArray[np.float64], poses: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Positions of the poses (m, 3) that are carried by ``mean exp(root normal)``, for each of n points (n, 3)."""
+    positions = np.empty((normal.shape[0], poses.shape[0], 2))
+    cos, sin = np.cos(mean[2]), np.sin(mean[2])
+    for n in range(normal.shape[0]):
+        a, b, c = normal[n]
+        turn = root[2, 0] * a + root[2, 1] * b + root[2, 2] * c
+        x, y = se2.exp_shift(root[0, 0] * a, root[1, 0] * a + root[1, 1] * b, turn)
+        along, across = np.cos(mean[2] + turn), np.sin(mean[2] + turn)
+        for k in range(poses.shape[0]):
+            positions[n, k, 0] = mean[0] + cos * x - sin * y + along * poses[k, 0] - across * poses[k, 1]
+            positions[n, k, 1] = mean[1] + sin * x + cos * y + across * poses[k, 0] + along * poses[k, 1]
+    return positions
 
 
 @njit(cache=True)
