@@ -5,8 +5,8 @@ from __future__ import annotations
 import ctypes
 import os
 
-_M_MMAP_THRESHOLD = -3  # <malloc.h>
-_LARGE = 1 << 20  # bytes
+_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # <malloc.h>
+_LARGE, _SPARE = 1 << 20, 1 << 21  # bytes
 
 
 def settle() -> None:
@@ -18,9 +18,12 @@ def settle() -> None:
 
     glibc's malloc maps large arrays one by one, and unmaps them when they are freed, but raises the bound from which on
     it does so up to 32 MB with every such array. What it takes from the heap instead, later small objects keep from
-    going back: a tenth of a run's memory. A bound that was set stays.
+    going back: a tenth of a run's memory. A bound that was set stays; but then so does the other one, of 128 kB, from
+    which on free memory at the end of the heap is given back at once, so that every map of an area has its pages made
+    anew. Two megabytes are kept for the next.
     """
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
     if mallopt is not None:
         mallopt(_M_MMAP_THRESHOLD, _LARGE)
+        mallopt(_M_TRIM_THRESHOLD, _SPARE)
