@@ -68,7 +68,7 @@ class _EverywhereSearch(ClosureSearch):
         new = max(1.0 - total, options.new_probability) if total else 1.0
         if shares:
             elsewhere = self.admission.divided(hybrid_map, area, query, excluded)[2]
-            self._count_likeness(hybrid_map, query, elsewhere, excluded)
+            self._count_likeness(query, [self._elsewhere(hybrid_map, other, excluded) for other in elsewhere])
         fits = [
             fit
             for known, share in shares.items()

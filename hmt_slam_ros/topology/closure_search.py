@@ -136,12 +136,15 @@ class ClosureSearch:
         candidates = self.admission.candidates(hybrid_map, query, compared, within)
         ranked = sorted(candidates, key=lambda known: (-candidates[known].most, known))
         looked_at, rest = ranked[:most], {known: candidates[known].most for known in ranked[most:]} | distant
+        # Before those of the candidates, for which they may have to go.
+        wanted = elsewhere if looked_at and max(query.poses) != self._counted else ()
+        others = [self._elsewhere(hybrid_map, other, excluded) for other in wanted]
         places = {known: self._views.place(hybrid_map, known, excluded) for known in looked_at}
         entries = {known: self._entry(place, candidates[known]) for known, place in places.items()}
         shares = {known: found.share for known, found in entries.items() if found.share > 0.0}
         model = transition(shares | rest, self._options.new_probability)
         if shares:
-            self._count_likeness(hybrid_map, query, elsewhere, excluded)
+            self._count_likeness(query, others)
         fits = [
             fit
             for known in sorted(shares, key=lambda known: (-shares[known], known))
@@ -162,14 +165,11 @@ class ClosureSearch:
     def _entry(self, place: Place, candidate: Candidate) -> Entry:
         return entry(place, candidate.prior, stacked(candidate.fresh), self._options.place_radius)
 
-    def _count_likeness(
-        self, hybrid_map: HybridMap, query: Query, elsewhere: Sequence[int], excluded: Collection[int]
-    ) -> None:
+    def _count_likeness(self, query: Query, places: Sequence[Elsewhere]) -> None:
         """Compare the keyframes with areas in which they do not lie, once for all hypotheses of an event."""
         newest = max(query.poses)
         if newest != self._counted:
             self._counted = newest
-            places = [self._elsewhere(hybrid_map, area, excluded) for area in elsewhere]
             self._likeness.count(best_shares(self._views.grid(query.poses), places, self._settings))
 
     def _elsewhere(self, hybrid_map: HybridMap, area: int, excluded: Collection[int]) -> Elsewhere:
