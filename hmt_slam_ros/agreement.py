@@ -62,9 +62,6 @@ class Contradiction(NamedTuple):
 MAPS = Contradiction(extra=0.03, strength=500.0, stretch=5.0)
 """The surfaces of one map, one sample every 0.2 m, in another."""
 
-MAPS_USUAL = 0.0074
-"""Share of a map's surfaces that contradict another map of the same place."""
-
 KNOWN = Contradiction(extra=0.03, strength=500.0, stretch=10.0)
 """The surfaces of one scan, one sample every 0.2 m, in a map of long before; the next scan sees half of them again."""
 
@@ -92,6 +89,11 @@ class Usual(NamedTuple):
     def after(self, found: Agreement, stretch: float) -> Usual:
         """With one more scan counted."""
         return Usual(self.on + found.on / stretch, self.free + found.free / stretch)
+
+
+MAPS_USUAL = Usual().share
+"""Share of a map's surfaces that contradict another map of the same place: as a run begins, since maps are compared too
+seldom to learn it."""
 
 
 def _log_beta(a: float, b: float) -> float:
