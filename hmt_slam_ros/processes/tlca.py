@@ -13,7 +13,7 @@ from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.chi_square import gate
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.processes.acceptance import Acceptance
-from hmt_slam_ros.processes.ambiguity import ambiguity
+from hmt_slam_ros.processes.ambiguity import Ambiguity
 from hmt_slam_ros.processes.closure_account import Account, Closure, History, Name, Step
 from hmt_slam_ros.processes.messages import (
     Accepted,
@@ -82,6 +82,7 @@ class Tlca:
         self._gate = gate(configuration.tsbi.gate_probability)
         self._doubted: set[Pair] = set()
         self._reopening = Reopening(self._options)
+        self._ambiguity = Ambiguity()
         # The stated risk: beyond it, TSBI's probabilities are not taken at their word.
         self._least_doubt = max(1.0 - self._options.accept_probability, _LEAST_DOUBT)
         self._accepted_now: frozenset[Name] = frozenset()
@@ -109,8 +110,9 @@ class Tlca:
         arcs, relabelled = ((), ()) if chosen is None else self._refined(chosen)
         accepted = Accepted(hypotheses.sequence, chosen, arcs, relabelled)
         self._replica.accept(accepted)
-        accepted = replace(accepted, ambiguity=ambiguity(self._replica, self._poses))
         self._paths = {hypothesis: self._paths[hypothesis] for hypothesis in self._replica.maps}
+        versions = {hypothesis: path.version for hypothesis, path in self._paths.items()}
+        accepted = replace(accepted, ambiguity=self._ambiguity.of(self._replica, self._poses, versions))
         question = None if chosen is None else self._contradicted(chosen, hypotheses.sequence)
         if question is not None:
             # No pose is told: the map is not bent to what does not fit.
