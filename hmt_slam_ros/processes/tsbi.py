@@ -26,6 +26,7 @@ from hmt_slam_ros.processes.messages import (
 )
 from hmt_slam_ros.processes.replica import FIRST_HYPOTHESIS, Replica
 from hmt_slam_ros.processes.tsbi_branching import Branches, Branching, Child, Parent
+from hmt_slam_ros.processes.tsbi_displacement import with_displaced
 from hmt_slam_ros.processes.tsbi_reopening import reopened
 from hmt_slam_ros.random_streams import Purpose, stream
 from hmt_slam_ros.sensing import Scan
@@ -75,9 +76,10 @@ class Tsbi:
         self._keyframe = keyframe
         self._estimates = {leaf.hypothesis: leaf for leaf in keyframe.leaves}
         for leaf in keyframe.leaves:
-            if leaf.stored and leaf.hypothesis in self._notes:
-                notes = self._notes[leaf.hypothesis]
-                self._notes[leaf.hypothesis] = notes.stored(keyframe.sequence, leaf.pose.covariance)
+            if leaf.hypothesis in self._notes:
+                notes = self._notes[leaf.hypothesis].heard(keyframe.sequence, leaf.log_evidence)
+                stored = notes.stored(keyframe.sequence, leaf.pose.covariance) if leaf.stored else notes
+                self._notes[leaf.hypothesis] = stored
 
     def _infer(self, events: AreaEvents) -> Hypotheses:
         """Weight, branch, normalise, reduce."""
@@ -132,7 +134,9 @@ class Tsbi:
         if self._reopened:
             return Branches([reopened(parent, leaf, keyframe.sequence) for leaf in self._reopened])
         if event is not None and event.kind == "cut":
-            return self._branching.cut(parent, event.keyframes)
+            return with_displaced(
+                self._branching, parent, event.keyframes, self._branching.cut(parent, event.keyframes)
+            )
         if event is not None:
             return self._branching.move(parent, event.area)
         return self._go_on(parent, self._estimates[parent.hypothesis], keyframe.scan)
@@ -144,7 +148,7 @@ class Tsbi:
         if notes.astray is not None and notes.astray[1] >= _ASTRAY:
             return self._branching.link(parent, notes.astray[0], scan, estimate.pose)
         if len(notes.unchecked) >= self._options.recheck_keyframes:
-            return self._branching.recheck(parent)
+            return with_displaced(self._branching, parent, notes.unchecked, self._branching.recheck(parent))
         return Branches([Child(parent.hypothesis, parent.log_weight, parent.area, notes)])
 
     def _settle(self, sequence: int, children: Sequence[Child], branches: Sequence[Branches]) -> Settled:

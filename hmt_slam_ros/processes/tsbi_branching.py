@@ -129,7 +129,7 @@ class Branching:
         Where the keyframes lie in the place of an area of the local map there is nothing to ask: the robot tracks its
         pose there, and "new" would be the same metric map under another name.
         """
-        query = self._query(parent, keyframes)
+        query = self.query(parent, keyframes)
         tracked = self.search.tracked_area(parent.hybrid_map, parent.area, parent.around(), query.in_area)
         if tracked is not None:
             return Branches([self._enter_tracked(parent, query, tracked)])
@@ -143,7 +143,7 @@ class Branching:
     def recheck(self, parent: Parent) -> Branches:
         """Stay as it is, or join the robot's area to a known one by a further arc; no keyframe changes its area."""
         keyframes = [k for k in parent.notes.unchecked if k in parent.hybrid_map.keyframes(parent.area)]
-        query = self._query(parent, keyframes)
+        query = self.query(parent, keyframes)
         excluded = {parent.area, *parent.around(), *parent.hybrid_map.neighbours(parent.area)}
         found = self._compared(parent, query, excluded)
         noted = replace(parent, notes=parent.notes.checked(found.examined, keyframes))
@@ -200,7 +200,8 @@ class Branching:
         found = arc or reachable(parent.hybrid_map, parent.area, until=(area,))[area]
         return PoseGaussian(parent.notes.local.get(area, found.mean), found.covariance)
 
-    def _query(self, parent: Parent, keyframes: Sequence[int]) -> Query:
+    def query(self, parent: Parent, keyframes: Sequence[int]) -> Query:
+        """Keyframes of a hypothesis as TSBI asks for them."""
         placed = parent.hybrid_map.keyframes(parent.area)
         reference = placed[keyframes[0]]
         covariance = parent.covariance(keyframes[0]) + self._floor
@@ -214,7 +215,7 @@ class Branching:
             self._areas = max(self._areas, parent.hybrid_map.largest_area) + 1
             self._named[keyframes] = self._areas
         origin = PoseGaussian.exactly(np.zeros(3))
-        return self._entered(parent, query, self._named[keyframes], origin, query.belief, log_factor)
+        return self.entered(parent, query, self._named[keyframes], origin, query.belief, log_factor)
 
     def _enter_tracked(self, parent: Parent, query: Query, area: int) -> Child:
         """A known area in whose place the robot is known to be.
@@ -224,7 +225,7 @@ class Branching:
         belief = self._belief(parent, area)
         entry = belief.inverse().compose(query.belief)
         arc = None if parent.hybrid_map.arc(parent.area, area) else self._measured_arc(parent, query, area, belief)
-        return self._entered(parent, query, area, entry, arc, 0.0)
+        return self.entered(parent, query, area, entry, arc, 0.0)
 
     def _measured_arc(self, parent: Parent, query: Query, area: int, belief: PoseGaussian) -> PoseGaussian:
         newest, pose = list(query.poses.items())[-1]
@@ -238,9 +239,9 @@ class Branching:
     def _enter_known(self, parent: Parent, query: Query, fit: Fit) -> Child:
         """A known area, recognised."""
         arc = query.belief.compose(fit.mode.measured.inverse())
-        return self._entered(parent, query, fit.area, fit.mode.pose, arc, fit.log_weight)
+        return self.entered(parent, query, fit.area, fit.mode.pose, arc, fit.log_weight)
 
-    def _entered(
+    def entered(
         self, parent: Parent, query: Query, area: int, entry: PoseGaussian, arc: PoseGaussian | None, log_factor: float
     ) -> Child:
         """The robot and the query's keyframes are in ``area``, at ``entry`` = ``area_T_reference``."""

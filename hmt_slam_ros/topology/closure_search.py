@@ -16,10 +16,12 @@ from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.sensing import Scan
 from hmt_slam_ros.topology.admission import Admission, Candidate, Query
-from hmt_slam_ros.topology.area_grid import AreaGrid, GridModel, build_area_grid, surface_points
+from hmt_slam_ros.topology.appearance import Looks
+from hmt_slam_ros.topology.area_grid import GridModel, build_area_grid, surface_points
 from hmt_slam_ros.topology.area_matching import MatchSettings, Mode, match
 from hmt_slam_ros.topology.hybrid_map import HybridMap
 from hmt_slam_ros.topology.likeness import Elsewhere, Likeness, best_shares
+from hmt_slam_ros.topology.relocation import Relocation, reach_of
 from hmt_slam_ros.topology.surroundings import Nearness, Views, gap, positions, stacked
 from hmt_slam_ros.topology.transition import Entry, Place, Transition, entry, owner_at, transition
 
@@ -72,6 +74,7 @@ class ClosureSearch:
         self._model = GridModel.of(configuration)
         self._views = Views(scans, self._model, self.nearness)
         self._likeness = Likeness(options.alike_probability)
+        self._relocation = Relocation(self._views, Looks(scans), self._settings, options.place_radius)
         self._counted = -1
         self._ahead: list[tuple[int, Collection[int]]] = []
 
@@ -162,6 +165,21 @@ class ClosureSearch:
                 self._elsewhere(hybrid_map, area, excluded)
                 return
 
+    def anywhere(self, hybrid_map: HybridMap, area: int, query: Query, since: int) -> tuple[Fit | None, float]:
+        """The one place in which a robot that was displaced may be, whatever the arcs say.
+
+        :param area: the area that the arcs have it in, where it may be as well.
+        :param since: the first keyframe after that; later ones are no part of the map.
+        :returns: the fit, weighed relative to all that a displaced robot may be in, half of which is new ground, or
+            None where no place fits, or more than one; and the probability of what was not told.
+        """
+        located, unseen = self._relocation.located(hybrid_map, query.poses, since, area)
+        if located is None or located.area == area:
+            return None, 0.5
+        rarity = self._likeness.log_rarity(located.found.share, foretold=False)
+        same = MAPS.log_ratio(located.found, MAPS_USUAL) + rarity
+        return Fit(located.area, located.mode, same - math.log(2 * len(hybrid_map.area_ids()))), 0.5 * unseen
+
     def _entry(self, place: Place, candidate: Candidate) -> Entry:
         return entry(place, candidate.prior, stacked(candidate.fresh), self._options.place_radius)
 
@@ -189,7 +207,7 @@ class ClosureSearch:
         fresh = candidate.fresh
         foretold = entered.share > 0.5 and bool(hybrid_map.claimed_closures)
         query = self._views.grid(fresh)
-        bounds = self._bounds(place, query, fresh)
+        bounds = reach_of(place, query, fresh, self._options.place_radius)
         modes = [
             mode
             for mode in match(query, place.grid, candidate.prior, self._settings, bounds).modes
@@ -203,15 +221,6 @@ class ClosureSearch:
             distance = float(away @ np.linalg.solve(candidate.prior.covariance, away))
             off = -0.5 * max(0.0, distance - entered.typical)
             yield Fit(place.area, mode, math.log(pi) + mode.log_mass - float(whole) + same + off)
-
-    def _bounds(self, place: Place, query: AreaGrid, fresh: Mapping[int, Pose]) -> NDArray[np.float64]:
-        """The smallest and the largest (x, y) of the middle of the query's points where a keyframe of it is in the
-        area's place or in one beside it, shape (2, 2).
-        """
-        middle = query.points.mean(axis=0) if len(query.points) else np.zeros(2)
-        lever = float(np.hypot(*(stacked(fresh)[:, :2] - middle).T).max())
-        reach = self._options.place_radius + lever
-        return np.array([place.positions.min(axis=0) - reach, place.positions.max(axis=0) + reach])
 
 
 def _parted(fits: Sequence[Fit], most: int) -> tuple[tuple[Fit, ...], tuple[Fit, ...]]:

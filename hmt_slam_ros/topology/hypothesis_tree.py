@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
@@ -13,6 +14,13 @@ from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.topology.reduction import reduce_hypotheses
 
 Covariance = NDArray[np.float64]
+
+# Probability per keyframe that wheels and scans both lose the robot: once in 50 km.
+_DISPLACED = 1e-5
+# Evidence of a scan, nats, below which a doubt is kept, and for how many keyframe events.
+_DOUBTFUL, _KEPT = -2.0, 30
+# Doubts at most so many events apart are about one and the same moment.
+_TOGETHER = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,6 +35,8 @@ class LeafNotes:
     :ivar unchecked: the unsettled keyframes that no re-check has looked at.
     :ivar astray: the area of the local map, joined to the robot's own by no arc, in whose place the robot seems to be,
         and for how many keyframe events in a row; or None.
+    :ivar doubts: {keyframe event: odds that the robot was displaced unnoticed just before it}, of the latest events
+        whose scans contradicted what the robot should have seen.
     """
 
     covariances: Mapping[int, Covariance] = field(default_factory=dict)
@@ -34,6 +44,25 @@ class LeafNotes:
     local: Mapping[int, NDArray[np.float64]] = field(default_factory=dict)
     unchecked: tuple[int, ...] = ()
     astray: tuple[int, int] | None = None
+    doubts: Mapping[int, float] = field(default_factory=dict)
+
+    def heard(self, event: int, log_evidence: float) -> LeafNotes:
+        """After the scan of a keyframe event; one that was displaced before it would see a place that looks alike."""
+        doubts = {k: odds for k, odds in self.doubts.items() if k > event - _KEPT}
+        if log_evidence < _DOUBTFUL:
+            doubts[event] = min(1.0, _DISPLACED * math.exp(min(-log_evidence, -math.log(_DISPLACED))))
+        return replace(self, doubts=doubts) if doubts != self.doubts else self
+
+    @property
+    def displaced(self) -> tuple[float, int]:
+        """The odds that the robot was displaced of late, and the first keyframe event after that."""
+        if not self.doubts:
+            return 0.0, 0
+        first = max(self.doubts, key=lambda event: self.doubts[event])
+        for event in sorted(self.doubts, reverse=True):
+            if first - _TOGETHER <= event < first:
+                first = event
+        return min(1.0, sum(self.doubts.values())), first
 
     def stored(self, keyframe: int, covariance: Covariance) -> LeafNotes:
         """After a keyframe entered the robot's area."""
@@ -54,7 +83,8 @@ class LeafNotes:
     def entered(self, covariances: Mapping[int, Covariance]) -> LeafNotes:
         """After the robot entered another area together with the keyframes of ``covariances``."""
         kept = {area: keyframes & covariances.keys() for area, keyframes in self.compared.items()}
-        return LeafNotes(covariances, {area: keyframes for area, keyframes in kept.items() if keyframes})
+        compared = {area: keyframes for area, keyframes in kept.items() if keyframes}
+        return LeafNotes(covariances, compared, doubts=self.doubts)
 
 
 def relative_covariance(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import OrderedDict
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
@@ -170,20 +171,25 @@ class Views:
             old |= zip(placed, se2.compose(pose, stacked(placed)), strict=True)
         return self.grid(old)
 
-    def place(self, hybrid_map: HybridMap, area: int, without: Collection[int]) -> Place:
+    def place(
+        self, hybrid_map: HybridMap, area: int, without: Collection[int], before: float = math.inf
+    ) -> Place:
         """An area with those around it, so that an overlap is not cut off at the area's edge.
 
         :param without: areas that are left out.
+        :param before: keyframes from this one on are left out as well.
         """
         around = areas_around(hybrid_map, area, self._nearness, without)
-        return self.place_of(hybrid_map, area, {other: belief.mean for other, belief in around.items()})
+        return self.place_of(hybrid_map, area, {other: belief.mean for other, belief in around.items()}, before)
 
-    def place_of(self, hybrid_map: HybridMap, area: int, poses: Mapping[int, Pose]) -> Place:
+    def place_of(
+        self, hybrid_map: HybridMap, area: int, poses: Mapping[int, Pose], before: float = math.inf
+    ) -> Place:
         """The place of ``area`` among the areas that stand at ``poses``, {other area: ``area_T_other``}."""
         keyframes: dict[int, Pose] = {}
         owners: list[int] = []
         for other, pose in poses.items():
-            placed = hybrid_map.keyframes(other)
+            placed = {k: at for k, at in hybrid_map.keyframes(other).items() if k < before}
             keyframes |= zip(placed, se2.compose(pose, stacked(placed)), strict=True)
             owners += [other] * len(placed)
         return Place(area, np.array(owners, dtype=np.int64), stacked(keyframes)[:, :2], self.grid(keyframes))
