@@ -52,8 +52,11 @@ class Run:
         self.evidence = {}
         self.stored = True
 
-    def keyframe(self, true_pose, cut=0, moved=None, only=None):
-        """One keyframe event; ``cut`` is how many of the newest keyframes leave the area, in every hypothesis."""
+    def keyframe(self, true_pose, cut=0, moved=None, merged=None):
+        """One keyframe event; ``cut`` is how many of the newest keyframes leave the area, in every hypothesis.
+
+        :param merged: an area, and the one that it becomes part of.
+        """
         sequence = len(self.answers)
         if self.true_pose is not None:
             step = se2.compose(se2.between(self.true_pose, true_pose), self.drift)
@@ -73,9 +76,11 @@ class Run:
         message = Keyframe(sequence, scan, 0.5 * sequence, leaves)
         assert self.tsbi.handle(message) == []
         self.replica.add(message)
-        return self._answer(sequence, self._events(sequence, cut, moved))
+        return self._answer(sequence, self._events(sequence, cut, moved, merged))
 
-    def _events(self, sequence, cut, moved):
+    def _events(self, sequence, cut, moved, merged):
+        if merged is not None:
+            return tuple(AreaEvent(h, "merged", (), merged[0], 0.9, merged[1]) for h in sorted(self.poses))
         if moved is not None:
             return tuple(AreaEvent(h, "moved", (), moved, 0.5) for h in sorted(self.poses))
         newest = tuple(range(sequence - cut + 1, sequence + 1))

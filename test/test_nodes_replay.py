@@ -98,6 +98,14 @@ def test_the_nodes_correct_scans_for_the_motion_during_their_sweeps_as_the_lock_
         assert (nodes / name).read_bytes() == (lock_step / name).read_bytes()
 
 
+def test_the_nodes_have_two_areas_become_one_as_the_lock_step_run_does(tmp_path):
+    nodes, lock_step = mapped_twice("sim:ring,seed=3,size=1.5", tmp_path)
+    table = np.genfromtxt(nodes / "pmf.csv", delimiter=",", names=True, usecols=("keyframe", "areas"))
+    assert np.diff(table["areas"]).min() < 0
+    for name in ("trajectory.tum", "trajectory_online.tum", "pmf.csv", "hmt_map/common.json", "hmt_map/global.json"):
+        assert (nodes / name).read_bytes() == (lock_step / name).read_bytes()
+
+
 def test_the_report_accounts_for_every_scan_and_every_process(folders):
     report = json.loads((folders[0] / "report.json").read_text())
     assert report["runtime"] == "nodes"

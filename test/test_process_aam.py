@@ -18,6 +18,7 @@ from hmt_slam_ros.processes.messages import (
     Leaf,
     LeafEstimate,
     LocalEstimate,
+    Merged,
     Relabelled,
 )
 
@@ -271,3 +272,73 @@ def test_acceptance_drops_the_other_hypotheses():
     pose = se2.between(THERE[0], THERE[k + 1])
     (answer,) = process.handle(keyframe(k + 1, THERE[k + 1], estimate(1, 1, pose), estimate(2, 0, pose)))
     assert answer.events == ()
+
+
+def closed(process, around, error=(0.0, 0.0, 0.0)):
+    """Rooms 0 and 1 known; area 2, begun at the first of the poses ``around``, is joined to area 0 by a closure.
+
+    Returns the answer to the next keyframe, and that keyframe's number.
+    """
+    first = answered_in_first_room(process)
+    moved = Relabelled(first, 1, 2, np.zeros(3))
+    one_T_two = se2.between(THERE[0], around[0])
+    begun = Leaf(0, 0, 1.0, 2, exact(se2.inverse(one_T_two)), (moved,), (Arc(1, 2, exact(one_T_two)),))
+    process.handle(keyframe(first, around[0], estimate(0, 1, one_T_two)))
+    process.handle(Hypotheses(first, (begun,)))
+    process.handle(Accepted(first, 0, begun.arcs))
+    for k, pose in enumerate(around[1:-1], start=first + 1):
+        (answer,) = process.handle(keyframe(k, pose, estimate(0, 2, se2.between(around[0], pose))))
+        assert answer.events == ()
+        process.handle(stay(k, 0, area=2))
+    last = first + len(around) - 1
+    arc = Arc(2, 0, exact(se2.compose(se2.inverse(one_T_two), np.array(error))), closure=True)
+    process.handle(keyframe(last, around[-1], estimate(0, 2, se2.between(around[0], around[-1]))))
+    process.handle(Hypotheses(last, (Leaf(0, 0, 1.0, 2, None, (), (arc,)),)))
+    process.handle(Accepted(last, 0, (arc,)))
+    pose = se2.between(around[0], around[-1])
+    (answer,) = process.handle(keyframe(last + 1, around[-1], estimate(0, 2, pose, stored=False)))
+    return answer, last + 1
+
+
+AGAIN = worlds.drive((2.0, 2.0), (4.5, 2.0), (4.5, 4.0))
+
+
+def test_a_room_that_was_taken_for_a_new_one_is_the_same_area_when_the_loop_is_closed():
+    process = aam()
+    answer, k = closed(process, AGAIN)
+    (event,) = answer.events
+    assert (event.hypothesis, event.kind, event.area, event.into) == (0, "merged", 2, 0)
+    assert 0.8 < event.score <= 2.0
+    process.handle(Hypotheses(k, (Leaf(0, 0, 1.0, 0, merged=Merged(2, 0, exact(se2.between(THERE[0], AGAIN[0])))),)))
+    process.handle(Accepted(k, 0))
+    # Its keyframes are the robot's own, and one graph holds them and the known ones.
+    watch = process._watches[0]
+    assert watch.area == 0
+    assert watch.own >= {*range(k - len(AGAIN) + 1, k)}
+    assert watch.graphs.keys() == {0, 1}
+    assert set(watch.graphs[0].keyframes) == set(process._replica.maps[0].keyframes(0))
+    (answer,) = process.handle(keyframe(k + 1, AGAIN[-1], estimate(0, 0, se2.between(THERE[0], AGAIN[-1]), False)))
+    assert answer.events == ()
+
+
+def test_another_room_stays_an_area_of_its_own_when_the_loop_is_closed():
+    """Through the door much of the first room is seen, but an area of both would be cut again."""
+    beyond = worlds.drive((10.0, 2.0), (8.0, 4.5), (10.0, 5.0))
+    answer, _ = closed(aam(), beyond)
+    assert [event.kind for event in answer.events if event.kind == "merged"] == []
+
+
+def test_the_question_comes_again_when_the_robot_leaves_one_of_the_two_and_waits_for_one_hypothesis():
+    process = aam()
+    _, k = closed(process, AGAIN)
+    in_two, in_zero = se2.between(AGAIN[0], AGAIN[-1]), se2.between(THERE[0], AGAIN[-1])
+    # TSBI finds that they contradict each other.
+    process.handle(stay(k, 0, area=2))
+    assert process.handle(keyframe(k + 1, AGAIN[-1], estimate(0, 2, in_two, stored=False)))[0].events == ()
+    gone_over = Leaf(1, 0, 0.6, 0, exact(se2.between(THERE[0], AGAIN[0])))
+    process.handle(Hypotheses(k + 1, (gone_over, Leaf(2, 0, 0.4, 2))))
+    both = estimate(1, 0, in_zero, stored=False), estimate(2, 2, in_two, stored=False)
+    assert process.handle(keyframe(k + 2, AGAIN[-1], *both))[0].events == ()
+    process.handle(Hypotheses(k + 2, (Leaf(1, 1, 1.0, 0),)))
+    (event,) = process.handle(keyframe(k + 3, AGAIN[-1], both[0]))[0].events
+    assert (event.kind, event.area, event.into) == ("merged", 2, 0)

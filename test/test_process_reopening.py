@@ -16,7 +16,8 @@ from hmt_slam_ros.logs import open_log
 from hmt_slam_ros.offline.final_map import final_map
 from hmt_slam_ros.processes.closure_account import Account, Closure, Step, unrefined, without
 from hmt_slam_ros.processes.doubts import Doubts
-from hmt_slam_ros.processes.messages import Arc, ArcEnds, Leaf, Relabelled
+from hmt_slam_ros.processes.merged_account import merged
+from hmt_slam_ros.processes.messages import Arc, ArcEnds, Leaf, Merged, Relabelled
 from hmt_slam_ros.processes.undo import Undo
 from hmt_slam_ros.sensing import Scan
 from hmt_slam_ros.topology.common_map import ArcValue
@@ -208,6 +209,57 @@ def test_what_a_refinement_moved_goes_back_and_what_was_stored_since_goes_with_i
     at_home = unrefined(replace(account, area=3, pose=se2.compose(bent, stored)), closure.name)
     np.testing.assert_allclose(at_home.pose, stored, atol=1e-12)
     np.testing.assert_allclose(at_home.rebase, se2.inverse(bent), atol=1e-12)
+
+
+def test_an_area_that_became_part_of_another_is_that_one_in_the_account():
+    """Areas 3 and 6 are one; the false closure of areas 7 and 1 can be withdrawn as before, that of 3 and 6 cannot."""
+    account = drive_with((80, 6, 3, TRUE), (81, 7, 1, FALSE), (82, 6, 0, TRUE))
+    history, closures = merged(account, Merged(6, 3, account.hybrid_map.arc(3, 6)))
+    assert [(c.name[0], c.near, c.far) for c in closures] == [(81, 7, 1), (82, 3, 0)]
+    np.testing.assert_allclose(closures[1].pose.mean, around(3, 0), atol=1e-9)
+    steps = []
+    while history is not None:
+        history, step = history
+        steps.insert(0, (step.event, step.before, step.after, step.arcs))
+    assert steps[4:] == [
+        (50, 4, 5, ((4, 5),)), (60, 5, 3, ((3, 5),)), (70, 3, 7, ((3, 7),)),
+        (80, 3, 3, ()), (81, 7, 7, ((1, 7),)), (82, 3, 3, ((0, 3),)),
+    ]  # fmt: skip
+    history, closures = merged(account, Merged(6, 3, account.hybrid_map.arc(3, 6)))
+    hybrid_map = account.hybrid_map.branch()
+    hybrid_map.merge(6, 3, hybrid_map.arc(3, 6))
+    found = without(Account(hybrid_map, history, closures, 7, np.zeros(3)), closures[0].name, 100)
+    assert found.hybrid_map.arc(1, 7) is None
+    assert found.hybrid_map.arc(3, 7) is not None
+    assert [c.name[0] for c in found.closures] == [82]
+
+
+def test_a_closure_beside_which_another_observation_of_its_arc_is_fused_is_not_withdrawn():
+    """Both 5 and 6 were found beside 0, and are then found to be one."""
+    account = drive_with((80, 6, 0, TRUE), (81, 5, 0, TRUE), (82, 6, 5, TRUE))
+    _, closures = merged(account, Merged(6, 5, account.hybrid_map.arc(5, 6)))
+    assert closures == ()
+
+
+def test_what_a_refinement_moved_goes_back_after_an_area_became_part_of_another():
+    hybrid_map, history = corridor(4)
+    bent = np.array([0.3, 0.2, 0.05])
+    former = {k: (k // 10, hybrid_map.keyframes(k // 10)[k].copy()) for k in (20, 21, 30, 31)}
+    for k, (area, pose) in former.items():
+        hybrid_map.place(k, area, se2.compose(bent, pose))
+    arcs = {pair: hybrid_map.arc_value(*pair) for pair in ((1, 2), (2, 3))}
+    closure = replace(closed(hybrid_map, 40, 2, 0), undo=Undo(former, arcs))
+    account = account_of(hybrid_map, history, [closure], 2)
+    history, closures = merged(account, Merged(3, 2, account.hybrid_map.arc(2, 3)))
+    assert set(closures[0].undo.keyframes) == {20, 21}
+    assert set(closures[0].undo.arcs) == {(1, 2)}
+    hybrid_map.merge(3, 2, hybrid_map.arc(2, 3))
+    found = unrefined(Account(hybrid_map, history, closures, 2, np.zeros(3)), closure.name).hybrid_map.keyframes(2)
+    for k in (20, 21):
+        np.testing.assert_array_equal(found[k], former[k][1])
+    was = hybrid_map.keyframes(2)
+    for k in (30, 31):
+        np.testing.assert_allclose(se2.between(found[21], found[k]), se2.between(was[21], was[k]), atol=1e-12)
 
 
 def test_tsbi_goes_on_with_the_explanations_as_live_hypotheses():

@@ -1,6 +1,7 @@
 """The metric SLAM process, answered by hand in the place of the topological processes."""
 
 from dataclasses import replace
+from itertools import groupby
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from hmt_slam_ros.processes.messages import (
     Leaf,
     LocalArea,
     LocalEstimate,
+    Merged,
     Notice,
     Relabelled,
     Trail,
@@ -228,6 +230,35 @@ def test_after_a_change_of_area_poses_are_in_the_new_frame_and_tracking_goes_on(
     last = dialogue.of(Keyframe)[-1].leaves[0]
     assert last.hypothesis == 1
     assert last.area == 1
+
+
+def test_a_robot_whose_area_becomes_part_of_another_goes_on_there():
+    back = PoseGaussian(np.array([3.0, 0.0, 0.0]), np.diag([1e-4, 1e-4, 1e-5]))
+    split = split_at(10)
+
+    def answer(keyframe):
+        if keyframe.sequence == 0 or keyframe.leaves[0].hypothesis == 0 or keyframe.sequence != 13:
+            return split(keyframe)
+        leaf = Leaf(1, 1, 1.0, 0, back, local=(LocalArea(0, np.zeros(3)),), merged=Merged(1, 0, back))
+        return [Hypotheses(13, (leaf,)), Accepted(13, 1)]
+
+    dialogue = Dialogue(answer=answer)
+    truths = []
+    for odometry, scan, pose in drive(80):
+        dialogue.tell(odometry, scan)
+        truths.append(pose)
+    estimates = dialogue.of(LocalEstimate)
+    assert [area for area, _ in groupby(estimates, lambda estimate: estimate.area)] == [0, 1, 0]
+    for truth, estimate in zip(truths, estimates, strict=True):
+        origin = np.array([3.0 if estimate.area == 1 else 0.0, 0.0, 0.0])
+        assert np.abs(se2.between(truth, se2.compose(origin, estimate.pose.mean))[:2]).max() < 0.06
+    hybrid_map = dialogue.slam._replica.maps[1]
+    assert hybrid_map.area_ids() == [0]
+    assert sorted(hybrid_map.keyframes(0)) == [keyframe.sequence for keyframe in dialogue.of(Keyframe)]
+    assert set(dialogue.slam._best.filter.keyframe_areas) == {0}
+    # The drift goes on from what it was, with what is not known of how the two lie to each other.
+    before, after = (dialogue.of(Keyframe)[k].leaves[0].pose.covariance for k in (13, 14))
+    assert np.trace(after[:2, :2]) > np.trace(before[:2, :2]) + 1e-4
 
 
 def test_the_drift_grows_from_the_origin_of_the_area():

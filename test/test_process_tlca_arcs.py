@@ -9,6 +9,7 @@ from hmt_slam_ros.geometry.gaussian import fuse
 from hmt_slam_ros.processes.messages import (
     Arc,
     Leaf,
+    Merged,
     Relabelled,
 )
 
@@ -96,3 +97,30 @@ def test_arcs_are_never_more_certain_than_the_floor():
     sigma = np.sqrt(np.diag(play.arc(0, 1).covariance))
     assert np.all(sigma[:2] >= 0.08 - 1e-12)
     assert np.degrees(sigma[2]) >= 1.0 - 1e-9
+
+
+def test_two_areas_that_are_one_are_definite_at_once_and_the_loop_stays_closed():
+    play = Play()
+    play.start()
+    for area in (1, 2, 3):
+        play.step(new_area(0, 0, 1.0, area, [2.0, 0.0, np.pi / 2], source=area - 1))
+    play.step(new_area(0, 0, 1.0, 4, [2.0, 0.0, np.pi / 2], source=3))
+    home = Arc(4, 0, belief(np.zeros(3), 0.01 * SPREAD), True)
+    before = play.step(Leaf(0, 0, 1.0, 4, None, (), (home,)))
+    assert sorted(poses_of(before)) == [0, 1, 2, 3, 4]
+    into = play.arc(0, 4)
+    verdict = play.step(Leaf(0, 0, 1.0, 0, into, merged=Merged(4, 0, into)))
+    assert verdict.hypothesis == 0
+    assert (verdict.arcs, verdict.relabelled, verdict.reopened) == ((), (), ())
+    poses = poses_of(verdict)
+    assert sorted(poses) == [0, 1, 2, 3]
+    for area in poses:
+        apart = se2.between(poses_of(before)[area].mean, poses[area].mean)
+        assert np.hypot(*apart[:2]) < 0.01
+        assert np.degrees(abs(apart[2])) < 0.1
+    assert play.process._replica.areas == {0: 0}
+    # What is found again of the arc that is left is fused with it, as always.
+    sharp = play.arc(0, 3).covariance
+    play.step(new_area(0, 0, 1.0, 5, [1.0, 0.0, 0.0]))
+    play.step(Leaf(0, 0, 1.0, 3, belief([2.0, 0.0, np.pi / 2]), (), (Arc(0, 3, play.arc(0, 3), True),)))
+    assert np.trace(play.arc(0, 3).covariance) < np.trace(sharp)

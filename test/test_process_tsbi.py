@@ -11,7 +11,7 @@ from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.processes.messages import AreaEvents, AreaPose, Hypotheses, Leaf
+from hmt_slam_ros.processes.messages import Arc, AreaEvents, AreaPose, Hypotheses, Leaf
 
 
 def test_without_an_event_the_hypothesis_stays():
@@ -71,6 +71,56 @@ def test_a_move_goes_to_the_known_area_and_no_keyframe_changes():
     assert (leaf.hypothesis, leaf.area, leaf.relabelled, leaf.arcs) == (0, 0, (), ())
     assert [local.area for local in leaf.local] == [0, 1]
     assert np.allclose(se2.compose(leaf.rebase.mean, before), se2.between(poses[0], poses[-1]))
+
+
+def two_areas(**changed):
+    """Areas 0 and 1 along a corridor, the robot in the second; what was accepted may be changed."""
+    run = Run(RING)
+    for k, pose in enumerate(ring_drive(10)):
+        run.keyframe(pose, cut=4 if k == 9 else 0)
+    run.accept(0, **changed)
+    return run, ring_drive(11)[10]
+
+
+def test_an_area_becomes_part_of_another_and_the_robot_goes_on_there():
+    run, pose = two_areas()
+    into = run.replica.maps[0].arc(0, 1)
+    before = {k: se2.compose(into.mean, at) for k, at in run.replica.maps[0].keyframes(1).items()}
+    (leaf,) = run.keyframe(pose, merged=(1, 0)).leaves
+    assert (leaf.hypothesis, leaf.probability, leaf.area, leaf.relabelled, leaf.arcs) == (0, 1.0, 0, (), ())
+    assert (leaf.merged.area, leaf.merged.into) == (1, 0)
+    assert [local.area for local in leaf.local] == [0]
+    np.testing.assert_allclose(leaf.rebase.mean, into.mean, atol=1e-12)
+    np.testing.assert_allclose(leaf.merged.pose.covariance, into.covariance, atol=1e-12)
+    hybrid_map = run.replica.maps[0]
+    assert hybrid_map.area_ids() == [0]
+    assert list(hybrid_map.all_arcs()) == []
+    for keyframe, at in before.items():
+        np.testing.assert_allclose(hybrid_map.keyframes(0)[keyframe], at, atol=1e-12)
+    # And is then left as any other.
+    for further in ring_drive(16)[11:]:
+        run.keyframe(further)
+    (leaf,) = run.keyframe(ring_drive(17)[16], cut=3).leaves
+    assert (leaf.area, leaf.arcs[0].source) == (2, 0)
+
+
+def test_a_robot_that_is_in_neither_of_two_areas_stays_where_it_is():
+    run, _ = two_areas()
+    for further in ring_drive(20)[10:]:
+        run.keyframe(further)
+    run.keyframe(ring_drive(21)[20], cut=3)
+    (leaf,) = run.keyframe(ring_drive(22)[21], merged=(1, 0)).leaves
+    assert (leaf.area, leaf.rebase, leaf.merged.into) == (2, None, 0)
+    assert leaf.local[0].area == 2
+    assert 1 not in [local.area for local in leaf.local]
+    assert run.replica.maps[0].neighbours(2) == [0]
+
+
+def test_areas_whose_surfaces_contradict_each_other_stay_two():
+    wrong = PoseGaussian(se2.compose(se2.between(*ring_drive(7)[[0, 6]]), [0.0, 0.6, 0.0]), STEP)
+    run, pose = two_areas(arcs=(Arc(0, 1, wrong, closure=True),))
+    (leaf,) = run.keyframe(pose, merged=(1, 0)).leaves
+    assert (leaf.area, leaf.rebase, leaf.merged, leaf.local) == (1, None, None, ())
 
 
 def test_turning_back_into_tracked_ground_is_no_new_area():

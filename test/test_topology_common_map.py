@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.geometry.gaussian import PoseGaussian, fuse
 from hmt_slam_ros.topology.common_map import ArcValue, CommonMap
 from hmt_slam_ros.topology.hybrid_map import HybridMap
 
@@ -89,3 +90,61 @@ def test_a_hypothesis_may_lack_a_common_arc_until_all_do(star):
     assert 7 not in whole.neighbours(40)
     hybrid_map.set_arc(40, 7, arc(2.0).pose, closure=True)
     assert 7 in hybrid_map.neighbours(40)
+
+
+SPREAD = np.diag([0.1, 0.2, 0.05]) ** 2
+ZERO_T_TWO = np.array([3.0, 1.0, 0.5])
+
+
+def joined_twice():
+    """Area 1 was left for area 2, which a closure joins to area 0; area 2 was left for area 3."""
+    hybrid_map = HybridMap()
+    for area in range(4):
+        hybrid_map.place(10 * area, area, np.zeros(3))
+        hybrid_map.place(10 * area + 1, area, np.array([1.0, 0.0, 0.2]))
+    hybrid_map.set_arc(0, 1, PoseGaussian(np.array([0.0, 5.0, 0.0]), SPREAD), closure=False)
+    hybrid_map.set_arc(1, 2, PoseGaussian(np.array([4.0, -4.0, 0.5]), SPREAD), closure=False)
+    hybrid_map.set_arc(2, 3, PoseGaussian(np.array([0.0, 2.0, 0.1]), SPREAD), closure=False)
+    hybrid_map.set_arc(0, 2, PoseGaussian(ZERO_T_TWO, 0.1 * SPREAD), closure=True)
+    hybrid_map.absorb()
+    return hybrid_map
+
+
+def test_an_area_that_becomes_part_of_another_is_seen_from_there():
+    before, merged = joined_twice(), joined_twice()
+    merged.remove_arc(0, 1)
+    merged.merge(2, 0, merged.arc(0, 2))
+    assert merged.area_ids() == [0, 1, 3]
+    assert not merged.has_area(2)
+    assert merged.neighbours(2) == []
+    assert list(merged.keyframes(0)) == [0, 1, 20, 21]
+    np.testing.assert_allclose(merged.keyframes(0)[21], se2.compose(ZERO_T_TWO, [1.0, 0.0, 0.2]), atol=1e-12)
+    zero_T_two = before.arc(0, 2)
+    for other in (1, 3):
+        expected = zero_T_two.compose(before.arc(2, other))
+        np.testing.assert_allclose(merged.arc(0, other).mean, expected.mean, atol=1e-12)
+        np.testing.assert_allclose(merged.arc(0, other).covariance, expected.covariance, atol=1e-12)
+    # The loop is as closed as it was, and what closed it is where the area was entered from.
+    assert [(a, b, arc.closure) for a, b, arc in merged.all_arcs()] == [(0, 1, True), (0, 3, False)]
+    assert merged.extents(np.array([0, 2])) == pytest.approx([np.hypot(3.0 + np.cos(0.5), 1.0 + np.sin(0.5)), 0.0])
+    assert merged.largest_area == 3
+
+
+def test_two_arcs_to_the_same_third_area_become_one_that_both_have_told():
+    before, merged = joined_twice(), joined_twice()
+    merged.merge(2, 0, merged.arc(0, 2))
+    found = [before.arc(0, 1), before.arc(0, 2).compose(before.arc(2, 1))]
+    both = fuse([PoseGaussian(belief.mean, 2.0 * belief.covariance) for belief in found])
+    arc = merged.arc(0, 1)
+    assert not merged.arc_value(0, 1).closure
+    np.testing.assert_allclose(arc.mean[:2], both.mean[:2], atol=0.2)
+    # They disagree by more than they admit: no more certain than if they did not, and not less than either by much.
+    assert np.trace(both.covariance) - 1e-12 <= np.trace(arc.covariance)
+
+
+def test_the_number_of_an_area_that_is_no_more_is_not_used_again():
+    hybrid_map = joined_twice()
+    hybrid_map.set_arc(3, 0, PoseGaussian(np.zeros(3), SPREAD), closure=True)
+    hybrid_map.merge(3, 0, hybrid_map.arc(0, 3))
+    assert hybrid_map.area_ids() == [0, 1, 2]
+    assert hybrid_map.largest_area == 3

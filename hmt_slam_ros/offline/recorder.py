@@ -7,7 +7,7 @@ matter; :meth:`Recorder.finish` then goes through the keyframe events in their o
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TypeVar
 
 import numpy as np
@@ -195,7 +195,7 @@ class Recorder:
             carried(scans, keyframe_poses(replica.maps[replica.best], area_poses)),
             online_trajectory(stamps, self.estimates, keyframes, accepted),
             probabilities,
-            self.last,
+            _in_area_now(self.last, hypotheses[-1]),
             self.finished,
             tuple(self.notices.values()),
         )
@@ -210,6 +210,14 @@ class Recorder:
             (trail for trail in self.trails.values() if trail.hypothesis in lineage),
             key=lambda trail: (trail.first_scan, trail.hypothesis),
         )
+
+
+def _in_area_now(last: LocalEstimate, newest: Hypotheses) -> LocalEstimate:
+    """The last estimate, where its area became part of another since in the frame of that one."""
+    for leaf in newest.leaves:
+        if leaf.merged is not None and leaf.merged.area == last.area:
+            return replace(last, area=leaf.merged.into, pose=leaf.merged.pose.compose(last.pose))
+    return last
 
 
 def _branched(message: Hypotheses) -> list[Leaf]:
@@ -252,7 +260,7 @@ def _replay(
 
 def _size(replica: Replica, leaf: Leaf, sizes: dict[int, tuple[int, int]]) -> tuple[int, int]:
     """Areas and loop closures of a leaf, counted anew only where the leaf changed."""
-    if leaf.hypothesis in sizes and not (leaf.arcs or leaf.relabelled or leaf.withdrawn):
+    if leaf.hypothesis in sizes and not (leaf.arcs or leaf.relabelled or leaf.withdrawn or leaf.merged):
         return sizes[leaf.hypothesis]
     hybrid_map = replica.maps[leaf.hypothesis]
     return len(hybrid_map.area_ids()), sum(arc.closure for _, _, arc in hybrid_map.all_arcs())

@@ -5,7 +5,6 @@ A hypothesis is one topological path, so "once for every group of particles with
 
 from __future__ import annotations
 
-from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -21,12 +20,20 @@ from hmt_slam_ros.processes.messages import (
     Keyframe,
     Leaf,
     LeafEstimate,
+    Merged,
     Message,
 )
 from hmt_slam_ros.processes.replica import FIRST_AREA, FIRST_HYPOTHESIS, Replica
+from hmt_slam_ros.topology.common_map import Keyframes, Pair
 from hmt_slam_ros.topology.hybrid_map import HybridMap
 from hmt_slam_ros.topology.overlap import overlaps, sensed_points
-from hmt_slam_ros.topology.overlap_graph import Measure, OverlapGraph, Separation, separation, synchronised
+from hmt_slam_ros.topology.overlap_graph import (
+    OverlapGraph,
+    Separation,
+    least_cut,
+    separation,
+    synchronised,
+)
 
 # An area's overlap with a scan is that of the best few keyframes among those taken nearest to it.
 _NEAREST, _BEST = 8, 3
@@ -58,6 +65,10 @@ class Aam:
     within an area is small against the radius of overlap.
 
     A cut and a move have to be found at ``aam.persistence`` evaluations in a row, so that one poor scan does nothing.
+
+    Two areas that a definite closure joins are one if nothing in what both hold together separates, so that an area of
+    all of it would not be cut. This is asked when the closure becomes definite, when it is refined again, and when the
+    robot leaves one of the two.
     """
 
     def __init__(self, configuration: Configuration) -> None:
@@ -66,6 +77,7 @@ class Aam:
         self._replica = Replica()
         self._points: dict[int, NDArray[np.float64]] = {}
         self._watches = {FIRST_HYPOTHESIS: _Watch(FIRST_AREA)}
+        self._asked: set[Pair] = set()
 
     def handle(self, message: Message) -> list[Message]:
         """Answer a ``Keyframe`` with its ``AreaEvents``; learn from ``Hypotheses`` and ``Accepted``."""
@@ -77,13 +89,19 @@ class Aam:
         elif isinstance(message, Accepted) and message.hypothesis is not None:
             self._replica.accept(message)
             self._watches = {message.hypothesis: self._watches[message.hypothesis]}
+            self._asked |= {(min(arc.source, arc.target), max(arc.source, arc.target)) for arc in message.arcs}
+            if message.reopened:
+                self._asked = set()
         return []
 
     def _examine(self, keyframe: Keyframe) -> AreaEvents:
         self._replica.add(keyframe)
         self._points[keyframe.sequence] = sensed_points(keyframe.scan, self._max_range, self._options.overlap_points)
         known = [leaf for leaf in keyframe.leaves if leaf.hypothesis in self._watches]
-        events = [self._cut(leaf, keyframe.sequence) or self._moved(leaf, keyframe.sequence) for leaf in known]
+        events = [
+            self._cut(leaf, keyframe.sequence) or self._merged(leaf.hypothesis) or self._moved(leaf, keyframe.sequence)
+            for leaf in known
+        ]
         if not any(leaf.stored for leaf in known):
             del self._points[keyframe.sequence]
         return AreaEvents(keyframe.sequence, tuple(event for event in events if event is not None))
@@ -106,6 +124,23 @@ class Aam:
         if found is None or watch.separate < self._options.persistence:
             return None
         return AreaEvent(hypothesis, "cut", found.keyframes, watch.area, found.ncut)
+
+    def _merged(self, hypothesis: int) -> AreaEvent | None:
+        """The event that two areas are one, where there is no other hypothesis."""
+        watch, hybrid_map = self._watches[hypothesis], self._replica.maps[hypothesis]
+        while self._asked and len(self._watches) == 1:
+            into, area = pair = min(self._asked)
+            self._asked.discard(pair)
+            arc = hybrid_map.arc_value(into, area)
+            if arc is None or not arc.closure:
+                continue
+            placed, other = dict(hybrid_map.keyframes(into)), hybrid_map.keyframes(area)
+            placed |= {keyframe: se2.compose(arc.pose.mean, pose) for keyframe, pose in other.items()}
+            graphs = (watch.graphs.get(known, OverlapGraph()) for known in pair)
+            least = least_cut(self._synchronised(placed, *graphs), other, self._options.min_cluster)
+            if least > self._options.ncut_threshold:
+                return AreaEvent(hypothesis, "merged", (), area, least, into)
+        return None
 
     def _moved(self, leaf: LeafEstimate, newest: int) -> AreaEvent | None:
         """The event that the robot went into a known area one arc away, when that has lasted.
@@ -153,28 +188,39 @@ class Aam:
     def _follow(self, leaf: Leaf) -> _Watch:
         """The watch over a hypothesis after TSBI's answer."""
         watch = self._watches[leaf.parent]
+        if leaf.merged is not None:
+            return self._follow_merged(watch, leaf, leaf.merged)
         if leaf.area == watch.area:
             return watch
         moved = frozenset(r.keyframe for r in leaf.relabelled if r.area == leaf.area)
         entered = self._graph(watch, leaf.hypothesis, leaf.area)
         left = watch.graphs.get(watch.area, OverlapGraph()).only(self._keyframes(leaf.hypothesis, watch.area))
+        beside = self._replica.maps[leaf.hypothesis].neighbours(watch.area)
+        self._asked |= {(min(watch.area, other), max(watch.area, other)) for other in beside}
         return _Watch(leaf.area, watch.graphs | {watch.area: left, leaf.area: entered}, moved)
+
+    def _follow_merged(self, watch: _Watch, leaf: Leaf, merged: Merged) -> _Watch:
+        """The watch with one area for two; what was the robot's own in one of them still is."""
+        self._asked = {pair for pair in self._asked if merged.area not in pair}
+        graphs = {area: graph for area, graph in watch.graphs.items() if area != merged.area}
+        one, other = (watch.graphs.get(area, OverlapGraph()) for area in (merged.into, merged.area))
+        graphs[merged.into] = self._synchronised(self._keyframes(leaf.hypothesis, merged.into), one, other)
+        return replace(watch, area=leaf.area, graphs=graphs, beyond=None)
 
     def _graph(self, watch: _Watch, hypothesis: int, area: int) -> OverlapGraph:
         """The overlap graph of an area as it is now, from what the watch knows."""
-        graph = watch.graphs.get(area, OverlapGraph())
-        keyframes = self._keyframes(hypothesis, area)
-        return synchronised(graph, keyframes, self._measure(hypothesis, area), watch.graphs.get(watch.area))
+        known = [watch.graphs.get(one, OverlapGraph()) for one in (area, watch.area)]
+        return self._synchronised(self._keyframes(hypothesis, area), *known)
 
-    def _keyframes(self, hypothesis: int, area: int) -> Collection[int]:
+    def _keyframes(self, hypothesis: int, area: int) -> Keyframes:
         return self._replica.maps[hypothesis].keyframes(area)
 
-    def _measure(self, hypothesis: int, area: int) -> Measure:
-        placed = self._replica.maps[hypothesis].keyframes(area)
+    def _synchronised(self, placed: Keyframes, graph: OverlapGraph, known: OverlapGraph) -> OverlapGraph:
+        """The overlap graph of keyframes, {keyframe: pose}, measuring only what neither of two graphs holds."""
 
         def measure(keyframe: int, others: tuple[int, ...]) -> NDArray[np.float64]:
             poses = np.array([placed[other] for other in others]).reshape(-1, 3)
             points = [self._points[other] for other in others]
             return overlaps(self._points[keyframe], placed[keyframe], points, poses, self._options.overlap_radius)
 
-        return measure
+        return synchronised(graph, placed, measure, known)

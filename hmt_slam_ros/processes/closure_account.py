@@ -161,7 +161,7 @@ def without(account: Account, name: Name, new_area: int) -> Account:
     closure = next((found for found in account.closures if found.name == name), None)
     if closure is None:
         return account
-    earlier, steps = _since(account.history, closure.name[0])
+    earlier, steps = since(account.history, closure.name[0])
     layer = _Layer(account.hybrid_map, closure)
     for step in steps:
         layer.follow(step)
@@ -204,11 +204,11 @@ def _taken_back(account: Account, k: int) -> Account:
     closure = account.closures[k]
     if closure.undo is None:
         return account
-    _, steps = _since(account.history, closure.name[0])
-    since = {pair for step in steps for pair in step.arcs} - {closure.pair}
+    _, steps = since(account.history, closure.name[0])
+    measured = {pair for step in steps for pair in step.arcs} - {closure.pair}
     back, hybrid_map = Return(closure.undo, account.hybrid_map), account.hybrid_map.branch()
     back.keyframes(hybrid_map)
-    back.arcs(hybrid_map, since)
+    back.arcs(hybrid_map, measured)
     later = (
         replace(other, pose=back.arc(other.near, other.far, other.pose)) for other in account.closures[k + 1 :]
     )
@@ -229,7 +229,7 @@ def as_measured(account: Account) -> HybridMap:
     return hybrid_map
 
 
-def _since(history: History, event: int) -> tuple[History, list[Step]]:
+def since(history: History, event: int) -> tuple[History, list[Step]]:
     """The history before an event, and the steps from it on."""
     steps = []
     while history is not None and history[1].event >= event:

@@ -113,9 +113,9 @@ class RobotStatus:
 # Raise a document's version with every change of its dataclass: a receiver refuses any other.
 _DOCUMENTS: dict[type, tuple[str, int]] = {
     KeyframeHead: ("keyframe", 2),
-    AreaEvents: ("area_events", 1),
-    Hypotheses: ("hypotheses", 2),
-    Accepted: ("accepted", 3),
+    AreaEvents: ("area_events", 2),
+    Hypotheses: ("hypotheses", 3),
+    Accepted: ("accepted", 4),
     LocalEstimate: ("local_estimate", 1),
     Notice: ("notice", 1),
     Closing: ("finished", 1),

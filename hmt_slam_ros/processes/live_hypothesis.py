@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 
@@ -15,7 +15,7 @@ from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.local_map.area_filter import AreaFilter, FilterStep, PlacedKeyframe
 from hmt_slam_ros.local_map.match_error import MatchError
-from hmt_slam_ros.processes.messages import Leaf, LeafEstimate, Relabelled, Trail
+from hmt_slam_ros.processes.messages import Leaf, LeafEstimate, Merged, Relabelled, Trail
 from hmt_slam_ros.sensing import Scan
 
 _FIRST_COVARIANCE = np.diag([1e-8, 1e-8, 1e-8])
@@ -193,11 +193,23 @@ class LiveHypothesis:
         area_T_previous = np.zeros(3) if leaf.rebase is None else leaf.rebase.mean
         self.filter.change_area(leaf.area, area_T_previous, content)
         self.event_pose = se2.compose(area_T_previous, self.event_pose)
-        if entered:
+        if entered and leaf.merged is None:
             moved = {relabelled.keyframe for relabelled in leaf.relabelled}
             self.fresh = {keyframe: step for keyframe, step in self.fresh.items() if keyframe in moved}
             self._drift_into(leaf.rebase or _STAY)
         self._relate()
+
+    def merge(self, merged: Merged, keyframes: Mapping[int, NDArray[np.float64]]) -> None:
+        """What is in an area is as uncertain in the one that it becomes part of as that is known relative to it.
+
+        :param keyframes: {keyframe: ``area_T_base``, shape (3,)} of the area.
+        """
+        for keyframe, pose in keyframes.items():
+            if keyframe in self.placed:
+                known = PoseGaussian(pose, self.placed[keyframe])
+                self.placed[keyframe] = merged.pose.compose(known).covariance
+        if self.filter.area == merged.area:
+            self.drift = merged.pose.compose(PoseGaussian(self.event_pose, self.drift)).covariance
 
     def _drift_into(self, rebase: PoseGaussian) -> None:
         """The drift in the area that was entered: along the keyframes that moved with the robot, or else by the map.

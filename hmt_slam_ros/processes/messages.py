@@ -78,17 +78,21 @@ class AreaEvent:
 
     :ivar hypothesis: id of the live hypothesis.
     :ivar kind: "cut" where the newest keyframes separate from the current area, "moved" where the robot went over a
-        known arc into a known area.
+        known arc into a known area, "merged" where two areas that a definite arc joins are one.
     :ivar keyframes: for "cut": the stored keyframes that leave, ascending, the newest among them; else empty.
-    :ivar area: for "moved": the known area in which the robot is now; for "cut": the area that was left.
-    :ivar score: for "cut": the normalised cut; for "moved": the overlap with the new area.
+    :ivar area: for "moved": the known area in which the robot is now; for "cut": the area that was left; for "merged":
+        the area that becomes part of ``into``.
+    :ivar score: for "cut": the normalised cut; for "moved": the overlap with the new area; for "merged": the least
+        normalised cut of the two together.
+    :ivar into: for "merged": the area that stays, else None.
     """
 
     hypothesis: int
-    kind: Literal["cut", "moved"]
+    kind: Literal["cut", "moved", "merged"]
     keyframes: tuple[int, ...]
     area: int
     score: float
+    into: int | None = None
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -132,6 +136,18 @@ class LocalArea:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
+class Merged:
+    """Area ``area`` is now part of ``into``, with its keyframes and its arcs.
+
+    :ivar pose: belief over ``into_T_area``, as the arc had it that joined the two.
+    """
+
+    area: int
+    into: int
+    pose: PoseGaussian
+
+
+@dataclass(frozen=True, eq=False, slots=True)
 class Leaf:
     """A live hypothesis after keyframe event k, as changes against the leaf ``parent`` before it.
 
@@ -147,6 +163,7 @@ class Leaf:
     :ivar arcs: arcs that are new or replaced.
     :ivar local: the areas of the local map, the current one first; empty where the local map stays as it is.
     :ivar withdrawn: arcs that this hypothesis does not believe any more.
+    :ivar merged: two areas that are one, where this is the only hypothesis; else None.
     """
 
     hypothesis: int
@@ -158,6 +175,7 @@ class Leaf:
     arcs: tuple[Arc, ...] = ()
     local: tuple[LocalArea, ...] = ()
     withdrawn: tuple[ArcEnds, ...] = ()
+    merged: Merged | None = None
 
 
 @dataclass(frozen=True, eq=False, slots=True)

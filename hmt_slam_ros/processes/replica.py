@@ -51,6 +51,8 @@ class Replica:
         parent = self.maps[leaf.parent]
         child = parent if leaf.hypothesis == leaf.parent else parent.branch()
         self.change(child, leaf.relabelled, leaf.arcs, leaf.withdrawn)
+        if leaf.merged is not None:
+            child.merge(leaf.merged.area, leaf.merged.into, leaf.merged.pose)
         return child
 
     def accept(self, accepted: Accepted) -> None:

@@ -202,6 +202,10 @@ class MetricSlam:
 
     def _change_hypotheses(self, hypotheses: Hypotheses) -> None:
         """Branch, re-base and drop filters as TSBI decided."""
+        for leaf in hypotheses.leaves:
+            if leaf.merged is not None:
+                keyframes = self._replica.maps[leaf.parent].keyframes(leaf.merged.area)
+                self._live[leaf.parent].merge(leaf.merged, keyframes)
         self._replica.apply(hypotheses)
         children = {}
         for leaf in hypotheses.leaves:

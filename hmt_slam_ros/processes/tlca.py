@@ -15,6 +15,7 @@ from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.processes.acceptance import Acceptance
 from hmt_slam_ros.processes.ambiguity import Ambiguity
 from hmt_slam_ros.processes.closure_account import Account, Closure, History, Name, Step
+from hmt_slam_ros.processes.merged_account import merged, witnesses_of
 from hmt_slam_ros.processes.messages import (
     Accepted,
     Arc,
@@ -133,7 +134,7 @@ class Tlca:
             path = replace(path, parted=self._travelled, held=0)
         dominates = leaf.probability >= self._options.accept_probability
         path = replace(path, held=path.held + 1 if dominates else 0)
-        if leaf.arcs or leaf.relabelled or leaf.withdrawn:
+        if leaf.arcs or leaf.relabelled or leaf.withdrawn or leaf.merged:
             self._changes += 1
             path = replace(path, version=self._changes, definite=False)
         elif leaf.rebase:
@@ -142,6 +143,10 @@ class Tlca:
         if account is not None:
             return replace(path, definite=False, history=account.history, closures=account.closures)
         parent = self._replica.maps[leaf.parent]
+        if leaf.merged is not None:
+            history, closures = merged(Account(parent, path.history, path.closures, before, np.zeros(3)), leaf.merged)
+            witnesses = witnesses_of(path.witnesses, leaf.merged)
+            return replace(path, history=history, closures=closures, witnesses=witnesses)
         observations = tuple(observed(arc, leaf, sequence, before, parent) for arc in leaf.arcs)
         new = tuple(seen.pair for seen in observations if seen.before is None)
         if new or leaf.area != before:

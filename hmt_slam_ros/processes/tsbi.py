@@ -27,6 +27,7 @@ from hmt_slam_ros.processes.messages import (
 from hmt_slam_ros.processes.replica import FIRST_HYPOTHESIS, Replica
 from hmt_slam_ros.processes.tsbi_branching import Branches, Branching, Child, Parent
 from hmt_slam_ros.processes.tsbi_displacement import with_displaced
+from hmt_slam_ros.processes.tsbi_merging import merged as merged_into
 from hmt_slam_ros.processes.tsbi_reopening import reopened
 from hmt_slam_ros.random_streams import Purpose, stream
 from hmt_slam_ros.sensing import Scan
@@ -137,6 +138,8 @@ class Tsbi:
             return with_displaced(
                 self._branching, parent, event.keyframes, self._branching.cut(parent, event.keyframes)
             )
+        if event is not None and event.into is not None:
+            return Branches([merged_into(parent, event.area, event.into, self._branching.search)])
         if event is not None:
             return self._branching.move(parent, event.area)
         return self._go_on(parent, self._estimates[parent.hypothesis], keyframe.scan)
@@ -184,7 +187,7 @@ class Tsbi:
             self._next_hypothesis += 1
         return Leaf(
             hypothesis, child.parent, probability, child.area, child.rebase, child.relabelled, child.arcs,
-            withdrawn=child.withdrawn,
+            withdrawn=child.withdrawn, merged=child.merged,
         )  # fmt: skip
 
     def _loaded(self, leaf: Leaf, child: Child) -> Leaf:

@@ -36,6 +36,16 @@ class Undo:
         """The same, leaving alone some arcs."""
         return Undo(self.keyframes, {pair: value for pair, value in self.arcs.items() if pair not in arcs})
 
+    def without(self, area: int) -> Undo:
+        """The same, leaving alone what is around an area that became part of another.
+
+        Its keyframes go back with the nearest of the other's.
+        """
+        return Undo(
+            {keyframe: place for keyframe, place in self.keyframes.items() if place[0] != area},
+            {pair: value for pair, value in self.arcs.items() if area not in pair},
+        )
+
     def apply_to_arcs(self, hybrid_map: HybridMap) -> None:
         """Give the arcs that are still there their former values."""
         for pair, value in self.arcs.items():

@@ -92,6 +92,15 @@ class ClosureSearch:
             return None
         return owner_at(self._views.place_of(hybrid_map, area, around), poses, self._options.place_radius)
 
+    def agree(self, hybrid_map: HybridMap, area: int, other: int, pose: Pose) -> bool:
+        """Whether what two areas saw is rather the same place than one that looks alike.
+
+        :param pose: ``area_T_other``, shape (3,).
+        """
+        known = self._views.place(hybrid_map, area, (other,)).grid
+        seen = self._views.grid(hybrid_map.keyframes(other))
+        return MAPS.log_ratio(known.agreement(seen.points, pose), MAPS_USUAL) > 0.0
+
     def measured(
         self, hybrid_map: HybridMap, other: int, without: int, scan: Scan, prior: PoseGaussian
     ) -> PoseGaussian | None:

@@ -54,7 +54,7 @@ class CommonMap:
 
     :ivar areas: {area: {keyframe: ``area_T_base`` (3,)}}.
     :ivar arcs: {(smaller area, larger area): arc}.
-    :ivar largest: the largest area, -1 where there is none.
+    :ivar largest: the largest area that there ever was, -1 where there was none.
     """
 
     def __init__(self) -> None:
@@ -82,6 +82,11 @@ class CommonMap:
         self.areas[area] = keyframes
         self.largest = max(self.largest, area)
         self._extents[area] = extent(keyframes)
+
+    def remove_area(self, area: int) -> None:
+        """Take an area out that no arc joins to another; no other area gets its number."""
+        del self.areas[area]
+        self._extents[area] = 0.0
 
     def set_arc(self, pair: Pair, arc: ArcValue) -> None:
         """Set or replace the arc of (smaller area, larger area), which become areas where they are none."""

@@ -12,7 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmt_slam_ros.arrays import Float64, Int64
+from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.topology.arc_fusion import fused
 from hmt_slam_ros.topology.common_map import ArcValue, CommonMap, Keyframes, extent
 
 
@@ -58,7 +60,7 @@ class HybridMap:
 
     @property
     def largest_area(self) -> int:
-        """The largest area, -1 where there is none."""
+        """The largest area that there ever was, -1 where there was none."""
         return max(self.common.largest, max(self.areas, default=-1))
 
     def keyframes(self, area: int) -> Keyframes:
@@ -119,6 +121,34 @@ class HybridMap:
     def remove_arc(self, a: int, b: int) -> None:
         """Take the arc between a and b out, if there is one."""
         self.arcs[_stored_direction(a, b)] = None
+
+    def merge(self, area: int, into: int, into_T_area: PoseGaussian) -> None:
+        """Make an area part of another; valid only when this is the one live hypothesis of ``common``.
+
+        Its keyframes lie there, and its arcs begin there. Where both had an arc to a third area these are fused, Eq.
+        (10), as if the same scans had told both, since refinement lets them agree. Where the arc between the two closed
+        a loop, that by which the area was first entered closes it now.
+
+        :param into_T_area: the belief over it.
+        """
+        self.absorb()
+        between = self.arc_value(into, area)
+        for keyframe, pose in self.keyframes(area).items():
+            self.place(keyframe, into, se2.compose(into_T_area.mean, pose))
+        self.remove_arc(area, into)
+        arcs = {other: self.common.arcs[_stored_direction(area, other)] for other in self.neighbours(area)}
+        entered = min((other for other, arc in arcs.items() if not arc.closure), default=None)
+        loop = between is None or between.closure
+        for other, arc in arcs.items():
+            seen = into_T_area.compose(arc.pose if area < other else arc.pose.inverse())
+            closure = arc.closure or (loop and other == entered)
+            known, value = self.arc(into, other), self.arc_value(into, other)
+            if known is not None and value is not None:
+                seen, closure = fused(known, seen, shared=1.0), value.closure and closure
+            self.remove_arc(area, other)
+            self.set_arc(into, other, seen, closure=closure)
+        self.absorb()
+        self.common.remove_area(area)
 
     def neighbours(self, area: int) -> list[int]:
         """The areas one arc away, ascending."""

@@ -107,6 +107,17 @@ def separation(
     return None
 
 
+def least_cut(graph: OverlapGraph, part: Collection[int], min_size: int) -> float:
+    """The least NCut at which a graph falls into two: that which sets ``part`` apart, or a better one.
+
+    :param part: some of its keyframes.
+    :param min_size: keyframes on each side at least, of any other cut.
+    """
+    side = np.array([keyframe in part for keyframe in graph.keyframes], dtype=np.bool_)
+    found = normalized_cut(graph.similarity, min_size)
+    return min(ncut(graph.similarity, side), np.inf if found is None else found.value)
+
+
 _OLD_GROUND = -1
 
 
