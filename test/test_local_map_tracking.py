@@ -162,3 +162,16 @@ def test_what_the_scans_leave_open_is_carried_on_until_the_next_keyframe(mapping
     assert along[-1] == pytest.approx(np.sqrt(8) * 0.02, rel=0.2)
     area_filter.update(mapping.matching_points(scan_in(CORRIDOR, truth)), 1)
     np.testing.assert_array_equal(area_filter.left_open, 0.0)
+
+
+@pytest.mark.parametrize("beams", [81, 91, 101])
+def test_a_turn_that_odometry_missed_in_a_pause_is_found_by_a_scan_that_fits_there_and_not_here(mapping, beams):
+    area_filter = mapped(mapping, ROOM, [(0, 0, 0)])
+    truth = np.array([0.0, -0.45, -1.4])
+    points = mapping.matching_points(scan_in(ROOM, truth, beams=beams, noise=0.01))
+    prediction = predicted(Step(np.array([0.0, 0.0, -0.4]), SURE), Step(np.array([0.0, -0.2, -1.6]), 16.0 * VAGUE))
+    tracked = area_filter.track(points, prediction)
+    distance, angle = error_of(area_filter.pose, truth)
+    assert distance < 0.1
+    assert angle < 2.0
+    assert tracked.contradicted

@@ -93,8 +93,10 @@ class ScanMatcher:
         if self._agrees(points, by_odometry, view):
             return by_odometry
         by_inertia = self._match(points, before, prediction.inertia, view)
-        # Unknown space has evidence 0: what was found has to be part of the map as well.
-        right = max(0.0, by_odometry.log_evidence + self._log_right)
+        right = by_odometry.log_evidence + self._log_right
+        if not self._fits(points, by_inertia.pose, view):
+            # Unknown space has evidence 0: what was found has to be part of the map as well.
+            right = max(0.0, right)
         if by_inertia.log_evidence + self._log_fault > right:
             return self._reconciled(points, before, prediction, by_inertia, view)
         return by_odometry if by_odometry.hessian.any() else self._unproven(by_odometry, prediction.inertia)
