@@ -20,6 +20,10 @@ from hmt_slam_ros.sensing.surfels import moved
 from hmt_slam_ros.topology.area_grid import AreaGrid, GridModel, build_area_grid
 from hmt_slam_ros.topology.area_matching import MatchSettings, match, moments
 
+# Factor on the covariance of what the match of two whole areas says: they are not quite rigid, and bend by more than
+# the width of their walls.
+_NOT_RIGID = 10.0
+
 Placed: TypeAlias = tuple[Scan, NDArray[np.float64]]
 
 
@@ -56,7 +60,8 @@ class AreaAlignment:
         start = [moved(se2.compose(found.mean, pose), self._mapping.matching_points(scan)) for scan, pose in joined]
         offset = self._offset(np.concatenate(start), closure, found, self._mapping.pool.view(table))
         self._mapping.pool.release(table)
-        return PoseGaussian(se2.compose(offset, found.mean), found.covariance)
+        covariance = min(_NOT_RIGID * found.covariance, closure.covariance, key=np.linalg.det)
+        return PoseGaussian(se2.compose(offset, found.mean), covariance)
 
     def _grid(self, placed: Sequence[Placed]) -> AreaGrid:
         poses = np.array([pose for _, pose in placed]).reshape(-1, 3)
