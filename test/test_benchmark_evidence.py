@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from benchmark.evidence import Comparison, contradictions, fitted
-from hmt_slam_ros.agreement import MAPS, Agreement
+from hmt_slam_ros.agreement import MAPS, MAPS_USUAL, Agreement
 
 
 @pytest.mark.parametrize("overstated", [1.0, 4.0])
@@ -20,5 +20,5 @@ def test_evidence_has_the_weight_that_it_deserves(overstated):
 def test_what_contradicts_is_that_of_the_inference():
     found = Agreement(100, 90, 5)
     (against,) = contradictions([Comparison("sim:ring,seed=0", False, found, 0.0, 0.0, 0.0)], MAPS)
-    assert against == MAPS.log_ratio(found, 0.0074)
+    assert against == MAPS.log_ratio(found, MAPS_USUAL)
     assert against < -1.0
