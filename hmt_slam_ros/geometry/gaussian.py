@@ -6,6 +6,8 @@ A covariance lives in the right tangent space of its mean: T = mean * exp(xi), x
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -81,4 +83,18 @@ def fuse(beliefs: list[PoseGaussian], iterations: int = 10) -> PoseGaussian:
         mean = se2.compose(mean, se2.exp(step))
         if np.abs(step).max() < 1e-12:
             break
+    return PoseGaussian(mean, covariance)
+
+
+def moments(weighed: Sequence[tuple[PoseGaussian, float]]) -> PoseGaussian:
+    """The second moment of several beliefs about the mean of the heaviest.
+
+    :param weighed: every belief with the log of its weight, at least one.
+    """
+    total = np.logaddexp.reduce([log_weight for _, log_weight in weighed])
+    mean = max(weighed, key=lambda each: each[1])[0].mean
+    covariance = np.zeros((3, 3))
+    for belief, log_weight in weighed:
+        away = se2.log(se2.between(mean, belief.mean))
+        covariance += math.exp(log_weight - total) * (belief.covariance_at(mean) + np.outer(away, away))
     return PoseGaussian(mean, covariance)

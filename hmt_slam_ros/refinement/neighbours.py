@@ -31,6 +31,7 @@ def neighbours(
     linked: Mapping[int, Collection[int]],
     reach: float,
     count: int,
+    passed: int = -1,
 ) -> list[NDArray[np.int64]]:
     """The nearest keyframes around given poses, in place and heading, in areas that the topology links.
 
@@ -39,9 +40,16 @@ def neighbours(
     :param linked: {area: areas whose keyframes may lie in the same place}; what is near by chance only is not matched.
     :param reach: largest distance, m.
     :param count: keyframes at most.
+    :param passed: rows of ``poses`` and ``seen_from`` that are apart by this or less are left out.
     :returns: m arrays of rows of ``poses``, nearest first; a radian counts as a metre.
     """
-    return _found(poses, areas, seen_from, seen_from_areas, linked, reach, count, -1)
+    known = np.unique(np.concatenate((areas, seen_from_areas)))
+    allowed = np.array([[other in linked[area] for other in known.tolist()] for area in known.tolist()])
+    rows = _nearest(
+        poses, np.searchsorted(known, areas), seen_from, np.searchsorted(known, seen_from_areas), allowed, reach, count,
+        passed,
+    )  # fmt: skip
+    return [own[own >= 0] for own in rows]
 
 
 def with_other_ways(
@@ -59,31 +67,12 @@ def with_other_ways(
     :param poses: shape (n, 3), of the keyframes in the order in which they were taken; ``areas`` (n,) theirs.
     :param reach: largest distance of those that are near, m.
     """
-    farther = _found(poses, areas, poses, areas, linked, _FARTHER * reach, _FEW, _ONE_WAY)
+    farther = neighbours(poses, areas, poses, areas, linked, _FARTHER * reach, _FEW, _ONE_WAY)
     alone = [bool(np.all(np.abs(rows - i) <= _ONE_WAY)) for i, rows in enumerate(around)]
     return [
         np.concatenate((rows, others)) if apart else rows
         for rows, others, apart in zip(around, farther, alone, strict=True)
     ]
-
-
-def _found(
-    poses: NDArray[np.float64],
-    areas: NDArray[np.int64],
-    seen_from: NDArray[np.float64],
-    seen_from_areas: NDArray[np.int64],
-    linked: Mapping[int, Collection[int]],
-    reach: float,
-    count: int,
-    passed: int,
-) -> list[NDArray[np.int64]]:
-    known = np.unique(np.concatenate((areas, seen_from_areas)))
-    allowed = np.array([[other in linked[area] for other in known.tolist()] for area in known.tolist()])
-    rows = _nearest(
-        poses, np.searchsorted(known, areas), seen_from, np.searchsorted(known, seen_from_areas), allowed, reach, count,
-        passed,
-    )  # fmt: skip
-    return [own[own >= 0] for own in rows]
 
 
 @njit(cache=True)

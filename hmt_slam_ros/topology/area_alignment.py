@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.chi_square import gate
-from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.geometry.gaussian import PoseGaussian, moments
 from hmt_slam_ros.local_map import matching
 from hmt_slam_ros.local_map.local_mapping import LocalMapping
 from hmt_slam_ros.local_map.patches import MapView
 from hmt_slam_ros.sensing import Scan
 from hmt_slam_ros.sensing.surfels import moved
 from hmt_slam_ros.topology.area_grid import AreaGrid, GridModel, build_area_grid
-from hmt_slam_ros.topology.area_matching import MatchSettings, match, moments
+from hmt_slam_ros.topology.area_matching import MatchSettings, match
 
 # Factor on the covariance of what the match of two whole areas says: they are not quite rigid, and bend by more than
 # the width of their walls.

@@ -7,7 +7,7 @@ Blanco et al. leave it to an expectation over samples of the prior; a lattice do
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -18,7 +18,7 @@ from hmt_slam_ros.arrays import Float64, Int64
 from hmt_slam_ros.configuration.topological import TopologicalInference
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.chi_square import gate
-from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.geometry.gaussian import PoseGaussian, moments
 from hmt_slam_ros.topology import area_modes
 from hmt_slam_ros.topology.area_bounds import Surface
 from hmt_slam_ros.topology.area_grid import AreaGrid
@@ -225,20 +225,6 @@ def _modes(searched: _Searched) -> list[Mode]:
             inside = labels == label
             _add(modes, _mode(problem, masses[inside], poses[inside]))
     return [_carried(mode, problem.to_middle) for mode in sorted(modes, key=lambda mode: -mode.log_mass)]
-
-
-def moments(weighed: Sequence[tuple[PoseGaussian, float]]) -> PoseGaussian:
-    """The second moment of several beliefs about the mean of the heaviest.
-
-    :param weighed: every belief with the log of its weight, at least one.
-    """
-    total = np.logaddexp.reduce([log_weight for _, log_weight in weighed])
-    mean = max(weighed, key=lambda each: each[1])[0].mean
-    covariance = np.zeros((3, 3))
-    for belief, log_weight in weighed:
-        away = se2.log(se2.between(mean, belief.mean))
-        covariance += math.exp(log_weight - total) * (belief.covariance_at(mean) + np.outer(away, away))
-    return PoseGaussian(mean, covariance)
 
 
 def _add(modes: list[Mode], mode: Mode) -> None:
