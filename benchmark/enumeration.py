@@ -63,7 +63,9 @@ class _EverywhereSearch(ClosureSearch):
         candidates = {known: Candidate(prior, fresh[known], 1.0) for known, prior in priors.items()}
         places = {known: self._views.place(hybrid_map, known, excluded) for known in candidates}
         entries = {known: self._entry(place, candidates[known]) for known, place in places.items()}
-        shares = {known: found.share for known, found in entries.items() if found.share}
+        asked_in = [known for known, found in entries.items() if found.share]
+        modes = {known: self._modes(places[known], candidates[known]) for known in asked_in}
+        shares = {known: entries[known].share for known, found in modes.items() if found is not None}
         total = sum(shares.values())
         new = max(1.0 - total, options.new_probability) if total else 1.0
         if shares:
@@ -73,10 +75,11 @@ class _EverywhereSearch(ClosureSearch):
             fit
             for known, share in shares.items()
             for fit in self._fits(
-                hybrid_map, places[known], candidates[known], (1.0 - new) * share / total, entries[known]
+                hybrid_map, places[known], candidates[known], modes[known] or (), entries[known],
+                (1.0 - new) * share / total,
             )
         ]
-        return Comparison(Transition({}, new), tuple(fits), tuple(shares), 0.0)
+        return Comparison(Transition({}, new), tuple(fits), tuple(shares), len(shares) < len(asked_in), 0.0)
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,17 +18,18 @@ ROOM = np.concatenate((box(0.0, 0.0, 5.0, 5.0), box(1.0, 3.0, 2.0, 3.5)))
 OTHER = np.concatenate((box(-0.8, 1.2, 7.5, 3.4), box(3.0, 1.2, 3.4, 1.5)))
 
 
-def rooms_apart(rooms, offsets, sigma, configuration=None):
+def rooms_apart(rooms, offsets, sigma, configuration=None, last=PATH):
     """The children of a hypothesis whose robot maps the last of several rooms, which may be one of the others.
 
     :param rooms: walls of areas 0, 1, ...; the robot is in the last. All were driven through on the same path.
     :param offsets: where the arcs place the frames of the known areas in that of the last one, (2,) each.
     :param sigma: deviation of the arcs, m.
+    :param last: the path through the last room, where it is another.
     """
     replica = Replica()
     hybrid_map, here = replica.maps[0], len(rooms) - 1
     for area, walls in enumerate(rooms):
-        for k, pose in enumerate(PATH):
+        for k, pose in enumerate(last if area == here else PATH):
             keyframe = 6 * area + k
             replica.scans[keyframe] = scan_in(
                 walls, pose, noise=0.01, seed=keyframe, field_of_view=2 * np.pi, beams=361
@@ -139,6 +140,25 @@ def test_a_keyframe_speaks_for_or_against_an_area_once():
     stay = replace(parent, notes=parent.notes.checked([0], newest))
     branches = branching.cut(stay, newest[1:])
     assert [child.area for child in branches.children] == [parent.area + 1]
+
+
+def approach(xs):
+    """What comes of comparing keyframes at ``xs`` in a hall with an area of which the last keyframe is at x = 3.7."""
+    walls = np.concatenate((box(0.0, 0.0, 12.0, 5.0), box(1.0, 3.0, 2.0, 3.5), box(7.0, 0.5, 7.6, 0.9)))
+    path = np.array([[x, 2.2, np.pi] for x in xs])
+    parent, branching, newest = rooms_apart((walls, walls), ((0.3, -0.2),), 0.5, last=path)
+    return parent, branching.cut(parent, newest)
+
+
+def test_keyframes_that_see_an_area_but_are_not_in_its_place_yet_are_asked_again():
+    parent, branches = approach((8.7, 8.2, 7.7, 7.2, 6.7, 6.2))
+    assert [child.area for child in branches.children] == [parent.area + 1]
+    assert 0 not in branches.children[0].notes.compared
+
+
+def test_keyframes_most_of_which_are_in_its_place_are_recognized():
+    _parent, branches = approach((6.2, 5.6, 5.0, 4.4, 3.8, 3.2))
+    assert max(branches.children, key=lambda child: child.log_weight).area == 0
 
 
 def test_further_ways_to_fit_into_an_area_count_as_not_examined():

@@ -76,6 +76,12 @@ def test_entering_an_area_keeps_the_notes_of_the_keyframes_that_came_along():
     assert entered.unchecked == ()
 
 
+def test_of_keyframes_beside_known_ground_the_newer_half_is_looked_at_again():
+    notes = LeafNotes(unchecked=(3, 4, 5, 6, 7))
+    assert notes.checked([], [3, 4, 5, 6, 7], beside=True).unchecked == (6, 7)
+    assert notes.checked([], [3, 4, 5, 6, 7]).unchecked == ()
+
+
 def test_notes_are_values():
     before = LeafNotes().stored(1, np.eye(3))
     before.stored(2, np.eye(3))

@@ -136,7 +136,7 @@ class Branching:
             return Branches([self._enter_tracked(parent, query, tracked)])
         excluded = {parent.area, *parent.around()}
         found = self._compared(parent, query, excluded)
-        noted = replace(parent, notes=parent.notes.checked(found.examined, keyframes))
+        noted = replace(parent, notes=parent.notes.checked(found.examined, keyframes, found.beside))
         children = [self._enter_new(noted, query, math.log(found.transition.new))]
         children += [self._enter_known(noted, query, fit) for fit in found.fits]
         return Branches(children, True, _log(found.skipped) + parent.log_weight)
@@ -147,7 +147,7 @@ class Branching:
         query = self.query(parent, keyframes)
         excluded = {parent.area, *parent.around(), *parent.hybrid_map.neighbours(parent.area)}
         found = self._compared(parent, query, excluded)
-        noted = replace(parent, notes=parent.notes.checked(found.examined, keyframes))
+        noted = replace(parent, notes=parent.notes.checked(found.examined, keyframes, found.beside))
         stay = parent.log_weight + math.log(found.transition.new)
         children = [Child(parent.hypothesis, stay, parent.area, noted.notes)]
         children += [self._join(noted, query, fit) for fit in found.fits]

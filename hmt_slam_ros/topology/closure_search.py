@@ -49,12 +49,15 @@ class Comparison(NamedTuple):
     :ivar transition: pi of the known areas and of new ground.
     :ivar fits: the modes in all areas that were examined, the heaviest of each.
     :ivar examined: those areas.
+    :ivar beside: whether the keyframes fit beside an area's place, where they are not in it yet; that one was not
+        examined.
     :ivar skipped: probability of those that were not, and of further modes, on the scale of ``exp(Fit.log_weight)``.
     """
 
     transition: Transition
     fits: tuple[Fit, ...]
     examined: tuple[int, ...]
+    beside: bool
     skipped: float
 
 
@@ -153,18 +156,22 @@ class ClosureSearch:
         others = [self._elsewhere(hybrid_map, other, excluded) for other in wanted]
         places = {known: self._views.place(hybrid_map, known, excluded) for known in looked_at}
         entries = {known: self._entry(place, candidates[known]) for known, place in places.items()}
-        shares = {known: found.share for known, found in entries.items() if found.share > 0.0}
+        asked = [known for known, found in entries.items() if found.share > 0.0]
+        modes = {known: self._modes(places[known], candidates[known]) for known in asked}
+        shares = {known: entries[known].share for known, found in modes.items() if found is not None}
         model = transition(shares | rest, self._options.new_probability)
         if shares:
             self._count_likeness(query, others)
         fits = [
             fit
             for known in sorted(shares, key=lambda known: (-shares[known], known))
-            for fit in self._fits(hybrid_map, places[known], candidates[known], model.known[known], entries[known])
+            for fit in self._fits(
+                hybrid_map, places[known], candidates[known], modes[known] or (), entries[known], model.known[known]
+            )
         ]
         kept, left_out = _parted(fits, self._options.max_modes)
         skipped = sum(model.known[known] for known in rest) + sum(math.exp(fit.log_weight) for fit in left_out)
-        return Comparison(model, kept, tuple(shares), skipped)
+        return Comparison(model, kept, tuple(shares), len(shares) < len(asked), skipped)
 
     def look_ahead(self, hybrid_map: HybridMap) -> None:
         """Make the map of one of the areas that the next keyframes will be laid into, while there is time for it."""
@@ -204,27 +211,35 @@ class ClosureSearch:
         poses = stacked(hybrid_map.keyframes(area))
         return Elsewhere(self._views.place(hybrid_map, area, excluded).grid, poses[len(poses) // 2])
 
+    def _modes(self, place: Place, candidate: Candidate) -> list[Mode] | None:
+        """How the keyframes lie in the candidate's place; None where they fit best beside every place.
+
+        A robot that comes back to known ground sees it before it is in it.
+        """
+        query, fresh = self._views.grid(candidate.fresh), candidate.fresh
+        bounds = reach_of(place, query, fresh, self._options.place_radius)
+        modes = match(query, place.grid, candidate.prior, self._settings, bounds).modes
+        poses = [se2.compose(mode.pose.mean, stacked(fresh)) for mode in modes]
+        owners = [owner_at(place, at, self._options.place_radius) for at in poses]
+        if modes and owners[max(range(len(modes)), key=lambda n: modes[n].log_mass)] is None:
+            return None
+        return [mode for mode, owner in zip(modes, owners, strict=True) if owner == place.area]
+
     def _fits(
-        self, hybrid_map: HybridMap, place: Place, candidate: Candidate, pi: float, entered: Entry
+        self, hybrid_map: HybridMap, place: Place, candidate: Candidate, modes: Sequence[Mode], entered: Entry,
+        pi: float,
     ) -> Iterator[Fit]:
-        """The modes of the query in the candidate's place, which share its probability by their masses.
+        """The modes share the probability of the candidate's place by their masses.
 
         The probability of the place is that of all poses in it. A mode that is farther off than these usually are has
         less, as the prior has there. Where a loop that the hypothesis closed has the robot in that place anyway, the
         fit was to be expected even if that loop is none.
-        """
-        fresh = candidate.fresh
+        """  # fmt: skip
         foretold = entered.share > 0.5 and bool(hybrid_map.claimed_closures)
-        query = self._views.grid(fresh)
-        bounds = reach_of(place, query, fresh, self._options.place_radius)
-        modes = [
-            mode
-            for mode in match(query, place.grid, candidate.prior, self._settings, bounds).modes
-            if owner_at(place, se2.compose(mode.pose.mean, stacked(fresh)), self._options.place_radius) == place.area
-        ]
+        points = self._views.grid(candidate.fresh).points
         whole = np.logaddexp.reduce([mode.log_mass for mode in modes]) if modes else 0.0
         for mode in modes:
-            found = place.grid.agreement(query.points, mode.pose.mean)
+            found = place.grid.agreement(points, mode.pose.mean)
             same = MAPS.log_ratio(found, MAPS_USUAL) + self._likeness.log_rarity(found.share, foretold=foretold)
             away = se2.log(se2.between(candidate.prior.mean, mode.pose.mean))
             distance = float(away @ np.linalg.solve(candidate.prior.covariance, away))

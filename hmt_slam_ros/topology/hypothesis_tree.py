@@ -70,10 +70,15 @@ class LeafNotes:
             self, covariances={**self.covariances, keyframe: covariance}, unchecked=(*self.unchecked, keyframe)
         )
 
-    def checked(self, areas: Sequence[int], keyframes: Sequence[int]) -> LeafNotes:
-        """After keyframes were compared with known areas."""
+    def checked(self, areas: Sequence[int], keyframes: Sequence[int], beside: bool = False) -> LeafNotes:
+        """After keyframes were compared with known areas.
+
+        :param beside: whether they fit beside another, in which the robot may be soon: then the newer half of them is
+            looked at again.
+        """
         added = {area: self.compared.get(area, frozenset()) | set(keyframes) for area in areas}
-        return replace(self, compared={**self.compared, **added}, unchecked=())
+        again = self.unchecked[(len(self.unchecked) + 1) // 2 :] if beside else ()
+        return replace(self, compared={**self.compared, **added}, unchecked=again)
 
     def seen_in(self, area: int | None) -> LeafNotes:
         """After a keyframe event at which the robot seemed to be in ``area`` of the local map, or in none such."""
