@@ -225,20 +225,22 @@ def _lower_distances(
     """Lower every cell near a point to the squared distance from its centre to that point, m^2."""
     span = int(np.ceil(reach / cell))
     rows, columns = distance2.shape
-    area = np.float32(cell * cell)
+    area, squares = np.float32(cell * cell), np.empty(2 * span + 1, np.float32)
     for k in range(points.shape[0]):
         x, y = (points[k, 0] - origin[0]) / cell - 0.5, (points[k, 1] - origin[1]) / cell - 0.5
         column, row = round(x), round(y)
         first, last = max(0, column - span), min(columns, column + span + 1)
         left = np.float32(x - first)
+        for c in range(last - first):
+            squares[c] = (np.float32(c) - left) * (np.float32(c) - left)
         for r in range(max(0, row - span), min(rows, row + span + 1)):
             up = np.float32((r - y) ** 2)
             # A part whose index begins at 0, and a choice instead of a branch: the compiler takes eight cells at once.
+            # The 0 keeps it from storing under a mask, which takes AMD's processors ten times as long.
             part = distance2[r, first:last]
             for c in range(last - first):
-                across = np.float32(c) - left
-                d2 = (across * across + up) * area
-                part[c] = d2 if d2 < part[c] else part[c]
+                d2 = (squares[c] + up) * area
+                part[c] = (d2 if d2 < part[c] else part[c]) + np.float32(0.0)
 
 
 @njit(cache=True)
