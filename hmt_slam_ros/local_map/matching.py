@@ -24,7 +24,7 @@ from hmt_slam_ros.geometry.symmetric import (
     times,
     total,
 )
-from hmt_slam_ros.local_map.patches import FAR, PATCH, MapView, field_at, odds_at
+from hmt_slam_ros.local_map.patches import FAR, PATCH, MapView, field_at, field_of_four, odds_at
 
 # Distance from its surface at which a point in unknown space counts, as a share of the robust scale.
 _UNSEEN = 0.6
@@ -161,10 +161,8 @@ def _smooth_distance(view: MapView, u: float, v: float) -> tuple[float, float, f
     """Bilinear distance and its gradient per cell at the continuous cell coordinates (u, v), in quanta."""
     column, row = int(np.floor(u)), int(np.floor(v))
     fu, fv = u - column, v - row
-    d00 = float(field_at(view, column, row))
-    d10 = float(field_at(view, column + 1, row))
-    d01 = float(field_at(view, column, row + 1))
-    d11 = float(field_at(view, column + 1, row + 1))
+    four = field_of_four(view, column, row)
+    d00, d10, d01, d11 = float(four[0]), float(four[1]), float(four[2]), float(four[3])
     low, high = d00 + fu * (d10 - d00), d01 + fu * (d11 - d01)
     gradient_u = (1.0 - fv) * (d10 - d00) + fv * (d11 - d01)
     return low + fv * (high - low), gradient_u, high - low

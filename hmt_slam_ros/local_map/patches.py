@@ -79,6 +79,25 @@ def field_at(view: MapView, column: int, row: int) -> int:
     return view.field[patch, row & MASK, column & MASK]
 
 
+@njit(cache=True, inline="always")
+def field_of_four(view: MapView, column: int, row: int) -> tuple[int, int, int, int]:
+    """:func:`field_at` of a cell, of the next one in its row, and of these two in the next row."""
+    c, r, tc, tr = column & MASK, row & MASK, column >> SHIFT, row >> SHIFT
+    if 0 <= tc < view.table.shape[1] and 0 <= tr < view.table.shape[0] and c < MASK and r < MASK:
+        # All four lie in one patch.
+        patch = view.table[tr, tc]
+        if patch < 0:
+            return FAR, FAR, FAR, FAR
+        field = view.field
+        return field[patch, r, c], field[patch, r, c + 1], field[patch, r + 1, c], field[patch, r + 1, c + 1]
+    return (
+        field_at(view, column, row),
+        field_at(view, column + 1, row),
+        field_at(view, column, row + 1),
+        field_at(view, column + 1, row + 1),
+    )
+
+
 @njit(cache=True)
 def add_references(table: Int32, references: Int32) -> None:
     """Count one reference more to every patch of a map."""
