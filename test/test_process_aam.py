@@ -342,3 +342,17 @@ def test_the_question_comes_again_when_the_robot_leaves_one_of_the_two_and_waits
     process.handle(Hypotheses(k + 2, (Leaf(1, 1, 1.0, 0),)))
     (event,) = process.handle(keyframe(k + 3, AGAIN[-1], both[0]))[0].events
     assert (event.kind, event.area, event.into) == ("merged", 2, 0)
+
+
+def test_two_areas_are_measured_again_only_where_the_arc_between_them_moved(measured):
+    process = aam()
+    answer, k = closed(process, AGAIN)
+    pose, before = se2.between(AGAIN[0], AGAIN[-1]), answer.events[0].score
+    for later, error in enumerate((0.0, 0.001, 0.1), start=k):
+        two_T_zero = se2.compose(se2.between(AGAIN[0], THERE[0]), (error, 0.0, 0.0))
+        process.handle(stay(later, 0, area=2))
+        process.handle(Accepted(later, 0, (Arc(2, 0, exact(two_T_zero), closure=True),)))
+        measured.clear()
+        (answer,) = process.handle(keyframe(later + 1, AGAIN[-1], estimate(0, 2, pose, stored=False)))
+        moved = error == 0.1
+        assert (answer.events[0].score != before) == bool(measured) == moved

@@ -33,7 +33,8 @@ def assert_measured(graph):
 
 
 def test_a_keyframe_is_inserted_in_order_of_time_with_its_overlaps():
-    graph = OverlapGraph((1, 5), np.array([[0.0, 0.3], [0.3, 0.0]])).with_keyframe(3, np.array([0.6, 0.7]))
+    known = OverlapGraph((1, 5), np.array([[0.0, 0.3], [0.3, 0.0]]))
+    graph = synchronised(known, (1, 3, 5), lambda *_: np.array([0.6, 0.7]))
     assert graph.keyframes == (1, 3, 5)
     np.testing.assert_array_equal(graph.similarity, [[0.0, 0.6, 0.3], [0.6, 0.0, 0.7], [0.3, 0.7, 0.0]])
 
@@ -57,7 +58,7 @@ def test_keyframes_that_come_over_bring_their_overlaps_along():
     left = synchronised(OverlapGraph(), range(10, 16), Meter())
     entered = synchronised(OverlapGraph(), range(3), Meter())
     meter = Meter()
-    both = synchronised(entered, [0, 1, 2, 13, 14, 15], meter, known=left)
+    both = synchronised(entered, [0, 1, 2, 13, 14, 15], meter, left)
     assert sorted(meter.asked) == [(k, other) for k in (13, 14, 15) for other in (0, 1, 2)]
     assert_measured(both)
 

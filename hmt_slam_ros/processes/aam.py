@@ -6,6 +6,7 @@ A hypothesis is one topological path, so "once for every group of particles with
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,6 +38,28 @@ from hmt_slam_ros.topology.overlap_graph import (
 
 # An area's overlap with a scan is that of the best few keyframes among those taken nearest to it.
 _NEAREST, _BEST = 8, 3
+# Where an arc moved keyframes by less than this share of the radius of overlap, overlaps are not measured again.
+_UNMOVED = 0.1
+
+
+class _Joint(NamedTuple):
+    """Two areas that a closure joins, as one.
+
+    :ivar arc: ``a_T_b``, shape (3,), by which overlaps between the two were measured.
+    :ivar graph: of the keyframes of both.
+    :ivar part: keyframes of area b.
+    :ivar least: least normalised cut of the graph.
+    """
+
+    arc: NDArray[np.float64]
+    graph: OverlapGraph
+    part: frozenset[int]
+    least: float
+
+    def moved(self, arc: NDArray[np.float64], placed: Keyframes) -> float:
+        """How far at most another arc has the keyframes of area b, {keyframe: pose in b}, from where they were, m."""
+        points = np.array([pose[:2] for pose in placed.values()]).reshape(-1, 2)
+        return float(np.hypot(*(se2.transform(arc, points) - se2.transform(self.arc, points)).T).max(initial=0.0))
 
 
 @dataclass(frozen=True)
@@ -48,6 +71,7 @@ class _Watch:
     :ivar own: keyframes stored since the robot entered ``area``, and those that came over with it.
     :ivar separate: at how many of the latest evaluations in a row the newest keyframes separated.
     :ivar beyond: the known area that the robot seems to be in, and for how many keyframes in a row.
+    :ivar joints: {pair of areas: what was found when it was last asked whether they are one}.
     """
 
     area: int
@@ -55,6 +79,7 @@ class _Watch:
     own: frozenset[int] = frozenset()
     separate: int = 0
     beyond: tuple[int, int] | None = None
+    joints: dict[Pair, _Joint] = field(default_factory=dict)
 
 
 class Aam:
@@ -62,7 +87,7 @@ class Aam:
 
     The overlap of two keyframes is measured once, when the later one joins the area of the earlier one, and inherited
     by the hypotheses that branch off. It is not measured again when metric SLAM or TLCA corrects poses: a correction
-    within an area is small against the radius of overlap.
+    within an area is small against the radius of overlap. Between two areas it is when the arc between them moved.
 
     A cut and a move have to be found at ``aam.persistence`` evaluations in a row, so that one poor scan does nothing.
 
@@ -92,6 +117,7 @@ class Aam:
             self._asked |= {(min(arc.source, arc.target), max(arc.source, arc.target)) for arc in message.arcs}
             if message.reopened:
                 self._asked = set()
+                self._watches = {one: replace(watch, joints={}) for one, watch in self._watches.items()}
         return []
 
     def _examine(self, keyframe: Keyframe) -> AreaEvents:
@@ -127,20 +153,33 @@ class Aam:
 
     def _merged(self, hypothesis: int) -> AreaEvent | None:
         """The event that two areas are one, where there is no other hypothesis."""
-        watch, hybrid_map = self._watches[hypothesis], self._replica.maps[hypothesis]
+        hybrid_map = self._replica.maps[hypothesis]
         while self._asked and len(self._watches) == 1:
             into, area = pair = min(self._asked)
             self._asked.discard(pair)
             arc = hybrid_map.arc_value(into, area)
             if arc is None or not arc.closure:
                 continue
-            placed, other = dict(hybrid_map.keyframes(into)), hybrid_map.keyframes(area)
-            placed |= {keyframe: se2.compose(arc.pose.mean, pose) for keyframe, pose in other.items()}
-            graphs = (watch.graphs.get(known, OverlapGraph()) for known in pair)
-            least = least_cut(self._synchronised(placed, *graphs), other, self._options.min_cluster)
+            least = self._joint(hypothesis, pair, arc.pose.mean).least
             if least > self._options.ncut_threshold:
                 return AreaEvent(hypothesis, "merged", (), area, least, into)
         return None
+
+    def _joint(self, hypothesis: int, pair: Pair, arc: NDArray[np.float64]) -> _Joint:
+        """Two areas as one, whose arc is ``arc``; from what was found before, measuring only what is new."""
+        watch, (into, area) = self._watches[hypothesis], pair
+        other, before = self._keyframes(hypothesis, area), watch.joints.get(pair)
+        placed = dict(self._keyframes(hypothesis, into))
+        placed |= {keyframe: se2.compose(arc, pose) for keyframe, pose in other.items()}
+        known = [watch.graphs.get(one, OverlapGraph()) for one in pair]
+        if before is not None and before.moved(arc, other) < _UNMOVED * self._options.overlap_radius:
+            if before.part == other.keys() and set(before.graph.keyframes) == placed.keys():
+                return before
+            arc, known = before.arc, [before.graph, *known]
+        graph = self._synchronised(placed, *known)
+        joint = _Joint(arc, graph, frozenset(other), least_cut(graph, other, self._options.min_cluster))
+        self._watches[hypothesis] = replace(watch, joints=watch.joints | {pair: joint})
+        return joint
 
     def _moved(self, leaf: LeafEstimate, newest: int) -> AreaEvent | None:
         """The event that the robot went into a known area one arc away, when that has lasted.
@@ -197,7 +236,7 @@ class Aam:
         left = watch.graphs.get(watch.area, OverlapGraph()).only(self._keyframes(leaf.hypothesis, watch.area))
         beside = self._replica.maps[leaf.hypothesis].neighbours(watch.area)
         self._asked |= {(min(watch.area, other), max(watch.area, other)) for other in beside}
-        return _Watch(leaf.area, watch.graphs | {watch.area: left, leaf.area: entered}, moved)
+        return _Watch(leaf.area, watch.graphs | {watch.area: left, leaf.area: entered}, moved, joints=watch.joints)
 
     def _follow_merged(self, watch: _Watch, leaf: Leaf, merged: Merged) -> _Watch:
         """The watch with one area for two; what was the robot's own in one of them still is."""
@@ -205,7 +244,8 @@ class Aam:
         graphs = {area: graph for area, graph in watch.graphs.items() if area != merged.area}
         one, other = (watch.graphs.get(area, OverlapGraph()) for area in (merged.into, merged.area))
         graphs[merged.into] = self._synchronised(self._keyframes(leaf.hypothesis, merged.into), one, other)
-        return replace(watch, area=leaf.area, graphs=graphs, beyond=None)
+        joints = {pair: joint for pair, joint in watch.joints.items() if merged.area not in pair}
+        return replace(watch, area=leaf.area, graphs=graphs, beyond=None, joints=joints)
 
     def _graph(self, watch: _Watch, hypothesis: int, area: int) -> OverlapGraph:
         """The overlap graph of an area as it is now, from what the watch knows."""
@@ -215,12 +255,12 @@ class Aam:
     def _keyframes(self, hypothesis: int, area: int) -> Keyframes:
         return self._replica.maps[hypothesis].keyframes(area)
 
-    def _synchronised(self, placed: Keyframes, graph: OverlapGraph, known: OverlapGraph) -> OverlapGraph:
-        """The overlap graph of keyframes, {keyframe: pose}, measuring only what neither of two graphs holds."""
+    def _synchronised(self, placed: Keyframes, graph: OverlapGraph, *others: OverlapGraph) -> OverlapGraph:
+        """The overlap graph of keyframes, {keyframe: pose}, measuring only what none of the graphs holds."""
 
         def measure(keyframe: int, others: tuple[int, ...]) -> NDArray[np.float64]:
             poses = np.array([placed[other] for other in others]).reshape(-1, 3)
             points = [self._points[other] for other in others]
             return overlaps(self._points[keyframe], placed[keyframe], points, poses, self._options.overlap_radius)
 
-        return synchronised(graph, placed, measure, known)
+        return synchronised(graph, placed, measure, *others)

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from bisect import bisect_left
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -31,43 +30,44 @@ class OverlapGraph:
             return self
         return OverlapGraph(tuple(self.keyframes[i] for i in rows), self.similarity[np.ix_(rows, rows)])
 
-    def with_keyframe(self, keyframe: int, overlaps: NDArray[np.float64]) -> OverlapGraph:
-        """The graph with one keyframe more, whose overlaps with ``keyframes``, shape (n,), are known."""
-        at, n = bisect_left(self.keyframes, keyframe), len(self.keyframes)
-        old = np.delete(np.arange(n + 1), at)
-        similarity = np.zeros((n + 1, n + 1))
-        similarity[np.ix_(old, old)] = self.similarity
-        similarity[at, old] = similarity[old, at] = overlaps
-        return OverlapGraph((*self.keyframes[:at], keyframe, *self.keyframes[at:]), similarity)
-
-    def between(self, keyframe: int, others: Collection[int]) -> NDArray[np.float64]:
+    def between(self, keyframe: int, others: Sequence[int]) -> NDArray[np.float64]:
         """Overlaps of a keyframe with others, NaN where either is not in this graph."""
         if keyframe not in self.keyframes:
             return np.full(len(others), np.nan)
-        row = dict(zip(self.keyframes, self.similarity[self.keyframes.index(keyframe)], strict=True))
-        return np.array([row.get(other, np.nan) for other in others])
+        known, wanted = np.array(self.keyframes), np.array(others, dtype=np.int64)
+        at = np.minimum(np.searchsorted(known, wanted), len(known) - 1)
+        return np.where(known[at] == wanted, self.similarity[self.keyframes.index(keyframe), at], np.nan)
 
 
 Measure = Callable[[int, tuple[int, ...]], NDArray[np.float64]]
 
 
 def synchronised(
-    graph: OverlapGraph, keyframes: Collection[int], measure: Measure, known: OverlapGraph | None = None
+    graph: OverlapGraph, keyframes: Collection[int], measure: Measure, *others: OverlapGraph
 ) -> OverlapGraph:
-    """The graph of exactly ``keyframes``, measuring only overlaps that neither ``graph`` nor ``known`` holds.
+    """The graph of exactly ``keyframes``, measuring only overlaps that neither ``graph`` nor one of ``others`` holds.
 
     :param graph: what was known of the area.
     :param keyframes: the area's keyframes now.
     :param measure: (keyframe, others) -> overlaps, shape (number of others,).
-    :param known: the graph of the area from which keyframes came over.
+    :param others: the graphs of areas from which keyframes came over.
     """
     graph = graph.only(keyframes)
-    for keyframe in sorted(set(keyframes) - set(graph.keyframes)):
-        row = (known or OverlapGraph()).between(keyframe, graph.keyframes)
+    held, new = graph.keyframes, sorted(set(keyframes) - set(graph.keyframes))
+    if not new:
+        return graph
+    ids = (*held, *new)
+    similarity = np.zeros((len(ids), len(ids)))
+    similarity[: len(held), : len(held)] = graph.similarity
+    for k, keyframe in enumerate(new, start=len(held)):
+        row = np.full(k, np.nan)
+        for other in others:
+            row = np.where(np.isnan(row), other.between(keyframe, ids[:k]), row)
         unknown = np.flatnonzero(np.isnan(row))
-        row[unknown] = measure(keyframe, tuple(graph.keyframes[i] for i in unknown))
-        graph = graph.with_keyframe(keyframe, row)
-    return graph
+        row[unknown] = measure(keyframe, tuple(ids[i] for i in unknown))
+        similarity[k, :k] = similarity[:k, k] = row
+    order = np.argsort(ids)
+    return OverlapGraph(tuple(sorted(ids)), similarity[np.ix_(order, order)])
 
 
 class Separation(NamedTuple):
