@@ -1,0 +1,189 @@
+"""Values of annotated types as plain data, which JSON can hold, and back, strictly checked.
+
+The form follows from the annotations: a dataclass or a named tuple is an object with exactly its fields, a tuple is a
+list, a set is a list in order, a mapping is a list of pairs in its own order. A float comes back with the same bits.
+"""
+
+from __future__ import annotations
+
+import math
+import types
+from collections.abc import Callable, Hashable, Mapping, Set
+from dataclasses import fields, is_dataclass
+from functools import cache
+from typing import Any, Literal, TypeVar, Union, cast, get_args, get_origin, get_type_hints
+
+import numpy as np
+
+from hmt_slam_ros.errors import HmtSlamError
+
+Value = TypeVar("Value")
+Reader = Callable[[object, str], object]
+"""Turns parsed plain data, found at a path in a document, into a value, or refuses it."""
+
+
+ReaderOf = Callable[[str, Hashable], Reader]
+"""Makes a reader for a field of some name and annotation."""
+
+
+def plain(value: object, forms: Mapping[type, Callable[[Any], object]]) -> Any:  # noqa: ANN401  what JSON can hold
+    """A value as plain data.
+
+    :param forms: {type: what makes plain data of its values}, of types that are no dataclasses, tuples and so on, such
+        as arrays.
+    """
+    if value is None or type(value) in (int, float, str, bool):
+        return value
+    form = next((form for kind, form in forms.items() if isinstance(value, kind)), None)
+    if form is not None:
+        return form(value)
+    if is_record(type(value)):
+        return {name: plain(getattr(value, name), forms) for name in names_in(cast(Any, type(value)))}
+    if isinstance(value, tuple | Set):
+        return [plain(item, forms) for item in (sorted(value) if isinstance(value, Set) else value)]
+    if isinstance(value, Mapping):
+        return [[plain(key, forms), plain(item, forms)] for key, item in value.items()]
+    return value.item() if isinstance(value, np.generic) else value
+
+
+class Values:
+    """Turns plain data back into values.
+
+    :ivar described: where the form of the documents is described, for the advice in a complaint.
+    """
+
+    def __init__(self, described: str, forms: Mapping[type, ReaderOf]) -> None:
+        """:param forms: {type: what makes a reader of its values}, of types that are no dataclasses and so on."""
+        self.described = described
+        self._forms = forms
+        self._readers: dict[tuple[str, Hashable], Reader] = {}
+
+    def value(self, content: object, kind: type[Value], path: str) -> Value:
+        """The value that plain data stands for.
+
+        :param kind: its type.
+        :param path: what the document is called in a complaint.
+        :raises HmtSlamError: where it is something else; names the field.
+        """
+        return cast(Value, self._reader("", cast(Hashable, kind))(content, path))
+
+    def _reader(self, field: str, kind: Hashable) -> Reader:
+        known = self._readers.get((field, kind))
+        if known is None:
+            known = self._readers[field, kind] = self._new_reader(field, kind)
+        return known
+
+    def _new_reader(self, field: str, kind: Hashable) -> Reader:
+        origin, arguments = get_origin(kind), get_args(kind)
+        own = self._forms.get(cast(type, origin or kind))
+        if own is not None:
+            return own(field, kind)
+        if kind in _SCALARS:
+            return self._number if kind is float else self._scalar(*_SCALARS[kind])
+        if is_record(kind):
+            return self._object(cast(type, kind))
+        if origin in (Union, types.UnionType):
+            return self._optional(self._reader(field, arguments[0]))
+        return self._word(arguments) if origin is Literal else self._collection(origin, arguments)
+
+    def _collection(self, origin: object, arguments: tuple[Any, ...]) -> Reader:
+        if origin is tuple and len(arguments) == 2 and arguments[1] is Ellipsis:
+            return self._list(self._reader("", arguments[0]), tuple)
+        if origin is tuple:
+            return self._row([self._reader("", argument) for argument in arguments])
+        if origin is frozenset:
+            return self._list(self._reader("", arguments[0]), frozenset)
+        if isinstance(origin, type) and issubclass(origin, Mapping):
+            return self._pairs(*(self._reader("", argument) for argument in arguments))
+        raise TypeError(f"a document cannot hold a {origin}[{arguments}]")
+
+    def _object(self, kind: type) -> Reader:
+        hints = get_type_hints(kind)
+        readers = {name: self._reader(name, hints[name]) for name in names_in(kind)}
+
+        def read(content: object, path: str) -> object:
+            if not isinstance(content, dict):
+                raise self.fault(path, content, "an object")
+            for name in readers.keys() - content.keys():
+                raise HmtSlamError(f"{path}.{name} is missing: see {self.described} for the form of the document")
+            for name in content.keys() - readers.keys():
+                raise HmtSlamError(f"{path}.{name} is unknown: see {self.described} for the form of the document")
+            return kind(**{name: reader(content[name], f"{path}.{name}") for name, reader in readers.items()})
+
+        return read
+
+    def _list(self, item: Reader, made: Callable[..., object]) -> Reader:
+        def read(content: object, path: str) -> object:
+            if not isinstance(content, list):
+                raise self.fault(path, content, "a list")
+            return made(item(entry, f"{path}[{k}]") for k, entry in enumerate(content))
+
+        return read
+
+    def _row(self, items: list[Reader]) -> Reader:
+        def read(content: object, path: str) -> tuple[object, ...]:
+            if not isinstance(content, list) or len(content) != len(items):
+                raise self.fault(path, content, f"a list of {len(items)}")
+            return tuple(item(content[k], f"{path}[{k}]") for k, item in enumerate(items))
+
+        return read
+
+    def _pairs(self, key: Reader, item: Reader) -> Reader:
+        pairs = self._list(self._row([key, item]), dict)
+
+        def read(content: object, path: str) -> object:
+            found = pairs(content, path)
+            if len(cast(dict[Any, Any], found)) < len(cast(list[Any], content)):
+                raise self.fault(path, content, "a list of pairs with different keys")
+            return found
+
+        return read
+
+    def _optional(self, some: Reader) -> Reader:
+        return lambda content, path: None if content is None else some(content, path)
+
+    def _word(self, words: tuple[str, ...]) -> Reader:
+        def read(content: object, path: str) -> object:
+            if content not in words:
+                raise self.fault(path, content, " or ".join(words))
+            return content
+
+        return read
+
+    def _scalar(self, kind: type, name: str) -> Reader:
+        def read(content: object, path: str) -> object:
+            if type(content) is not kind:
+                raise self.fault(path, content, name)
+            return content
+
+        return read
+
+    def _number(self, content: object, path: str) -> float:
+        if not isinstance(content, int | float) or isinstance(content, bool) or not math.isfinite(content):
+            raise self.fault(path, content, _SCALARS[float][1])
+        return float(content)
+
+    def fault(self, path: str, content: object, wanted: str) -> HmtSlamError:
+        """The complaint about what was found at a path."""
+        return HmtSlamError(
+            f"{path} = {str(content)[:60]} is not {wanted}: see {self.described} for the document's form"
+        )
+
+
+def is_record(kind: object) -> bool:
+    """Whether a type is a dataclass or a named tuple."""
+    return isinstance(kind, type) and (is_dataclass(kind) or hasattr(kind, "_fields"))
+
+
+@cache
+def names_in(kind: type) -> tuple[str, ...]:
+    """The names of the fields of a dataclass or named tuple."""
+    return tuple(entry.name for entry in fields(kind)) if is_dataclass(kind) else cast(Any, kind)._fields
+
+
+_SCALARS: dict[Hashable, tuple[type, str]] = {
+    bool: (bool, "true or false"),
+    int: (int, "a whole number"),
+    float: (float, "a finite number"),
+    str: (str, "a text"),
+}
