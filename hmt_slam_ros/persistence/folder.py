@@ -1,0 +1,159 @@
+"""A folder of typed documents, each in a JSON file and one of arrays, with a manifest that tells whether all is well.
+
+The manifest lists every file with its size and its SHA-256, and holds its own, so that nothing is read that is not what
+was written.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, BinaryIO, TypeVar
+
+import numpy as np
+
+from hmt_slam_ros.errors import HmtSlamError
+from hmt_slam_ros.persistence.arrays import ReadArrays, WrittenArrays
+from hmt_slam_ros.persistence.scans import ReadScans, ScanTable, WrittenScans
+from hmt_slam_ros.plain_data import ReaderOf, Values, plain
+from hmt_slam_ros.sensing import Scan
+
+MANIFEST = "manifest.json"
+DESCRIBED = "docs/map_format.md"
+SCANS = "scans"
+_REMEDY = "take a copy that is whole, or map the log again"
+
+Document = TypeVar("Document")
+
+
+class _Hashed:
+    """A file that counts and hashes what is written to it."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file = file
+        self._digest = hashlib.sha256()
+        self._size = 0
+
+    def write(self, content: bytes) -> None:
+        self._file.write(content)
+        self._digest.update(content)
+        self._size += len(content)
+
+    @property
+    def entry(self) -> dict[str, object]:
+        return {"bytes": self._size, "sha256": self._digest.hexdigest()}
+
+
+class FolderWriter:
+    """Writes documents into a folder, then all scans that they speak of, then the manifest."""
+
+    def __init__(self, directory: Path) -> None:
+        """:param directory: to be made."""
+        directory.mkdir()
+        self._directory = directory
+        self._scans = WrittenScans()
+        self._files: dict[str, dict[str, object]] = {}
+
+    def write(self, name: str, document: object) -> None:
+        """Write a document, the same byte for byte for the same content."""
+        with (self._directory / f"{name}.bin").open("wb") as file:
+            hashed = _Hashed(file)
+            content = plain(document, {np.ndarray: WrittenArrays(hashed).plain, Scan: self._scans.plain})
+        self._files[f"{name}.bin"] = hashed.entry
+        self.write_text(f"{name}.json", json.dumps(content, allow_nan=False, separators=(",", ":")) + "\n")
+
+    def write_text(self, name: str, text: str) -> None:
+        """Write a file of text."""
+        with (self._directory / name).open("wb") as file:
+            hashed = _Hashed(file)
+            hashed.write(text.encode())
+        self._files[name] = hashed.entry
+
+    def finish(self, kind: str, version: int, facts: Mapping[str, object]) -> None:
+        """Write the scans and the manifest.
+
+        :param kind: what the folder holds; a reader refuses any other.
+        :param version: of the form of its documents, likewise.
+        :param facts: what else a person may want to know of it.
+        """
+        self.write(SCANS, self._scans.table)
+        content = {"format": kind, "version": version, **facts, "files": dict(sorted(self._files.items()))}
+        content["sha256"] = _own_digest(content)
+        text = json.dumps(content, indent=1, allow_nan=False) + "\n"
+        (self._directory / MANIFEST).write_text(text, encoding="utf-8")
+
+
+class FolderReader:
+    """Reads documents from a folder of which everything is as it was written.
+
+    :ivar names: of the files.
+    """
+
+    def __init__(self, directory: Path, kind: str, version: int) -> None:
+        """Check the whole folder.
+
+        :param kind: what it has to hold.
+        :param version: of the form of its documents.
+        :raises HmtSlamError: where it holds something else, of another version, or a file is missing or damaged.
+        """
+        self._directory = directory
+        manifest = self._manifest(kind, version)
+        self.names = frozenset(manifest["files"])
+        for name, entry in manifest["files"].items():
+            self._check(name, entry["bytes"], entry["sha256"])
+        self._scans = ReadScans(self._read(SCANS, ScanTable, {}))
+
+    def _manifest(self, kind: str, version: int) -> dict[str, Any]:
+        path = self._directory / MANIFEST
+        try:
+            manifest = json.loads(path.read_text(encoding="utf-8"))
+        except OSError as fault:
+            raise HmtSlamError(
+                f"{self._directory} holds no {kind}, there is no {MANIFEST} to read ({fault.strerror}): give an "
+                f"output folder, or the {kind} in it"
+            ) from fault
+        except ValueError as fault:
+            raise HmtSlamError(f"{path} is truncated or damaged, it is no JSON: {_REMEDY}") from fault
+        if not isinstance(manifest, dict) or manifest.get("format") != kind:
+            raise HmtSlamError(f"{path} is of something else than a {kind}: give an output folder, or the {kind} in it")
+        if manifest.get("version") != version:
+            raise HmtSlamError(
+                f"{self._directory} is a {kind} of version {manifest.get('version')}, this program reads version "
+                f"{version}: map the log again"
+            )
+        if manifest.get("sha256") != _own_digest(manifest):
+            raise HmtSlamError(f"{path} is damaged, it is not as it was written: {_REMEDY}")
+        return manifest
+
+    def _check(self, name: str, size: int, digest: str) -> None:
+        path = self._directory / name
+        try:
+            found = path.stat().st_size
+            if found != size:
+                raise HmtSlamError(f"{path} is truncated or damaged, it has {found} of {size} bytes: {_REMEDY}")
+            with path.open("rb") as file:
+                same = hashlib.file_digest(file, "sha256").hexdigest() == digest
+        except OSError as fault:
+            raise HmtSlamError(f"{path} is missing or cannot be read ({fault.strerror}): {_REMEDY}") from fault
+        if not same:
+            raise HmtSlamError(f"{path} is damaged, its SHA-256 is not that of {MANIFEST}: {_REMEDY}")
+
+    def read(self, name: str, kind: type[Document]) -> Document:
+        """A document.
+
+        :raises HmtSlamError: where it is not of this form.
+        """
+        return self._read(name, kind, {Scan: self._scans.reader})
+
+    def _read(self, name: str, kind: type[Document], forms: Mapping[type, ReaderOf]) -> Document:
+        arrays = ReadArrays((self._directory / f"{name}.bin").read_bytes())
+        content = json.loads((self._directory / f"{name}.json").read_text(encoding="utf-8"))
+        return Values(DESCRIBED, {np.ndarray: arrays.reader, **forms}).value(content, kind, name)
+
+
+def _own_digest(manifest: Mapping[str, object]) -> str:
+    """SHA-256 of all that a manifest holds besides it."""
+    content = {name: value for name, value in manifest.items() if name != "sha256"}
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
