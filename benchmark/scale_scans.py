@@ -23,7 +23,6 @@ from hmt_slam_ros.processes.tlca import Tlca
 from hmt_slam_ros.processes.tsbi import Tsbi
 from hmt_slam_ros.processes.tsbi_branching import Branching
 from hmt_slam_ros.sensing import Odometry
-from hmt_slam_ros.topology.overlap import sensed_points
 
 _REPEATS = 5
 _STEP, _TURN = 0.1, 10  # m and degrees between scans
@@ -44,18 +43,6 @@ class _Timed:
         said = self._process.handle(message)
         self.seconds += time.process_time() - begin
         return said
-
-
-class _Points(dict[int, Float64]):
-    """Sensed points of keyframes; those of the lattice come from its scans."""
-
-    def __init__(self, configuration: Configuration) -> None:
-        super().__init__()
-        self._scans = LatticeScans()
-        self._options = configuration.local_map.max_range, configuration.aam.overlap_points
-
-    def __missing__(self, keyframe: int) -> Float64:
-        return sensed_points(self._scans[keyframe], *self._options)
 
 
 def cost_of_scans(
@@ -79,7 +66,6 @@ def _costs(lattice: Lattice, configuration: Configuration) -> dict[str, float]:
     tsbi = Tsbi(configuration, lambda c, replica: Branching(c, _filled(replica, lattice)))
     for process in (slam, aam, tlca):
         _filled(process._replica, lattice)
-    aam._points = _Points(configuration)
     processes: dict[str, Process] = {"slam": slam, "aam": aam, "tsbi": tsbi, "tlca": tlca, "rtl": Rtl(configuration)}
     timed = {name: _Timed(process) for name, process in processes.items()}
     lock_step = LockStep(timed)

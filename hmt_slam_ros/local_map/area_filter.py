@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hmt_slam_ros.agreement import SCAN, Agreement, Usual
-from hmt_slam_ros.arrays import Float64
+from hmt_slam_ros.arrays import Float64, Int32
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.covariance import inverse, turned
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
@@ -24,7 +24,7 @@ from hmt_slam_ros.local_map.patches import MapView
 from hmt_slam_ros.local_map.tracking import ScanMatcher, Tracked, map_information
 from hmt_slam_ros.random_streams import Purpose, stream
 from hmt_slam_ros.sensing import Scan
-from hmt_slam_ros.sensing.motion import NO_STEP, Prediction
+from hmt_slam_ros.sensing.motion import NO_STEP, Prediction, Step
 
 # Another particle takes the lead when it is more likely by this much, nats.
 _CLEARLY = 3.0
@@ -58,6 +58,45 @@ class FilterStep:
     log_evidence: float
     effective_samples: float
     history_changed: bool
+
+
+@dataclass(frozen=True, eq=False)
+class FilterState:
+    """M particles of one hypothesis in one area; the map frame is that of the area.
+
+    :ivar hypothesis: id of the hypothesis.
+    :ivar area: the current area.
+    :ivar poses: shape (M, 3), ``map_T_base``, m and rad.
+    :ivar log_weights: shape (M,), nats, the largest is 0.
+    :ivar keyframes: the local map's keyframes, ids.
+    :ivar keyframe_areas: their areas.
+    :ivar keyframe_poses: shape (M, K, 3), ``map_T_base`` of each under each particle.
+    :ivar tables: shape (M, T, T), of each particle's map the numbers of its patches, [row, column], -1 for one never
+        seen; the origin lies at the corner between the four middle ones.
+    :ivar priors: shape (M, 3), the poses as predicted by odometry and inertia since the last filter step.
+    :ivar last_poses: shape (M, 3), those at the last filter step.
+    :ivar since_update: the predicted motion since then.
+    :ivar leader: the particle whose pose is the filter's.
+    :ivar tracking_covariance: of the leader's motion since the last filter step, shape (3, 3), right tangent frame.
+    :ivar left_open: covariance of the leader's pose that the scans since the last filter step leave, likewise.
+    :ivar usual: what contradicted the map so far.
+    """
+
+    hypothesis: int
+    area: int
+    poses: Float64
+    log_weights: Float64
+    keyframes: tuple[int, ...]
+    keyframe_areas: tuple[int, ...]
+    keyframe_poses: Float64
+    tables: Int32
+    priors: Float64
+    last_poses: Float64
+    since_update: Step
+    leader: int
+    tracking_covariance: Float64
+    left_open: Float64
+    usual: Usual
 
 
 class AreaFilter:
@@ -94,6 +133,28 @@ class AreaFilter:
         self.tracking_covariance = np.zeros((3, 3))
         self.left_open = NO_STEP.covariance
         self._usual = Usual()
+
+    @classmethod
+    def of(cls, mapping: LocalMapping, state: FilterState) -> AreaFilter:
+        """The filter of a state, whose patches are in the pool and count its tables already."""
+        found = cls(mapping, state.hypothesis, state.area)
+        found.poses, found.log_weights = state.poses, state.log_weights
+        found.keyframes, found.keyframe_areas = list(state.keyframes), list(state.keyframe_areas)
+        found.keyframe_poses, found._tables = state.keyframe_poses, state.tables
+        found._priors, found._last_poses = state.priors, state.last_poses
+        found._since_update = state.since_update
+        found.leader, found.tracking_covariance = state.leader, state.tracking_covariance
+        found.left_open, found._usual = state.left_open, state.usual
+        return found
+
+    @property
+    def state(self) -> FilterState:
+        """All but the patches, to which the tables refer by their numbers in the pool."""
+        return FilterState(
+            self.hypothesis, self.area, self.poses, self.log_weights, tuple(self.keyframes),
+            tuple(self.keyframe_areas), self.keyframe_poses, self._tables, self._priors, self._last_poses,
+            self._since_update, self.leader, self.tracking_covariance, self.left_open, self._usual,
+        )  # fmt: skip
 
     @property
     def pose(self) -> Float64:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -32,6 +33,22 @@ class Beams(NamedTuple):
     origins: Float64
 
 
+@dataclass(frozen=True, eq=False)
+class PatchState:
+    """The patches of some maps, numbered in the order in which the tables name them first.
+
+    :ivar odds: shape (n, 32, 32), evidence of occupancy of every cell in units of 0.05 nats, positive for occupied.
+    :ivar field: shape (n, 32, 32), distance to the nearest occupied cell, 255 for the field's radius and more.
+    :ivar occupied: shape (n, 32), of every row the cells whose odds are positive, as bits, the lowest for column 0.
+    :ivar most_used: patches that were in use at most.
+    """
+
+    odds: Int8
+    field: UInt8
+    occupied: UInt32
+    most_used: int
+
+
 class PatchPool:
     """Storage of the patches of all maps of one process.
 
@@ -60,6 +77,30 @@ class PatchPool:
         self._most_used = 0
         self._marks = insertion.marks(table_size)
         self._field_work = field_work(table_size, cell, radius)
+
+    def state(self, tables: Int32) -> tuple[PatchState, Int32]:
+        """The patches that maps name, and the tables (m, T, T) of these maps by the numbers that patches have there.
+
+        :param tables: of all maps, shape (m, T, T).
+        """
+        named, first = np.unique(tables[tables != NO_PATCH], return_index=True)
+        named = named[np.argsort(first)]
+        # The last is for NO_PATCH.
+        numbers = np.full(self.references.size + 1, NO_PATCH, dtype=np.int32)
+        numbers[named] = np.arange(named.size, dtype=np.int32)
+        return PatchState(self.odds[named], self.field[named], self.occupied[named], self._most_used), numbers[tables]
+
+    def load(self, state: PatchState, tables: Int32) -> None:
+        """Take over patches into an empty pool.
+
+        :param tables: of all maps, shape (m, T, T), by the numbers that patches have there.
+        """
+        count = len(state.odds)
+        self._reserve(count)
+        self.odds[:count], self.field[:count], self.occupied[:count] = state.odds, state.field, state.occupied
+        self.references[:count] = np.bincount(tables[tables != NO_PATCH], minlength=count)
+        self._free_count[0] -= count
+        self._most_used = state.most_used
 
     @property
     def used(self) -> int:

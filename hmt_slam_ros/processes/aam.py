@@ -5,6 +5,7 @@ A hypothesis is one topological path, so "once for every group of particles with
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -24,7 +25,8 @@ from hmt_slam_ros.processes.messages import (
     Merged,
     Message,
 )
-from hmt_slam_ros.processes.replica import FIRST_AREA, FIRST_HYPOTHESIS, Replica
+from hmt_slam_ros.processes.replica import FIRST_AREA, FIRST_HYPOTHESIS, Replica, ReplicaState
+from hmt_slam_ros.sensing import Scan
 from hmt_slam_ros.topology.common_map import Keyframes, Pair
 from hmt_slam_ros.topology.hybrid_map import HybridMap
 from hmt_slam_ros.topology.overlap import overlaps, sensed_points
@@ -82,6 +84,58 @@ class _Watch:
     joints: dict[Pair, _Joint] = field(default_factory=dict)
 
 
+@dataclass(frozen=True, eq=False)
+class JointState:
+    """Two areas a and b that a closure joins, as one.
+
+    :ivar arc: ``a_T_b``, shape (3,), by which overlaps between the two were measured, m and rad.
+    :ivar graph: number of the overlap graph of the keyframes of both in ``AamState.graphs``.
+    :ivar part: keyframes of area b.
+    :ivar least: least normalised cut of the graph.
+    """
+
+    arc: NDArray[np.float64]
+    graph: int
+    part: frozenset[int]
+    least: float
+
+
+@dataclass(frozen=True, eq=False)
+class WatchState:
+    """What the AAM remembers of one hypothesis.
+
+    :ivar area: the robot's area.
+    :ivar graphs: {area: number of the overlap graph of its keyframes in ``AamState.graphs``}.
+    :ivar own: keyframes stored since the robot entered ``area``, and those that came over with it.
+    :ivar separate: at how many of the latest evaluations in a row the newest keyframes separated.
+    :ivar beyond: the known area that the robot seems to be in, and for how many keyframes in a row.
+    :ivar joints: {pair of areas: what was found when it was last asked whether they are one}.
+    """
+
+    area: int
+    graphs: Mapping[int, int] = field(default_factory=dict)
+    own: frozenset[int] = frozenset()
+    separate: int = 0
+    beyond: tuple[int, int] | None = None
+    joints: Mapping[Pair, JointState] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class AamState:
+    """The AAM between two keyframe events, at first before the first one.
+
+    :ivar replica: the maps of the live hypotheses.
+    :ivar graphs: overlap graphs; hypotheses share them.
+    :ivar watches: {hypothesis: what is remembered of it}.
+    :ivar asked: areas, the smaller first, of which is still to be asked whether they are one.
+    """
+
+    replica: ReplicaState = field(default_factory=ReplicaState)
+    graphs: tuple[OverlapGraph, ...] = ()
+    watches: Mapping[int, WatchState] = field(default_factory=lambda: {FIRST_HYPOTHESIS: WatchState(FIRST_AREA)})
+    asked: frozenset[Pair] = frozenset()
+
+
 class Aam:
     """Answers every keyframe event with the areas that were left.
 
@@ -96,13 +150,25 @@ class Aam:
     robot leaves one of the two.
     """
 
-    def __init__(self, configuration: Configuration) -> None:
+    def __init__(self, configuration: Configuration, state: AamState | None = None) -> None:
+        """:param state: to go on from."""
+        state = state or AamState()
         self._options = configuration.aam
         self._max_range = configuration.local_map.max_range
-        self._replica = Replica()
+        self._replica = Replica.of(state.replica)
         self._points: dict[int, NDArray[np.float64]] = {}
-        self._watches = {FIRST_HYPOTHESIS: _Watch(FIRST_AREA)}
-        self._asked: set[Pair] = set()
+        self._watches = {hypothesis: _watch(own, state.graphs) for hypothesis, own in state.watches.items()}
+        self._asked = set(state.asked)
+
+    @property
+    def state(self) -> AamState:
+        """All that the AAM knows, as a value."""
+        known = self._watches.values()
+        graphs = {id(graph): graph for watch in known for graph in watch.graphs.values()}
+        graphs |= {id(joint.graph): joint.graph for watch in known for joint in watch.joints.values()}
+        numbers = {name: number for number, name in enumerate(graphs)}
+        watches = {hypothesis: _numbered(watch, numbers) for hypothesis, watch in self._watches.items()}
+        return AamState(self._replica.state, tuple(graphs.values()), watches, frozenset(self._asked))
 
     def handle(self, message: Message) -> list[Message]:
         """Answer a ``Keyframe`` with its ``AreaEvents``; learn from ``Hypotheses`` and ``Accepted``."""
@@ -122,7 +188,7 @@ class Aam:
 
     def _examine(self, keyframe: Keyframe) -> AreaEvents:
         self._replica.add(keyframe)
-        self._points[keyframe.sequence] = sensed_points(keyframe.scan, self._max_range, self._options.overlap_points)
+        self._points[keyframe.sequence] = self._sensed(keyframe.scan)
         known = [leaf for leaf in keyframe.leaves if leaf.hypothesis in self._watches]
         events = [
             self._cut(leaf, keyframe.sequence) or self._merged(leaf.hypothesis) or self._moved(leaf, keyframe.sequence)
@@ -131,6 +197,15 @@ class Aam:
         if not any(leaf.stored for leaf in known):
             del self._points[keyframe.sequence]
         return AreaEvents(keyframe.sequence, tuple(event for event in events if event is not None))
+
+    def _sensed(self, scan: Scan) -> NDArray[np.float64]:
+        return sensed_points(scan, self._max_range, self._options.overlap_points)
+
+    def _points_of(self, keyframe: int) -> NDArray[np.float64]:
+        """What is compared of a keyframe's scan, shape (k, 2), m, worked out once."""
+        if keyframe not in self._points:
+            self._points[keyframe] = self._sensed(self._replica.scans[keyframe])
+        return self._points[keyframe]
 
     def _cut(self, leaf: LeafEstimate, newest: int) -> AreaEvent | None:
         """The event that the newest keyframes leave the robot's area, when that has lasted."""
@@ -216,9 +291,9 @@ class Aam:
         poses = np.array([placed[keyframe] for keyframe in others])
         nearest = np.argsort(np.hypot(*(poses[:, :2] - pose[:2]).T), kind="stable")[:_NEAREST]
         found = overlaps(
-            self._points[newest],
+            self._points_of(newest),
             pose,
-            [self._points[others[i]] for i in nearest],
+            [self._points_of(others[i]) for i in nearest],
             poses[nearest],
             self._options.overlap_radius,
         )
@@ -260,7 +335,25 @@ class Aam:
 
         def measure(keyframe: int, others: tuple[int, ...]) -> NDArray[np.float64]:
             poses = np.array([placed[other] for other in others]).reshape(-1, 3)
-            points = [self._points[other] for other in others]
-            return overlaps(self._points[keyframe], placed[keyframe], points, poses, self._options.overlap_radius)
+            points = [self._points_of(other) for other in others]
+            return overlaps(self._points_of(keyframe), placed[keyframe], points, poses, self._options.overlap_radius)
 
         return synchronised(graph, placed, measure, *others)
+
+
+def _numbered(watch: _Watch, numbers: Mapping[int, int]) -> WatchState:
+    """A watch as a value, where its graphs have numbers by their identities."""
+    joints = {
+        pair: JointState(joint.arc, numbers[id(joint.graph)], joint.part, joint.least)
+        for pair, joint in watch.joints.items()
+    }
+    graphs = {area: numbers[id(graph)] for area, graph in watch.graphs.items()}
+    return WatchState(watch.area, graphs, watch.own, watch.separate, watch.beyond, joints)
+
+
+def _watch(state: WatchState, graphs: Sequence[OverlapGraph]) -> _Watch:
+    joints = {
+        pair: _Joint(joint.arc, graphs[joint.graph], joint.part, joint.least) for pair, joint in state.joints.items()
+    }
+    own = {area: graphs[number] for area, number in state.graphs.items()}
+    return _Watch(state.area, own, state.own, state.separate, state.beyond, joints)

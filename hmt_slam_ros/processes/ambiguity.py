@@ -12,12 +12,19 @@ from hmt_slam_ros.processes.replica import FIRST_AREA, Replica
 from hmt_slam_ros.topology.hybrid_map import HybridMap
 from hmt_slam_ros.topology.shortest_path import reachable
 
+Frame = tuple[int, int, int]
+
 
 class Ambiguity:
-    """Remembers where each hypothesis has the robot's area, as long as nothing about it changes."""
+    """Remembers where each hypothesis has the robot's area, as long as nothing about it changes.
 
-    def __init__(self) -> None:
-        self._frames: dict[tuple[int, int, int], NDArray[np.float64] | None] = {}
+    :ivar frames: {(hypothesis, number of the last change of its map, area): ``map_T_area``, shape (3,), or None where
+        no arc joins the area with the first}.
+    """
+
+    def __init__(self, frames: Mapping[Frame, NDArray[np.float64] | None] | None = None) -> None:
+        """:param frames: to go on from."""
+        self.frames = dict(frames or {})
 
     def of(
         self, replica: Replica, poses: Mapping[int, NDArray[np.float64]], versions: Mapping[int, int]
@@ -34,14 +41,14 @@ class Ambiguity:
         """
         found = np.zeros((3, 3))
         if len(replica.maps) == 1:
-            self._frames = {}
+            self.frames = {}
             return found
         named = {h: (h, versions[h], replica.areas[h]) for h in replica.maps}
-        self._frames = {
-            name: self._frames[name] if name in self._frames else _frame(replica.maps[h], replica.areas[h])
+        self.frames = {
+            name: self.frames[name] if name in self.frames else _frame(replica.maps[h], replica.areas[h])
             for h, name in named.items()
         }
-        frames = {h: frame for h, name in named.items() if (frame := self._frames[name]) is not None}
+        frames = {h: frame for h, name in named.items() if (frame := self.frames[name]) is not None}
         if replica.best in frames:
             placed = {h: se2.compose(frame, poses[h]) for h, frame in frames.items()}
             for hypothesis, pose in placed.items():

@@ -7,7 +7,7 @@ that begin in it begin there.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -33,7 +33,9 @@ def pair_of(a: int, b: int) -> Pair:
 class Step:
     """A keyframe event at which the robot changed its area or arcs were new.
 
-    :ivar before: the robot's area before the event; ``after``, after it.
+    :ivar event: the event.
+    :ivar before: the robot's area before it.
+    :ivar after: the robot's area after it.
     :ivar arcs: the arcs that were new.
     :ivar joined: the keyframes that came over with the robot.
     """
@@ -54,7 +56,8 @@ class Closure:
     """An arc that closed a loop.
 
     :ivar name: the event at which TSBI found it and the arc that it was then; it never changes.
-    :ivar near: the area in which the robot was; ``far``, the known one.
+    :ivar near: the area in which the robot was.
+    :ivar far: the known one.
     :ivar pose: belief over ``near_T_far`` as TSBI found it.
     :ivar log_odds: of its being true, when it was accepted.
     :ivar undo: what was changed then; None where that is still to be done.
@@ -227,6 +230,19 @@ def as_measured(account: Account) -> HybridMap:
         if closure.undo is not None:
             closure.undo.apply_to_arcs(hybrid_map)
     return hybrid_map
+
+
+def steps_of(history: History) -> tuple[Step, ...]:
+    """The steps of a history, in their order."""
+    return tuple(since(history, 0)[1])
+
+
+def history_of(steps: Iterable[Step]) -> History:
+    """The history of some steps, in their order."""
+    history: History = None
+    for step in steps:
+        history = history, step
+    return history
 
 
 def since(history: History, event: int) -> tuple[History, list[Step]]:

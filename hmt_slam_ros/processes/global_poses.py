@@ -17,6 +17,11 @@ class GlobalPoses(Mapping[int, PoseGaussian]):
         """:param areas: ordered by id, as ``Accepted.global_poses`` is."""
         self._areas = areas
 
+    @property
+    def areas(self) -> tuple[AreaPose, ...]:
+        """All of them, ordered by id."""
+        return tuple(self._areas)
+
     def __getitem__(self, area: int) -> PoseGaussian:
         place = bisect_left(self._areas, area, key=attrgetter("area"))
         if place == len(self._areas) or self._areas[place].area != area:

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hmt_slam_ros.arrays import Int32
 from hmt_slam_ros.configuration.metric import Filter
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.local_map.area_filter import AreaFilter, FilterStep, PlacedKeyframe
+from hmt_slam_ros.local_map.area_filter import AreaFilter, FilterState, FilterStep, PlacedKeyframe
+from hmt_slam_ros.local_map.local_mapping import LocalMapping
 from hmt_slam_ros.local_map.match_error import MatchError
 from hmt_slam_ros.processes.messages import Leaf, LeafEstimate, Merged, Relabelled, Trail
 from hmt_slam_ros.sensing import Scan
@@ -23,6 +25,35 @@ _STAY = PoseGaussian.exactly(np.zeros(3))
 _NO_ERROR = MatchError(_FIRST_COVARIANCE, _FIRST_COVARIANCE, np.zeros((3, 3)))
 # Below 1, since the filter step at a keyframe may move the robot a little back towards the last one.
 _SAME_PLACE = 0.8
+
+
+@dataclass(frozen=True, eq=False)
+class LiveState:
+    """One live hypothesis inside metric SLAM.
+
+    :ivar filter: its particles.
+    :ivar event_pose: ``area_T_base`` at the last keyframe event, shape (3,), m and rad.
+    :ivar moved: the motion between the last two keyframe events, as matched, shape (3,).
+    :ivar information: of the last keyframe event's match alone, in the frame of its pose, shape (3, 3).
+    :ivar error: of that motion.
+    :ivar anchor: the stored keyframe to which scans are now related.
+    :ivar fresh: {keyframe: covariance (3, 3) that the step which led to it adds to the drift}, of those stored since
+        the area was entered.
+    :ivar placed: {keyframe: covariance (3, 3) of its pose in its area's frame, right tangent}, of all that are known.
+    :ivar drift: covariance of the pose at the last keyframe event in the area's frame, right tangent, shape (3, 3).
+    :ivar trail: (stamp, anchor, ``anchor_T_base``) of the scans since the last keyframe event.
+    """
+
+    filter: FilterState
+    event_pose: NDArray[np.float64]
+    moved: NDArray[np.float64]
+    information: NDArray[np.float64]
+    error: MatchError
+    anchor: int
+    fresh: Mapping[int, NDArray[np.float64]]
+    placed: Mapping[int, NDArray[np.float64]]
+    drift: NDArray[np.float64]
+    trail: tuple[tuple[int, int, NDArray[np.float64]], ...]
 
 
 @dataclass
@@ -53,6 +84,25 @@ class LiveHypothesis:
     placed: dict[int, NDArray[np.float64]] = field(default_factory=dict)
     drift: NDArray[np.float64] = field(default_factory=_FIRST_COVARIANCE.copy)
     trail: list[tuple[int, int, NDArray[np.float64]]] = field(default_factory=list)
+
+    @classmethod
+    def of(cls, mapping: LocalMapping, state: LiveState) -> LiveHypothesis:
+        """The hypothesis of a state, whose patches are in the pool."""
+        return cls(
+            AreaFilter.of(mapping, state.filter), mapping.configuration.filter, state.event_pose, state.moved,
+            state.information, state.error, state.anchor, dict(state.fresh), dict(state.placed), state.drift,
+            list(state.trail),
+        )  # fmt: skip
+
+    def state(self, tables: Int32) -> LiveState:
+        """All that is remembered.
+
+        :param tables: of the filter, shape (M, T, T), by the numbers that patches have in the state.
+        """
+        return LiveState(
+            replace(self.filter.state, tables=tables), self.event_pose, self.moved, self.information, self.error,
+            self.anchor, dict(self.fresh), dict(self.placed), self.drift, tuple(self.trail),
+        )  # fmt: skip
 
     def branch(self, hypothesis: int) -> LiveHypothesis:
         """A child with its own filter, in the same state."""

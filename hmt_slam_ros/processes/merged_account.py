@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 
-from hmt_slam_ros.processes.closure_account import Account, Closure, History, Step, pair_of, since
+from hmt_slam_ros.processes.closure_account import Account, Closure, History, Step, history_of, pair_of, steps_of
 from hmt_slam_ros.processes.messages import Merged
 from hmt_slam_ros.topology.common_map import Pair
 
@@ -21,9 +21,7 @@ def merged(account: Account, areas: Merged) -> tuple[History, tuple[Closure, ...
     hybrid_map = account.hybrid_map
     beside = {*hybrid_map.neighbours(areas.area)} & {*hybrid_map.neighbours(areas.into)}
     fused = {pair_of(areas.into, other) for other in beside}
-    history: History = None
-    for step in since(account.history, 0)[1]:
-        history = history, _renamed(step, areas)
+    history = history_of(_renamed(step, areas) for step in steps_of(account.history))
     found = (_closure(closure, areas).but_for(fused) for closure in account.closures)
     return history, tuple(closure for closure in found if closure.near != closure.far and closure.pair not in fused)
 

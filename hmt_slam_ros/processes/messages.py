@@ -23,7 +23,13 @@ Pose = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Relabelled:
-    """Keyframe ``keyframe`` of area ``source`` now belongs to ``area``, at ``pose`` = ``area_T_base``, shape (3,)."""
+    """A keyframe that is in another area now, or at another pose.
+
+    :ivar keyframe: its number.
+    :ivar source: the area in which it was.
+    :ivar area: the area to which it belongs now.
+    :ivar pose: shape (3,), ``area_T_base``.
+    """
 
     keyframe: int
     source: int
@@ -121,7 +127,11 @@ class Arc:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class ArcEnds:
-    """Two areas between which an arc is taken out; ``source`` is the smaller."""
+    """Two areas between which an arc is taken out.
+
+    :ivar source: the smaller.
+    :ivar target: the larger.
+    """
 
     source: int
     target: int
@@ -129,7 +139,11 @@ class ArcEnds:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class LocalArea:
-    """An area that the local map must hold: ``pose`` = ``current_T_area``, shape (3,)."""
+    """An area that the local map must hold.
+
+    :ivar area: its id.
+    :ivar pose: shape (3,), ``current_T_area``.
+    """
 
     area: int
     pose: Pose
@@ -137,8 +151,10 @@ class LocalArea:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Merged:
-    """Area ``area`` is now part of ``into``, with its keyframes and its arcs.
+    """Two areas that are one, with all keyframes and arcs.
 
+    :ivar area: the one that becomes part of the other.
+    :ivar into: the other.
     :ivar pose: belief over ``into_T_area``, as the arc had it that joined the two.
     """
 
@@ -194,7 +210,11 @@ class Hypotheses:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class AreaPose:
-    """Belief over ``map_T_area`` of the globally consistent map."""
+    """Where an area is in the globally consistent map.
+
+    :ivar area: its id.
+    :ivar pose: belief over ``map_T_area``.
+    """
 
     area: int
     pose: PoseGaussian

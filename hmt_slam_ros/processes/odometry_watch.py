@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.geometry import se2
@@ -20,29 +21,40 @@ _GROWTH = math.radians(1.0)
 _SECOND = 1e-9
 
 
-class _Episode:
+@dataclass(frozen=True, eq=False)
+class Episode:
     """From the first contradicted scan until odometry and scans go on alike.
 
     :ivar begin: stamp of the scan before the first one, ns.
     :ivar last: stamp of the last contradicted scan, ns.
     :ivar end: stamp of the scan by which their headings had parted, ns.
-    :ivar odometry: the motion in between by odometry, shape (3,).
+    :ivar odometry: the motion from ``begin`` to ``end`` by odometry, shape (3,), m and rad.
     :ivar scans: the same by the scans.
+    :ivar odometry_now: the motion from ``begin`` to the last scan by odometry, shape (3,), m and rad.
+    :ivar scans_now: the same by the scans.
     """
 
-    def __init__(self, begin: int) -> None:
-        self.begin = self.last = self.end = begin
-        self.odometry = self.scans = self._odometry = self._scans = NO_STEP.increment
+    begin: int
+    last: int
+    end: int
+    odometry: Float64
+    scans: Float64
+    odometry_now: Float64
+    scans_now: Float64
 
-    def add(self, stamp: int, step: Step, tracked: Tracked) -> None:
-        """Go on by a scan."""
-        self._odometry = se2.compose(self._odometry, step.increment)
-        self._scans = se2.compose(self._scans, tracked.moved)
-        if tracked.contradicted:
-            self.last = stamp
-        turned, angle = _apart(self._odometry, self._scans)[1], _apart(self.odometry, self.scans)[1]
-        if tracked.contradicted or turned > angle + _GROWTH:
-            self.end, self.odometry, self.scans = stamp, self._odometry, self._scans
+    @classmethod
+    def begun(cls, begin: int) -> Episode:
+        """One in which nothing was heard yet."""
+        return cls(begin, begin, begin, *[NO_STEP.increment] * 4)
+
+    def and_then(self, stamp: int, step: Step, tracked: Tracked) -> Episode:
+        """With one scan more."""
+        odometry = se2.compose(self.odometry_now, step.increment)
+        scans = se2.compose(self.scans_now, tracked.moved)
+        last = stamp if tracked.contradicted else self.last
+        if tracked.contradicted or _apart(odometry, scans)[1] > _apart(self.odometry, self.scans)[1] + _GROWTH:
+            return Episode(self.begin, last, stamp, odometry, scans, odometry, scans)
+        return Episode(self.begin, last, self.end, self.odometry, self.scans, odometry, scans)
 
     def matters(self) -> bool:
         """Whether odometry was wrong altogether, not early or late."""
@@ -50,15 +62,37 @@ class _Episode:
         return distance >= _DISTANCE or angle >= _ANGLE
 
 
+@dataclass(frozen=True, eq=False)
+class OdometryWatchState:
+    """What was heard of odometry and scans, and what was said of it.
+
+    :ivar before: stamp of the last scan, ns.
+    :ivar episode: the one that is open.
+    :ivar told: when the last one ended of which something was said, s, None where nothing was said.
+    :ivar untold: those since then of which nothing was said.
+    :ivar noise_told: whether it was said that odometry is noisy.
+    """
+
+    before: int = 0
+    episode: Episode | None = None
+    told: float | None = None
+    untold: int = 0
+    noise_told: bool = False
+
+
 class OdometryWatch:
     """Collects what odometry and scans say while they contradict each other."""
 
-    def __init__(self) -> None:
-        self._before = 0
-        self._episode: _Episode | None = None
-        self._told = -math.inf
-        self._untold = 0
-        self._noise_told = False
+    def __init__(self, state: OdometryWatchState | None = None) -> None:
+        """:param state: to go on from."""
+        state = state or OdometryWatchState()
+        self._before, self._episode = state.before, state.episode
+        self._told, self._untold, self._noise_told = state.told, state.untold, state.noise_told
+
+    @property
+    def state(self) -> OdometryWatchState:
+        """All that was heard and said."""
+        return OdometryWatchState(self._before, self._episode, self._told, self._untold, self._noise_told)
 
     def hear(self, stamp: int, step: Step | None, tracked: Tracked) -> str | None:
         """Take note of a scan; the sentence about an episode that is over, if there is one.
@@ -68,11 +102,11 @@ class OdometryWatch:
         """
         before, self._before = self._before, stamp
         if tracked.contradicted and self._episode is None:
-            self._episode = _Episode(before)
+            self._episode = Episode.begun(before)
         if self._episode is None:
             return None
         if step is not None and (tracked.contradicted or (stamp - self._episode.last) * _SECOND <= _QUIET):
-            self._episode.add(stamp, step, tracked)
+            self._episode = self._episode.and_then(stamp, step, tracked)
             return None
         return self.close()
 
@@ -81,7 +115,7 @@ class OdometryWatch:
         episode, self._episode = self._episode, None
         if episode is None or not episode.matters():
             return None
-        if episode.end * _SECOND - self._told < _PAUSE:
+        if self._told is not None and episode.end * _SECOND - self._told < _PAUSE:
             self._untold += 1
             return None
         since = f" ({self._untold} times more since it was last said)" if self._untold else ""

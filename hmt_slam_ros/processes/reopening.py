@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -10,14 +11,14 @@ import numpy as np
 from hmt_slam_ros.configuration.topological import LoopClosureAcceptance
 from hmt_slam_ros.geometry.chi_square import gate
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.processes.closure_account import Account, Name
+from hmt_slam_ros.processes.closure_account import Account, Closure, Name, Step, steps_of
 from hmt_slam_ros.processes.doubts import Doubt, Doubts, Explanation
 from hmt_slam_ros.processes.messages import Arc, ArcEnds, Leaf, Notice, Relabelled
 from hmt_slam_ros.processes.replica import FIRST_AREA
 from hmt_slam_ros.topology.common_map import Pair
 from hmt_slam_ros.topology.hybrid_map import HybridMap
 
-_Key = tuple[tuple[Pair, ...], tuple[Pair, ...]]
+Key = tuple[tuple[Pair, ...], tuple[Pair, ...]]
 
 
 class Question(NamedTuple):
@@ -31,15 +32,46 @@ class Question(NamedTuple):
     notice: Notice
 
 
+class Past(NamedTuple):
+    """What a path went through.
+
+    :ivar steps: the keyframe events at which the robot changed its area or arcs were new, in order.
+    :ivar closures: those that were accepted, in order.
+    """
+
+    steps: tuple[Step, ...]
+    closures: tuple[Closure, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class ReopeningState:
+    """What is known of questions that were opened again.
+
+    :ivar largest_area: the largest area that there ever was.
+    :ivar asked_at: the keyframe event of the last question, -1 before the first.
+    :ivar answers: {(arcs withdrawn, arcs set): the past of a path that goes on with this answer to it}.
+    """
+
+    largest_area: int = FIRST_AREA
+    asked_at: int = -1
+    answers: Mapping[Key, Past] = field(default_factory=dict)
+
+
 class Reopening:
     """Finds contradictions, and knows the answers again that TSBI goes on with."""
 
-    def __init__(self, options: LoopClosureAcceptance) -> None:
+    def __init__(self, options: LoopClosureAcceptance, state: ReopeningState) -> None:
+        """:param state: to go on from."""
         self._bound = gate(options.contradiction_probability)
         self._least = 1.0 - options.accept_probability
-        self._largest_area = FIRST_AREA
-        self._asked_at = -1
-        self._accounts: dict[_Key, Account] = {}
+        self._largest_area = state.largest_area
+        self._asked_at = state.asked_at
+        self._answers = dict(state.answers)
+
+    @property
+    def state(self) -> ReopeningState:
+        """All that is known."""
+        return ReopeningState(self._largest_area, self._asked_at, dict(self._answers))
 
     def asked(self, event: int, account: Account, new: Collection[Name], hypothesis: int) -> Question | None:
         """The question that closures raise which have just been accepted, if they do not fit.
@@ -52,17 +84,18 @@ class Reopening:
             return None
         leaves = tuple(_as_leaf(explanation, hypothesis, account.hybrid_map) for explanation in doubt.explanations)
         self._asked_at = event
-        self._accounts = {
-            _key(leaf): explanation.account for leaf, explanation in zip(leaves, doubt.explanations, strict=True)
+        self._answers = {
+            _key(leaf): Past(steps_of(explanation.account.history), explanation.account.closures)
+            for leaf, explanation in zip(leaves, doubt.explanations, strict=True)
         }
         for leaf in leaves:
             self._know(leaf)
         return Question(leaves, Notice("tlca", _told(doubt, self._bound)))
 
-    def followed(self, leaf: Leaf, event: int) -> Account | None:
-        """Learn of a leaf; where it answers the question of the event before, the account of that answer."""
+    def followed(self, leaf: Leaf, event: int) -> Past | None:
+        """Learn of a leaf; where it answers the question of the event before, the past of a path with that answer."""
         self._know(leaf)
-        return self._accounts[_key(leaf)] if event == self._asked_at + 1 and self._accounts else None
+        return self._answers[_key(leaf)] if event == self._asked_at + 1 and self._answers else None
 
     def _know(self, leaf: Leaf) -> None:
         areas = [area for arc in leaf.arcs for area in (arc.source, arc.target)]
@@ -98,7 +131,7 @@ def _as_leaf(explanation: Explanation, hypothesis: int, hybrid_map: HybridMap) -
     )
 
 
-def _key(leaf: Leaf) -> _Key:
+def _key(leaf: Leaf) -> Key:
     withdrawn = tuple((ends.source, ends.target) for ends in leaf.withdrawn)
     return withdrawn, tuple((arc.source, arc.target) for arc in leaf.arcs)
 

@@ -2,14 +2,37 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from hmt_slam_ros.processes.messages import Accepted, Arc, ArcEnds, Hypotheses, Keyframe, Leaf, Relabelled
 from hmt_slam_ros.sensing import Scan
+from hmt_slam_ros.topology.common_map import CommonMap
 from hmt_slam_ros.topology.hybrid_map import HybridMap
+from hmt_slam_ros.topology.map_state import GraphState
 
 FIRST_HYPOTHESIS = 0
 FIRST_AREA = 0
+
+
+@dataclass(frozen=True, eq=False)
+class ReplicaState:
+    """The maps of all live hypotheses, at first one in which nothing is known.
+
+    :ivar scans: {keyframe: scan}.
+    :ivar common: the areas and arcs that all hypotheses agree on.
+    :ivar largest: the largest area that there ever was among these, -1 where there was none.
+    :ivar changes: {hypothesis: the areas in which it differs from ``common``, whole, and likewise the arcs}.
+    :ivar probabilities: {hypothesis: P(gamma^t | d)}.
+    :ivar areas: {hypothesis: the robot's area}.
+    """
+
+    scans: Mapping[int, Scan] = field(default_factory=dict)
+    common: GraphState = field(default_factory=GraphState.empty)
+    largest: int = -1
+    changes: Mapping[int, GraphState] = field(default_factory=lambda: {FIRST_HYPOTHESIS: GraphState.empty()})
+    probabilities: Mapping[int, float] = field(default_factory=lambda: {FIRST_HYPOTHESIS: 1.0})
+    areas: Mapping[int, int] = field(default_factory=lambda: {FIRST_HYPOTHESIS: FIRST_AREA})
 
 
 @dataclass
@@ -26,6 +49,32 @@ class Replica:
     maps: dict[int, HybridMap] = field(default_factory=lambda: {FIRST_HYPOTHESIS: HybridMap()})
     probabilities: dict[int, float] = field(default_factory=lambda: {FIRST_HYPOTHESIS: 1.0})
     areas: dict[int, int] = field(default_factory=lambda: {FIRST_HYPOTHESIS: FIRST_AREA})
+
+    @classmethod
+    def of(cls, state: ReplicaState) -> Replica:
+        """The replica of a state."""
+        common = CommonMap()
+        for area, keyframes in state.common.area_keyframes().items():
+            common.set_area(area, keyframes)
+        for pair, arc in state.common.arc_values().items():
+            assert arc is not None
+            common.set_arc(pair, arc)
+        common.largest = state.largest
+        maps = {h: HybridMap(common, own.area_keyframes(), own.arc_values()) for h, own in state.changes.items()}
+        return cls(dict(state.scans), maps, dict(state.probabilities), dict(state.areas))
+
+    @property
+    def state(self) -> ReplicaState:
+        """All of it as a value."""
+        common = next(iter(self.maps.values())).common
+        return ReplicaState(
+            dict(self.scans),
+            GraphState.of(common.areas, common.arcs),
+            common.largest,
+            {hypothesis: GraphState.of(own.areas, own.arcs) for hypothesis, own in self.maps.items()},
+            dict(self.probabilities),
+            dict(self.areas),
+        )
 
     @property
     def best(self) -> int:

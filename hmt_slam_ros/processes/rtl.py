@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from dataclasses import dataclass, field
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -29,9 +31,10 @@ _SLACK_ANGLE = math.radians(30.0)
 _READINGS_KEPT = 90_000
 
 
-class _Reading(NamedTuple):
+class Reading(NamedTuple):
     """An odometry reading on the path without resets.
 
+    :ivar stamp: ns.
     :ivar raw: ``odom_T_base`` as measured, shape (3,).
     :ivar smooth: the same with the resets taken out, shape (3,).
     :ivar distance: path length since the start, m.
@@ -44,26 +47,59 @@ class _Reading(NamedTuple):
     distance: float
     angle: float
 
-    def moved_to(self, raw: NDArray[np.float64]) -> _Reading:
+    def moved_to(self, raw: NDArray[np.float64]) -> Reading:
         """This reading with another measured pose nearby, shape (3,)."""
         return self._replace(raw=raw, smooth=se2.compose(self.smooth, se2.between(self.raw, raw)))
+
+
+# The map's frame is the first area's: known before TLCA has spoken.
+_FIRST = AreaPose(FIRST_AREA, PoseGaussian(np.zeros(3), np.zeros((3, 3))))
+
+
+@dataclass(frozen=True, eq=False)
+class RtlState:
+    """RTL between two messages, at first before the first one.
+
+    :ivar readings: odometry since the last estimate, and the reading before that.
+    :ivar newest: metric SLAM's last estimate.
+    :ivar estimate: the last one whose area's place in the map is known, on which the pose rests.
+    :ivar start: the reading at that estimate, None before the next reading.
+    :ivar areas: ``map_T_area`` as TLCA told it last, ordered by area.
+    :ivar area_pose: that of the area of ``estimate``.
+    :ivar ambiguity: of TLCA's last answer, shape (3, 3).
+    """
+
+    readings: tuple[Reading, ...] = ()
+    newest: LocalEstimate | None = None
+    estimate: LocalEstimate | None = None
+    start: Reading | None = None
+    areas: tuple[AreaPose, ...] = (_FIRST,)
+    area_pose: PoseGaussian = _FIRST.pose
+    ambiguity: NDArray[np.float64] = field(default_factory=partial(np.zeros, (3, 3)))
 
 
 class Rtl:
     """The RTL process. Consumes Odometry, LocalEstimate, Accepted; produces RealTimePose, Notice."""
 
-    def __init__(self, configuration: Configuration) -> None:
+    def __init__(self, configuration: Configuration, state: RtlState | None = None) -> None:
+        """:param state: to go on from."""
+        state = state or RtlState()
         self._motion = configuration.motion
         self._settings = configuration.rtl
-        self._readings: deque[_Reading] = deque(maxlen=_READINGS_KEPT)
-        self._newest: LocalEstimate | None = None
-        self._estimate: LocalEstimate | None = None
-        self._start: _Reading | None = None
-        # The map's frame is the first area's: known before TLCA has spoken.
-        self._areas = GlobalPoses((AreaPose(FIRST_AREA, PoseGaussian(np.zeros(3), np.zeros((3, 3)))),))
+        self._readings = deque(state.readings, maxlen=_READINGS_KEPT)
+        self._newest, self._estimate, self._start = state.newest, state.estimate, state.start
+        self._areas = GlobalPoses(state.areas)
         # That of the estimate's area, kept where another hypothesis leads, which may not know it.
-        self._area_pose = self._areas[FIRST_AREA]
-        self._ambiguity = np.zeros((3, 3))
+        self._area_pose = state.area_pose
+        self._ambiguity = state.ambiguity
+
+    @property
+    def state(self) -> RtlState:
+        """All that RTL knows, as a value."""
+        return RtlState(
+            tuple(self._readings), self._newest, self._estimate, self._start, self._areas.areas, self._area_pose,
+            self._ambiguity,
+        )  # fmt: skip
 
     def handle(self, message: Message) -> list[Message]:
         """Take in one message; an odometry reading is answered with the pose at its stamp, once one is known."""
@@ -88,7 +124,7 @@ class Rtl:
     def _hear_odometry(self, reading: Odometry) -> list[Message]:
         """Carry the path on to a reading; one that is not newer than its predecessor is passed over."""
         if not self._readings:
-            self._readings.append(_Reading(reading.stamp, reading.pose, reading.pose, 0.0, 0.0))
+            self._readings.append(Reading(reading.stamp, reading.pose, reading.pose, 0.0, 0.0))
             return self._predict()
         last = self._readings[-1]
         if reading.stamp <= last.stamp:
@@ -101,7 +137,7 @@ class Rtl:
             step, distance, angle = np.zeros(3), 0.0, 0.0
         smooth = se2.compose(last.smooth, step)
         self._readings.append(
-            _Reading(reading.stamp, reading.pose, smooth, last.distance + distance, last.angle + angle)
+            Reading(reading.stamp, reading.pose, smooth, last.distance + distance, last.angle + angle)
         )
         return said + self._predict()
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +18,8 @@ from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.local_map.area_filter import AreaFilter, PlacedKeyframe
 from hmt_slam_ros.local_map.local_mapping import LocalMapping
-from hmt_slam_ros.processes.live_hypothesis import LiveHypothesis
+from hmt_slam_ros.local_map.patch_pool import PatchState
+from hmt_slam_ros.processes.live_hypothesis import LiveHypothesis, LiveState
 from hmt_slam_ros.processes.messages import (
     Accepted,
     EndOfLog,
@@ -28,15 +30,55 @@ from hmt_slam_ros.processes.messages import (
     Message,
     Notice,
 )
-from hmt_slam_ros.processes.odometry_watch import OdometryWatch
-from hmt_slam_ros.processes.replica import FIRST_AREA, FIRST_HYPOTHESIS, Replica
+from hmt_slam_ros.processes.odometry_watch import OdometryWatch, OdometryWatchState
+from hmt_slam_ros.processes.replica import FIRST_AREA, FIRST_HYPOTHESIS, Replica, ReplicaState
 from hmt_slam_ros.sensing import Odometry, Scan
-from hmt_slam_ros.sensing.deskew import SweepCheck, deskewed
-from hmt_slam_ros.sensing.motion import MotionModel, Prediction
+from hmt_slam_ros.sensing.deskew import SweepCheck, SweepState, deskewed
+from hmt_slam_ros.sensing.motion import MotionModel, MotionState, Prediction
 from hmt_slam_ros.topology.shortest_path import reachable
 
 # Odometry that has come before may only be late, by more scans than a paced robot runs ahead of its acknowledgements.
 _LATE = 4
+
+
+@dataclass(frozen=True, eq=False)
+class SlamState:
+    """Metric SLAM between two messages, at first before the first scan.
+
+    :ivar replica: the maps of the live hypotheses.
+    :ivar motion: what is known of the motion between scans.
+    :ivar watch: what was heard of odometry and scans.
+    :ivar sweeps: what is known of the times between scans.
+    :ivar queue: scans that wait for odometry, or for the answer to a keyframe event.
+    :ivar last_stamp: of the last scan received, ns, -1 before the first.
+    :ivar noticed: the faults of which something was said.
+    :ivar patches: of the maps of all particles, None before the first scan.
+    :ivar live: {hypothesis: its filter and what is remembered beside it}.
+    :ivar events: keyframe events.
+    :ivar waiting: whether the answer to the last one is due.
+    :ivar patient: whether scans wait for odometry.
+    :ivar travelled: path length since the start, m.
+    :ivar scans: scans that were given a pose.
+    :ivar dropped: scans that were not.
+    :ivar first_of_trail: number of the first scan that no trail was told of.
+    """
+
+    replica: ReplicaState = field(default_factory=ReplicaState)
+    motion: MotionState = field(default_factory=MotionState)
+    watch: OdometryWatchState = field(default_factory=OdometryWatchState)
+    sweeps: SweepState = field(default_factory=SweepState)
+    queue: tuple[Scan, ...] = ()
+    last_stamp: int = -1
+    noticed: frozenset[str] = frozenset()
+    patches: PatchState | None = None
+    live: Mapping[int, LiveState] = field(default_factory=dict)
+    events: int = 0
+    waiting: bool = False
+    patient: bool = True
+    travelled: float = 0.0
+    scans: int = 0
+    dropped: int = 0
+    first_of_trail: int = 0
 
 
 class MetricSlam:
@@ -45,26 +87,45 @@ class MetricSlam:
     Consumes Scan, Odometry, Hypotheses, Accepted, EndOfLog; produces Keyframe, Trail, LocalEstimate, Notice, Finished.
     """
 
-    def __init__(self, configuration: Configuration) -> None:
+    def __init__(self, configuration: Configuration, state: SlamState | None = None) -> None:
+        """:param state: to go on from."""
+        state = state or SlamState()
         self._configuration = configuration
         self._mapping = LocalMapping(configuration)
-        self._replica = Replica()
-        self._motion = MotionModel(configuration.motion)
-        self._watch = OdometryWatch()
-        self._queue: deque[Scan] = deque()
-        self._sweeps = SweepCheck()
-        self._last_stamp = -1
-        self._noticed: set[str] = set()
-        first = AreaFilter(self._mapping, FIRST_HYPOTHESIS, FIRST_AREA)
-        self._live = {FIRST_HYPOTHESIS: LiveHypothesis(first, configuration.filter)}
-        self._events = 0
-        self._waiting = False
-        self._patient = True
-        self._travelled = 0.0
-        self._scans = 0
-        self._dropped = 0
-        self._first_of_trail = 0
+        self._replica = Replica.of(state.replica)
+        self._motion = MotionModel(configuration.motion, state.motion)
+        self._watch = OdometryWatch(state.watch)
+        self._queue = deque(state.queue)
+        self._sweeps = SweepCheck(state.sweeps)
+        self._last_stamp = state.last_stamp
+        self._noticed = set(state.noticed)
+        self._live = self._live_in(state)
+        self._events, self._waiting, self._patient = state.events, state.waiting, state.patient
+        self._travelled = state.travelled
+        self._scans, self._dropped = state.scans, state.dropped
+        self._first_of_trail = state.first_of_trail
         self._ended = False
+
+    def _live_in(self, state: SlamState) -> dict[int, LiveHypothesis]:
+        if state.patches is None:
+            first = AreaFilter(self._mapping, FIRST_HYPOTHESIS, FIRST_AREA)
+            return {FIRST_HYPOTHESIS: LiveHypothesis(first, self._configuration.filter)}
+        self._mapping.pool.load(state.patches, np.concatenate([live.filter.tables for live in state.live.values()]))
+        return {hypothesis: LiveHypothesis.of(self._mapping, live) for hypothesis, live in state.live.items()}
+
+    @property
+    def state(self) -> SlamState:
+        """All that metric SLAM knows, as a value."""
+        filters = [live.filter.state for live in self._live.values()]
+        patches, tables = self._mapping.pool.state(np.concatenate([own.tables for own in filters]))
+        each = np.split(tables, len(filters))
+        return SlamState(
+            self._replica.state, self._motion.state, self._watch.state, self._sweeps.state, tuple(self._queue),
+            self._last_stamp, frozenset(self._noticed), patches,
+            {name: live.state(own) for (name, live), own in zip(self._live.items(), each, strict=True)},
+            self._events, self._waiting, self._patient, self._travelled, self._scans, self._dropped,
+            self._first_of_trail,
+        )  # fmt: skip
 
     @property
     def waiting_scans(self) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -13,8 +14,8 @@ from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.chi_square import gate
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.processes.acceptance import Acceptance
-from hmt_slam_ros.processes.ambiguity import Ambiguity
-from hmt_slam_ros.processes.closure_account import Account, Closure, History, Name, Step
+from hmt_slam_ros.processes.ambiguity import Ambiguity, Frame
+from hmt_slam_ros.processes.closure_account import Account, Closure, History, Name, Step, history_of, steps_of
 from hmt_slam_ros.processes.merged_account import merged, witnesses_of
 from hmt_slam_ros.processes.messages import (
     Accepted,
@@ -28,8 +29,8 @@ from hmt_slam_ros.processes.messages import (
     Relabelled,
 )
 from hmt_slam_ros.processes.observation import Observation, observed
-from hmt_slam_ros.processes.reopening import Question, Reopening
-from hmt_slam_ros.processes.replica import FIRST_HYPOTHESIS, Replica
+from hmt_slam_ros.processes.reopening import Past, Question, Reopening, ReopeningState
+from hmt_slam_ros.processes.replica import FIRST_HYPOTHESIS, Replica, ReplicaState
 from hmt_slam_ros.processes.undo import Undo
 from hmt_slam_ros.topology.common_map import Pair
 from hmt_slam_ros.topology.global_map import consistent_map, shortest_path_map
@@ -62,6 +63,68 @@ class _Path:
     closures: tuple[Closure, ...] = ()
 
 
+@dataclass(frozen=True, eq=False)
+class PathState:
+    """What TLCA remembers of one hypothesis.
+
+    :ivar version: number of the last change of its areas and arcs, of all hypotheses.
+    :ivar parted: path length at which it parted from others, m.
+    :ivar held: at how many of the latest keyframes in a row it dominated since then.
+    :ivar definite: whether nothing happened since it was accepted.
+    :ivar observations: arcs that wait for acceptance, in order.
+    :ivar witnesses: {arc: the keyframes by which it was observed}, of the definite arcs.
+    :ivar past: where the robot was, and the closures that were accepted.
+    """
+
+    version: int
+    parted: float
+    held: int
+    definite: bool
+    observations: tuple[Observation, ...]
+    witnesses: Mapping[Pair, frozenset[int]]
+    past: Past
+
+    @classmethod
+    def of(cls, path: _Path) -> PathState:
+        """Of a path."""
+        past = Past(steps_of(path.history), path.closures)
+        return cls(path.version, path.parted, path.held, path.definite, path.observations, path.witnesses, past)
+
+    def path(self) -> _Path:
+        """The path."""
+        return _Path(
+            self.version, self.parted, self.held, self.definite, self.observations, dict(self.witnesses),
+            history_of(self.past.steps), self.past.closures,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class TlcaState:
+    """TLCA between two keyframe events, at first before the first one.
+
+    :ivar replica: the maps of the live hypotheses.
+    :ivar paths: {hypothesis: what is remembered of it}.
+    :ivar travelled: path length since the start, m.
+    :ivar poses: {hypothesis: the robot's ``area_T_base`` at the last keyframe event, shape (3,), m and rad}.
+    :ivar changes: how often areas or arcs of hypotheses changed.
+    :ivar published: the change after which global poses were told last, -1 before the first.
+    :ivar doubted: definite arcs of which it was told that they do not fit the others.
+    :ivar reopening: what is known of questions that were opened again.
+    :ivar frames: {(hypothesis, number of the last change of its map, area): ``map_T_area``, shape (3,), or None where
+        no arc joins the area with the first}, of the robot's areas under several hypotheses.
+    """
+
+    replica: ReplicaState = field(default_factory=ReplicaState)
+    paths: Mapping[int, PathState] = field(default_factory=lambda: {FIRST_HYPOTHESIS: PathState.of(_Path())})
+    travelled: float = 0.0
+    poses: Mapping[int, NDArray[np.float64]] = field(default_factory=lambda: {FIRST_HYPOTHESIS: np.zeros(3)})
+    changes: int = 0
+    published: int = -1
+    doubted: frozenset[Pair] = frozenset()
+    reopening: ReopeningState = field(default_factory=ReopeningState)
+    frames: Mapping[Frame, NDArray[np.float64] | None] = field(default_factory=dict)
+
+
 class Tlca:
     """Answers every ``Hypotheses`` with an ``Accepted``.
 
@@ -71,22 +134,38 @@ class Tlca:
     TSBI is asked anew instead.
     """
 
-    def __init__(self, configuration: Configuration) -> None:
+    def __init__(self, configuration: Configuration, state: TlcaState | None = None) -> None:
+        """:param state: to go on from."""
+        state = state or TlcaState()
         self._options = configuration.tlca
         self._acceptance = Acceptance(configuration)
-        self._replica = Replica()
-        self._paths = {FIRST_HYPOTHESIS: _Path()}
-        self._travelled = 0.0
-        self._poses = {FIRST_HYPOTHESIS: np.zeros(3)}
-        self._changes = 0
-        self._published = -1
+        self._replica = Replica.of(state.replica)
+        self._paths = {hypothesis: path.path() for hypothesis, path in state.paths.items()}
+        self._travelled = state.travelled
+        self._poses = dict(state.poses)
+        self._changes, self._published = state.changes, state.published
         self._gate = gate(configuration.tsbi.gate_probability)
-        self._doubted: set[Pair] = set()
-        self._reopening = Reopening(self._options)
-        self._ambiguity = Ambiguity()
+        self._doubted = set(state.doubted)
+        self._reopening = Reopening(self._options, state.reopening)
+        self._ambiguity = Ambiguity(state.frames)
         # The stated risk: beyond it, TSBI's probabilities are not taken at their word.
         self._least_doubt = max(1.0 - self._options.accept_probability, _LEAST_DOUBT)
         self._accepted_now: frozenset[Name] = frozenset()
+
+    @property
+    def state(self) -> TlcaState:
+        """All that TLCA knows between two keyframe events, as a value."""
+        return TlcaState(
+            self._replica.state,
+            {hypothesis: PathState.of(path) for hypothesis, path in self._paths.items()},
+            self._travelled,
+            dict(self._poses),
+            self._changes,
+            self._published,
+            frozenset(self._doubted),
+            self._reopening.state,
+            dict(self._ambiguity.frames),
+        )
 
     def handle(self, message: Message) -> list[Message]:
         """Learn from a ``Keyframe``; answer ``Hypotheses``."""
@@ -139,9 +218,9 @@ class Tlca:
             path = replace(path, version=self._changes, definite=False)
         elif leaf.rebase:
             path = replace(path, definite=False)
-        account = self._reopening.followed(leaf, sequence)
-        if account is not None:
-            return replace(path, definite=False, history=account.history, closures=account.closures)
+        past = self._reopening.followed(leaf, sequence)
+        if past is not None:
+            return replace(path, definite=False, history=history_of(past.steps), closures=past.closures)
         parent = self._replica.maps[leaf.parent]
         if leaf.merged is not None:
             history, closures = merged(Account(parent, path.history, path.closures, before, np.zeros(3)), leaf.merged)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,7 @@ from hmt_slam_ros.processes.messages import (
     Accepted,
     AreaEvent,
     AreaEvents,
+    AreaPose,
     Hypotheses,
     Keyframe,
     Leaf,
@@ -24,8 +25,8 @@ from hmt_slam_ros.processes.messages import (
     LocalArea,
     Message,
 )
-from hmt_slam_ros.processes.replica import FIRST_HYPOTHESIS, Replica
-from hmt_slam_ros.processes.tsbi_branching import Branches, Branching, Child, Parent
+from hmt_slam_ros.processes.replica import FIRST_HYPOTHESIS, Replica, ReplicaState
+from hmt_slam_ros.processes.tsbi_branching import Branches, Branching, BranchingState, Child, Parent
 from hmt_slam_ros.processes.tsbi_displacement import with_displaced
 from hmt_slam_ros.processes.tsbi_merging import merged as merged_into
 from hmt_slam_ros.processes.tsbi_reopening import reopened
@@ -39,6 +40,28 @@ from hmt_slam_ros.topology.surroundings import agreeing, areas_around
 _ASTRAY = 3
 
 
+@dataclass(frozen=True, eq=False)
+class TsbiState:
+    """TSBI between two keyframe events, at first before the first one.
+
+    :ivar replica: the maps of the live hypotheses.
+    :ivar branching: what is known of areas beside these.
+    :ivar notes: {hypothesis: what is remembered of it}.
+    :ivar next_hypothesis: the first number that no hypothesis had.
+    :ivar unexamined: probability of the topologies that were not looked at.
+    :ivar global_poses: ``map_T_area`` as TLCA told it last, ordered by area.
+    :ivar reopened: the explanations of a contradiction that TLCA has asked about, else empty.
+    """
+
+    replica: ReplicaState = field(default_factory=ReplicaState)
+    branching: BranchingState = field(default_factory=BranchingState)
+    notes: Mapping[int, LeafNotes] = field(default_factory=lambda: {FIRST_HYPOTHESIS: LeafNotes()})
+    next_hypothesis: int = FIRST_HYPOTHESIS + 1
+    unexamined: float = 0.0
+    global_poses: tuple[AreaPose, ...] = ()
+    reopened: tuple[Leaf, ...] = ()
+
+
 class Tsbi:
     """Answers the area events of every keyframe with the live hypotheses.
 
@@ -46,20 +69,36 @@ class Tsbi:
     """
 
     def __init__(
-        self, configuration: Configuration, branching: Callable[[Configuration, Replica], Branching] = Branching
+        self,
+        configuration: Configuration,
+        branching: Callable[[Configuration, Replica], Branching] = Branching,
+        state: TsbiState | None = None,
     ) -> None:
-        """:param branching: what makes the children of hypotheses, such as one that is watched."""
+        """:param branching: what makes the children of hypotheses, such as one that is watched.
+
+        :param state: to go on from.
+        """
+        state = state or TsbiState()
         self._options = configuration.tsbi
         self._seed = configuration.seed
-        self._replica = Replica()
+        self._replica = Replica.of(state.replica)
         self._branching = branching(configuration, self._replica)
-        self._notes = {FIRST_HYPOTHESIS: LeafNotes()}
+        self._branching.go_on_from(state.branching)
+        self._notes = dict(state.notes)
         self._keyframe: Keyframe | None = None
         self._estimates: dict[int, LeafEstimate] = {}
-        self._next_hypothesis = FIRST_HYPOTHESIS + 1
-        self._unexamined = 0.0
-        self._global_poses = GlobalPoses()
-        self._reopened: tuple[Leaf, ...] = ()
+        self._next_hypothesis = state.next_hypothesis
+        self._unexamined = state.unexamined
+        self._global_poses = GlobalPoses(state.global_poses)
+        self._reopened = state.reopened
+
+    @property
+    def state(self) -> TsbiState:
+        """All that TSBI knows between two keyframe events, as a value."""
+        return TsbiState(
+            self._replica.state, self._branching.state, dict(self._notes), self._next_hypothesis, self._unexamined,
+            self._global_poses.areas, self._reopened,
+        )  # fmt: skip
 
     def handle(self, message: Message) -> list[Message]:
         """Learn from ``Keyframe`` and ``Accepted``; answer ``AreaEvents`` with ``Hypotheses``."""

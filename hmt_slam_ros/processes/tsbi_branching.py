@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -22,7 +22,7 @@ from hmt_slam_ros.processes.messages import Arc, ArcEnds, Merged, Relabelled
 from hmt_slam_ros.processes.replica import FIRST_AREA, Replica
 from hmt_slam_ros.sensing import Scan
 from hmt_slam_ros.topology.admission import Query
-from hmt_slam_ros.topology.closure_search import ClosureSearch, Comparison, Fit
+from hmt_slam_ros.topology.closure_search import ClosureSearch, Comparison, Fit, SearchState
 from hmt_slam_ros.topology.hybrid_map import HybridMap
 from hmt_slam_ros.topology.hypothesis_tree import LeafNotes, relative_covariance
 from hmt_slam_ros.topology.shortest_path import reachable
@@ -92,6 +92,18 @@ class Branches(NamedTuple):
     log_skipped: float = -math.inf
 
 
+@dataclass(frozen=True)
+class BranchingState:
+    """What is known of areas beside the maps of the hypotheses.
+
+    :ivar areas: the largest number that an area was given.
+    :ivar search: what was learnt by comparing areas.
+    """
+
+    areas: int = FIRST_AREA
+    search: SearchState = field(default_factory=SearchState)
+
+
 class Branching:
     """Makes the children of hypotheses; numbers new areas.
 
@@ -106,6 +118,16 @@ class Branching:
         self._floor = np.diag([sigma**2, sigma**2, angle**2])
         self._areas = FIRST_AREA
         self._named: dict[tuple[int, ...], int] = {}
+
+    @property
+    def state(self) -> BranchingState:
+        """All that is known between two events."""
+        return BranchingState(self._areas, self.search.state)
+
+    def go_on_from(self, state: BranchingState) -> None:
+        """Take over what was known before the first event."""
+        self._areas = state.areas
+        self.search.go_on_from(state.search)
 
     def begin_event(self) -> None:
         """Forget which new areas were named; within one event hypotheses share the ids of the same new area."""

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from statistics import median
 
 from hmt_slam_ros.configuration.live import RealTimeLocalization
@@ -24,15 +24,34 @@ _JITTER = 1.2
 _NANOSECOND = 1e-9
 
 
+@dataclass(frozen=True)
+class SweepState:
+    """What is known of the times between scans.
+
+    :ivar periods: the last ones, s.
+    :ivar last_stamp: of the last scan, ns, None before the first.
+    """
+
+    periods: tuple[float, ...] = ()
+    last_stamp: int | None = None
+
+
 class SweepCheck:
     """Judges whether the sweeps of one laser's scans can have taken as long as they say.
 
     The verdict depends on the sequence of the scans alone, so that it is the same however they mix with odometry.
     """
 
-    def __init__(self) -> None:
-        self._periods: deque[float] = deque(maxlen=_PERIODS)
-        self._last_stamp: int | None = None
+    def __init__(self, state: SweepState | None = None) -> None:
+        """:param state: to go on from."""
+        state = state or SweepState()
+        self._periods = deque(state.periods, maxlen=_PERIODS)
+        self._last_stamp = state.last_stamp
+
+    @property
+    def state(self) -> SweepState:
+        """All that is known."""
+        return SweepState(tuple(self._periods), self._last_stamp)
 
     def checked(self, scan: Scan) -> tuple[Scan, str | None]:
         """The scan, and what is wrong with its ``time_increment``; where something is, the scan is without one."""

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, field
+from functools import partial
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -11,7 +13,7 @@ from numpy.typing import NDArray
 from hmt_slam_ros.configuration.metric import Motion
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.covariance import carried, inverse
-from hmt_slam_ros.sensing.odometry import OdometryBuffer
+from hmt_slam_ros.sensing.odometry import Odometry, OdometryBuffer
 
 # Weight of the newest scan in the mean time between scans, of late and over a while that outlasts a burst.
 _NEWEST, _NEW = 0.1, 0.02
@@ -73,6 +75,28 @@ class Prediction(NamedTuple):
     together: Step
 
 
+@dataclass(frozen=True, eq=False)
+class InertiaState:
+    """What is known of the robot's velocity.
+
+    :ivar velocity: shape (3,), the body's twist, m/s, m/s, rad/s.
+    :ivar covariance: of the velocity, shape (3, 3).
+    :ivar certainty: its information as predicted, before the last motion was observed, shape (3, 3).
+    :ivar usually: mean time between scans over a while, s, 0 before the second scan.
+    :ivar period: mean time between scans of late, s, likewise.
+    :ivar seconds: the time that the last prediction took for that between two scans, s.
+    :ivar doubt: shape (3,), how far off the last prediction is if that time is not true, m, m, rad.
+    """
+
+    velocity: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    certainty: NDArray[np.float64]
+    usually: float = 0.0
+    period: float = 0.0
+    seconds: float = 0.0
+    doubt: NDArray[np.float64] = field(default_factory=partial(np.zeros, 3))
+
+
 class Inertia:
     """The robot's velocity, from the motions that scan matching found: a Kalman filter on the body's twist.
 
@@ -80,16 +104,23 @@ class Inertia:
     taken to lie between its stamps' difference and the mean of late.
     """
 
-    def __init__(self, motion: Motion) -> None:
+    def __init__(self, motion: Motion, state: InertiaState | None = None) -> None:
+        """:param state: to go on from."""
         self._acceleration = _squared_accelerations(motion)
         self._floor = increment_covariance(np.zeros(3), motion)
-        self._velocity = np.zeros(3)
-        self._covariance = self._acceleration * _MEMORY**2
-        self._usual = np.linalg.inv(self._covariance)
-        self._certainty = self._usual
-        self._usually = self._period = 0.0
-        self._seconds = 0.0
-        self._doubt = np.zeros(3)
+        usual = self._acceleration * _MEMORY**2
+        self._usual = np.linalg.inv(usual)
+        state = state or InertiaState(np.zeros(3), usual, self._usual)
+        self._velocity, self._covariance, self._certainty = state.velocity, state.covariance, state.certainty
+        self._usually, self._period = state.usually, state.period
+        self._seconds, self._doubt = state.seconds, state.doubt
+
+    @property
+    def state(self) -> InertiaState:
+        """All that is known."""
+        return InertiaState(
+            self._velocity, self._covariance, self._certainty, self._usually, self._period, self._seconds, self._doubt
+        )
 
     def predict(self, seconds: float) -> Step:
         """The motion of the next ``seconds`` since the last scan."""
@@ -140,17 +171,42 @@ class Inertia:
             self._velocity = self._velocity + self._covariance @ told
 
 
+@dataclass(frozen=True, eq=False)
+class NoiseState:
+    """What odometry turned out to be worth; at first, one step that was as the model says.
+
+    So the first few steps do not count for much.
+
+    :ivar ratios: shape (2,), weighted sums of the squared differences of late, of translation and rotation, against
+        what the model expects of them.
+    :ivar weights: shape (2,), the sums of these weights.
+    """
+
+    ratios: NDArray[np.float64] = field(default_factory=partial(np.ones, 2))
+    weights: NDArray[np.float64] = field(default_factory=partial(np.ones, 2))
+
+
 class OdometryNoise:
     """How many times as noisy as its model the odometry turned out to be: factors on its deviations, at least 1.
 
     The squared difference between odometry and match over the steps of late, against what the model expects of it.
     """
 
-    def __init__(self) -> None:
-        # One step that was as the model says, so that the first few do not count for much.
-        self._ratios = np.ones(2)
-        self._weights = np.ones(2)
-        self._scales = np.ones((3, 3))
+    def __init__(self, state: NoiseState | None = None) -> None:
+        """:param state: to go on from."""
+        state = state or NoiseState()
+        self._ratios, self._weights = state.ratios.copy(), state.weights.copy()
+        self._scales = self._squared_factors()
+
+    @property
+    def state(self) -> NoiseState:
+        """All that is known."""
+        return NoiseState(self._ratios.copy(), self._weights.copy())
+
+    def _squared_factors(self) -> NDArray[np.float64]:
+        """On a covariance, shape (3, 3)."""
+        scale = self.factors[[0, 0, 1]]
+        return np.outer(scale, scale)
 
     @property
     def factors(self) -> NDArray[np.float64]:
@@ -195,8 +251,32 @@ class OdometryNoise:
             ratio = squares[rows].sum() / max(expected[rows].sum(), 1e-12)
             self._ratios[k] = _PAST * self._ratios[k] + weight * min(ratio, (_OUTLIER * self.factors[k]) ** 2)
             self._weights[k] = _PAST * self._weights[k] + weight
-        scale = self.factors[[0, 0, 1]]
-        self._scales = np.outer(scale, scale)
+        self._scales = self._squared_factors()
+
+
+@dataclass(frozen=True, eq=False)
+class MotionState:
+    """What is known of the motion between scans.
+
+    :ivar readings: the odometry readings that are still needed.
+    :ivar odometry_pose: shape (3,), ``odom_T_base`` at the last scan, m and rad.
+    :ivar noise: what odometry turned out to be worth.
+    :ivar inertia: what is known of the velocity, None before the first scan.
+    :ivar stamp: of the last scan, ns, None before the first.
+    :ivar gap: half the product of the times from the last scan to the readings around it, s^2, None where odometry
+        does not enclose it.
+    :ivar leg: the motion by odometry since the last keyframe event, None where it is unknown.
+    :ivar step: the motion by odometry to the last scan, likewise.
+    """
+
+    readings: tuple[Odometry, ...] = ()
+    odometry_pose: NDArray[np.float64] = field(default_factory=partial(np.zeros, 3))
+    noise: NoiseState = field(default_factory=NoiseState)
+    inertia: InertiaState | None = None
+    stamp: int | None = None
+    gap: float | None = None
+    leg: Step | None = None
+    step: Step | None = None
 
 
 class MotionModel:
@@ -207,17 +287,25 @@ class MotionModel:
     :ivar odometry_pose: ``odom_T_base`` (3,) at the last scan; where odometry said nothing, carried on as matched.
     """
 
-    def __init__(self, motion: Motion) -> None:
-        self.odometry = OdometryBuffer()
-        self.noise = OdometryNoise()
-        self.odometry_pose: NDArray[np.float64] = np.zeros(3)
+    def __init__(self, motion: Motion, state: MotionState | None = None) -> None:
+        """:param state: to go on from."""
+        state = state or MotionState()
+        self.odometry = OdometryBuffer(state.readings)
+        self.noise = OdometryNoise(state.noise)
+        self.odometry_pose = state.odometry_pose
         self._motion = motion
-        self._inertia = Inertia(motion)
+        self._inertia = Inertia(motion, state.inertia)
         self._bounds = _squared_accelerations(motion)
-        self._stamp: int | None = None
-        self._gap: float | None = None
-        self._leg: Step | None = None
-        self._step: Step | None = None
+        self._stamp, self._gap = state.stamp, state.gap
+        self._leg, self._step = state.leg, state.step
+
+    @property
+    def state(self) -> MotionState:
+        """All that is known."""
+        return MotionState(
+            self.odometry.readings, self.odometry_pose, self.noise.state, self._inertia.state, self._stamp, self._gap,
+            self._leg, self._step,
+        )  # fmt: skip
 
     def predict(self, stamp: int) -> Prediction:
         """The motion from the last scan to the one at ``stamp``, ns; at the first scan, which sets the start, none."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,8 +27,14 @@ class Odometry:
 class OdometryBuffer:
     """The recent odometry readings, from which the pose at a scan is interpolated."""
 
-    def __init__(self) -> None:
-        self._readings: deque[Odometry] = deque()
+    def __init__(self, readings: Iterable[Odometry] = ()) -> None:
+        """:param readings: the first ones."""
+        self._readings: deque[Odometry] = deque(readings)
+
+    @property
+    def readings(self) -> tuple[Odometry, ...]:
+        """Those that are not forgotten."""
+        return tuple(self._readings)
 
     @property
     def empty(self) -> bool:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -61,6 +62,19 @@ class Comparison(NamedTuple):
     skipped: float
 
 
+@dataclass(frozen=True)
+class SearchState:
+    """What was learnt of the building by comparing its places.
+
+    :ivar shares: how large a share of their surfaces keyframes found in places where they do not lie, of those that
+        were tried last.
+    :ivar counted: the newest of the keyframes with which that was tried last, -1 before the first.
+    """
+
+    shares: tuple[float, ...] = ()
+    counted: int = -1
+
+
 class ClosureSearch:
     """Compares keyframes with the areas of a hybrid map.
 
@@ -80,6 +94,16 @@ class ClosureSearch:
         self._relocation = Relocation(self._views, Looks(scans), self._settings, options.place_radius)
         self._counted = -1
         self._ahead: list[tuple[int, Collection[int]]] = []
+
+    @property
+    def state(self) -> SearchState:
+        """All that was learnt."""
+        return SearchState(tuple(self._likeness.shares), self._counted)
+
+    def go_on_from(self, state: SearchState) -> None:
+        """Take over what was learnt before anything is compared."""
+        self._likeness.count(state.shares)
+        self._counted = state.counted
 
     def tracked_area(
         self, hybrid_map: HybridMap, area: int, around: Mapping[int, Pose], poses: NDArray[np.float64]

@@ -24,7 +24,11 @@ _FIRST_ROOM = 16
 
 @dataclass(frozen=True, eq=False, slots=True)
 class ArcValue:
-    """What the map stores of an arc: the belief over ``a_T_b`` (a < b) and whether it closed a loop."""
+    """What the map stores of an arc.
+
+    :ivar pose: belief over ``a_T_b``, a < b.
+    :ivar closure: whether the arc closed a loop.
+    """
 
     pose: PoseGaussian
     closure: bool
