@@ -1,12 +1,18 @@
 #!/usr/bin/env python3
-"""Write config/hmt_slam.yaml and docs/parameters.md anew from the configuration tree, and the simulation's settings."""
+"""Write anew what follows from the code: config/hmt_slam.yaml; in docs/, parameters, settings and the map's form."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from string import Template
 
 from hmt_slam_ros.configuration import Configuration, flat_parameters
 from hmt_slam_ros.configuration.documents import parameter_table, reference, ros_yaml
+from hmt_slam_ros.offline.going_on import SHAPING
+from hmt_slam_ros.offline.saved_map import FORMAT, PARTS, VERSION, MapDocument
+from hmt_slam_ros.persistence.folder import SCANS
+from hmt_slam_ros.persistence.reference import described
+from hmt_slam_ros.persistence.scans import ScanTable
 from hmt_slam_ros.simulation.families import FAMILIES
 from hmt_slam_ros.simulation.settings import Settings
 
@@ -35,8 +41,20 @@ def simulation_settings(_configuration: Configuration) -> str:
     return "\n".join(lines) + "\n"
 
 
+def map_format(_configuration: Configuration) -> str:
+    """docs/map_format.md: every file of a saved map, and every field."""
+    head = Template((ROOT / "scripts" / "map_format.template.md").read_text(encoding="utf-8")).substitute(
+        name=FORMAT,
+        version=VERSION,
+        parts=", ".join(PARTS),
+        shaping=", ".join(f"`{name}`" for name in SHAPING),
+    )
+    return head + "\n".join(described({"map": MapDocument, SCANS: ScanTable, **PARTS}))
+
+
 GENERATED = {
     "config/hmt_slam.yaml": ros_yaml,
+    "docs/map_format.md": map_format,
     "docs/parameters.md": reference,
     "docs/simulation_settings.md": simulation_settings,
 }

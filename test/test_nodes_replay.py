@@ -13,6 +13,7 @@ import pytest
 from logs_for_nodes import corridor_bag, is_alive
 
 from hmt_slam_ros.evaluation import read_tum
+from hmt_slam_ros.offline.saved_map import read_saved_map
 
 pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
 
@@ -87,14 +88,15 @@ def test_the_nodes_take_the_same_decisions_as_the_lock_step_run(folders, name):
 
 def test_the_nodes_correct_scans_for_the_motion_during_their_sweeps_as_the_lock_step_run_does(tmp_path):
     nodes, lock_step = mapped_twice(corridor_bag(tmp_path, scans=60, sweep=0.15), tmp_path)
-    scans = nodes / "hmt_map" / "scans"
+    scans, others = (read_saved_map(folder / "hmt_map").replica.scans for folder in (nodes, lock_step))
+    assert {k: scan.motion.tobytes() for k, scan in scans.items()} == {k: s.motion.tobytes() for k, s in others.items()}
     # The log ends within the last sweep.
-    whole = np.load(scans / "stamps.npy") < read_tum(nodes / "trajectory.tum").stamps[-1]
-    assert whole.sum() > 8
-    motions = np.load(scans / "motions.npy")[whole]
+    end = read_tum(nodes / "trajectory.tum").stamps[-1]
+    motions = np.array([scan.motion for scan in scans.values() if scan.stamp < end])
+    assert len(motions) > 8
     np.testing.assert_allclose(np.hypot(motions[:, 0], motions[:, 1]), 0.075, rtol=1e-3)
     np.testing.assert_allclose(motions[:, 2], 0.006, rtol=1e-3)
-    for name in ("trajectory.tum", "map.pgm", "hmt_map/scans/motions.npy"):
+    for name in ("trajectory.tum", "map.pgm", "hmt_map/map.json"):
         assert (nodes / name).read_bytes() == (lock_step / name).read_bytes()
 
 
@@ -102,7 +104,7 @@ def test_the_nodes_have_two_areas_become_one_as_the_lock_step_run_does(tmp_path)
     nodes, lock_step = mapped_twice("sim:ring,seed=3,size=1.5", tmp_path)
     table = np.genfromtxt(nodes / "pmf.csv", delimiter=",", names=True, usecols=("keyframe", "areas"))
     assert np.diff(table["areas"]).min() < 0
-    for name in ("trajectory.tum", "trajectory_online.tum", "pmf.csv", "hmt_map/common.json", "hmt_map/global.json"):
+    for name in ("trajectory.tum", "trajectory_online.tum", "pmf.csv", "hmt_map/map.json", "hmt_map/map.bin"):
         assert (nodes / name).read_bytes() == (lock_step / name).read_bytes()
 
 

@@ -17,7 +17,7 @@ from hmt_slam_ros.offline.map_image import read_map
 from hmt_slam_ros.offline.output_folder import replacing, write_output
 from hmt_slam_ros.offline.recorder import Recorder
 from hmt_slam_ros.offline.report import RunFigures, read_table
-from hmt_slam_ros.offline.saved_map import read_saved_map, write_saved_map
+from hmt_slam_ros.offline.saved_map import MapWriter, read_run_state, read_saved_map
 from hmt_slam_ros.processes.messages import (
     Accepted,
     Arc,
@@ -321,19 +321,15 @@ def test_the_saved_map_keeps_that_a_hypothesis_lacks_an_arc(tmp_path: Path) -> N
         recorder.hypotheses[k] = Hypotheses(k, (Leaf(1, 1, 0.6, 1, withdrawn=withdrawn), Leaf(2, 2, 0.4, 0)))
         recorder.accepted[k] = Accepted(k)
     recording = recorder.finish(STAMPS)
-    write_saved_map(tmp_path / "hmt_map", recording, recorder.configuration)
+    MapWriter(tmp_path / "hmt_map").finish(recording, recorder.configuration)
     saved = read_saved_map(tmp_path / "hmt_map")
     assert list(saved.replica.maps[1].arcs) == [(0, 1)]
     assert saved.replica.maps[1].arc(0, 1) is None
 
 
-@pytest.mark.parametrize("name", ["manifest.json", "common.json", "global.json", "scans/ranges.npy"])
-def test_a_damaged_map_is_refused(folder: Path, tmp_path: Path, name: str) -> None:
-    for path, content in contents(folder / "hmt_map").items():
-        (tmp_path / path).parent.mkdir(exist_ok=True)
-        (tmp_path / path).write_bytes(content[: len(content) // 2] if path == name else content)
-    with pytest.raises(HmtSlamError, match="no complete HMT map"):
-        read_saved_map(tmp_path)
+def test_a_map_without_state_is_nothing_to_go_on_from(folder: Path) -> None:
+    with pytest.raises(HmtSlamError, match="a map without the state of the processes"):
+        read_run_state(folder / "hmt_map")
 
 
 def test_all_plots_are_drawn_from_the_files_alone(folder: Path) -> None:

@@ -62,6 +62,6 @@ def test_a_folder_with_the_file_in_it_can_still_be_replaced(folder: Path) -> Non
 
 
 def test_a_folder_without_a_map_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(HmtSlamError, match="map the log again"):
+    with pytest.raises(HmtSlamError, match="holds no hmt_map"):
         export_topology(tmp_path)
     assert list(tmp_path.iterdir()) == []

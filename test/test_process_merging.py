@@ -7,7 +7,7 @@ from misled import run
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.logs import open_log
-from hmt_slam_ros.offline.saved_map import read_saved_map, write_saved_map
+from hmt_slam_ros.offline.saved_map import MapWriter, read_saved_map
 
 # Corridors around four blocks: crossings are entered from several sides and at first taken for new ground.
 LOG = "sim:grid,seed=1,count=2"
@@ -104,7 +104,7 @@ def test_loops_stay_closed(drive):
 
 def test_the_saved_map_has_the_areas_that_are_left(drive, tmp_path):
     recording, _ = drive
-    write_saved_map(tmp_path / "hmt_map", recording, Configuration())
+    MapWriter(tmp_path / "hmt_map").finish(recording, Configuration())
     saved = read_saved_map(tmp_path / "hmt_map")
     best = saved.replica.maps[saved.replica.best]
     assert best.area_ids() == recording.hybrid_map.area_ids() == sorted(saved.area_poses)

@@ -36,9 +36,10 @@ def parser() -> argparse.ArgumentParser:
     return top
 
 
-def chosen_configuration(options: argparse.Namespace) -> Configuration:
+def chosen_configuration(options: argparse.Namespace, base: Configuration | None = None) -> Configuration:
     """Defaults, then ``--config``, then ``--set``, then the options that have names of their own.
 
+    :param base: instead of the defaults.
     :raises HmtSlamError: for a file, a name or a value that cannot be.
     """
     named = {"start": "robot.start", "duration": "robot.duration", "rate": "robot.rate"}
@@ -46,11 +47,15 @@ def chosen_configuration(options: argparse.Namespace) -> Configuration:
     for option, name in named.items():
         value = getattr(options, option, None)
         settings += [] if value is None else [f"{name}={value}"]
-    return load_configuration(options.config, settings, options.seed)
+    return load_configuration(options.config, settings, options.seed, base)
 
 
 def _map(command: argparse.ArgumentParser) -> None:
     _log_to_folder(command)
+    command.add_argument(
+        "--from", type=Path, dest="source", metavar="MAP",
+        help="output folder or hmt_map of a part of the log, to go on from with its parameters",
+    )  # fmt: skip
 
 
 def _replay(command: argparse.ArgumentParser) -> None:

@@ -5,7 +5,9 @@ from __future__ import annotations
 import argparse
 import gc
 import resource
+import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -14,44 +16,68 @@ from numpy.typing import NDArray
 from hmt_slam_ros.cli.arguments import chosen_configuration
 from hmt_slam_ros.cli.progress import Progress
 from hmt_slam_ros.cli.summary import summary
-from hmt_slam_ros.configuration import Configuration
+from hmt_slam_ros.configuration import Configuration, with_changes
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.logs import Log, open_log
 from hmt_slam_ros.offline.corrected_scans import corrected_scans
 from hmt_slam_ros.offline.final_map import FinalMap, final_map
+from hmt_slam_ros.offline.going_on import differences, map_folder
 from hmt_slam_ros.offline.memory import code_bytes
-from hmt_slam_ros.offline.output_folder import replacing, write_output
+from hmt_slam_ros.offline.output_folder import map_writer, replacing, write_output
 from hmt_slam_ros.offline.report import RunFigures
 from hmt_slam_ros.offline.runtime import run_log
+from hmt_slam_ros.offline.saved_map import RunState, read_run_state
 
 
 def run(options: argparse.Namespace) -> None:
     """Map the log and say what came of it."""
-    configuration = chosen_configuration(options)
+    configuration, state = _beginning(options)
     with replacing(options.out) as folder:
-        final, source_stamps, figures, log_seconds = _mapped(options.log, configuration)
-        write_output(folder, final, source_stamps, figures, configuration)
+        writer = map_writer(folder)
+        log, log_seconds = _opened(options.log, configuration)
+        final, source_stamps, figures = measured_run(log, configuration, state, writer.write_state)
+        del log, state  # they may be large
+        write_output(folder, final, source_stamps, figures, configuration, writer)
     print(summary(options.out, final.recording, log_seconds, figures.wall_seconds))
 
 
-def _mapped(path: Path, configuration: Configuration) -> tuple[FinalMap, NDArray[np.int64], RunFigures, float]:
-    """:func:`measured_run` and the log's duration, s; the log, which may be large, is forgotten."""
+def _beginning(options: argparse.Namespace) -> tuple[Configuration, RunState]:
+    """What the run begins with: nothing, or the map that it goes on from."""
+    if options.source is None:
+        return chosen_configuration(options), RunState()
+    state, saved = read_run_state(map_folder(options.source))
+    configuration = chosen_configuration(options, with_changes(saved, {"robot.duration": 0.0}))
+    told = differences(saved, configuration)
+    if told:
+        print(f"hmt_slam map: {told}", file=sys.stderr)
+    return configuration, state
+
+
+def _opened(path: Path, configuration: Configuration) -> tuple[Log, float]:
+    """The part of the log that was asked for, and its duration, s."""
     log = open_log(path, start=configuration.robot.start, duration=configuration.robot.duration or None)
     if not log.scan_count:
         raise HmtSlamError(f"{path} has no scans in the part asked for: check --start and --duration")
-    return *measured_run(log, configuration), log.duration
+    return log, log.duration
 
 
-def measured_run(log: Log, configuration: Configuration) -> tuple[FinalMap, NDArray[np.int64], RunFigures]:
+def measured_run(
+    log: Log,
+    configuration: Configuration,
+    state: RunState | None = None,
+    keep: Callable[[RunState], None] | None = None,
+) -> tuple[FinalMap, NDArray[np.int64], RunFigures]:
     """Map a log, and measure what that costs.
 
+    :param state: to go on from.
+    :param keep: called with the state at the end of the log, before that is told.
     :returns: the map, the log's own stamps of all scans (n,), ns, and the figures.
     """
     wall, cpu = time.monotonic(), time.process_time()
     # Libraries and the log stay to the end: the garbage collector need not look through them again and again.
     gc.freeze()
     with Progress(log.scan_count, log.duration) as progress:
-        result = run_log(log, configuration, progress)
+        result = run_log(log, configuration, progress, state=state, keep=keep)
     begin = time.process_time()
     final = final_map(result.recorder.finish(result.stamps), corrected_scans(log, configuration), configuration)
     figures = RunFigures(

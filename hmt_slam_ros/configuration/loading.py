@@ -18,16 +18,20 @@ _FOREIGN = ("use_sim_time", "start_type_description_service", "qos_overrides.")
 
 
 def load_configuration(
-    file: Path | None = None, settings: Iterable[str] = (), seed: int | None = None
+    file: Path | None = None,
+    settings: Iterable[str] = (),
+    seed: int | None = None,
+    base: Configuration | None = None,
 ) -> Configuration:
     """The configuration of a run.
 
     :param file: YAML, either plain (``filter: {particles: 12}``) or as ROS reads it (``/**: ros__parameters: ...``).
     :param settings: texts ``name=value`` with dotted names, later ones winning.
     :param seed: the value of ``--seed``, which wins over both.
+    :param base: what they change, None for the defaults.
     :raises HmtSlamError: for a file that cannot be read, an unknown name or a value that cannot be.
     """
-    configuration = Configuration()
+    configuration = base or Configuration()
     if file is not None:
         configuration = with_changes(configuration, read_file(file))
     changes = dict(parse_setting(setting) for setting in settings)

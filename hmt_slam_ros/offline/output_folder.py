@@ -18,9 +18,13 @@ from hmt_slam_ros.evaluation import StampedPoses, write_tum
 from hmt_slam_ros.offline.final_map import FinalMap
 from hmt_slam_ros.offline.map_image import occupancy_image, write_map
 from hmt_slam_ros.offline.recorder import Recording, keyframe_poses
-from hmt_slam_ros.offline.report import RunFigures, report, write_cost, write_probabilities
-from hmt_slam_ros.offline.saved_map import MANIFEST, write_json, write_saved_map
+from hmt_slam_ros.offline.report import RunFigures, report, write_cost, write_probabilities, write_report
+from hmt_slam_ros.offline.saved_map import MapWriter
 from hmt_slam_ros.offline.topology_file import TOPOLOGY
+from hmt_slam_ros.persistence.folder import MANIFEST
+from hmt_slam_ros.persistence.replacing import put_in_place
+
+HMT_MAP = "hmt_map"
 
 # Everything that ever stands in an output folder; a folder with anything else in it is not ours to replace.
 OWN_NAMES = frozenset(
@@ -31,7 +35,7 @@ OWN_NAMES = frozenset(
         "map.pgm",
         "map.yaml",
         "map.png",
-        "hmt_map",
+        HMT_MAP,
         "graph.g2o",
         TOPOLOGY,
         "report.json",
@@ -62,9 +66,7 @@ def replacing(directory: Path) -> Iterator[Path]:
         yield folder
         check_replaceable(target)
         target.parent.mkdir(parents=True, exist_ok=True)
-        if target.exists():
-            target.rename(scratch / "old")
-        folder.rename(target)
+        put_in_place(folder, target)
     except OSError as fault:
         raise HmtSlamError(f"{directory} cannot be written ({fault.strerror}): choose another --out") from fault
     finally:
@@ -83,7 +85,7 @@ def check_replaceable(directory: Path) -> None:
         raise HmtSlamError(f"{directory} cannot be made since {blocking} is not a folder: choose another --out")
     names = {entry.name for entry in directory.iterdir()} if directory.exists() else set()
     strange = sorted(names - OWN_NAMES)
-    if strange or (names and not (directory / "hmt_map" / MANIFEST).is_file()):
+    if strange or (names and not (directory / HMT_MAP / MANIFEST).is_file()):
         found = strange[0] if strange else min(names)
         raise HmtSlamError(f"{directory} is not an output folder, it holds {found}: choose another --out or empty it")
 
@@ -94,11 +96,13 @@ def write_output(
     source_stamps: NDArray[np.int64],
     figures: RunFigures,
     configuration: Configuration,
+    state: MapWriter | None = None,
 ) -> None:
     """Write every file of a run.
 
     :param directory: an empty folder, see :func:`replacing`.
     :param source_stamps: shape (n,), the log's own stamps of all scans, ns, in file order.
+    :param state: of :func:`map_writer`, where the state of the run was kept.
     """
     recording = final.recording
     write_tum(directory / "trajectory.tum", StampedPoses(source_stamps, recording.trajectory))
@@ -107,15 +111,20 @@ def write_output(
     for name, trajectory in final.stages.items():
         write_tum(directory / "stages" / f"{name}.tum", StampedPoses(source_stamps, trajectory))
     _write_map(directory, recording, configuration)
-    write_saved_map(directory / "hmt_map", recording, configuration)
+    (state or map_writer(directory)).finish(recording, configuration)
     write_graph(directory / "graph.g2o", recording)
     write_probabilities(directory / "pmf.csv", recording.probabilities)
     write_cost(directory / "cost.csv", figures.seconds_per_scan)
-    write_json(directory / "report.json", report(recording, configuration, figures))
+    write_report(directory / "report.json", report(recording, configuration, figures))
     # matplotlib is loaded when the processes have given their memory back, and only where something is drawn.
     from hmt_slam_ros.offline.plots import plot_map  # noqa: PLC0415
 
     plot_map(directory)
+
+
+def map_writer(directory: Path) -> MapWriter:
+    """What writes the map of an output folder."""
+    return MapWriter(directory / HMT_MAP)
 
 
 def _write_map(directory: Path, recording: Recording, configuration: Configuration) -> None:

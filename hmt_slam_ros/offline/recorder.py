@@ -6,7 +6,7 @@ matter; :meth:`Recorder.finish` then goes through the keyframe events in their o
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TypeVar
 
@@ -17,17 +17,20 @@ from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.offline.record import EstimateTable, ProbabilityTable, Record, TopologyProbability
 from hmt_slam_ros.offline.trajectories import (
     Anchored,
     OnlinePose,
+    OnlinePoses,
     Trajectory,
+    Verdict,
     anchored,
     carried,
-    odometry_trajectory,
-    online_trajectory,
+    of_all,
 )
 from hmt_slam_ros.processes.messages import (
     Accepted,
+    AreaPose,
     Finished,
     Hypotheses,
     Keyframe,
@@ -42,36 +45,6 @@ from hmt_slam_ros.topology.hybrid_map import HybridMap
 from hmt_slam_ros.topology.shortest_path import reachable
 
 Numbered = TypeVar("Numbered", Keyframe, Hypotheses, Accepted)
-
-
-@dataclass(frozen=True)
-class TopologyProbability:
-    """P(gamma^t | d), Eq. (14), of one live topology at one keyframe event.
-
-    :ivar keyframe: the keyframe event.
-    :ivar stamp: of its scan, ns.
-    :ivar travelled: path length since the start, m.
-    :ivar hypothesis: id of the topology.
-    :ivar parent: id before the event.
-    :ivar probability: as TSBI gave it.
-    :ivar area: the robot's area.
-    :ivar areas: number of areas of the topology.
-    :ivar closures: number of arcs that closed a loop.
-    :ivar accepted: whether TLCA made this topology definite at this event.
-    :ivar unexamined: probability of topologies not among the live ones.
-    """
-
-    keyframe: int
-    stamp: int
-    travelled: float
-    hypothesis: int
-    parent: int
-    probability: float
-    area: int
-    areas: int
-    closures: int
-    accepted: bool
-    unexamined: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,6 +87,7 @@ class Recorder:
     """Value machine that answers nothing and remembers everything.
 
     :ivar configuration: that of the run, which goes into the output.
+    :ivar past: what was recorded before the run, if it goes on from there.
     :ivar keyframes: {keyframe event: message}, likewise ``hypotheses`` and ``accepted``.
     :ivar trails: {(hypothesis, first scan): message}.
     :ivar estimates: {scan index: what is kept of the message}; ``last``, the message of the last scan.
@@ -122,6 +96,7 @@ class Recorder:
     """
 
     configuration: Configuration
+    past: Record = field(default_factory=Record)
     keyframes: dict[int, Keyframe] = field(default_factory=dict)
     hypotheses: dict[int, Hypotheses] = field(default_factory=dict)
     accepted: dict[int, Accepted] = field(default_factory=dict)
@@ -130,6 +105,10 @@ class Recorder:
     last: LocalEstimate | None = None
     notices: dict[tuple[str, str], Notice] = field(default_factory=dict)
     finished: Finished | None = None
+
+    def __post_init__(self) -> None:
+        self.last = self.past.last
+        self.notices = {(notice.process, notice.text): notice for notice in self.past.notices}
 
     def handle(self, message: Message) -> list[Message]:
         """File a message; one that comes twice counts once."""
@@ -160,12 +139,57 @@ class Recorder:
     @property
     def complete(self) -> bool:
         """Whether the end has been heard and nothing is still on its way."""
-        events = len(self.keyframes)
+        events, estimates = len(self.keyframes), len(self.past.estimates.scans) + len(self.estimates)
         return (
             self.finished is not None
             and len(self.hypotheses) == len(self.accepted) == events
-            and len(self.estimates) >= self.finished.processed
+            and estimates >= self.finished.processed
         )
+
+    def record(self) -> Record:
+        """All that was heard up to now, when the answers to all keyframe events are here.
+
+        :raises HmtSlamError: where messages were lost on the way.
+        """
+        past, first = self.past, self.past.events
+        events = 1 + max([first - 1, *self.keyframes, *self.hypotheses, *self.accepted])
+        keyframes = _gapless("Keyframe", self.keyframes, first, events)
+        hypotheses = _gapless("Hypotheses", self.hypotheses, first, events)
+        accepted = _gapless("Accepted", self.accepted, first, events)
+        replica, sizes, probabilities = _replay(past, keyframes, hypotheses, accepted)
+        branched = {leaf.hypothesis: leaf.parent for message in hypotheses for leaf in _branched(message)}
+        given = [verdict.global_poses for verdict in accepted if verdict.global_poses]
+        found = replace(
+            past,
+            events=events,
+            replica=replica.state,
+            sizes=sizes,
+            parents={**past.parents, **branched},
+            probabilities=ProbabilityTable.of([*past.probabilities.rows(), *probabilities]),
+            global_poses=given[-1] if given else past.global_poses,
+            estimates=past.estimates.and_then(EstimateTable.of(self.estimates)),
+            online=np.concatenate((past.online, self._online(keyframes, accepted))),
+            last=self.last if self.last is None or not hypotheses else _in_area_now(self.last, hypotheses[-1]),
+            notices=tuple(self.notices.values()),
+        )
+        alive = {known for hypothesis in replica.maps for known in found.lineage(hypothesis)}
+        trails = {(trail.hypothesis, trail.first_scan): trail for trail in past.trails} | self.trails
+        return replace(
+            found,
+            parents={child: parent for child, parent in found.parents.items() if child in alive},
+            trails=tuple(trail for trail in trails.values() if trail.hypothesis in alive),
+        )
+
+    def _online(self, keyframes: list[Keyframe], accepted: list[Accepted]) -> Trajectory:
+        """The poses of the scans that came since the past."""
+        past = self.past
+        before = None if not past.online.size else (past.online[-1], past.estimates.odometry[-1])
+        verdicts = [
+            Verdict(keyframe.scan.stamp, {entry.area: entry.pose.mean for entry in verdict.global_poses})
+            for keyframe, verdict in zip(keyframes, accepted, strict=True)
+        ]
+        poses = OnlinePoses({entry.area: entry.pose.mean for entry in past.global_poses}, before)
+        return poses.of([self.estimates[scan] for scan in sorted(self.estimates)], verdicts)
 
     def finish(self, stamps: NDArray[np.int64]) -> Recording:
         """Work out the final map, trajectories and probabilities.
@@ -174,41 +198,28 @@ class Recorder:
             trajectories have a pose for each.
         :raises HmtSlamError: where no scan gave a pose, or messages were lost on the way.
         """
-        if self.last is None or not self.keyframes or self.finished is None:
+        if self.last is None or self.finished is None or not (self.keyframes or self.past.events):
             raise HmtSlamError(
                 f"none of the {stamps.size} scans gave a pose: check that their ranges lie between range_min and "
                 "range_max and that the log has odometry"
             )
-        events = 1 + max(max(heard) for heard in (self.keyframes, self.hypotheses, self.accepted) if heard)
-        keyframes = _gapless("Keyframe", self.keyframes, events)
-        hypotheses = _gapless("Hypotheses", self.hypotheses, events)
-        accepted = _gapless("Accepted", self.accepted, events)
-        replica, probabilities = _replay(keyframes, hypotheses, accepted)
-        area_poses = _area_poses(replica.maps[replica.best], accepted)
-        scans = anchored(stamps, self._own_trails(replica.best))
+        record = self.record()
+        assert record.last is not None
+        replica, given = Replica.of(record.replica), record.estimates
+        area_poses = _area_poses(replica.maps[replica.best], record.global_poses)
+        scans = anchored(stamps, record.own_trails(replica.best))
         return Recording(
             replica,
             area_poses,
             stamps,
             scans,
-            odometry_trajectory(stamps, self.estimates),
+            of_all(stamps, given.stamps, given.odometry),
             carried(scans, keyframe_poses(replica.maps[replica.best], area_poses)),
-            online_trajectory(stamps, self.estimates, keyframes, accepted),
-            probabilities,
-            _in_area_now(self.last, hypotheses[-1]),
+            of_all(stamps, given.stamps, record.online),
+            record.probabilities.rows(),
+            record.last,
             self.finished,
-            tuple(self.notices.values()),
-        )
-
-    def _own_trails(self, hypothesis: int) -> list[Trail]:
-        """The trails of a hypothesis and of its ancestors, in the order of their scans; ids are never used twice."""
-        parents = {leaf.hypothesis: leaf.parent for message in self.hypotheses.values() for leaf in _branched(message)}
-        lineage = [hypothesis]
-        while lineage[-1] in parents:
-            lineage.append(parents[lineage[-1]])
-        return sorted(
-            (trail for trail in self.trails.values() if trail.hypothesis in lineage),
-            key=lambda trail: (trail.first_scan, trail.hypothesis),
+            record.notices,
         )
 
 
@@ -224,17 +235,18 @@ def _branched(message: Hypotheses) -> list[Leaf]:
     return [leaf for leaf in message.leaves if leaf.hypothesis != leaf.parent]
 
 
-def _gapless(name: str, messages: dict[int, Numbered], events: int) -> list[Numbered]:
-    missing = next((sequence for sequence in range(events) if sequence not in messages), None)
+def _gapless(name: str, messages: dict[int, Numbered], first: int, events: int) -> list[Numbered]:
+    missing = next((sequence for sequence in range(first, events) if sequence not in messages), None)
     if missing is not None:
         raise HmtSlamError(f"the message {name} {missing} was lost: run again, with robot.paced=true in a replay")
-    return [messages[sequence] for sequence in range(events)]
+    return [messages[sequence] for sequence in range(first, events)]
 
 
 def _replay(
-    keyframes: list[Keyframe], hypotheses: list[Hypotheses], accepted: list[Accepted]
-) -> tuple[Replica, list[TopologyProbability]]:
-    replica, probabilities, sizes = Replica(), list[TopologyProbability](), dict[int, tuple[int, int]]()
+    past: Record, keyframes: list[Keyframe], hypotheses: list[Hypotheses], accepted: list[Accepted]
+) -> tuple[Replica, Mapping[int, tuple[int, int]], list[TopologyProbability]]:
+    """The maps after some events, their numbers of areas and loop closures, and the probabilities at the events."""
+    replica, sizes, probabilities = Replica.of(past.replica), past.sizes, list[TopologyProbability]()
     for keyframe, belief, verdict in zip(keyframes, hypotheses, accepted, strict=True):
         replica.add(keyframe)
         replica.apply(belief)
@@ -255,10 +267,10 @@ def _replay(
             for leaf in belief.leaves
         ]
         replica.accept(verdict)
-    return replica, probabilities
+    return replica, sizes, probabilities
 
 
-def _size(replica: Replica, leaf: Leaf, sizes: dict[int, tuple[int, int]]) -> tuple[int, int]:
+def _size(replica: Replica, leaf: Leaf, sizes: Mapping[int, tuple[int, int]]) -> tuple[int, int]:
     """Areas and loop closures of a leaf, counted anew only where the leaf changed."""
     if leaf.hypothesis in sizes and not (leaf.arcs or leaf.relabelled or leaf.withdrawn or leaf.merged):
         return sizes[leaf.hypothesis]
@@ -266,9 +278,9 @@ def _size(replica: Replica, leaf: Leaf, sizes: dict[int, tuple[int, int]]) -> tu
     return len(hybrid_map.area_ids()), sum(arc.closure for _, _, arc in hybrid_map.all_arcs())
 
 
-def _area_poses(hybrid_map: HybridMap, accepted: list[Accepted]) -> dict[int, PoseGaussian]:
+def _area_poses(hybrid_map: HybridMap, given: Sequence[AreaPose]) -> dict[int, PoseGaussian]:
     """``map_T_area`` of every area: as TLCA last gave it, else along the arcs from an area that TLCA did give."""
-    known = latest_poses(accepted)
+    known = {entry.area: entry.pose for entry in given}
     areas = hybrid_map.area_ids()
     start = next((area for area in areas if area in known), areas[0])
     along_arcs = reachable(hybrid_map, start)
@@ -285,9 +297,3 @@ def keyframe_poses(
         for area in hybrid_map.area_ids()
         for keyframe, pose in hybrid_map.keyframes(area).items()
     }
-
-
-def latest_poses(accepted: list[Accepted]) -> dict[int, PoseGaussian]:
-    """``map_T_area`` of the last verdict that gave any."""
-    given = next((verdict.global_poses for verdict in reversed(accepted) if verdict.global_poses), ())
-    return {entry.area: entry.pose for entry in given}

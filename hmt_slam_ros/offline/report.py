@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 import platform
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
@@ -16,7 +17,8 @@ from numpy.typing import NDArray
 from hmt_slam_ros import __version__
 from hmt_slam_ros.configuration import Configuration, as_nested
 from hmt_slam_ros.offline.memory import scan_bytes
-from hmt_slam_ros.offline.recorder import Recording, TopologyProbability
+from hmt_slam_ros.offline.record import TopologyProbability
+from hmt_slam_ros.offline.recorder import Recording
 
 _LIBRARIES = ("numpy", "scipy", "networkx", "numba", "rosbags", "matplotlib")
 
@@ -75,6 +77,11 @@ def report(recording: Recording, configuration: Configuration, figures: RunFigur
         "configuration": as_nested(configuration),
         "versions": _versions(),
     }
+
+
+def write_report(path: Path, content: Mapping[str, Any]) -> None:
+    """report.json."""
+    path.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
 
 def _cost(seconds: NDArray[np.float64]) -> dict[str, float]:

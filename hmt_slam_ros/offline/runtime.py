@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hmt_slam_ros.configuration.tree import Configuration
-from hmt_slam_ros.logs.records import Log
+from hmt_slam_ros.errors import HmtSlamError
+from hmt_slam_ros.logs.records import Log, LogRecord
+from hmt_slam_ros.logs.stamps import seconds_from_stamp
 from hmt_slam_ros.offline.recorder import Recorder
+from hmt_slam_ros.offline.saved_map import LogState, RunState
 from hmt_slam_ros.processes.aam import Aam
 from hmt_slam_ros.processes.messages import EndOfLog, Message
 from hmt_slam_ros.processes.routing import HEARD_BY, Process
@@ -63,7 +67,7 @@ class RunResult:
     :ivar recorder: what was said.
     :ivar stamps: shape (n,), int64, stamp of every scan on the log's running clock, ns, increasing.
     :ivar source_stamps: shape (n,), int64, the log's own stamp of every scan in file order, ns.
-    :ivar seconds_per_scan: {process: shape (n,) seconds}.
+    :ivar seconds_per_scan: {process: shape (m,) seconds}, of the scans that this run read.
     :ivar map_bytes: what the maps of all particles took at most.
     """
 
@@ -74,41 +78,123 @@ class RunResult:
     map_bytes: int
 
 
+class Run:
+    """The five processes and the recorder in lock-step, from the start or from a state on.
+
+    :ivar lock_step: that runs them.
+    :ivar recorder: that listens.
+    """
+
+    def __init__(
+        self,
+        configuration: Configuration,
+        abstraction: Callable[[Configuration], Process] | None = None,
+        state: RunState | None = None,
+    ) -> None:
+        """:param abstraction: what makes areas of keyframes instead of the AAM, such as nothing.
+
+        :param state: to go on from.
+        """
+        state = state or RunState()
+        self._slam = MetricSlam(configuration, state.slam)
+        self._aam = Aam(configuration, state.aam)
+        self._tsbi = Tsbi(configuration, state=state.tsbi)
+        self._tlca = Tlca(configuration, state.tlca)
+        self._rtl = Rtl(configuration, state.rtl)
+        self.recorder = Recorder(configuration, state.recorder)
+        self.lock_step = LockStep(
+            {
+                "slam": self._slam,
+                "aam": abstraction(configuration) if abstraction else self._aam,
+                "tsbi": self._tsbi,
+                "tlca": self._tlca,
+                "rtl": self._rtl,
+                "recorder": self.recorder,
+            }
+        )
+        self._records = state.log.records
+        self._stamps = list(zip(state.log.stamps.tolist(), state.log.source_stamps.tolist(), strict=True))
+        self._spent: list[dict[str, float]] = []
+
+    @property
+    def scans(self) -> int:
+        """Scans read."""
+        return len(self._stamps)
+
+    @property
+    def state(self) -> RunState:
+        """All that is known, between two records of the log."""
+        return RunState(
+            LogState(self._records, *self._columns()), self._slam.state, self._aam.state, self._tsbi.state,
+            self._tlca.state, self._rtl.state, self.recorder.record(),
+        )  # fmt: skip
+
+    def _columns(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Stamps of the scans, running and the log's own."""
+        running, source = np.array(self._stamps, dtype=np.int64).reshape(-1, 2).T.copy()
+        return running, source
+
+    def unread(self, log: Log) -> Iterator[LogRecord]:
+        """The records of a log that were not read.
+
+        :raises HmtSlamError: where it is another log than the one that was read.
+        """
+        records, scans = log.records(), iter(self._stamps)
+        for record in itertools.islice(records, self._records):
+            if isinstance(record.measurement, Scan) and next(scans, None) != _stamps(record):
+                raise HmtSlamError(
+                    f"{log.name} is not the log that the map was made of: a scan of it, at "
+                    f"{seconds_from_stamp(record.source_stamp)} s, is not in the map; give that log"
+                )
+        if next(scans, None) is not None:
+            raise HmtSlamError(
+                f"{log.name} ends before the last scan that the map was made of: give a larger --duration, or the log "
+                "that the map was made of"
+            )
+        return records
+
+    def read(self, record: LogRecord) -> None:
+        """Take in a record."""
+        self.lock_step.feed(record.measurement)
+        self._records += 1
+        if isinstance(record.measurement, Scan):
+            self._stamps.append(_stamps(record))
+            self._spent.append(self.lock_step.take_seconds())
+
+    def finish(self) -> RunResult:
+        """End the run."""
+        self.lock_step.feed(EndOfLog())
+        names = (name for name in self.lock_step.processes if name != "recorder")
+        seconds = {name: np.array([taken.get(name, 0.0) for taken in self._spent]) for name in names}
+        return RunResult(self.recorder, *self._columns(), seconds, self._slam.map_bytes)
+
+
+def _stamps(record: LogRecord) -> tuple[int, int]:
+    """Of a scan, running and the log's own, ns."""
+    return record.measurement.stamp, record.source_stamp
+
+
 def run_log(
     log: Log,
     configuration: Configuration,
     progress: Callable[[int], None] | None = None,
-    abstraction: Callable[[Configuration], Process] = Aam,
+    abstraction: Callable[[Configuration], Process] | None = None,
+    state: RunState | None = None,
+    keep: Callable[[RunState], None] | None = None,
 ) -> RunResult:
     """Map a whole log.
 
     :param progress: called with the number of scans read, after each.
-    :param abstraction: what makes areas of keyframes, such as nothing.
+    :param abstraction: what makes areas of keyframes instead of the AAM, such as nothing.
+    :param state: to go on from, at the first record that it does not know.
+    :param keep: called with the state after the last record, before the end of the log is told.
     :raises HmtSlamError: where the log is faulty.
     """
-    recorder, slam = Recorder(configuration), MetricSlam(configuration)
-    lock_step = LockStep(
-        {
-            "slam": slam,
-            "aam": abstraction(configuration),
-            "tsbi": Tsbi(configuration),
-            "tlca": Tlca(configuration),
-            "rtl": Rtl(configuration),
-            "recorder": recorder,
-        }
-    )
-    stamps: list[tuple[int, int]] = []
-    spent: list[dict[str, float]] = []
-    for record in log.records():
-        lock_step.feed(record.measurement)
-        if isinstance(record.measurement, Scan):
-            stamps.append((record.measurement.stamp, record.source_stamp))
-            spent.append(lock_step.take_seconds())
-            if progress:
-                progress(len(stamps))
-    lock_step.feed(EndOfLog())
-    seconds = {
-        name: np.array([taken.get(name, 0.0) for taken in spent]) for name in lock_step.processes if name != "recorder"
-    }
-    running, source = np.array(stamps, dtype=np.int64).reshape(-1, 2).T
-    return RunResult(recorder, running, source, seconds, slam.map_bytes)
+    run = Run(configuration, abstraction, state)
+    for record in run.unread(log):
+        run.read(record)
+        if progress and isinstance(record.measurement, Scan):
+            progress(run.scans)
+    if keep:
+        keep(run.state)
+    return run.finish()

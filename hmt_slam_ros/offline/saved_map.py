@@ -1,36 +1,87 @@
-"""The HMT map as a folder: written deterministically byte for byte, and read back complete.
+"""hmt_map/: the HMT map as a folder, the same byte for byte for the same run, and read back complete.
 
-manifest.json names format, version, seed, the robot's last pose and the probabilities; common.json holds the areas and
-arcs that all hypotheses agree on, hypotheses.json what each changes, global.json ``map_T_area`` of the most probable
-one, configuration.yaml the parameters (it serves as ``--config``), scans/*.npy the scans of the keyframes.
+Part ``map`` is the map at its best, after the final refinement; the others are the state from which a run goes on, as
+it was before that. docs/map_format.md describes every file and field.
 """
 
 from __future__ import annotations
 
-import json
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import get_type_hints
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hmt_slam_ros.arrays import Int64
 from hmt_slam_ros.configuration import Configuration, load_configuration
 from hmt_slam_ros.configuration.documents import ros_yaml
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.offline.record import Record
 from hmt_slam_ros.offline.recorder import Recording
-from hmt_slam_ros.processes.replica import Replica
-from hmt_slam_ros.sensing import Scan
-from hmt_slam_ros.topology.common_map import ArcValue
-from hmt_slam_ros.topology.hybrid_map import HybridMap
+from hmt_slam_ros.persistence.folder import FolderReader, FolderWriter
+from hmt_slam_ros.processes.aam import AamState
+from hmt_slam_ros.processes.messages import AreaPose, LocalEstimate
+from hmt_slam_ros.processes.replica import Replica, ReplicaState
+from hmt_slam_ros.processes.rtl import RtlState
+from hmt_slam_ros.processes.slam import SlamState
+from hmt_slam_ros.processes.tlca import TlcaState
+from hmt_slam_ros.processes.tsbi import TsbiState
 
-FORMAT, VERSION = "hmt_map", 3
-MANIFEST = "manifest.json"
+FORMAT, VERSION = "hmt_map", 4
 
-# Columns of scans/geometry.npy after which the laser's pose (x, y, theta) follows.
-_GEOMETRY = ("angle_min", "angle_increment", "range_min", "range_max", "time_increment")
+CONFIGURATION = "configuration.yaml"
+
+
+@dataclass(frozen=True, eq=False)
+class LogState:
+    """How far a log was read.
+
+    :ivar records: scans and odometry readings.
+    :ivar stamps: shape (n,), of the scans on the log's running clock, ns, increasing.
+    :ivar source_stamps: shape (n,), the log's own stamps of them, ns.
+    """
+
+    records: int = 0
+    stamps: Int64 = field(default_factory=lambda: np.zeros(0, np.int64))
+    source_stamps: Int64 = field(default_factory=lambda: np.zeros(0, np.int64))
+
+
+@dataclass(frozen=True, eq=False)
+class RunState:
+    """All that a run in lock-step knows between two records of its log, at first before the first one.
+
+    :ivar log: how far that was read.
+    :ivar slam: metric SLAM, and so on the other processes.
+    :ivar recorder: what the output folder needs of the run so far.
+    """
+
+    log: LogState = field(default_factory=LogState)
+    slam: SlamState = field(default_factory=SlamState)
+    aam: AamState = field(default_factory=AamState)
+    tsbi: TsbiState = field(default_factory=TsbiState)
+    tlca: TlcaState = field(default_factory=TlcaState)
+    rtl: RtlState = field(default_factory=RtlState)
+    recorder: Record = field(default_factory=Record)
+
+
+@dataclass(frozen=True, eq=False)
+class MapDocument:
+    """The map at its best.
+
+    :ivar replica: the maps of the live hypotheses; that of the most probable one is refined.
+    :ivar area_poses: ``map_T_area`` of all areas of the most probable hypothesis, ordered by id.
+    :ivar robot: where the robot was last.
+    """
+
+    replica: ReplicaState
+    area_poses: tuple[AreaPose, ...]
+    robot: LocalEstimate
+
+
+PARTS: Mapping[str, type] = get_type_hints(RunState)
+"""The parts of the state from which a run goes on."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,172 +98,51 @@ class SavedMap:
     configuration: Configuration
 
 
-def write_saved_map(directory: Path, recording: Recording, configuration: Configuration) -> None:
-    """Write the map of a run into a folder that is made."""
-    replica = recording.replica
-    scans = {keyframe: replica.scans[keyframe] for keyframe in _mapped_keyframes(replica.maps.values())}
-    directory.mkdir()
-    write_json(directory / MANIFEST, _manifest(recording, configuration, len(scans)))
-    write_json(directory / "common.json", _map_content(*_common_part(recording.hybrid_map)))
-    write_json(
-        directory / "hypotheses.json",
-        [
-            {
-                "id": hypothesis,
-                "robot_area": replica.areas[hypothesis],
-                "probability": replica.probabilities[hypothesis],
-            }
-            | _map_content(hybrid_map.areas, {pair: arc for pair, arc in hybrid_map.arcs.items() if arc is not None})
-            | {"withdrawn": sorted([a, b] for (a, b), arc in hybrid_map.arcs.items() if arc is None)}
-            for hypothesis, hybrid_map in sorted(replica.maps.items())
-        ],
-    )
-    write_json(
-        directory / "global.json",
-        [{"area": area} | _belief_content(pose) for area, pose in sorted(recording.area_poses.items())],
-    )
-    (directory / "configuration.yaml").write_text(ros_yaml(configuration), encoding="utf-8")
-    _write_scans(directory / "scans", scans)
+class MapWriter:
+    """Writes a map into a folder: first the state, if there is one to go on from, last the map at its best."""
+
+    def __init__(self, directory: Path) -> None:
+        """:param directory: to be made."""
+        self._folder = FolderWriter(directory)
+
+    def write_state(self, state: RunState) -> None:
+        """Write what a run goes on from."""
+        for name in PARTS:
+            self._folder.write(name, getattr(state, name))
+
+    def finish(self, recording: Recording, configuration: Configuration) -> None:
+        """Write the map and the manifest."""
+        replica, hybrid_map = recording.replica, recording.hybrid_map
+        mapped = sorted({k for own in replica.maps.values() for area in own.area_ids() for k in own.keyframes(area)})
+        scans = {keyframe: replica.scans[keyframe] for keyframe in mapped}
+        best = Replica(scans, replica.maps, replica.probabilities, replica.areas)
+        poses = tuple(AreaPose(area, pose) for area, pose in sorted(recording.area_poses.items()))
+        self._folder.write("map", MapDocument(best.state, poses, recording.last))
+        self._folder.write_text(CONFIGURATION, ros_yaml(configuration))
+        facts = {"seed": configuration.seed, "keyframes": len(mapped), "areas": len(hybrid_map.area_ids())}
+        self._folder.finish(FORMAT, VERSION, facts)
 
 
 def read_saved_map(directory: Path) -> SavedMap:
-    """Read a map back.
+    """Read the map at its best.
 
     :raises HmtSlamError: where the folder holds no map, one of another version, or a damaged one.
     """
-    try:
-        manifest = read_json(directory / MANIFEST)
-        if (manifest["format"], manifest["version"]) != (FORMAT, VERSION):
-            raise HmtSlamError(
-                f"{directory} is of version {manifest['version']}, this program reads {VERSION}: map the log again"
-            )
-        return SavedMap(
-            _read_replica(directory),
-            {entry["area"]: _belief(entry) for entry in read_json(directory / "global.json")},
-            load_configuration(directory / "configuration.yaml"),
+    document = FolderReader(directory, FORMAT, VERSION).read("map", MapDocument)
+    poses = {entry.area: entry.pose for entry in document.area_poses}
+    return SavedMap(Replica.of(document.replica), poses, load_configuration(directory / CONFIGURATION))
+
+
+def read_run_state(directory: Path) -> tuple[RunState, Configuration]:
+    """Read what a run goes on from, and the configuration with which it was made.
+
+    :raises HmtSlamError: as :func:`read_saved_map`, and where the map was saved without its state.
+    """
+    folder = FolderReader(directory, FORMAT, VERSION)
+    if not {f"{part}.json" for part in PARTS} <= folder.names:
+        raise HmtSlamError(
+            f"{directory} holds a map without the state of the processes, so that no run can go on from it: give one "
+            "that hmt_slam map wrote"
         )
-    except (OSError, ValueError, KeyError, TypeError, IndexError) as fault:
-        raise HmtSlamError(f"{directory} holds no complete HMT map: map the log again") from fault
-
-
-def write_json(path: Path, content: object) -> None:
-    """Write JSON that is the same byte for byte for the same content."""
-    path.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-
-
-def read_json(path: Path) -> Any:  # noqa: ANN401  whatever the document holds
-    """Read a JSON document."""
-    return json.loads(path.read_text(encoding="utf-8"))
-
-
-def _manifest(recording: Recording, configuration: Configuration, keyframes: int) -> dict[str, Any]:
-    last = recording.last
-    return {
-        "format": FORMAT,
-        "version": VERSION,
-        "seed": configuration.seed,
-        "keyframes": keyframes,
-        "areas": len(recording.area_poses),
-        "most_probable": recording.replica.best,
-        "robot": {"stamp": last.stamp, "area": last.area} | _belief_content(last.pose),
-    }
-
-
-def _mapped_keyframes(maps: Iterable[HybridMap]) -> list[int]:
-    return sorted({keyframe for m in maps for area in m.area_ids() for keyframe in m.keyframes(area)})
-
-
-def _common_part(
-    hybrid_map: HybridMap,
-) -> tuple[dict[int, Mapping[int, NDArray[np.float64]]], dict[tuple[int, int], ArcValue]]:
-    common = HybridMap(hybrid_map.common)
-    return (
-        {area: common.keyframes(area) for area in common.area_ids()},
-        {(a, b): arc for a, b, arc in common.all_arcs()},
-    )
-
-
-def _map_content(
-    areas: Mapping[int, Mapping[int, NDArray[np.float64]]], arcs: Mapping[tuple[int, int], ArcValue]
-) -> dict[str, Any]:
-    return {
-        "areas": [
-            {"id": area, "keyframes": [{"id": k, "pose": pose.tolist()} for k, pose in keyframes.items()]}
-            for area, keyframes in sorted(areas.items())
-        ],
-        "arcs": [
-            {"source": a, "target": b, "closure": arc.closure} | _belief_content(arc.pose)
-            for (a, b), arc in sorted(arcs.items())
-        ],
-    }
-
-
-def _belief_content(belief: PoseGaussian) -> dict[str, Any]:
-    return {"pose": belief.mean.tolist(), "covariance": belief.covariance.tolist()}
-
-
-def _belief(content: Mapping[str, Any]) -> PoseGaussian:
-    return PoseGaussian(np.array(content["pose"]), np.array(content["covariance"]))
-
-
-def _write_scans(directory: Path, scans: Mapping[int, Scan]) -> None:
-    directory.mkdir()
-    rows = list(scans.values())
-    arrays: dict[str, NDArray[Any]] = {
-        "keyframes": np.array(list(scans), dtype=np.int64),
-        "stamps": np.array([scan.stamp for scan in rows], dtype=np.int64),
-        "beams": np.array([scan.ranges.size for scan in rows], dtype=np.int64),
-        "geometry": np.array([[getattr(scan, name) for name in _GEOMETRY] for scan in rows], dtype=np.float64),
-        "laser_poses": np.array([scan.laser_pose for scan in rows], dtype=np.float64),
-        "motions": np.array([scan.motion for scan in rows], dtype=np.float64),
-        "ranges": np.concatenate([scan.ranges for scan in rows]).astype(np.float32, copy=False),
-    }
-    for name, array in arrays.items():
-        np.save(directory / f"{name}.npy", array)
-
-
-def _read_scans(directory: Path) -> dict[int, Scan]:
-    arrays = {
-        name: np.load(directory / f"{name}.npy")
-        for name in ("keyframes", "stamps", "beams", "geometry", "laser_poses", "motions", "ranges")
-    }
-    ends = np.cumsum(arrays["beams"])[:-1]
-    return {
-        int(keyframe): Scan(
-            stamp=int(stamp),
-            ranges=ranges,
-            laser_pose=laser_pose,
-            motion=motion,
-            **dict(zip(_GEOMETRY, geometry, strict=True)),
-        )
-        for keyframe, stamp, ranges, geometry, laser_pose, motion in zip(
-            arrays["keyframes"],
-            arrays["stamps"],
-            np.split(arrays["ranges"], ends),
-            arrays["geometry"].tolist(),
-            arrays["laser_poses"],
-            arrays["motions"],
-            strict=True,
-        )
-    }
-
-
-def _read_replica(directory: Path) -> Replica:
-    common = _read_map(read_json(directory / "common.json"), HybridMap())
-    common.absorb()
-    replica = Replica(_read_scans(directory / "scans"), {}, {}, {})
-    for entry in read_json(directory / "hypotheses.json"):
-        hybrid_map = replica.maps[entry["id"]] = _read_map(entry, HybridMap(common.common))
-        for a, b in entry["withdrawn"]:
-            hybrid_map.remove_arc(a, b)
-        replica.probabilities[entry["id"]] = entry["probability"]
-        replica.areas[entry["id"]] = entry["robot_area"]
-    return replica
-
-
-def _read_map(content: Mapping[str, Any], hybrid_map: HybridMap) -> HybridMap:
-    for area in content["areas"]:
-        hybrid_map.areas[area["id"]] = {entry["id"]: np.array(entry["pose"]) for entry in area["keyframes"]}
-    for arc in content["arcs"]:
-        hybrid_map.set_arc(arc["source"], arc["target"], _belief(arc), closure=arc["closure"])
-    return hybrid_map
+    state = RunState(**{name: folder.read(name, kind) for name, kind in PARTS.items()})
+    return state, load_configuration(directory / CONFIGURATION)

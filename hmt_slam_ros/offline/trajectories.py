@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.processes.messages import Accepted, Keyframe, Trail
+from hmt_slam_ros.processes.messages import Trail
 from hmt_slam_ros.processes.replica import FIRST_AREA
 
 Trajectory = NDArray[np.float64]
@@ -71,49 +71,62 @@ def carried(scans: Anchored, keyframes: Mapping[int, NDArray[np.float64]]) -> Tr
     return _filled(poses)
 
 
-def odometry_trajectory(stamps: NDArray[np.int64], estimates: Mapping[int, OnlinePose]) -> Trajectory:
-    """``odom_T_base`` at every scan, shape (n, 3).
+def of_all(stamps: NDArray[np.int64], given: NDArray[np.int64], poses: Trajectory) -> Trajectory:
+    """A pose for every scan, of which some are given.
 
     :param stamps: shape (n,), of all scans, ns, increasing.
+    :param given: shape (m,), stamps of those whose poses are given.
+    :param poses: shape (m, 3), these poses.
+    :raises HmtSlamError: where a stamp is of none of the scans, or no pose is given.
     """
-    poses = np.full((stamps.size, 3), np.nan)
-    given = list(estimates.values())
-    poses[_rows(stamps, np.array([estimate.stamp for estimate in given], dtype=np.int64))] = np.array(
-        [estimate.odometry for estimate in given]
-    )
-    return _filled(poses)
+    found = np.full((stamps.size, 3), np.nan)
+    found[_rows(stamps, given)] = poses
+    return _filled(found)
 
 
-def online_trajectory(
-    stamps: NDArray[np.int64],
-    estimates: Mapping[int, OnlinePose],
-    keyframes: Sequence[Keyframe],
-    accepted: Sequence[Accepted],
-) -> Trajectory:
-    """``map_T_base`` of every scan from what was known when it was taken.
+class Verdict(NamedTuple):
+    """TLCA's answer to a keyframe event.
+
+    :ivar stamp: of the keyframe's scan, ns.
+    :ivar areas: {area: ``map_T_area``, shape (3,)}, empty where they stay as they were.
+    """
+
+    stamp: int
+    areas: Mapping[int, NDArray[np.float64]]
+
+
+class OnlinePoses:
+    """``map_T_base`` of one scan after the other from what was known when it was taken.
 
     The verdict on a keyframe holds for the scans after it. In an area that no verdict has placed yet, the pose goes on
     from the one before it along the odometry.
-
-    :param stamps: shape (n,), of all scans, ns, increasing.
     """
-    poses = np.full((stamps.size, 3), np.nan)
-    rows = _rows(stamps, np.array([estimates[index].stamp for index in sorted(estimates)], dtype=np.int64))
-    areas = {FIRST_AREA: np.zeros(3)}
-    verdicts, previous = 0, None
-    for row, index in zip(rows, sorted(estimates), strict=True):
-        estimate = estimates[index]
-        while verdicts < len(keyframes) and keyframes[verdicts].scan.stamp < estimate.stamp:
-            given = accepted[verdicts].global_poses
-            areas = {entry.area: entry.pose.mean for entry in given} if given else areas
-            verdicts += 1
-        if estimate.area in areas or previous is None:
-            pose = se2.compose(areas.get(estimate.area, np.zeros(3)), estimate.pose)
-        else:
-            pose = se2.compose(previous[0], se2.between(previous[1], estimate.odometry))
-        poses[row] = pose
-        previous = (pose, estimate.odometry)
-    return _filled(poses)
+
+    def __init__(
+        self, areas: Mapping[int, NDArray[np.float64]], previous: tuple[NDArray[np.float64], NDArray[np.float64]] | None
+    ) -> None:
+        """:param areas: {area: ``map_T_area``}, of the last verdict that gave any; empty before the first.
+
+        :param previous: of the scan before, ``map_T_base`` and ``odom_T_base``, shape (3,); None before the first.
+        """
+        self._areas = areas or {FIRST_AREA: np.zeros(3)}
+        self._previous = previous
+
+    def of(self, estimates: Sequence[OnlinePose], verdicts: Sequence[Verdict]) -> Trajectory:
+        """The poses of the scans to come, shape (n, 3)."""
+        poses, given = np.zeros((len(estimates), 3)), 0
+        for k, estimate in enumerate(estimates):
+            while given < len(verdicts) and verdicts[given].stamp < estimate.stamp:
+                self._areas = verdicts[given].areas or self._areas
+                given += 1
+            poses[k] = self._placed(estimate)
+            self._previous = (poses[k], estimate.odometry)
+        return poses
+
+    def _placed(self, estimate: OnlinePose) -> NDArray[np.float64]:
+        if estimate.area in self._areas or self._previous is None:
+            return se2.compose(self._areas.get(estimate.area, np.zeros(3)), estimate.pose)
+        return se2.compose(self._previous[0], se2.between(self._previous[1], estimate.odometry))
 
 
 def _rows(stamps: NDArray[np.int64], wanted: NDArray[np.int64]) -> NDArray[np.intp]:

@@ -1,0 +1,43 @@
+"""A run that goes on from a saved map: what it starts with, and what of its configuration may differ."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from hmt_slam_ros.configuration import Configuration
+from hmt_slam_ros.configuration.flat import as_flat
+from hmt_slam_ros.errors import HmtSlamError
+from hmt_slam_ros.offline.output_folder import HMT_MAP
+
+# Which part of a log is used, and how it is played.
+_FREE = "robot."
+# What the numbers in the state mean depends on these.
+SHAPING = ("robot.start", "filter.particles", "local_map.cell", "local_map.extent", "local_map.field_radius")
+
+
+def map_folder(path: Path) -> Path:
+    """The folder of the map, where that or the output folder around it is given."""
+    inner = path / HMT_MAP
+    return inner if inner.is_dir() else path
+
+
+def differences(saved: Configuration, asked: Configuration) -> str | None:
+    """A sentence about the parameters that change as the run goes on, None where none does.
+
+    :param saved: the configuration of the map.
+    :raises HmtSlamError: where one of them cannot change.
+    """
+    before, now = as_flat(saved), as_flat(asked)
+    changed = [name for name in before if before[name] != now[name]]
+    fixed = [name for name in changed if name in SHAPING]
+    if fixed:
+        raise HmtSlamError(
+            f"the map was made with {_listed(fixed, before)}, not with {_listed(fixed, now)}, and cannot go on with "
+            "another value: leave that away, or map the log anew"
+        )
+    free = [name for name in changed if not name.startswith(_FREE)]
+    return f"goes on with {_listed(free, now)}; the map was made with {_listed(free, before)}" if free else None
+
+
+def _listed(names: list[str], values: dict[str, bool | int | float | str]) -> str:
+    return " and ".join(f"{name} = {values[name]}" for name in names)

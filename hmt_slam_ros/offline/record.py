@@ -1,0 +1,169 @@
+"""What the output folder needs of a run so far, without the messages from which it came."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+import numpy as np
+
+from hmt_slam_ros.arrays import Bool, Float64, Int64
+from hmt_slam_ros.offline.trajectories import OnlinePose
+from hmt_slam_ros.processes.messages import AreaPose, LocalEstimate, Notice, Trail
+from hmt_slam_ros.processes.replica import ReplicaState
+
+
+@dataclass(frozen=True)
+class TopologyProbability:
+    """P(gamma^t | d), Eq. (14), of one live topology at one keyframe event.
+
+    :ivar keyframe: the keyframe event.
+    :ivar stamp: of its scan, ns.
+    :ivar travelled: path length since the start, m.
+    :ivar hypothesis: id of the topology.
+    :ivar parent: id before the event.
+    :ivar probability: as TSBI gave it.
+    :ivar area: the robot's area.
+    :ivar areas: number of areas of the topology.
+    :ivar closures: number of arcs that closed a loop.
+    :ivar accepted: whether TLCA made this topology definite at this event.
+    :ivar unexamined: probability of topologies not among the live ones.
+    """
+
+    keyframe: int
+    stamp: int
+    travelled: float
+    hypothesis: int
+    parent: int
+    probability: float
+    area: int
+    areas: int
+    closures: int
+    accepted: bool
+    unexamined: float
+
+
+@dataclass(frozen=True, eq=False)
+class ProbabilityTable:
+    """The probabilities of all live topologies at all keyframe events, each column of shape (n,).
+
+    :ivar keyframe: the keyframe event.
+    :ivar stamp: of its scan, ns.
+    :ivar travelled: path length since the start, m.
+    :ivar hypothesis: id of the topology.
+    :ivar parent: id before the event.
+    :ivar probability: as TSBI gave it.
+    :ivar area: the robot's area.
+    :ivar areas: number of areas of the topology.
+    :ivar closures: number of arcs that closed a loop.
+    :ivar accepted: whether TLCA made this topology definite at this event.
+    :ivar unexamined: probability of topologies not among the live ones.
+    """
+
+    keyframe: Int64
+    stamp: Int64
+    travelled: Float64
+    hypothesis: Int64
+    parent: Int64
+    probability: Float64
+    area: Int64
+    areas: Int64
+    closures: Int64
+    accepted: Bool
+    unexamined: Float64
+
+    @classmethod
+    def of(cls, rows: Iterable[TopologyProbability] = ()) -> ProbabilityTable:
+        """Of some rows."""
+        kept = list(rows)
+        kinds = {"int": np.int64, "float": np.float64, "bool": np.bool_}
+        columns: dict[str, Any] = {
+            entry.name: np.array([getattr(row, entry.name) for row in kept], dtype=kinds[str(entry.type)])
+            for entry in fields(TopologyProbability)
+        }
+        return cls(**columns)
+
+    def rows(self) -> list[TopologyProbability]:
+        """Its rows."""
+        columns = [getattr(self, entry.name).tolist() for entry in fields(self)]
+        return [TopologyProbability(*row) for row in zip(*columns, strict=True)]
+
+
+@dataclass(frozen=True, eq=False)
+class EstimateTable:
+    """What metric SLAM said of every scan, in their order.
+
+    :ivar scans: shape (n,), number of the scan.
+    :ivar stamps: shape (n,), ns.
+    :ivar areas: shape (n,), the robot's area.
+    :ivar poses: shape (n, 3), ``area_T_base``, m and rad.
+    :ivar odometry: shape (n, 3), ``odom_T_base``, m and rad.
+    """
+
+    scans: Int64
+    stamps: Int64
+    areas: Int64
+    poses: Float64
+    odometry: Float64
+
+    @classmethod
+    def of(cls, estimates: Mapping[int, OnlinePose]) -> EstimateTable:
+        """Of {number of the scan: what was said of it}."""
+        numbers = sorted(estimates)
+        rows = [estimates[number] for number in numbers]
+        return cls(
+            np.array(numbers, dtype=np.int64),
+            np.array([row.stamp for row in rows], dtype=np.int64),
+            np.array([row.area for row in rows], dtype=np.int64),
+            np.array([row.pose for row in rows]).reshape(-1, 3),
+            np.array([row.odometry for row in rows]).reshape(-1, 3),
+        )
+
+    def and_then(self, later: EstimateTable) -> EstimateTable:
+        """With those of later scans."""
+        both = ((getattr(self, entry.name), getattr(later, entry.name)) for entry in fields(self))
+        return EstimateTable(*(np.concatenate(columns) for columns in both))
+
+
+@dataclass(frozen=True, eq=False)
+class Record:
+    """A run up to some moment between two keyframe events.
+
+    :ivar events: keyframe events.
+    :ivar replica: the maps of the live hypotheses.
+    :ivar sizes: {hypothesis: numbers of its areas and of its arcs that closed a loop}.
+    :ivar parents: {hypothesis: the one from which it branched}, of the live ones and their ancestors.
+    :ivar probabilities: of every live topology at every keyframe event, in their order.
+    :ivar global_poses: ``map_T_area`` as TLCA told it last, ordered by area.
+    :ivar trails: where scans were taken, of the live hypotheses and their ancestors.
+    :ivar estimates: what metric SLAM said of every scan.
+    :ivar online: shape (n, 3), ``map_T_base`` of these scans as it was known at the time.
+    :ivar last: the last of what metric SLAM said, None before the first.
+    :ivar notices: what the processes had to tell a person.
+    """
+
+    events: int = 0
+    replica: ReplicaState = field(default_factory=ReplicaState)
+    sizes: Mapping[int, tuple[int, int]] = field(default_factory=dict)
+    parents: Mapping[int, int] = field(default_factory=dict)
+    probabilities: ProbabilityTable = field(default_factory=ProbabilityTable.of)
+    global_poses: tuple[AreaPose, ...] = ()
+    trails: tuple[Trail, ...] = ()
+    estimates: EstimateTable = field(default_factory=lambda: EstimateTable.of({}))
+    online: Float64 = field(default_factory=lambda: np.zeros((0, 3)))
+    last: LocalEstimate | None = None
+    notices: tuple[Notice, ...] = ()
+
+    def lineage(self, hypothesis: int) -> list[int]:
+        """A hypothesis and its ancestors; ids are never used twice."""
+        found = [hypothesis]
+        while found[-1] in self.parents:
+            found.append(self.parents[found[-1]])
+        return found
+
+    def own_trails(self, hypothesis: int) -> list[Trail]:
+        """The trails of a hypothesis and of its ancestors, in the order of their scans."""
+        lineage = set(self.lineage(hypothesis))
+        own = (trail for trail in self.trails if trail.hypothesis in lineage)
+        return sorted(own, key=lambda trail: (trail.first_scan, trail.hypothesis))

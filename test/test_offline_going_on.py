@@ -1,0 +1,208 @@
+"""A run that was saved and goes on is the run that never stopped, to the byte."""
+
+import dataclasses
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from misled import misled
+
+from hmt_slam_ros.cli import map_command
+from hmt_slam_ros.cli.arguments import parser
+from hmt_slam_ros.configuration import Configuration, load_configuration, with_changes
+from hmt_slam_ros.errors import HmtSlamError
+from hmt_slam_ros.logs import open_log
+from hmt_slam_ros.offline.going_on import differences, map_folder
+from hmt_slam_ros.offline.runtime import Run, run_log
+from hmt_slam_ros.offline.saved_map import PARTS, RunState, read_run_state
+from hmt_slam_ros.persistence.folder import FolderReader, FolderWriter
+from hmt_slam_ros.processes.tsbi import Tsbi
+from hmt_slam_ros.processes.tsbi_branching import Branching
+from hmt_slam_ros.sensing import Scan
+
+LOG = Path(__file__).parents[1] / "data" / "malaga_one_loop"
+
+def contents(directory):
+    return {path.name: path.read_bytes() for path in sorted(directory.iterdir())}
+
+
+def written(directory, state):
+    """A folder with nothing but the state of a run."""
+    writer = FolderWriter(directory)
+    for name in PARTS:
+        writer.write(name, getattr(state, name))
+    writer.finish("state", 1, {})
+    return directory
+
+
+def read(directory):
+    folder = FolderReader(directory, "state", 1)
+    return RunState(**{name: folder.read(name, kind) for name, kind in PARTS.items()})
+
+
+def same_outcome(one, other):
+    for name in ("trajectory", "online", "odometry"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+    assert one.probabilities == other.probabilities
+    assert [notice.text for notice in one.notices] == [notice.text for notice in other.notices]
+    assert dataclasses.astuple(one.totals) == dataclasses.astuple(other.totals)
+
+
+def beginning(configuration, branching):
+    """A run whose TSBI makes the children of hypotheses in some way."""
+    run = Run(configuration)
+    run.lock_step.processes["tsbi"] = run._tsbi = Tsbi(configuration, branching)
+    return run
+
+
+def compared(log, folder, stops, branching=lambda: Branching):
+    """Compare a run that stops after some records with one that does not.
+
+    :param stops: (number of the record, state of TSBI) -> whether it is saved then, and another goes on.
+    :param branching: makes what makes the children of hypotheses until it stops for the first time.
+    :returns: the states of TSBI where it stopped.
+    """
+    configuration = Configuration()
+    whole, run, stopped = beginning(configuration, branching()), beginning(configuration, branching()), []
+    for number, record in enumerate(log.records()):
+        whole.read(record)
+        run.read(record)
+        if stops(number, run._tsbi.state):
+            state = run.state
+            stopped.append(state.tsbi)
+            run = Run(configuration, state=read(written(folder / str(number), state)))
+    assert contents(written(folder / "stopped", run.state)) == contents(written(folder / "whole", whole.state))
+    same_outcome(*(end.recorder.finish(end.stamps) for end in (run.finish(), whole.finish())))
+    return stopped
+
+
+def once(*conditions):
+    """When to stop: when each of some conditions on TSBI's state holds for the first time."""
+    open_ones = list(conditions)
+
+    def stops(_, state):
+        met = [condition for condition in open_ones if condition(state)]
+        open_ones[:] = [condition for condition in open_ones if condition not in met]
+        return bool(met)
+
+    return stops
+
+
+def test_a_run_that_stops_again_and_again_ends_as_one_that_does_not(tmp_path):
+    """Also where two hypotheses are alive, and between an odometry reading and its scan."""
+    several = once(lambda state: len(state.notes) > 1)
+    stopped = compared(open_log(LOG), tmp_path, lambda number, state: number % 77 == 7 or several(number, state))
+    assert len(stopped) > 5
+    assert max(len(state.notes) for state in stopped) == 2
+
+
+def test_a_run_in_which_closures_were_accepted_and_areas_became_one_can_stop(tmp_path):
+    def closed(state):
+        return state.replica.common.closures.any()
+
+    def merged(state):
+        return len(state.replica.common.areas) <= state.replica.largest
+
+    several = once(lambda state: len(state.notes) > 1, closed, merged)
+    stopped = compared(open_log("sim:grid,seed=1,count=2", duration=110.0), tmp_path, several)
+    assert len(stopped) == 3
+
+
+def test_a_run_in_which_a_closure_is_doubted_can_stop_before_the_question_is_answered(tmp_path):
+    log = open_log("sim:ring,seed=3,size=1.5", duration=165.0)
+    (stopped,) = compared(log, tmp_path, once(lambda state: state.reopened), lambda: misled(2, 0, 3.8))
+    assert [ends.source for ends in stopped.reopened[0].withdrawn] == [0]
+
+
+def test_before_the_first_scan_and_after_the_last_a_run_can_stop_as_well(tmp_path):
+    log = open_log(LOG, duration=3.0)
+    last = sum(1 for _ in log.records()) - 1
+    assert len(compared(log, tmp_path, lambda number, _: number in (0, 1, last))) == 3
+
+
+def test_scans_without_odometry_wait_in_the_saved_map_as_well(tmp_path):
+    """A log without odometry: scans wait, until patience ends."""
+    scans = [record for record in open_log(LOG, duration=8.0).records() if isinstance(record.measurement, Scan)]
+    whole, run = Run(Configuration()), Run(Configuration())
+    for record in scans[:3]:
+        whole.read(record)
+        run.read(record)
+    state = run.state
+    assert len(state.slam.queue) == 3
+    run = Run(Configuration(), state=read(written(tmp_path / "waiting", state)))
+    for record in scans[3:]:
+        whole.read(record)
+        run.read(record)
+    same_outcome(*(end.recorder.finish(end.stamps) for end in (run.finish(), whole.finish())))
+
+
+def mapped(folder, *options):
+    command = [sys.executable, "-m", "hmt_slam_ros.cli.main", "map", str(LOG), "--out", str(folder), *options]
+    return subprocess.run(command, check=False, timeout=300, capture_output=True, text=True)
+
+
+@pytest.fixture(scope="module")
+def first(tmp_path_factory):
+    """The map of the first seconds, with parameters of its own."""
+    folder = tmp_path_factory.mktemp("maps") / "first"
+    done = mapped(folder, "--duration", "6", "--seed", "3", "--set", "aam.persistence=3")
+    assert done.returncode == 0, done.stderr
+    return folder
+
+
+def test_the_command_goes_on_with_the_parameters_of_the_map_which_it_may_replace(first, tmp_path):
+    shutil.copytree(first, tmp_path / "on")
+    for folder, options in {
+        "whole": ("--seed", "3", "--set", "aam.persistence=3"),
+        "on": ("--from", str(tmp_path / "on")),
+    }.items():
+        done = mapped(tmp_path / folder, "--duration", "12", *options)
+        assert done.returncode == 0, done.stderr
+    assert contents(tmp_path / "whole" / "hmt_map") == contents(tmp_path / "on" / "hmt_map")
+    for name in ("trajectory.tum", "trajectory_online.tum", "pmf.csv", "map.pgm", "graph.g2o"):
+        assert (tmp_path / "whole" / name).read_bytes() == (tmp_path / "on" / name).read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        (("--set", "filter.particles=5"), "the map was made with filter.particles = 12, not with filter.particles = 5"),
+        (("--start", "2"), "the map was made with robot.start = 0.0, not with robot.start = 2.0"),
+        (("--duration", "3"), "malaga_one_loop ends before the last scan that the map was made of"),
+    ],
+)
+def test_what_cannot_go_on_is_refused_and_nothing_is_left(first, tmp_path, options, sentence):
+    arguments = ["map", str(LOG), "--out", str(tmp_path / "out"), "--from", str(first), *options]
+    with pytest.raises(HmtSlamError, match=sentence):
+        map_command.run(parser().parse_args(arguments))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_another_log_is_refused(first):
+    state, configuration = read_run_state(first / "hmt_map")
+    with pytest.raises(HmtSlamError, match=r"not the log that the map was made of: a scan of it, at 1000\.0+ s"):
+        run_log(open_log("sim:ring", duration=10.0), configuration, state=state)
+
+
+def test_parameters_that_may_change_are_told_with_both_values():
+    saved = with_changes(Configuration(), {"tlca.accept_probability": 0.9, "robot.duration": 60.0})
+    assert differences(saved, with_changes(saved, {"robot.duration": 0.0})) is None
+    told = differences(saved, with_changes(saved, {"tlca.accept_probability": 0.95, "seed": 4}))
+    assert told == (
+        "goes on with seed = 4 and tlca.accept_probability = 0.95; the map was made with seed = 0 and "
+        "tlca.accept_probability = 0.9"
+    )
+
+
+def test_the_configuration_of_a_map_serves_as_a_file_of_parameters(first):
+    assert load_configuration(map_folder(first) / "configuration.yaml").seed == 3
+
+
+def test_no_field_of_a_saved_map_goes_undescribed():
+    text = (Path(__file__).parents[1] / "docs" / "map_format.md").read_text(encoding="utf-8")
+    rows = [line.split(" | ") for line in text.splitlines() if line.startswith("| `")]
+    assert len(rows) > 200
+    assert [row[0] for row in rows if len(row[2].strip(" |")) < 3] == []
