@@ -34,7 +34,7 @@ def plain(value: object, forms: Mapping[type, Callable[[Any], object]]) -> Any: 
     """
     if value is None or type(value) in (int, float, str, bool):
         return value
-    form = next((form for kind, form in forms.items() if isinstance(value, kind)), None)
+    form = forms.get(type(value))
     if form is not None:
         return form(value)
     if is_record(type(value)):

@@ -12,7 +12,7 @@ import pytest
 import yaml
 
 from hmt_slam_ros import __version__
-from hmt_slam_ros.configuration import Configuration, as_nested
+from hmt_slam_ros.configuration import Configuration, as_nested, load_configuration
 
 ROOT = Path(__file__).resolve().parents[1]
 BAG = ROOT / "data" / "malaga_one_loop"
@@ -172,8 +172,7 @@ def test_map_makes_the_folder_and_replaces_it_and_plot_draws_from_it(tmp_path: P
         assert result.returncode == 0, result.stderr
         assert result.stdout.splitlines()[-1].startswith(f"{out}: ")
         assert ", 0 dropped" in result.stdout
-        manifest = yaml.safe_load((out / "hmt_map" / "manifest.json").read_text())
-        assert manifest["seed"] == seed
+        assert load_configuration(out / "hmt_map" / "configuration.yaml").seed == seed
     assert [entry.name for entry in out.parent.iterdir()] == ["out"]
     drawn = hmt_slam("plot", out)
     assert drawn.returncode == 0, drawn.stderr

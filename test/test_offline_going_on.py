@@ -34,7 +34,7 @@ def written(directory, state):
     writer = FolderWriter(directory)
     for name in PARTS:
         writer.write(name, getattr(state, name))
-    writer.finish("state", 1, {})
+    writer.finish("state", 1)
     return directory
 
 

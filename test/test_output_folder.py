@@ -321,7 +321,9 @@ def test_the_saved_map_keeps_that_a_hypothesis_lacks_an_arc(tmp_path: Path) -> N
         recorder.hypotheses[k] = Hypotheses(k, (Leaf(1, 1, 0.6, 1, withdrawn=withdrawn), Leaf(2, 2, 0.4, 0)))
         recorder.accepted[k] = Accepted(k)
     recording = recorder.finish(STAMPS)
-    MapWriter(tmp_path / "hmt_map").finish(recording, recorder.configuration)
+    writer = MapWriter(tmp_path / "hmt_map")
+    writer.write_map(recording.replica, recording.area_poses, recording.last)
+    writer.finish(recorder.configuration)
     saved = read_saved_map(tmp_path / "hmt_map")
     assert list(saved.replica.maps[1].arcs) == [(0, 1)]
     assert saved.replica.maps[1].arc(0, 1) is None

@@ -75,7 +75,7 @@ def written(directory, document=None, version=3):
     writer.write("notes", document)
     writer.write("more", document)
     writer.write_text("words.txt", "hear\n")
-    writer.finish("book", version, {"pages": 2})
+    writer.finish("book", version)
     return directory
 
 
@@ -159,7 +159,7 @@ def test_what_else_a_manifest_can_be_has_its_sentence(tmp_path):
         whole[:40]: "manifest.json is truncated or damaged, it is no JSON: take a copy",
         whole.replace('"book"', '"menu"'): "is of something else than a book: give an output folder, or the book in it",
         "[]": "is of something else than a book",
-        whole.replace('"pages": 2', '"pages": 3'): "manifest.json is damaged, it is not as it was written: take a copy",
+        whole.replace('"bytes"', '"size"'): "manifest.json is damaged, it is not as it was written: take a copy",
     }.items():
         path.write_text(content)
         with pytest.raises(HmtSlamError, match=sentence):
@@ -196,7 +196,7 @@ def test_an_array_beyond_its_file_and_a_key_that_comes_twice_are_refused(tmp_pat
         text = (directory / "notes.json").read_text()
         assert old in text
         writer.write_text("notes.json", text.replace(old, new))
-        writer.finish("book", 3, {})
+        writer.finish("book", 3)
         with pytest.raises(HmtSlamError, match=sentence):
             read(directory)
 

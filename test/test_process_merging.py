@@ -104,7 +104,9 @@ def test_loops_stay_closed(drive):
 
 def test_the_saved_map_has_the_areas_that_are_left(drive, tmp_path):
     recording, _ = drive
-    MapWriter(tmp_path / "hmt_map").finish(recording, Configuration())
+    writer = MapWriter(tmp_path / "hmt_map")
+    writer.write_map(recording.replica, recording.area_poses, recording.last)
+    writer.finish(Configuration())
     saved = read_saved_map(tmp_path / "hmt_map")
     best = saved.replica.maps[saved.replica.best]
     assert best.area_ids() == recording.hybrid_map.area_ids() == sorted(saved.area_poses)

@@ -111,7 +111,9 @@ def write_output(
     for name, trajectory in final.stages.items():
         write_tum(directory / "stages" / f"{name}.tum", StampedPoses(source_stamps, trajectory))
     _write_map(directory, recording, configuration)
-    (state or map_writer(directory)).finish(recording, configuration)
+    saved = state or map_writer(directory)
+    saved.write_map(recording.replica, recording.area_poses, recording.last)
+    saved.finish(configuration)
     write_graph(directory / "graph.g2o", recording)
     write_probabilities(directory / "pmf.csv", recording.probabilities)
     write_cost(directory / "cost.csv", figures.seconds_per_scan)

@@ -127,6 +127,48 @@ class EstimateTable:
 
 
 @dataclass(frozen=True, eq=False)
+class TrailTable:
+    """Where scans were taken, under one hypothesis or another, one trail after the other.
+
+    :ivar hypotheses: shape (n,), of each trail.
+    :ivar first_scans: shape (n,), number of the first scan of each.
+    :ivar sizes: shape (n,), how many scans each has.
+    :ivar stamps: shape (sum of the sizes,), of the scans, ns.
+    :ivar anchors: shape (sum of the sizes,), the stored keyframe to which a scan's pose is relative.
+    :ivar poses: shape (sum of the sizes, 3), ``anchor_T_base``, m and rad.
+    """
+
+    hypotheses: Int64
+    first_scans: Int64
+    sizes: Int64
+    stamps: Int64
+    anchors: Int64
+    poses: Float64
+
+    @classmethod
+    def of(cls, trails: Iterable[Trail] = ()) -> TrailTable:
+        """Of some trails."""
+        kept = list(trails)
+        return cls(
+            np.array([trail.hypothesis for trail in kept], dtype=np.int64),
+            np.array([trail.first_scan for trail in kept], dtype=np.int64),
+            np.array([trail.stamps.size for trail in kept], dtype=np.int64),
+            np.concatenate([np.zeros(0, np.int64), *(trail.stamps for trail in kept)]),
+            np.concatenate([np.zeros(0, np.int64), *(trail.anchors for trail in kept)]),
+            np.concatenate([np.zeros((0, 3)), *(trail.poses for trail in kept)]),
+        )
+
+    def trails(self) -> list[Trail]:
+        """The trails."""
+        ends = np.cumsum(self.sizes)
+        heads = zip(self.hypotheses.tolist(), self.first_scans.tolist(), ends - self.sizes, ends, strict=True)
+        return [
+            Trail(hypothesis, first, self.stamps[begin:end], self.anchors[begin:end], self.poses[begin:end])
+            for hypothesis, first, begin, end in heads
+        ]
+
+
+@dataclass(frozen=True, eq=False)
 class Record:
     """A run up to some moment between two keyframe events.
 
@@ -149,7 +191,7 @@ class Record:
     parents: Mapping[int, int] = field(default_factory=dict)
     probabilities: ProbabilityTable = field(default_factory=ProbabilityTable.of)
     global_poses: tuple[AreaPose, ...] = ()
-    trails: tuple[Trail, ...] = ()
+    trails: TrailTable = field(default_factory=TrailTable.of)
     estimates: EstimateTable = field(default_factory=lambda: EstimateTable.of({}))
     online: Float64 = field(default_factory=lambda: np.zeros((0, 3)))
     last: LocalEstimate | None = None
@@ -165,5 +207,5 @@ class Record:
     def own_trails(self, hypothesis: int) -> list[Trail]:
         """The trails of a hypothesis and of its ancestors, in the order of their scans."""
         lineage = set(self.lineage(hypothesis))
-        own = (trail for trail in self.trails if trail.hypothesis in lineage)
+        own = (trail for trail in self.trails.trails() if trail.hypothesis in lineage)
         return sorted(own, key=lambda trail: (trail.first_scan, trail.hypothesis))

@@ -17,7 +17,7 @@ from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.offline.record import EstimateTable, ProbabilityTable, Record, TopologyProbability
+from hmt_slam_ros.offline.record import EstimateTable, ProbabilityTable, Record, TopologyProbability, TrailTable
 from hmt_slam_ros.offline.trajectories import (
     Anchored,
     OnlinePose,
@@ -173,11 +173,11 @@ class Recorder:
             notices=tuple(self.notices.values()),
         )
         alive = {known for hypothesis in replica.maps for known in found.lineage(hypothesis)}
-        trails = {(trail.hypothesis, trail.first_scan): trail for trail in past.trails} | self.trails
+        trails = {(trail.hypothesis, trail.first_scan): trail for trail in past.trails.trails()} | self.trails
         return replace(
             found,
             parents={child: parent for child, parent in found.parents.items() if child in alive},
-            trails=tuple(trail for trail in trails.values() if trail.hypothesis in alive),
+            trails=TrailTable.of(trail for trail in trails.values() if trail.hypothesis in alive),
         )
 
     def _online(self, keyframes: list[Keyframe], accepted: list[Accepted]) -> Trajectory:

@@ -19,7 +19,6 @@ from hmt_slam_ros.configuration.documents import ros_yaml
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.offline.record import Record
-from hmt_slam_ros.offline.recorder import Recording
 from hmt_slam_ros.persistence.folder import FolderReader, FolderWriter
 from hmt_slam_ros.processes.aam import AamState
 from hmt_slam_ros.processes.messages import AreaPose, LocalEstimate
@@ -110,17 +109,22 @@ class MapWriter:
         for name in PARTS:
             self._folder.write(name, getattr(state, name))
 
-    def finish(self, recording: Recording, configuration: Configuration) -> None:
-        """Write the map and the manifest."""
-        replica, hybrid_map = recording.replica, recording.hybrid_map
+    def write_map(self, replica: Replica, area_poses: Mapping[int, PoseGaussian], robot: LocalEstimate) -> None:
+        """Write the map at its best.
+
+        :param area_poses: {area: belief over ``map_T_area``} of the most probable hypothesis.
+        :param robot: the last of what metric SLAM said.
+        """
         mapped = sorted({k for own in replica.maps.values() for area in own.area_ids() for k in own.keyframes(area)})
         scans = {keyframe: replica.scans[keyframe] for keyframe in mapped}
-        best = Replica(scans, replica.maps, replica.probabilities, replica.areas)
-        poses = tuple(AreaPose(area, pose) for area, pose in sorted(recording.area_poses.items()))
-        self._folder.write("map", MapDocument(best.state, poses, recording.last))
+        kept = Replica(scans, replica.maps, replica.probabilities, replica.areas)
+        poses = tuple(AreaPose(area, pose) for area, pose in sorted(area_poses.items()))
+        self._folder.write("map", MapDocument(kept.state, poses, robot))
+
+    def finish(self, configuration: Configuration) -> None:
+        """Write the configuration, and last the manifest."""
         self._folder.write_text(CONFIGURATION, ros_yaml(configuration))
-        facts = {"seed": configuration.seed, "keyframes": len(mapped), "areas": len(hybrid_map.area_ids())}
-        self._folder.finish(FORMAT, VERSION, facts)
+        self._folder.finish(FORMAT, VERSION)
 
 
 def read_saved_map(directory: Path) -> SavedMap:

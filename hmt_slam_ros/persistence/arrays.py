@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Hashable
+from functools import cache
 from typing import Any, Protocol, get_args
 
 import numpy as np
@@ -64,5 +65,6 @@ class ReadArrays:
         return read
 
 
+@cache
 def _name(dtype: np.dtype[Any]) -> str:
     return str(dtype.newbyteorder("="))

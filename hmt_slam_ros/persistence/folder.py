@@ -71,15 +71,14 @@ class FolderWriter:
             hashed.write(text.encode())
         self._files[name] = hashed.entry
 
-    def finish(self, kind: str, version: int, facts: Mapping[str, object]) -> None:
+    def finish(self, kind: str, version: int) -> None:
         """Write the scans and the manifest.
 
         :param kind: what the folder holds; a reader refuses any other.
         :param version: of the form of its documents, likewise.
-        :param facts: what else a person may want to know of it.
         """
         self.write(SCANS, self._scans.table)
-        content = {"format": kind, "version": version, **facts, "files": dict(sorted(self._files.items()))}
+        content = {"format": kind, "version": version, "files": dict(sorted(self._files.items()))}
         content["sha256"] = _own_digest(content)
         text = json.dumps(content, indent=1, allow_nan=False) + "\n"
         (self._directory / MANIFEST).write_text(text, encoding="utf-8")

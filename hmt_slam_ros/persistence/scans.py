@@ -54,16 +54,17 @@ class ScanTable:
 
     def scans(self) -> dict[int, Scan]:
         """{name: scan}."""
+        ends = np.cumsum(self.beams)
         rows = zip(
-            self.names.tolist(), self.stamps.tolist(), np.split(self.ranges, np.cumsum(self.beams)[:-1]),
+            self.names.tolist(), self.stamps.tolist(), (ends - self.beams).tolist(), ends.tolist(),
             self.geometry.tolist(), self.laser_poses, self.motions, strict=True,
-        ) if self.names.size else ()  # fmt: skip
+        )  # fmt: skip
         return {
             name: Scan(
-                stamp=stamp, ranges=ranges.copy(), laser_pose=laser_pose.copy(), motion=motion.copy(),
+                stamp=stamp, ranges=self.ranges[begin:end], laser_pose=laser_pose, motion=motion,
                 **dict(zip(_GEOMETRY, geometry, strict=True)),
             )
-            for name, stamp, ranges, geometry, laser_pose, motion in rows
+            for name, stamp, begin, end, geometry, laser_pose, motion in rows
         }  # fmt: skip
 
 

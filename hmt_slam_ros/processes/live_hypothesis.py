@@ -10,7 +10,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from hmt_slam_ros.arrays import Int32
+from hmt_slam_ros.arrays import Int32, Int64
 from hmt_slam_ros.configuration.metric import Filter
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
@@ -28,6 +28,28 @@ _SAME_PLACE = 0.8
 
 
 @dataclass(frozen=True, eq=False)
+class KeyframeCovariances:
+    """Covariances by keyframe, in the order in which these came.
+
+    :ivar keyframes: shape (n,).
+    :ivar covariances: shape (n, 3, 3), right tangent frame.
+    """
+
+    keyframes: Int64
+    covariances: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, covariances: Mapping[int, NDArray[np.float64]]) -> KeyframeCovariances:
+        """Of {keyframe: covariance}."""
+        rows = np.array(list(covariances.values())).reshape(-1, 3, 3)
+        return cls(np.array(list(covariances), dtype=np.int64), rows)
+
+    def by_keyframe(self) -> dict[int, NDArray[np.float64]]:
+        """{keyframe: covariance}."""
+        return dict(zip(self.keyframes.tolist(), self.covariances, strict=True))
+
+
+@dataclass(frozen=True, eq=False)
 class LiveState:
     """One live hypothesis inside metric SLAM.
 
@@ -37,9 +59,8 @@ class LiveState:
     :ivar information: of the last keyframe event's match alone, in the frame of its pose, shape (3, 3).
     :ivar error: of that motion.
     :ivar anchor: the stored keyframe to which scans are now related.
-    :ivar fresh: {keyframe: covariance (3, 3) that the step which led to it adds to the drift}, of those stored since
-        the area was entered.
-    :ivar placed: {keyframe: covariance (3, 3) of its pose in its area's frame, right tangent}, of all that are known.
+    :ivar fresh: what the step which led to a keyframe adds to the drift, of those stored since the area was entered.
+    :ivar placed: of the poses of keyframes in their areas' frames, of all that are known.
     :ivar drift: covariance of the pose at the last keyframe event in the area's frame, right tangent, shape (3, 3).
     :ivar trail: (stamp, anchor, ``anchor_T_base``) of the scans since the last keyframe event.
     """
@@ -50,8 +71,8 @@ class LiveState:
     information: NDArray[np.float64]
     error: MatchError
     anchor: int
-    fresh: Mapping[int, NDArray[np.float64]]
-    placed: Mapping[int, NDArray[np.float64]]
+    fresh: KeyframeCovariances
+    placed: KeyframeCovariances
     drift: NDArray[np.float64]
     trail: tuple[tuple[int, int, NDArray[np.float64]], ...]
 
@@ -90,8 +111,8 @@ class LiveHypothesis:
         """The hypothesis of a state, whose patches are in the pool."""
         return cls(
             AreaFilter.of(mapping, state.filter), mapping.configuration.filter, state.event_pose, state.moved,
-            state.information, state.error, state.anchor, dict(state.fresh), dict(state.placed), state.drift,
-            list(state.trail),
+            state.information, state.error, state.anchor, state.fresh.by_keyframe(), state.placed.by_keyframe(),
+            state.drift, list(state.trail),
         )  # fmt: skip
 
     def state(self, tables: Int32) -> LiveState:
@@ -101,7 +122,8 @@ class LiveHypothesis:
         """
         return LiveState(
             replace(self.filter.state, tables=tables), self.event_pose, self.moved, self.information, self.error,
-            self.anchor, dict(self.fresh), dict(self.placed), self.drift, tuple(self.trail),
+            self.anchor, KeyframeCovariances.of(self.fresh), KeyframeCovariances.of(self.placed), self.drift,
+            tuple(self.trail),
         )  # fmt: skip
 
     def branch(self, hypothesis: int) -> LiveHypothesis:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -61,14 +62,14 @@ class GraphState:
 
     def area_keyframes(self) -> dict[int, dict[int, Float64]]:
         """{area: {keyframe: ``area_T_base``}}."""
-        placed = iter(zip(self.keyframes.tolist(), map(np.copy, self.poses), strict=True))
+        placed = zip(self.keyframes.tolist(), self.poses, strict=True)
         sizes = zip(self.areas.tolist(), self.sizes.tolist(), strict=True)
-        return {area: dict(next(placed) for _ in range(size)) for area, size in sizes}
+        return {area: dict(itertools.islice(placed, size)) for area, size in sizes}
 
     def arc_values(self) -> dict[Pair, ArcValue | None]:
         """{(smaller area, larger area): arc}, None for one that is withdrawn."""
         columns = (self.arcs.tolist(), self.means, self.covariances, self.closures.tolist(), self.withdrawn.tolist())
         return {
-            (a, b): None if withdrawn else ArcValue(PoseGaussian(mean.copy(), covariance.copy()), closure)
+            (a, b): None if withdrawn else ArcValue(PoseGaussian(mean, covariance), closure)
             for (a, b), mean, covariance, closure, withdrawn in zip(*columns, strict=True)
         }
