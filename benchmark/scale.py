@@ -12,6 +12,8 @@ from benchmark.plots import plot_scale
 from benchmark.report import Report, Requirement, table
 from benchmark.runs import PARAMETERS
 from benchmark.scale_cuts import Cut, measured_cuts
+from benchmark.scale_maps import BEAMS as SAVED_BEAMS
+from benchmark.scale_maps import SCANS_PER_KEYFRAME, Lasting, lasting
 from benchmark.scale_memory import BEAMS as STORED_BEAMS
 from benchmark.scale_memory import Stored, stored
 from benchmark.scale_scans import cost_of_scans
@@ -34,6 +36,12 @@ GROWTH = 0.1
 STORED = 20.0
 """Largest memory of a stored area, kB."""
 
+LASTING = Lattice(50, 40)
+"""The map that is saved and loaded."""
+
+SAVED_AND_LOADED = 5.0
+"""Largest time to save and load it, s."""
+
 _FEW = 2  # excursions under stress
 
 POLICY = (
@@ -46,7 +54,10 @@ POLICY = (
     "decide little. For the scans all five processes run in a loop through known ground; CPU time a "
     "scan, the median of the repetitions. Memory is what Python allocates: poses and arcs in each process that keeps "
     f"the map, and the ranges of its scans, here of {STORED_BEAMS} beams; what can be computed anew from them is told, "
-    "and does not count."
+    "and does not count. What is saved is the whole state of a run that mapped the lattice in one pass, under one "
+    f"hypothesis, with a scan of its own of {SAVED_BEAMS} beams for every keyframe and {SCANS_PER_KEYFRAME} scans of "
+    "the log to each. Saving ends when all is on the disk of the system's folder for temporary files, loading with "
+    "processes that can go on; wall time."
 )
 
 
@@ -61,13 +72,17 @@ def measure_scale(settings: Settings) -> Report:
     report.requirements += [growth_requirement(process, scans) for process in ("slam", "rtl")]
     area = stored(LARGE[0])
     report.requirements.append(Requirement("memory of a stored area with its scans", area.whole, STORED, "kB"))
+    saved = lasting(LASTING, configuration)
+    name = f"saving and loading a map of {saved.areas} areas"
+    report.requirements.append(Requirement(name, saved.whole, SAVED_AND_LOADED, "s"))
     named = {str(areas): own for areas, own in cuts.items()} | {f"{LARGE[0].areas}, stress": stressed}
     bound = _bound(configuration, [cut for own in named.values() for cut in own])
-    report.body += [_cut_table(named), bound, _scan_table(scans), _stored_table(area), POLICY]
+    report.body += [_cut_table(named), bound, _scan_table(scans), _stored_table(area), _lasting_table(saved), POLICY]
     report.data |= {
         "cuts": {name: [cut._asdict() for cut in own] for name, own in named.items()},
         "ms_per_scan": scans,
         "stored_kB": area._asdict(),
+        "saved": saved._asdict(),
     }
     report.pictures["scale.png"] = "Time of a cut, and of a scan in every process, against the number of areas."
     plot_scale(settings.out / "scale.png", {n: [cut.ms for cut in own] for n, own in cuts.items()}, scans, CUT_BOUNDS)
@@ -140,3 +155,8 @@ def _stored_table(area: Stored) -> str:
         ("their end points, kept where the area was compared", area.points),
     ]
     return table(["of a stored area", "memory [kB]"], [[name, f"{size:.2f}"] for name, size in rows])
+
+
+def _lasting_table(saved: Lasting) -> str:
+    head = ["areas", "files [MB]", "save [s]", "load [s]", "load the map alone [s]"]
+    return table(head, [[str(saved.areas), *(f"{value:.1f}" for value in saved[1:])]])

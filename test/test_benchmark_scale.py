@@ -7,6 +7,7 @@ from benchmark.documents import VALIDATION, marks
 from benchmark.lattice import FIRST_KEYFRAME, PER_AREA, SPACING, Lattice, LatticeScans, scan_at, stops
 from benchmark.scale import cut_requirement, growth_requirement
 from benchmark.scale_cuts import Cut, measured_cuts
+from benchmark.scale_maps import lasting, state_of
 from benchmark.scale_memory import stored
 from benchmark.scale_scans import cost_of_scans
 from hmt_slam_ros.configuration import Configuration
@@ -74,3 +75,15 @@ def test_the_longest_cut_and_the_growth_of_a_scans_cost_are_judged():
 def test_the_document_has_a_place_for_the_tables(kind):
     text = VALIDATION.read_text()
     assert all(text.count(mark) == 1 for mark in marks(kind))
+
+
+def test_a_map_is_saved_and_loaded_with_all_that_was_mapped():
+    state = state_of(Lattice(4, 3), Configuration())
+    assert len(state.slam.replica.common.areas) == len(state.aam.graphs) == 12
+    assert len(state.recorder.replica.scans) == len(state.slam.live[0].placed.keyframes) == 12 * PER_AREA
+    assert len({scan.ranges.tobytes() for scan in state.tlca.replica.scans.values()}) == 12 * PER_AREA
+    saved = lasting(Lattice(4, 3), Configuration())
+    assert saved.areas == 12
+    assert saved.megabytes > 12 * PER_AREA * 181 * 4 / 1e6
+    assert saved.look > 0.0
+    assert saved.whole == saved.save + saved.load > 0.0

@@ -1,0 +1,163 @@
+"""How long does it take to save and to load a map of many areas, with all that is needed to go on from it?"""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from benchmark.lattice import ARC, FIRST_KEYFRAME, PER_AREA, Lattice, shared_scan
+from hmt_slam_ros.configuration import Configuration
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.logs import open_log
+from hmt_slam_ros.offline.record import EstimateTable, ProbabilityTable, TopologyProbability, TrailTable
+from hmt_slam_ros.offline.runtime import Run
+from hmt_slam_ros.offline.saved_map import LogState, MapWriter, RunState, read_run_state, read_saved_map
+from hmt_slam_ros.persistence.replacing import put_in_place
+from hmt_slam_ros.processes.aam import WatchState
+from hmt_slam_ros.processes.closure_account import Step
+from hmt_slam_ros.processes.live_hypothesis import KeyframeCovariances
+from hmt_slam_ros.processes.messages import LocalEstimate, Trail
+from hmt_slam_ros.processes.reopening import Past
+from hmt_slam_ros.processes.replica import FIRST_HYPOTHESIS, Replica
+from hmt_slam_ros.sensing import Scan
+from hmt_slam_ros.topology.overlap_graph import OverlapGraph
+
+BEAMS = 181
+"""Of the scans that are saved."""
+
+SCANS_PER_KEYFRAME = 10
+"""Scans of the log to each keyframe, of which the trajectory has a pose."""
+
+_PERIOD = 100_000_000  # ns
+_DRIVE, _SECONDS = "sim:office", 20.0
+_ROBOT = LocalEstimate(0, 0, 0, PoseGaussian.exactly(np.zeros(3)), np.zeros(3), 0)
+
+
+class Lasting(NamedTuple):
+    """A map that was saved and loaded.
+
+    :ivar areas: of it.
+    :ivar megabytes: of its files.
+    :ivar save: s, from the running processes to the last byte on the disk.
+    :ivar load: s, from the files to processes that can go on.
+    :ivar look: s, from the files to the map alone, without the state.
+    """
+
+    areas: int
+    megabytes: float
+    save: float
+    load: float
+    look: float
+
+    @property
+    def whole(self) -> float:
+        """Saving and loading, s."""
+        return self.save + self.load
+
+
+def lasting(lattice: Lattice, configuration: Configuration) -> Lasting:
+    """Save and load a map of all crossings of a lattice, after a first one that loads code and is not counted."""
+    _saved_and_loaded(Lattice(5, 2), configuration)
+    return _saved_and_loaded(lattice, configuration)
+
+
+def _saved_and_loaded(lattice: Lattice, configuration: Configuration) -> Lasting:
+    run = Run(configuration, state=state_of(lattice, configuration))
+    with tempfile.TemporaryDirectory() as folder:
+        scratch, directory = Path(folder) / "new", Path(folder) / "hmt_map"
+        begin = time.perf_counter()
+        state = run.state
+        writer = MapWriter(scratch)
+        writer.write_state(state)
+        writer.write_map(Replica.of(state.tlca.replica), {entry.area: entry.pose for entry in lattice.poses()}, _ROBOT)
+        writer.finish(configuration)
+        put_in_place(scratch, directory)
+        written = time.perf_counter()
+        Run(configuration, state=read_run_state(directory)[0])
+        loaded = time.perf_counter()
+        read_saved_map(directory)
+        looked = time.perf_counter()
+        size = sum(path.stat().st_size for path in directory.iterdir()) / 1e6
+    return Lasting(lattice.areas, size, written - begin, loaded - written, looked - loaded)
+
+
+def state_of(lattice: Lattice, configuration: Configuration) -> RunState:
+    """The state of a run that mapped all crossings of a lattice, each by a way of its own through it.
+
+    The particle filter is that of a drive through a simulated building.
+    """
+    driven = _driven(configuration)
+    hybrid_map = lattice.hybrid_map()
+    keyframes = [k for area in hybrid_map.area_ids() for k in hybrid_map.keyframes(area)]
+    scans = {k: _own(shared_scan((k - FIRST_KEYFRAME) % 2 * 1.6, 0), k) for k in keyframes}
+    maps, one = {FIRST_HYPOTHESIS: hybrid_map}, {FIRST_HYPOTHESIS: 1.0}
+    replica = Replica(scans, maps, one, {FIRST_HYPOTHESIS: 0}).state
+    placed = KeyframeCovariances.of(dict.fromkeys(keyframes, ARC))
+    live = {hypothesis: replace(own, placed=placed) for hypothesis, own in driven.slam.live.items()}
+    graph = OverlapGraph(tuple(range(PER_AREA)), np.full((PER_AREA, PER_AREA), 0.5))
+    graphs = tuple(replace(graph, keyframes=tuple(hybrid_map.keyframes(a))) for a in hybrid_map.area_ids())
+    watch = WatchState(0, {area: area for area in hybrid_map.area_ids()}, frozenset(keyframes[:PER_AREA]))
+    path = driven.tlca.paths[FIRST_HYPOTHESIS]
+    arcs = [(a, b) for a, b, _ in hybrid_map.all_arcs()]
+    steps = tuple(Step(k, a, b, ((a, b),), frozenset({k})) for k, (a, b) in enumerate(arcs))
+    path = replace(path, witnesses={pair: frozenset(pair) for pair in arcs}, past=Past(steps, ()))
+    return RunState(
+        _log_state(keyframes),
+        replace(driven.slam, replica=replica, live=live, events=len(keyframes)),
+        replace(driven.aam, replica=replica, graphs=graphs, watches={FIRST_HYPOTHESIS: watch}),
+        replace(driven.tsbi, replica=replica, global_poses=lattice.poses()),
+        replace(driven.tlca, replica=replica, paths={FIRST_HYPOTHESIS: path}),
+        replace(driven.rtl, areas=lattice.poses()),
+        replace(driven.recorder, replica=replica, **_recorded(keyframes)),
+    )
+
+
+def _driven(configuration: Configuration) -> RunState:
+    """The state after the first seconds of a simulated drive."""
+    run = Run(configuration)
+    for record in open_log(_DRIVE, duration=_SECONDS).records():
+        run.read(record)
+    return run.state
+
+
+def _own(scan: Scan, keyframe: int) -> Scan:
+    """A scan of a keyframe's own, of ``BEAMS`` beams."""
+    ranges = np.resize(scan.ranges, BEAMS) + np.float32(1e-6 * (keyframe - FIRST_KEYFRAME))
+    return replace(scan, stamp=_stamp(keyframe), ranges=ranges)
+
+
+def _stamp(keyframe: int) -> int:
+    return (keyframe - FIRST_KEYFRAME) * SCANS_PER_KEYFRAME * _PERIOD
+
+
+def _log_state(keyframes: Sequence[int]) -> LogState:
+    """A log with a reading of the odometry to each scan."""
+    stamps = _stamp(keyframes[0]) + _PERIOD * np.arange(len(keyframes) * SCANS_PER_KEYFRAME)
+    return LogState(2 * stamps.size, stamps, stamps)
+
+
+def _recorded(keyframes: Sequence[int]) -> dict[str, Any]:
+    """What the recorder keeps of all scans and of the events, a keyframe each."""
+    scans = np.arange(len(keyframes) * SCANS_PER_KEYFRAME)
+    stamps, poses = _stamp(keyframes[0]) + _PERIOD * scans, np.zeros((scans.size, 3))
+    each = zip(np.split(scans, len(keyframes)), np.split(stamps, len(keyframes)), keyframes, strict=True)
+    rows = [
+        TopologyProbability(event, 0, 0.0, FIRST_HYPOTHESIS, FIRST_HYPOTHESIS, 1.0, 0, 1, 0, True, 0.0)
+        for event in range(len(keyframes))
+    ]
+    return {
+        "events": len(keyframes),
+        "probabilities": ProbabilityTable.of(rows),
+        "trails": TrailTable.of(
+            Trail(FIRST_HYPOTHESIS, int(own[0]), moments, np.full(own.size, keyframe), np.zeros((own.size, 3)))
+            for own, moments, keyframe in each
+        ),
+        "estimates": EstimateTable(scans, stamps, np.zeros_like(scans), poses, poses),
+        "online": poses,
+    }
