@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from hmt_slam_ros.arrays import Float64, Int64
+from hmt_slam_ros.arrays import Float64, Int32, Int64
 from hmt_slam_ros.configuration.topological import Refinement
 from hmt_slam_ros.refinement.surfaces import Surfaces, bin_of
 
@@ -91,22 +91,26 @@ def _add_points(
     # Sums in variables of their own stay in registers.
     xx = xy = xt = yy = yt = tt = gx = gy = gt = 0.0
     seen = met = 0
-    first, last = ones.starts[one], ones.starts[one + 1]
-    for k in range(first, last, every):
+    # Taken from their tuples once: each time counts references to them.
+    own, own_normals, own_flat = ones.points, ones.normals, ones.flat
+    points, normals, flat, bins = others.points, others.normals, others.flat, others.bins
+    laser_x, laser_y = others.lasers[other, 0], others.lasers[other, 1]
+    begin, end = others.bin_starts[other], others.bin_starts[other + 1]
+    for k in range(ones.starts[one], ones.starts[one + 1], every):
         seen += 1
-        px, py = ones.points[k, 0], ones.points[k, 1]
+        px, py = own[k, 0], own[k, 1]
         x = pose[0] + cos * px - sin * py
         y = pose[1] + sin * px + cos * py
-        q = _nearest(others, other, x, y, gate)
-        if q < 0 or not others.flat[q]:
+        q = _nearest(points, bins, begin, end - begin, x, y, x - laser_x, y - laser_y, gate)
+        if q < 0 or not flat[q]:
             continue
-        nx, ny = others.normals[q, 0], others.normals[q, 1]
+        nx, ny = normals[q, 0], normals[q, 1]
         jx, jy = cos * nx + sin * ny, -sin * nx + cos * ny
-        if ones.flat[k] and jx * ones.normals[k, 0] + jy * ones.normals[k, 1] < _SAME_WALL:
+        if own_flat[k] and jx * own_normals[k, 0] + jy * own_normals[k, 1] < _SAME_WALL:
             continue
         met += 1
         jt = jy * px - jx * py
-        error = nx * (x - others.points[q, 0]) + ny * (y - others.points[q, 1])
+        error = nx * (x - points[q, 0]) + ny * (y - points[q, 1])
         weight = most / (1.0 + (error * sharpness) ** 2)
         wx, wy, wt = weight * jx, weight * jy, weight * jt
         xx += wx * jx
@@ -127,12 +131,14 @@ def _add_points(
 
 
 @njit(cache=True, inline="always")
-def _nearest(surfaces: Surfaces, scan: int, x: float, y: float, gate: float) -> int:
-    """The point of a scan nearest to (x, y) in its base frame, among those seen in that direction; -1 for none."""
-    points, bins = surfaces.points, surfaces.bins
-    dx, dy = x - surfaces.lasers[scan, 0], y - surfaces.lasers[scan, 1]
-    first = surfaces.bin_starts[scan]
-    count = surfaces.bin_starts[scan + 1] - first
+def _nearest(
+    points: Float64, bins: Int32, first: int, count: int, x: float, y: float, dx: float, dy: float, gate: float
+) -> int:
+    """The point of a scan nearest to (x, y) in its base frame, among those seen in that direction; -1 for none.
+
+    :param bins: see :class:`Surfaces`; those of the scan are ``count`` from ``first`` on.
+    :param dx: from the laser to (x, y), ``dy``.
+    """
     middle = bin_of(dx, dy, count)
     # What is seen so many bins away is at least so far off: the chord grows by about this with each bin.
     squared_width = (2.0 * np.pi / count) ** 2 * (dx * dx + dy * dy)
