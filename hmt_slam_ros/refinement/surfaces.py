@@ -100,7 +100,10 @@ def _piece(points: Float64, i: int, step: int, reach: float) -> int:
     """The last of the points that follow each other from i on, downwards or upwards, within reach of it."""
     last = i
     for k in range(i + step, i + step * (_BEAMS + 1), step):
-        if k < 0 or k >= len(points) or np.hypot(points[k, 0] - points[i, 0], points[k, 1] - points[i, 1]) > reach:
+        if k < 0 or k >= len(points):
+            break
+        dx, dy = points[k, 0] - points[i, 0], points[k, 1] - points[i, 1]
+        if dx * dx + dy * dy > reach * reach:
             break
         last = k
     return last

@@ -6,8 +6,10 @@ from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
+from hmt_slam_ros.arrays import Bool, Float32, Float64
 from hmt_slam_ros.geometry import se2
 
 _MICROSECONDS = 1e6
@@ -18,6 +20,27 @@ def _directions(count: int, first: float, increment: float) -> NDArray[np.float6
     """Unit vectors (n, 2) of evenly spaced angles, rad; the same for all scans of a laser."""
     angles = first + increment * np.arange(count)
     return np.stack((np.cos(angles), np.sin(angles)), axis=1)
+
+
+@njit(cache=True)
+def _ends(ranges: Float32, directions: Float64, laser: Float64, valid: Bool) -> Float64:
+    """Where the valid beams of a laser at ``laser`` end, (k, 2)."""
+    ends, k = np.empty((valid.sum(), 2)), 0
+    for n in range(ranges.size):
+        if valid[n]:
+            ends[k, 0] = laser[0] + np.float64(ranges[n]) * directions[n, 0]
+            ends[k, 1] = laser[1] + np.float64(ranges[n]) * directions[n, 1]
+            k += 1
+    return ends
+
+
+@njit(cache=True)
+def _with_return(ranges: Float32, nearest: np.float32, farthest: np.float32) -> Bool:
+    """Which ranges are from ``nearest`` on and below ``farthest``; NaN is not."""
+    valid = np.empty(ranges.size, np.bool_)
+    for n in range(ranges.size):
+        valid[n] = nearest <= ranges[n] < farthest
+    return valid
 
 
 def _zeros() -> NDArray[np.float64]:
@@ -74,20 +97,21 @@ class Scan:
     @cached_property
     def valid(self) -> NDArray[np.bool_]:
         """Beams with a return, shape (n,)."""
-        with np.errstate(invalid="ignore"):
-            return (self.ranges >= max(self.range_min, 1e-3)) & (self.ranges < self.range_max)
+        return _with_return(self.ranges, np.float32(max(self.range_min, 1e-3)), np.float32(self.range_max))
 
     @cached_property
     def points(self) -> NDArray[np.float64]:
         """End points of the beams with a return, shape (k, 2), metres, robot base frame."""
         first = self.angle_min + float(self.laser_pose[2])
-        directions = _directions(self.ranges.size, first, self.angle_increment).compress(self.valid, axis=0)
-        return self._carried_back(self.laser_pose[:2] + self.ranges[self.valid][:, None] * directions)
+        directions = _directions(self.ranges.size, first, self.angle_increment)
+        return self._carried_back(_ends(self.ranges, directions, self.laser_pose, self.valid))
 
     @property
     def origins(self) -> NDArray[np.float64]:
         """Where the laser was at each of those beams, shape (k, 2), metres, robot base frame."""
-        return self._carried_back(np.full((len(self.points), 2), self.laser_pose[:2]))
+        origins = np.empty((len(self.points), 2))
+        origins[:] = self.laser_pose[:2]
+        return self._carried_back(origins)
 
     @property
     def beams(self) -> NDArray[np.float64]:
