@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numba import njit
 
 from hmt_slam_ros.arrays import Float64, Int32
 from hmt_slam_ros.configuration.tree import Configuration
@@ -50,16 +51,28 @@ class LocalMapping:
 
     def mapped_beams(self, scan: Scan) -> Beams:
         """The part of a scan within the map's range."""
-        limit = self.configuration.local_map.max_range
-        points, origins = scan.points, scan.origins
-        beams = points - origins
-        distance = np.hypot(beams[:, 0], beams[:, 1])
-        near = distance <= limit
-        if near.all():
-            return Beams(points, np.zeros((0, 2)), origins)
-        beyond = origins[~near] + beams[~near] * (limit / distance[~near, None])
-        return Beams(points[near], beyond, np.concatenate((origins[near], origins[~near])))
+        return Beams(*_cut_off(scan.points, scan.origins, self.configuration.local_map.max_range))
 
     def insert(self, tables: Int32, poses: Float64, scan: Scan) -> None:
         """Enter a scan into maps (m, T, T), into each at its own ``map_T_base`` (m, 3)."""
         self.pool.insert(tables, poses, self.mapped_beams(scan), self._inverse_model)
+
+
+@njit(cache=True)
+def _cut_off(points: Float64, origins: Float64, limit: float) -> tuple[Float64, Float64, Float64]:
+    """Those of the points (n, 2) within a limit of their origins (n, 2), the others at the limit, and their origins."""
+    distance = np.hypot(points[:, 0] - origins[:, 0], points[:, 1] - origins[:, 1])
+    near = (distance <= limit).sum()
+    within, beyond, ordered = np.empty((near, 2)), np.empty((len(points) - near, 2)), np.empty((len(points), 2))
+    i = j = 0
+    for n in range(len(points)):
+        if distance[n] <= limit:
+            within[i, 0], within[i, 1] = points[n, 0], points[n, 1]
+            ordered[i, 0], ordered[i, 1] = origins[n, 0], origins[n, 1]
+            i += 1
+        else:
+            share, x, y = limit / distance[n], origins[n, 0], origins[n, 1]
+            beyond[j, 0], beyond[j, 1] = x + (points[n, 0] - x) * share, y + (points[n, 1] - y) * share
+            ordered[near + j, 0], ordered[near + j, 1] = x, y
+            j += 1
+    return within, beyond, ordered

@@ -42,6 +42,7 @@ class Wall(NamedTuple):
 _WALL = Wall(0.1, 0.2)
 
 
+@njit(cache=True)
 def surfels(points: Float64, origins: Float64, stride: int = 1) -> Float64:
     """Every so many of the points, with their normals, which all points show.
 
@@ -50,23 +51,16 @@ def surfels(points: Float64, origins: Float64, stride: int = 1) -> Float64:
     :returns: shape (k, 4): x, y, and the unit normal, of either sign, or zeros for a point on no surface. Points that
         only show where the shadow of something nearer ends are left out.
     """
-    beams = points - origins
-    return _with_normals(points, beams, np.hypot(beams[:, 0], beams[:, 1]), stride)
+    found, beams = np.zeros((-(-len(points) // stride), 4)), points - origins
+    for k in range(len(found)):
+        found[k, 0], found[k, 1] = points[k * stride, 0], points[k * stride, 1]
+    return found[_find_normals(beams, np.hypot(beams[:, 0], beams[:, 1]), stride, found)]
 
 
 def moved(a_T_b: Float64, surfels: Float64) -> Float64:
     """Surfels (n, 4) of frame b in frame a, for one pose (3,)."""
     turned = se2.transform((0.0, 0.0, a_T_b[2]), surfels[:, 2:])
     return np.concatenate((se2.transform(a_T_b, surfels[:, :2]), turned), axis=1)
-
-
-@njit(cache=True)
-def _with_normals(points: Float64, beams: Float64, ranges: Float64, stride: int) -> Float64:
-    """:func:`surfels` of points whose beams (n, 2), m, from the laser to them, have the lengths ``ranges`` (n,)."""
-    found = np.zeros((-(-len(points) // stride), 4))
-    for k in range(len(found)):
-        found[k, 0], found[k, 1] = points[k * stride, 0], points[k * stride, 1]
-    return found[_find_normals(beams, ranges, stride, found)]
 
 
 @njit(cache=True)
