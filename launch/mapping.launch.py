@@ -23,14 +23,17 @@ def generate_launch_description() -> LaunchDescription:
             description="Take the time from /clock, for a replay or a simulator.",
         ),
         DeclareLaunchArgument("namespace", default_value="", description="Namespace of the nodes and their topics."),
+        DeclareLaunchArgument("start_from", default_value="", description="Saved map to go on from; empty for none."),
+        DeclareLaunchArgument("save_to", default_value="hmt_map", description="Folder for the service slam/save."),
         DeclareLaunchArgument("log_level", default_value="info", description="Level of the nodes' log output."),
     ]
+    folders = {name: ParameterValue(LaunchConfiguration(name), value_type=str) for name in ("start_from", "save_to")}
     nodes = [
         Node(
             package="hmt_slam_ros",
             executable=process,
             namespace=LaunchConfiguration("namespace"),
-            parameters=[LaunchConfiguration("params_file"), {"use_sim_time": use_sim_time}],
+            parameters=[LaunchConfiguration("params_file"), {"use_sim_time": use_sim_time}, folders],
             ros_arguments=["--log-level", LaunchConfiguration("log_level")],
             output="screen",
         )

@@ -9,8 +9,9 @@ from string import Template
 from hmt_slam_ros.configuration import Configuration, flat_parameters
 from hmt_slam_ros.configuration.documents import parameter_table, reference, ros_yaml
 from hmt_slam_ros.offline.going_on import SHAPING
-from hmt_slam_ros.offline.saved_map import FORMAT, PARTS, VERSION, MapDocument
+from hmt_slam_ros.offline.saved_map import PARTS, ChainState, MapDocument
 from hmt_slam_ros.persistence.folder import SCANS
+from hmt_slam_ros.persistence.hmt_map import FORMAT, VERSION
 from hmt_slam_ros.persistence.reference import described
 from hmt_slam_ros.persistence.scans import ScanTable
 from hmt_slam_ros.simulation.families import FAMILIES
@@ -49,7 +50,7 @@ def map_format(_configuration: Configuration) -> str:
         parts=", ".join(PARTS),
         shaping=", ".join(f"`{name}`" for name in SHAPING),
     )
-    return head + "\n".join(described({"map": MapDocument, SCANS: ScanTable, **PARTS}))
+    return head + "\n".join(described({"map": MapDocument, SCANS: ScanTable, "chain": ChainState, **PARTS}))
 
 
 GENERATED = {

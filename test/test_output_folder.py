@@ -330,7 +330,7 @@ def test_the_saved_map_keeps_that_a_hypothesis_lacks_an_arc(tmp_path: Path) -> N
 
 
 def test_a_map_without_state_is_nothing_to_go_on_from(folder: Path) -> None:
-    with pytest.raises(HmtSlamError, match="a map without the state of the processes"):
+    with pytest.raises(HmtSlamError, match="a map without the state of a run"):
         read_run_state(folder / "hmt_map")
 
 

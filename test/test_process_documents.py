@@ -14,7 +14,15 @@ from hypothesis import strategies as st
 
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.processes.documents import Closing, KeyframeHead, RobotStatus, decode, encode
+from hmt_slam_ros.processes.documents import (
+    Closing,
+    KeyframeHead,
+    RobotStatus,
+    SavedPart,
+    SaveRequest,
+    decode,
+    encode,
+)
 from hmt_slam_ros.processes.messages import (
     Accepted,
     AreaEvents,
@@ -26,7 +34,18 @@ from hmt_slam_ros.processes.messages import (
 )
 from hmt_slam_ros.sensing import Scan
 
-KINDS = (KeyframeHead, AreaEvents, Hypotheses, Accepted, LocalEstimate, Notice, Closing, RobotStatus)
+KINDS = (
+    KeyframeHead,
+    AreaEvents,
+    Hypotheses,
+    Accepted,
+    LocalEstimate,
+    Notice,
+    Closing,
+    RobotStatus,
+    SaveRequest,
+    SavedPart,
+)
 NUMBERS = st.floats(allow_nan=False, allow_infinity=False)
 
 

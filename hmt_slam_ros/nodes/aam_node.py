@@ -4,16 +4,23 @@ from __future__ import annotations
 
 import sys
 
+from hmt_slam_ros.configuration import Configuration
+from hmt_slam_ros.nodes.beginning import Beginning
 from hmt_slam_ros.nodes.process_node import ProcessNode
 from hmt_slam_ros.nodes.running import run
 from hmt_slam_ros.processes.messages import AreaEvents
+from hmt_slam_ros.processes.routing import Remembering
 
 
 def make() -> ProcessNode:
     """The node ``aam``."""
-    from hmt_slam_ros.processes.aam import Aam  # noqa: PLC0415  takes time, in which a signal has to be heard
+    return ProcessNode("aam", _make_process, (AreaEvents,))
 
-    return ProcessNode("aam", Aam, (AreaEvents,))
+
+def _make_process(configuration: Configuration, beginning: Beginning) -> Remembering:
+    from hmt_slam_ros.processes.aam import Aam, AamState  # noqa: PLC0415  takes time, in which a signal has to be heard
+
+    return Aam(configuration, beginning.part("aam", AamState))
 
 
 def main() -> None:

@@ -24,13 +24,16 @@ class ChainOrder:
     :ivar fault: one sentence about the first gap, None where nothing is missing.
     """
 
-    def __init__(self, heard: Iterable[type]) -> None:
-        """Take the message types that the process listens to; those outside the chain are ignored."""
+    def __init__(self, heard: Iterable[type], first: int = 0) -> None:
+        """Take the message types that the process listens to; those outside the chain are ignored.
+
+        :param first: keyframe event with which the chain begins.
+        """
         heard = tuple(heard)
         self._kinds = tuple(kind for kind in CHAIN if kind in heard)
         self._waiting: dict[type, deque[ChainMessage]] = {kind: deque() for kind in self._kinds}
-        self._arrived = dict.fromkeys(self._kinds, 0)
-        self._delivered = 0
+        self._arrived = dict.fromkeys(self._kinds, first)
+        self._delivered = first * len(self._kinds)
         self.repeated = 0
         self.fault: str | None = None
 

@@ -39,16 +39,18 @@ class Inbox:
         deliver: Deliver,
         figures: Figures,
         estimates: QoSProfile = qos.CHAIN_FROM_NOW,
+        first: int = 0,
     ) -> None:
         """Subscribe.
 
         :param heard: kinds of messages; Scan and EndOfLog are left to the node.
         :param deliver: called for each message in its turn.
         :param estimates: profile for LocalEstimate, of which most nodes have no use for the past.
+        :param first: keyframe event with which the chain begins.
         """
         heard = tuple(heard)
         self._node, self._deliver, self._figures = node, deliver, figures
-        self._order = ChainOrder(heard)
+        self._order = ChainOrder(heard, first)
         self._estimates = estimates
         self._heads: deque[KeyframeHead] = deque()
         self._ranges: deque[tuple[int, Any]] = deque()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from array import array
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from geometry_msgs.msg import Point, Vector3
@@ -17,6 +17,9 @@ from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.nodes.conversions import header, time_message
 from hmt_slam_ros.processes.messages import Accepted, Hypotheses, Keyframe, Message
 from hmt_slam_ros.processes.replica import Replica
+
+if TYPE_CHECKING:
+    from hmt_slam_ros.offline.saved_map import MapDocument
 
 _AREA = ColorRGBA(r=0.12, g=0.47, b=0.71, a=0.9)
 _ROBOT_AREA = ColorRGBA(r=0.84, g=0.15, b=0.16, a=0.9)
@@ -32,12 +35,14 @@ class MapView:
     :ivar version: number of changes so far.
     """
 
-    def __init__(self, configuration: Configuration, frame: str) -> None:
-        self.stamp = 0
-        self.version = 0
+    def __init__(self, configuration: Configuration, frame: str, known: MapDocument | None = None) -> None:
+        """:param known: the map to begin with."""
+        self.stamp = known.robot.stamp if known else 0
+        self.version = 1 if known else 0
         self._settings, self._frame = configuration.local_map, frame
-        self._replica = Replica()
-        self._poses: dict[int, NDArray[np.float64]] = {}
+        self._replica = Replica.of(known.replica) if known else Replica()
+        poses = known.area_poses if known else ()
+        self._poses = {entry.area: entry.pose.mean for entry in poses}
 
     def hear(self, message: Message) -> None:
         """Take in a message of the chain."""

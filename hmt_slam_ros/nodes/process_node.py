@@ -6,12 +6,14 @@ from collections.abc import Callable, Iterable
 
 from hmt_slam_ros.compilation import tell_of_compilation
 from hmt_slam_ros.configuration import Configuration
+from hmt_slam_ros.nodes.beginning import Beginning
 from hmt_slam_ros.nodes.figures import Figures
 from hmt_slam_ros.nodes.inbox import Inbox
 from hmt_slam_ros.nodes.outbox import Outbox
 from hmt_slam_ros.nodes.parameters import ConfiguredNode
+from hmt_slam_ros.nodes.part_saver import PARTS, PartSaver
 from hmt_slam_ros.processes.messages import Message, Notice
-from hmt_slam_ros.processes.routing import HEARD_BY, Process
+from hmt_slam_ros.processes.routing import HEARD_BY, Remembering
 
 
 class ProcessNode(ConfiguredNode):
@@ -20,23 +22,26 @@ class ProcessNode(ConfiguredNode):
     def __init__(
         self,
         name: str,
-        make_process: Callable[[Configuration], Process],
+        make_process: Callable[[Configuration, Beginning], Remembering],
         said: Iterable[type],
         changeable: Iterable[str] = (),
     ) -> None:
         """Make the process with the configuration from the node's parameters.
 
         :param name: one of those in ``HEARD_BY``.
+        :param make_process: makes it from what the node begins with.
         :param said: kinds of messages that the process says.
         :param changeable: parameters that may change while the node runs.
         :raises HmtSlamError: for a parameter that cannot be.
         """
         super().__init__(name, changeable)
         self.figures = Figures(self)
-        self.process = make_process(self.configuration)
+        self.beginning = Beginning(self)
+        self.process = make_process(self.configuration, self.beginning)
         tell_of_compilation(self.get_logger().info)
         self.outbox = Outbox(self, (*said, Notice))
-        self.inbox = Inbox(self, HEARD_BY[name], self.deliver, self.figures)
+        self.inbox = Inbox(self, HEARD_BY[name], self.deliver, self.figures, first=self.beginning.events)
+        self._part = PartSaver(self, name) if name in PARTS else None
 
     def deliver(self, message: Message) -> None:
         """Let the process handle a message and publish its answers."""
@@ -49,6 +54,8 @@ class ProcessNode(ConfiguredNode):
             if isinstance(answer, Notice):
                 self.figures.warn(answer.text)
         self.show(message, said)
+        if self._part is not None:
+            self._part.delivered(message)
 
     def show(self, _heard: Message, _said: list[Message]) -> None:
         """Publish what is for people to see; nothing, unless a node has something."""

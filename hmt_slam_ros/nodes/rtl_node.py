@@ -6,21 +6,24 @@ import sys
 
 from geometry_msgs.msg import PoseWithCovarianceStamped
 
+from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.nodes import conversions, qos
+from hmt_slam_ros.nodes.beginning import Beginning
 from hmt_slam_ros.nodes.parameters import declare_frame
 from hmt_slam_ros.nodes.process_node import ProcessNode
 from hmt_slam_ros.nodes.running import run
 from hmt_slam_ros.nodes.topics import HMT_POSE, POSE
 from hmt_slam_ros.nodes.transforms import transform_publisher
 from hmt_slam_ros.processes.messages import RealTimePose
-from hmt_slam_ros.processes.rtl import Rtl
+from hmt_slam_ros.processes.routing import Remembering
+from hmt_slam_ros.processes.rtl import Rtl, RtlState
 
 
 class RtlNode(ProcessNode):
     """The node ``rtl``."""
 
     def __init__(self) -> None:
-        super().__init__("rtl", Rtl, (), changeable=("rtl.publish_tf",))
+        super().__init__("rtl", _make_process, (), changeable=("rtl.publish_tf",))
         self._map, self._odom = declare_frame(self, "map", "map"), declare_frame(self, "odom", "odom")
         self._hmt_poses = self.create_publisher(PoseWithCovarianceStamped, HMT_POSE, qos.STREAM)
         self._poses = self.create_publisher(PoseWithCovarianceStamped, POSE, qos.STREAM)
@@ -33,6 +36,10 @@ class RtlNode(ProcessNode):
         if self.configuration.rtl.publish_tf:
             joint = conversions.transform_message(pose.stamp, self._map, self._odom, pose.map_T_odom)
             self._send_transforms([joint])
+
+
+def _make_process(configuration: Configuration, beginning: Beginning) -> Remembering:
+    return Rtl(configuration, beginning.part("rtl", RtlState))
 
 
 def main() -> None:

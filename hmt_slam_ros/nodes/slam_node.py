@@ -15,8 +15,11 @@ from std_msgs.msg import String
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.nodes import conversions, qos
+from hmt_slam_ros.nodes.beginning import Beginning
 from hmt_slam_ros.nodes.figures import PERIOD
+from hmt_slam_ros.nodes.map_saver import MapSaver
 from hmt_slam_ros.nodes.parameters import declare_frame
 from hmt_slam_ros.nodes.process_node import ProcessNode
 from hmt_slam_ros.nodes.running import run
@@ -24,10 +27,20 @@ from hmt_slam_ros.nodes.sensor_subscription import SensorSubscription
 from hmt_slam_ros.nodes.topics import PARTICLES, ROBOT_STATUS, SCAN
 from hmt_slam_ros.nodes.transforms import LaserMounting
 from hmt_slam_ros.processes.documents import RobotStatus, decode
-from hmt_slam_ros.processes.messages import Accepted, EndOfLog, Finished, Keyframe, LocalEstimate, Message, Trail
+from hmt_slam_ros.processes.messages import (
+    Accepted,
+    AreaPose,
+    EndOfLog,
+    Finished,
+    Keyframe,
+    LocalEstimate,
+    Message,
+    Trail,
+)
 from hmt_slam_ros.processes.replica import FIRST_AREA
 
 if TYPE_CHECKING:
+    from hmt_slam_ros.offline.saved_map import MapWriter
     from hmt_slam_ros.processes.slam import MetricSlam
 
 # Live, scans beyond this many in the queue are dropped; a replay never drops one.
@@ -49,7 +62,12 @@ class SlamNode(ProcessNode):
         self._pending_since = self._last_scan = time.monotonic()
         self._scans, self._dropped = 0, 0
         self._end: RobotStatus | None = None
-        self._areas = {FIRST_AREA: np.zeros(3)}
+        known = self.beginning.map
+        self._areas = {FIRST_AREA: AreaPose(FIRST_AREA, PoseGaussian(np.zeros(3), np.zeros((3, 3))))}
+        self._areas |= {entry.area: entry for entry in known.area_poses} if known else {}
+        self.estimate = known.robot if known else None
+        self._held: deque[Message] = deque()
+        self._saver = MapSaver(self, self._release)
         self._laser = SensorSubscription(self, LaserScan, SCAN, self._hear_scan)
         self._particles = self.create_publisher(PoseArray, PARTICLES, qos.STREAM)
         self.create_subscription(String, ROBOT_STATUS, self._hear_status, qos.LATCHED)
@@ -92,10 +110,31 @@ class SlamNode(ProcessNode):
             self._end_if_all_came()
 
     def deliver(self, message: Message) -> None:
-        """As any process node; the odometry may have been the last thing that was missing."""
+        """As any process node; the odometry may have been the last thing that was missing.
+
+        While the other nodes save their parts of a map, what comes is held.
+        """
+        if self._saver.holding:
+            self._held.append(message)
+            return
         super().deliver(message)
         if self._end is not None:
             self._end_if_all_came()
+        self._saver.look()
+
+    def _release(self) -> None:
+        """Go on with what was held."""
+        while self._held and not self._saver.holding:
+            self.deliver(self._held.popleft())
+
+    def write_map(self, writer: MapWriter) -> None:
+        """Write the map as it is known now."""
+        from hmt_slam_ros.offline.recorder import placed_areas  # noqa: PLC0415  only where something is saved
+
+        assert self.estimate is not None
+        replica = self.process.replica
+        poses = placed_areas(replica.maps[replica.best], tuple(self._areas.values()))
+        writer.write_map(replica, poses, self.estimate)
 
     def _end_if_all_came(self, *, give_up: bool = False) -> None:
         end = self._end
@@ -119,23 +158,26 @@ class SlamNode(ProcessNode):
     def show(self, heard: Message, said: list[Message]) -> None:
         """Publish the particles of the most probable hypothesis in the map, at keyframes."""
         if isinstance(heard, Accepted) and heard.global_poses:
-            self._areas = {area.area: area.pose.mean for area in heard.global_poses}
+            self._areas = {area.area: area for area in heard.global_poses}
         for message in said:
+            if isinstance(message, LocalEstimate):
+                self.estimate = message
             if isinstance(message, Keyframe):
                 self._publish_particles(message.scan.stamp)
 
     def _publish_particles(self, stamp: int) -> None:
         area, poses = self.process.particles
         if area in self._areas and self._particles.get_subscription_count():
-            placed = se2.compose(self._areas[area], poses)
+            placed = se2.compose(self._areas[area].pose.mean, poses)
             header = conversions.header(stamp, self._map)
             self._particles.publish(PoseArray(header=header, poses=[conversions.pose_message(pose) for pose in placed]))
 
 
-def _make_process(configuration: Configuration) -> MetricSlam:
-    from hmt_slam_ros.processes.slam import MetricSlam  # noqa: PLC0415  takes time, in which a signal has to be heard
+def _make_process(configuration: Configuration, beginning: Beginning) -> MetricSlam:
+    # It takes time, in which a signal has to be heard.
+    from hmt_slam_ros.processes.slam import MetricSlam, SlamState  # noqa: PLC0415
 
-    return MetricSlam(configuration)
+    return MetricSlam(configuration, beginning.part("slam", SlamState))
 
 
 def main() -> None:

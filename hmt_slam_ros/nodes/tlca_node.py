@@ -10,13 +10,14 @@ from visualization_msgs.msg import MarkerArray
 
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.nodes import qos
+from hmt_slam_ros.nodes.beginning import Beginning
 from hmt_slam_ros.nodes.map_view import MapView
 from hmt_slam_ros.nodes.parameters import declare_frame
 from hmt_slam_ros.nodes.process_node import ProcessNode
 from hmt_slam_ros.nodes.running import run
 from hmt_slam_ros.nodes.topics import GRAPH, MAP
 from hmt_slam_ros.processes.messages import Accepted, Message
-from hmt_slam_ros.processes.routing import Process
+from hmt_slam_ros.processes.routing import Remembering
 
 _PERIOD = 3.0  # s between two looks at whether the map has to be drawn anew
 
@@ -26,7 +27,7 @@ class TlcaNode(ProcessNode):
 
     def __init__(self) -> None:
         super().__init__("tlca", _make_process, (Accepted,))
-        self._view = MapView(self.configuration, declare_frame(self, "map", "map"))
+        self._view = MapView(self.configuration, declare_frame(self, "map", "map"), self.beginning.map)
         self._grids = self.create_publisher(OccupancyGrid, MAP, qos.LATCHED)
         self._graphs = self.create_publisher(MarkerArray, GRAPH, qos.LATCHED)
         self._drawn = {GRAPH: 0, MAP: 0}
@@ -51,10 +52,11 @@ class TlcaNode(ProcessNode):
         return due
 
 
-def _make_process(configuration: Configuration) -> Process:
-    from hmt_slam_ros.processes.tlca import Tlca  # noqa: PLC0415  takes time, in which a signal has to be heard
+def _make_process(configuration: Configuration, beginning: Beginning) -> Remembering:
+    # It takes time, in which a signal has to be heard.
+    from hmt_slam_ros.processes.tlca import Tlca, TlcaState  # noqa: PLC0415
 
-    return Tlca(configuration)
+    return Tlca(configuration, beginning.part("tlca", TlcaState))
 
 
 def main() -> None:

@@ -8,12 +8,13 @@ from std_msgs.msg import Float64MultiArray, MultiArrayDimension, MultiArrayLayou
 
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.nodes import qos
+from hmt_slam_ros.nodes.beginning import Beginning
 from hmt_slam_ros.nodes.conversions import rows_message_data
 from hmt_slam_ros.nodes.process_node import ProcessNode
 from hmt_slam_ros.nodes.running import run
 from hmt_slam_ros.nodes.topics import PMF
 from hmt_slam_ros.processes.messages import Hypotheses, Message
-from hmt_slam_ros.processes.routing import Process
+from hmt_slam_ros.processes.routing import Remembering
 
 
 class TsbiNode(ProcessNode):
@@ -41,10 +42,11 @@ def pmf_message(hypotheses: Hypotheses) -> Float64MultiArray:
     return Float64MultiArray(layout=MultiArrayLayout(dim=layout), data=rows_message_data(rows))
 
 
-def _make_process(configuration: Configuration) -> Process:
-    from hmt_slam_ros.processes.tsbi import Tsbi  # noqa: PLC0415  takes time, in which a signal has to be heard
+def _make_process(configuration: Configuration, beginning: Beginning) -> Remembering:
+    # It takes time, in which a signal has to be heard.
+    from hmt_slam_ros.processes.tsbi import Tsbi, TsbiState  # noqa: PLC0415
 
-    return Tsbi(configuration)
+    return Tsbi(configuration, state=beginning.part("tsbi", TsbiState))
 
 
 def main() -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.configuration.flat import as_flat
 from hmt_slam_ros.errors import HmtSlamError
-from hmt_slam_ros.offline.output_folder import HMT_MAP
+from hmt_slam_ros.persistence.hmt_map import HMT_MAP
 
 # Which part of a log is used, and how it is played.
 _FREE = "robot."

@@ -22,9 +22,8 @@ from hmt_slam_ros.offline.report import RunFigures, report, write_cost, write_pr
 from hmt_slam_ros.offline.saved_map import MapWriter
 from hmt_slam_ros.offline.topology_file import TOPOLOGY
 from hmt_slam_ros.persistence.folder import MANIFEST
+from hmt_slam_ros.persistence.hmt_map import HMT_MAP
 from hmt_slam_ros.persistence.replacing import put_in_place
-
-HMT_MAP = "hmt_map"
 
 # Everything that ever stands in an output folder; a folder with anything else in it is not ours to replace.
 OWN_NAMES = frozenset(

@@ -206,7 +206,7 @@ class Recorder:
         record = self.record()
         assert record.last is not None
         replica, given = Replica.of(record.replica), record.estimates
-        area_poses = _area_poses(replica.maps[replica.best], record.global_poses)
+        area_poses = placed_areas(replica.maps[replica.best], record.global_poses)
         scans = anchored(stamps, record.own_trails(replica.best))
         return Recording(
             replica,
@@ -278,7 +278,7 @@ def _size(replica: Replica, leaf: Leaf, sizes: Mapping[int, tuple[int, int]]) ->
     return len(hybrid_map.area_ids()), sum(arc.closure for _, _, arc in hybrid_map.all_arcs())
 
 
-def _area_poses(hybrid_map: HybridMap, given: Sequence[AreaPose]) -> dict[int, PoseGaussian]:
+def placed_areas(hybrid_map: HybridMap, given: Sequence[AreaPose]) -> dict[int, PoseGaussian]:
     """``map_T_area`` of every area: as TLCA last gave it, else along the arcs from an area that TLCA did give."""
     known = {entry.area: entry.pose for entry in given}
     areas = hybrid_map.area_ids()

@@ -6,7 +6,7 @@ it was before that. docs/map_format.md describes every file and field.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import get_type_hints
@@ -19,7 +19,8 @@ from hmt_slam_ros.configuration.documents import ros_yaml
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.offline.record import Record
-from hmt_slam_ros.persistence.folder import FolderReader, FolderWriter
+from hmt_slam_ros.persistence.folder import File, FolderReader, FolderWriter
+from hmt_slam_ros.persistence.hmt_map import CONFIGURATION, FORMAT, VERSION
 from hmt_slam_ros.processes.aam import AamState
 from hmt_slam_ros.processes.messages import AreaPose, LocalEstimate
 from hmt_slam_ros.processes.replica import Replica, ReplicaState
@@ -27,10 +28,6 @@ from hmt_slam_ros.processes.rtl import RtlState
 from hmt_slam_ros.processes.slam import SlamState
 from hmt_slam_ros.processes.tlca import TlcaState
 from hmt_slam_ros.processes.tsbi import TsbiState
-
-FORMAT, VERSION = "hmt_map", 4
-
-CONFIGURATION = "configuration.yaml"
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,6 +76,16 @@ class MapDocument:
     robot: LocalEstimate
 
 
+@dataclass(frozen=True)
+class ChainState:
+    """Where the messages between the processes go on.
+
+    :ivar events: keyframe events up to now, which is the number of the next one.
+    """
+
+    events: int
+
+
 PARTS: Mapping[str, type] = get_type_hints(RunState)
 """The parts of the state from which a run goes on."""
 
@@ -108,6 +115,16 @@ class MapWriter:
         """Write what a run goes on from."""
         for name in PARTS:
             self._folder.write(name, getattr(state, name))
+        self._folder.write("chain", ChainState(state.slam.events))
+
+    def write_slam(self, state: SlamState) -> None:
+        """Write metric SLAM's part of what nodes go on from; :meth:`join` takes those of the others."""
+        self._folder.write("slam", state)
+        self._folder.write("chain", ChainState(state.events))
+
+    def join(self, files: Iterable[File]) -> None:
+        """Take in files that others wrote into the folder."""
+        self._folder.join(files)
 
     def write_map(self, replica: Replica, area_poses: Mapping[int, PoseGaussian], robot: LocalEstimate) -> None:
         """Write the map at its best.
@@ -145,8 +162,8 @@ def read_run_state(directory: Path) -> tuple[RunState, Configuration]:
     folder = FolderReader(directory, FORMAT, VERSION)
     if not {f"{part}.json" for part in PARTS} <= folder.names:
         raise HmtSlamError(
-            f"{directory} holds a map without the state of the processes, so that no run can go on from it: give one "
-            "that hmt_slam map wrote"
+            f"{directory} holds a map without the state of a run, so that none can go on from it: give one that "
+            "hmt_slam map wrote, or start nodes from one that nodes saved"
         )
     state = RunState(**{name: folder.read(name, kind) for name, kind in PARTS.items()})
     return state, load_configuration(directory / CONFIGURATION)

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO, TypeVar
 
@@ -28,6 +29,20 @@ _REMEDY = "take a copy that is whole, or map the log again"
 Document = TypeVar("Document")
 
 
+@dataclass(frozen=True)
+class File:
+    """A file as it was written.
+
+    :ivar name: its name in the folder.
+    :ivar bytes: its size.
+    :ivar sha256: its hash, hexadecimal.
+    """
+
+    name: str
+    bytes: int
+    sha256: str
+
+
 class _Hashed:
     """A file that counts and hashes what is written to it."""
 
@@ -41,27 +56,35 @@ class _Hashed:
         self._digest.update(content)
         self._size += len(content)
 
-    @property
-    def entry(self) -> dict[str, object]:
-        return {"bytes": self._size, "sha256": self._digest.hexdigest()}
+    def as_file(self, name: str) -> File:
+        return File(name, self._size, self._digest.hexdigest())
 
 
 class FolderWriter:
     """Writes documents into a folder, then all scans that they speak of, then the manifest."""
 
     def __init__(self, directory: Path) -> None:
-        """:param directory: to be made."""
-        directory.mkdir()
+        """:param directory: made where it is missing."""
+        directory.mkdir(exist_ok=True)
         self._directory = directory
         self._scans = WrittenScans()
-        self._files: dict[str, dict[str, object]] = {}
+        self._files: dict[str, File] = {}
+
+    @property
+    def files(self) -> tuple[File, ...]:
+        """What was written."""
+        return tuple(self._files.values())
+
+    def join(self, files: Iterable[File]) -> None:
+        """Take in what another process wrote into the folder; the scans of that are among one's own."""
+        self._files |= {file.name: file for file in files}
 
     def write(self, name: str, document: object) -> None:
         """Write a document, the same byte for byte for the same content."""
         with (self._directory / f"{name}.bin").open("wb") as file:
             hashed = _Hashed(file)
             content = plain(document, {np.ndarray: WrittenArrays(hashed).plain, Scan: self._scans.plain})
-        self._files[f"{name}.bin"] = hashed.entry
+        self.join([hashed.as_file(f"{name}.bin")])
         self.write_text(f"{name}.json", json.dumps(content, allow_nan=False, separators=(",", ":")) + "\n")
 
     def write_text(self, name: str, text: str) -> None:
@@ -69,7 +92,7 @@ class FolderWriter:
         with (self._directory / name).open("wb") as file:
             hashed = _Hashed(file)
             hashed.write(text.encode())
-        self._files[name] = hashed.entry
+        self.join([hashed.as_file(name)])
 
     def finish(self, kind: str, version: int) -> None:
         """Write the scans and the manifest.
@@ -78,7 +101,8 @@ class FolderWriter:
         :param version: of the form of its documents, likewise.
         """
         self.write(SCANS, self._scans.table)
-        content = {"format": kind, "version": version, "files": dict(sorted(self._files.items()))}
+        files = {name: {"bytes": file.bytes, "sha256": file.sha256} for name, file in sorted(self._files.items())}
+        content: dict[str, object] = {"format": kind, "version": version, "files": files}
         content["sha256"] = _own_digest(content)
         text = json.dumps(content, indent=1, allow_nan=False) + "\n"
         (self._directory / MANIFEST).write_text(text, encoding="utf-8")

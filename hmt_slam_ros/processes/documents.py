@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmt_slam_ros.errors import HmtSlamError
+from hmt_slam_ros.persistence.folder import File
 from hmt_slam_ros.plain_data import Reader, Values, plain
 from hmt_slam_ros.processes.messages import (
     Accepted,
@@ -106,6 +107,36 @@ class RobotStatus:
     acknowledged: int
 
 
+@dataclass(frozen=True, eq=False)
+class SaveRequest:
+    """slam asks the others for their parts of a map.
+
+    :ivar number: of the request, from 1.
+    :ivar events: keyframe events after which all parts are.
+    :ivar folder: into which they are written.
+    """
+
+    number: int
+    events: int
+    folder: str
+
+
+@dataclass(frozen=True, eq=False)
+class SavedPart:
+    """The answer to a :class:`SaveRequest`.
+
+    :ivar number: of the request.
+    :ivar part: the process that answers.
+    :ivar files: what it wrote.
+    :ivar fault: what went wrong, empty where nothing did.
+    """
+
+    number: int
+    part: str
+    files: tuple[File, ...]
+    fault: str = ""
+
+
 # Raise a document's version with every change of its dataclass: a receiver refuses any other.
 _DOCUMENTS: dict[type, tuple[str, int]] = {
     KeyframeHead: ("keyframe", 2),
@@ -116,6 +147,8 @@ _DOCUMENTS: dict[type, tuple[str, int]] = {
     Notice: ("notice", 1),
     Closing: ("finished", 1),
     RobotStatus: ("robot_status", 1),
+    SaveRequest: ("save_request", 1),
+    SavedPart: ("saved_part", 1),
 }
 
 

@@ -26,6 +26,14 @@ class Process(Protocol):
         """Take in one message and return what there is to say."""
 
 
+class Remembering(Process, Protocol):
+    """A process whose memory is a value, from which another one can go on."""
+
+    @property
+    def state(self) -> object:
+        """All that it knows between two messages, or between two keyframe events."""
+
+
 HEARD_BY: dict[str, tuple[type, ...]] = {
     "slam": (Scan, Odometry, Hypotheses, Accepted, EndOfLog),
     "aam": (Keyframe, Hypotheses, Accepted),

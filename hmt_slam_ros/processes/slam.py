@@ -128,6 +128,16 @@ class MetricSlam:
         )  # fmt: skip
 
     @property
+    def replica(self) -> Replica:
+        """The maps of the live hypotheses."""
+        return self._replica
+
+    @property
+    def waiting(self) -> bool:
+        """Whether the answer to a keyframe event is due."""
+        return self._waiting
+
+    @property
     def waiting_scans(self) -> int:
         """Scans in the queue."""
         return len(self._queue)

@@ -1,0 +1,73 @@
+"""What a node begins with: nothing, or its part of a saved map."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeVar
+
+from rcl_interfaces.msg import ParameterDescriptor
+
+from hmt_slam_ros.configuration import load_configuration
+from hmt_slam_ros.errors import HmtSlamError
+from hmt_slam_ros.nodes.parameters import ConfiguredNode
+from hmt_slam_ros.offline.going_on import differences, map_folder
+from hmt_slam_ros.persistence.folder import FolderReader
+from hmt_slam_ros.persistence.hmt_map import CONFIGURATION, FORMAT, VERSION
+
+if TYPE_CHECKING:
+    from hmt_slam_ros.offline.saved_map import MapDocument
+
+State = TypeVar("State")
+
+
+class Beginning:
+    """The map of the parameter ``start_from``, if it is set.
+
+    :ivar events: keyframe events in it, 0 without.
+    """
+
+    def __init__(self, node: ConfiguredNode) -> None:
+        """Check the map.
+
+        :raises HmtSlamError: where it is damaged, or the node's parameters do not go with it.
+        """
+        descriptor = ParameterDescriptor(description="Output folder or hmt_map to go on from.", read_only=True)
+        path = str(node.declare_parameter("start_from", "", descriptor).value)
+        self.events, self._folder = 0, None
+        if path:
+            folder = map_folder(Path(path))
+            self._folder = FolderReader(folder, FORMAT, VERSION)
+            saved = load_configuration(folder / CONFIGURATION)
+            told = differences(saved, replace(node.configuration, robot=saved.robot))
+            if told:
+                node.get_logger().warning(told)
+            # The other processes need not be loaded for it.
+            self.events = self._chain_events()
+
+    def _chain_events(self) -> int:
+        from hmt_slam_ros.offline.saved_map import ChainState  # noqa: PLC0415
+
+        state = self.part("chain", ChainState)
+        return 0 if state is None else state.events
+
+    def part(self, name: str, kind: type[State]) -> State | None:
+        """A part of the map, None where the node begins with nothing.
+
+        :raises HmtSlamError: where the map lacks it.
+        """
+        if self._folder is None:
+            return None
+        if f"{name}.json" not in self._folder.names:
+            raise HmtSlamError(
+                f"the map to start from lacks the part {name}: give one that hmt_slam map wrote or nodes saved"
+            )
+        return self._folder.read(name, kind)
+
+    @cached_property
+    def map(self) -> MapDocument | None:
+        """The map itself."""
+        from hmt_slam_ros.offline.saved_map import MapDocument  # noqa: PLC0415  for those who ask for it
+
+        return self.part("map", MapDocument)

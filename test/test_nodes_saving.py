@@ -1,0 +1,142 @@
+"""The nodes save one map together while they run, and begin with it again."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from logs_for_nodes import PACE, START, corridor_bag
+
+pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
+
+from std_msgs.msg import String
+from std_srvs.srv import SetBool, Trigger
+
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.nodes import qos
+from hmt_slam_ros.nodes.topics import DOCUMENTS, KEYFRAMES
+from hmt_slam_ros.offline.saved_map import ChainState, read_saved_map
+from hmt_slam_ros.persistence.folder import FolderReader
+from hmt_slam_ros.processes.aam import AamState
+from hmt_slam_ros.processes.documents import KeyframeHead, decode
+from hmt_slam_ros.processes.messages import LocalEstimate
+from hmt_slam_ros.processes.slam import SlamState
+from hmt_slam_ros.processes.tlca import TlcaState
+from hmt_slam_ros.processes.tsbi import TsbiState
+
+NODES = ("slam", "aam", "tsbi", "tlca", "rtl")
+STATES = {"slam": SlamState, "aam": AamState, "tsbi": TsbiState, "tlca": TlcaState}
+
+
+class Nodes:
+    """The five processes and a robot, and what is heard of them."""
+
+    def __init__(self, start, listener, log, folder, rate, **robot):
+        self.listener = listener
+        self.estimates = listener.hear(String, DOCUMENTS[LocalEstimate], qos.CHAIN)
+        self.keyframes = listener.hear(String, KEYFRAMES, qos.CHAIN)
+        self.processes = [start(name, save_to=folder) if name == "slam" else start(name) for name in NODES]
+        self.robot = start("robot", log=log, robot__rate=rate, **robot)
+
+    def until(self, condition):
+        self.listener.until(condition, alive=[*self.processes, self.robot])
+
+    def save(self):
+        return self.listener.call(Trigger, "slam/save", Trigger.Request())
+
+    def pause(self, on):
+        assert self.listener.call(SetBool, "robot/pause", SetBool.Request(data=on)).success
+
+    def stop(self):
+        for process in (*self.processes, self.robot):
+            process.terminate()
+        for process in (*self.processes, self.robot):
+            assert process.wait(20) == 0
+
+    @property
+    def last(self):
+        return decode(self.estimates[-1].data, LocalEstimate)
+
+
+def states(folder):
+    """The parts of the map by process; reading it checks that it is whole."""
+    reader = FolderReader(folder, "hmt_map", 4)
+    return {name: reader.read(name, kind) for name, kind in STATES.items()}, reader.read("chain", ChainState).events
+
+
+def replica_in_words(replica):
+    """What a map says, to be compared."""
+    return (
+        sorted(replica.scans),
+        replica.common.areas.tolist(),
+        replica.common.poses.tolist(),
+        replica.common.means.tolist(),
+        {h: (own.keyframes.tolist(), own.poses.tolist()) for h, own in replica.changes.items()},
+        dict(replica.areas),
+    )
+
+
+def test_a_map_is_saved_while_the_robot_drives_and_other_nodes_go_on_from_it(tmp_path, listener, start):
+    log, folder = corridor_bag(tmp_path, scans=80), tmp_path / "maps" / "hmt_map"
+    first = Nodes(start, listener, log, folder, 4.0)
+    first.until(lambda: len(first.estimates) > 20)
+    saved = first.save()  # while scans come
+    assert saved.success, saved.message
+    assert saved.message == f"saved to {folder}"
+    parts, events = states(folder)
+    assert events == parts["slam"].events > 3
+    # All parts are of one and the same moment.
+    maps = {name: replica_in_words(part.replica) for name, part in parts.items()}
+    assert maps["slam"] == maps["aam"] == maps["tsbi"] == maps["tlca"]
+    assert max(maps["slam"][0]) < events
+    assert sorted(path.name for path in folder.parent.iterdir()) == ["hmt_map"]
+
+    first.pause(on=True)
+    listener.spin(1.0)
+    assert first.save().success
+    stopped, events = states(folder)
+    assert stopped["slam"].scans == len(first.estimates) < 80
+    first.stop()
+
+    # At the first scan that is not in the map.
+    begin = (stopped["slam"].last_stamp - START) / 1e9 + 0.001
+    second = Nodes(start_with(start, start_from=folder), listener, log, folder, 0.0, robot__start=begin)
+    second.until(lambda: second.estimates and second.last.scan_index == 79)
+    heads = [decode(message.data, KeyframeHead).sequence for message in second.keyframes]
+    assert heads == list(range(events, events + len(heads)))
+    known = read_saved_map(folder)
+    assert second.save().success
+    grown = read_saved_map(folder)
+    best, before = grown.replica.maps[grown.replica.best], known.replica.maps[known.replica.best]
+    assert set(before.area_ids()) <= set(best.area_ids())
+    # The robot is where it truly is, in the map of before.
+    at = se2.compose(grown.area_poses[second.last.area].mean, second.last.pose.mean)
+    assert np.abs(at - 4 * 79 * PACE).max() < 0.1
+
+
+def start_with(start, **parameters):
+    """As ``start``, the processes with further parameters."""
+    return lambda name, **own: start(name, **(own if name == "robot" else own | parameters))
+
+
+def test_what_cannot_be_saved_is_told(tmp_path, listener, start):
+    (tmp_path / "notes").mkdir()
+    (tmp_path / "notes" / "notes.txt").write_text("precious")
+    start("slam", save_to=tmp_path / "notes")
+    answer = listener.call(Trigger, "slam/save", Trigger.Request())
+    assert (answer.success, answer.message) == (
+        False, f"{tmp_path / 'notes'} cannot be saved: nothing is mapped yet, drive first"
+    )  # fmt: skip
+
+
+def test_a_map_that_is_damaged_or_made_with_other_particles_keeps_the_nodes_from_starting(tmp_path, start):
+    out = tmp_path / "out"
+    command = [sys.executable, "-m", "hmt_slam_ros.cli.main", "map", str(corridor_bag(tmp_path)), "--out", str(out)]
+    subprocess.run(command, check=True, timeout=120)
+    node = start("slam", start_from=out, filter__particles=5)
+    assert "made with filter.particles = 12, not with filter.particles = 5" in node.communicate(timeout=40)[1]
+    assert node.returncode == 2
+    (out / "hmt_map" / "tlca.json").write_text("{}")
+    node = start("rtl", start_from=out)
+    assert "tlca.json is truncated or damaged" in node.communicate(timeout=40)[1]
+    assert node.returncode == 2
