@@ -25,15 +25,22 @@ def generate_launch_description() -> LaunchDescription:
         DeclareLaunchArgument("namespace", default_value="", description="Namespace of the nodes and their topics."),
         DeclareLaunchArgument("start_from", default_value="", description="Saved map to go on from; empty for none."),
         DeclareLaunchArgument("save_to", default_value="hmt_map", description="Folder for the service slam/save."),
+        DeclareLaunchArgument(
+            "save_at_end",
+            default_value="false",
+            choices=["true", "false"],
+            description="Whether the map is saved there before the nodes end.",
+        ),
         DeclareLaunchArgument("log_level", default_value="info", description="Level of the nodes' log output."),
     ]
-    folders = {name: ParameterValue(LaunchConfiguration(name), value_type=str) for name in ("start_from", "save_to")}
+    saving = {name: ParameterValue(LaunchConfiguration(name), value_type=str) for name in ("start_from", "save_to")}
+    saving["save_at_end"] = ParameterValue(LaunchConfiguration("save_at_end"), value_type=bool)
     nodes = [
         Node(
             package="hmt_slam_ros",
             executable=process,
             namespace=LaunchConfiguration("namespace"),
-            parameters=[LaunchConfiguration("params_file"), {"use_sim_time": use_sim_time}, folders],
+            parameters=[LaunchConfiguration("params_file"), {"use_sim_time": use_sim_time}, saving],
             ros_arguments=["--log-level", LaunchConfiguration("log_level")],
             output="screen",
         )

@@ -1,7 +1,9 @@
 """The nodes save one map together while they run, and begin with it again."""
 
+import signal
 import subprocess
 import sys
+import time
 
 import numpy as np
 import pytest
@@ -112,6 +114,30 @@ def test_a_map_is_saved_while_the_robot_drives_and_other_nodes_go_on_from_it(tmp
     # The robot is where it truly is, in the map of before.
     at = se2.compose(grown.area_poses[second.last.area].mean, second.last.pose.mean)
     assert np.abs(at - 4 * 79 * PACE).max() < 0.1
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=lambda number: number.name)
+def test_nodes_that_are_told_to_end_save_their_map_first_if_that_is_wanted(tmp_path, listener, start, number):
+    """All at once, twice, and the robot with them, as a launch does whose terminal is interrupted."""
+    log, folder = corridor_bag(tmp_path, scans=200), tmp_path / "hmt_map"
+    nodes = Nodes(start_with(start, save_at_end=True), listener, log, folder, 4.0)
+    nodes.until(lambda: len(nodes.estimates) > 20)
+    everybody = [*nodes.processes, nodes.robot]
+    for process in everybody:
+        process.send_signal(number)
+    time.sleep(0.1)
+    for process in nodes.processes:
+        process.send_signal(number)
+    begin = time.monotonic()
+    for process in everybody:
+        error = process.communicate(timeout=20)[1]
+        assert process.returncode == 0, error
+        assert "Traceback" not in error, error
+    assert time.monotonic() - begin < 8.0
+    parts, events = states(folder)
+    assert events > 3
+    maps = {name: replica_in_words(part.replica) for name, part in parts.items()}
+    assert maps["slam"] == maps["aam"] == maps["tsbi"] == maps["tlca"]
 
 
 def start_with(start, **parameters):

@@ -6,6 +6,7 @@ import sys
 
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.nodes.beginning import Beginning
+from hmt_slam_ros.nodes.last_save import spin
 from hmt_slam_ros.nodes.process_node import ProcessNode
 from hmt_slam_ros.nodes.running import run
 from hmt_slam_ros.processes.messages import AreaEvents
@@ -25,7 +26,7 @@ def _make_process(configuration: Configuration, beginning: Beginning) -> Remembe
 
 def main() -> None:
     """Run the node."""
-    sys.exit(run(make))
+    sys.exit(run(make, spin))
 
 
 if __name__ == "__main__":

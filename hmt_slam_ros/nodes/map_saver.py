@@ -68,6 +68,8 @@ class MapSaver:
         self._node, self._release = node, release
         self._target = Path(node.declare_parameter("save_to", HMT_MAP, _DESCRIPTOR).value).absolute()
         self._asked: Future | None = None
+        self._last: Future | None = None
+        self._ending = False
         self._since, self._number = 0.0, 0
         self._saving: _Saving | None = None
         self._requests = node.create_publisher(String, SAVE, qos.CHAIN)
@@ -81,15 +83,26 @@ class MapSaver:
         if self._asked is not None:
             response.message = "a map is being saved already: ask again"
             return response
-        self._asked, self._since = Future(), time.monotonic()
-        self.look()
-        response.success, response.message = await self._asked
-        self._asked = None
+        response.success, response.message = await self._ask()
         return response
+
+    def _ask(self) -> Future:
+        """The outcome of saving a map from now on: whether it was saved, and a sentence."""
+        asked = self._asked = Future()
+        self._since = time.monotonic()
+        self.look()
+        return asked
+
+    def saved_last(self) -> bool:
+        """Whether the map of a node that was told to end is saved, or cannot be; the first call asks for it."""
+        self._ending = True
+        if self._last is None and self._asked is None:
+            self._last = self._ask()
+        return self._last is not None and self._last.done()
 
     def look(self) -> None:
         """Begin to save where that is asked for and no keyframe event is under way."""
-        if self._asked is None or self._asked.done() or self._saving is not None or self._node.process.waiting:
+        if self._asked is None or self._saving is not None or self._node.process.waiting:
             return
         try:
             self._check()
@@ -115,7 +128,7 @@ class MapSaver:
         self._saving.writer.write_slam(state)
         self._node.write_map(self._saving.writer)
         self._number += 1
-        request = SaveRequest(self._number, state.events, str(self._saving.folder))
+        request = SaveRequest(self._number, state.events, str(self._saving.folder), self._ending)
         self._requests.publish(String(data=encode(request)))
 
     def _hear(self, message: String) -> None:
@@ -141,7 +154,7 @@ class MapSaver:
             self._end(None)
 
     def _lose_patience(self) -> None:
-        if self._asked is None or self._asked.done() or time.monotonic() - self._since < _PATIENCE:
+        if self._asked is None or time.monotonic() - self._since < _PATIENCE:
             return
         missing = [name for name in PARTS if self._saving is not None and name not in self._saving.parts]
         late = f"{' and '.join(missing)} did not answer" if missing else "a keyframe event is not answered"
@@ -154,8 +167,9 @@ class MapSaver:
         self._saving, self.holding = None, False
         if fault is not None:
             self._node.figures.warn(fault)
-        if self._asked is not None:
-            self._asked.set_result((fault is None, fault or f"saved to {self._target}"))
+        asked, self._asked = self._asked, None
+        if asked is not None:
+            asked.set_result((fault is None, fault or f"saved to {self._target}"))
         self._release()
 
 

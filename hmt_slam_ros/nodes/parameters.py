@@ -15,7 +15,8 @@ from hmt_slam_ros.configuration import Configuration, FlatParameter, flat_parame
 from hmt_slam_ros.errors import HmtSlamError
 
 # Names that are not in the tree but in a node's parameters all the same.
-_NODE_PARAMETERS = ("base_frame", "odom_frame", "map_frame", "laser_pose", "log", "save_to", "start_from")
+_FRAMES = ("base_frame", "odom_frame", "map_frame", "laser_pose")
+_NODE_PARAMETERS = (*_FRAMES, "log", "save_to", "save_at_end", "start_from")
 _ROS_PARAMETERS = ("use_sim_time", "start_type_description_service", "qos_overrides.")
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -36,6 +37,7 @@ class PartSaver:
         self._last = [kind for kind in CHAIN if kind in HEARD_BY[name]][-1]
         self._events = node.beginning.events
         self._request: SaveRequest | None = None
+        self._gave_last: float | None = None
         self._answers = node.create_publisher(String, SAVED, qos.CHAIN)
         node.create_subscription(String, SAVE, self._hear, qos.CHAIN_FROM_NOW)
 
@@ -44,6 +46,10 @@ class PartSaver:
         if isinstance(message, self._last):
             self._events += 1
             self._answer_if_due()
+
+    def gave_last(self, linger: float) -> bool:
+        """Whether the part of the last map was written, at least some seconds ago, or there is nothing to be saved."""
+        return not self._events or (self._gave_last is not None and time.monotonic() - self._gave_last >= linger)
 
     def _hear(self, message: String) -> None:
         try:
@@ -60,6 +66,8 @@ class PartSaver:
         self._request = None
         files, fault = self._written(request)
         self._answers.publish(String(data=encode(SavedPart(request.number, self._name, files, fault))))
+        if request.last:
+            self._gave_last = time.monotonic()
 
     def _written(self, request: SaveRequest) -> tuple[tuple[File, ...], str]:
         """What was written, or what went wrong."""

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 
+from rcl_interfaces.msg import ParameterDescriptor
+
 from hmt_slam_ros.compilation import tell_of_compilation
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.nodes.beginning import Beginning
@@ -15,9 +17,16 @@ from hmt_slam_ros.nodes.part_saver import PARTS, PartSaver
 from hmt_slam_ros.processes.messages import Message, Notice
 from hmt_slam_ros.processes.routing import HEARD_BY, Remembering
 
+_SAVE_AT_END = ParameterDescriptor(
+    description="Whether all nodes save the map to save_to of slam when they are told to end.", read_only=True
+)
+
 
 class ProcessNode(ConfiguredNode):
-    """A process of :mod:`hmt_slam_ros.processes` as a node of the same name."""
+    """A process of :mod:`hmt_slam_ros.processes` as a node of the same name.
+
+    :ivar saves_at_end: whether it stays for that when it is told to end.
+    """
 
     def __init__(
         self,
@@ -35,6 +44,7 @@ class ProcessNode(ConfiguredNode):
         :raises HmtSlamError: for a parameter that cannot be.
         """
         super().__init__(name, changeable)
+        self.saves_at_end = bool(self.declare_parameter("save_at_end", False, _SAVE_AT_END).value)
         self.figures = Figures(self)
         self.beginning = Beginning(self)
         self.process = make_process(self.configuration, self.beginning)
@@ -56,6 +66,10 @@ class ProcessNode(ConfiguredNode):
         self.show(message, said)
         if self._part is not None:
             self._part.delivered(message)
+
+    def saved_last(self, linger: float) -> bool:
+        """Whether the node's part of the last map is saved, and the others had some seconds to hear of it."""
+        return self._part is not None and self._part.gave_last(linger)
 
     def show(self, _heard: Message, _said: list[Message]) -> None:
         """Publish what is for people to see; nothing, unless a node has something."""

@@ -9,6 +9,7 @@ from geometry_msgs.msg import PoseWithCovarianceStamped
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.nodes import conversions, qos
 from hmt_slam_ros.nodes.beginning import Beginning
+from hmt_slam_ros.nodes.last_save import spin
 from hmt_slam_ros.nodes.parameters import declare_frame
 from hmt_slam_ros.nodes.process_node import ProcessNode
 from hmt_slam_ros.nodes.running import run
@@ -44,7 +45,7 @@ def _make_process(configuration: Configuration, beginning: Beginning) -> Remembe
 
 def main() -> None:
     """Run the node."""
-    sys.exit(run(RtlNode))
+    sys.exit(run(RtlNode, spin))
 
 
 if __name__ == "__main__":

@@ -19,6 +19,7 @@ from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.nodes import conversions, qos
 from hmt_slam_ros.nodes.beginning import Beginning
 from hmt_slam_ros.nodes.figures import PERIOD
+from hmt_slam_ros.nodes.last_save import spin
 from hmt_slam_ros.nodes.map_saver import MapSaver
 from hmt_slam_ros.nodes.parameters import declare_frame
 from hmt_slam_ros.nodes.process_node import ProcessNode
@@ -127,6 +128,10 @@ class SlamNode(ProcessNode):
         while self._held and not self._saver.holding:
             self.deliver(self._held.popleft())
 
+    def saved_last(self, linger: float) -> bool:  # noqa: ARG002  all others have answered
+        """Whether the last map is saved, or cannot be."""
+        return self._saver.saved_last()
+
     def write_map(self, writer: MapWriter) -> None:
         """Write the map as it is known now."""
         from hmt_slam_ros.offline.recorder import placed_areas  # noqa: PLC0415  only where something is saved
@@ -182,7 +187,7 @@ def _make_process(configuration: Configuration, beginning: Beginning) -> MetricS
 
 def main() -> None:
     """Run the node."""
-    sys.exit(run(SlamNode))
+    sys.exit(run(SlamNode, spin))
 
 
 if __name__ == "__main__":

@@ -11,6 +11,7 @@ from visualization_msgs.msg import MarkerArray
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.nodes import qos
 from hmt_slam_ros.nodes.beginning import Beginning
+from hmt_slam_ros.nodes.last_save import spin
 from hmt_slam_ros.nodes.map_view import MapView
 from hmt_slam_ros.nodes.parameters import declare_frame
 from hmt_slam_ros.nodes.process_node import ProcessNode
@@ -61,7 +62,7 @@ def _make_process(configuration: Configuration, beginning: Beginning) -> Remembe
 
 def main() -> None:
     """Run the node."""
-    sys.exit(run(TlcaNode))
+    sys.exit(run(TlcaNode, spin))
 
 
 if __name__ == "__main__":

@@ -10,6 +10,7 @@ from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.nodes import qos
 from hmt_slam_ros.nodes.beginning import Beginning
 from hmt_slam_ros.nodes.conversions import rows_message_data
+from hmt_slam_ros.nodes.last_save import spin
 from hmt_slam_ros.nodes.process_node import ProcessNode
 from hmt_slam_ros.nodes.running import run
 from hmt_slam_ros.nodes.topics import PMF
@@ -51,7 +52,7 @@ def _make_process(configuration: Configuration, beginning: Beginning) -> Remembe
 
 def main() -> None:
     """Run the node."""
-    sys.exit(run(TsbiNode))
+    sys.exit(run(TsbiNode, spin))
 
 
 if __name__ == "__main__":

@@ -114,11 +114,13 @@ class SaveRequest:
     :ivar number: of the request, from 1.
     :ivar events: keyframe events after which all parts are.
     :ivar folder: into which they are written.
+    :ivar last: whether all nodes end afterwards.
     """
 
     number: int
     events: int
     folder: str
+    last: bool
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,61 @@
+"""Nodes that are told to end and save their map first, all together, where the parameter ``save_at_end`` is set.
+
+rclpy's own handler of signals takes the context away at once, and with it all talk among the nodes. So these nodes do
+without it: the one that is told goes on until the map is saved, or some seconds are over.
+"""
+
+from __future__ import annotations
+
+import signal
+import time
+
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.signals import uninstall_signal_handlers
+
+from hmt_slam_ros.nodes.departure import end_within
+from hmt_slam_ros.nodes.process_node import ProcessNode
+
+# A launch tells its nodes to end once more, and less kindly, after 5 s, and kills them after 10 s.
+_PATIENCE = 8.0  # s
+# What a node said last has to reach the others before it takes leave.
+_LINGER = 0.5  # s
+_POLL = 0.05  # s
+
+
+def spin(node: ProcessNode) -> None:
+    """Spin a node until it is told to end and its part of the last map is saved, if one is to be."""
+    if not node.saves_at_end:
+        rclpy.spin(node)
+        return
+    told = _Told()
+    uninstall_signal_handlers()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, told)
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    try:
+        while rclpy.ok() and not told.over and not (told.at and node.saved_last(_LINGER)):
+            executor.spin_once(timeout_sec=_POLL)
+    finally:
+        executor.shutdown()
+
+
+class _Told:
+    """Takes note of the first signal; more of them change nothing.
+
+    :ivar at: when that was, by the monotonic clock, None before.
+    """
+
+    def __init__(self) -> None:
+        self.at: float | None = None
+
+    @property
+    def over(self) -> bool:
+        """Whether there is no time left."""
+        return self.at is not None and time.monotonic() - self.at > _PATIENCE
+
+    def __call__(self, _number: int, _frame: object) -> None:
+        if self.at is None:
+            self.at = time.monotonic()
+            end_within(_PATIENCE + 1.0, 0)
