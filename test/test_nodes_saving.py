@@ -11,12 +11,13 @@ from logs_for_nodes import PACE, START, corridor_bag
 
 pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
 
+from nav_msgs.msg import OccupancyGrid
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.nodes import qos
-from hmt_slam_ros.nodes.topics import DOCUMENTS, KEYFRAMES
+from hmt_slam_ros.nodes.topics import DOCUMENTS, KEYFRAMES, MAP
 from hmt_slam_ros.offline.saved_map import ChainState, read_saved_map
 from hmt_slam_ros.persistence.folder import FolderReader
 from hmt_slam_ros.processes.aam import AamState
@@ -138,6 +139,19 @@ def test_nodes_that_are_told_to_end_save_their_map_first_if_that_is_wanted(tmp_p
     assert events > 3
     maps = {name: replica_in_words(part.replica) for name, part in parts.items()}
     assert maps["slam"] == maps["aam"] == maps["tsbi"] == maps["tlca"]
+
+
+def test_nodes_show_a_map_of_the_command_line_at_once_and_go_on_from_it(tmp_path, listener, start):
+    log, out = corridor_bag(tmp_path, scans=60), tmp_path / "out"
+    command = [sys.executable, "-m", "hmt_slam_ros.cli.main", "map", str(log), "--out", str(out), "--duration", "6"]
+    subprocess.run(command, check=True, timeout=120)
+    grids = listener.hear(OccupancyGrid, MAP, qos.LATCHED)
+    nodes = Nodes(start_with(start, start_from=out), listener, log, tmp_path / "hmt_map", 0.0, robot__start=6.001)
+    nodes.until(lambda: grids and nodes.estimates and nodes.last.scan_index == 59)
+    known = (np.frombuffer(grids[0].data, dtype=np.int8) == 100).sum()
+    assert known > 100
+    events = FolderReader(out / "hmt_map", "hmt_map", 4).read("chain", ChainState).events
+    assert decode(nodes.keyframes[0].data, KeyframeHead).sequence == events > 3
 
 
 def start_with(start, **parameters):

@@ -6,9 +6,11 @@ was written.
 
 from __future__ import annotations
 
+import gc
 import hashlib
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO, TypeVar
@@ -81,7 +83,7 @@ class FolderWriter:
 
     def write(self, name: str, document: object) -> None:
         """Write a document, the same byte for byte for the same content."""
-        with (self._directory / f"{name}.bin").open("wb") as file:
+        with (self._directory / f"{name}.bin").open("wb") as file, _no_collection():
             hashed = _Hashed(file)
             content = plain(document, {np.ndarray: WrittenArrays(hashed).plain, Scan: self._scans.plain})
         self.join([hashed.as_file(f"{name}.bin")])
@@ -172,8 +174,21 @@ class FolderReader:
 
     def _read(self, name: str, kind: type[Document], forms: Mapping[type, ReaderOf]) -> Document:
         arrays = ReadArrays((self._directory / f"{name}.bin").read_bytes())
-        content = json.loads((self._directory / f"{name}.json").read_text(encoding="utf-8"))
-        return Values(DESCRIBED, {np.ndarray: arrays.reader, **forms}).value(content, kind, name)
+        with _no_collection():
+            content = json.loads((self._directory / f"{name}.json").read_text(encoding="utf-8"))
+            return Values(DESCRIBED, {np.ndarray: arrays.reader, **forms}).value(content, kind, name)
+
+
+@contextmanager
+def _no_collection() -> Iterator[None]:
+    """The garbage collector need not look again and again through much that is made at once and stays."""
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
 
 
 def _own_digest(manifest: Mapping[str, object]) -> str:
