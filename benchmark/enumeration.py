@@ -47,10 +47,10 @@ class _EverywhereSearch(ClosureSearch):
 
     def compare(
         self, hybrid_map: HybridMap, area: int, query: Query, compared: Mapping[int, Collection[int]],
-        excluded: Collection[int], most: int,
+        excluded: Collection[int], most: int, only: Collection[int] = (),
     ) -> Comparison:  # fmt: skip
         """As in the model, over all areas, however many they are."""
-        del most
+        del most, only
         options = self._options
         fresh = {
             known: {k: pose for k, pose in query.poses.items() if k not in compared.get(known, ())}
@@ -63,9 +63,8 @@ class _EverywhereSearch(ClosureSearch):
         candidates = {known: Candidate(prior, fresh[known], 1.0) for known, prior in priors.items()}
         places = {known: self._views.place(hybrid_map, known, excluded) for known in candidates}
         entries = {known: self._entry(place, candidates[known]) for known, place in places.items()}
-        asked_in = [known for known, found in entries.items() if found.share]
-        modes = {known: self._modes(places[known], candidates[known]) for known in asked_in}
-        shares = {known: entries[known].share for known, found in modes.items() if found is not None}
+        shares = {known: found.share for known, found in entries.items() if found.share}
+        modes = {known: self._modes(places[known], candidates[known]) for known in shares}
         total = sum(shares.values())
         new = max(1.0 - total, options.new_probability) if total else 1.0
         if shares:
@@ -79,7 +78,8 @@ class _EverywhereSearch(ClosureSearch):
                 (1.0 - new) * share / total,
             )
         ]
-        return Comparison(Transition({}, new), tuple(fits), tuple(shares), len(shares) < len(asked_in), 0.0)
+        beside = tuple(known for known, found in modes.items() if found is None)
+        return Comparison(Transition({}, new), tuple(fits), tuple(known for known in shares if known not in beside), beside, 0.0)
 
 
 @dataclass(frozen=True, eq=False)

@@ -30,9 +30,9 @@ def misled(area, known, deviations):
     class Misled(Branching):
         done = False
 
-        def recheck(self, parent):
+        def recheck(self, parent, only=()):
             if self.done or parent.area != area:
-                return super().recheck(parent)
+                return super().recheck(parent, only)
             Misled.done = True
             belief = reachable(parent.hybrid_map, area, until=(known,))[known]
             values, vectors = np.linalg.eigh(belief.covariance)

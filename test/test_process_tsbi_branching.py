@@ -44,6 +44,13 @@ def rooms_apart(rooms, offsets, sigma, configuration=None, last=PATH):
     return parent, Branching(configuration or Configuration(), replica), list(newest)
 
 
+def known_through_another(hybrid_map):
+    """Let area 0 be known only by way of area 1, where it is a neighbour of the robot's area 2."""
+    arc_1_0 = hybrid_map.arc(2, 1).inverse().compose(hybrid_map.arc(2, 0))
+    del hybrid_map.arcs[0, 2]
+    hybrid_map.set_arc(1, 0, arc_1_0, closure=False)
+
+
 def weights_by_area(branches):
     weights = {}
     for child in branches.children:
@@ -119,11 +126,7 @@ def test_candidates_beyond_the_number_that_is_examined_keep_their_prior_mass():
 
 def test_a_re_check_joins_areas_by_an_arc_and_moves_nothing():
     parent, branching, _ = rooms_apart((ROOM, ROOM, ROOM), ((0.6, 0.4), (-0.5, 0.3)), 1.0)
-    # Area 0 is the robot's neighbour; let it be known only by way of area 1.
-    hybrid_map = parent.hybrid_map
-    arc_1_0 = hybrid_map.arc(2, 1).inverse().compose(hybrid_map.arc(2, 0))
-    del hybrid_map.arcs[0, 2]
-    hybrid_map.set_arc(1, 0, arc_1_0, closure=False)
+    known_through_another(parent.hybrid_map)
     children = branching.recheck(parent).children
     stay, *joined = children
     assert (stay.area, stay.arcs, stay.reload) == (2, (), False)
@@ -142,22 +145,38 @@ def test_a_keyframe_speaks_for_or_against_an_area_once():
     assert [child.area for child in branches.children] == [parent.area + 1]
 
 
-def approach(xs):
-    """What comes of comparing keyframes at ``xs`` in a hall with an area of which the last keyframe is at x = 3.7."""
+def approaching(xs):
+    """A robot with keyframes at ``xs`` in a hall with a known area, of which the last keyframe is at x = 3.7."""
     walls = np.concatenate((box(0.0, 0.0, 12.0, 5.0), box(1.0, 3.0, 2.0, 3.5), box(7.0, 0.5, 7.6, 0.9)))
     path = np.array([[x, 2.2, np.pi] for x in xs])
-    parent, branching, newest = rooms_apart((walls, walls), ((0.3, -0.2),), 0.5, last=path)
-    return parent, branching.cut(parent, newest)
+    parent, branching, newest = rooms_apart((walls, OTHER, walls), ((0.3, -0.2), (0.0, 40.0)), 0.5, last=path)
+    known_through_another(parent.hybrid_map)
+    return parent, branching, newest
 
 
 def test_keyframes_that_see_an_area_but_are_not_in_its_place_yet_are_asked_again():
-    parent, branches = approach((8.7, 8.2, 7.7, 7.2, 6.7, 6.2))
+    parent, branching, newest = approaching((8.7, 8.2, 7.7, 7.2, 6.7, 6.2))
+    branches = branching.cut(parent, newest)
     assert [child.area for child in branches.children] == [parent.area + 1]
     assert 0 not in branches.children[0].notes.compared
 
 
+def test_whether_the_robot_is_in_known_ground_now_is_asked_of_the_newest_keyframes():
+    parent, branching, _ = approaching((6.2, 5.6, 5.0, 4.4, 3.8, 3.2))
+    parent = replace(parent, notes=replace(parent.notes, unchecked=(), beside=(0,)))
+    stay, joined = branching.recheck(parent, (0,)).children
+    assert [arc.target for arc in joined.arcs] == [0]
+    assert joined.log_weight > stay.log_weight
+    parent, branching, newest = approaching((8.7, 8.2, 7.7, 7.2, 6.7, 6.2))
+    parent = replace(parent, notes=replace(parent.notes, unchecked=tuple(newest[-3:]), beside=(0,)))
+    (stay,) = branching.recheck(parent, (0,)).children
+    assert stay.log_weight == parent.log_weight
+    assert (stay.notes.unchecked, stay.notes.beside) == (tuple(newest[-3:]), (0,))
+
+
 def test_keyframes_most_of_which_are_in_its_place_are_recognized():
-    _parent, branches = approach((6.2, 5.6, 5.0, 4.4, 3.8, 3.2))
+    parent, branching, newest = approaching((6.2, 5.6, 5.0, 4.4, 3.8, 3.2))
+    branches = branching.cut(parent, newest)
     assert max(branches.children, key=lambda child: child.log_weight).area == 0
 
 

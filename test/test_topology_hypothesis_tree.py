@@ -1,6 +1,7 @@
 """Weights of the leaves and what is remembered of them."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -76,10 +77,12 @@ def test_entering_an_area_keeps_the_notes_of_the_keyframes_that_came_along():
     assert entered.unchecked == ()
 
 
-def test_of_keyframes_beside_known_ground_the_newer_half_is_looked_at_again():
-    notes = LeafNotes(unchecked=(3, 4, 5, 6, 7))
-    assert notes.checked([], [3, 4, 5, 6, 7], beside=True).unchecked == (6, 7)
-    assert notes.checked([], [3, 4, 5, 6, 7]).unchecked == ()
+def test_areas_beside_which_keyframes_fitted_are_remembered_until_the_next_comparison():
+    notes = LeafNotes(unchecked=(3, 4, 5, 6, 7)).checked([1], [3, 4, 5, 6, 7], (2,))
+    assert (notes.unchecked, notes.beside) == ((), (2,))
+    assert notes.compared == {1: {3, 4, 5, 6, 7}}
+    soon = replace(notes, unchecked=(8, 9)).checked([2], [5, 6, 7, 8, 9], all_areas=False)
+    assert (soon.unchecked, soon.beside) == ((8, 9), ())
 
 
 def test_notes_are_values():

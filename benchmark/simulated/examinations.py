@@ -80,9 +80,9 @@ class WatchedBranching(Branching):
         """As always."""
         return self._told("cut", parent, super().cut(parent, keyframes))
 
-    def recheck(self, parent: Parent) -> Branches:
+    def recheck(self, parent: Parent, only: Collection[int] = ()) -> Branches:
         """As always."""
-        return self._told("recheck", parent, super().recheck(parent))
+        return self._told("recheck", parent, super().recheck(parent, only))
 
     def _told(self, kind: str, parent: Parent, branches: Branches) -> Branches:
         if (asked := self._watched.take()) is not None:
@@ -109,10 +109,10 @@ class _WatchedSearch(ClosureSearch):
 
     def compare(
         self, hybrid_map: HybridMap, area: int, query: Query, compared: Mapping[int, Collection[int]],
-        excluded: Collection[int], most: int,
+        excluded: Collection[int], most: int, only: Collection[int] = (),
     ) -> Comparison:  # fmt: skip
         """As always."""
-        found = super().compare(hybrid_map, area, query, compared, excluded, most)
+        found = super().compare(hybrid_map, area, query, compared, excluded, most, only)
         self._last = query, compared, frozenset(excluded), found
         return found
 

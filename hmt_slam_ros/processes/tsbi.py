@@ -38,6 +38,8 @@ from hmt_slam_ros.topology.surroundings import agreeing, areas_around
 
 # Keyframe events in a row that the robot has to spend in an area of the local map before an arc joins it.
 _ASTRAY = 3
+# Keyframes after which it is looked whether the robot is in known ground that it saw before it.
+_SOON = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,6 +193,8 @@ class Tsbi:
             return self._branching.link(parent, notes.astray[0], scan, estimate.pose)
         if len(notes.unchecked) >= self._options.recheck_keyframes:
             return with_displaced(self._branching, parent, notes.unchecked, self._branching.recheck(parent))
+        if notes.beside and len(notes.unchecked) == _SOON:
+            return self._branching.recheck(parent, notes.beside)
         return Branches([Child(parent.hypothesis, parent.log_weight, parent.area, notes)])
 
     def _settle(self, sequence: int, children: Sequence[Child], branches: Sequence[Branches]) -> Settled:

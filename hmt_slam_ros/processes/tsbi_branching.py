@@ -163,22 +163,32 @@ class Branching:
         children += [self._enter_known(noted, query, fit) for fit in found.fits]
         return Branches(children, True, _log(found.skipped) + parent.log_weight)
 
-    def recheck(self, parent: Parent) -> Branches:
-        """Stay as it is, or join the robot's area to a known one by a further arc; no keyframe changes its area."""
-        keyframes = [k for k in parent.notes.unchecked if k in parent.hybrid_map.keyframes(parent.area)]
+    def recheck(self, parent: Parent, only: Collection[int] = ()) -> Branches:
+        """Stay as it is, or join the robot's area to a known one by a further arc; no keyframe changes its area.
+
+        :param only: known areas beside which keyframes fitted: whether the newest are in one of them now.
+        """
+        newest = sorted(parent.notes.covariances)[-self._options.recheck_keyframes :]
+        placed = parent.hybrid_map.keyframes(parent.area)
+        keyframes = [k for k in (newest if only else parent.notes.unchecked) if k in placed]
         query = self.query(parent, keyframes)
         excluded = {parent.area, *parent.around(), *parent.hybrid_map.neighbours(parent.area)}
-        found = self._compared(parent, query, excluded)
-        noted = replace(parent, notes=parent.notes.checked(found.examined, keyframes, found.beside))
-        stay = parent.log_weight + math.log(found.transition.new)
+        found = self._compared(parent, query, excluded, only)
+        notes = parent.notes.checked(found.examined, keyframes, found.beside, all_areas=not only)
+        noted = replace(parent, notes=notes)
+        # That none is in the place was weighed when they fitted beside it.
+        log_new = 0.0 if only and not found.fits else math.log(found.transition.new)
+        stay = parent.log_weight + log_new
         children = [Child(parent.hypothesis, stay, parent.area, noted.notes)]
         children += [self._join(noted, query, fit) for fit in found.fits]
         return Branches(children, True, _log(found.skipped) + parent.log_weight)
 
-    def _compared(self, parent: Parent, query: Query, excluded: Collection[int]) -> Comparison:
+    def _compared(
+        self, parent: Parent, query: Query, excluded: Collection[int], only: Collection[int] = ()
+    ) -> Comparison:
         """The comparison with known areas, of which a hypothesis may examine the more the more probable it is."""
         most = min(self._options.max_candidates, max(FEWEST, math.ceil(self._options.max_comparisons * parent.share)))
-        return self.search.compare(parent.hybrid_map, parent.area, query, parent.notes.compared, excluded, most)
+        return self.search.compare(parent.hybrid_map, parent.area, query, parent.notes.compared, excluded, most, only)
 
     def move(self, parent: Parent, area: int) -> Branches:
         """The robot went into a known area; the keyframes stay where they are."""

@@ -50,15 +50,14 @@ class Comparison(NamedTuple):
     :ivar transition: pi of the known areas and of new ground.
     :ivar fits: the modes in all areas that were examined, the heaviest of each.
     :ivar examined: those areas.
-    :ivar beside: whether the keyframes fit beside an area's place, where they are not in it yet; that one was not
-        examined.
+    :ivar beside: areas beside whose place the keyframes fit; they are not in it yet, so that was not examined.
     :ivar skipped: probability of those that were not, and of further modes, on the scale of ``exp(Fit.log_weight)``.
     """
 
     transition: Transition
     fits: tuple[Fit, ...]
     examined: tuple[int, ...]
-    beside: bool
+    beside: tuple[int, ...]
     skipped: float
 
 
@@ -161,7 +160,7 @@ class ClosureSearch:
 
     def compare(
         self, hybrid_map: HybridMap, area: int, query: Query, compared: Mapping[int, Collection[int]],
-        excluded: Collection[int], most: int,
+        excluded: Collection[int], most: int, only: Collection[int] = (),
     ) -> Comparison:
         """Prior and evidence of all admitted areas.
 
@@ -169,8 +168,11 @@ class ClosureSearch:
         :param compared: {known area: keyframes that were compared with it}.
         :param excluded: areas that are neither candidates nor part of a candidate's map.
         :param most: this many areas are examined at most, those that the keyframes are most probably in.
+        :param only: if there are any, none but these.
         """  # fmt: skip
         within, distant, elsewhere = self.admission.divided(hybrid_map, area, query, excluded)
+        if only:
+            within, distant = {known: prior for known, prior in within.items() if known in only}, {}
         self._ahead = [(other, excluded) for other in elsewhere if within]
         candidates = self.admission.candidates(hybrid_map, query, compared, within)
         ranked = sorted(candidates, key=lambda known: (-candidates[known].most, known))
@@ -180,9 +182,9 @@ class ClosureSearch:
         others = [self._elsewhere(hybrid_map, other, excluded) for other in wanted]
         places = {known: self._views.place(hybrid_map, known, excluded) for known in looked_at}
         entries = {known: self._entry(place, candidates[known]) for known, place in places.items()}
-        asked = [known for known, found in entries.items() if found.share > 0.0]
-        modes = {known: self._modes(places[known], candidates[known]) for known in asked}
-        shares = {known: entries[known].share for known, found in modes.items() if found is not None}
+        shares = {known: found.share for known, found in entries.items() if found.share > 0.0}
+        modes = {known: self._modes(places[known], candidates[known]) for known in shares}
+        beside = tuple(known for known, found in modes.items() if found is None)
         model = transition(shares | rest, self._options.new_probability)
         if shares:
             self._count_likeness(query, others)
@@ -195,7 +197,7 @@ class ClosureSearch:
         ]
         kept, left_out = _parted(fits, self._options.max_modes)
         skipped = sum(model.known[known] for known in rest) + sum(math.exp(fit.log_weight) for fit in left_out)
-        return Comparison(model, kept, tuple(shares), len(shares) < len(asked), skipped)
+        return Comparison(model, kept, tuple(known for known in shares if known not in beside), beside, skipped)
 
     def look_ahead(self, hybrid_map: HybridMap) -> None:
         """Make the map of one of the areas that the next keyframes will be laid into, while there is time for it."""

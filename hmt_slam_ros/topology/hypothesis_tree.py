@@ -33,6 +33,7 @@ class LeafNotes:
         known area once.
     :ivar local: {area: ``current_T_area``} of the areas in the local map besides the robot's own.
     :ivar unchecked: the unsettled keyframes that no re-check has looked at.
+    :ivar beside: known areas that the newest of them fitted beside, and in which the robot may be soon.
     :ivar astray: the area of the local map, joined to the robot's own by no arc, in whose place the robot seems to be,
         and for how many keyframe events in a row; or None.
     :ivar doubts: {keyframe event: odds that the robot was displaced unnoticed just before it}, of the latest events
@@ -43,6 +44,7 @@ class LeafNotes:
     compared: Mapping[int, frozenset[int]] = field(default_factory=dict)
     local: Mapping[int, NDArray[np.float64]] = field(default_factory=dict)
     unchecked: tuple[int, ...] = ()
+    beside: tuple[int, ...] = ()
     astray: tuple[int, int] | None = None
     doubts: Mapping[int, float] = field(default_factory=dict)
 
@@ -70,15 +72,17 @@ class LeafNotes:
             self, covariances={**self.covariances, keyframe: covariance}, unchecked=(*self.unchecked, keyframe)
         )
 
-    def checked(self, areas: Sequence[int], keyframes: Sequence[int], beside: bool = False) -> LeafNotes:
+    def checked(
+        self, areas: Sequence[int], keyframes: Sequence[int], beside: tuple[int, ...] = (), *, all_areas: bool = True
+    ) -> LeafNotes:
         """After keyframes were compared with known areas.
 
-        :param beside: whether they fit beside another, in which the robot may be soon: then the newer half of them is
-            looked at again.
+        :param beside: others, beside which they fitted.
+        :param all_areas: whether they were compared with all that come into question.
         """
         added = {area: self.compared.get(area, frozenset()) | set(keyframes) for area in areas}
-        again = self.unchecked[(len(self.unchecked) + 1) // 2 :] if beside else ()
-        return replace(self, compared={**self.compared, **added}, unchecked=again)
+        unchecked = () if all_areas else self.unchecked
+        return replace(self, compared={**self.compared, **added}, unchecked=unchecked, beside=beside)
 
     def seen_in(self, area: int | None) -> LeafNotes:
         """After a keyframe event at which the robot seemed to be in ``area`` of the local map, or in none such."""
