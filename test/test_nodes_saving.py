@@ -117,18 +117,17 @@ def test_a_map_is_saved_while_the_robot_drives_and_other_nodes_go_on_from_it(tmp
     assert np.abs(at - 4 * 79 * PACE).max() < 0.1
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=lambda number: number.name)
-def test_nodes_that_are_told_to_end_save_their_map_first_if_that_is_wanted(tmp_path, listener, start, number):
-    """All at once, twice, and the robot with them, as a launch does whose terminal is interrupted."""
+def test_nodes_that_are_told_to_end_save_their_map_first_if_that_is_wanted(tmp_path, listener, start):
+    """All at once, twice, and the robot with them, as a launch does that is in a hurry."""
     log, folder = corridor_bag(tmp_path, scans=200), tmp_path / "hmt_map"
     nodes = Nodes(start_with(start, save_at_end=True), listener, log, folder, 4.0)
     nodes.until(lambda: len(nodes.estimates) > 20)
     everybody = [*nodes.processes, nodes.robot]
     for process in everybody:
-        process.send_signal(number)
+        process.send_signal(signal.SIGINT)
     time.sleep(0.1)
     for process in nodes.processes:
-        process.send_signal(number)
+        process.send_signal(signal.SIGTERM)
     begin = time.monotonic()
     for process in everybody:
         error = process.communicate(timeout=20)[1]
