@@ -79,7 +79,8 @@ class _EverywhereSearch(ClosureSearch):
             )
         ]
         beside = tuple(known for known, found in modes.items() if found is None)
-        return Comparison(Transition({}, new), tuple(fits), tuple(known for known in shares if known not in beside), beside, 0.0)
+        examined = tuple(known for known in shares if known not in beside)
+        return Comparison(Transition({}, new), tuple(fits), examined, beside, 0.0)
 
 
 @dataclass(frozen=True, eq=False)
