@@ -277,6 +277,13 @@ class AreaFilter:
         self._since_update = NO_STEP
         self.left_open = NO_STEP.covariance
 
+    def forget(self) -> None:
+        """All particles stand where the leader does, as if that were known, and predict from there."""
+        self.poses = np.repeat(self.pose[None], len(self.poses), axis=0)
+        self.log_weights = np.zeros(len(self.poses))
+        self.tracking_covariance = np.zeros((3, 3))
+        self._restart()
+
     def _resample(self, step: int) -> None:
         """Systematic resampling; the leader is kept, and stands first afterwards."""
         weights = _normalised(self.log_weights)

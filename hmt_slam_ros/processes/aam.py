@@ -37,6 +37,7 @@ from hmt_slam_ros.topology.overlap_graph import (
     separation,
     synchronised,
 )
+from hmt_slam_ros.topology.unknown import tells_nothing
 
 # An area's overlap with a scan is that of the best few keyframes among those taken nearest to it.
 _NEAREST, _BEST = 8, 3
@@ -278,7 +279,8 @@ class Aam:
         shares = {here: self._share(hybrid_map, here, leaf.pose.mean, newest)}
         for area in hybrid_map.neighbours(here):
             arc = hybrid_map.arc(area, here)
-            assert arc is not None
+            if arc is None or tells_nothing(arc):
+                continue
             shares[area] = self._share(hybrid_map, area, se2.compose(arc.mean, leaf.pose.mean), newest)
         return shares
 

@@ -54,13 +54,14 @@ class KeyframeHead:
     scan: ScanGeometry
     travelled: float
     leaves: tuple[LeafEstimate, ...]
+    carried: bool
 
     @classmethod
     def of(cls, keyframe: Keyframe) -> KeyframeHead:
         """What is left of a keyframe without the ranges."""
         scan = keyframe.scan
         geometry = ScanGeometry(**{entry.name: getattr(scan, entry.name) for entry in fields(ScanGeometry)})
-        return cls(keyframe.sequence, geometry, keyframe.travelled, keyframe.leaves)
+        return cls(keyframe.sequence, geometry, keyframe.travelled, keyframe.leaves, keyframe.carried)
 
     def with_ranges(self, ranges: NDArray[np.float32]) -> Keyframe:
         """The keyframe.
@@ -68,7 +69,7 @@ class KeyframeHead:
         :param ranges: shape (n,), m.
         """
         geometry = {entry.name: getattr(self.scan, entry.name) for entry in fields(self.scan)}
-        return Keyframe(self.sequence, Scan(ranges=ranges, **geometry), self.travelled, self.leaves)
+        return Keyframe(self.sequence, Scan(ranges=ranges, **geometry), self.travelled, self.leaves, self.carried)
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,9 +142,9 @@ class SavedPart:
 
 # Raise a document's version with every change of its dataclass: a receiver refuses any other.
 _DOCUMENTS: dict[type, tuple[str, int]] = {
-    KeyframeHead: ("keyframe", 2),
+    KeyframeHead: ("keyframe", 3),
     AreaEvents: ("area_events", 2),
-    Hypotheses: ("hypotheses", 3),
+    Hypotheses: ("hypotheses", 4),
     Accepted: ("accepted", 4),
     LocalEstimate: ("local_estimate", 1),
     Notice: ("notice", 1),

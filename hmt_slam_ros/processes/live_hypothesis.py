@@ -148,18 +148,21 @@ class LiveHypothesis:
         far = math.hypot(moved[0], moved[1]) >= self.settings.keyframe_distance
         return far or abs(moved[2]) >= math.radians(self.settings.keyframe_angle)
 
-    def event(self, sequence: int, scan: Scan, points: NDArray[np.float64]) -> LeafEstimate:
+    def event(
+        self, sequence: int, scan: Scan, points: NDArray[np.float64], *, arriving: bool = False
+    ) -> LeafEstimate:
         """One filter step with a keyframe's scan, which enters the map where it adds something new.
 
-        :param sequence: number of the keyframe event; the first one finds the robot at the origin of its area.
+        :param sequence: number of the keyframe event.
         :param points: surfels of the scan, to be matched, shape (n, 4), base frame.
+        :param arriving: whether nothing tells how the robot came there: the scan is matched with nothing.
         """
-        if sequence == 0:
+        if arriving:
             unmoved, nothing = np.zeros(3), np.zeros((3, 3))
             step = FilterStep(unmoved, _NO_ERROR, nothing, 0.0, float(len(self.filter.poses)), False)
         else:
             step = self.filter.update(points, sequence)
-        stored = self._is_new()
+        stored = arriving or self._is_new()
         self.error = step.error
         self._drift_on(sequence if stored else None)
         if stored:

@@ -70,12 +70,14 @@ class Keyframe:
     :ivar scan: the keyframe's scan.
     :ivar travelled: path length since the start, m.
     :ivar leaves: one estimate for every live hypothesis, ordered by hypothesis id.
+    :ivar carried: whether nothing tells how the robot came there from the keyframe before.
     """
 
     sequence: int
     scan: Scan
     travelled: float
     leaves: tuple[LeafEstimate, ...]
+    carried: bool = False
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -180,6 +182,7 @@ class Leaf:
     :ivar local: the areas of the local map, the current one first; empty where the local map stays as it is.
     :ivar withdrawn: arcs that this hypothesis does not believe any more.
     :ivar merged: two areas that are one, where this is the only hypothesis; else None.
+    :ivar lost: whether the robot may be anywhere in the map, and maps around itself until it is recognized where.
     """
 
     hypothesis: int
@@ -192,6 +195,7 @@ class Leaf:
     local: tuple[LocalArea, ...] = ()
     withdrawn: tuple[ArcEnds, ...] = ()
     merged: Merged | None = None
+    lost: bool = False
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -326,6 +330,11 @@ class RealTimePose:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
+class Carried:
+    """robot -> slam, rtl: the next scan may be from anywhere, at any time; odometry begins anew."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
 class EndOfLog:
     """robot -> slam: no more scans will come; slam answers with the last trails and ``Finished``."""
 
@@ -366,6 +375,7 @@ Message = (
     | LocalEstimate
     | Trail
     | RealTimePose
+    | Carried
     | EndOfLog
     | Finished
     | Notice

@@ -7,6 +7,7 @@ from typing import Protocol
 from hmt_slam_ros.processes.messages import (
     Accepted,
     AreaEvents,
+    Carried,
     EndOfLog,
     Finished,
     Hypotheses,
@@ -35,10 +36,10 @@ class Remembering(Process, Protocol):
 
 
 HEARD_BY: dict[str, tuple[type, ...]] = {
-    "slam": (Scan, Odometry, Hypotheses, Accepted, EndOfLog),
+    "slam": (Scan, Odometry, Carried, Hypotheses, Accepted, EndOfLog),
     "aam": (Keyframe, Hypotheses, Accepted),
     "tsbi": (Keyframe, AreaEvents, Accepted),
     "tlca": (Keyframe, Hypotheses),
-    "rtl": (Odometry, LocalEstimate, Hypotheses, Accepted),
+    "rtl": (Odometry, Carried, LocalEstimate, Hypotheses, Accepted),
     "recorder": (Keyframe, Hypotheses, Accepted, Trail, LocalEstimate, Finished, Notice),
 }

@@ -19,7 +19,7 @@ from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.processes.global_poses import GlobalPoses
-from hmt_slam_ros.processes.messages import Accepted, AreaPose, LocalEstimate, Message, Notice, RealTimePose
+from hmt_slam_ros.processes.messages import Accepted, AreaPose, Carried, LocalEstimate, Message, Notice, RealTimePose
 from hmt_slam_ros.processes.replica import FIRST_AREA
 from hmt_slam_ros.sensing import Odometry
 from hmt_slam_ros.sensing.motion import path_covariance
@@ -79,7 +79,7 @@ class RtlState:
 
 
 class Rtl:
-    """The RTL process. Consumes Odometry, LocalEstimate, Accepted; produces RealTimePose, Notice."""
+    """The RTL process. Consumes Odometry, Carried, LocalEstimate, Accepted; produces RealTimePose, Notice."""
 
     def __init__(self, configuration: Configuration, state: RtlState | None = None) -> None:
         """:param state: to go on from."""
@@ -111,6 +111,9 @@ class Rtl:
                 self._correct()
         elif isinstance(message, Accepted):
             self._hear_accepted(message)
+        elif isinstance(message, Carried):
+            self._readings.clear()
+            self._newest = self._estimate = self._start = None
         return []
 
     def _hear_accepted(self, accepted: Accepted) -> None:

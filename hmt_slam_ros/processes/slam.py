@@ -22,6 +22,7 @@ from hmt_slam_ros.local_map.patch_pool import PatchState
 from hmt_slam_ros.processes.live_hypothesis import LiveHypothesis, LiveState
 from hmt_slam_ros.processes.messages import (
     Accepted,
+    Carried,
     EndOfLog,
     Finished,
     Hypotheses,
@@ -61,6 +62,7 @@ class SlamState:
     :ivar scans: scans that were given a pose.
     :ivar dropped: scans that were not.
     :ivar first_of_trail: number of the first scan that no trail was told of.
+    :ivar arriving: whether nothing tells how the robot comes to where the next scan is from.
     """
 
     replica: ReplicaState = field(default_factory=ReplicaState)
@@ -79,12 +81,14 @@ class SlamState:
     scans: int = 0
     dropped: int = 0
     first_of_trail: int = 0
+    arriving: bool = True
 
 
 class MetricSlam:
     """The metric SLAM process.
 
-    Consumes Scan, Odometry, Hypotheses, Accepted, EndOfLog; produces Keyframe, Trail, LocalEstimate, Notice, Finished.
+    Consumes Scan, Odometry, Carried, Hypotheses, Accepted, EndOfLog; produces Keyframe, Trail, LocalEstimate, Notice,
+    Finished.
     """
 
     def __init__(self, configuration: Configuration, state: SlamState | None = None) -> None:
@@ -100,7 +104,8 @@ class MetricSlam:
         self._last_stamp = state.last_stamp
         self._noticed = set(state.noticed)
         self._live = self._live_in(state)
-        self._events, self._waiting, self._patient = state.events, state.waiting, state.patient
+        self._events, self._arriving = state.events, state.arriving
+        self._waiting, self._patient = state.waiting, state.patient
         self._travelled = state.travelled
         self._scans, self._dropped = state.scans, state.dropped
         self._first_of_trail = state.first_of_trail
@@ -124,7 +129,7 @@ class MetricSlam:
             self._last_stamp, frozenset(self._noticed), patches,
             {name: live.state(own) for (name, live), own in zip(self._live.items(), each, strict=True)},
             self._events, self._waiting, self._patient, self._travelled, self._scans, self._dropped,
-            self._first_of_trail,
+            self._first_of_trail, self._arriving,
         )  # fmt: skip
 
     @property
@@ -167,6 +172,8 @@ class MetricSlam:
             self._change_hypotheses(message)
         elif isinstance(message, Accepted):
             self._accept(message)
+        elif isinstance(message, Carried):
+            self._arrive()
         elif isinstance(message, EndOfLog):
             self._ended = True
         return self._work()
@@ -178,6 +185,17 @@ class MetricSlam:
         if self._ended and not self._queue and not self._waiting:
             said += self._finish()
         return said
+
+    def _arrive(self) -> None:
+        """Forget how the robot came here; scans that still wait were taken before and are passed over."""
+        self._motion = MotionModel(self._configuration.motion)
+        self._sweeps = SweepCheck()
+        self._dropped += len(self._queue)
+        self._queue.clear()
+        self._last_stamp = -1
+        self._patient = self._arriving = True
+        for live in self._live.values():
+            live.filter.forget()
 
     def _receive(self, scan: Scan) -> list[Message]:
         """Put a scan into the queue; say, once for each fault, what is wrong with it."""
@@ -229,8 +247,8 @@ class MetricSlam:
         prediction = self._motion.predict(scan.stamp)
         scan = deskewed(scan, self._motion.odometry, self._configuration.rtl)
         points = self._mapping.matching_points(scan)
-        said = self._track(scan.stamp, points, prediction) if self._events else []
-        if not self._events or self._best.event_due():
+        said = [] if self._arriving else self._track(scan.stamp, points, prediction)
+        if self._arriving or self._best.event_due():
             said += self._keyframe_event(scan, points)
         for live in self._live.values():
             live.note_scan(scan.stamp)
@@ -252,12 +270,12 @@ class MetricSlam:
     def _keyframe_event(self, scan: Scan, points: NDArray[np.float64]) -> list[Message]:
         sequence = self._events
         trails: list[Message] = self._trails()
-        leaves = tuple(live.event(sequence, scan, points) for live in self._live.values())
+        leaves = tuple(live.event(sequence, scan, points, arriving=self._arriving) for live in self._live.values())
         self._motion.keyframe(self._best.moved, self._best.information)
-        keyframe = Keyframe(sequence, scan, self._travelled, leaves)
+        keyframe = Keyframe(sequence, scan, self._travelled, leaves, carried=self._arriving and sequence > 0)
         self._replica.add(keyframe)
         self._events += 1
-        self._waiting = True
+        self._waiting, self._arriving = True, False
         return [*trails, keyframe, *self._tell(self._watch.judge(self._motion.noise))]
 
     def _trails(self) -> list[Message]:

@@ -26,6 +26,7 @@ from hmt_slam_ros.processes.messages import (
     Message,
 )
 from hmt_slam_ros.processes.replica import FIRST_HYPOTHESIS, Replica, ReplicaState
+from hmt_slam_ros.processes.tsbi_awakening import awoken, looked_for
 from hmt_slam_ros.processes.tsbi_branching import Branches, Branching, BranchingState, Child, Parent
 from hmt_slam_ros.processes.tsbi_displacement import with_displaced
 from hmt_slam_ros.processes.tsbi_merging import merged as merged_into
@@ -143,7 +144,7 @@ class Tsbi:
         changed = self._leaves(children, chosen, settled.probabilities)
         self._replica.apply(Hypotheses(events.sequence, tuple(changed), settled.unexamined))
         loaded = [self._loaded(changed[n], child) for n, child in enumerate(chosen)]
-        self._unexamined, self._reopened = settled.unexamined, ()
+        self._unexamined, self._reopened = settled.unexamined, self._reopened if keyframe.carried else ()
         leaves = tuple(sorted(loaded, key=lambda leaf: leaf.hypothesis))
         return Hypotheses(events.sequence, leaves, settled.unexamined)
 
@@ -173,6 +174,8 @@ class Tsbi:
 
     def _branch(self, parent: Parent, event: AreaEvent | None, keyframe: Keyframe) -> Branches:
         """The continuations of one hypothesis, each with its weight."""
+        if keyframe.carried:
+            return awoken(self._branching, parent, keyframe.sequence)
         if self._reopened:
             return Branches([reopened(parent, leaf, keyframe.sequence) for leaf in self._reopened])
         if event is not None and event.kind == "cut":
@@ -191,6 +194,8 @@ class Tsbi:
         parent = replace(parent, notes=notes)
         if notes.astray is not None and notes.astray[1] >= _ASTRAY:
             return self._branching.link(parent, notes.astray[0], scan, estimate.pose)
+        if len(notes.unchecked) >= self._options.recheck_keyframes and notes.lost is not None:
+            return looked_for(self._branching, parent)
         if len(notes.unchecked) >= self._options.recheck_keyframes:
             return with_displaced(self._branching, parent, notes.unchecked, self._branching.recheck(parent))
         if notes.beside and len(notes.unchecked) == _SOON:
@@ -230,7 +235,7 @@ class Tsbi:
             self._next_hypothesis += 1
         return Leaf(
             hypothesis, child.parent, probability, child.area, child.rebase, child.relabelled, child.arcs,
-            withdrawn=child.withdrawn, merged=child.merged,
+            withdrawn=child.withdrawn, merged=child.merged, lost=child.notes.lost is not None,
         )  # fmt: skip
 
     def _loaded(self, leaf: Leaf, child: Child) -> Leaf:

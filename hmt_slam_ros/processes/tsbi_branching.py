@@ -243,12 +243,16 @@ class Branching:
 
     def _enter_new(self, parent: Parent, query: Query, log_factor: float) -> Child:
         """New ground: the reference keyframe becomes the frame of a new area."""
+        origin = PoseGaussian.exactly(np.zeros(3))
+        return self.entered(parent, query, self.new_area(parent, query), origin, query.belief, log_factor)
+
+    def new_area(self, parent: Parent, query: Query) -> int:
+        """The number of an area that keyframes begin, the same for all hypotheses of an event."""
         keyframes = tuple(query.poses)
         if keyframes not in self._named:
             self._areas = max(self._areas, parent.hybrid_map.largest_area) + 1
             self._named[keyframes] = self._areas
-        origin = PoseGaussian.exactly(np.zeros(3))
-        return self.entered(parent, query, self._named[keyframes], origin, query.belief, log_factor)
+        return self._named[keyframes]
 
     def _enter_tracked(self, parent: Parent, query: Query, area: int) -> Child:
         """A known area in whose place the robot is known to be.

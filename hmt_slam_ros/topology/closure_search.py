@@ -25,6 +25,7 @@ from hmt_slam_ros.topology.likeness import Elsewhere, Likeness, best_shares
 from hmt_slam_ros.topology.relocation import Relocation, reach_of
 from hmt_slam_ros.topology.surroundings import Nearness, Views, gap, positions, stacked
 from hmt_slam_ros.topology.transition import Entry, Place, Transition, entry, owner_at, transition
+from hmt_slam_ros.topology.whereabouts import Whereabouts, whereabouts
 
 Pose = NDArray[np.float64]
 
@@ -68,10 +69,12 @@ class SearchState:
     :ivar shares: how large a share of their surfaces keyframes found in places where they do not lie, of those that
         were tried last.
     :ivar counted: the newest of the keyframes with which that was tried last, -1 before the first.
+    :ivar anywhere: as ``shares``, of robots that might have been anywhere.
     """
 
     shares: tuple[float, ...] = ()
     counted: int = -1
+    anywhere: tuple[float, ...] = ()
 
 
 class ClosureSearch:
@@ -90,6 +93,7 @@ class ClosureSearch:
         self._model = GridModel.of(configuration)
         self._views = Views(scans, self._model, self.nearness)
         self._likeness = Likeness(options.alike_probability)
+        self._anywhere = Likeness(options.alike_probability)
         self._relocation = Relocation(self._views, Looks(scans), self._settings, options.place_radius)
         self._counted = -1
         self._ahead: list[tuple[int, Collection[int]]] = []
@@ -97,11 +101,12 @@ class ClosureSearch:
     @property
     def state(self) -> SearchState:
         """All that was learnt."""
-        return SearchState(tuple(self._likeness.shares), self._counted)
+        return SearchState(tuple(self._likeness.shares), self._counted, tuple(self._anywhere.shares))
 
     def go_on_from(self, state: SearchState) -> None:
         """Take over what was learnt before anything is compared."""
         self._likeness.count(state.shares)
+        self._anywhere.count(state.anywhere)
         self._counted = state.counted
 
     def tracked_area(
@@ -221,6 +226,14 @@ class ClosureSearch:
         rarity = self._likeness.log_rarity(located.found.share, foretold=False)
         same = MAPS.log_ratio(located.found, MAPS_USUAL) + rarity
         return Fit(located.area, located.mode, same - math.log(2 * len(hybrid_map.area_ids()))), 0.5 * unseen
+
+    def everywhere(self, hybrid_map: HybridMap, poses: Mapping[int, Pose], before: int) -> Whereabouts:
+        """Where in the map keyframes lie of which the arcs tell nothing.
+
+        :param poses: {keyframe: ``reference_T_base``}.
+        :param before: the map is that of the keyframes before this one.
+        """
+        return whereabouts(self._relocation, self._anywhere, hybrid_map, poses, before)
 
     def _entry(self, place: Place, candidate: Candidate) -> Entry:
         return entry(place, candidate.prior, stacked(candidate.fresh), self._options.place_radius)

@@ -38,6 +38,7 @@ class LeafNotes:
         and for how many keyframe events in a row; or None.
     :ivar doubts: {keyframe event: odds that the robot was displaced unnoticed just before it}, of the latest events
         whose scans contradicted what the robot should have seen.
+    :ivar lost: the keyframe at which the robot arrived it is not known where, until that is recognized; else None.
     """
 
     covariances: Mapping[int, Covariance] = field(default_factory=dict)
@@ -47,6 +48,7 @@ class LeafNotes:
     beside: tuple[int, ...] = ()
     astray: tuple[int, int] | None = None
     doubts: Mapping[int, float] = field(default_factory=dict)
+    lost: int | None = None
 
     def heard(self, event: int, log_evidence: float) -> LeafNotes:
         """After the scan of a keyframe event; one that was displaced before it would see a place that looks alike."""
@@ -93,7 +95,7 @@ class LeafNotes:
         """After the robot entered another area together with the keyframes of ``covariances``."""
         kept = {area: keyframes & covariances.keys() for area, keyframes in self.compared.items()}
         compared = {area: keyframes for area, keyframes in kept.items() if keyframes}
-        return LeafNotes(covariances, compared, doubts=self.doubts)
+        return LeafNotes(covariances, compared, doubts=self.doubts, lost=self.lost)
 
 
 def relative_covariance(

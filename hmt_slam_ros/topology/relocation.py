@@ -8,7 +8,7 @@ among the areas that look most alike. A building in which every corridor is like
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -32,12 +32,17 @@ Pose = NDArray[np.float64]
 _MOST = 4
 # Flat over a place and all headings, m, m, rad.
 _FLAT = PoseGaussian(np.zeros(3), np.diag([20.0, 20.0, 20.0]) ** 2)
+# Of the samples, one of so many is looked for.
+_EVERY = 3
 # Share that the best answer has to have of the probability of all, and nats below it that others are looked at.
 _ALONE, _MARGIN = 0.9, 5.0
 # Deviation of an answer's position at most, m, and share of the surfaces that are known at least.
 _SHARP, _KNOWN = 0.2, 0.7
 # Of the log-ratio of a sample on a surface, as much on average at least.
-_LEAST = 0.35 * math.log(3.0)
+_SURE = math.log(3.0)
+_LEAST = 0.35 * _SURE
+# Where so much less of the surfaces is known than in another area, an area does not matter.
+_WORSE = 0.15
 
 
 class Located(NamedTuple):
@@ -73,18 +78,34 @@ class Relocation:
         :param here: an area that is looked at in any case.
         :returns: that, and the probability by their looks of the areas that were not looked at.
         """
-        shares = self.shares(hybrid_map, list(poses), before)
-        chosen = sorted(shares, key=lambda area: (-shares[area], area))[:_MOST]
-        unseen = max(0.0, 1.0 - sum(shares[area] for area in chosen))
-        query = self._views.grid(poses)
-        looked_at = {*chosen, *shares.keys() & {here}}
-        found = [fit for area in sorted(looked_at) for fit in self._fits(hybrid_map, poses, query, area, before)]
+        found, _, unseen = self.fits(hybrid_map, poses, before, _MOST, {here})
         if not found:
             return None, unseen
         masses = np.array([fit.mode.log_mass for fit in found])
         best = int(masses.argmax())
         alone = masses[best] - np.logaddexp.reduce(masses) >= math.log(_ALONE)
-        return found[best] if alone and _is_certain(found[best]) else None, unseen
+        known = found[best].found.share >= _KNOWN
+        return found[best] if alone and known and is_certain(found[best]) else None, unseen
+
+    def fits(
+        self, hybrid_map: HybridMap, poses: Mapping[int, Pose], before: float, most: int, always: Collection[int] = ()
+    ) -> tuple[list[Located], list[int], float]:
+        """How the keyframes lie in the areas that look most like them.
+
+        :param most: this many areas are looked at.
+        :param always: and these.
+        :returns: the fits that matter beside the best, the areas that were looked at, and the probability by their
+            looks of the others.
+        """
+        shares = self.shares(hybrid_map, list(poses), before)
+        chosen = sorted(shares, key=lambda area: (-shares[area], area))[:most]
+        unseen = max(0.0, 1.0 - sum(shares[area] for area in chosen))
+        looked_at = list(dict.fromkeys([*chosen, *sorted(shares.keys() & set(always))]))
+        found: list[Located] = []
+        for area in looked_at:
+            best = max((fit.found.share for fit in found), default=0.0)
+            found += self._fits(hybrid_map, poses, area, before, (best - _WORSE) * _SURE)
+        return found, looked_at, unseen
 
     def shares(self, hybrid_map: HybridMap, keyframes: Sequence[int], before: float) -> dict[int, float]:
         """p(gamma | phi): the probability of every area by its look alone; they sum to 1.
@@ -98,10 +119,14 @@ class Relocation:
         return dict(zip(areas, weights.tolist(), strict=True))
 
     def _fits(
-        self, hybrid_map: HybridMap, poses: Mapping[int, Pose], query: AreaGrid, area: int, before: float
+        self, hybrid_map: HybridMap, poses: Mapping[int, Pose], area: int, before: float, least: float
     ) -> list[Located]:
+        """How the keyframes lie in one area, where their samples' log-ratio is at least so much on average."""
+        query = self._views.grid(poses)
         place = self._views.place(hybrid_map, area, (), before)
-        modes = match(query, place.grid, _FLAT, self._settings, reach_of(place, query, poses, self._radius)).modes
+        some, known = (replace(grid, points=grid.points[::_EVERY]) for grid in (query, place.grid))
+        settings = replace(self._settings, temper=_EVERY * self._settings.temper, least=max(_LEAST, least))
+        modes = match(some, known, _FLAT, settings, reach_of(place, query, poses, self._radius)).modes
         return [
             Located(area, mode, place.grid.agreement(query.points, mode.pose.mean))
             for mode in modes
@@ -109,10 +134,10 @@ class Relocation:
         ]
 
 
-def _is_certain(located: Located) -> bool:
-    """Whether the surfaces alone say where, also along corridors, and most of them are known."""
+def is_certain(located: Located) -> bool:
+    """Whether the surfaces alone say where, also along corridors."""
     variance = float(np.linalg.eigvalsh(located.mode.measured.covariance[:2, :2])[-1])
-    return variance <= _SHARP**2 and located.found.share >= _KNOWN
+    return variance <= _SHARP**2
 
 
 def reach_of(place: Place, query: AreaGrid, poses: Mapping[int, Pose], radius: float) -> NDArray[np.float64]:

@@ -1,0 +1,26 @@
+"""The arc to where a robot woke up: it joins what is mapped from there on to the map, and tells nothing of where."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
+
+# Larger than a building, m, and all headings.
+_DEVIATION, _HEADING = 300.0, math.pi
+
+
+def unknown(mean: NDArray[np.float64]) -> PoseGaussian:
+    """A belief that could be any.
+
+    :param mean: shape (3,), where it is drawn as long as nothing is known.
+    """
+    return PoseGaussian(mean, np.diag([_DEVIATION, _DEVIATION, _HEADING]) ** 2)
+
+
+def tells_nothing(belief: PoseGaussian) -> bool:
+    """Whether a belief is about as wide as :func:`unknown`."""
+    return bool(np.trace(belief.covariance[:2, :2]) > _DEVIATION**2)
