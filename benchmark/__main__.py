@@ -43,6 +43,7 @@ MEASUREMENTS = {
     "table": "time and memory against a global metric RBPF at equal accuracy, the paper's Table II",
     "ambiguity": "whether both answers stay alive where places are identical, until the evidence",
     "oracle": "TSBI's PMF against an exact enumeration of all topologies",
+    "awakening": "whether a robot that wakes up in a saved map finds out where, and after how many metres",
     "scale": "time and memory in maps of up to 100,000 areas",
     "short": "for CI, whether accuracy became worse than benchmark/expected.toml beyond noise",
 }
@@ -50,7 +51,7 @@ _GROUPS = {
     "all": ("accuracy", "steps", "robustness", "choices", "speed"),
     "validation": (
         "calibration", "loops", "topology", "consistency", "evidence", "appearance", "ambiguity", "table", "oracle",
-        "scale",
+        "awakening", "scale",
     ),
 }  # fmt: skip
 
