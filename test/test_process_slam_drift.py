@@ -37,7 +37,7 @@ class Drive:
         points = self.mapping.matching_points(scan)
         if sequence:
             self.live.filter.track(points, Prediction(step, step, step))
-        return self.live.event(sequence, scan, points)
+        return self.live.event(sequence, scan, points, arriving=sequence == 0)
 
     def along(self, poses):
         return [self.to(pose) for pose in poses]
