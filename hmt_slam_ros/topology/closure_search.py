@@ -69,12 +69,10 @@ class SearchState:
     :ivar shares: how large a share of their surfaces keyframes found in places where they do not lie, of those that
         were tried last.
     :ivar counted: the newest of the keyframes with which that was tried last, -1 before the first.
-    :ivar anywhere: as ``shares``, of robots that might have been anywhere.
     """
 
     shares: tuple[float, ...] = ()
     counted: int = -1
-    anywhere: tuple[float, ...] = ()
 
 
 class ClosureSearch:
@@ -93,7 +91,6 @@ class ClosureSearch:
         self._model = GridModel.of(configuration)
         self._views = Views(scans, self._model, self.nearness)
         self._likeness = Likeness(options.alike_probability)
-        self._anywhere = Likeness(options.alike_probability)
         self._relocation = Relocation(self._views, Looks(scans), self._settings, options.place_radius)
         self._counted = -1
         self._ahead: list[tuple[int, Collection[int]]] = []
@@ -101,12 +98,11 @@ class ClosureSearch:
     @property
     def state(self) -> SearchState:
         """All that was learnt."""
-        return SearchState(tuple(self._likeness.shares), self._counted, tuple(self._anywhere.shares))
+        return SearchState(tuple(self._likeness.shares), self._counted)
 
     def go_on_from(self, state: SearchState) -> None:
         """Take over what was learnt before anything is compared."""
         self._likeness.count(state.shares)
-        self._anywhere.count(state.anywhere)
         self._counted = state.counted
 
     def tracked_area(
@@ -233,7 +229,7 @@ class ClosureSearch:
         :param poses: {keyframe: ``reference_T_base``}.
         :param before: the map is that of the keyframes before this one.
         """
-        return whereabouts(self._relocation, self._anywhere, hybrid_map, poses, before)
+        return whereabouts(self._relocation, self._options.alike_probability, hybrid_map, poses, before)
 
     def _entry(self, place: Place, candidate: Candidate) -> Entry:
         return entry(place, candidate.prior, stacked(candidate.fresh), self._options.place_radius)

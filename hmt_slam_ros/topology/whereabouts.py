@@ -38,11 +38,6 @@ class Whereabouts(NamedTuple):
     unseen: float
 
     @property
-    def unmapped(self) -> float:
-        """Probability that the robot is where the map does not reach."""
-        return max(0.0, 1.0 - float(self.probabilities.sum()) - self.unseen)
-
-    @property
     def best(self) -> tuple[Located, float] | None:
         """The most probable place and its probability."""
         if not self.found:
@@ -53,7 +48,7 @@ class Whereabouts(NamedTuple):
 
 def whereabouts(
     relocation: Relocation,
-    likeness: Likeness,
+    alike: float,
     hybrid_map: HybridMap,
     poses: Mapping[int, NDArray[np.float64]],
     before: int,
@@ -62,7 +57,7 @@ def whereabouts(
 
     How rare a fit is shows in the other areas, in which the same was tried.
 
-    :param likeness: of that, at any pose; counts on.
+    :param alike: probability that keyframes fit into an area where they do not lie, before any was tried.
     :param poses: {keyframe: ``reference_T_base`` (3,)}.
     :param before: the map is that of the keyframes before this one.
     """
@@ -73,6 +68,7 @@ def whereabouts(
         whole[fit.area] = float(np.logaddexp(whole.get(fit.area, -math.inf), fit.mode.log_mass))
     log_prior = math.log((1.0 - _UNMAPPED) / max(1, known))
     best = {area: max((fit.found.share for fit in found if fit.area == area), default=0.0) for area in looked_at}
+    likeness = Likeness(alike)
     likeness.count(sorted(best.values())[:-1])
     logs = [
         log_prior + fit.mode.log_mass - whole[fit.area]
