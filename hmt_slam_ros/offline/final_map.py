@@ -16,7 +16,7 @@ from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.offline.recorder import Recording, keyframe_poses
 from hmt_slam_ros.offline.trajectories import Trajectory, carried
 from hmt_slam_ros.refinement.joint import refine_jointly
-from hmt_slam_ros.refinement.neighbours import linked_areas, neighbours, pairs_of, with_other_ways
+from hmt_slam_ros.refinement.neighbours import certain_areas, linked_areas, neighbours, pairs_of, with_other_ways
 from hmt_slam_ros.refinement.placement import place
 from hmt_slam_ros.refinement.surfaces import Surfaces, surfaces_of
 from hmt_slam_ros.sensing import Scan
@@ -91,9 +91,11 @@ class _Keyframes:
         poses = self._poses(recording)
         # Each keyframe is the nearest to itself.
         around = self._around(poses, poses, self.areas, self._options.neighbours + 1)
-        around = with_other_ways(around, poses, self.areas, self._linked, self._options.reach)
+        near = pairs_of(around, self._options.min_share)
+        certain = certain_areas(recording.hybrid_map, self._options.first_gate)
+        pairs = with_other_ways(near, self._surfaces, poses, self.areas, certain, self._options)
         motion = self._motion(recording, poses)
-        refined = refine_jointly(self._surfaces, poses, pairs_of(around), motion, self._options)
+        refined = refine_jointly(self._surfaces, poses, pairs, motion, self._options)
         return dict(zip(self.ids, refined, strict=True))
 
     def _motion(self, recording: Recording, poses: NDArray[np.float64]) -> Edges:

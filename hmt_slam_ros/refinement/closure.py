@@ -15,7 +15,7 @@ from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.refinement.joint import refine_jointly, relative_beliefs
-from hmt_slam_ros.refinement.neighbours import neighbours, pairs_of
+from hmt_slam_ros.refinement.neighbours import Pairs, neighbours, pairs_of
 from hmt_slam_ros.refinement.surfaces import Surfaces, surfaces_of
 from hmt_slam_ros.sensing import Scan
 from hmt_slam_ros.sensing.motion import path_covariance
@@ -91,7 +91,7 @@ class ClosureRefinement:
         taken: RefinedClosure,
         surfaces: Surfaces,
         poses: NDArray[np.float64],
-        pairs: NDArray[np.int64],
+        pairs: Pairs,
         motion: Edges,
         ids: list[int],
     ) -> RefinedClosure:
@@ -109,11 +109,12 @@ class ClosureRefinement:
             arcs[a, b] = PoseGaussian(taken.arcs[a, b].mean, known.covariance)
         return replace(taken, arcs=taken.arcs | arcs)
 
-    def _pairs(self, poses: NDArray[np.float64], areas: NDArray[np.int64]) -> NDArray[np.int64]:
+    def _pairs(self, poses: NDArray[np.float64], areas: NDArray[np.int64]) -> Pairs:
         """The keyframes that may overlap; all these areas are at most two arcs apart."""
         linked = dict.fromkeys(areas.tolist(), frozenset(areas.tolist()))
         count = self._options.neighbours + 1
-        return pairs_of(neighbours(poses, areas, poses, areas, linked, self._options.reach, count))
+        around = neighbours(poses, areas, poses, areas, linked, self._options.reach, count)
+        return pairs_of(around, self._options.min_share)
 
     def _edges(
         self, hybrid_map: HybridMap, areas: list[int], closed: Collection[int], loosened: float = 1.0

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from hmt_slam_ros.configuration.topological import Refinement
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.refinement.neighbours import Pairs
 from hmt_slam_ros.refinement.registration import normal_equations, weighting
 from hmt_slam_ros.refinement.surfaces import Surfaces
 from hmt_slam_ros.topology.pose_graph import Edges, optimise, relative_covariances
@@ -35,7 +36,7 @@ _SCALE, _LEAST = np.array([1.0, 1.0, 1.0 / 3.0]), 0.004
 def refine_jointly(
     surfaces: Surfaces,
     poses: NDArray[np.float64],
-    pairs: NDArray[np.int64],
+    pairs: Pairs,
     motion: Edges,
     options: Refinement,
     fixed: int = 0,
@@ -44,7 +45,7 @@ def refine_jointly(
 
     :param surfaces: of n scans.
     :param poses: shape (n, 3), ``map_T_base`` to start from.
-    :param pairs: shape (m, 2), scans that may overlap.
+    :param pairs: scans that may overlap.
     :param motion: edges of the motion, which join all scans; they hold the directions that walls leave open.
     :param fixed: the scan that stays.
     :returns: shape (n, 3).
@@ -60,7 +61,7 @@ def refine_jointly(
 def relative_beliefs(
     surfaces: Surfaces,
     poses: NDArray[np.float64],
-    pairs: NDArray[np.int64],
+    pairs: Pairs,
     motion: Edges,
     options: Refinement,
     between: NDArray[np.int64],
@@ -98,23 +99,23 @@ def _determined(information: NDArray[np.float64]) -> NDArray[np.float64]:
 def _registered(
     surfaces: Surfaces,
     poses: NDArray[np.float64],
-    pairs: NDArray[np.int64],
+    pairs: Pairs,
     gate: float,
     every: int,
     options: Refinement,
 ) -> Edges:
     """One Gauss-Newton step of every pair on its own, as edges from the second scan to the first."""
-    relative = se2.between(poses[pairs[:, 1]], poses[pairs[:, 0]])
-    one, other = pairs.T
+    one, other = pairs.rows.T
+    relative = se2.between(poses[other], poses[one])
     information, gradient, share = normal_equations(
         surfaces, one, surfaces, other, relative, gate, weighting(options), every
     )
-    meets = share >= options.min_share
+    meets = share >= pairs.least_share
     information = information[meets] + _VAGUE
     step = -np.linalg.solve(information, gradient[meets, :, None])[..., 0]
     return Edges(
-        pairs[meets, 1],
-        pairs[meets, 0],
+        other[meets],
+        one[meets],
         se2.compose(relative[meets], se2.exp(step)),
         np.linalg.inv(information),
     )
