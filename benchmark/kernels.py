@@ -159,7 +159,7 @@ def _measure_matching(
         "Gauss-Newton, a scan", 1, lambda: matching.align(points, poses[0], prior, view, mapping.alignment)
     )
     figures.timed(
-        "things that moved, a scan", 1, lambda: movers.standing(points, prior, view, mapping.alignment)
+        "things that moved, a scan", 1, lambda: movers.standing(points, prior.mean, prior, view, mapping.alignment)
     )
     figures.timed(
         "likelihood, a point",

@@ -189,11 +189,13 @@ class AreaFilter:
 
         :param points: surfels of the scan, shape (n, 4), base frame.
         """
-        before = PoseGaussian(self.pose, self.left_open)
-        match = self._matcher.match(points, before, prediction, self._leading_view())
-        moved = se2.between(before.mean, match.pose)
+        before, view = PoseGaussian(self.pose, self.left_open), self._leading_view()
+        match = self._matcher.match(points, before, prediction, view)
         self._priors = se2.compose(self._priors, match.step.increment)
         self._since_update = self._since_update.then(match.step)
+        leg = PoseGaussian(self._priors[self.leader], self._since_update.covariance)
+        match = self._matcher.over_leg(points, match, leg, self._since_update, view)
+        moved = se2.between(before.mean, match.pose)
         self.poses = se2.compose(self.poses, moved)
         information = map_information(self._since_update.covariance, match.pose[2])
         information = information + match.hessian / self.mapping.alignment.inflation

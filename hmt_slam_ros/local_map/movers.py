@@ -37,20 +37,22 @@ _RIDGE = 1e-9
 
 
 @njit(cache=True)
-def standing(points: Float64, prior: Prior, view: MapView, settings: Alignment) -> Float64:
+def standing(points: Float64, pose: Float64, prior: Prior, view: MapView, settings: Alignment) -> Float64:
     """The surfels (k, 4) of those given (n, 4) that lie on nothing that has moved since it entered the map.
 
-    A thing tells at the prior's mean the information L and the gradient g. If a pose off by N(m, C) is what all else
-    tells, L m + g is a draw from N(0, L C L + L). Of the things whose draw is too unlikely the most unlikely one is
-    left out, and so on with those that remain.
+    A thing tells at a pose the information L and the gradient g. If a pose off by N(m, C) is what all else tells,
+    L m + g is a draw from N(0, L C L + L). Of the things whose draw is too unlikely the most unlikely one is left out,
+    and so on with those that remain.
 
     :param points: in the order of the beams.
+    :param pose: shape (3,), ``map_T_base``, where things meet the map: the prior's mean, or where a match ended.
     """
     begins = _things(points)
-    informations, gradients, suspected = _told(points, begins, prior, view, settings)
+    predicted = _off(prior.mean, pose)
+    informations, gradients, suspected = _told(points, begins, pose, predicted, prior, view, settings)
     if not suspected.any():
         return points
-    moved = _moved(np.nonzero(suspected)[0], informations, gradients, prior.information)
+    moved = _moved(np.nonzero(suspected)[0], informations, gradients, predicted, prior.information)
     kept = np.ones(points.shape[0], np.bool_)
     for k in np.nonzero(moved)[0]:
         kept[begins[k] : begins[k + 1]] = False
@@ -72,19 +74,29 @@ def _things(points: Float64) -> Int64:
 
 @njit(cache=True)
 def _told(
-    points: Float64, begins: Int64, prior: Prior, view: MapView, settings: Alignment
+    points: Float64,
+    begins: Int64,
+    pose: Float64,
+    predicted: Vector,
+    prior: Prior,
+    view: MapView,
+    settings: Alignment,
 ) -> tuple[Float64, Float64, Bool]:
-    """What each thing tells: information (k, 3, 3), gradient (k, 3), and whether it contradicts the prior (k,)."""
+    """What each thing tells: information (k, 3, 3), gradient (k, 3), and whether it contradicts the prior (k,).
+
+    :param predicted: the prior's mean, seen from the pose.
+    """
     count = begins.size - 1
     informations, gradients, contradicts = np.empty((count, 3, 3)), np.empty((count, 3)), np.zeros(count, np.bool_)
     plain = Alignment(settings.sigma * np.sqrt(settings.inflation), np.inf, 1.0, 1)
-    covariance, unmoved = inverse(of_array(prior.information)), (0.0, 0.0, 0.0)
+    covariance = inverse(of_array(prior.information))
+    there = predicted[0] == 0.0 and predicted[1] == 0.0 and predicted[2] == 0.0
     for k in range(count):
         own = points[begins[k] : begins[k + 1]]
-        information, gradient, square = linearise(own, prior.mean[0], prior.mean[1], prior.mean[2], view, plain)
-        # No chi-square exceeds that of a prior that is certain.
-        if square > _GATE:
-            contradicts[k] = _surprise(information, gradient, covariance, unmoved) > _GATE
+        information, gradient, square = linearise(own, pose[0], pose[1], pose[2], view, plain)
+        # At its mean, no chi-square exceeds that of a prior that is certain.
+        if square > _GATE or not there:
+            contradicts[k] = _surprise(information, gradient, covariance, predicted) > _GATE
         into_array(information, informations[k])
         gradients[k, 0], gradients[k, 1], gradients[k, 2] = gradient
     return informations, gradients, contradicts
@@ -107,13 +119,14 @@ def _sum(a: Vector, b: Vector, factor: float) -> Vector:
 
 
 @njit(cache=True)
-def _moved(suspects: Int64, informations: Float64, gradients: Float64, prior: Float64) -> Bool:
+def _moved(suspects: Int64, informations: Float64, gradients: Float64, predicted: Vector, prior: Float64) -> Bool:
     """Those of the suspects that contradict all that is not among them, (k,).
 
-    :param prior: information of the prediction.
+    :param predicted: the prediction, seen from the pose; ``prior``, its information.
     """
     moved = np.zeros(gradients.shape[0], np.bool_)
-    information, gradient = of_array(prior), (0.0, 0.0, 0.0)
+    information = of_array(prior)
+    gradient = _sum((0.0, 0.0, 0.0), times(information, predicted), -1.0)
     for k in range(gradients.shape[0]):
         information = total(information, of_array(informations[k]), 1.0)
         gradient = _sum(gradient, _row(gradients, k), 1.0)
@@ -131,6 +144,12 @@ def _moved(suspects: Int64, informations: Float64, gradients: Float64, prior: Fl
         moved[worst] = True
         information = total(information, of_array(informations[worst]), -1.0)
         gradient = _sum(gradient, _row(gradients, worst), -1.0)
+
+
+@njit(cache=True)
+def _off(mean: Float64, pose: Float64) -> Vector:
+    turn = (mean[2] - pose[2] + np.pi) % (2.0 * np.pi) - np.pi
+    return mean[0] - pose[0], mean[1] - pose[1], turn
 
 
 @njit(cache=True)

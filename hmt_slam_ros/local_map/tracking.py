@@ -101,6 +101,26 @@ class ScanMatcher:
             return self._reconciled(points, before, prediction, by_inertia, view)
         return by_odometry if by_odometry.hessian.any() else self._unproven(by_odometry, prediction.inertia)
 
+    def over_leg(self, points: Float64, match: Match, leg: PoseGaussian, step: Step, view: MapView) -> Match:
+        """The match, or another one where it contradicts the motion predicted since the last keyframe and need not.
+
+        What walks along a corridor draws the robot with it a little by every scan, of which no single one contradicts
+        odometry; all of them together do. Without what contradicts the leg, the scan is matched from where that leads
+        as well, and the match so far is believed if odometry has failed and the scan shows it.
+
+        :param leg: belief over ``map_T_base`` by the leg's prediction.
+        :param step: that prediction.
+        """
+        prior = _prior(leg)
+        if match.contradicted or _distance(match.pose, prior) <= _GATE:
+            return match
+        still = standing(points, match.pose, prior, view, self._mapping.alignment)
+        otherwise = self._refined(points, still, prior.mean, prior, step, view)
+        if not self._fits(points, otherwise.pose, view) or _distance(otherwise.pose, prior) > _GATE:
+            return match
+        right = otherwise.log_evidence + self._log_right
+        return otherwise if right > match.log_evidence + self._log_fault else match
+
     def _reconciled(
         self, points: Float64, before: PoseGaussian, prediction: Prediction, found: Match, view: MapView
     ) -> Match:
@@ -138,8 +158,7 @@ class ScanMatcher:
         return turned(match.hessian / self._mapping.alignment.inflation, -match.pose[2])
 
     def _agrees(self, points: Float64, match: Match, view: MapView) -> bool:
-        far = -2.0 * matching.log_prior(match.pose, match.prior) > _GATE
-        return not far and self._fits(points, match.pose, view)
+        return _distance(match.pose, match.prior) <= _GATE and self._fits(points, match.pose, view)
 
     def _fits(self, points: Float64, pose: Float64, view: MapView) -> bool:
         share = matching.matched_fraction(points, pose, view, self._mapping.near)
@@ -174,7 +193,7 @@ class ScanMatcher:
 
     def still(self, points: Float64, prior: matching.Prior, covariance: Float64, view: MapView) -> Float64:
         """The points to be matched under a prior: all where its covariance is too wide to tell what moved."""
-        return points if _wide(covariance) else standing(points, prior, view, self._mapping.alignment)
+        return points if _wide(covariance) else standing(points, prior.mean, prior, view, self._mapping.alignment)
 
     def _refined(
         self, points: Float64, still: Float64, start: Float64, prior: matching.Prior, step: Step, view: MapView
@@ -199,6 +218,11 @@ class ScanMatcher:
 def _after(before: PoseGaussian, step: Step) -> PoseGaussian:
     covariance = carried(before.covariance, step.increment) + step.covariance
     return PoseGaussian(se2.compose(before.mean, step.increment), covariance)
+
+
+def _distance(pose: Float64, prior: matching.Prior) -> float:
+    """Squared Mahalanobis distance of a pose from a prior's mean."""
+    return -2.0 * matching.log_prior(pose, prior)
 
 
 def _prior(predicted: PoseGaussian) -> matching.Prior:
