@@ -24,6 +24,12 @@ def generate_launch_description() -> LaunchDescription:
         ),
         DeclareLaunchArgument("namespace", default_value="", description="Namespace of the nodes and their topics."),
         DeclareLaunchArgument("start_from", default_value="", description="Saved map to go on from; empty for none."),
+        DeclareLaunchArgument(
+            "start_carried",
+            default_value="true",
+            choices=["true", "false"],
+            description="Whether the robot may be anywhere in that map; otherwise it is where it was.",
+        ),
         DeclareLaunchArgument("save_to", default_value="hmt_map", description="Folder for the service slam/save."),
         DeclareLaunchArgument(
             "save_at_end",
@@ -34,7 +40,8 @@ def generate_launch_description() -> LaunchDescription:
         DeclareLaunchArgument("log_level", default_value="info", description="Level of the nodes' log output."),
     ]
     saving = {name: ParameterValue(LaunchConfiguration(name), value_type=str) for name in ("start_from", "save_to")}
-    saving["save_at_end"] = ParameterValue(LaunchConfiguration("save_at_end"), value_type=bool)
+    for name in ("save_at_end", "start_carried"):
+        saving[name] = ParameterValue(LaunchConfiguration(name), value_type=bool)
     nodes = [
         Node(
             package="hmt_slam_ros",

@@ -103,7 +103,8 @@ def test_a_map_is_saved_while_the_robot_drives_and_other_nodes_go_on_from_it(tmp
 
     # At the first scan that is not in the map.
     begin = (stopped["slam"].last_stamp - START) / 1e9 + 0.001
-    second = Nodes(start_with(start, start_from=folder), listener, log, folder, 0.0, robot__start=begin)
+    stayed = start_with(start, start_from=folder, start_carried=False)
+    second = Nodes(stayed, listener, log, folder, 0.0, robot__start=begin)
     second.until(lambda: second.estimates and second.last.scan_index == 79)
     heads = [decode(message.data, KeyframeHead).sequence for message in second.keyframes]
     assert heads == list(range(events, events + len(heads)))
@@ -145,7 +146,8 @@ def test_nodes_show_a_map_of_the_command_line_at_once_and_go_on_from_it(tmp_path
     command = [sys.executable, "-m", "hmt_slam_ros.cli.main", "map", str(log), "--out", str(out), "--duration", "6"]
     subprocess.run(command, check=True, timeout=120)
     grids = listener.hear(OccupancyGrid, MAP, qos.LATCHED)
-    nodes = Nodes(start_with(start, start_from=out), listener, log, tmp_path / "hmt_map", 0.0, robot__start=6.001)
+    stayed = start_with(start, start_from=out, start_carried=False)
+    nodes = Nodes(stayed, listener, log, tmp_path / "hmt_map", 0.0, robot__start=6.001)
     nodes.until(lambda: grids and nodes.estimates and nodes.last.scan_index == 59)
     known = (np.frombuffer(grids[0].data, dtype=np.int8) == 100).sum()
     assert known > 100

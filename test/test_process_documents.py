@@ -26,6 +26,7 @@ from hmt_slam_ros.processes.documents import (
 from hmt_slam_ros.processes.messages import (
     Accepted,
     AreaEvents,
+    Arriving,
     Hypotheses,
     Keyframe,
     LeafEstimate,
@@ -40,6 +41,7 @@ KINDS = (
     Hypotheses,
     Accepted,
     LocalEstimate,
+    Arriving,
     Notice,
     Closing,
     RobotStatus,

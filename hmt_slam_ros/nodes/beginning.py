@@ -21,11 +21,17 @@ if TYPE_CHECKING:
 
 State = TypeVar("State")
 
+_CARRIED = ParameterDescriptor(
+    description="Whether the robot may be anywhere in the map of start_from; otherwise it is where it was.",
+    read_only=True,
+)
+
 
 class Beginning:
     """The map of the parameter ``start_from``, if it is set.
 
     :ivar events: keyframe events in it, 0 without.
+    :ivar carried: whether nothing tells how the robot came from where it was then.
     """
 
     def __init__(self, node: ConfiguredNode) -> None:
@@ -35,7 +41,8 @@ class Beginning:
         """
         descriptor = ParameterDescriptor(description="Output folder or hmt_map to go on from.", read_only=True)
         path = str(node.declare_parameter("start_from", "", descriptor).value)
-        self.events, self._folder = 0, None
+        carried = bool(node.declare_parameter("start_carried", True, _CARRIED).value)
+        self.events, self._folder, self.carried = 0, None, carried and bool(path)
         if path:
             folder = map_folder(Path(path))
             self._folder = FolderReader(folder, FORMAT, VERSION)

@@ -14,7 +14,7 @@ from hmt_slam_ros.nodes.inbox import Inbox
 from hmt_slam_ros.nodes.outbox import Outbox
 from hmt_slam_ros.nodes.parameters import ConfiguredNode
 from hmt_slam_ros.nodes.part_saver import PARTS, PartSaver
-from hmt_slam_ros.processes.messages import Message, Notice
+from hmt_slam_ros.processes.messages import Arriving, Message, Notice
 from hmt_slam_ros.processes.routing import HEARD_BY, Remembering
 
 _SAVE_AT_END = ParameterDescriptor(
@@ -48,6 +48,9 @@ class ProcessNode(ConfiguredNode):
         self.figures = Figures(self)
         self.beginning = Beginning(self)
         self.process = make_process(self.configuration, self.beginning)
+        if self.beginning.carried and Arriving in HEARD_BY[name]:
+            # Slam says so too, but not before this node could say otherwise.
+            self.process.handle(Arriving(self.beginning.events, 0))
         tell_of_compilation(self.get_logger().info)
         self.outbox = Outbox(self, (*said, Notice))
         self.inbox = Inbox(self, HEARD_BY[name], self.deliver, self.figures, first=self.beginning.events)

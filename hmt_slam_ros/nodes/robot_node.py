@@ -31,7 +31,7 @@ from hmt_slam_ros.nodes.running import run
 from hmt_slam_ros.nodes.topics import CLOCK, ODOM, ROBOT_STATUS, SCAN
 from hmt_slam_ros.nodes.transforms import transform_publisher
 from hmt_slam_ros.processes.documents import RobotStatus, encode
-from hmt_slam_ros.processes.messages import LocalEstimate, Message
+from hmt_slam_ros.processes.messages import Arriving, LocalEstimate, Message
 from hmt_slam_ros.sensing import Odometry, Scan
 
 _CHANGEABLE = ("robot.rate", "robot.paced", "robot.window")
@@ -63,7 +63,7 @@ class RobotNode(ConfiguredNode):
         self._send_transforms = transform_publisher(self, "tf")
         self._send_static_transforms = transform_publisher(self, "tf_static")
         # The past too: the first answers may come before the two nodes have found each other.
-        self._inbox = Inbox(self, (LocalEstimate,), self._hear, self.figures, qos.CHAIN)
+        self._inbox = Inbox(self, (LocalEstimate, Arriving), self._hear, self.figures, qos.CHAIN)
         self.create_service(SetBool, "~/pause", self._pause)
         self.create_timer(_STATUS_PERIOD, self._report, clock=self.figures.steady_clock)
 
@@ -161,8 +161,11 @@ class RobotNode(ConfiguredNode):
         return self._lasers[key][0]
 
     def _hear(self, message: Message) -> None:
-        assert isinstance(message, LocalEstimate)
-        self._player.acknowledge(message.stamp)
+        if isinstance(message, LocalEstimate):
+            self._player.acknowledge(message.stamp)
+        elif isinstance(message, Arriving):
+            # Scans that waited are passed over.
+            self._player.acknowledge(self._player.stamp)
         self._last_progress = time.monotonic()
 
     def _pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:

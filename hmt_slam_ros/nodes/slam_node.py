@@ -11,6 +11,7 @@ import numpy as np
 from geometry_msgs.msg import PoseArray
 from sensor_msgs.msg import LaserScan
 from std_msgs.msg import String
+from std_srvs.srv import Trigger
 
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.errors import HmtSlamError
@@ -31,6 +32,8 @@ from hmt_slam_ros.processes.documents import RobotStatus, decode
 from hmt_slam_ros.processes.messages import (
     Accepted,
     AreaPose,
+    Arriving,
+    Carried,
     EndOfLog,
     Finished,
     Keyframe,
@@ -56,7 +59,7 @@ class SlamNode(ProcessNode):
     process: MetricSlam
 
     def __init__(self) -> None:
-        super().__init__("slam", _make_process, (Keyframe, Trail, LocalEstimate, Finished))
+        super().__init__("slam", _make_process, (Arriving, Keyframe, Trail, LocalEstimate, Finished))
         self._map = declare_frame(self, "map", "map")
         self._mounting = LaserMounting(self, self._work_off)
         self._pending: deque[LaserScan] = deque()
@@ -72,7 +75,10 @@ class SlamNode(ProcessNode):
         self._laser = SensorSubscription(self, LaserScan, SCAN, self._hear_scan)
         self._particles = self.create_publisher(PoseArray, PARTICLES, qos.STREAM)
         self.create_subscription(String, ROBOT_STATUS, self._hear_status, qos.LATCHED)
+        self.create_service(Trigger, "~/carried", self._hear_carried)
         self.create_timer(PERIOD, self._look_around, clock=self.figures.steady_clock)
+        if self.beginning.carried:
+            self.deliver(Carried())
 
     def _hear_scan(self, message: LaserScan) -> None:
         self._scans += 1
@@ -109,6 +115,13 @@ class SlamNode(ProcessNode):
         if status.state == "ended":
             self._end = status
             self._end_if_all_came()
+
+    def _hear_carried(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        """The robot may be anywhere; scans whose laser is not known yet were taken before."""
+        self._pending.clear()
+        self.deliver(Carried())
+        response.success, response.message = True, "the next scan may be from anywhere"
+        return response
 
     def deliver(self, message: Message) -> None:
         """As any process node; the odometry may have been the last thing that was missing.

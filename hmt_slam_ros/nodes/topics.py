@@ -1,6 +1,6 @@
 """The names of the topics; all relative, so that a namespace moves them together."""
 
-from hmt_slam_ros.processes.messages import Accepted, AreaEvents, Hypotheses, LocalEstimate, Notice
+from hmt_slam_ros.processes.messages import Accepted, AreaEvents, Arriving, Hypotheses, LocalEstimate, Notice
 
 SCAN, ODOM, CLOCK = "scan", "odom", "clock"
 KEYFRAMES, KEYFRAME_SCANS = "hmt/keyframes", "hmt/keyframe_scans"
@@ -11,6 +11,7 @@ SAVE, SAVED = "hmt/save", "hmt/saved"
 COST = "hmt/cost"
 HMT_POSE, POSE = "hmt/pose", "pose"
 MAP, GRAPH, PARTICLES, PMF = "map", "hmt/graph", "hmt/particles", "hmt/pmf"
+IS_LOCALIZED, ENTROPY = "hmt/is_localized", "hmt/entropy"
 DIAGNOSTICS = "diagnostics"
 
 DOCUMENTS: dict[type, str] = {
@@ -18,5 +19,6 @@ DOCUMENTS: dict[type, str] = {
     Hypotheses: "hmt/hypotheses",
     Accepted: "hmt/accepted",
     LocalEstimate: "hmt/local_pose",
+    Arriving: "hmt/arriving",
     Notice: "hmt/notices",
 }

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import sys
+from typing import TYPE_CHECKING
 
-from std_msgs.msg import Float64MultiArray, MultiArrayDimension, MultiArrayLayout
+from std_msgs.msg import Bool, Float64, Float64MultiArray, MultiArrayDimension, MultiArrayLayout
 
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.nodes import qos
@@ -13,23 +14,40 @@ from hmt_slam_ros.nodes.conversions import rows_message_data
 from hmt_slam_ros.nodes.last_save import spin
 from hmt_slam_ros.nodes.process_node import ProcessNode
 from hmt_slam_ros.nodes.running import run
-from hmt_slam_ros.nodes.topics import PMF
-from hmt_slam_ros.processes.messages import Hypotheses, Message
-from hmt_slam_ros.processes.routing import Remembering
+from hmt_slam_ros.nodes.topics import ENTROPY, IS_LOCALIZED, PMF
+from hmt_slam_ros.processes.messages import Accepted, Arriving, Hypotheses, Message
+
+if TYPE_CHECKING:
+    from hmt_slam_ros.processes.tsbi import Tsbi
 
 
 class TsbiNode(ProcessNode):
     """The node ``tsbi``."""
 
+    process: Tsbi
+
     def __init__(self) -> None:
         super().__init__("tsbi", _make_process, (Hypotheses,))
         self._pmf = self.create_publisher(Float64MultiArray, PMF, qos.LATCHED)
+        self._localized = self.create_publisher(Bool, IS_LOCALIZED, qos.LATCHED)
+        self._entropy = self.create_publisher(Float64, ENTROPY, qos.LATCHED)
+        self._tell_whether_localized()
 
-    def show(self, _heard: Message, said: list[Message]) -> None:
-        """Publish the distribution over the topological paths, Eq. (14)."""
+    def show(self, heard: Message, said: list[Message]) -> None:
+        """Publish the distribution over the topological paths, Eq. (14), and whether the robot's place is known."""
+        if said or isinstance(heard, Accepted | Arriving):
+            self._tell_whether_localized()
         for message in said:
             if isinstance(message, Hypotheses):
                 self._pmf.publish(pmf_message(message))
+
+
+    def _tell_whether_localized(self) -> None:
+        found = self.process.localization
+        self._localized.publish(Bool(data=found.localized))
+        self._entropy.publish(Float64(data=found.entropy))
+        self.figures.state["localized"] = "yes" if found.localized else "no, the robot may be anywhere in the map"
+        self.figures.state["entropy of the area"] = f"{found.entropy:.3f} nats"
 
 
 def pmf_message(hypotheses: Hypotheses) -> Float64MultiArray:
@@ -43,7 +61,7 @@ def pmf_message(hypotheses: Hypotheses) -> Float64MultiArray:
     return Float64MultiArray(layout=MultiArrayLayout(dim=layout), data=rows_message_data(rows))
 
 
-def _make_process(configuration: Configuration, beginning: Beginning) -> Remembering:
+def _make_process(configuration: Configuration, beginning: Beginning) -> Tsbi:
     # It takes time, in which a signal has to be heard.
     from hmt_slam_ros.processes.tsbi import Tsbi, TsbiState  # noqa: PLC0415
 

@@ -20,6 +20,7 @@ from hmt_slam_ros.plain_data import Reader, Values, plain
 from hmt_slam_ros.processes.messages import (
     Accepted,
     AreaEvents,
+    Arriving,
     Finished,
     Hypotheses,
     Keyframe,
@@ -147,6 +148,7 @@ _DOCUMENTS: dict[type, tuple[str, int]] = {
     Hypotheses: ("hypotheses", 4),
     Accepted: ("accepted", 4),
     LocalEstimate: ("local_estimate", 1),
+    Arriving: ("arriving", 1),
     Notice: ("notice", 1),
     Closing: ("finished", 1),
     RobotStatus: ("robot_status", 1),

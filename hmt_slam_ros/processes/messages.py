@@ -331,7 +331,19 @@ class RealTimePose:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Carried:
-    """robot -> slam, rtl: the next scan may be from anywhere, at any time; odometry begins anew."""
+    """robot -> slam: the next scan may be from anywhere, at any time; odometry begins anew."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Arriving:
+    """slam -> tsbi, rtl, robot: where the robot is, and when, is not known from here on.
+
+    :ivar event: the keyframe event with which it arrives, which is the next one.
+    :ivar scans: scans before it; what slam says of these is past.
+    """
+
+    event: int
+    scans: int
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -376,6 +388,7 @@ Message = (
     | Trail
     | RealTimePose
     | Carried
+    | Arriving
     | EndOfLog
     | Finished
     | Notice

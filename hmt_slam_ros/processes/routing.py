@@ -7,6 +7,7 @@ from typing import Protocol
 from hmt_slam_ros.processes.messages import (
     Accepted,
     AreaEvents,
+    Arriving,
     Carried,
     EndOfLog,
     Finished,
@@ -38,8 +39,8 @@ class Remembering(Process, Protocol):
 HEARD_BY: dict[str, tuple[type, ...]] = {
     "slam": (Scan, Odometry, Carried, Hypotheses, Accepted, EndOfLog),
     "aam": (Keyframe, Hypotheses, Accepted),
-    "tsbi": (Keyframe, AreaEvents, Accepted),
+    "tsbi": (Arriving, Keyframe, AreaEvents, Accepted),
     "tlca": (Keyframe, Hypotheses),
-    "rtl": (Odometry, Carried, LocalEstimate, Hypotheses, Accepted),
+    "rtl": (Odometry, Arriving, LocalEstimate, Hypotheses, Accepted),
     "recorder": (Keyframe, Hypotheses, Accepted, Trail, LocalEstimate, Finished, Notice),
 }

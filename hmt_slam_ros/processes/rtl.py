@@ -19,7 +19,7 @@ from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.processes.global_poses import GlobalPoses
-from hmt_slam_ros.processes.messages import Accepted, AreaPose, Carried, LocalEstimate, Message, Notice, RealTimePose
+from hmt_slam_ros.processes.messages import Accepted, AreaPose, Arriving, LocalEstimate, Message, Notice, RealTimePose
 from hmt_slam_ros.processes.replica import FIRST_AREA
 from hmt_slam_ros.sensing import Odometry
 from hmt_slam_ros.sensing.motion import path_covariance
@@ -79,7 +79,7 @@ class RtlState:
 
 
 class Rtl:
-    """The RTL process. Consumes Odometry, Carried, LocalEstimate, Accepted; produces RealTimePose, Notice."""
+    """The RTL process. Consumes Odometry, Arriving, LocalEstimate, Accepted; produces RealTimePose, Notice."""
 
     def __init__(self, configuration: Configuration, state: RtlState | None = None) -> None:
         """:param state: to go on from."""
@@ -92,6 +92,8 @@ class Rtl:
         # That of the estimate's area, kept where another hypothesis leads, which may not know it.
         self._area_pose = state.area_pose
         self._ambiguity = state.ambiguity
+        # Estimates of scans before this one are of before the robot arrived; a state is saved when none is under way.
+        self._first = 0
 
     @property
     def state(self) -> RtlState:
@@ -106,12 +108,13 @@ class Rtl:
         if isinstance(message, Odometry):
             return self._hear_odometry(message)
         if isinstance(message, LocalEstimate):
-            if self._newest is None or message.stamp > self._newest.stamp:
+            if message.scan_index >= self._first and (self._newest is None or message.stamp > self._newest.stamp):
                 self._newest = message
                 self._correct()
         elif isinstance(message, Accepted):
             self._hear_accepted(message)
-        elif isinstance(message, Carried):
+        elif isinstance(message, Arriving):
+            self._first = message.scans
             self._readings.clear()
             self._newest = self._estimate = self._start = None
         return []

@@ -22,6 +22,7 @@ from hmt_slam_ros.local_map.patch_pool import PatchState
 from hmt_slam_ros.processes.live_hypothesis import LiveHypothesis, LiveState
 from hmt_slam_ros.processes.messages import (
     Accepted,
+    Arriving,
     Carried,
     EndOfLog,
     Finished,
@@ -87,8 +88,8 @@ class SlamState:
 class MetricSlam:
     """The metric SLAM process.
 
-    Consumes Scan, Odometry, Carried, Hypotheses, Accepted, EndOfLog; produces Keyframe, Trail, LocalEstimate, Notice,
-    Finished.
+    Consumes Scan, Odometry, Carried, Hypotheses, Accepted, EndOfLog; produces Arriving, Keyframe, Trail, LocalEstimate,
+    Notice, Finished.
     """
 
     def __init__(self, configuration: Configuration, state: SlamState | None = None) -> None:
@@ -173,7 +174,7 @@ class MetricSlam:
         elif isinstance(message, Accepted):
             self._accept(message)
         elif isinstance(message, Carried):
-            self._arrive()
+            return self._arrive()
         elif isinstance(message, EndOfLog):
             self._ended = True
         return self._work()
@@ -186,9 +187,9 @@ class MetricSlam:
             said += self._finish()
         return said
 
-    def _arrive(self) -> None:
+    def _arrive(self) -> list[Message]:
         """Forget how the robot came here; scans that still wait were taken before and are passed over."""
-        self._motion = MotionModel(self._configuration.motion)
+        self._motion, self._watch = MotionModel(self._configuration.motion), OdometryWatch()
         self._sweeps = SweepCheck()
         self._dropped += len(self._queue)
         self._queue.clear()
@@ -196,6 +197,7 @@ class MetricSlam:
         self._patient = self._arriving = True
         for live in self._live.values():
             live.filter.forget()
+        return [Arriving(self._events, self._scans)]
 
     def _receive(self, scan: Scan) -> list[Message]:
         """Put a scan into the queue; say, once for each fault, what is wrong with it."""

@@ -13,11 +13,13 @@ from numpy.typing import NDArray
 from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.processes.global_poses import GlobalPoses
+from hmt_slam_ros.processes.localization import Localization, Standing, localization
 from hmt_slam_ros.processes.messages import (
     Accepted,
     AreaEvent,
     AreaEvents,
     AreaPose,
+    Arriving,
     Hypotheses,
     Keyframe,
     Leaf,
@@ -36,6 +38,7 @@ from hmt_slam_ros.sensing import Scan
 from hmt_slam_ros.topology.hypothesis_tree import LeafNotes, Settled, settle
 from hmt_slam_ros.topology.same_claim import Claim, merged
 from hmt_slam_ros.topology.surroundings import agreeing, areas_around
+from hmt_slam_ros.topology.whereabouts import Whereabouts
 
 # Keyframe events in a row that the robot has to spend in an area of the local map before an arc joins it.
 _ASTRAY = 3
@@ -68,7 +71,7 @@ class TsbiState:
 class Tsbi:
     """Answers the area events of every keyframe with the live hypotheses.
 
-    Consumes Keyframe, AreaEvents, Accepted; produces Hypotheses.
+    Consumes Arriving, Keyframe, AreaEvents, Accepted; produces Hypotheses.
     """
 
     def __init__(
@@ -94,6 +97,9 @@ class Tsbi:
         self._unexamined = state.unexamined
         self._global_poses = GlobalPoses(state.global_poses)
         self._reopened = state.reopened
+        # What the next look finds out anew: the keyframe event before which the robot arrived, and where it may be.
+        self._arriving = -1
+        self._where: Whereabouts | None = None
 
     @property
     def state(self) -> TsbiState:
@@ -103,6 +109,22 @@ class Tsbi:
             self._global_poses.areas, self._reopened,
         )  # fmt: skip
 
+    @property
+    def localization(self) -> Localization:
+        """What is known of the robot's place."""
+        arriving = (-1 if self._keyframe is None else self._keyframe.sequence) < self._arriving
+        standings = [
+            Standing(probability, self._replica.areas[hypothesis], arriving or self._notes[hypothesis].lost is not None)
+            for hypothesis, probability in self._replica.probabilities.items()
+        ]
+        best = self._replica.best
+        since = self._arriving if arriving else self._notes[best].lost
+        hybrid_map = self._replica.maps[best]
+        known = sum(
+            since is None or any(k < since for k in hybrid_map.keyframes(area)) for area in hybrid_map.area_ids()
+        )
+        return localization(standings, self._unexamined, known, None if arriving else self._where)
+
     def handle(self, message: Message) -> list[Message]:
         """Learn from ``Keyframe`` and ``Accepted``; answer ``AreaEvents`` with ``Hypotheses``."""
         if isinstance(message, Keyframe):
@@ -111,6 +133,8 @@ class Tsbi:
             return [self._infer(message)]
         elif isinstance(message, Accepted):
             self._accept(message)
+        elif isinstance(message, Arriving):
+            self._arriving, self._where = message.event, None
         return []
 
     def _note(self, keyframe: Keyframe) -> None:
@@ -137,6 +161,7 @@ class Tsbi:
         parents = self._parents(keyframe)
         branches = [self._branch(parent, by_hypothesis.get(parent.hypothesis), keyframe) for parent in parents]
         children = [child for branch in branches for child in branch.children]
+        self._where = next((branch.where for branch in branches if branch.where is not None), self._where)
         if not any(branch.looked for branch in branches):
             self._branching.search.look_ahead(max(parents, key=lambda parent: parent.log_weight).hybrid_map)
         settled = self._settle(events.sequence, children, branches)

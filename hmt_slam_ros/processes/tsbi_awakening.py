@@ -48,7 +48,7 @@ def looked_for(branching: Branching, parent: Parent) -> Branches:
     still = Child(parent.hypothesis, parent.log_weight, parent.area, noted.notes)
     best = where.best
     if best is None or best[1] < _ENOUGH or not is_certain(best[0]):
-        return Branches([still], True)
+        return Branches([still], True, where=where)
     located, probability = best
     arc = Arc(parent.area, located.area, PoseGaussian.exactly(reference).compose(located.mode.measured.inverse()), True)
     found = Child(
@@ -56,7 +56,7 @@ def looked_for(branching: Branching, parent: Parent) -> Branches:
         arcs=(arc,), reload=True,
     )  # fmt: skip
     still = replace(still, log_weight=parent.log_weight + math.log(max(1.0 - probability, 1e-300)))
-    return Branches([still, found], True)
+    return Branches([still, found], True, where=where)
 
 
 def _seen_since(parent: Parent, keyframe: int) -> dict[int, Pose]:

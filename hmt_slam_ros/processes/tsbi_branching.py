@@ -27,6 +27,7 @@ from hmt_slam_ros.topology.hybrid_map import HybridMap
 from hmt_slam_ros.topology.hypothesis_tree import LeafNotes, relative_covariance
 from hmt_slam_ros.topology.shortest_path import reachable
 from hmt_slam_ros.topology.surroundings import gap, positions
+from hmt_slam_ros.topology.whereabouts import Whereabouts
 
 FEWEST = 4
 """Known areas that every hypothesis may examine at a cut, however improbable it is."""
@@ -85,11 +86,13 @@ class Branches(NamedTuple):
 
     :ivar looked: whether known areas were looked for.
     :ivar log_skipped: log of the weight of those that were not looked at.
+    :ivar where: where in the map a robot may be of which nothing told how it came there, if that was asked.
     """
 
     children: list[Child]
     looked: bool = False
     log_skipped: float = -math.inf
+    where: Whereabouts | None = None
 
 
 @dataclass(frozen=True)

@@ -19,8 +19,9 @@ from hmt_slam_ros.topology.hybrid_map import HybridMap
 from hmt_slam_ros.topology.likeness import Likeness
 from hmt_slam_ros.topology.relocation import Located, Relocation
 
-# Probability that the robot is where the map does not reach.
-_UNMAPPED = 0.2
+UNMAPPED = 0.2
+"""Probability that a robot that woke up somewhere is where the map does not reach."""
+
 # Areas whose surfaces are compared.
 _MOST = 16
 
@@ -31,11 +32,13 @@ class Whereabouts(NamedTuple):
     :ivar found: ways in which what it saw lies in the map.
     :ivar probabilities: shape (len(found),).
     :ivar unseen: probability of the areas that were not looked at.
+    :ivar others: their number.
     """
 
     found: tuple[Located, ...]
     probabilities: NDArray[np.float64]
     unseen: float
+    others: int
 
     @property
     def best(self) -> tuple[Located, float] | None:
@@ -66,7 +69,7 @@ def whereabouts(
     whole: dict[int, float] = {}
     for fit in found:
         whole[fit.area] = float(np.logaddexp(whole.get(fit.area, -math.inf), fit.mode.log_mass))
-    log_prior = math.log((1.0 - _UNMAPPED) / max(1, known))
+    log_prior = math.log((1.0 - UNMAPPED) / max(1, known))
     best = {area: max((fit.found.share for fit in found if fit.area == area), default=0.0) for area in looked_at}
     likeness = Likeness(alike)
     likeness.count(sorted(best.values())[:-1])
@@ -76,6 +79,7 @@ def whereabouts(
         + likeness.log_rarity(fit.found.share, foretold=False)
         for fit in found
     ]  # fmt: skip
-    weights = np.exp(np.array([*logs, math.log(_UNMAPPED), math.log((1.0 - _UNMAPPED) * unseen + 1e-300)]))
+    weights = np.exp(np.array([*logs, math.log(UNMAPPED), math.log((1.0 - UNMAPPED) * unseen + 1e-300)]))
     probabilities = weights / weights.sum()
-    return Whereabouts(tuple(found), probabilities[: len(found)], float(probabilities[-1]))
+    others = max(0, known - len(looked_at))
+    return Whereabouts(tuple(found), probabilities[: len(found)], float(probabilities[-1]), others)

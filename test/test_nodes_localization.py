@@ -1,0 +1,130 @@
+"""Nodes that start from a map, or whose robot is carried, do not know where it is until they recognize the place."""
+
+import math
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from logs_for_nodes import PACE, corridor_bag
+
+pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
+
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from std_msgs.msg import Bool, Float64, String
+from std_srvs.srv import Trigger
+
+from hmt_slam_ros.nodes import qos
+from hmt_slam_ros.nodes.conversions import planar_pose, stamp_of
+from hmt_slam_ros.nodes.topics import DIAGNOSTICS, DOCUMENTS, ENTROPY, IS_LOCALIZED, POSE
+from hmt_slam_ros.processes.messages import LocalEstimate, Notice
+
+NODES = ("slam", "aam", "tsbi", "tlca", "rtl")
+SCANS = 120
+
+
+@pytest.fixture(scope="module")
+def corridor(tmp_path_factory):
+    """The log of the corridor, and the folder of its map."""
+    folder = tmp_path_factory.mktemp("corridor")
+    log, out = corridor_bag(folder, scans=SCANS), folder / "out"
+    command = [sys.executable, "-m", "hmt_slam_ros.cli.main", "map", str(log), "--out", str(out)]
+    subprocess.run(command, check=True, timeout=120)
+    return log, out
+
+
+class Nodes:
+    """The five processes, robots one after the other, and what is heard of them."""
+
+    def __init__(self, start, listener, **parameters):
+        self.start, self.listener = start, listener
+        self.localized = listener.hear(Bool, IS_LOCALIZED, qos.LATCHED)
+        self.entropies = listener.hear(Float64, ENTROPY, qos.LATCHED)
+        self.estimates = listener.hear(String, DOCUMENTS[LocalEstimate], qos.CHAIN)
+        self.notices = listener.hear(String, DOCUMENTS[Notice], qos.CHAIN)
+        self.poses = listener.hear(PoseWithCovarianceStamped, POSE, qos.STREAM)
+        self.diagnostics = listener.hear(DiagnosticArray, DIAGNOSTICS, qos.STREAM)
+        self.alive = [start(name, **parameters) for name in NODES]
+
+    def until(self, condition):
+        self.listener.until(condition, alive=self.alive)
+
+    def drive(self, log, first, rate=0.0, **robot):
+        """A robot that begins with a scan of the log, and the scans that it will send."""
+        begin = max(0.0, 0.2 * first - 0.001)
+        self.alive.append(self.start("robot", log=log, robot__rate=rate, robot__start=begin, **robot))
+
+    def park(self):
+        robot = self.alive.pop()
+        robot.terminate()
+        assert robot.wait(20) == 0
+
+    def is_localized(self):
+        return bool(self.localized) and self.localized[-1].data
+
+    def diagnosis(self):
+        """What tsbi said of itself last."""
+        status = next(m.status[0] for m in reversed(self.diagnostics) if m.status[0].name == "/tsbi")
+        return {value.key: value.value for value in status.values}
+
+
+def assert_true(message, begin):
+    """A pose in the map is where the robot was.
+
+    :param begin: stamp of the log's first scan, ns.
+    """
+    k = (stamp_of(message.header.stamp) - begin) / 50e6
+    assert np.abs(planar_pose(message.pose.pose) - k * PACE).max() < 0.15
+
+
+def test_a_robot_that_wakes_up_in_a_saved_map_says_so_until_it_is_recognized_where_it_is(corridor, listener, start):
+    log, out = corridor
+    nodes = Nodes(start, listener, start_from=out)
+    nodes.until(lambda: nodes.localized and nodes.entropies)
+    assert not nodes.is_localized()
+    # One area, or none that is known.
+    assert nodes.entropies[-1].data == pytest.approx(-0.8 * math.log(0.8) - 0.2 * math.log(0.2))
+    assert not nodes.poses
+    nodes.drive(log, first=20)
+    nodes.until(nodes.is_localized)
+    nodes.until(lambda: len(nodes.estimates) == SCANS - 20)
+    listener.spin(1.5)
+    begin = stamp_of(nodes.poses[-1].header.stamp) - (SCANS - 1) * 200_000_000
+    assert_true(nodes.poses[-1], begin)
+    # Odometry, which is elsewhere than when the map was saved, was not taken for a jump.
+    assert not nodes.notices
+    assert nodes.diagnosis()["localized"] == "yes"
+    assert nodes.entropies[-1].data < 0.3
+
+
+def test_a_robot_that_stayed_where_it_was_is_localized_at_once_where_that_is_told(corridor, listener, start):
+    nodes = Nodes(start, listener, start_from=corridor[1], start_carried=False)
+    nodes.until(lambda: nodes.localized and nodes.entropies)
+    assert nodes.is_localized()
+    assert nodes.entropies[-1].data == 0.0
+
+
+def test_a_robot_that_is_carried_while_the_nodes_run_is_recognized_elsewhere(corridor, listener, start):
+    log, out = corridor
+    nodes = Nodes(start, listener, start_from=out, start_carried=False)
+    nodes.until(nodes.is_localized)
+    answer = listener.call(Trigger, "slam/carried", Trigger.Request())
+    assert answer.success
+    nodes.until(lambda: not nodes.is_localized())
+    # Back in time, which an odometry and a clock that begin anew are.
+    nodes.drive(log, first=40, rate=8.0)
+    nodes.until(nodes.is_localized)
+    nodes.until(lambda: len(nodes.estimates) == SCANS - 40)
+    nodes.park()
+    again = listener.call(Trigger, "slam/carried", Trigger.Request())
+    assert again.success
+    nodes.until(lambda: not nodes.is_localized())
+    said = len(nodes.poses)
+    nodes.drive(log, first=0)
+    nodes.until(nodes.is_localized)
+    nodes.until(lambda: len(nodes.estimates) == SCANS - 40 + SCANS)
+    listener.spin(1.5)
+    assert len(nodes.poses) > said
+    begin = stamp_of(nodes.poses[-1].header.stamp) - (SCANS - 1) * 200_000_000
+    assert_true(nodes.poses[-1], begin)
