@@ -32,6 +32,7 @@ MEASUREMENTS = {
     "steps": "what arc optimisation and keyframe refinement gain",
     "robustness": "the same with degraded odometry",
     "choices": "what each choice of the design is worth, one parameter changed at a time",
+    "sessions": "whether a log mapped in two sessions is as accurate as in one go",
     "speed": "CPU time, memory, cost of a scan, start",
     "kernels": "CPU time of the inner loops, and that they take no memory",
     "calibration": "whether the probabilities of topological paths are right, on simulated worlds",
@@ -48,7 +49,7 @@ MEASUREMENTS = {
     "short": "for CI, whether accuracy became worse than benchmark/expected.toml beyond noise",
 }
 _GROUPS = {
-    "all": ("accuracy", "steps", "robustness", "choices", "speed"),
+    "all": ("accuracy", "steps", "robustness", "choices", "sessions", "speed"),
     "validation": (
         "calibration", "loops", "topology", "consistency", "evidence", "appearance", "ambiguity", "table", "oracle",
         "awakening", "scale",

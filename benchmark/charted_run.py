@@ -103,14 +103,14 @@ def charted(way: str, log: TimedLog, configuration: Configuration) -> tuple[RunR
             memory.append((scans, resident_bytes()))
 
     result = run_log(log, configuration, sample, WAYS[way])
-    memory.append((len(result.stamps), resident_bytes()))
+    memory.append((len(result.log.stamps), resident_bytes()))
     begin, log_seconds = time.process_time(), log.seconds
-    final = final_map(result.recorder.finish(result.stamps), corrected_scans(log, configuration), configuration)
+    final = final_map(result.recorder.finish(result.log.stamps), corrected_scans(log, configuration), configuration)
     hybrid_map = final.recording.hybrid_map
     refinement = time.process_time() - begin - (log.seconds - log_seconds)
     facts = {
         "particles": configuration.filter.particles,
-        "scans": len(result.stamps),
+        "scans": len(result.log.stamps),
         "travelled_m": final.recording.probabilities[-1].travelled,
         "areas": len(hybrid_map.area_ids()),
         "loop_closures": sum(arc.closure for _, _, arc in hybrid_map.all_arcs()),
@@ -126,7 +126,7 @@ def charted(way: str, log: TimedLog, configuration: Configuration) -> tuple[RunR
 
 def _seconds(result: RunResult, scans: int) -> float:
     """Time of the log after so many scans, s."""
-    return float(result.stamps[max(0, scans - 1)] - result.stamps[0]) / 1e9
+    return float(result.log.stamps[max(0, scans - 1)] - result.log.stamps[0]) / 1e9
 
 
 def _cost(result: RunResult, every: int) -> list[dict[str, float]]:
@@ -147,7 +147,7 @@ def main(arguments: list[str]) -> int:
         print(f"charted_run: {fault}", file=sys.stderr)
         return 2
     options.out.mkdir(parents=True)
-    write_tum(options.out / "trajectory.tum", StampedPoses(result.source_stamps, final.recording.trajectory))
+    write_tum(options.out / "trajectory.tum", StampedPoses(result.log.source_stamps, final.recording.trajectory))
     (options.out / "report.json").write_text(json.dumps(facts), encoding="utf-8")
     return 0
 

@@ -31,6 +31,8 @@ class Case:
     :ivar kind: of degradation of the odometry, empty for none.
     :ivar changes: parameters that differ from the file, as ``name=value``.
     :ivar duration: seconds of the log that are used, 0 for all.
+    :ivar start: seconds of the log that are skipped.
+    :ivar source: output folder whose map is extended, None for none.
     """
 
     log: MeasuredLog
@@ -38,18 +40,22 @@ class Case:
     kind: str = ""
     changes: tuple[str, ...] = ()
     duration: float = 0.0
+    start: float = 0.0
+    source: Path | None = None
 
     @property
     def name(self) -> str:
         """Of the output folder."""
         changes = "_".join(re.sub(r"[^\w.]+", "_", change) for change in self.changes)
-        return "-".join(filter(None, (self.log.name, self.kind, changes, str(self.seed))))
+        part = "_".join(f"{name}_{of:g}" for name, of in (("from", self.start), ("for", self.duration)) if of)
+        return "-".join(filter(None, (self.log.name, self.kind, changes, part, str(self.seed))))
 
     def command(self, folder: Path) -> list[str]:
         """The command line that maps the log into a folder."""
         program = ["benchmark.map_degraded", self.kind] if self.kind else ["hmt_slam_ros.cli.main", "map"]
         options = ["--out", str(folder), "--seed", str(self.seed), "--config", str(PARAMETERS)]
-        part = ["--duration", str(self.duration)] if self.duration else []
+        given = {"--duration": self.duration, "--start": self.start, "--from": self.source}
+        part = [word for name, value in given.items() if value for word in (name, str(value))]
         changes = [word for change in self.changes for word in ("--set", change)]
         return [sys.executable, "-m", *program, str(self.log.path), *options, *part, *changes]
 

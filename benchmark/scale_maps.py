@@ -15,9 +15,10 @@ from benchmark.lattice import ARC, FIRST_KEYFRAME, PER_AREA, Lattice, shared_sca
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.logs import open_log
+from hmt_slam_ros.offline.reading import LogState
 from hmt_slam_ros.offline.record import EstimateTable, ProbabilityTable, TopologyProbability, TrailTable
 from hmt_slam_ros.offline.runtime import Run
-from hmt_slam_ros.offline.saved_map import LogState, MapWriter, RunState, read_run_state, read_saved_map
+from hmt_slam_ros.offline.saved_map import MapWriter, RunState, read_run_state, read_saved_map
 from hmt_slam_ros.persistence.replacing import put_in_place
 from hmt_slam_ros.processes.aam import WatchState
 from hmt_slam_ros.processes.closure_account import Step

@@ -10,7 +10,7 @@ import numpy as np
 
 from benchmark.logs import MeasuredLog
 from hmt_slam_ros.errors import HmtSlamError
-from hmt_slam_ros.evaluation import PairErrors, RelationErrors, evaluate_relations, pair_errors, read_tum
+from hmt_slam_ros.evaluation import PairErrors, RelationErrors, StampedPoses, evaluate_relations, pair_errors, read_tum
 
 FINAL, ONLINE = "trajectory.tum", "trajectory_online.tum"
 
@@ -27,9 +27,17 @@ def score(folder: Path, log: MeasuredLog, file: str = FINAL) -> RelationErrors:
     :param file: name of the trajectory.
     :raises HmtSlamError: where the log has no true relations, or there is no such trajectory.
     """
+    return scored(read_tum(folder / file), log)
+
+
+def scored(trajectory: StampedPoses, log: MeasuredLog) -> RelationErrors:
+    """Errors of a trajectory of a log.
+
+    :raises HmtSlamError: where the log has no true relations.
+    """
     if log.relations is None:
         raise HmtSlamError(f"the log {log.name} has no true relations: its trajectory cannot be scored")
-    return evaluate_relations(read_tum(folder / file), log.relations, log.odometry)
+    return evaluate_relations(trajectory, log.relations, log.odometry)
 
 
 def errors(folder: Path, log: MeasuredLog, file: str = FINAL) -> PairErrors:

@@ -141,7 +141,7 @@ def record(tmp_path_factory):
 def test_watching_changes_nothing_of_a_run(record):
     _, watched = record
     result = run_log(open_simulated(WORLD.log), load_configuration(None, [], WORLD.seed))
-    recording = result.recorder.finish(result.stamps)
+    recording = result.recorder.finish(result.log.stamps)
     arcs = list(recording.hybrid_map.all_arcs())
     assert [tuple(arc["areas"]) for arc in watched["arcs"]] == [(a, b) for a, b, _ in arcs]
     sigmas = [np.sqrt(np.trace(arc.pose.covariance[:2, :2])) for *_, arc in arcs]

@@ -54,7 +54,7 @@ def _map(command: argparse.ArgumentParser) -> None:
     _log_to_folder(command)
     command.add_argument(
         "--from", type=Path, dest="source", metavar="MAP",
-        help="output folder or hmt_map of a part of the log, to go on from with its parameters",
+        help="output folder or hmt_map of a part of the log or of other logs, to go on from with its parameters",
     )  # fmt: skip
 
 

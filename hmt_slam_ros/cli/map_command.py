@@ -8,6 +8,7 @@ import resource
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,44 +22,54 @@ from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.logs import Log, open_log
 from hmt_slam_ros.offline.corrected_scans import corrected_scans
 from hmt_slam_ros.offline.final_map import FinalMap, final_map
-from hmt_slam_ros.offline.going_on import differences, map_folder
+from hmt_slam_ros.offline.going_on import differences, map_folder, which_log
 from hmt_slam_ros.offline.memory import code_bytes
 from hmt_slam_ros.offline.output_folder import map_writer, replacing, write_output
+from hmt_slam_ros.offline.reading import goes_on
 from hmt_slam_ros.offline.report import RunFigures
 from hmt_slam_ros.offline.runtime import run_log
-from hmt_slam_ros.offline.saved_map import RunState, read_run_state
+from hmt_slam_ros.offline.saved_map import RunState, read_run_state, read_saved_map
 
 
 def run(options: argparse.Namespace) -> None:
     """Map the log and say what came of it."""
-    configuration, state = _beginning(options)
+    configuration, state, log = _beginning(options)
+    log_seconds = log.duration
     with replacing(options.out) as folder:
         writer = map_writer(folder)
-        log, log_seconds = _opened(options.log, configuration)
         final, source_stamps, figures = measured_run(log, configuration, state, writer.write_state)
         del log, state  # they may be large
         write_output(folder, final, source_stamps, figures, configuration, writer)
     print(summary(options.out, final.recording, log_seconds, figures.wall_seconds))
 
 
-def _beginning(options: argparse.Namespace) -> tuple[Configuration, RunState]:
-    """What the run begins with: nothing, or the map that it goes on from."""
+def _beginning(options: argparse.Namespace) -> tuple[Configuration, RunState, Log]:
+    """What the run begins with, which is nothing or the map that it goes on from, and the log."""
     if options.source is None:
-        return chosen_configuration(options), RunState()
-    state, saved = read_run_state(map_folder(options.source))
-    configuration = chosen_configuration(options, with_changes(saved, {"robot.duration": 0.0}))
-    told = differences(saved, configuration)
-    if told:
+        configuration = chosen_configuration(options)
+        return configuration, RunState(), _opened(options.log, configuration)
+    folder = map_folder(options.source)
+    state, saved = read_run_state(folder)
+    whole = with_changes(saved, {"robot.duration": 0.0})
+    configuration = chosen_configuration(options, whole)
+    log = _opened(options.log, configuration)
+    further = not goes_on(state.log, log)
+    if further:
+        state = replace(state, log=replace(state.log, earlier=read_saved_map(folder).scans))
+        configuration = chosen_configuration(options, with_changes(whole, {"robot.start": 0.0}))
+        log = _opened(options.log, configuration)
+    changes = differences(saved, configuration, further=further)
+    for told in filter(None, (which_log(state.log, log.name, further=further), changes)):
         print(f"hmt_slam map: {told}", file=sys.stderr)
-    return configuration, state
+    return configuration, state, log
 
 
-def _opened(path: Path, configuration: Configuration) -> tuple[Log, float]:
-    """The part of the log that was asked for, and its duration, s."""
+def _opened(path: Path, configuration: Configuration) -> Log:
+    """The part of the log that was asked for."""
     log = open_log(path, start=configuration.robot.start, duration=configuration.robot.duration or None)
     if not log.scan_count:
         raise HmtSlamError(f"{path} has no scans in the part asked for: check --start and --duration")
-    return log, log.duration
+    return log
 
 
 def measured_run(
@@ -79,7 +90,8 @@ def measured_run(
     with Progress(log.scan_count, log.duration) as progress:
         result = run_log(log, configuration, progress, state=state, keep=keep)
     begin = time.process_time()
-    final = final_map(result.recorder.finish(result.stamps), corrected_scans(log, configuration), configuration)
+    recording = result.recorder.finish(result.log.stamps, result.log.first_scans, result.log.earlier)
+    final = final_map(recording, corrected_scans(log, configuration), configuration)
     figures = RunFigures(
         log=log.name,
         runtime="lock-step",
@@ -91,4 +103,4 @@ def measured_run(
         refinement_seconds=time.process_time() - begin,
         memory={"particle_maps": result.map_bytes} | code_bytes(),
     )
-    return final, result.source_stamps, figures
+    return final, result.log.source_stamps, figures

@@ -1,4 +1,4 @@
-"""The final map: keyframes refined jointly over all areas, and every scan of the log placed among them."""
+"""The final map: keyframes refined jointly over all areas, and every scan of the newest log placed among them."""
 
 from __future__ import annotations
 
@@ -24,6 +24,7 @@ from hmt_slam_ros.sensing.motion import path_covariance
 from hmt_slam_ros.topology.hybrid_map import HybridMap
 from hmt_slam_ros.topology.pose_graph import Edges
 from hmt_slam_ros.topology.shortest_path import reachable
+from hmt_slam_ros.topology.unknown import unknown
 
 # Scans whose surfaces are in memory at once.
 _BATCH = 500
@@ -45,7 +46,7 @@ class FinalMap:
 def final_map(recording: Recording, scans: Iterable[Scan], configuration: Configuration) -> FinalMap:
     """Refine a run's map.
 
-    :param scans: all scans of the log in its order, those that the recording's trajectory has poses for.
+    :param scans: all scans of the newest log in its order; those of earlier logs stay where they are to keyframes.
     """
     travelled = carried(recording.scans, keyframe_poses(recording.hybrid_map, _areas_as_travelled(recording)))
     stages = {"filter": travelled, "arcs": recording.trajectory}
@@ -54,7 +55,9 @@ def final_map(recording: Recording, scans: Iterable[Scan], configuration: Config
     keyframes = _Keyframes(recording, configuration)
     refined = _with_keyframes(recording, keyframes.refined(recording))
     stages["keyframes"] = refined.trajectory
-    return FinalMap(replace(refined, trajectory=keyframes.placed(refined, scans)), stages)
+    placed = keyframes.placed(refined, scans)
+    relative = refined.scans.at(placed, keyframe_poses(refined.hybrid_map, refined.area_poses))
+    return FinalMap(replace(refined, trajectory=placed, scans=relative), stages)
 
 
 class _Keyframes:
@@ -101,22 +104,23 @@ class _Keyframes:
     def _motion(self, recording: Recording, poses: NDArray[np.float64]) -> Edges:
         """From each keyframe to the next the motion that metric SLAM found, as uncertain as the odometry of that way.
 
-        Where no pair of scans overlaps enough, metric SLAM has seen more in its map than odometry could tell.
+        Where no pair of scans overlaps enough, metric SLAM has seen more in its map than odometry could tell. From one
+        log to the next nothing is known of it.
         """
         rows, count = _scan_rows(recording, self.ids), len(poses) - 1
-        return Edges(
-            np.arange(count),
-            np.arange(1, count + 1),
-            se2.between(poses[:-1], poses[1:]),
-            _path_covariances(recording.odometry, rows, self._configuration.motion),
-        )
+        steps = se2.between(poses[:-1], poses[1:])
+        covariances = _path_covariances(recording.odometry, rows, self._configuration.motion)
+        logs = np.searchsorted(recording.first_scans, rows, side="right")
+        for n in np.flatnonzero(np.diff(logs)):
+            covariances[n] = unknown(steps[n]).covariance
+        return Edges(np.arange(count), np.arange(1, count + 1), steps, covariances)
 
     def placed(self, recording: Recording, scans: Iterable[Scan]) -> Trajectory:
-        """Every scan of the log, registered with the keyframes around it."""
+        """The trajectory with every scan of the newest log registered with the keyframes around it."""
         poses, options = self._poses(recording), self._options
         areas = self.areas[np.searchsorted(self.ids, np.maximum(recording.scans.keyframes, self.ids[0]))]
         placed, remaining = recording.trajectory.copy(), iter(scans)
-        for first in range(0, len(placed), _BATCH):
+        for first in range(recording.first_scans[-1], len(placed), _BATCH):
             batch = list(itertools.islice(remaining, _BATCH))
             rows = slice(first, first + len(batch))
             around = self._around(poses, placed[rows], areas[rows], options.scan_neighbours)
@@ -125,7 +129,7 @@ class _Keyframes:
 
 
 def _scan_rows(recording: Recording, keyframes: list[int]) -> NDArray[np.intp]:
-    """Where in the log the scans of keyframes are."""
+    """Numbers of the scans of keyframes."""
     stamps = [recording.replica.scans[keyframe].stamp for keyframe in keyframes]
     return np.searchsorted(recording.stamps, stamps)
 

@@ -6,6 +6,7 @@ import shutil
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -25,12 +26,16 @@ from hmt_slam_ros.persistence.folder import MANIFEST
 from hmt_slam_ros.persistence.hmt_map import HMT_MAP
 from hmt_slam_ros.persistence.replacing import put_in_place
 
+EARLIER = "earlier"
+"""The folder of the trajectories of earlier logs, 1.tum, 2.tum and so on."""
+
 # Everything that ever stands in an output folder; a folder with anything else in it is not ours to replace.
 OWN_NAMES = frozenset(
     {
         "trajectory.tum",
         "trajectory_online.tum",
         "stages",
+        EARLIER,
         "map.pgm",
         "map.yaml",
         "map.png",
@@ -100,18 +105,14 @@ def write_output(
     """Write every file of a run.
 
     :param directory: an empty folder, see :func:`replacing`.
-    :param source_stamps: shape (n,), the log's own stamps of all scans, ns, in file order.
+    :param source_stamps: shape (n,), the logs' own stamps of all scans, ns, in file order.
     :param state: of :func:`map_writer`, where the state of the run was kept.
     """
     recording = final.recording
-    write_tum(directory / "trajectory.tum", StampedPoses(source_stamps, recording.trajectory))
-    write_tum(directory / "trajectory_online.tum", StampedPoses(source_stamps, recording.online))
-    (directory / "stages").mkdir()
-    for name, trajectory in final.stages.items():
-        write_tum(directory / "stages" / f"{name}.tum", StampedPoses(source_stamps, trajectory))
+    _write_trajectories(directory, final, source_stamps)
     _write_map(directory, recording, configuration)
     saved = state or map_writer(directory)
-    saved.write_map(recording.replica, recording.area_poses, recording.last)
+    saved.write_map(recording.replica, recording.area_poses, recording.last, recording.scans)
     saved.finish(configuration)
     write_graph(directory / "graph.g2o", recording)
     write_probabilities(directory / "pmf.csv", recording.probabilities)
@@ -121,6 +122,21 @@ def write_output(
     from hmt_slam_ros.offline.plots import plot_map  # noqa: PLC0415
 
     plot_map(directory)
+
+
+def _write_trajectories(directory: Path, final: FinalMap, source_stamps: NDArray[np.int64]) -> None:
+    """Those of the newest log, and of the earlier ones where they are in the final map."""
+    recording = final.recording
+    trajectories = {"trajectory": recording.trajectory, "trajectory_online": recording.online}
+    trajectories |= {f"stages/{name}": trajectory for name, trajectory in final.stages.items()}
+    (directory / "stages").mkdir()
+    newest = slice(recording.first_scans[-1], None)
+    for name, trajectory in trajectories.items():
+        write_tum(directory / f"{name}.tum", StampedPoses(source_stamps[newest], trajectory[newest]))
+    for number, (first, end) in enumerate(pairwise(recording.first_scans), start=1):
+        (directory / EARLIER).mkdir(exist_ok=True)
+        poses = StampedPoses(source_stamps[first:end], recording.trajectory[first:end])
+        write_tum(directory / EARLIER / f"{number}.tum", poses)
 
 
 def map_writer(directory: Path) -> MapWriter:

@@ -53,8 +53,9 @@ class Recording:
 
     :ivar replica: scans and maps of the hypotheses that are alive at the end.
     :ivar area_poses: {area: belief over ``map_T_area``} of the most probable hypothesis.
-    :ivar stamps: shape (n,), of all scans of the log, ns, increasing.
-    :ivar scans: the scans of the log relative to the keyframes of the most probable hypothesis.
+    :ivar stamps: shape (n,), of all scans of all logs, ns, increasing.
+    :ivar first_scans: number of the first scan of each log.
+    :ivar scans: the scans relative to the keyframes of the most probable hypothesis.
     :ivar odometry: ``odom_T_base`` of the scans.
     :ivar trajectory: ``map_T_base`` of the scans in the map.
     :ivar online: the same as it was known when the scan was taken.
@@ -67,6 +68,7 @@ class Recording:
     replica: Replica
     area_poses: dict[int, PoseGaussian]
     stamps: NDArray[np.int64]
+    first_scans: tuple[int, ...]
     scans: Anchored
     odometry: Trajectory
     trajectory: Trajectory
@@ -191,11 +193,15 @@ class Recorder:
         poses = OnlinePoses({entry.area: entry.pose.mean for entry in past.global_poses}, before)
         return poses.of([self.estimates[scan] for scan in sorted(self.estimates)], verdicts)
 
-    def finish(self, stamps: NDArray[np.int64]) -> Recording:
+    def finish(
+        self, stamps: NDArray[np.int64], first_scans: tuple[int, ...] = (0,), earlier: Anchored | None = None
+    ) -> Recording:
         """Work out the final map, trajectories and probabilities.
 
-        :param stamps: shape (n,), stamps of all scans of the log as the processes got them, ns, increasing; the
-            trajectories have a pose for each.
+        :param stamps: shape (n,), stamps of all scans as the processes got them, ns, increasing; the trajectories have
+            a pose for each.
+        :param first_scans: number of the first scan of each log, where they are of several.
+        :param earlier: where scans of earlier logs were taken after the final refinement of that time.
         :raises HmtSlamError: where no scan gave a pose, or messages were lost on the way.
         """
         if self.last is None or self.finished is None or not (self.keyframes or self.past.events):
@@ -207,14 +213,16 @@ class Recorder:
         assert record.last is not None
         replica, given = Replica.of(record.replica), record.estimates
         area_poses = placed_areas(replica.maps[replica.best], record.global_poses)
-        scans = anchored(stamps, record.own_trails(replica.best))
+        poses = keyframe_poses(replica.maps[replica.best], area_poses)
+        scans = anchored(stamps, record.own_trails(replica.best)).beginning_with(earlier or Anchored.none(), poses)
         return Recording(
             replica,
             area_poses,
             stamps,
+            first_scans,
             scans,
             of_all(stamps, given.stamps, given.odometry),
-            carried(scans, keyframe_poses(replica.maps[replica.best], area_poses)),
+            carried(scans, poses),
             of_all(stamps, given.stamps, record.online),
             record.probabilities.rows(),
             record.last,

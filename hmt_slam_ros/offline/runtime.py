@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
@@ -12,13 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmt_slam_ros.configuration.tree import Configuration
-from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.logs.records import Log, LogRecord
-from hmt_slam_ros.logs.stamps import seconds_from_stamp
+from hmt_slam_ros.offline.reading import LogState, Reading, goes_on
 from hmt_slam_ros.offline.recorder import Recorder
-from hmt_slam_ros.offline.saved_map import LogState, RunState
+from hmt_slam_ros.offline.saved_map import RunState
 from hmt_slam_ros.processes.aam import Aam
-from hmt_slam_ros.processes.messages import EndOfLog, Message
+from hmt_slam_ros.processes.messages import Carried, EndOfLog, Message
 from hmt_slam_ros.processes.routing import HEARD_BY, Process
 from hmt_slam_ros.processes.rtl import Rtl
 from hmt_slam_ros.processes.slam import MetricSlam
@@ -65,15 +63,13 @@ class RunResult:
     """What a run leaves.
 
     :ivar recorder: what was said.
-    :ivar stamps: shape (n,), int64, stamp of every scan on the log's running clock, ns, increasing.
-    :ivar source_stamps: shape (n,), int64, the log's own stamp of every scan in file order, ns.
+    :ivar log: which scans were read.
     :ivar seconds_per_scan: {process: shape (m,) seconds}, of the scans that this run read.
     :ivar map_bytes: what the maps of all particles took at most.
     """
 
     recorder: Recorder
-    stamps: NDArray[np.int64]
-    source_stamps: NDArray[np.int64]
+    log: LogState
     seconds_per_scan: dict[str, NDArray[np.float64]]
     map_bytes: int
 
@@ -112,53 +108,40 @@ class Run:
                 "recorder": self.recorder,
             }
         )
-        self._records = state.log.records
-        self._stamps = list(zip(state.log.stamps.tolist(), state.log.source_stamps.tolist(), strict=True))
+        self._reading = Reading(state.log)
         self._spent: list[dict[str, float]] = []
 
     @property
     def scans(self) -> int:
-        """Scans read."""
-        return len(self._stamps)
+        """Scans of the newest log that were read."""
+        return self._reading.scans
 
     @property
     def state(self) -> RunState:
         """All that is known, between two records of the log."""
         return RunState(
-            LogState(self._records, *self._columns()), self._slam.state, self._aam.state, self._tsbi.state,
+            self._reading.state, self._slam.state, self._aam.state, self._tsbi.state,
             self._tlca.state, self._rtl.state, self.recorder.record(),
         )  # fmt: skip
-
-    def _columns(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Stamps of the scans, running and the log's own."""
-        running, source = np.array(self._stamps, dtype=np.int64).reshape(-1, 2).T.copy()
-        return running, source
 
     def unread(self, log: Log) -> Iterator[LogRecord]:
         """The records of a log that were not read.
 
-        :raises HmtSlamError: where it is another log than the one that was read.
+        Where it is a further one, the robot may be anywhere, at any time.
+
+        :raises HmtSlamError: where it is not as it was when the others were read.
         """
-        records, scans = log.records(), iter(self._stamps)
-        for record in itertools.islice(records, self._records):
-            if isinstance(record.measurement, Scan) and next(scans, None) != _stamps(record):
-                raise HmtSlamError(
-                    f"{log.name} is not the log that the map was made of: a scan of it, at "
-                    f"{seconds_from_stamp(record.source_stamp)} s, is not in the map; give that log"
-                )
-        if next(scans, None) is not None:
-            raise HmtSlamError(
-                f"{log.name} ends before the last scan that the map was made of: give a larger --duration, or the log "
-                "that the map was made of"
-            )
-        return records
+        if not goes_on(self._reading.state, log):
+            self.lock_step.feed(EndOfLog())
+            self.lock_step.feed(Carried())
+            self._reading.begin(log)
+        return self._reading.unread(log)
 
     def read(self, record: LogRecord) -> None:
         """Take in a record."""
         self.lock_step.feed(record.measurement)
-        self._records += 1
+        self._reading.note(record)
         if isinstance(record.measurement, Scan):
-            self._stamps.append(_stamps(record))
             self._spent.append(self.lock_step.take_seconds())
 
     def finish(self) -> RunResult:
@@ -166,12 +149,7 @@ class Run:
         self.lock_step.feed(EndOfLog())
         names = (name for name in self.lock_step.processes if name != "recorder")
         seconds = {name: np.array([taken.get(name, 0.0) for taken in self._spent]) for name in names}
-        return RunResult(self.recorder, *self._columns(), seconds, self._slam.map_bytes)
-
-
-def _stamps(record: LogRecord) -> tuple[int, int]:
-    """Of a scan, running and the log's own, ns."""
-    return record.measurement.stamp, record.source_stamp
+        return RunResult(self.recorder, self._reading.state, seconds, self._slam.map_bytes)
 
 
 def run_log(
@@ -184,6 +162,7 @@ def run_log(
 ) -> RunResult:
     """Map a whole log.
 
+    :param log: the newest of the state's logs, or a further one.
     :param progress: called with the number of scans read, after each.
     :param abstraction: what makes areas of keyframes instead of the AAM, such as nothing.
     :param state: to go on from, at the first record that it does not know.

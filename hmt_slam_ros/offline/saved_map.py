@@ -11,14 +11,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import get_type_hints
 
-import numpy as np
-
-from hmt_slam_ros.arrays import Int64
 from hmt_slam_ros.configuration import Configuration, load_configuration
 from hmt_slam_ros.configuration.documents import ros_yaml
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.offline.reading import LogState
 from hmt_slam_ros.offline.record import Record
+from hmt_slam_ros.offline.trajectories import Anchored
 from hmt_slam_ros.persistence.folder import File, FolderReader, FolderWriter
 from hmt_slam_ros.persistence.hmt_map import CONFIGURATION, FORMAT, VERSION
 from hmt_slam_ros.processes.aam import AamState
@@ -31,24 +30,10 @@ from hmt_slam_ros.processes.tsbi import TsbiState
 
 
 @dataclass(frozen=True, eq=False)
-class LogState:
-    """How far a log was read.
-
-    :ivar records: scans and odometry readings.
-    :ivar stamps: shape (n,), of the scans on the log's running clock, ns, increasing.
-    :ivar source_stamps: shape (n,), the log's own stamps of them, ns.
-    """
-
-    records: int = 0
-    stamps: Int64 = field(default_factory=lambda: np.zeros(0, np.int64))
-    source_stamps: Int64 = field(default_factory=lambda: np.zeros(0, np.int64))
-
-
-@dataclass(frozen=True, eq=False)
 class RunState:
-    """All that a run in lock-step knows between two records of its log, at first before the first one.
+    """All that a run in lock-step knows between two records of a log, at first before the first one.
 
-    :ivar log: how far that was read.
+    :ivar log: how far the logs were read.
     :ivar slam: metric SLAM, and so on the other processes.
     :ivar recorder: what the output folder needs of the run so far.
     """
@@ -69,11 +54,13 @@ class MapDocument:
     :ivar replica: the maps of the live hypotheses; that of the most probable one is refined.
     :ivar area_poses: ``map_T_area`` of all areas of the most probable hypothesis, ordered by id.
     :ivar robot: where the robot was last.
+    :ivar scans: where the scans of all logs were taken; none in a map that nodes saved.
     """
 
     replica: ReplicaState
     area_poses: tuple[AreaPose, ...]
     robot: LocalEstimate
+    scans: Anchored
 
 
 @dataclass(frozen=True)
@@ -97,11 +84,13 @@ class SavedMap:
     :ivar replica: scans and maps of the live hypotheses with their probabilities.
     :ivar area_poses: {area: belief over ``map_T_area``} of the most probable hypothesis.
     :ivar configuration: that of the run.
+    :ivar scans: where the scans of all logs were taken, if that is known.
     """
 
     replica: Replica
     area_poses: dict[int, PoseGaussian]
     configuration: Configuration
+    scans: Anchored = field(default_factory=Anchored.none)
 
 
 class MapWriter:
@@ -126,17 +115,24 @@ class MapWriter:
         """Take in files that others wrote into the folder."""
         self._folder.join(files)
 
-    def write_map(self, replica: Replica, area_poses: Mapping[int, PoseGaussian], robot: LocalEstimate) -> None:
+    def write_map(
+        self,
+        replica: Replica,
+        area_poses: Mapping[int, PoseGaussian],
+        robot: LocalEstimate,
+        placed: Anchored | None = None,
+    ) -> None:
         """Write the map at its best.
 
         :param area_poses: {area: belief over ``map_T_area``} of the most probable hypothesis.
         :param robot: the last of what metric SLAM said.
+        :param placed: where the scans of all logs were taken, where that is known.
         """
         mapped = sorted({k for own in replica.maps.values() for area in own.area_ids() for k in own.keyframes(area)})
         scans = {keyframe: replica.scans[keyframe] for keyframe in mapped}
         kept = Replica(scans, replica.maps, replica.probabilities, replica.areas)
         poses = tuple(AreaPose(area, pose) for area, pose in sorted(area_poses.items()))
-        self._folder.write("map", MapDocument(kept.state, poses, robot))
+        self._folder.write("map", MapDocument(kept.state, poses, robot, placed or Anchored.none()))
 
     def finish(self, configuration: Configuration) -> None:
         """Write the configuration, and last the manifest."""
@@ -151,7 +147,8 @@ def read_saved_map(directory: Path) -> SavedMap:
     """
     document = FolderReader(directory, FORMAT, VERSION).read("map", MapDocument)
     poses = {entry.area: entry.pose for entry in document.area_poses}
-    return SavedMap(Replica.of(document.replica), poses, load_configuration(directory / CONFIGURATION))
+    configuration = load_configuration(directory / CONFIGURATION)
+    return SavedMap(Replica.of(document.replica), poses, configuration, document.scans)
 
 
 def read_run_state(directory: Path) -> tuple[RunState, Configuration]:

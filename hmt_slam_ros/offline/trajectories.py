@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hmt_slam_ros.arrays import Float64, Int64
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.processes.messages import Trail
@@ -24,8 +25,30 @@ class Anchored(NamedTuple):
     :ivar poses: shape (n, 3), ``keyframe_T_base``, m and rad.
     """
 
-    keyframes: NDArray[np.int64]
-    poses: Trajectory
+    keyframes: Int64
+    poses: Float64
+
+    @classmethod
+    def none(cls) -> Anchored:
+        """Of no scan."""
+        return cls(np.zeros(0, np.int64), np.zeros((0, 3)))
+
+    def beginning_with(self, better: Anchored, known: Collection[int]) -> Anchored:
+        """The same with the first scans where they are better known to be, relative to keyframes that are known."""
+        keyframes, poses = self.keyframes.copy(), self.poses.copy()
+        rows = np.flatnonzero(np.isin(better.keyframes, list(known)))
+        keyframes[rows], poses[rows] = better.keyframes[rows], better.poses[rows]
+        return Anchored(keyframes, poses)
+
+    def at(self, trajectory: Trajectory, keyframes: Mapping[int, NDArray[np.float64]]) -> Anchored:
+        """The same scans where a trajectory has them.
+
+        :param keyframes: {keyframe: ``map_T_base``, shape (3,)}.
+        """
+        poses, known = self.poses.copy(), self.keyframes >= 0
+        map_T_keyframe = np.array([keyframes[keyframe] for keyframe in self.keyframes[known].tolist()])
+        poses[known] = se2.between(map_T_keyframe, trajectory[known])
+        return Anchored(self.keyframes, poses)
 
 
 class OnlinePose(NamedTuple):

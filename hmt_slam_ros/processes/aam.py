@@ -37,7 +37,7 @@ from hmt_slam_ros.topology.overlap_graph import (
     separation,
     synchronised,
 )
-from hmt_slam_ros.topology.unknown import tells_nothing
+from hmt_slam_ros.topology.unknown import telling_arc
 
 # An area's overlap with a scan is that of the best few keyframes among those taken nearest to it.
 _NEAREST, _BEST = 8, 3
@@ -278,10 +278,9 @@ class Aam:
         hybrid_map, here = self._replica.maps[leaf.hypothesis], leaf.area
         shares = {here: self._share(hybrid_map, here, leaf.pose.mean, newest)}
         for area in hybrid_map.neighbours(here):
-            arc = hybrid_map.arc(area, here)
-            if arc is None or tells_nothing(arc):
-                continue
-            shares[area] = self._share(hybrid_map, area, se2.compose(arc.mean, leaf.pose.mean), newest)
+            arc = telling_arc(hybrid_map, area, here)
+            if arc is not None:
+                shares[area] = self._share(hybrid_map, area, se2.compose(arc.mean, leaf.pose.mean), newest)
         return shares
 
     def _share(self, hybrid_map: HybridMap, area: int, pose: NDArray[np.float64], newest: int) -> float:

@@ -27,6 +27,7 @@ from hmt_slam_ros.topology.hybrid_map import HybridMap
 from hmt_slam_ros.topology.hypothesis_tree import LeafNotes, relative_covariance
 from hmt_slam_ros.topology.shortest_path import reachable
 from hmt_slam_ros.topology.surroundings import gap, positions
+from hmt_slam_ros.topology.unknown import beside, telling_arc
 from hmt_slam_ros.topology.whereabouts import Whereabouts
 
 FEWEST = 4
@@ -175,7 +176,7 @@ class Branching:
         placed = parent.hybrid_map.keyframes(parent.area)
         keyframes = [k for k in (newest if only else parent.notes.unchecked) if k in placed]
         query = self.query(parent, keyframes)
-        excluded = {parent.area, *parent.around(), *parent.hybrid_map.neighbours(parent.area)}
+        excluded = {parent.area, *parent.around(), *beside(parent.hybrid_map, parent.area)}
         found = self._compared(parent, query, excluded, only)
         notes = parent.notes.checked(found.examined, keyframes, found.beside, all_areas=not only)
         noted = replace(parent, notes=notes)
@@ -207,7 +208,7 @@ class Branching:
 
         :param pose: ``area_T_base``.
         """
-        joined = parent.hybrid_map.neighbours(parent.area)
+        joined = beside(parent.hybrid_map, parent.area)
         around = {area: at for area, at in parent.around().items() if area not in joined}
         found = self.search.tracked_area(parent.hybrid_map, parent.area, around, pose[None])
         if found is None:
@@ -232,7 +233,7 @@ class Branching:
 
     def _belief(self, parent: Parent, area: int) -> PoseGaussian:
         """The belief over ``area_T_other``, its mean as the local map has it, so that the robot does not jump."""
-        arc = parent.hybrid_map.arc(parent.area, area)
+        arc = telling_arc(parent.hybrid_map, parent.area, area)
         found = arc or reachable(parent.hybrid_map, parent.area, until=(area,))[area]
         return PoseGaussian(parent.notes.local.get(area, found.mean), found.covariance)
 
@@ -264,7 +265,8 @@ class Branching:
         """
         belief = self._belief(parent, area)
         entry = belief.inverse().compose(query.belief)
-        arc = None if parent.hybrid_map.arc(parent.area, area) else self._measured_arc(parent, query, area, belief)
+        joined = telling_arc(parent.hybrid_map, parent.area, area) is not None
+        arc = None if joined else self._measured_arc(parent, query, area, belief)
         return self.entered(parent, query, area, entry, arc, 0.0)
 
     def _measured_arc(self, parent: Parent, query: Query, area: int, belief: PoseGaussian) -> PoseGaussian:

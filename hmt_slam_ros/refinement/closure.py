@@ -22,6 +22,7 @@ from hmt_slam_ros.sensing.motion import path_covariance
 from hmt_slam_ros.topology.global_map import consistent_map
 from hmt_slam_ros.topology.hybrid_map import HybridMap
 from hmt_slam_ros.topology.pose_graph import Edges
+from hmt_slam_ros.topology.unknown import beside
 
 # Keyframes this far apart in number were taken on one way through an area.
 _ONE_WAY = 3
@@ -148,7 +149,7 @@ class ClosureRefinement:
 
 def _surroundings(hybrid_map: HybridMap, closed: Collection[int]) -> list[list[int]]:
     """The areas joined and those one arc away, in groups that arcs join, each ascending."""
-    arcs = np.array([(area, beside) for area in closed for beside in (area, *hybrid_map.neighbours(area))])
+    arcs = np.array([(area, other) for area in closed for other in (area, *beside(hybrid_map, area))])
     areas, rows = np.unique(arcs, return_inverse=True)
     graph = csc_matrix((np.ones(len(arcs)), rows.reshape(-1, 2).T), shape=(areas.size, areas.size))
     groups, labels = connected_components(graph, directed=False)

@@ -19,6 +19,7 @@ from hmt_slam_ros.refinement.registration import normal_equations, weighting
 from hmt_slam_ros.refinement.surfaces import Surfaces
 from hmt_slam_ros.topology.hybrid_map import HybridMap
 from hmt_slam_ros.topology.shortest_path import reachable
+from hmt_slam_ros.topology.unknown import beside
 
 # Keyframes farther apart in number than this were taken on two ways.
 _ONE_WAY = 20
@@ -41,7 +42,7 @@ class Pairs(NamedTuple):
 
 def linked_areas(hybrid_map: HybridMap) -> dict[int, frozenset[int]]:
     """Every area with itself and the areas up to two arcs away: what lies near otherwise does so by chance."""
-    one = {area: {area, *hybrid_map.neighbours(area)} for area in hybrid_map.area_ids()}
+    one = {area: {area, *beside(hybrid_map, area)} for area in hybrid_map.area_ids()}
     return {area: frozenset().union(*(one[next_one] for next_one in near)) for area, near in one.items()}
 
 

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.topology.hybrid_map import HybridMap
 
 # Larger than a building, m, and all headings.
 _DEVIATION, _HEADING = 300.0, math.pi
@@ -24,3 +25,14 @@ def unknown(mean: NDArray[np.float64]) -> PoseGaussian:
 def tells_nothing(belief: PoseGaussian) -> bool:
     """Whether a belief is about as wide as :func:`unknown`."""
     return bool(np.trace(belief.covariance[:2, :2]) > _DEVIATION**2)
+
+
+def telling_arc(hybrid_map: HybridMap, a: int, b: int) -> PoseGaussian | None:
+    """The belief over ``a_T_b``, or None where no arc joins the two that tells anything."""
+    arc = hybrid_map.arc(a, b)
+    return None if arc is None or tells_nothing(arc) else arc
+
+
+def beside(hybrid_map: HybridMap, area: int) -> list[int]:
+    """The areas one arc away that tells where they are, ascending."""
+    return [other for other in hybrid_map.neighbours(area) if telling_arc(hybrid_map, area, other) is not None]

@@ -1,0 +1,122 @@
+"""How far the logs of a map were read: their records on one clock, which goes on from one log to the next."""
+
+from __future__ import annotations
+
+import itertools
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from hmt_slam_ros.arrays import Int64
+from hmt_slam_ros.errors import HmtSlamError
+from hmt_slam_ros.logs.records import Log, LogRecord
+from hmt_slam_ros.logs.stamps import NANOSECONDS, seconds_from_stamp
+from hmt_slam_ros.offline.trajectories import Anchored
+from hmt_slam_ros.sensing import Scan
+
+# Of the map's clock, from the last scan of a log to the first record of the next.
+_BETWEEN_LOGS = 60 * NANOSECONDS
+
+
+@dataclass(frozen=True, eq=False)
+class LogState:
+    """How far the logs of a map were read.
+
+    :ivar records: scans and odometry readings of the newest log.
+    :ivar stamps: shape (n,), of the scans of all logs on the map's clock, ns, increasing.
+    :ivar source_stamps: shape (n,), the logs' own stamps of them, ns.
+    :ivar first_scans: number of the first scan of each log.
+    :ivar earlier: where the scans of all logs before the newest were taken after the final refinement of that time, or
+        none.
+    :ivar shift: what the map's clock is ahead of the running clock of the newest log, ns.
+    :ivar checksum: CRC-32 of the ranges of the first scan of the newest log.
+    """
+
+    records: int = 0
+    stamps: Int64 = field(default_factory=lambda: np.zeros(0, np.int64))
+    source_stamps: Int64 = field(default_factory=lambda: np.zeros(0, np.int64))
+    first_scans: tuple[int, ...] = (0,)
+    earlier: Anchored = field(default_factory=Anchored.none)
+    shift: int = 0
+    checksum: int = 0
+
+
+def goes_on(state: LogState, log: Log) -> bool:
+    """Whether a log is the newest one of a map, and no further one: it begins with the same scan."""
+    first = state.first_scans[-1]
+    if first == state.stamps.size:
+        return True
+    for record in log.records():
+        if isinstance(record.measurement, Scan):
+            return (record.source_stamp, _checksum(record.measurement)) == (state.source_stamps[first], state.checksum)
+    return False
+
+
+class Reading:
+    """Reads one log after the other."""
+
+    def __init__(self, state: LogState) -> None:
+        """:param state: to go on from."""
+        self._records, self._first_scans, self._earlier = state.records, state.first_scans, state.earlier
+        self._shift, self._checksum = state.shift, state.checksum
+        self._stamps = list(zip(state.stamps.tolist(), state.source_stamps.tolist(), strict=True))
+
+    @property
+    def state(self) -> LogState:
+        """How far the logs were read, as a value."""
+        running, source = np.array(self._stamps, dtype=np.int64).reshape(-1, 2).T.copy()
+        return LogState(self._records, running, source, self._first_scans, self._earlier, self._shift, self._checksum)
+
+    @property
+    def scans(self) -> int:
+        """Scans of the newest log that were read."""
+        return len(self._stamps) - self._first_scans[-1]
+
+    def begin(self, log: Log) -> None:
+        """Begin a further log, on a clock that goes on."""
+        self._first_scans = (*self._first_scans, len(self._stamps))
+        first = next((record.measurement.stamp for record in log.records()), 0)
+        self._records, self._shift = 0, self._stamps[-1][0] + _BETWEEN_LOGS - first
+
+    def unread(self, log: Log) -> Iterator[LogRecord]:
+        """The records of the newest log that were not read, with stamps on the map's clock.
+
+        :raises HmtSlamError: where it is not as it was when the others were read.
+        """
+        records, scans = map(self._shifted, log.records()), iter(self._stamps[self._first_scans[-1] :])
+        for record in itertools.islice(records, self._records):
+            if isinstance(record.measurement, Scan) and next(scans, None) != _stamps(record):
+                raise HmtSlamError(
+                    f"{log.name} begins as the log that the map was made of and is another: a scan of it, at "
+                    f"{seconds_from_stamp(record.source_stamp)} s, is not in the map; give that log"
+                )
+        if next(scans, None) is not None:
+            raise HmtSlamError(
+                f"{log.name} ends before the last scan that the map was made of: give a larger --duration, or the log "
+                "that the map was made of"
+            )
+        return records
+
+    def note(self, record: LogRecord) -> None:
+        """Note that a record was read."""
+        self._records += 1
+        if isinstance(record.measurement, Scan):
+            if not self.scans:
+                self._checksum = _checksum(record.measurement)
+            self._stamps.append(_stamps(record))
+
+    def _shifted(self, record: LogRecord) -> LogRecord:
+        if not self._shift:
+            return record
+        return replace(record, measurement=replace(record.measurement, stamp=record.measurement.stamp + self._shift))
+
+
+def _stamps(record: LogRecord) -> tuple[int, int]:
+    """Of a scan, on the map's clock and the log's own, ns."""
+    return record.measurement.stamp, record.source_stamp
+
+
+def _checksum(scan: Scan) -> int:
+    return zlib.crc32(scan.ranges.tobytes())

@@ -1,0 +1,154 @@
+"""A map that a further log extends: poses of all logs in one frame, whatever the clocks of the logs say."""
+
+import dataclasses
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hmt_slam_ros.configuration import Configuration
+from hmt_slam_ros.evaluation import read_tum
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.logs import open_log
+from hmt_slam_ros.offline.corrected_scans import corrected_scans
+from hmt_slam_ros.offline.final_map import final_map
+from hmt_slam_ros.offline.reading import LogState, Reading, goes_on
+from hmt_slam_ros.offline.runtime import Run, run_log
+from hmt_slam_ros.sensing import Scan
+from hmt_slam_ros.topology.unknown import tells_nothing
+
+WORLD = "sim:office,seed=3,size=0.7"
+BUNDLED = Path(__file__).parents[1] / "data" / "malaga_one_loop"
+FIRST, BEGIN, SECOND = 130.0, 130.1, 120.0
+NEAR, TURN = 0.15, np.radians(2.0)
+
+
+class Restamped:
+    """A log with other stamps of its own."""
+
+    def __init__(self, log, by):
+        self.log, self.by = log, by
+        self.name, self.scan_count, self.duration = log.name, log.scan_count, log.duration
+
+    def records(self):
+        for record in self.log.records():
+            measurement = dataclasses.replace(record.measurement, stamp=record.measurement.stamp + self.by)
+            yield dataclasses.replace(record, source_stamp=record.source_stamp + self.by, measurement=measurement)
+
+
+def scans_of(log):
+    return [record for record in log.records() if isinstance(record.measurement, Scan)]
+
+
+@pytest.fixture(scope="module")
+def first():
+    """The state after the first part of a drive."""
+    run = Run(Configuration())
+    for record in open_log(WORLD, duration=FIRST).records():
+        run.read(record)
+    return run.state
+
+
+@pytest.fixture(scope="module")
+def second_log():
+    return open_log(WORLD, start=BEGIN, duration=SECOND)
+
+
+def extended(state, log):
+    """The final map of a map and a further log, and how the logs were read."""
+    result = run_log(log, Configuration(), state=state)
+    recording = result.recorder.finish(result.log.stamps, result.log.first_scans)
+    return final_map(recording, corrected_scans(log, Configuration()), Configuration()).recording, result.log
+
+
+@pytest.fixture(scope="module")
+def both(first, second_log):
+    return extended(first, second_log)
+
+
+def test_the_poses_of_both_logs_are_in_one_frame(both, first):
+    recording, log = both
+    assert log.first_scans == (0, first.log.stamps.size)
+    truth = np.array([record.truth for record in scans_of(open_log(WORLD, duration=BEGIN + SECOND))])
+    assert len(truth) == len(recording.trajectory)
+    away = se2.between(se2.between(truth[0], truth), se2.between(recording.trajectory[0], recording.trajectory))
+    assert np.hypot(away[:, 0], away[:, 1]).max() < NEAR
+    assert np.abs(away[:, 2]).max() < TURN
+
+
+def test_the_robot_was_lost_at_first_and_then_joined(both, first):
+    recording, _ = both
+    hybrid_map = recording.hybrid_map
+    own = {area for area in hybrid_map.area_ids() if min(hybrid_map.keyframes(area)) >= first.slam.events}
+    assert own
+    assert any(len({a, b} & own) == 1 and not tells_nothing(arc.pose) for a, b, arc in hybrid_map.all_arcs())
+
+
+@pytest.mark.parametrize("by", [-3600, -60])
+def test_stamps_before_and_among_those_of_the_map_make_no_difference(both, first, second_log, by):
+    log = Restamped(second_log, by * 1_000_000_000)
+    recording, read = extended(first, log)
+    np.testing.assert_array_equal(recording.trajectory, both[0].trajectory)
+    own = [record.source_stamp for record in scans_of(log)]
+    np.testing.assert_array_equal(read.source_stamps[read.first_scans[-1] :], own)
+
+
+def test_a_run_can_stop_in_the_second_log_as_well(both, first, second_log):
+    run = Run(Configuration(), state=first)
+    for number, record in enumerate(run.unread(second_log)):
+        run.read(record)
+        if number == 1500:
+            break
+    recording, log = extended(run.state, second_log)
+    np.testing.assert_array_equal(recording.trajectory, both[0].trajectory)
+    assert log.first_scans == both[1].first_scans
+
+
+def test_a_log_that_the_map_does_not_know_is_an_island_in_it(first):
+    """Neither bends the other."""
+    recording, log = extended(first, open_log(BUNDLED, duration=20.0))
+    alone, _ = extended(None, open_log(WORLD, duration=FIRST))
+    apart = se2.between(alone.trajectory, recording.trajectory[: log.first_scans[1]])
+    assert np.hypot(apart[:, 0], apart[:, 1]).max() < NEAR
+    assert np.isfinite(recording.trajectory).all()
+
+
+def test_a_log_is_known_by_the_stamp_and_the_ranges_of_its_first_scan(first):
+    assert goes_on(first.log, open_log(WORLD))
+    assert not goes_on(first.log, Restamped(open_log(WORLD), 1))
+    assert not goes_on(first.log, open_log("sim:office,seed=4,size=0.7"))
+    assert goes_on(LogState(), open_log(BUNDLED))
+
+
+def test_the_clock_of_a_map_goes_on_in_a_log_that_is_older(first, second_log):
+    reading = Reading(first.log)
+    log = Restamped(second_log, -10**12)
+    reading.begin(log)
+    record = next(iter(reading.unread(log)))
+    assert record.measurement.stamp > first.log.stamps[-1]
+    assert record.source_stamp < first.log.source_stamps[0]
+
+
+def hmt_slam(*words):
+    command = [sys.executable, "-m", "hmt_slam_ros.cli.main", *map(str, words)]
+    done = subprocess.run(command, check=False, timeout=300, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return done
+
+
+def test_the_command_says_whether_the_log_is_a_further_one_and_writes_the_poses_of_all(tmp_path):
+    hmt_slam("map", BUNDLED, "--out", tmp_path / "a", "--duration", 6, "--start", 0.5)
+    told = hmt_slam("map", BUNDLED, "--out", tmp_path / "b", "--duration", 9, "--from", tmp_path / "a").stderr
+    assert "malaga_one_loop is the log that the map was made of, of which " in told
+    assert "it is a further one" not in told
+    assert not (tmp_path / "b" / "earlier").exists()
+    told = hmt_slam("map", WORLD, "--out", tmp_path / "c", "--duration", 5, "--from", tmp_path / "b").stderr
+    assert "it is a further one" in told
+    scans = [len(scans_of(log)) for log in (open_log(BUNDLED, start=0.5, duration=9.0), open_log(WORLD, duration=5.0))]
+    for name in ("trajectory", "trajectory_online", "stages/keyframes"):
+        assert read_tum(tmp_path / "c" / f"{name}.tum").stamps.size == scans[1]
+    np.testing.assert_array_equal(
+        read_tum(tmp_path / "c" / "earlier" / "1.tum").stamps, read_tum(tmp_path / "b" / "trajectory.tum").stamps
+    )
