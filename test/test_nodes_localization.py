@@ -15,8 +15,9 @@ from geometry_msgs.msg import PoseWithCovarianceStamped
 from std_msgs.msg import Bool, Float64, String
 from std_srvs.srv import Trigger
 
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.nodes import qos
-from hmt_slam_ros.nodes.conversions import planar_pose, stamp_of
+from hmt_slam_ros.nodes.conversions import planar_pose, pose_with_covariance, stamp_of
 from hmt_slam_ros.nodes.topics import DIAGNOSTICS, DOCUMENTS, ENTROPY, IS_LOCALIZED, POSE
 from hmt_slam_ros.processes.messages import LocalEstimate, Notice
 
@@ -63,9 +64,9 @@ class Nodes:
     def is_localized(self):
         return bool(self.localized) and self.localized[-1].data
 
-    def diagnosis(self):
-        """What tsbi said of itself last."""
-        status = next(m.status[0] for m in reversed(self.diagnostics) if m.status[0].name == "/tsbi")
+    def diagnosis(self, node):
+        """What a node said of itself last."""
+        status = next(m.status[0] for m in reversed(self.diagnostics) if m.status[0].name == f"/{node}")
         return {value.key: value.value for value in status.values}
 
 
@@ -94,7 +95,7 @@ def test_a_robot_that_wakes_up_in_a_saved_map_says_so_until_it_is_recognized_whe
     assert_true(nodes.poses[-1], begin)
     # Odometry, which is elsewhere than when the map was saved, was not taken for a jump.
     assert not nodes.notices
-    assert nodes.diagnosis()["localized"] == "yes"
+    assert nodes.diagnosis("tsbi")["localized"] == "yes"
     assert nodes.entropies[-1].data < 0.3
 
 
@@ -128,3 +129,56 @@ def test_a_robot_that_is_carried_while_the_nodes_run_is_recognized_elsewhere(cor
     assert len(nodes.poses) > said
     begin = stamp_of(nodes.poses[-1].header.stamp) - (SCANS - 1) * 200_000_000
     assert_true(nodes.poses[-1], begin)
+
+
+def initial_pose(at, frame="map", deviations=(0.5, 0.5, 0.26)):
+    """As RViz sends it, for a robot at a pose (3,) in the map."""
+    return pose_with_covariance(0, frame, PoseGaussian(at, np.diag(deviations) ** 2))
+
+
+def test_a_person_says_where_the_robot_is_and_where_it_cannot_be(corridor, listener, start):
+    log, out = corridor
+    nodes = Nodes(start, listener, start_from=out)
+    publisher = listener.node.create_publisher(PoseWithCovarianceStamped, "initialpose", qos.STREAM)
+    listener.until(lambda: publisher.get_subscription_count() == 1)
+    nodes.until(lambda: nodes.localized and any(m.status[0].name == "/slam" for m in nodes.diagnostics))
+    publisher.publish(initial_pose(np.array([100.0, 50.0, 0.0])))
+    nodes.until(lambda: "outside of the map" in nodes.diagnosis("slam")["last error"])
+    complaint = nodes.diagnosis("slam")["last error"]
+    assert "initialpose is left out: (100.00, 50.00) is outside of the map" in complaint
+    publisher.publish(initial_pose(np.zeros(3), frame="odom"))
+    nodes.until(lambda: "the pose is in the frame 'odom', not in 'map'" in nodes.diagnosis("slam")["last error"])
+    # Lost, and told 0.4 m beside where it is: a keyframe later it is recognized, else it takes five.
+    nodes.drive(log, first=20, robot__duration=2.5)
+    nodes.until(lambda: len(nodes.estimates) == 13)
+    assert not nodes.is_localized()
+    publisher.publish(initial_pose(4 * 32 * PACE + [0.3, -0.25, 0.1]))
+    listener.spin(1.0)
+    nodes.park()
+    nodes.drive(log, first=33, robot__duration=2.0)
+    nodes.until(nodes.is_localized)
+    nodes.until(lambda: len(nodes.estimates) == 13 + 10)
+    nodes.park()
+    # While it knows its place, it is told of another one, where it is put.
+    publisher.publish(initial_pose(4 * 80 * PACE + [0.3, -0.25, 0.1]))
+    nodes.until(lambda: not nodes.is_localized())
+    # As slowly as odometry comes, which rtl answers.
+    nodes.drive(log, first=80, rate=2.0, robot__duration=6.0)
+    nodes.until(nodes.is_localized)
+    nodes.until(lambda: len(nodes.estimates) == 13 + 10 + 30)
+    nodes.until(lambda: nodes.poses and np.abs(planar_pose(nodes.poses[-1].pose.pose) - 4 * 109 * PACE).max() < 0.2)
+
+
+def test_an_initial_pose_that_is_given_as_a_parameter_is_where_the_robot_is_looked_for(corridor, listener, start):
+    log, out = corridor
+    x, y, heading = (4 * 80 * PACE + [0.3, -0.25, 0.1]).tolist()
+    nodes = Nodes(start, listener, start_from=out, initial_pose=f"[{x}, {y}, {heading}]")
+    nodes.drive(log, first=80, robot__duration=1.5)
+    nodes.until(nodes.is_localized)
+    nodes.until(lambda: len(nodes.estimates) == 8)
+
+
+def test_an_initial_pose_without_a_map_is_refused(start):
+    node = start("slam", initial_pose="[1.0, 2.0, 0.0]")
+    assert "initial_pose is set, but no map that it is a pose in: set start_from" in node.communicate(timeout=40)[1]
+    assert node.returncode == 2

@@ -20,6 +20,7 @@ from hmt_slam_ros.nodes import qos
 from hmt_slam_ros.nodes.topics import DOCUMENTS, KEYFRAMES, MAP
 from hmt_slam_ros.offline.saved_map import ChainState, read_saved_map
 from hmt_slam_ros.persistence.folder import FolderReader
+from hmt_slam_ros.persistence.hmt_map import FORMAT, VERSION
 from hmt_slam_ros.processes.aam import AamState
 from hmt_slam_ros.processes.documents import KeyframeHead, decode
 from hmt_slam_ros.processes.messages import LocalEstimate
@@ -63,7 +64,7 @@ class Nodes:
 
 def states(folder):
     """The parts of the map by process; reading it checks that it is whole."""
-    reader = FolderReader(folder, "hmt_map", 4)
+    reader = FolderReader(folder, FORMAT, VERSION)
     return {name: reader.read(name, kind) for name, kind in STATES.items()}, reader.read("chain", ChainState).events
 
 
@@ -151,7 +152,7 @@ def test_nodes_show_a_map_of_the_command_line_at_once_and_go_on_from_it(tmp_path
     nodes.until(lambda: grids and nodes.estimates and nodes.last.scan_index == 59)
     known = (np.frombuffer(grids[0].data, dtype=np.int8) == 100).sum()
     assert known > 100
-    events = FolderReader(out / "hmt_map", "hmt_map", 4).read("chain", ChainState).events
+    events = FolderReader(out / "hmt_map", FORMAT, VERSION).read("chain", ChainState).events
     assert decode(nodes.keyframes[0].data, KeyframeHead).sequence == events > 3
 
 

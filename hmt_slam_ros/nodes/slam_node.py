@@ -8,7 +8,7 @@ from collections import deque
 from typing import TYPE_CHECKING
 
 import numpy as np
-from geometry_msgs.msg import PoseArray
+from geometry_msgs.msg import PoseArray, PoseWithCovarianceStamped
 from sensor_msgs.msg import LaserScan
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
@@ -20,13 +20,14 @@ from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.nodes import conversions, qos
 from hmt_slam_ros.nodes.beginning import Beginning
 from hmt_slam_ros.nodes.figures import PERIOD
+from hmt_slam_ros.nodes.initial_pose import declare_initial_pose, place_of
 from hmt_slam_ros.nodes.last_save import spin
 from hmt_slam_ros.nodes.map_saver import MapSaver
 from hmt_slam_ros.nodes.parameters import declare_frame
 from hmt_slam_ros.nodes.process_node import ProcessNode
 from hmt_slam_ros.nodes.running import run
 from hmt_slam_ros.nodes.sensor_subscription import SensorSubscription
-from hmt_slam_ros.nodes.topics import PARTICLES, ROBOT_STATUS, SCAN
+from hmt_slam_ros.nodes.topics import INITIAL_POSE, PARTICLES, ROBOT_STATUS, SCAN
 from hmt_slam_ros.nodes.transforms import LaserMounting
 from hmt_slam_ros.processes.documents import RobotStatus, decode
 from hmt_slam_ros.processes.messages import (
@@ -39,6 +40,7 @@ from hmt_slam_ros.processes.messages import (
     Keyframe,
     LocalEstimate,
     Message,
+    Place,
     Trail,
 )
 from hmt_slam_ros.processes.replica import FIRST_AREA
@@ -77,8 +79,36 @@ class SlamNode(ProcessNode):
         self.create_subscription(String, ROBOT_STATUS, self._hear_status, qos.LATCHED)
         self.create_service(Trigger, "~/carried", self._hear_carried)
         self.create_timer(PERIOD, self._look_around, clock=self.figures.steady_clock)
-        if self.beginning.carried:
+        self.create_subscription(PoseWithCovarianceStamped, INITIAL_POSE, self._hear_initial_pose, qos.STREAM)
+        self._begin()
+
+    def _begin(self) -> None:
+        """Say where the robot is in the map that the node starts from."""
+        told = declare_initial_pose(self)
+        if told is not None and self.beginning.map is None:
+            raise HmtSlamError("initial_pose is set, but no map that it is a pose in: set start_from, or leave it away")
+        if told is not None:
+            self.deliver(Carried(self._place(told)))
+        elif self.beginning.carried:
             self.deliver(Carried())
+
+    def _place(self, belief: PoseGaussian) -> Place:
+        return place_of(self.process, self._areas, belief, self.configuration.tsbi.place_radius)
+
+    def _hear_initial_pose(self, message: PoseWithCovarianceStamped) -> None:
+        """Somebody says where the robot is; scans whose laser is not known yet were taken before."""
+        try:
+            if message.header.frame_id != self._map:
+                raise HmtSlamError(
+                    f"the pose is in the frame '{message.header.frame_id}', not in '{self._map}': set the fixed frame "
+                    "of RViz, or map_frame"
+                )
+            place = self._place(conversions.belief_from(message.pose))
+        except HmtSlamError as fault:
+            self.figures.warn(f"{INITIAL_POSE} is left out: {fault}")
+            return
+        self._pending.clear()
+        self.deliver(Carried(place))
 
     def _hear_scan(self, message: LaserScan) -> None:
         self._scans += 1

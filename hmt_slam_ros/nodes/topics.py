@@ -12,6 +12,7 @@ COST = "hmt/cost"
 HMT_POSE, POSE = "hmt/pose", "pose"
 MAP, GRAPH, PARTICLES, PMF = "map", "hmt/graph", "hmt/particles", "hmt/pmf"
 IS_LOCALIZED, ENTROPY = "hmt/is_localized", "hmt/entropy"
+INITIAL_POSE = "initialpose"
 DIAGNOSTICS = "diagnostics"
 
 DOCUMENTS: dict[type, str] = {

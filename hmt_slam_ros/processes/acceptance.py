@@ -20,6 +20,7 @@ from hmt_slam_ros.topology.arc_fusion import floored, fused
 from hmt_slam_ros.topology.area_alignment import AreaAlignment
 from hmt_slam_ros.topology.common_map import ArcValue, Pair
 from hmt_slam_ros.topology.hybrid_map import HybridMap
+from hmt_slam_ros.topology.unknown import tells_nothing
 
 Scans: TypeAlias = Mapping[int, Scan]
 Witnesses: TypeAlias = dict[Pair, frozenset[int]]
@@ -152,7 +153,7 @@ class Acceptance:
     def _fused(self, seen: Observation, old: Arc | None, witnesses: frozenset[int]) -> Arc:
         """The definite arc from an observation and what was known before, which tells whether it closed a loop."""
         belief, closure = seen.pose, seen.closure
-        if old is not None:
+        if old is not None and not tells_nothing(old.pose):
             shared = len(seen.witnesses & witnesses) / len(seen.witnesses)
             known = old.pose if old.source == seen.source else old.pose.inverse()
             belief, closure = fused(known, belief, shared), old.closure

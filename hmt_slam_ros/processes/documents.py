@@ -27,6 +27,7 @@ from hmt_slam_ros.processes.messages import (
     LeafEstimate,
     LocalEstimate,
     Notice,
+    Place,
 )
 from hmt_slam_ros.sensing import Scan
 
@@ -56,13 +57,16 @@ class KeyframeHead:
     travelled: float
     leaves: tuple[LeafEstimate, ...]
     carried: bool
+    place: Place | None
 
     @classmethod
     def of(cls, keyframe: Keyframe) -> KeyframeHead:
         """What is left of a keyframe without the ranges."""
         scan = keyframe.scan
         geometry = ScanGeometry(**{entry.name: getattr(scan, entry.name) for entry in fields(ScanGeometry)})
-        return cls(keyframe.sequence, geometry, keyframe.travelled, keyframe.leaves, keyframe.carried)
+        return cls(
+            keyframe.sequence, geometry, keyframe.travelled, keyframe.leaves, keyframe.carried, keyframe.place
+        )  # fmt: skip
 
     def with_ranges(self, ranges: NDArray[np.float32]) -> Keyframe:
         """The keyframe.
@@ -70,7 +74,8 @@ class KeyframeHead:
         :param ranges: shape (n,), m.
         """
         geometry = {entry.name: getattr(self.scan, entry.name) for entry in fields(self.scan)}
-        return Keyframe(self.sequence, Scan(ranges=ranges, **geometry), self.travelled, self.leaves, self.carried)
+        scan = Scan(ranges=ranges, **geometry)
+        return Keyframe(self.sequence, scan, self.travelled, self.leaves, self.carried, self.place)
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,7 +148,7 @@ class SavedPart:
 
 # Raise a document's version with every change of its dataclass: a receiver refuses any other.
 _DOCUMENTS: dict[type, tuple[str, int]] = {
-    KeyframeHead: ("keyframe", 3),
+    KeyframeHead: ("keyframe", 4),
     AreaEvents: ("area_events", 2),
     Hypotheses: ("hypotheses", 4),
     Accepted: ("accepted", 4),

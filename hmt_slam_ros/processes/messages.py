@@ -63,6 +63,18 @@ class LeafEstimate:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
+class Place:
+    """Where the robot is, as somebody says.
+
+    :ivar area: a known area.
+    :ivar pose: belief over ``area_T_base``.
+    """
+
+    area: int
+    pose: PoseGaussian
+
+
+@dataclass(frozen=True, eq=False, slots=True)
 class Keyframe:
     """A keyframe event: slam -> aam, tsbi, tlca, recorder.
 
@@ -71,6 +83,7 @@ class Keyframe:
     :ivar travelled: path length since the start, m.
     :ivar leaves: one estimate for every live hypothesis, ordered by hypothesis id.
     :ivar carried: whether nothing tells how the robot came there from the keyframe before.
+    :ivar place: where that is as somebody says, None where nobody did.
     """
 
     sequence: int
@@ -78,6 +91,7 @@ class Keyframe:
     travelled: float
     leaves: tuple[LeafEstimate, ...]
     carried: bool = False
+    place: Place | None = None
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -331,7 +345,13 @@ class RealTimePose:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Carried:
-    """robot -> slam: the next scan may be from anywhere, at any time; odometry begins anew."""
+    """robot -> slam: the next scan may be from anywhere, at any time; odometry begins anew.
+
+    :ivar place: where it is as somebody says, None where nobody knows. A robot that may be anywhere was not carried
+        then: that its place was not known is why it is said.
+    """
+
+    place: Place | None = None
 
 
 @dataclass(frozen=True, eq=False, slots=True)

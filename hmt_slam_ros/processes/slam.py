@@ -31,6 +31,7 @@ from hmt_slam_ros.processes.messages import (
     LocalEstimate,
     Message,
     Notice,
+    Place,
 )
 from hmt_slam_ros.processes.odometry_watch import OdometryWatch, OdometryWatchState
 from hmt_slam_ros.processes.replica import FIRST_AREA, FIRST_HYPOTHESIS, Replica, ReplicaState
@@ -64,6 +65,8 @@ class SlamState:
     :ivar dropped: scans that were not.
     :ivar first_of_trail: number of the first scan that no trail was told of.
     :ivar arriving: whether nothing tells how the robot comes to where the next scan is from.
+    :ivar lost: whether the robot may be anywhere in the map, under all hypotheses.
+    :ivar place: where it is at the next scan as somebody says, None where nobody did.
     """
 
     replica: ReplicaState = field(default_factory=ReplicaState)
@@ -83,6 +86,8 @@ class SlamState:
     dropped: int = 0
     first_of_trail: int = 0
     arriving: bool = True
+    lost: bool = False
+    place: Place | None = None
 
 
 class MetricSlam:
@@ -106,6 +111,7 @@ class MetricSlam:
         self._noticed = set(state.noticed)
         self._live = self._live_in(state)
         self._events, self._arriving = state.events, state.arriving
+        self._lost, self._place = state.lost, state.place
         self._waiting, self._patient = state.waiting, state.patient
         self._travelled = state.travelled
         self._scans, self._dropped = state.scans, state.dropped
@@ -130,7 +136,7 @@ class MetricSlam:
             self._last_stamp, frozenset(self._noticed), patches,
             {name: live.state(own) for (name, live), own in zip(self._live.items(), each, strict=True)},
             self._events, self._waiting, self._patient, self._travelled, self._scans, self._dropped,
-            self._first_of_trail, self._arriving,
+            self._first_of_trail, self._arriving, self._lost, self._place,
         )  # fmt: skip
 
     @property
@@ -142,6 +148,11 @@ class MetricSlam:
     def waiting(self) -> bool:
         """Whether the answer to a keyframe event is due."""
         return self._waiting
+
+    @property
+    def lost(self) -> bool:
+        """Whether the robot may be anywhere in the map."""
+        return self._lost
 
     @property
     def waiting_scans(self) -> int:
@@ -174,7 +185,8 @@ class MetricSlam:
         elif isinstance(message, Accepted):
             self._accept(message)
         elif isinstance(message, Carried):
-            return self._arrive()
+            self._place = message.place
+            return [] if self._lost and self._place is not None else self._arrive()
         elif isinstance(message, EndOfLog):
             self._ended = True
         return self._work()
@@ -250,7 +262,7 @@ class MetricSlam:
         scan = deskewed(scan, self._motion.odometry, self._configuration.rtl)
         points = self._mapping.matching_points(scan)
         said = [] if self._arriving else self._track(scan.stamp, points, prediction)
-        if self._arriving or self._best.event_due():
+        if self._arriving or self._place is not None or self._best.event_due():
             said += self._keyframe_event(scan, points)
         for live in self._live.values():
             live.note_scan(scan.stamp)
@@ -274,10 +286,11 @@ class MetricSlam:
         trails: list[Message] = self._trails()
         leaves = tuple(live.event(sequence, scan, points, arriving=self._arriving) for live in self._live.values())
         self._motion.keyframe(self._best.moved, self._best.information)
-        keyframe = Keyframe(sequence, scan, self._travelled, leaves, carried=self._arriving and sequence > 0)
+        carried, place = self._arriving and sequence > 0, self._place
+        keyframe = Keyframe(sequence, scan, self._travelled, leaves, carried, place)
         self._replica.add(keyframe)
         self._events += 1
-        self._waiting, self._arriving = True, False
+        self._waiting, self._arriving, self._place = True, False, None
         return [*trails, keyframe, *self._tell(self._watch.judge(self._motion.noise))]
 
     def _trails(self) -> list[Message]:
@@ -298,6 +311,7 @@ class MetricSlam:
                 keyframes = self._replica.maps[leaf.parent].keyframes(leaf.merged.area)
                 self._live[leaf.parent].merge(leaf.merged, keyframes)
         self._replica.apply(hypotheses)
+        self._lost = all(leaf.lost for leaf in hypotheses.leaves)
         children = {}
         for leaf in hypotheses.leaves:
             parent = self._live[leaf.parent]

@@ -28,7 +28,7 @@ from hmt_slam_ros.processes.messages import (
     Message,
 )
 from hmt_slam_ros.processes.replica import FIRST_HYPOTHESIS, Replica, ReplicaState
-from hmt_slam_ros.processes.tsbi_awakening import awoken, looked_for
+from hmt_slam_ros.processes.tsbi_awakening import arrived, looked_for
 from hmt_slam_ros.processes.tsbi_branching import Branches, Branching, BranchingState, Child, Parent
 from hmt_slam_ros.processes.tsbi_displacement import with_displaced
 from hmt_slam_ros.processes.tsbi_merging import merged as merged_into
@@ -199,8 +199,8 @@ class Tsbi:
 
     def _branch(self, parent: Parent, event: AreaEvent | None, keyframe: Keyframe) -> Branches:
         """The continuations of one hypothesis, each with its weight."""
-        if keyframe.carried:
-            return awoken(self._branching, parent, keyframe.sequence)
+        if keyframe.carried or keyframe.place is not None:
+            return arrived(self._branching, parent, keyframe, self._estimates[parent.hypothesis].pose.mean)
         if self._reopened:
             return Branches([reopened(parent, leaf, keyframe.sequence) for leaf in self._reopened])
         if event is not None and event.kind == "cut":
@@ -219,7 +219,8 @@ class Tsbi:
         parent = replace(parent, notes=notes)
         if notes.astray is not None and notes.astray[1] >= _ASTRAY:
             return self._branching.link(parent, notes.astray[0], scan, estimate.pose)
-        if len(notes.unchecked) >= self._options.recheck_keyframes and notes.lost is not None:
+        enough = self._options.recheck_keyframes if notes.told is None else 1
+        if len(notes.unchecked) >= enough and notes.lost is not None:
             return looked_for(self._branching, parent)
         if len(notes.unchecked) >= self._options.recheck_keyframes:
             return with_displaced(self._branching, parent, notes.unchecked, self._branching.recheck(parent))

@@ -15,26 +15,83 @@ from numpy.typing import NDArray
 
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.processes.messages import Arc
+from hmt_slam_ros.processes.messages import Arc, Keyframe, Place
 from hmt_slam_ros.processes.tsbi_branching import Branches, Branching, Child, Parent
 from hmt_slam_ros.topology.relocation import is_certain
-from hmt_slam_ros.topology.unknown import unknown
+from hmt_slam_ros.topology.shortest_path import reachable
+from hmt_slam_ros.topology.unknown import tells_nothing, unknown
+from hmt_slam_ros.topology.whereabouts import Told
 
 Pose = NDArray[np.float64]
 
 # Probability that the most probable place needs to have.
 _ENOUGH = 0.9
+# So many keyframes that fit nowhere near where somebody says refute it.
+_REFUTED = 5
 # Keyframes that are laid into the map at most, the newest.
 _MOST = 25
 
 
-def awoken(branching: Branching, parent: Parent, keyframe: int) -> Branches:
-    """The one continuation of a hypothesis where the robot may be anywhere: in a new area."""
+def arrived(branching: Branching, parent: Parent, keyframe: Keyframe, pose: Pose) -> Branches:
+    """The continuations of a hypothesis at a keyframe of which nothing or somebody tells where it is.
+
+    :param pose: ``area_T_base`` of its scan.
+    """
+    if keyframe.carried:
+        return _awoken(branching, parent, keyframe.sequence, keyframe.place)
+    if keyframe.place is not None and parent.notes.lost is not None:
+        return _told_where(branching, parent, keyframe.place, pose)
+    return Branches([Child(parent.hypothesis, parent.log_weight, parent.area, parent.notes)])
+
+
+def _awoken(branching: Branching, parent: Parent, keyframe: int, place: Place | None) -> Branches:
+    """The one continuation of a hypothesis where the robot may be anywhere: in a new area.
+
+    :param place: where it is as somebody says: there the area is drawn, and there it is looked for first.
+    """
     query = branching.query(parent, [keyframe])
-    arc = unknown(query.belief.mean)
+    told = None
+    if place is not None and parent.hybrid_map.has_area(place.area):
+        told = Told(keyframe, place.area, place.pose)
+    arc = unknown(query.belief.mean if told is None else _as_told(parent, parent.area, told))
     origin = PoseGaussian.exactly(np.zeros(3))
     child = branching.entered(parent, query, branching.new_area(parent, query), origin, arc, 0.0)
-    return Branches([replace(child, notes=replace(child.notes, lost=keyframe))])
+    return Branches([replace(child, notes=replace(child.notes, lost=keyframe, told=told))])
+
+
+def _told_where(branching: Branching, parent: Parent, place: Place, pose: Pose) -> Branches:
+    """A robot that may be anywhere, of which somebody says where it is: it is drawn there, and looked for at once.
+
+    :param pose: ``area_T_base`` of the newest scan.
+    """
+    assert parent.notes.lost is not None
+    seen = _seen_since(parent, parent.notes.lost)
+    if not parent.hybrid_map.has_area(place.area) or not seen:
+        return Branches([Child(parent.hypothesis, parent.log_weight, parent.area, parent.notes)])
+    newest = max(seen)
+    told = Told(newest, place.area, place.pose.compose(PoseGaussian.exactly(se2.between(pose, seen[newest]))))
+    looked = looked_for(branching, replace(parent, notes=replace(parent.notes, told=told)))
+    arcs = _drawn_anew(parent, parent.notes.lost, told, seen[newest])
+    return looked._replace(children=[replace(child, arcs=child.arcs or arcs) for child in looked.children])
+
+
+def _as_told(parent: Parent, area: int, told: Told) -> Pose:
+    """``area_T_base`` of what somebody said, shape (3,), in the frame of another area."""
+    between = reachable(parent.hybrid_map, area, until=(told.area,)).get(told.area)
+    return told.pose.mean if between is None else se2.compose(between.mean, told.pose.mean)
+
+
+def _drawn_anew(parent: Parent, lost: int, told: Told, pose: Pose) -> tuple[Arc, ...]:
+    """The arc that tells nothing, such that all since the robot arrived is drawn where somebody says.
+
+    :param pose: ``area_T_base`` of the keyframe of which it is said, in the robot's area.
+    """
+    for known, new, arc in parent.hybrid_map.all_arcs():
+        if tells_nothing(arc.pose) and min(parent.hybrid_map.keyframes(new), default=-1) >= lost:
+            own = reachable(parent.hybrid_map, parent.area, until=(new,))[new].mean
+            mean = se2.compose(_as_told(parent, known, told), se2.between(pose, own))
+            return (Arc(known, new, unknown(mean)),)
+    return ()
 
 
 def looked_for(branching: Branching, parent: Parent) -> Branches:
@@ -43,20 +100,30 @@ def looked_for(branching: Branching, parent: Parent) -> Branches:
     keyframes = _seen_since(parent, parent.notes.lost)
     reference = next(iter(keyframes.values()))
     poses = {k: se2.between(reference, pose) for k, pose in keyframes.items()}
-    where = branching.search.everywhere(parent.hybrid_map, poses, parent.notes.lost)
+    where = branching.search.everywhere(parent.hybrid_map, poses, parent.notes.lost, _told_of(parent, keyframes))
     noted = replace(parent, notes=parent.notes.checked((), tuple(poses)))
+    if len(keyframes) >= _REFUTED and float(where.probabilities.sum()) < 1.0 - _ENOUGH:
+        noted = replace(noted, notes=replace(noted.notes, told=None))
     still = Child(parent.hypothesis, parent.log_weight, parent.area, noted.notes)
     best = where.best
     if best is None or best[1] < _ENOUGH or not is_certain(best[0]):
         return Branches([still], True, where=where)
     located, probability = best
     arc = Arc(parent.area, located.area, PoseGaussian.exactly(reference).compose(located.mode.measured.inverse()), True)
-    found = Child(
-        parent.hypothesis, parent.log_weight + math.log(probability), parent.area, replace(noted.notes, lost=None),
-        arcs=(arc,), reload=True,
-    )  # fmt: skip
+    log_weight, notes = parent.log_weight + math.log(probability), replace(noted.notes, lost=None, told=None)
+    found = Child(parent.hypothesis, log_weight, parent.area, notes, arcs=(arc,), reload=True)
     still = replace(still, log_weight=parent.log_weight + math.log(max(1.0 - probability, 1e-300)))
     return Branches([still, found], True, where=where)
+
+
+def _told_of(parent: Parent, keyframes: dict[int, Pose]) -> Told | None:
+    """Where the first of keyframes, {keyframe: ``area_T_base``}, is, as somebody said of one of them."""
+    told = parent.notes.told
+    if told is None or told.keyframe not in keyframes:
+        return None
+    first = next(iter(keyframes))
+    moved = PoseGaussian.exactly(se2.between(keyframes[told.keyframe], keyframes[first]))
+    return Told(first, told.area, told.pose.compose(moved))
 
 
 def _seen_since(parent: Parent, keyframe: int) -> dict[int, Pose]:

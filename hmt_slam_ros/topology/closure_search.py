@@ -25,7 +25,7 @@ from hmt_slam_ros.topology.likeness import Elsewhere, Likeness, best_shares
 from hmt_slam_ros.topology.relocation import Relocation, reach_of
 from hmt_slam_ros.topology.surroundings import Nearness, Views, gap, positions, stacked
 from hmt_slam_ros.topology.transition import Entry, Place, Transition, entry, owner_at, transition
-from hmt_slam_ros.topology.whereabouts import Whereabouts, whereabouts
+from hmt_slam_ros.topology.whereabouts import Told, Whereabouts, whereabouts
 
 Pose = NDArray[np.float64]
 
@@ -223,13 +223,17 @@ class ClosureSearch:
         same = MAPS.log_ratio(located.found, MAPS_USUAL) + rarity
         return Fit(located.area, located.mode, same - math.log(2 * len(hybrid_map.area_ids()))), 0.5 * unseen
 
-    def everywhere(self, hybrid_map: HybridMap, poses: Mapping[int, Pose], before: int) -> Whereabouts:
+    def everywhere(
+        self, hybrid_map: HybridMap, poses: Mapping[int, Pose], before: int, told: Told | None = None
+    ) -> Whereabouts:
         """Where in the map keyframes lie of which the arcs tell nothing.
 
         :param poses: {keyframe: ``reference_T_base``}.
         :param before: the map is that of the keyframes before this one.
+        :param told: where the reference is, if somebody says so.
         """
-        return whereabouts(self._relocation, self._options.alike_probability, hybrid_map, poses, before)
+        alike, radius = self._options.alike_probability, self._options.place_radius
+        return whereabouts(self._relocation, alike, hybrid_map, poses, before, told, radius)
 
     def _entry(self, place: Place, candidate: Candidate) -> Entry:
         return entry(place, candidate.prior, stacked(candidate.fresh), self._options.place_radius)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.topology.reduction import reduce_hypotheses
+from hmt_slam_ros.topology.whereabouts import Told
 
 Covariance = NDArray[np.float64]
 
@@ -39,6 +40,7 @@ class LeafNotes:
     :ivar doubts: {keyframe event: odds that the robot was displaced unnoticed just before it}, of the latest events
         whose scans contradicted what the robot should have seen.
     :ivar lost: the keyframe at which the robot arrived it is not known where, until that is recognized; else None.
+    :ivar told: where one of the keyframes since then is, as somebody says; else None.
     """
 
     covariances: Mapping[int, Covariance] = field(default_factory=dict)
@@ -49,6 +51,7 @@ class LeafNotes:
     astray: tuple[int, int] | None = None
     doubts: Mapping[int, float] = field(default_factory=dict)
     lost: int | None = None
+    told: Told | None = None
 
     def heard(self, event: int, log_evidence: float) -> LeafNotes:
         """After the scan of a keyframe event; one that was displaced before it would see a place that looks alike."""
@@ -95,7 +98,7 @@ class LeafNotes:
         """After the robot entered another area together with the keyframes of ``covariances``."""
         kept = {area: keyframes & covariances.keys() for area, keyframes in self.compared.items()}
         compared = {area: keyframes for area, keyframes in kept.items() if keyframes}
-        return LeafNotes(covariances, compared, doubts=self.doubts, lost=self.lost)
+        return LeafNotes(covariances, compared, doubts=self.doubts, lost=self.lost, told=self.told)
 
 
 def relative_covariance(

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.topology.hybrid_map import HybridMap
+from hmt_slam_ros.topology.shortest_path import reachable
 
 # Larger than a building, m, and all headings.
 _DEVIATION, _HEADING = 300.0, math.pi
@@ -20,6 +21,11 @@ def unknown(mean: NDArray[np.float64]) -> PoseGaussian:
     :param mean: shape (3,), where it is drawn as long as nothing is known.
     """
     return PoseGaussian(mean, np.diag([_DEVIATION, _DEVIATION, _HEADING]) ** 2)
+
+
+def joined(hybrid_map: HybridMap, area: int) -> dict[int, PoseGaussian]:
+    """{other area: belief over ``area_T_other``} of those to which arcs lead that tell something, and of itself."""
+    return reachable(hybrid_map, area, _DEVIATION**2)
 
 
 def tells_nothing(belief: PoseGaussian) -> bool:

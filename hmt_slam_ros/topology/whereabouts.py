@@ -9,21 +9,44 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hmt_slam_ros.agreement import MAPS, MAPS_USUAL
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.topology.hybrid_map import HybridMap
 from hmt_slam_ros.topology.likeness import Likeness
 from hmt_slam_ros.topology.relocation import Located, Relocation
+from hmt_slam_ros.topology.surroundings import positions
+from hmt_slam_ros.topology.unknown import joined
 
 UNMAPPED = 0.2
 """Probability that a robot that woke up somewhere is where the map does not reach."""
 
 # Areas whose surfaces are compared.
 _MOST = 16
+# Deviations of what somebody says, beyond which no place is looked at.
+_DEVIATIONS = 4.0
+
+Pose = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Told:
+    """Where a keyframe is, as somebody says.
+
+    :ivar keyframe: its number.
+    :ivar area: a known area.
+    :ivar pose: belief over ``area_T_base`` of the keyframe.
+    """
+
+    keyframe: int
+    area: int
+    pose: PoseGaussian
 
 
 class Whereabouts(NamedTuple):
@@ -53,28 +76,39 @@ def whereabouts(
     relocation: Relocation,
     alike: float,
     hybrid_map: HybridMap,
-    poses: Mapping[int, NDArray[np.float64]],
+    poses: Mapping[int, Pose],
     before: int,
+    told: Told | None = None,
+    radius: float = 0.0,
 ) -> Whereabouts:
     """Where some keyframes are.
 
-    How rare a fit is shows in the other areas, in which the same was tried.
+    How rare a fit is shows in the other areas, in which the same was tried. Where somebody says where they are, the
+    prior is not flat, but as wide as that is uncertain, and areas farther off are not looked at.
 
     :param alike: probability that keyframes fit into an area where they do not lie, before any was tried.
     :param poses: {keyframe: ``reference_T_base`` (3,)}.
     :param before: the map is that of the keyframes before this one.
+    :param told: of the reference.
+    :param radius: farthest distance to a keyframe of an area's place, m.
     """
+    near = None if told is None else _near(hybrid_map, told, radius, before)
     known = sum(any(k < before for k in hybrid_map.keyframes(area)) for area in hybrid_map.area_ids())
-    found, looked_at, unseen = relocation.fits(hybrid_map, poses, before, _MOST)
+    if near is None:
+        found, looked_at, unseen = relocation.fits(hybrid_map, poses, before, _MOST)
+    else:
+        found, looked_at, _ = relocation.fits(hybrid_map, poses, before, 0, near)
+        unseen = 0.0
     whole: dict[int, float] = {}
     for fit in found:
         whole[fit.area] = float(np.logaddexp(whole.get(fit.area, -math.inf), fit.mode.log_mass))
-    log_prior = math.log((1.0 - UNMAPPED) / max(1, known))
+    log_flat = math.log((1.0 - UNMAPPED) / max(1, known))
     best = {area: max((fit.found.share for fit in found if fit.area == area), default=0.0) for area in looked_at}
     likeness = Likeness(alike)
     likeness.count(sorted(best.values())[:-1])
     logs = [
-        log_prior + fit.mode.log_mass - whole[fit.area]
+        (log_flat if told is None or near is None else _log_prior(told, near[fit.area], fit))
+        + fit.mode.log_mass - whole[fit.area]
         + MAPS.log_ratio(fit.found, MAPS_USUAL)
         + likeness.log_rarity(fit.found.share, foretold=False)
         for fit in found
@@ -83,3 +117,29 @@ def whereabouts(
     probabilities = weights / weights.sum()
     others = max(0, known - len(looked_at))
     return Whereabouts(tuple(found), probabilities[: len(found)], float(probabilities[-1]), others)
+
+
+def _near(hybrid_map: HybridMap, told: Told, radius: float, before: int) -> dict[int, PoseGaussian]:
+    """{area: belief over ``told_area_T_area``} of those in which the reference may be."""
+    if not hybrid_map.has_area(told.area):
+        return {}
+    reach = radius + _DEVIATIONS * math.sqrt(float(np.linalg.eigvalsh(told.pose.covariance[:2, :2])[-1]))
+    near = {}
+    for area, belief in joined(hybrid_map, told.area).items():
+        if min(hybrid_map.keyframes(area), default=before) >= before:
+            continue
+        away = positions(hybrid_map, area, belief.mean) - told.pose.mean[:2]
+        if np.hypot(*away.T).min() <= reach:
+            near[area] = belief
+    return near
+
+
+def _log_prior(told: Told, belief: PoseGaussian, fit: Located) -> float:
+    """Of a fit, relative to the best that there could be.
+
+    :param belief: over ``told_area_T_area`` of the fit's area.
+    """
+    there = belief.compose(fit.mode.measured)
+    away = se2.log(se2.between(told.pose.mean, there.mean))
+    distance = float(away @ np.linalg.solve(told.pose.covariance + there.covariance, away))
+    return math.log(1.0 - UNMAPPED) - 0.5 * distance
