@@ -28,6 +28,8 @@ from hmt_slam_ros.local_map.patches import FAR, PATCH, MapView, field_at, field_
 
 # Distance from its surface at which a point in unknown space counts, as a share of the robust scale.
 _UNSEEN = 0.6
+# Cells from a point to the free space on every side of it, where it is said to be in free space.
+_BESIDE = 3
 
 
 class BeamModel(NamedTuple):
@@ -126,8 +128,15 @@ def agreement(points: Float64, pose: Float64, view: MapView, near: int, far: int
         row = int((pose[1] + sin * points[i, 0] + cos * points[i, 1]) / view.cell + half)
         distance = field_at(view, column, row)
         on += distance < near
-        free += distance >= far and odds_at(view, column, row) < 0
+        free += distance >= far and odds_at(view, column, row) < 0 and _free_around(view, column, row)
     return on, free
+
+
+@njit(cache=True)
+def _free_around(view: MapView, column: int, row: int) -> bool:
+    """Whether it is free to all sides: along the edge of what a beam passed there may be a wall that it grazed."""
+    across = max(odds_at(view, column - _BESIDE, row), odds_at(view, column + _BESIDE, row))
+    return bool(max(across, odds_at(view, column, row - _BESIDE), odds_at(view, column, row + _BESIDE)) < 0)
 
 
 @njit(cache=True)

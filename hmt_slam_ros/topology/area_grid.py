@@ -20,6 +20,8 @@ Points = NDArray[np.float64]
 _JOIN = 0.3
 # Log-ratio above which a sample is on a known surface, and below which in free space: 0.25 m from a surface and more.
 _ON, _OFF = 0.3, -0.5
+# Half cells from a sample to the free space on every side of it, where it is said to be in free space.
+_BESIDE = 3
 
 
 @dataclass(frozen=True)
@@ -248,7 +250,14 @@ def _agreeing(points: Points, fine: NDArray[np.float32], origin: Points, cell: f
     on, free = 0, 0
     for n in range(points.shape[0]):
         column, row = int(np.floor((points[n, 0] - origin[0]) / cell)), int(np.floor((points[n, 1] - origin[1]) / cell))
-        if 0 <= column < fine.shape[1] and 0 <= row < fine.shape[0]:
+        if _BESIDE <= column < fine.shape[1] - _BESIDE and _BESIDE <= row < fine.shape[0] - _BESIDE:
             on += fine[row, column] > _ON
-            free += fine[row, column] < _OFF
+            free += fine[row, column] < _OFF and _free_around(fine, row, column)
     return on, free
+
+
+@njit(cache=True)
+def _free_around(fine: NDArray[np.float32], row: int, column: int) -> bool:
+    """Whether it is free to all sides: along the edge of what a beam passed there may be a wall that it grazed."""
+    across = max(fine[row, column - _BESIDE], fine[row, column + _BESIDE])
+    return bool(max(across, fine[row - _BESIDE, column], fine[row + _BESIDE, column]) < _OFF)
