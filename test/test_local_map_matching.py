@@ -12,6 +12,7 @@ from hmt_slam_ros.local_map.insertion import InverseModel
 from hmt_slam_ros.local_map.matching import (
     Alignment,
     Prior,
+    agreement,
     align,
     beam_model,
     log_ratio,
@@ -28,11 +29,11 @@ ROOM = np.concatenate((box(-4.02, -3.03, 5.03, 4.01), box(1.01, 1.02, 2.03, 2.52
 CORRIDOR = np.array([[-100.0, -1.22, 100.0, -1.22], [-100.0, 1.22, 100.0, 1.22]])
 
 
-def mapped(walls, poses, beams=721):
+def mapped(walls, poses, beams=721, field_of_view=2 * np.pi):
     pool = PatchPool(20, CELL, RADIUS)
     table = pool.empty_table()
     for pose in poses:
-        scan = scan_in(walls, pose, beams=beams, field_of_view=2 * np.pi)
+        scan = scan_in(walls, pose, beams=beams, field_of_view=field_of_view)
         near = np.hypot(*scan.points.T) < 12.0
         told = Beams(scan.points[near], np.empty((0, 2)), scan.origins[near])
         pool.insert(table[None], np.array([pose], dtype=float), told, InverseModel(17, -8, 70))
@@ -151,3 +152,12 @@ def test_evidence_is_zero_in_unknown_space_positive_in_the_right_place_and_negat
     assert propose(pool, table, points, np.zeros(3), deviations).evidences[0] > 10.0
     wrong = seen(box(-1.5, -1.5, 1.5, 1.5), (0, 0, 0))
     assert propose(pool, table, wrong, np.zeros(3), deviations).evidences[0] < -3.0
+
+
+def test_a_point_on_the_edge_of_what_beams_passed_contradicts_nothing_and_one_amid_it_does():
+    # Sees from straight ahead to the right: whatever stands on the line ahead is grazed.
+    pool, table = mapped(box(-9.0, -9.0, 9.0, 9.0), [(0.0, 0.0, -np.pi / 4)], field_of_view=np.pi / 2)
+    along = np.column_stack((np.arange(2.0, 7.0, 0.2), np.zeros(25)))
+    for aside, free in ((-0.02, 0), (-0.08, 0), (-0.5, 25)):
+        points = along + (0.0, aside)
+        assert agreement(points, np.zeros(3), pool.view(table), FAR // 3, FAR // 2) == (0, free)
