@@ -21,7 +21,7 @@ from hmt_slam_ros.errors import HmtSlamError
 
 COMPARED = ("edmonton", CAMPUS, "aces")
 
-PARTICLES = (12, 40, 100, 400)
+PARTICLES = (12, 100, 1000)
 """Of the metric filter; more are tried until it is as accurate."""
 
 FACTOR, SLACK = 1.25, 0.01

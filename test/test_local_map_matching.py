@@ -159,5 +159,5 @@ def test_a_point_on_the_edge_of_what_beams_passed_contradicts_nothing_and_one_am
     pool, table = mapped(box(-9.0, -9.0, 9.0, 9.0), [(0.0, 0.0, -np.pi / 4)], field_of_view=np.pi / 2)
     along = np.column_stack((np.arange(2.0, 7.0, 0.2), np.zeros(25)))
     for aside, free in ((-0.02, 0), (-0.08, 0), (-0.5, 25)):
-        points = along + (0.0, aside)
+        points = along + np.array([0.0, aside])
         assert agreement(points, np.zeros(3), pool.view(table), FAR // 3, FAR // 2) == (0, free)

@@ -81,7 +81,7 @@ def test_a_moved_grid_says_the_same_of_the_same_place(room):
 def test_a_surface_on_the_edge_of_what_beams_passed_contradicts_nothing_and_one_amid_it_does():
     # Sees from straight ahead to the right: whatever stands on the line ahead is grazed.
     ahead = scan_in(box(-9.0, -9.0, 9.0, 9.0), (0.0, 0.0, -np.pi / 4), beams=181, field_of_view=np.pi / 2)
-    grid = build_area_grid([ahead], np.zeros((1, 3)) + (0.0, 0.0, -np.pi / 4), GridModel())
+    grid = build_area_grid([ahead], np.array([[0.0, 0.0, -np.pi / 4]]), GridModel())
     along = np.column_stack((np.arange(2.0, 7.0, 0.2), np.zeros(25)))
     for aside, free in ((-0.02, 0), (-0.08, 0), (-0.5, 25)):
-        assert grid.agreement(along + (0.0, aside), np.zeros(3)) == (25, 0, free)
+        assert grid.agreement(along + np.array([0.0, aside]), np.zeros(3)) == (25, 0, free)
