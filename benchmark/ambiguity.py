@@ -14,7 +14,7 @@ from benchmark.settings import Settings
 from benchmark.simulated.measured import chosen_seeds, records_of
 from benchmark.simulated.records import Record
 from benchmark.simulated.rivals import BEAMS, RADIUS, VIEW
-from benchmark.stories import DECIDED, HIGH, LOW, SOON, SURE, Moment, Verdict, story, told, verdict
+from benchmark.stories import DECIDED, HIGH, LATER, LOW, SOON, SURE, Moment, Verdict, story, told, verdict
 from hmt_slam_ros.configuration import load_configuration
 from hmt_slam_ros.logs import open_log
 from hmt_slam_ros.offline.runtime import run_log
@@ -59,7 +59,7 @@ def measure_ambiguity(settings: Settings) -> Report:
     report = Report("ambiguity", "Identical places", seeds=chosen_seeds(settings, SEEDS))
     for family in dict.fromkeys(record["family"] for record in records):
         report.requirements += requirements(family, [entry for entry in found if entry.record["family"] == family])
-    report.body += [reentry_table(found), _by_odometry(found), POLICY]
+    report.body += [reentry_table(found), _by_odometry(found), settling_table(found), POLICY]
     report.data["reentries"] = [
         {"world": e.record["world"], **e.rivalry, **vars(e.verdict), "decided": is_decided(e.rivalry)} for e in found
     ]
@@ -73,9 +73,14 @@ def measure_ambiguity(settings: Settings) -> Report:
 
 
 def _judged(record: Record, rivalry: Record) -> Reentry:
-    evidence = rivalry["event"] if is_decided(rivalry) or rivalry["evidence"] is None else rivalry["evidence"]
     moments = story(record["pmf"], rivalry["event"])
-    return Reentry(record, rivalry, moments, verdict(moments, evidence))
+    return Reentry(record, rivalry, moments, verdict(moments, _evidence(rivalry)))
+
+
+def _evidence(rivalry: Record) -> int:
+    """The keyframe event from which on the places can be told apart."""
+    event: int = rivalry["event"] if is_decided(rivalry) or rivalry["evidence"] is None else rivalry["evidence"]
+    return event
 
 
 def is_decided(rivalry: Record) -> bool:
@@ -85,7 +90,7 @@ def is_decided(rivalry: Record) -> bool:
 
 def requirements(family: str, found: Sequence[Reentry]) -> list[Requirement]:
     """What is asked for of the re-entries of a family."""
-    open_ones, asked = undecided(found), [e for e in found if e.verdict.asked or not is_decided(e.rivalry)]
+    open_ones, asked = undecided(found), to_settle(found)
     alive = sum(entry.verdict.both_alive for entry in open_ones)
     settled = sum(entry.verdict.settled for entry in asked)
     count, all_of = len(open_ones), f"of {len(asked)}"
@@ -98,9 +103,30 @@ def requirements(family: str, found: Sequence[Reentry]) -> list[Requirement]:
     ]
 
 
+def decided(found: Sequence[Reentry]) -> list[Reentry]:
+    """Those that odometry alone decides."""
+    return [entry for entry in found if is_decided(entry.rivalry)]
+
+
 def undecided(found: Sequence[Reentry]) -> list[Reentry]:
     """Those that odometry alone does not decide."""
     return [entry for entry in found if not is_decided(entry.rivalry)]
+
+
+def to_settle(found: Sequence[Reentry]) -> list[Reentry]:
+    """Those in which the true place has to become sure."""
+    return [entry for entry in found if entry.verdict.asked or not is_decided(entry.rivalry)]
+
+
+def settling_table(found: Sequence[Reentry]) -> str:
+    """Of how many re-entries the true place is sure, and stays so, after how much path."""
+    rows = []
+    for family in dict.fromkeys(entry.record["family"] for entry in found):
+        own = to_settle([entry for entry in found if entry.record["family"] == family])
+        for kind, chosen in (("decided by odometry", decided(own)), ("not decided by it", undecided(own))):
+            sure = [sum(verdict(e.moments, _evidence(e.rivalry), way).settled for e in chosen) for way in LATER]
+            rows.append([f"{family}, {kind}", str(len(chosen)), *map(str, sure)])
+    return table(["re-entries", "number", *(f"sure {way:g} m after the evidence" for way in LATER)], rows)
 
 
 def reentry_table(found: Sequence[Reentry]) -> str:

@@ -17,6 +17,9 @@ SURE = 0.95
 SOON = 2.0
 """Path within which it does, m: ``tlca.accept_distance``."""
 
+LATER = (SOON, 5.0, 10.0, 20.0)
+"""Paths after which it is told of how many re-entries the true hypothesis is sure, m."""
+
 DECIDED = 0.99
 """Odometry that says as much tells the places apart by itself."""
 
@@ -108,10 +111,11 @@ class Verdict:
         return self.waited is not None and self.final > SURE
 
 
-def verdict(moments: Sequence[Moment], evidence: int) -> Verdict:
+def verdict(moments: Sequence[Moment], evidence: int, soon: float = SOON) -> Verdict:
     """Judge a story.
 
     :param evidence: the keyframe event from which on the places can be told apart.
+    :param soon: path within which the true one is to be sure, m.
     """
     asked = next((moment for moment in moments if moment.asked), None)
     if asked is None:
@@ -119,7 +123,7 @@ def verdict(moments: Sequence[Moment], evidence: int) -> Verdict:
     open_ones = [moment for moment in moments if asked.event <= moment.event < evidence]
     shares = [moment.probabilities[kind] for moment in open_ones for kind in (RIGHT, WRONG)]
     begin = next((m.travelled for m in moments if m.event >= max(evidence, asked.event)), moments[-1].travelled)
-    after = [m for m in moments if m.event >= max(evidence, asked.event) and m.travelled <= begin + SOON]
+    after = [m for m in moments if m.event >= max(evidence, asked.event) and m.travelled <= begin + soon]
     sure = next((m.travelled - begin for m in after if m.probabilities[RIGHT] > SURE), None)
     return Verdict(
         True,

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from benchmark.ambiguity import Reentry, requirements
+from benchmark.ambiguity import Reentry, requirements, settling_table
 from benchmark.simulated.loops import Loop
 from benchmark.simulated.rivals import by_odometry, looks_alike, rivalries
 from benchmark.simulated.truth import Truth
@@ -165,3 +165,14 @@ def test_in_the_ring_odometry_decides_and_views_never_do():
 def test_a_world_without_identical_places_has_no_rivalry():
     log = SimpleNamespace(scenario=SimpleNamespace(building=SimpleNamespace(places={})))
     assert rivalries(log, None, [Loop(1, 0.0, 0.0, 1.0, {1: (0,)})], {}) == []
+
+
+def test_it_is_told_how_much_path_the_true_place_needs_to_become_sure():
+    slow = [entry(0, leaf(0, 0, 1.0)), entry(1, leaf(2, 0, 0.5, right=1), leaf(3, 0, 0.5, wrong=1))]
+    slow += [entry(k, leaf(2, 2, min(1.0, 0.5 + 0.04 * k)), leaf(3, 3, max(0.0, 0.5 - 0.04 * k))) for k in range(2, 60)]
+    moments = story(slow, 0)
+    rivalry = {"event": 0, "evidence": 1, "by_odometry": 0.6}
+    found = [Reentry({"family": "twins"}, rivalry, moments, verdict(moments, 1))]
+    # Over 0.95 from event 12 on, which is 5.5 m after the evidence.
+    assert "| twins, not decided by it | 1 | 0 | 0 | 1 | 1 |" in settling_table(found)
+    assert "| twins, decided by odometry | 0 | 0 | 0 | 0 | 0 |" in settling_table(found)
