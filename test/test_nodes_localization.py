@@ -25,14 +25,18 @@ NODES = ("slam", "aam", "tsbi", "tlca", "rtl")
 SCANS = 120
 
 
-@pytest.fixture(scope="module")
-def corridor(tmp_path_factory):
-    """The log of the corridor, and the folder of its map."""
-    folder = tmp_path_factory.mktemp("corridor")
+def mapped_corridor(folder):
+    """The log of the corridor, and its map by the command line."""
     log, out = corridor_bag(folder, scans=SCANS), folder / "out"
     command = [sys.executable, "-m", "hmt_slam_ros.cli.main", "map", str(log), "--out", str(out)]
     subprocess.run(command, check=True, timeout=120)
     return log, out
+
+
+@pytest.fixture(scope="module")
+def corridor(tmp_path_factory):
+    """The log of the corridor, and the folder of its map."""
+    return mapped_corridor(tmp_path_factory.mktemp("corridor"))
 
 
 class Nodes:

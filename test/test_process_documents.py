@@ -15,6 +15,8 @@ from hypothesis import strategies as st
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.processes.documents import (
+    BeginRequest,
+    BegunPart,
     Closing,
     KeyframeHead,
     RobotStatus,
@@ -47,6 +49,8 @@ KINDS = (
     RobotStatus,
     SaveRequest,
     SavedPart,
+    BeginRequest,
+    BegunPart,
 )
 NUMBERS = st.floats(allow_nan=False, allow_infinity=False)
 

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 State = TypeVar("State")
 
+_FROM = ParameterDescriptor(description="Output folder or hmt_map to go on from.", read_only=True)
 _CARRIED = ParameterDescriptor(
     description="Whether the robot may be anywhere in the map of start_from; otherwise it is where it was.",
     read_only=True,
@@ -28,21 +29,20 @@ _CARRIED = ParameterDescriptor(
 
 
 class Beginning:
-    """The map of the parameter ``start_from``, if it is set.
+    """A saved map, or nothing.
 
     :ivar events: keyframe events in it, 0 without.
     :ivar carried: whether nothing tells how the robot came from where it was then.
+    :ivar scans: scans that had a pose before; those to come are numbered on, so that they are told from these.
     """
 
-    def __init__(self, node: ConfiguredNode) -> None:
+    def __init__(self, node: ConfiguredNode, path: str, *, carried: bool, scans: int = 0) -> None:
         """Check the map.
 
+        :param path: its folder or the output folder around it, empty for nothing.
         :raises HmtSlamError: where it is damaged, or the node's parameters do not go with it.
         """
-        descriptor = ParameterDescriptor(description="Output folder or hmt_map to go on from.", read_only=True)
-        path = str(node.declare_parameter("start_from", "", descriptor).value)
-        carried = bool(node.declare_parameter("start_carried", True, _CARRIED).value)
-        self.events, self._folder, self.carried = 0, None, carried and bool(path)
+        self.events, self._folder, self.carried, self.scans = 0, None, carried and bool(path), scans
         if path:
             folder = map_folder(Path(path))
             self._folder = FolderReader(folder, FORMAT, VERSION)
@@ -78,3 +78,13 @@ class Beginning:
         from hmt_slam_ros.offline.saved_map import MapDocument  # noqa: PLC0415  for those who ask for it
 
         return self.part("map", MapDocument)
+
+
+def declare_beginning(node: ConfiguredNode) -> Beginning:
+    """What the parameters ``start_from`` and ``start_carried`` say.
+
+    :raises HmtSlamError: where the map is damaged, or the node's parameters do not go with it.
+    """
+    path = str(node.declare_parameter("start_from", "", _FROM).value)
+    carried = bool(node.declare_parameter("start_carried", True, _CARRIED).value)
+    return Beginning(node, path, carried=carried)

@@ -48,7 +48,7 @@ class Inbox:
         :param estimates: profile for LocalEstimate, of which most nodes have no use for the past.
         :param first: keyframe event with which the chain begins.
         """
-        heard = tuple(heard)
+        self._heard = heard = tuple(heard)
         self._node, self._deliver, self._figures = node, deliver, figures
         self._order = ChainOrder(heard, first)
         self._estimates = estimates
@@ -57,6 +57,13 @@ class Inbox:
         self.closing: Closing | None = None
         for kind in heard:
             self._subscribe(kind)
+
+    def begin_anew(self, first: int) -> None:
+        """The chain begins once more, when all of it so far was heard.
+
+        :param first: keyframe event with which it begins.
+        """
+        self._order = ChainOrder(self._heard, first)
 
     def _subscribe(self, kind: type) -> None:
         if kind is Keyframe:

@@ -8,12 +8,12 @@ from rcl_interfaces.msg import ParameterDescriptor
 
 from hmt_slam_ros.compilation import tell_of_compilation
 from hmt_slam_ros.configuration import Configuration
-from hmt_slam_ros.nodes.beginning import Beginning
+from hmt_slam_ros.nodes.beginning import Beginning, declare_beginning
 from hmt_slam_ros.nodes.figures import Figures
 from hmt_slam_ros.nodes.inbox import Inbox
 from hmt_slam_ros.nodes.outbox import Outbox
 from hmt_slam_ros.nodes.parameters import ConfiguredNode
-from hmt_slam_ros.nodes.part_saver import PARTS, PartSaver
+from hmt_slam_ros.nodes.part import PARTS, Part
 from hmt_slam_ros.processes.messages import Arriving, Message, Notice
 from hmt_slam_ros.processes.routing import HEARD_BY, Remembering
 
@@ -46,15 +46,31 @@ class ProcessNode(ConfiguredNode):
         super().__init__(name, changeable)
         self.saves_at_end = bool(self.declare_parameter("save_at_end", False, _SAVE_AT_END).value)
         self.figures = Figures(self)
-        self.beginning = Beginning(self)
-        self.process = make_process(self.configuration, self.beginning)
-        if self.beginning.carried and Arriving in HEARD_BY[name]:
-            # Slam says so too, but not before this node could say otherwise.
-            self.process.handle(Arriving(self.beginning.events, 0))
+        self._make_process, self._name = make_process, name
+        self.beginning = declare_beginning(self)
+        self.process = self._made()
         tell_of_compilation(self.get_logger().info)
         self.outbox = Outbox(self, (*said, Notice))
         self.inbox = Inbox(self, HEARD_BY[name], self.deliver, self.figures, first=self.beginning.events)
-        self._part = PartSaver(self, name) if name in PARTS else None
+        self._part = Part(self, name) if name in PARTS else None
+
+    def _made(self) -> Remembering:
+        """The process, made from the beginning."""
+        process = self._make_process(self.configuration, self.beginning)
+        if self.beginning.carried and Arriving in HEARD_BY[self._name]:
+            # Slam says so too, but not before this node could say otherwise.
+            process.handle(Arriving(self.beginning.events, 0))
+        return process
+
+    def begin_anew(self, folder: str) -> None:
+        """Forget all, and go on from a map in which the robot may be anywhere, or from nothing.
+
+        :param folder: of the map, empty for nothing.
+        :raises HmtSlamError: where it is damaged, or the node's parameters do not go with it.
+        """
+        self.beginning = Beginning(self, folder, carried=True, scans=self.scans)
+        self.process = self._made()
+        self.inbox.begin_anew(self.beginning.events)
 
     def deliver(self, message: Message) -> None:
         """Let the process handle a message and publish its answers."""
@@ -69,6 +85,11 @@ class ProcessNode(ConfiguredNode):
         self.show(message, said)
         if self._part is not None:
             self._part.delivered(message)
+
+    @property
+    def scans(self) -> int:
+        """Scans that have a pose, as far as the node gives it."""
+        return 0
 
     def saved_last(self, linger: float) -> bool:
         """Whether the node's part of the last map is saved, and the others had some seconds to hear of it."""

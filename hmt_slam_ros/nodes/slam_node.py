@@ -5,13 +5,14 @@ from __future__ import annotations
 import sys
 import time
 from collections import deque
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 from geometry_msgs.msg import PoseArray, PoseWithCovarianceStamped
 from sensor_msgs.msg import LaserScan
 from std_msgs.msg import String
-from std_srvs.srv import Trigger
+from std_srvs.srv import SetBool, Trigger
 
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.errors import HmtSlamError
@@ -22,6 +23,7 @@ from hmt_slam_ros.nodes.beginning import Beginning
 from hmt_slam_ros.nodes.figures import PERIOD
 from hmt_slam_ros.nodes.initial_pose import declare_initial_pose, place_of
 from hmt_slam_ros.nodes.last_save import spin
+from hmt_slam_ros.nodes.map_changer import MapChanger
 from hmt_slam_ros.nodes.map_saver import MapSaver
 from hmt_slam_ros.nodes.parameters import declare_frame
 from hmt_slam_ros.nodes.process_node import ProcessNode
@@ -62,25 +64,69 @@ class SlamNode(ProcessNode):
 
     def __init__(self) -> None:
         super().__init__("slam", _make_process, (Arriving, Keyframe, Trail, LocalEstimate, Finished))
-        self._map = declare_frame(self, "map", "map")
+        self.map_frame = declare_frame(self, "map", "map")
         self._mounting = LaserMounting(self, self._work_off)
         self._pending: deque[LaserScan] = deque()
         self._pending_since = self._last_scan = time.monotonic()
         self._scans, self._dropped = 0, 0
         self._end: RobotStatus | None = None
-        known = self.beginning.map
-        self._areas = {FIRST_AREA: AreaPose(FIRST_AREA, PoseGaussian(np.zeros(3), np.zeros((3, 3))))}
-        self._areas |= {entry.area: entry for entry in known.area_poses} if known else {}
-        self.estimate = known.robot if known else None
+        self._areas: dict[int, AreaPose] = {}
+        self.estimate: LocalEstimate | None = None
+        self._take_over_map()
         self._held: deque[Message] = deque()
         self._saver = MapSaver(self, self._release)
+        self._changer = MapChanger(self, self._release)
+        self._paused = False
+        self._skipped: LaserScan | None = None
         self._laser = SensorSubscription(self, LaserScan, SCAN, self._hear_scan)
         self._particles = self.create_publisher(PoseArray, PARTICLES, qos.STREAM)
         self.create_subscription(String, ROBOT_STATUS, self._hear_status, qos.LATCHED)
         self.create_service(Trigger, "~/carried", self._hear_carried)
+        self.create_service(SetBool, "~/pause", self._pause)
         self.create_timer(PERIOD, self._look_around, clock=self.figures.steady_clock)
         self.create_subscription(PoseWithCovarianceStamped, INITIAL_POSE, self._hear_initial_pose, qos.STREAM)
         self._begin()
+
+    def _take_over_map(self) -> None:
+        """What the node shows of the map that it begins with."""
+        known = self.beginning.map
+        self._areas = {FIRST_AREA: AreaPose(FIRST_AREA, PoseGaussian(np.zeros(3), np.zeros((3, 3))))}
+        self._areas |= {entry.area: entry for entry in known.area_poses} if known else {}
+        self.estimate = known.robot if known else None
+
+    @property
+    def scans(self) -> int:
+        """Scans that have a pose."""
+        return self.process.scans
+
+    @property
+    def busy(self) -> bool:
+        """Whether a map is being saved or exchanged."""
+        return self._saver.busy or self._changer.busy
+
+    @property
+    def holding(self) -> bool:
+        """Whether what is heard has to wait for that."""
+        return self._saver.holding or self._changer.holding
+
+    def begin_anew(self, folder: str) -> None:
+        """As any process node; what waits was of before, and scans are numbered on."""
+        super().begin_anew(folder)
+        self._pending.clear()
+        self._take_over_map()
+        self._held.appendleft(Carried())
+
+    def _pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+        """Scans are passed over, but for the last, by which the robot is found when it goes on."""
+        self._paused = request.data
+        self.figures.state["paused"] = "yes, scans are passed over" if request.data else "no"
+        skipped, self._skipped = self._skipped, None
+        if skipped is not None and not self._paused:
+            self._take(skipped)
+        self._work_off()
+        response.success, response.message = True, "paused, scans are passed over" if request.data else "mapping"
+        self.get_logger().info(response.message)
+        return response
 
     def _begin(self) -> None:
         """Say where the robot is in the map that the node starts from."""
@@ -98,10 +144,10 @@ class SlamNode(ProcessNode):
     def _hear_initial_pose(self, message: PoseWithCovarianceStamped) -> None:
         """Somebody says where the robot is; scans whose laser is not known yet were taken before."""
         try:
-            if message.header.frame_id != self._map:
+            if message.header.frame_id != self.map_frame:
                 raise HmtSlamError(
-                    f"the pose is in the frame '{message.header.frame_id}', not in '{self._map}': set the fixed frame "
-                    "of RViz, or map_frame"
+                    f"the pose is in the frame '{message.header.frame_id}', not in '{self.map_frame}': set the fixed "
+                    "frame of RViz, or map_frame"
                 )
             place = self._place(conversions.belief_from(message.pose))
         except HmtSlamError as fault:
@@ -114,13 +160,22 @@ class SlamNode(ProcessNode):
         self._scans += 1
         self._last_scan = time.monotonic()
         self.figures.received["Scan"] += 1
+        if self._paused:
+            self._dropped += self._skipped is not None
+            self.figures.state["dropped scans"] = self._dropped
+            self._skipped = message
+            return
+        self._take(message)
+
+    def _take(self, message: LaserScan) -> None:
+        """Work on a scan as soon as its laser's place is known."""
         if self._laser.live and self.process.waiting_scans + len(self._pending) >= _LIVE_QUEUE:
             self._dropped += 1
             self.figures.state["dropped scans"] = self._dropped
             self.figures.warn("scans come faster than they can be worked off: some are dropped, lower filter.particles")
             return
         if not self._pending:
-            self._pending_since = self._last_scan
+            self._pending_since = time.monotonic()
         self._pending.append(message)
         self._work_off()
 
@@ -158,17 +213,18 @@ class SlamNode(ProcessNode):
 
         While the other nodes save their parts of a map, what comes is held.
         """
-        if self._saver.holding:
+        if self.holding:
             self._held.append(message)
             return
         super().deliver(message)
         if self._end is not None:
             self._end_if_all_came()
         self._saver.look()
+        self._changer.look()
 
     def _release(self) -> None:
         """Go on with what was held."""
-        while self._held and not self._saver.holding:
+        while self._held and not self.holding:
             self.deliver(self._held.popleft())
 
     def saved_last(self, linger: float) -> bool:  # noqa: ARG002  all others have answered
@@ -186,7 +242,7 @@ class SlamNode(ProcessNode):
 
     def _end_if_all_came(self, *, give_up: bool = False) -> None:
         end = self._end
-        if end is None or self._pending:
+        if end is None or self._pending or self._paused:
             return
         complete = self._scans >= end.scans and self.figures.received["Odometry"] >= end.odometry
         if complete or give_up:
@@ -217,7 +273,7 @@ class SlamNode(ProcessNode):
         area, poses = self.process.particles
         if area in self._areas and self._particles.get_subscription_count():
             placed = se2.compose(self._areas[area].pose.mean, poses)
-            header = conversions.header(stamp, self._map)
+            header = conversions.header(stamp, self.map_frame)
             self._particles.publish(PoseArray(header=header, poses=[conversions.pose_message(pose) for pose in placed]))
 
 
@@ -225,7 +281,10 @@ def _make_process(configuration: Configuration, beginning: Beginning) -> MetricS
     # It takes time, in which a signal has to be heard.
     from hmt_slam_ros.processes.slam import MetricSlam, SlamState  # noqa: PLC0415
 
-    return MetricSlam(configuration, beginning.part("slam", SlamState))
+    state = beginning.part("slam", SlamState) or SlamState()
+    more = max(0, beginning.scans - state.scans)
+    numbered_on = replace(state, scans=state.scans + more, first_of_trail=state.first_of_trail + more)
+    return MetricSlam(configuration, numbered_on)
 
 
 def main() -> None:

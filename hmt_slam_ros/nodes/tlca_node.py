@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 
 from nav_msgs.msg import OccupancyGrid
+from nav_msgs.srv import GetMap
 from rclpy.publisher import Publisher
 from visualization_msgs.msg import MarkerArray
 
@@ -28,11 +29,24 @@ class TlcaNode(ProcessNode):
 
     def __init__(self) -> None:
         super().__init__("tlca", _make_process, (Accepted,))
-        self._view = MapView(self.configuration, declare_frame(self, "map", "map"), self.beginning.map)
+        self._map = declare_frame(self, "map", "map")
+        self._view = MapView(self.configuration, self._map, self.beginning.map)
         self._grids = self.create_publisher(OccupancyGrid, MAP, qos.LATCHED)
         self._graphs = self.create_publisher(MarkerArray, GRAPH, qos.LATCHED)
         self._drawn = {GRAPH: 0, MAP: 0}
         self.create_timer(_PERIOD, self._draw, clock=self.figures.steady_clock)
+        self.create_service(GetMap, "~/get_map", self._get_map)
+
+    def begin_anew(self, folder: str) -> None:
+        """As any process node, and draw what is known then."""
+        super().begin_anew(folder)
+        self._view = MapView(self.configuration, self._map, self.beginning.map)
+        self._drawn = {GRAPH: -1, MAP: -1}
+
+    def _get_map(self, _request: GetMap.Request, response: GetMap.Response) -> GetMap.Response:
+        """The grid as it would be published now, an empty one where nothing is mapped."""
+        response.map = self._view.grid() or response.map
+        return response
 
     def show(self, heard: Message, said: list[Message]) -> None:
         """Follow what is heard and said."""

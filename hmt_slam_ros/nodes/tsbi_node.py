@@ -42,6 +42,11 @@ class TsbiNode(ProcessNode):
                 self._pmf.publish(pmf_message(message))
 
 
+    def begin_anew(self, folder: str) -> None:
+        """As any process node, and say that the robot's place is not known."""
+        super().begin_anew(folder)
+        self._tell_whether_localized()
+
     def _tell_whether_localized(self) -> None:
         found = self.process.localization
         self._localized.publish(Bool(data=found.localized))

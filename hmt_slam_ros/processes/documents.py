@@ -146,6 +146,34 @@ class SavedPart:
     fault: str = ""
 
 
+@dataclass(frozen=True, eq=False)
+class BeginRequest:
+    """slam asks the others to begin anew.
+
+    :ivar number: of the request, from 1.
+    :ivar events: keyframe events after which all do.
+    :ivar folder: the map with which they begin, empty where with none.
+    """
+
+    number: int
+    events: int
+    folder: str
+
+
+@dataclass(frozen=True, eq=False)
+class BegunPart:
+    """The answer to a :class:`BeginRequest`.
+
+    :ivar number: of the request.
+    :ivar part: the process that answers.
+    :ivar fault: what went wrong, empty where nothing did.
+    """
+
+    number: int
+    part: str
+    fault: str = ""
+
+
 # Raise a document's version with every change of its dataclass: a receiver refuses any other.
 _DOCUMENTS: dict[type, tuple[str, int]] = {
     KeyframeHead: ("keyframe", 4),
@@ -159,6 +187,8 @@ _DOCUMENTS: dict[type, tuple[str, int]] = {
     RobotStatus: ("robot_status", 1),
     SaveRequest: ("save_request", 1),
     SavedPart: ("saved_part", 1),
+    BeginRequest: ("begin_request", 1),
+    BegunPart: ("begun_part", 1),
 }
 
 

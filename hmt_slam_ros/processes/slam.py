@@ -150,6 +150,16 @@ class MetricSlam:
         return self._waiting
 
     @property
+    def events(self) -> int:
+        """Keyframe events so far."""
+        return self._events
+
+    @property
+    def scans(self) -> int:
+        """Scans that were given a pose."""
+        return self._scans
+
+    @property
     def lost(self) -> bool:
         """Whether the robot may be anywhere in the map."""
         return self._lost

@@ -1,4 +1,4 @@
-"""A node's part of a map that slam asks for, as it is after one and the same keyframe event in all nodes."""
+"""A node's part of what slam asks of all: its share of a map, or to begin anew, after one and the same event."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from std_msgs.msg import String
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.nodes import qos
 from hmt_slam_ros.nodes.chain_order import CHAIN
-from hmt_slam_ros.nodes.topics import SAVE, SAVED
+from hmt_slam_ros.nodes.topics import BEGIN, BEGUN, SAVE, SAVED
 from hmt_slam_ros.persistence.folder import File, FolderWriter
-from hmt_slam_ros.processes.documents import SavedPart, SaveRequest, decode, encode
+from hmt_slam_ros.processes.documents import BeginRequest, BegunPart, SavedPart, SaveRequest, decode, encode
 from hmt_slam_ros.processes.messages import Message
 from hmt_slam_ros.processes.routing import HEARD_BY
 
@@ -24,8 +24,8 @@ PARTS = ("aam", "tsbi", "tlca", "rtl")
 """The nodes that slam asks."""
 
 
-class PartSaver:
-    """Writes the state of a node's process when it has heard as many keyframe events as slam says."""
+class Part:
+    """Answers slam when the node's process has heard as many keyframe events as slam says."""
 
     def __init__(self, node: ProcessNode, name: str) -> None:
         """Listen to slam.
@@ -36,13 +36,26 @@ class PartSaver:
         # The last message of an event that the process hears.
         self._last = [kind for kind in CHAIN if kind in HEARD_BY[name]][-1]
         self._events = node.beginning.events
-        self._request: SaveRequest | None = None
+        self._request: SaveRequest | BeginRequest | None = None
         self._gave_last: float | None = None
-        self._answers = node.create_publisher(String, SAVED, qos.CHAIN)
-        node.create_subscription(String, SAVE, self._hear, qos.CHAIN_FROM_NOW)
+        self._saved = node.create_publisher(String, SAVED, qos.CHAIN)
+        self._begun = node.create_publisher(String, BEGUN, qos.CHAIN)
+        for topic, kind in ((SAVE, SaveRequest), (BEGIN, BeginRequest)):
+            self._listen(topic, kind)
+
+    def _listen(self, topic: str, kind: type[SaveRequest | BeginRequest]) -> None:
+        def hear(message: String) -> None:
+            try:
+                self._request = decode(message.data, kind)
+            except HmtSlamError as error:
+                self._node.figures.fail(f"{topic}: {error}")
+            else:
+                self._answer_if_due()
+
+        self._node.create_subscription(String, topic, hear, qos.CHAIN_FROM_NOW)
 
     def delivered(self, message: Message) -> None:
-        """Count an event that the process has worked off; write what waits for it."""
+        """Count an event that the process has worked off; do what waits for it."""
         if isinstance(message, self._last):
             self._events += 1
             self._answer_if_due()
@@ -51,28 +64,35 @@ class PartSaver:
         """Whether the part of the last map was written, at least some seconds ago, or there is nothing to be saved."""
         return not self._events or (self._gave_last is not None and time.monotonic() - self._gave_last >= linger)
 
-    def _hear(self, message: String) -> None:
-        try:
-            self._request = decode(message.data, SaveRequest)
-        except HmtSlamError as error:
-            self._node.figures.fail(f"{SAVE}: {error}")
-            return
-        self._answer_if_due()
-
     def _answer_if_due(self) -> None:
         request = self._request
         if request is None or self._events < request.events:
             return
         self._request = None
-        files, fault = self._written(request)
-        self._answers.publish(String(data=encode(SavedPart(request.number, self._name, files, fault))))
+        ahead = f"it is at keyframe event {self._events}, not {request.events}: restart all nodes"
+        fault = ahead if self._events > request.events else ""
+        if isinstance(request, BeginRequest):
+            fault = fault or self._begin(request)
+            self._begun.publish(String(data=encode(BegunPart(request.number, self._name, fault))))
+            return
+        files: tuple[File, ...] = ()
+        if not fault:
+            files, fault = self._written(request)
+        self._saved.publish(String(data=encode(SavedPart(request.number, self._name, files, fault))))
         if request.last:
             self._gave_last = time.monotonic()
 
+    def _begin(self, request: BeginRequest) -> str:
+        """Begin anew; what went wrong."""
+        try:
+            self._node.begin_anew(request.folder)
+        except HmtSlamError as fault:
+            return f"{fault}; restart all nodes"
+        self._events = self._node.beginning.events
+        return ""
+
     def _written(self, request: SaveRequest) -> tuple[tuple[File, ...], str]:
         """What was written, or what went wrong."""
-        if self._events > request.events:
-            return (), f"it is at keyframe event {self._events}, not {request.events}: restart all nodes"
         folder = Path(request.folder)
         if not folder.is_dir():
             return (), f"it does not see the folder {folder}: run all nodes where that is, or set save_to of slam"

@@ -1,0 +1,113 @@
+"""Services by which the map is asked for, exchanged and forgotten, and mapping pauses, while the nodes run."""
+
+import shutil
+
+import numpy as np
+import pytest
+from logs_for_nodes import PACE
+from test_nodes_localization import NODES, SCANS, Nodes, mapped_corridor
+
+pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
+
+from nav_msgs.msg import OccupancyGrid
+from nav_msgs.srv import GetMap, LoadMap
+from std_msgs.msg import String
+from std_srvs.srv import SetBool, Trigger
+
+from hmt_slam_ros.nodes import qos
+from hmt_slam_ros.nodes.conversions import planar_pose
+from hmt_slam_ros.nodes.topics import KEYFRAMES, MAP
+from hmt_slam_ros.processes.documents import KeyframeHead, decode
+from hmt_slam_ros.processes.messages import LocalEstimate
+
+
+@pytest.fixture(scope="module")
+def corridor(tmp_path_factory):
+    return mapped_corridor(tmp_path_factory.mktemp("corridor"))
+
+
+def occupied(grid):
+    return int((np.frombuffer(grid.data, dtype=np.int8) == 100).sum())
+
+
+def load(listener, folder):
+    return listener.call(LoadMap, "slam/load_map", LoadMap.Request(map_url=str(folder)))
+
+
+def last(nodes):
+    return decode(nodes.estimates[-1].data, LocalEstimate)
+
+
+def test_a_map_is_loaded_while_the_nodes_run_and_the_robot_recognized_in_it(corridor, listener, start, tmp_path):
+    log, out = corridor
+    nodes = Nodes(start, listener)
+    assert listener.call(GetMap, "tlca/get_map", GetMap.Request()).map.info.width == 0
+    nodes.drive(log, first=90, robot__duration=2.0)
+    nodes.until(lambda: len(nodes.estimates) == 10)
+    nodes.park()
+    little = listener.call(GetMap, "tlca/get_map", GetMap.Request()).map
+    assert occupied(little) > 20
+
+    assert load(listener, tmp_path / "nowhere").result == LoadMap.Response.RESULT_MAP_DOES_NOT_EXIST
+    shutil.copytree(out / "hmt_map", tmp_path / "damaged")
+    (tmp_path / "damaged" / "tlca.json").write_text("{}")
+    assert load(listener, tmp_path / "damaged").result == LoadMap.Response.RESULT_INVALID_MAP_DATA
+    nodes.until(lambda: "tlca.json is truncated or damaged" in nodes.diagnosis("slam")["last error"])
+    assert nodes.is_localized()
+
+    grids = listener.hear(OccupancyGrid, MAP, qos.LATCHED)
+    answer = load(listener, f"file://{out}")
+    assert answer.result == LoadMap.Response.RESULT_SUCCESS
+    assert occupied(answer.map) > 2 * occupied(little)
+    nodes.until(lambda: not nodes.is_localized())
+    nodes.until(lambda: grids and occupied(grids[-1]) == occupied(answer.map))
+    nodes.drive(log, first=20, rate=8.0)
+    nodes.until(nodes.is_localized)
+    nodes.until(lambda: last(nodes).scan_index == SCANS + (SCANS - 20) - 1)
+    nodes.until(lambda: np.abs(planar_pose(nodes.poses[-1].pose.pose) - 4 * (SCANS - 1) * PACE).max() < 0.15)
+
+
+def test_after_a_reset_a_new_map_begins_where_the_robot_is(corridor, listener, start):
+    log, out = corridor
+    nodes = Nodes(start, listener, start_from=out, start_carried=False)
+    keyframes = listener.hear(String, KEYFRAMES, qos.CHAIN)
+    nodes.until(lambda: {m.status[0].name for m in nodes.diagnostics} == {f"/{name}" for name in NODES})
+    answer = listener.call(Trigger, "slam/reset", Trigger.Request())
+    assert (answer.success, answer.message) == (True, "the map is forgotten, a new one begins")
+    assert listener.call(GetMap, "tlca/get_map", GetMap.Request()).map.info.width == 0
+    nodes.drive(log, first=40, rate=8.0, robot__duration=8.0)
+    nodes.until(lambda: len(nodes.estimates) == 40)
+    assert decode(keyframes[0].data, KeyframeHead).sequence == 0
+    nodes.until(nodes.is_localized)
+    # In the frame of the first scan after it.
+    nodes.until(lambda: nodes.poses and abs(planar_pose(nodes.poses[-1].pose.pose)[0] - 4 * 39 * PACE[0]) < 0.3)
+    assert occupied(listener.call(GetMap, "tlca/get_map", GetMap.Request()).map) > 20
+
+
+def test_while_paused_scans_are_passed_over_and_odometry_is_not(corridor, listener, start):
+    nodes = Nodes(start, listener)
+    nodes.drive(corridor[0], first=0, rate=2.0)
+    nodes.until(lambda: len(nodes.estimates) > 10)
+    paused = listener.call(SetBool, "slam/pause", SetBool.Request(data=True))
+    assert (paused.success, paused.message) == (True, "paused, scans are passed over")
+    listener.spin(2.0)
+    said = len(nodes.estimates)
+    listener.spin(1.0)
+    assert len(nodes.estimates) == said
+    nodes.until(lambda: nodes.diagnosis("slam").get("paused", "").startswith("yes"))
+    assert listener.call(SetBool, "slam/pause", SetBool.Request(data=False)).success
+    # The robot, which waited for an acknowledgement, goes on.
+    end = 4 * (SCANS - 1) * PACE
+    nodes.until(lambda: np.abs(last(nodes).pose.mean - end).max() < 0.1)
+    nodes.until(lambda: nodes.diagnosis("slam").get("paused") == "no")
+    dropped = int(nodes.diagnosis("slam")["dropped scans"])
+    assert dropped >= 5
+    nodes.until(lambda: len(nodes.estimates) == SCANS - dropped)
+
+
+def test_nothing_is_exchanged_where_not_all_processes_run(listener, start):
+    start("slam")
+    answer = listener.call(Trigger, "slam/reset", Trigger.Request())
+    assert (answer.success, answer.message) == (
+        False, "the map cannot be exchanged: 0 of aam, tsbi, tlca, rtl are running: start all of them"
+    )  # fmt: skip
