@@ -31,7 +31,7 @@ def parser() -> argparse.ArgumentParser:
     _simulate(commands.add_parser("simulate", help="write a drive through a simulated world as a rosbag2"))
     _evaluate(commands.add_parser("evaluate", help="errors of an output folder against true relations"))
     _plot(commands.add_parser("plot", help="draw map, probabilities and cost of an output folder"))
-    _export(commands.add_parser("export", help="write the topology of an output folder as GraphML"))
+    _export(commands.add_parser("export", help="write a map's topology as GraphML, or its grid for nav2"))
     _parameters(commands.add_parser("parameters", help="print every parameter as a YAML file"))
     return top
 
@@ -120,7 +120,14 @@ def _plot(command: argparse.ArgumentParser) -> None:
 
 
 def _export(command: argparse.ArgumentParser) -> None:
-    command.add_argument("directory", type=Path, metavar="DIR", help="output folder, in which the file is put")
+    command.add_argument(
+        "directory", type=Path, metavar="DIR", help="output folder, in which the file is put; for --grid also a hmt_map"
+    )
+    command.add_argument(
+        "--grid", type=Path, dest="to", metavar="FOLDER", help="write map.pgm and map.yaml for nav2 there instead"
+    )
+    command.add_argument("--resolution", type=float, metavar="M", help="side of a cell of the grid; default: as mapped")
+    command.add_argument("--area", type=int, metavar="N", help="the grid of one area alone, in that area's frame")
 
 
 def _parameters(command: argparse.ArgumentParser) -> None:

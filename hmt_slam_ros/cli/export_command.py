@@ -1,12 +1,21 @@
-"""``hmt_slam export``: the topology of an output folder for other programs."""
+"""``hmt_slam export``: the topology of an output folder, or its grid, for other programs."""
 
 from __future__ import annotations
 
 import argparse
 
+from hmt_slam_ros.errors import HmtSlamError
+from hmt_slam_ros.offline.grid_files import export_grid
 from hmt_slam_ros.offline.topology_file import export_topology
 
 
 def run(options: argparse.Namespace) -> None:
-    """Write the file and name it."""
-    print(export_topology(options.directory))
+    """Write the files and name them."""
+    asked = options.resolution is not None or options.area is not None
+    if options.to is None:
+        if asked:
+            raise HmtSlamError("--resolution and --area are of a grid: say with --grid into which folder")
+        print(export_topology(options.directory))
+        return
+    for path in export_grid(options.directory, options.to, options.resolution, options.area):
+        print(path)
