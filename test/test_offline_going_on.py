@@ -78,6 +78,17 @@ def compared(log, folder, stops, branching=lambda: Branching):
     same_outcome(*(end.recorder.finish(end.log.stamps) for end in (run.finish(), whole.finish())))
     return stopped
 
+def test_a_run_that_forgot_keyframes_goes_on_without_them(tmp_path):
+    known = [0]
+
+    def forgot(_, state):
+        known.append(len(state.replica.scans))
+        return known[-1] < known[-2] and len(state.notes) == 1
+
+    log = open_log("sim:office,size=0.7,rate=2.5,laps=3")
+    assert len(compared(log, tmp_path, forgot)) > 2
+
+
 
 def once(*conditions):
     """When to stop: when each of some conditions on TSBI's state holds for the first time."""

@@ -138,13 +138,13 @@ def test_the_keyframes_that_left_begin_the_new_area():
 def measured(monkeypatch):
     """The numbers of scan pairs that were compared, call by call."""
     counts = []
-    original = aam_module.overlaps
+    original = aam_module.sensed_overlaps
 
     def counting(points, pose, others, other_poses, radius):
         counts.append(len(others))
         return original(points, pose, others, other_poses, radius)
 
-    monkeypatch.setattr(aam_module, "overlaps", counting)
+    monkeypatch.setattr(aam_module, "sensed_overlaps", counting)
     return counts
 
 

@@ -119,13 +119,13 @@ def test_a_keyframe_is_whole_again_with_its_ranges():
 
 STATUS = RobotStatus("playing", "aces", 12, 3, 7374, 3, 1)
 EVENT = '{"hypothesis":1,"kind":"cut","keyframes":[1,2],"area":0,"score":0.5,"into":null}'
-EVENTS = f'{{"document":"area_events","version":2,"sequence":3,"events":[{EVENT}]}}'
+EVENTS = f'{{"document":"area_events","version":3,"sequence":3,"events":[{EVENT}],"forgotten":[]}}'
 
 
 @pytest.mark.parametrize(
     ("old", "new", "sentence"),
     [
-        ('"version":2', '"version":3', "has version 3, not 2"),
+        ('"version":3', '"version":2', "has version 2, not 3"),
         ("area_events", "hypotheses", "is no area_events"),
         ('"sequence":3', '"sequence":"3"', r"area_events\.sequence = 3 is not a whole number"),
         ('"sequence":3', '"sequence":true', r"area_events\.sequence = True is not a whole number"),
@@ -135,7 +135,7 @@ EVENTS = f'{{"document":"area_events","version":2,"sequence":3,"events":[{EVENT}
         ('"score":0.5', '"score":NaN', r"score = nan is not a finite number"),
         ('"keyframes":[1,2]', '"keyframes":[1,2.5]', r"keyframes\[1\] = 2.5 is not a whole number"),
         ('"keyframes":[1,2]', '"keyframes":1', r"keyframes = 1 is not a list"),
-        ("}]}", "}]", "no JSON"),
+        ("[]}", "[]", "no JSON"),
     ],
 )
 def test_a_malformed_document_is_refused_by_name(old, new, sentence):

@@ -6,7 +6,7 @@ from scipy.spatial import cKDTree
 
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.sensing import Scan
-from hmt_slam_ros.topology.overlap import overlaps, sensed_points
+from hmt_slam_ros.topology.overlap import Sensed, overlaps, sensed_overlaps, sensed_points
 
 HERE = np.zeros(3)
 
@@ -84,6 +84,14 @@ def test_a_scan_without_returns_overlaps_nothing():
     poses = np.zeros((3, 3))
     np.testing.assert_array_equal(overlaps(wall(0, 5), HERE, [wall(0, 5), empty, wall(0, 5)], poses, 0.2), [1, 0, 1])
     np.testing.assert_array_equal(overlaps(empty, HERE, [wall(0, 5), empty], poses[:2], 0.2), [0, 0])
+
+
+def test_scans_that_saw_free_space_only_overlap_the_less_the_farther_apart_they_were_taken():
+    blank, seen = Sensed(np.empty((0, 2)), 8.0), Sensed(wall(0, 5), 8.0)
+    poses = np.array([[0.0, 0.0, 1.0], [8.0, 0.0, 0.0], [0.0, 20.0, 0.0], [0.0, 0.0, 0.0]])
+    found = sensed_overlaps(blank, HERE, [blank, blank, blank, seen], poses, 0.2)
+    np.testing.assert_allclose(found, [1.0, 0.5, 0.0, 0.0])
+    np.testing.assert_array_equal(sensed_overlaps(seen, HERE, [blank, seen], poses[3:].repeat(2, 0), 0.2), [0.0, 1.0])
 
 
 def test_nothing_to_compare_with_gives_no_values():

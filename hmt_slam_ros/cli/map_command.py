@@ -88,7 +88,7 @@ def measured_run(
     # Libraries and the log stay to the end: the garbage collector need not look through them again and again.
     gc.freeze()
     with Progress(log.scan_count, log.duration) as progress:
-        result = run_log(log, configuration, progress, state=state, keep=keep)
+        result = run_log(log, configuration, progress, state=state, keep=keep, lasting=True)
     begin = time.process_time()
     recording = result.recorder.finish(result.log.stamps, result.log.first_scans, result.log.earlier)
     final = final_map(recording, corrected_scans(log, configuration), configuration)

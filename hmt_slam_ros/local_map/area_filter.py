@@ -6,7 +6,7 @@ entered. The map frame is the frame of the current area.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -309,6 +309,13 @@ class AreaFilter:
         self.keyframes.append(keyframe)
         self.keyframe_areas.append(self.area)
         self.keyframe_poses = np.concatenate((self.keyframe_poses, self.poses[:, None]), axis=1)
+
+    def drop(self, keyframes: Collection[int]) -> None:
+        """Forget keyframes, but not what the maps hold of them."""
+        kept = [k for k, keyframe in enumerate(self.keyframes) if keyframe not in keyframes]
+        self.keyframes = [self.keyframes[k] for k in kept]
+        self.keyframe_areas = [self.keyframe_areas[k] for k in kept]
+        self.keyframe_poses = self.keyframe_poses[:, kept]
 
     def change_area(self, area: int, area_T_previous: Float64, content: Sequence[PlacedKeyframe]) -> None:
         """Go over to the frame of another area and load its local map, the same for all particles.

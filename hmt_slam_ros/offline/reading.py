@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import zlib
+from array import array
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
@@ -61,12 +62,12 @@ class Reading:
         """:param state: to go on from."""
         self._records, self._first_scans, self._earlier = state.records, state.first_scans, state.earlier
         self._shift, self._checksum = state.shift, state.checksum
-        self._stamps = list(zip(state.stamps.tolist(), state.source_stamps.tolist(), strict=True))
+        self._stamps, self._source_stamps = (array("q", part.tobytes()) for part in (state.stamps, state.source_stamps))
 
     @property
     def state(self) -> LogState:
         """How far the logs were read, as a value."""
-        running, source = np.array(self._stamps, dtype=np.int64).reshape(-1, 2).T.copy()
+        running, source = np.array(self._stamps, np.int64), np.array(self._source_stamps, np.int64)
         return LogState(self._records, running, source, self._first_scans, self._earlier, self._shift, self._checksum)
 
     @property
@@ -78,14 +79,16 @@ class Reading:
         """Begin a further log, on a clock that goes on."""
         self._first_scans = (*self._first_scans, len(self._stamps))
         first = next((record.measurement.stamp for record in log.records()), 0)
-        self._records, self._shift = 0, self._stamps[-1][0] + _BETWEEN_LOGS - first
+        self._records, self._shift = 0, self._stamps[-1] + _BETWEEN_LOGS - first
 
     def unread(self, log: Log) -> Iterator[LogRecord]:
         """The records of the newest log that were not read, with stamps on the map's clock.
 
         :raises HmtSlamError: where it is not as it was when the others were read.
         """
-        records, scans = map(self._shifted, log.records()), iter(self._stamps[self._first_scans[-1] :])
+        first = self._first_scans[-1]
+        scans = zip(self._stamps[first:], self._source_stamps[first:], strict=True)
+        records = map(self._shifted, log.records())
         for record in itertools.islice(records, self._records):
             if isinstance(record.measurement, Scan) and next(scans, None) != _stamps(record):
                 raise HmtSlamError(
@@ -105,7 +108,9 @@ class Reading:
         if isinstance(record.measurement, Scan):
             if not self.scans:
                 self._checksum = _checksum(record.measurement)
-            self._stamps.append(_stamps(record))
+            running, source = _stamps(record)
+            self._stamps.append(running)
+            self._source_stamps.append(source)
 
     def _shifted(self, record: LogRecord) -> LogRecord:
         if not self._shift:

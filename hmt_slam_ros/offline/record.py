@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, fields
-from typing import Any
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hmt_slam_ros.arrays import Bool, Float64, Int64
+from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.offline.trajectories import OnlinePose
 from hmt_slam_ros.processes.messages import AreaPose, LocalEstimate, Notice, Trail
 from hmt_slam_ros.processes.replica import ReplicaState
+from hmt_slam_ros.topology.crowding import Successor
 
 
 @dataclass(frozen=True)
@@ -84,6 +87,10 @@ class ProbabilityTable:
         }
         return cls(**columns)
 
+    def and_then(self, later: ProbabilityTable) -> ProbabilityTable:
+        """With those of later events."""
+        return ProbabilityTable(*_joined(self, later))
+
     def rows(self) -> list[TopologyProbability]:
         """Its rows."""
         columns = [getattr(self, entry.name).tolist() for entry in fields(self)]
@@ -122,8 +129,7 @@ class EstimateTable:
 
     def and_then(self, later: EstimateTable) -> EstimateTable:
         """With those of later scans."""
-        both = ((getattr(self, entry.name), getattr(later, entry.name)) for entry in fields(self))
-        return EstimateTable(*(np.concatenate(columns) for columns in both))
+        return EstimateTable(*_joined(self, later))
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,6 +164,32 @@ class TrailTable:
             np.concatenate([np.zeros((0, 3)), *(trail.poses for trail in kept)]),
         )
 
+    def and_then(self, later: TrailTable) -> TrailTable:
+        """With other trails."""
+        return TrailTable(*_joined(self, later))
+
+    def of_hypotheses(self, hypotheses: Collection[int]) -> TrailTable:
+        """Those of some hypotheses alone."""
+        kept = np.isin(self.hypotheses, list(hypotheses))
+        scans = np.repeat(kept, self.sizes)
+        return TrailTable(
+            self.hypotheses[kept], self.first_scans[kept], self.sizes[kept], self.stamps[scans], self.anchors[scans],
+            self.poses[scans],
+        )  # fmt: skip
+
+    def related_to(self, successors: Mapping[int, Successor]) -> TrailTable:
+        """With scans that are related to forgotten keyframes related to others.
+
+        :param successors: {forgotten keyframe: the one instead}, in the order in which they were forgotten.
+        """
+        if not successors:
+            return self
+        anchors, poses = self.anchors.copy(), self.poses.copy()
+        for gone, held in successors.items():
+            rows = np.flatnonzero(anchors == gone)
+            anchors[rows], poses[rows] = held.keyframe, se2.compose(held.pose, poses[rows])
+        return replace(self, anchors=anchors, poses=poses)
+
     def trails(self) -> list[Trail]:
         """The trails."""
         ends = np.cumsum(self.sizes)
@@ -166,6 +198,14 @@ class TrailTable:
             Trail(hypothesis, first, self.stamps[begin:end], self.anchors[begin:end], self.poses[begin:end])
             for hypothesis, first, begin, end in heads
         ]
+
+
+Table = TypeVar("Table", ProbabilityTable, EstimateTable, TrailTable)
+
+
+def _joined(table: Table, later: Table) -> list[NDArray[Any]]:
+    """The columns of two tables, one after the other."""
+    return [np.concatenate((getattr(table, entry.name), getattr(later, entry.name))) for entry in fields(table)]
 
 
 @dataclass(frozen=True, eq=False)

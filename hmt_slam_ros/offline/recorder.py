@@ -32,6 +32,7 @@ from hmt_slam_ros.processes.messages import (
     Accepted,
     AreaPose,
     Finished,
+    Forgotten,
     Hypotheses,
     Keyframe,
     Leaf,
@@ -41,8 +42,12 @@ from hmt_slam_ros.processes.messages import (
     Trail,
 )
 from hmt_slam_ros.processes.replica import Replica
+from hmt_slam_ros.topology.crowding import Successor, successor
 from hmt_slam_ros.topology.hybrid_map import HybridMap
 from hmt_slam_ros.topology.shortest_path import reachable
+
+# Keyframe events whose messages are kept at least, and as a share of all before: a record is written anew as a whole.
+_FOLDED, _SHARE = 64, 32
 
 Numbered = TypeVar("Numbered", Keyframe, Hypotheses, Accepted)
 
@@ -158,7 +163,7 @@ class Recorder:
         keyframes = _gapless("Keyframe", self.keyframes, first, events)
         hypotheses = _gapless("Hypotheses", self.hypotheses, first, events)
         accepted = _gapless("Accepted", self.accepted, first, events)
-        replica, sizes, probabilities = _replay(past, keyframes, hypotheses, accepted)
+        replica, sizes, probabilities, successors = _replay(past, keyframes, hypotheses, accepted)
         branched = {leaf.hypothesis: leaf.parent for message in hypotheses for leaf in _branched(message)}
         given = [verdict.global_poses for verdict in accepted if verdict.global_poses]
         found = replace(
@@ -167,7 +172,7 @@ class Recorder:
             replica=replica.state,
             sizes=sizes,
             parents={**past.parents, **branched},
-            probabilities=ProbabilityTable.of([*past.probabilities.rows(), *probabilities]),
+            probabilities=past.probabilities.and_then(ProbabilityTable.of(probabilities)),
             global_poses=given[-1] if given else past.global_poses,
             estimates=past.estimates.and_then(EstimateTable.of(self.estimates)),
             online=np.concatenate((past.online, self._online(keyframes, accepted))),
@@ -175,12 +180,23 @@ class Recorder:
             notices=tuple(self.notices.values()),
         )
         alive = {known for hypothesis in replica.maps for known in found.lineage(hypothesis)}
-        trails = {(trail.hypothesis, trail.first_scan): trail for trail in past.trails.trails()} | self.trails
+        trails = past.trails.and_then(TrailTable.of(self.trails.values()))
         return replace(
             found,
             parents={child: parent for child, parent in found.parents.items() if child in alive},
-            trails=TrailTable.of(trail for trail in trails.values() if trail.hypothesis in alive),
+            trails=trails.of_hypotheses(alive).related_to(successors),
         )
+
+    def fold(self) -> None:
+        """Keep a record of what was heard instead of the messages, if these are many by now.
+
+        They take ten times as much memory. To be called when the answers to all keyframe events are here.
+        """
+        if len(self.accepted) < max(_FOLDED, self.past.events // _SHARE):
+            return
+        self.past = self.record()
+        for messages in (self.keyframes, self.hypotheses, self.accepted, self.trails, self.estimates):
+            messages.clear()
 
     def _online(self, keyframes: list[Keyframe], accepted: list[Accepted]) -> Trajectory:
         """The poses of the scans that came since the past."""
@@ -252,11 +268,16 @@ def _gapless(name: str, messages: dict[int, Numbered], first: int, events: int) 
 
 def _replay(
     past: Record, keyframes: list[Keyframe], hypotheses: list[Hypotheses], accepted: list[Accepted]
-) -> tuple[Replica, Mapping[int, tuple[int, int]], list[TopologyProbability]]:
-    """The maps after some events, their numbers of areas and loop closures, and the probabilities at the events."""
+) -> tuple[Replica, Mapping[int, tuple[int, int]], list[TopologyProbability], dict[int, Successor]]:
+    """The maps after some events, their numbers of areas and loop closures, and the probabilities at the events.
+
+    Last, in their order, the keyframes that were forgotten and those that stand for them since then.
+    """
     replica, sizes, probabilities = Replica.of(past.replica), past.sizes, list[TopologyProbability]()
+    successors: dict[int, Successor] = {}
     for keyframe, belief, verdict in zip(keyframes, hypotheses, accepted, strict=True):
         replica.add(keyframe)
+        successors |= _successors(replica, belief.forgotten)
         replica.apply(belief)
         sizes = {leaf.hypothesis: _size(replica, leaf, sizes) for leaf in belief.leaves}
         probabilities += [
@@ -275,7 +296,17 @@ def _replay(
             for leaf in belief.leaves
         ]
         replica.accept(verdict)
-    return replica, sizes, probabilities
+    return replica, sizes, probabilities, successors
+
+
+def _successors(replica: Replica, forgotten: Sequence[Forgotten]) -> dict[int, Successor]:
+    """{keyframe that is forgotten: the one that stands for it}, of the one hypothesis that there is then."""
+    gone, hybrid_map = {one.keyframe for one in forgotten}, replica.maps[replica.best]
+    found = {}
+    for one in forgotten:
+        placed = hybrid_map.keyframes(one.area)
+        found[one.keyframe] = successor(placed[one.keyframe], {k: at for k, at in placed.items() if k not in gone})
+    return found
 
 
 def _size(replica: Replica, leaf: Leaf, sizes: Mapping[int, tuple[int, int]]) -> tuple[int, int]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from array import array
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -109,7 +110,7 @@ class Run:
             }
         )
         self._reading = Reading(state.log)
-        self._spent: list[dict[str, float]] = []
+        self._spent = {name: array("d") for name in self.lock_step.processes if name != "recorder"}
 
     @property
     def scans(self) -> int:
@@ -142,13 +143,14 @@ class Run:
         self.lock_step.feed(record.measurement)
         self._reading.note(record)
         if isinstance(record.measurement, Scan):
-            self._spent.append(self.lock_step.take_seconds())
+            taken = self.lock_step.take_seconds()
+            for name, spent in self._spent.items():
+                spent.append(taken.get(name, 0.0))
 
     def finish(self) -> RunResult:
         """End the run."""
         self.lock_step.feed(EndOfLog())
-        names = (name for name in self.lock_step.processes if name != "recorder")
-        seconds = {name: np.array([taken.get(name, 0.0) for taken in self._spent]) for name in names}
+        seconds = {name: np.array(spent) for name, spent in self._spent.items()}
         return RunResult(self.recorder, self._reading.state, seconds, self._slam.map_bytes)
 
 
@@ -159,6 +161,7 @@ def run_log(
     abstraction: Callable[[Configuration], Process] | None = None,
     state: RunState | None = None,
     keep: Callable[[RunState], None] | None = None,
+    lasting: bool = False,
 ) -> RunResult:
     """Map a whole log.
 
@@ -167,11 +170,14 @@ def run_log(
     :param abstraction: what makes areas of keyframes instead of the AAM, such as nothing.
     :param state: to go on from, at the first record that it does not know.
     :param keep: called with the state after the last record, before the end of the log is told.
+    :param lasting: whether the recorder keeps a record of what was said, and not the messages, so that a run may last.
     :raises HmtSlamError: where the log is faulty.
     """
     run = Run(configuration, abstraction, state)
     for record in run.unread(log):
         run.read(record)
+        if lasting:
+            run.recorder.fold()
         if progress and isinstance(record.measurement, Scan):
             progress(run.scans)
     if keep:

@@ -18,6 +18,7 @@ from hmt_slam_ros.processes.messages import (
     Accepted,
     AreaEvent,
     AreaEvents,
+    Forgotten,
     Hypotheses,
     Keyframe,
     Leaf,
@@ -28,8 +29,9 @@ from hmt_slam_ros.processes.messages import (
 from hmt_slam_ros.processes.replica import FIRST_AREA, FIRST_HYPOTHESIS, Replica, ReplicaState
 from hmt_slam_ros.sensing import Scan
 from hmt_slam_ros.topology.common_map import Keyframes, Pair
+from hmt_slam_ros.topology.crowding import crowded, in_place
 from hmt_slam_ros.topology.hybrid_map import HybridMap
-from hmt_slam_ros.topology.overlap import overlaps, sensed_points
+from hmt_slam_ros.topology.overlap import Sensed, sensed_overlaps
 from hmt_slam_ros.topology.overlap_graph import (
     OverlapGraph,
     Separation,
@@ -41,6 +43,8 @@ from hmt_slam_ros.topology.unknown import telling_arc
 
 # An area's overlap with a scan is that of the best few keyframes among those taken nearest to it.
 _NEAREST, _BEST = 8, 3
+# Keyframes that one place of an area may hold, and keyframe events for which all that is new stays.
+_MOST_IN_PLACE, _RECENT = 2, 30
 # Where an arc moved keyframes by less than this share of the radius of overlap, overlaps are not measured again.
 _UNMOVED = 0.1
 
@@ -129,12 +133,14 @@ class AamState:
     :ivar graphs: overlap graphs; hypotheses share them.
     :ivar watches: {hypothesis: what is remembered of it}.
     :ivar asked: areas, the smaller first, of which is still to be asked whether they are one.
+    :ivar left: areas that the robot left, of which is still to be asked whether they hold too much.
     """
 
     replica: ReplicaState = field(default_factory=ReplicaState)
     graphs: tuple[OverlapGraph, ...] = ()
     watches: Mapping[int, WatchState] = field(default_factory=lambda: {FIRST_HYPOTHESIS: WatchState(FIRST_AREA)})
     asked: frozenset[Pair] = frozenset()
+    left: frozenset[int] = frozenset()
 
 
 class Aam:
@@ -149,17 +155,23 @@ class Aam:
     Two areas that a definite closure joins are one if nothing in what both hold together separates, so that an area of
     all of it would not be cut. This is asked when the closure becomes definite, when it is refined again, and when the
     robot leaves one of the two.
+
+    Keyframes of ground that is passed again and again are forgotten, where there is one hypothesis: those stored in an
+    area before it showed that the robot was in the next one, which has some there itself; and of an area that the robot
+    left, those of which a place holds too many.
     """
 
     def __init__(self, configuration: Configuration, state: AamState | None = None) -> None:
         """:param state: to go on from."""
         state = state or AamState()
         self._options = configuration.aam
+        self._filter = configuration.filter
         self._max_range = configuration.local_map.max_range
         self._replica = Replica.of(state.replica)
-        self._points: dict[int, NDArray[np.float64]] = {}
+        self._seen: dict[int, Sensed] = {}
         self._watches = {hypothesis: _watch(own, state.graphs) for hypothesis, own in state.watches.items()}
         self._asked = set(state.asked)
+        self._left = set(state.left)
 
     @property
     def state(self) -> AamState:
@@ -169,7 +181,8 @@ class Aam:
         graphs |= {id(joint.graph): joint.graph for watch in known for joint in watch.joints.values()}
         numbers = {name: number for number, name in enumerate(graphs)}
         watches = {hypothesis: _numbered(watch, numbers) for hypothesis, watch in self._watches.items()}
-        return AamState(self._replica.state, tuple(graphs.values()), watches, frozenset(self._asked))
+        asked, left = frozenset(self._asked), frozenset(self._left)
+        return AamState(self._replica.state, tuple(graphs.values()), watches, asked, left)
 
     def handle(self, message: Message) -> list[Message]:
         """Answer a ``Keyframe`` with its ``AreaEvents``; learn from ``Hypotheses`` and ``Accepted``."""
@@ -178,6 +191,7 @@ class Aam:
         if isinstance(message, Hypotheses):
             self._replica.apply(message)
             self._watches = {leaf.hypothesis: self._follow(leaf) for leaf in message.leaves}
+            self._forget({one.keyframe for one in message.forgotten})
         elif isinstance(message, Accepted) and message.hypothesis is not None:
             self._replica.accept(message)
             self._watches = {message.hypothesis: self._watches[message.hypothesis]}
@@ -189,24 +203,71 @@ class Aam:
 
     def _examine(self, keyframe: Keyframe) -> AreaEvents:
         self._replica.add(keyframe)
-        self._points[keyframe.sequence] = self._sensed(keyframe.scan)
+        self._seen[keyframe.sequence] = self._sensed(keyframe.scan)
         known = [leaf for leaf in keyframe.leaves if leaf.hypothesis in self._watches]
         events = [
             self._cut(leaf, keyframe.sequence) or self._merged(leaf.hypothesis) or self._moved(leaf, keyframe.sequence)
             for leaf in known
         ]
         if not any(leaf.stored for leaf in known):
-            del self._points[keyframe.sequence]
-        return AreaEvents(keyframe.sequence, tuple(event for event in events if event is not None))
+            del self._seen[keyframe.sequence]
+        forgotten = self._superfluous(known[0], events[0], keyframe.sequence) if len(self._watches) == 1 else ()
+        return AreaEvents(keyframe.sequence, tuple(event for event in events if event is not None), forgotten)
 
-    def _sensed(self, scan: Scan) -> NDArray[np.float64]:
-        return sensed_points(scan, self._max_range, self._options.overlap_points)
+    def _superfluous(self, leaf: LeafEstimate, event: AreaEvent | None, newest: int) -> tuple[Forgotten, ...]:
+        """The keyframes of the one hypothesis that may be forgotten now."""
+        if event is None:
+            return self._crowded(leaf.hypothesis, newest)
+        return self._passed_again(leaf.hypothesis, event.area) if event.kind == "moved" else ()
 
-    def _points_of(self, keyframe: int) -> NDArray[np.float64]:
-        """What is compared of a keyframe's scan, shape (k, 2), m, worked out once."""
-        if keyframe not in self._points:
-            self._points[keyframe] = self._sensed(self._replica.scans[keyframe])
-        return self._points[keyframe]
+    def _passed_again(self, hypothesis: int, entered: int) -> tuple[Forgotten, ...]:
+        """The robot's own keyframes of the area that it leaves which the one that it is in would not have stored.
+
+        Metric SLAM did, as it does not hold areas whose place is uncertain. Without that an area grew into the next one
+        with every pass, by as many keyframes as it takes to notice the move.
+        """
+        watch, hybrid_map = self._watches[hypothesis], self._replica.maps[hypothesis]
+        arc, known = hybrid_map.arc(entered, watch.area), np.array(list(self._keyframes(hypothesis, entered).values()))
+        placed = self._keyframes(hypothesis, watch.area)
+        if arc is None or not known.size:
+            return ()
+        first = next(iter(placed))
+        return tuple(
+            Forgotten(keyframe, watch.area)
+            for keyframe in sorted(watch.own & placed.keys() - {first})
+            if in_place(se2.between(known, se2.compose(arc.mean, placed[keyframe])), self._filter).any()
+        )
+
+    def _crowded(self, hypothesis: int, newest: int) -> tuple[Forgotten, ...]:
+        """The superfluous keyframes of an area that the robot left."""
+        if not self._left:
+            return ()
+        area = min(self._left)
+        self._left.discard(area)
+        if not self._replica.maps[hypothesis].has_area(area):
+            return ()
+        placed = self._keyframes(hypothesis, area)
+        kept = {*list(placed)[:1], *(k for k in placed if k > newest - _RECENT), *self._watches[hypothesis].own}
+        return tuple(Forgotten(k, area) for k in crowded(placed, kept, _MOST_IN_PLACE, self._filter))
+
+    def _forget(self, keyframes: set[int]) -> None:
+        """Go on without what the maps do not hold any more."""
+        if not keyframes:
+            return
+        for keyframe in keyframes:
+            self._seen.pop(keyframe, None)
+        for hypothesis, watch in self._watches.items():
+            held = {area: graph.without(keyframes) for area, graph in watch.graphs.items()}
+            self._watches[hypothesis] = replace(watch, graphs=held, own=watch.own - keyframes)
+
+    def _sensed(self, scan: Scan) -> Sensed:
+        return Sensed.of(scan, self._max_range, self._options.overlap_points)
+
+    def _seen_by(self, keyframe: int) -> Sensed:
+        """What is compared of a keyframe's scan, worked out once."""
+        if keyframe not in self._seen:
+            self._seen[keyframe] = self._sensed(self._replica.scans[keyframe])
+        return self._seen[keyframe]
 
     def _cut(self, leaf: LeafEstimate, newest: int) -> AreaEvent | None:
         """The event that the newest keyframes leave the robot's area, when that has lasted."""
@@ -291,10 +352,10 @@ class Aam:
             return 0.0
         poses = np.array([placed[keyframe] for keyframe in others])
         nearest = np.argsort(np.hypot(*(poses[:, :2] - pose[:2]).T), kind="stable")[:_NEAREST]
-        found = overlaps(
-            self._points_of(newest),
+        found = sensed_overlaps(
+            self._seen_by(newest),
             pose,
-            [self._points_of(others[i]) for i in nearest],
+            [self._seen_by(others[i]) for i in nearest],
             poses[nearest],
             self._options.overlap_radius,
         )
@@ -312,6 +373,7 @@ class Aam:
         left = watch.graphs.get(watch.area, OverlapGraph()).only(self._keyframes(leaf.hypothesis, watch.area))
         beside = self._replica.maps[leaf.hypothesis].neighbours(watch.area)
         self._asked |= {(min(watch.area, other), max(watch.area, other)) for other in beside}
+        self._left.add(watch.area)
         return _Watch(leaf.area, watch.graphs | {watch.area: left, leaf.area: entered}, moved, joints=watch.joints)
 
     def _follow_merged(self, watch: _Watch, leaf: Leaf, merged: Merged) -> _Watch:
@@ -336,8 +398,8 @@ class Aam:
 
         def measure(keyframe: int, others: tuple[int, ...]) -> NDArray[np.float64]:
             poses = np.array([placed[other] for other in others]).reshape(-1, 3)
-            points = [self._points_of(other) for other in others]
-            return overlaps(self._points_of(keyframe), placed[keyframe], points, poses, self._options.overlap_radius)
+            seen = [self._seen_by(other) for other in others]
+            return sensed_overlaps(self._seen_by(keyframe), placed[keyframe], seen, poses, self._options.overlap_radius)
 
         return synchronised(graph, placed, measure, *others)
 

@@ -177,8 +177,8 @@ class BegunPart:
 # Raise a document's version with every change of its dataclass: a receiver refuses any other.
 _DOCUMENTS: dict[type, tuple[str, int]] = {
     KeyframeHead: ("keyframe", 4),
-    AreaEvents: ("area_events", 2),
-    Hypotheses: ("hypotheses", 4),
+    AreaEvents: ("area_events", 3),
+    Hypotheses: ("hypotheses", 5),
     Accepted: ("accepted", 4),
     LocalEstimate: ("local_estimate", 1),
     Arriving: ("arriving", 1),

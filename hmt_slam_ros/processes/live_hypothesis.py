@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
@@ -19,12 +19,11 @@ from hmt_slam_ros.local_map.local_mapping import LocalMapping
 from hmt_slam_ros.local_map.match_error import MatchError
 from hmt_slam_ros.processes.messages import Leaf, LeafEstimate, Merged, Relabelled, Trail
 from hmt_slam_ros.sensing import Scan
+from hmt_slam_ros.topology.crowding import Successor, in_place, successor
 
 _FIRST_COVARIANCE = np.diag([1e-8, 1e-8, 1e-8])
 _STAY = PoseGaussian.exactly(np.zeros(3))
 _NO_ERROR = MatchError(_FIRST_COVARIANCE, _FIRST_COVARIANCE, np.zeros((3, 3)))
-# Below 1, since the filter step at a keyframe may move the robot a little back towards the last one.
-_SAME_PLACE = 0.8
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,9 +184,7 @@ class LiveHypothesis:
         if not self.filter.keyframes:
             return True
         relative = se2.between(self.filter.leading_keyframe_poses(), self.filter.pose)
-        near = np.hypot(relative[:, 0], relative[:, 1]) < _SAME_PLACE * self.settings.keyframe_distance
-        alike = np.abs(relative[:, 2]) < _SAME_PLACE * math.radians(self.settings.keyframe_angle)
-        return not bool(np.any(near & alike))
+        return not bool(np.any(in_place(relative, self.settings)))
 
     def _drift_on(self, keyframe: int | None) -> None:
         """Carry the drift on to the pose now, of a keyframe that is stored, or of none over ground that is mapped."""
@@ -223,6 +220,32 @@ class LiveHypothesis:
         relative = se2.between(self.filter.leading_keyframe_poses(), self.filter.pose)
         cost = np.hypot(relative[:, 0], relative[:, 1]) + np.abs(relative[:, 2])
         self.anchor = self.filter.keyframes[int(np.argmin(cost))]
+
+    def forget(self, keyframes: Collection[int]) -> None:
+        """Go on without some keyframes of known ground; scans related to them are related to those that stay.
+
+        What they added to the local map stays there until that is loaded anew.
+        """
+        if not keyframes:
+            return
+        for keyframe in keyframes:
+            self.fresh.pop(keyframe, None)
+            self.placed.pop(keyframe, None)
+        names, poses = list(self.filter.keyframes), self.filter.leading_keyframe_poses()
+        areas, placed = dict(zip(names, self.filter.keyframe_areas, strict=True)), dict(zip(names, poses, strict=True))
+        for lost in ({self.anchor} | {anchor for _, anchor, _ in self.trail}) & set(keyframes):
+            staying = {k: at for k, at in placed.items() if k not in keyframes and areas[k] == areas[lost]}
+            self._relate_anew(lost, successor(placed[lost], staying))
+        self.filter.drop(keyframes)
+
+    def _relate_anew(self, lost: int, held: Successor) -> None:
+        """Relate to another keyframe what is related to one that is forgotten."""
+        self.trail = [
+            (stamp, held.keyframe, se2.compose(held.pose, pose)) if anchor == lost else (stamp, anchor, pose)
+            for stamp, anchor, pose in self.trail
+        ]
+        if self.anchor == lost:
+            self.anchor = held.keyframe
 
     def _revised(self, newest: int) -> tuple[Relabelled, ...]:
         # The messages must not hold on to the poses under all particles.

@@ -118,11 +118,29 @@ class AreaEvent:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
+class Forgotten:
+    """A keyframe of ground that others hold as well.
+
+    :ivar keyframe: its number.
+    :ivar area: the area in which it is.
+    """
+
+    keyframe: int
+    area: int
+
+
+@dataclass(frozen=True, eq=False, slots=True)
 class AreaEvents:
-    """aam -> tsbi, one for every keyframe event, mostly without events."""
+    """aam -> tsbi, one for every keyframe event, mostly without events.
+
+    :ivar sequence: the keyframe event that it answers.
+    :ivar events: of the hypotheses.
+    :ivar forgotten: keyframes that may be forgotten, where this is the map of one hypothesis alone.
+    """
 
     sequence: int
     events: tuple[AreaEvent, ...]
+    forgotten: tuple[Forgotten, ...] = ()
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -219,11 +237,13 @@ class Hypotheses:
     :ivar sequence: the keyframe event that it answers.
     :ivar leaves: every live hypothesis, ordered by id; probabilities sum to 1 less ``unexamined``.
     :ivar unexamined: probability of topologies that the gate did not examine or the reduction dropped.
+    :ivar forgotten: keyframes that are no more, in any map, after all other changes.
     """
 
     sequence: int
     leaves: tuple[Leaf, ...]
     unexamined: float = 0.0
+    forgotten: tuple[Forgotten, ...] = ()
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -43,12 +43,14 @@ class Replica:
     :ivar maps: {hypothesis: map}.
     :ivar probabilities: {hypothesis: P(gamma^t | d)}.
     :ivar areas: {hypothesis: the robot's area}.
+    :ivar contested: keyframes stored while there were several hypotheses, of which it may be that only some did.
     """
 
     scans: dict[int, Scan] = field(default_factory=dict)
     maps: dict[int, HybridMap] = field(default_factory=lambda: {FIRST_HYPOTHESIS: HybridMap()})
     probabilities: dict[int, float] = field(default_factory=lambda: {FIRST_HYPOTHESIS: 1.0})
     areas: dict[int, int] = field(default_factory=lambda: {FIRST_HYPOTHESIS: FIRST_AREA})
+    contested: set[int] = field(default_factory=set)
 
     @classmethod
     def of(cls, state: ReplicaState) -> Replica:
@@ -61,7 +63,9 @@ class Replica:
             common.set_arc(pair, arc)
         common.largest = state.largest
         maps = {h: HybridMap(common, own.area_keyframes(), own.arc_values()) for h, own in state.changes.items()}
-        return cls(dict(state.scans), maps, dict(state.probabilities), dict(state.areas))
+        agreed = {keyframe for keyframes in common.areas.values() for keyframe in keyframes}
+        contested = state.scans.keys() - agreed
+        return cls(dict(state.scans), maps, dict(state.probabilities), dict(state.areas), contested)
 
     @property
     def state(self) -> ReplicaState:
@@ -89,12 +93,19 @@ class Replica:
             if leaf.stored and leaf.hypothesis in self.maps:
                 self.maps[leaf.hypothesis].place(keyframe.sequence, leaf.area, leaf.pose.mean)
                 self.scans[keyframe.sequence] = keyframe.scan
+                if len(self.maps) > 1:
+                    self.contested.add(keyframe.sequence)
 
     def apply(self, hypotheses: Hypotheses) -> None:
         """Branch, change and drop hypotheses as TSBI decided."""
         self.maps = {leaf.hypothesis: self._child(leaf) for leaf in hypotheses.leaves}
         self.probabilities = {leaf.hypothesis: leaf.probability for leaf in hypotheses.leaves}
         self.areas = {leaf.hypothesis: leaf.area for leaf in hypotheses.leaves}
+        for one in hypotheses.forgotten:
+            for hybrid_map in self.maps.values():
+                hybrid_map.remove(one.keyframe, one.area)
+            del self.scans[one.keyframe]
+            self.contested.discard(one.keyframe)
 
     def _child(self, leaf: Leaf) -> HybridMap:
         parent = self.maps[leaf.parent]
@@ -111,9 +122,17 @@ class Replica:
         chosen = self.maps[accepted.hypothesis]
         self.change(chosen, accepted.relabelled, accepted.arcs)
         chosen.absorb()
+        self._drop_contested(chosen)
         self.maps = {accepted.hypothesis: chosen}
         self.probabilities = {accepted.hypothesis: 1.0}
         self.areas = {accepted.hypothesis: self.areas[accepted.hypothesis]}
+
+    def _drop_contested(self, hybrid_map: HybridMap) -> None:
+        """Forget the scans that were stored under hypotheses that are no more, when the map of one is left."""
+        for keyframe in self.contested:
+            if not any(keyframe in keyframes for keyframes in hybrid_map.common.areas.values()):
+                del self.scans[keyframe]
+        self.contested = set()
 
     @staticmethod
     def change(

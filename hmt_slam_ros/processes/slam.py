@@ -316,6 +316,8 @@ class MetricSlam:
 
     def _change_hypotheses(self, hypotheses: Hypotheses) -> None:
         """Branch, re-base and drop filters as TSBI decided."""
+        for live in self._live.values():
+            live.forget({one.keyframe for one in hypotheses.forgotten})
         for leaf in hypotheses.leaves:
             if leaf.merged is not None:
                 keyframes = self._replica.maps[leaf.parent].keyframes(leaf.merged.area)

@@ -167,11 +167,14 @@ class Tsbi:
         settled = self._settle(events.sequence, children, branches)
         chosen = [children[k] for k in settled.kept]
         changed = self._leaves(children, chosen, settled.probabilities)
-        self._replica.apply(Hypotheses(events.sequence, tuple(changed), settled.unexamined))
+        # What a question that is open again moves has to be there.
+        arrived_now = keyframe.carried or keyframe.place is not None
+        forgotten = () if self._reopened or arrived_now else events.forgotten
+        self._replica.apply(Hypotheses(events.sequence, tuple(changed), settled.unexamined, forgotten))
         loaded = [self._loaded(changed[n], child) for n, child in enumerate(chosen)]
         self._unexamined, self._reopened = settled.unexamined, self._reopened if keyframe.carried else ()
         leaves = tuple(sorted(loaded, key=lambda leaf: leaf.hypothesis))
-        return Hypotheses(events.sequence, leaves, settled.unexamined)
+        return Hypotheses(events.sequence, leaves, settled.unexamined, forgotten)
 
     def _parents(self, keyframe: Keyframe) -> list[Parent]:
         """The live hypotheses with their weights; of those that say the same, the heaviest, with the weight of all."""

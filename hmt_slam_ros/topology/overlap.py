@@ -2,6 +2,9 @@
 
 The overlap of scans i and j is the mean of two shares: of the points of i that have a point of j within a radius, and
 of the points of j that have one of i (Blanco, Gonzalez, Fernandez-Madrigal, IROS 2006, symmetrised by averaging).
+
+Scans in the middle of a hall, where the laser reaches nothing, saw free space only: that of two overlaps the less, the
+farther apart they were taken.
 """
 
 from __future__ import annotations
@@ -28,6 +31,40 @@ def sensed_points(scan: Scan, max_range: float, count: int = 180) -> NDArray[np.
     if len(near) <= count:
         return near
     return near[np.linspace(0.0, len(near) - 1.0, count).round().astype(np.int64)]
+
+
+class Sensed(NamedTuple):
+    """What is compared of a scan.
+
+    :ivar points: of :func:`sensed_points`, shape (k, 2), m.
+    :ivar reach: up to which the scan would have had others, m.
+    """
+
+    points: NDArray[np.float64]
+    reach: float
+
+    @classmethod
+    def of(cls, scan: Scan, max_range: float, count: int = 180) -> Sensed:
+        """Of a scan, as :func:`sensed_points`."""
+        return cls(sensed_points(scan, max_range, count), min(max_range, scan.range_max))
+
+
+def sensed_overlaps(
+    one: Sensed, pose: NDArray[np.float64], others: Sequence[Sensed], other_poses: NDArray[np.float64], radius: float
+) -> NDArray[np.float64]:
+    """Overlap of one scan with each of several others as :func:`overlaps`, where neither has points that of free space.
+
+    That falls from 1 to 0 as they are two reaches apart, linearly, as the common part of two discs does nearly.
+
+    :param others: m scans.
+    :returns: shape (m,), values in [0, 1].
+    """
+    found = overlaps(one.points, pose, [other.points for other in others], other_poses, radius)
+    free = [j for j, other in enumerate(others) if not len(other.points)]
+    if free and not len(one.points):
+        apart = np.hypot(*(other_poses[free, :2] - pose[:2]).T)
+        found[free] = np.maximum(0.0, 1.0 - apart / (one.reach + np.array([others[j].reach for j in free])))
+    return found
 
 
 def overlaps(

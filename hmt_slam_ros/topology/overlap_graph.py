@@ -30,6 +30,10 @@ class OverlapGraph:
             return self
         return OverlapGraph(tuple(self.keyframes[i] for i in rows), self.similarity[np.ix_(rows, rows)])
 
+    def without(self, gone: Collection[int]) -> OverlapGraph:
+        """The graph without those of its keyframes that are in ``gone``."""
+        return self.only(set(self.keyframes).difference(gone))
+
     def between(self, keyframe: int, others: Sequence[int]) -> NDArray[np.float64]:
         """Overlaps of a keyframe with others, NaN where either is not in this graph."""
         if keyframe not in self.keyframes:

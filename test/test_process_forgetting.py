@@ -1,0 +1,104 @@
+"""A robot that drives round and round over the same ground: what it knows does not grow with time."""
+
+import numpy as np
+import pytest
+
+from hmt_slam_ros.configuration import Configuration
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.logs import open_log
+from hmt_slam_ros.offline.recorder import Recorder
+from hmt_slam_ros.offline.runtime import Run
+from hmt_slam_ros.processes.messages import Hypotheses
+from hmt_slam_ros.sensing import Scan
+
+LAPS = 6
+
+
+class Ears:
+    """Two recorders, of which one keeps all messages; what was forgotten, and when."""
+
+    def __init__(self, *recorders):
+        self.recorders, self.forgotten = recorders, []
+
+    def handle(self, message):
+        if isinstance(message, Hypotheses):
+            self.forgotten += message.forgotten
+        return [answer for recorder in self.recorders for answer in recorder.handle(message)]
+
+
+class Rounds:
+    """A run of several laps.
+
+    :ivar keyframes: of the map after every lap.
+    """
+
+    def __init__(self):
+        self.log = open_log(f"sim:office,size=0.7,rate=2.5,laps={LAPS}")
+        self.run, self.folding = Run(Configuration()), Recorder(Configuration())
+        self.ears = Ears(self.run.recorder, self.folding)
+        self.run.lock_step.processes["recorder"] = self.ears
+        self.keyframes, self.kept = [], 0
+        for record in self.log.records():
+            self.run.read(record)
+            self.folding.fold()
+            self.kept = max(self.kept, len(self.folding.keyframes))
+            if isinstance(record.measurement, Scan) and self.run.scans * LAPS >= self.log.scan_count * (
+                len(self.keyframes) + 1
+            ):
+                self.keyframes.append(len(self.placed))
+        self.result = self.run.finish()
+        self.log_state = self.result.log
+        self.recording = self.run.recorder.finish(self.log_state.stamps)
+
+    @property
+    def placed(self):
+        """{keyframe: its area} of the map, of which there is one."""
+        replica = self.run.state.slam.replica
+        return {k for area in replica.common.area_keyframes().values() for k in area} | {
+            k for own in replica.changes.values() for area in own.area_keyframes().values() for k in area
+        }
+
+
+@pytest.fixture(scope="module")
+def rounds():
+    return Rounds()
+
+
+def test_the_map_of_later_laps_is_no_larger(rounds):
+    assert len(rounds.keyframes) == LAPS
+    assert rounds.keyframes[-1] <= 1.03 * rounds.keyframes[2], rounds.keyframes
+
+
+def test_what_is_forgotten_was_stored_before_and_is_gone_in_every_process(rounds):
+    state, gone = rounds.run.state, {one.keyframe for one in rounds.ears.forgotten}
+    assert len(gone) >= 4 * (LAPS - 2)
+    for replica in (state.slam.replica, state.aam.replica, state.tsbi.replica, state.tlca.replica,
+                    state.recorder.replica):
+        assert not gone & replica.scans.keys()
+        assert replica.scans.keys() == state.slam.replica.scans.keys()
+    assert not gone & rounds.placed
+    for live in state.slam.live.values():
+        assert not gone & {*live.filter.keyframes, *live.placed.by_keyframe(), *live.fresh.by_keyframe(), live.anchor}
+    assert not gone & {keyframe for graph in state.aam.graphs for keyframe in graph.keyframes}
+
+
+def test_every_scan_keeps_its_pose_relative_to_a_keyframe_that_is_there(rounds):
+    scans = rounds.recording.scans
+    assert set(scans.keyframes.tolist()) <= rounds.placed
+    known = scans.keyframes >= 0
+    assert known.all()
+    assert np.hypot(*scans.poses[:, :2].T).max() < 3.0
+    truth = rounds.log.true_poses(rounds.log_state.stamps)
+    steps = [se2.between(poses[:-10], poses[10:]) for poses in (truth, rounds.recording.trajectory)]
+    away = np.hypot(*(steps[1] - steps[0])[:, :2].T)
+    assert np.median(away) < 0.03
+    assert away.max() < 0.3
+
+
+def test_a_record_instead_of_messages_tells_the_same(rounds):
+    assert rounds.kept < 100 < len(rounds.run.recorder.keyframes)
+    folded = rounds.folding.finish(rounds.log_state.stamps)
+    for name in ("trajectory", "online", "odometry"):
+        np.testing.assert_array_equal(getattr(folded, name), getattr(rounds.recording, name))
+    assert folded.probabilities == rounds.recording.probabilities
+    assert folded.area_poses.keys() == rounds.recording.area_poses.keys()
