@@ -45,6 +45,7 @@ MEASUREMENTS = {
     "ambiguity": "whether both answers stay alive where places are identical, until the evidence",
     "oracle": "TSBI's PMF against an exact enumeration of all topologies",
     "awakening": "whether a robot that wakes up in a saved map finds out where, and after how many metres",
+    "laps": "whether memory, cost and errors grow where a robot drives over known ground again and again",
     "scale": "time and memory in maps of up to 100,000 areas",
     "short": "for CI, whether accuracy became worse than benchmark/expected.toml beyond noise",
 }
@@ -52,7 +53,7 @@ _GROUPS = {
     "all": ("accuracy", "steps", "robustness", "choices", "sessions", "speed"),
     "validation": (
         "calibration", "loops", "topology", "consistency", "evidence", "appearance", "ambiguity", "table", "oracle",
-        "awakening", "scale",
+        "awakening", "laps", "scale",
     ),
 }  # fmt: skip
 

@@ -12,7 +12,10 @@ import numpy as np
 import pytest
 from logs_for_nodes import corridor_bag, is_alive
 
+from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.evaluation import read_tum
+from hmt_slam_ros.logs import open_log
+from hmt_slam_ros.offline.runtime import Run
 from hmt_slam_ros.offline.saved_map import read_saved_map
 
 pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
@@ -106,6 +109,19 @@ def test_the_nodes_have_two_areas_become_one_as_the_lock_step_run_does(tmp_path)
     assert np.diff(table["areas"]).min() < 0
     for name in ("trajectory.tum", "trajectory_online.tum", "pmf.csv", "hmt_map/map.json", "hmt_map/map.bin"):
         assert (nodes / name).read_bytes() == (lock_step / name).read_bytes()
+
+
+def test_the_nodes_forget_the_keyframes_that_the_lock_step_run_forgets(tmp_path):
+    name = "sim:office,size=0.7,rate=1.5,laps=2"
+    log, run = open_log(name), Run(Configuration())
+    for record in log.records():
+        run.read(record)
+    gone = {one.keyframe for answer in run.recorder.hypotheses.values() for one in answer.forgotten}
+    assert len(gone) > 3
+    nodes, lock_step = mapped_twice(name, tmp_path)
+    assert not gone & read_saved_map(nodes / "hmt_map").replica.scans.keys()
+    for file in ("trajectory.tum", "trajectory_online.tum", "pmf.csv", "hmt_map/map.json", "hmt_map/map.bin"):
+        assert (nodes / file).read_bytes() == (lock_step / file).read_bytes()
 
 
 def test_the_report_accounts_for_every_scan_and_every_process(folders):

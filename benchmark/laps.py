@@ -1,0 +1,223 @@
+"""What grows with time where a robot drives over known ground again and again?"""
+
+from __future__ import annotations
+
+import gc
+import multiprocessing
+import resource
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+
+from benchmark.logs import opened
+from benchmark.report import Report, Requirement, table
+from benchmark.runs import PARAMETERS
+from benchmark.settings import Settings
+from hmt_slam_ros.configuration import Configuration, load_configuration
+from hmt_slam_ros.evaluation import (
+    Relations,
+    StampedPoses,
+    evaluate_relations,
+    read_relations,
+    true_relations,
+    truth_of,
+)
+from hmt_slam_ros.logs import open_log
+from hmt_slam_ros.logs.records import SIMULATED, Log, LogRecord
+from hmt_slam_ros.logs.stamps import NANOSECONDS
+from hmt_slam_ros.offline.memory import scan_bytes
+from hmt_slam_ros.offline.runtime import Run
+from hmt_slam_ros.processes.messages import Carried
+from hmt_slam_ros.processes.slam import MetricSlam
+from hmt_slam_ros.sensing import Scan
+
+WORLDS = ("office", "nested", "hall")
+LAPS, STEADY = 20, 3
+"""Laps of a simulated world, and after how many the memory is compared with that at the end."""
+
+LOGS = ("intel",)
+PASSES = 3
+"""How often a real log is played."""
+
+GROWTH = 0.05
+"""Largest growth of areas, keyframes and memory."""
+
+NOISE = 0.1
+"""Largest growth of what a scan costs, and of errors: they differ by as much from lap to lap."""
+
+_BETWEEN = 60 * NANOSECONDS
+
+POLICY = (
+    f"One run of {LAPS} laps of each world (seed 0), and one in which a log of a real robot is played {PASSES} times: "
+    "from its end the robot is carried to its beginning, is not told where it is, and maps on until it is recognized. "
+    f"The growth is that from lap {STEADY} to the last, of a log from its first pass to the last. Areas and keyframes "
+    "are those of the most probable map. Resident memory is that of the one OS process in which all five processes "
+    "run, libraries and kernels included, after a collection of garbage; it holds a pose for every scan of the log "
+    "too, about 200 bytes. The cost of a scan is CPU time of the processes. Errors are those of metric SLAM's "
+    "trajectory in the map at the end, before the final refinement, at relations within the lap."
+)
+
+
+@dataclass(frozen=True)
+class Lap:
+    """What a run came to after a lap.
+
+    :ivar areas: of the most probable map.
+    :ivar keyframes: likewise.
+    :ivar scans: kept in memory.
+    :ivar scan_bytes: what they take.
+    :ivar resident: memory of the OS process, bytes.
+    :ivar hypotheses: alive.
+    :ivar milliseconds: of computing for a scan of the lap, mean.
+    """
+
+    areas: int
+    keyframes: int
+    scans: int
+    scan_bytes: int
+    resident: int
+    hypotheses: int
+    milliseconds: float
+
+
+@dataclass(frozen=True, eq=False)
+class Laps:
+    """A run of several laps.
+
+    :ivar laps: in their order.
+    :ivar errors: mean error of translation at the relations of each lap, m.
+    """
+
+    laps: tuple[Lap, ...]
+    errors: tuple[float, ...]
+
+    def growth(self, value: Callable[[Lap], float], steady: int) -> float:
+        """From the end of lap ``steady`` to that of the last one, as a share."""
+        return value(self.laps[-1]) / value(self.laps[steady - 1]) - 1.0
+
+
+def measure_laps(settings: Settings) -> Report:
+    """Drive the laps, and compare the last with the first."""
+    report = Report("laps", "Known ground again and again", seeds=(0,))
+    configuration = load_configuration(PARAMETERS, list(settings.changes))
+    names = settings.logs_or((*WORLDS, *LOGS))
+    with opened([name for name in names if name not in WORLDS]) as logs:
+        asked: dict[str, tuple[str, Path | None, int]] = {
+            name: (f"{SIMULATED}{name},laps={LAPS}", None, LAPS) for name in names if name in WORLDS
+        }
+        asked |= {log.name: (str(log.path), log.relations_file, PASSES) for log in logs}
+        # A process of its own for each: memory is what it takes.
+        with ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), max_tasks_per_child=1) as pool:
+            runs = {name: pool.submit(driven, *what, configuration) for name, what in asked.items()}
+            found = {name: run.result() for name, run in runs.items()}
+    for name, laps in found.items():
+        report.requirements += requirements(name, laps)
+        report.data[name] = [asdict(lap) | {"error": own} for lap, own in zip(laps.laps, laps.errors, strict=True)]
+    report.body += [_table(found), POLICY]
+    return report
+
+
+def requirements(name: str, found: Laps) -> list[Requirement]:
+    """What is asked for of a run: that what it holds, what a scan costs and what it errs are the same in late laps."""
+    count = len(found.laps)
+    steady = STEADY if count > STEADY else 1
+    since = f"{name}, lap {steady} to {count}: growth of"
+    cost, error = ([*values] for values in ((lap.milliseconds for lap in found.laps), found.errors))
+    return [
+        Requirement(f"{since} areas", found.growth(lambda lap: lap.areas, steady), GROWTH),
+        Requirement(f"{since} keyframes", found.growth(lambda lap: lap.keyframes, steady), GROWTH),
+        Requirement(f"{since} resident memory", found.growth(lambda lap: lap.resident, steady), GROWTH),
+        Requirement(f"{since} the cost of a scan", cost[-1] / cost[steady - 1] - 1.0, NOISE),
+        Requirement(f"{since} the error", error[-1] / error[steady - 1] - 1.0, NOISE),
+    ]
+
+
+def driven(log: str, relations: Path | None, count: int, configuration: Configuration) -> Laps:
+    """Drive over a log ``count`` times, or over a simulated one that has as many laps."""
+    gc.freeze()
+    source, run = open_log(log), Run(configuration)
+    times = 1 if relations is None else count
+    ends = [round(source.scan_count * times * (lap + 1) / count) for lap in range(count)]
+    laps: list[Lap] = []
+    begin = time.process_time()
+    for record, carried in _passes(source, times):
+        if carried:
+            run.lock_step.feed(Carried())
+        run.read(record)
+        run.recorder.fold()
+        if isinstance(record.measurement, Scan) and run.scans == ends[len(laps)]:
+            seconds = time.process_time() - begin
+            laps.append(_lap(run, seconds / (ends[len(laps)] - ([0, *ends][len(laps)]))))
+            begin = time.process_time()
+    known = None if relations is None else read_relations(relations)
+    return Laps(tuple(laps), tuple(_errors(run, source, known, ends)))
+
+
+def _passes(log: Log, count: int) -> Iterator[tuple[LogRecord, bool]]:
+    """The records of a log, over and over on one clock, and whether the robot was carried before each."""
+    shift = stamp = 0
+    for number in range(count):
+        for n, record in enumerate(log.records()):
+            again = number > 0 and n == 0
+            if again:
+                shift = stamp + _BETWEEN - record.measurement.stamp
+            stamp = record.measurement.stamp + shift
+            yield replace(record, measurement=replace(record.measurement, stamp=stamp)), again
+
+
+def _lap(run: Run, seconds: float) -> Lap:
+    """What a run is after a lap in which a scan took so many seconds."""
+    gc.collect()
+    slam = run.lock_step.processes["slam"]
+    assert isinstance(slam, MetricSlam)
+    replica = slam.replica
+    hybrid_map, scans = replica.maps[replica.best], replica.scans
+    areas = hybrid_map.area_ids()
+    keyframes = sum(len(hybrid_map.keyframes(area)) for area in areas)
+    weight = scan_bytes(scans.values())
+    return Lap(len(areas), keyframes, len(scans), weight, _resident(), len(replica.maps), 1e3 * seconds)
+
+
+def _resident() -> int:
+    """Memory of this OS process, bytes."""
+    pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
+    return pages * resource.getpagesize()
+
+
+def _errors(run: Run, log: Log, known: Relations | None, ends: Sequence[int]) -> Iterator[float]:
+    """Mean error at the relations of each lap, m.
+
+    :param known: those of a log of a real robot; None where its records tell the truth.
+    :param ends: number of scans at the end of each lap.
+    """
+    result = run.finish()
+    recording, stamps = result.recorder.finish(result.log.stamps), result.log.source_stamps
+    truth = truth_of(log) if known is None else None
+    for first, end in pairwise([0, *ends]):
+        rows = slice(first, end)
+        lap = StampedPoses(stamps[rows], recording.trajectory[rows])
+        if truth is not None:
+            true = StampedPoses(truth.stamps[rows], truth.poses[rows])
+            yield evaluate_relations(lap, true_relations(true)).overall.translation.mean
+        elif known is not None:
+            yield evaluate_relations(lap, known).overall.translation.mean
+
+
+def _table(found: Mapping[str, Laps]) -> str:
+    head = ["log", "lap", "areas", "keyframes", "their scans [MB]", "resident [MB]", "hypotheses", "ms a scan"]
+    rows = []
+    for name, run in found.items():
+        for number in _shown(len(run.laps)):
+            lap = run.laps[number - 1]
+            figures = [lap.areas, lap.keyframes, f"{lap.scan_bytes / 1e6:.1f}", f"{lap.resident / 1e6:.0f}"]
+            figures += [lap.hypotheses, f"{lap.milliseconds:.2f}", f"{run.errors[number - 1]:.4f}"]
+            rows.append([name, str(number), *map(str, figures)])
+    return table([*head, "error [m]"], rows)
+
+
+def _shown(count: int) -> list[int]:
+    """The laps that stand in the table: the first ones, then every fifth, and the last."""
+    return [lap for lap in range(1, count + 1) if lap <= STEADY or lap % 5 == 0 or lap == count]
