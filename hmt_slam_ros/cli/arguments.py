@@ -42,7 +42,7 @@ def chosen_configuration(options: argparse.Namespace, base: Configuration | None
     :param base: instead of the defaults.
     :raises HmtSlamError: for a file, a name or a value that cannot be.
     """
-    named = {"start": "robot.start", "duration": "robot.duration", "rate": "robot.rate"}
+    named = {"mode": "mode", "start": "robot.start", "duration": "robot.duration", "rate": "robot.rate"}
     settings = list(options.settings)
     for option, name in named.items():
         value = getattr(options, option, None)
@@ -56,6 +56,9 @@ def _map(command: argparse.ArgumentParser) -> None:
         "--from", type=Path, dest="source", metavar="MAP",
         help="output folder or hmt_map of a part of the log or of other logs, to go on from with its parameters",
     )  # fmt: skip
+    command.add_argument(
+        "--mode", choices=("mapping", "localization"), help="localization leaves the map of --from as it is"
+    )
 
 
 def _replay(command: argparse.ArgumentParser) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import gc
 import resource
+import shutil
 import sys
 import time
 from collections.abc import Callable
@@ -29,6 +30,7 @@ from hmt_slam_ros.offline.reading import goes_on
 from hmt_slam_ros.offline.report import RunFigures
 from hmt_slam_ros.offline.runtime import run_log
 from hmt_slam_ros.offline.saved_map import RunState, read_run_state, read_saved_map
+from hmt_slam_ros.persistence.hmt_map import HMT_MAP
 
 
 def run(options: argparse.Namespace) -> None:
@@ -40,6 +42,9 @@ def run(options: argparse.Namespace) -> None:
         final, source_stamps, figures = measured_run(log, configuration, state, writer.write_state)
         del log, state  # they may be large
         write_output(folder, final, source_stamps, figures, configuration, writer)
+        if configuration.mode == "localization":
+            shutil.rmtree(folder / HMT_MAP)
+            shutil.copytree(map_folder(options.source), folder / HMT_MAP)
     print(summary(options.out, final.recording, log_seconds, figures.wall_seconds))
 
 
@@ -47,6 +52,8 @@ def _beginning(options: argparse.Namespace) -> tuple[Configuration, RunState, Lo
     """What the run begins with, which is nothing or the map that it goes on from, and the log."""
     if options.source is None:
         configuration = chosen_configuration(options)
+        if configuration.mode == "localization":
+            raise HmtSlamError("mode = localization wants a map to find the robot in: give --from, or map first")
         return configuration, RunState(), _opened(options.log, configuration)
     folder = map_folder(options.source)
     state, saved = read_run_state(folder)

@@ -28,9 +28,15 @@ class Configuration:
     """All parameters. Build one with ``loading.load_configuration`` or ``flat.with_changes``, which check it.
 
     :ivar seed: the one seed that all random numbers are derived from.
+    :ivar mode: what is done with known ground.
     """
 
     seed: int = parameter(0, "Seed of all random numbers of a run.", low=0, high=2**31 - 1)
+    mode: str = parameter(
+        "mapping",
+        "Whether the map grows, or the robot only finds its place in a map that stays as it was loaded.",
+        choices=("mapping", "localization"),
+    )
     motion: Motion = field(default_factory=Motion)
     local_map: LocalMap = field(default_factory=LocalMap)
     matching: Matching = field(default_factory=Matching)

@@ -33,6 +33,7 @@ class Beginning:
 
     :ivar events: keyframe events in it, 0 without.
     :ivar carried: whether nothing tells how the robot came from where it was then.
+    :ivar folder: of the map, None without.
     :ivar scans: scans that had a pose before; those to come are numbered on, so that they are told from these.
     """
 
@@ -43,8 +44,9 @@ class Beginning:
         :raises HmtSlamError: where it is damaged, or the node's parameters do not go with it.
         """
         self.events, self._folder, self.carried, self.scans = 0, None, carried and bool(path), scans
+        self.folder: Path | None = None
         if path:
-            folder = map_folder(Path(path))
+            self.folder = folder = map_folder(Path(path)).absolute()
             self._folder = FolderReader(folder, FORMAT, VERSION)
             saved = load_configuration(folder / CONFIGURATION)
             told = differences(saved, replace(node.configuration, robot=saved.robot))

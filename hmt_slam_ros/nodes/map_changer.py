@@ -43,6 +43,9 @@ class MapChanger(Round):
         if self._node.busy:
             response.message = "a map is being saved or loaded: ask again"
             return response
+        if not self._node.process.mapping:
+            response.message = "mode = localization keeps the map: set mode of slam to mapping first"
+            return response
         response.success, response.message = await self.ask()
         return response
 

@@ -97,12 +97,18 @@ class MapSaver(Round):
                 assert isinstance(part, SavedPart)
                 self._saving.writer.join(part.files)
             self._saving.writer.finish(self._node.configuration)
-            put_in_place(self._saving.folder, self._target)
+            put_in_place(self._kept() or self._saving.folder, self._target)
         except OSError as fault:
             raise HmtSlamError(
                 f"{self._target} cannot be written ({fault.strerror}): set save_to of slam to another folder"
             ) from fault
         return f"saved to {self._target}"
+
+    def _kept(self) -> Path | None:
+        """A copy of the map that was loaded, where the robot was only localized in it, without what it saw since."""
+        assert self._saving is not None
+        loaded = self._node.unchanged_map
+        return None if loaded is None else Path(shutil.copytree(loaded, self._saving.scratch / "kept"))
 
     def _clean_up(self) -> None:
         if self._saving is not None:

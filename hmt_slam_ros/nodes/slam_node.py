@@ -6,6 +6,7 @@ import sys
 import time
 from collections import deque
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -63,7 +64,7 @@ class SlamNode(ProcessNode):
     process: MetricSlam
 
     def __init__(self) -> None:
-        super().__init__("slam", _make_process, (Arriving, Keyframe, Trail, LocalEstimate, Finished))
+        super().__init__("slam", _make_process, (Arriving, Keyframe, Trail, LocalEstimate, Finished), ("mode",))
         self.map_frame = declare_frame(self, "map", "map")
         self._mounting = LaserMounting(self, self._work_off)
         self._pending: deque[LaserScan] = deque()
@@ -72,6 +73,7 @@ class SlamNode(ProcessNode):
         self._end: RobotStatus | None = None
         self._areas: dict[int, AreaPose] = {}
         self.estimate: LocalEstimate | None = None
+        self._unchanged = True
         self._take_over_map()
         self._held: deque[Message] = deque()
         self._saver = MapSaver(self, self._release)
@@ -93,6 +95,18 @@ class SlamNode(ProcessNode):
         self._areas = {FIRST_AREA: AreaPose(FIRST_AREA, PoseGaussian(np.zeros(3), np.zeros((3, 3))))}
         self._areas |= {entry.area: entry for entry in known.area_poses} if known else {}
         self.estimate = known.robot if known else None
+        self._unchanged = not self.process.mapping
+
+    def configuration_changed(self, configuration: Configuration) -> None:
+        """Take note of another mode, from the next keyframe on."""
+        super().configuration_changed(configuration)
+        self.process.mapping = configuration.mode == "mapping"
+        self._unchanged = self._unchanged and not self.process.mapping
+
+    @property
+    def unchanged_map(self) -> Path | None:
+        """The folder of the map that the node began with, where nothing but localization was done since."""
+        return self.beginning.folder if self._unchanged else None
 
     @property
     def scans(self) -> int:
@@ -130,6 +144,8 @@ class SlamNode(ProcessNode):
 
     def _begin(self) -> None:
         """Say where the robot is in the map that the node starts from."""
+        if not self.process.mapping and self.beginning.map is None:
+            self.figures.warn("mode = localization, but there is no map: call load_map, or set start_from or mode")
         told = declare_initial_pose(self)
         if told is not None and self.beginning.map is None:
             raise HmtSlamError("initial_pose is set, but no map that it is a pose in: set start_from, or leave it away")

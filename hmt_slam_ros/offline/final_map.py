@@ -44,13 +44,13 @@ class FinalMap:
 
 
 def final_map(recording: Recording, scans: Iterable[Scan], configuration: Configuration) -> FinalMap:
-    """Refine a run's map.
+    """Refine a run's map, if it is one that may change.
 
     :param scans: all scans of the newest log in its order; those of earlier logs stay where they are to keyframes.
     """
     travelled = carried(recording.scans, keyframe_poses(recording.hybrid_map, _areas_as_travelled(recording)))
     stages = {"filter": travelled, "arcs": recording.trajectory}
-    if not configuration.refinement.iterations:
+    if not configuration.refinement.iterations or configuration.mode == "localization":
         return FinalMap(recording, stages)
     keyframes = _Keyframes(recording, configuration)
     refined = _with_keyframes(recording, keyframes.refined(recording))

@@ -206,12 +206,15 @@ class Aam:
         self._seen[keyframe.sequence] = self._sensed(keyframe.scan)
         known = [leaf for leaf in keyframe.leaves if leaf.hypothesis in self._watches]
         events = [
-            self._cut(leaf, keyframe.sequence) or self._merged(leaf.hypothesis) or self._moved(leaf, keyframe.sequence)
+            self._cut(leaf, keyframe.sequence)
+            or (self._merged(leaf.hypothesis) if keyframe.mapping else None)
+            or self._moved(leaf, keyframe.sequence)
             for leaf in known
         ]
         if not any(leaf.stored for leaf in known):
             del self._seen[keyframe.sequence]
-        forgotten = self._superfluous(known[0], events[0], keyframe.sequence) if len(self._watches) == 1 else ()
+        may_forget = keyframe.mapping and len(self._watches) == 1
+        forgotten = self._superfluous(known[0], events[0], keyframe.sequence) if may_forget else ()
         return AreaEvents(keyframe.sequence, tuple(event for event in events if event is not None), forgotten)
 
     def _superfluous(self, leaf: LeafEstimate, event: AreaEvent | None, newest: int) -> tuple[Forgotten, ...]:

@@ -58,6 +58,7 @@ class KeyframeHead:
     leaves: tuple[LeafEstimate, ...]
     carried: bool
     place: Place | None
+    mapping: bool
 
     @classmethod
     def of(cls, keyframe: Keyframe) -> KeyframeHead:
@@ -65,7 +66,8 @@ class KeyframeHead:
         scan = keyframe.scan
         geometry = ScanGeometry(**{entry.name: getattr(scan, entry.name) for entry in fields(ScanGeometry)})
         return cls(
-            keyframe.sequence, geometry, keyframe.travelled, keyframe.leaves, keyframe.carried, keyframe.place
+            keyframe.sequence, geometry, keyframe.travelled, keyframe.leaves, keyframe.carried, keyframe.place,
+            keyframe.mapping,
         )  # fmt: skip
 
     def with_ranges(self, ranges: NDArray[np.float32]) -> Keyframe:
@@ -75,7 +77,9 @@ class KeyframeHead:
         """
         geometry = {entry.name: getattr(self.scan, entry.name) for entry in fields(self.scan)}
         scan = Scan(ranges=ranges, **geometry)
-        return Keyframe(self.sequence, scan, self.travelled, self.leaves, self.carried, self.place)
+        return Keyframe(
+            self.sequence, scan, self.travelled, self.leaves, self.carried, self.place, self.mapping
+        )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,7 +180,7 @@ class BegunPart:
 
 # Raise a document's version with every change of its dataclass: a receiver refuses any other.
 _DOCUMENTS: dict[type, tuple[str, int]] = {
-    KeyframeHead: ("keyframe", 4),
+    KeyframeHead: ("keyframe", 5),
     AreaEvents: ("area_events", 3),
     Hypotheses: ("hypotheses", 5),
     Accepted: ("accepted", 4),

@@ -148,20 +148,21 @@ class LiveHypothesis:
         return far or abs(moved[2]) >= math.radians(self.settings.keyframe_angle)
 
     def event(
-        self, sequence: int, scan: Scan, points: NDArray[np.float64], *, arriving: bool = False
+        self, sequence: int, scan: Scan, points: NDArray[np.float64], *, arriving: bool = False, storing: bool = True
     ) -> LeafEstimate:
         """One filter step with a keyframe's scan, which enters the map where it adds something new.
 
         :param sequence: number of the keyframe event.
         :param points: surfels of the scan, to be matched, shape (n, 4), base frame.
         :param arriving: whether nothing tells how the robot came there: the scan is matched with nothing.
+        :param storing: whether the hypothesis's map may change.
         """
         if arriving:
             unmoved, nothing = np.zeros(3), np.zeros((3, 3))
             step = FilterStep(unmoved, _NO_ERROR, nothing, 0.0, float(len(self.filter.poses)), False)
         else:
             step = self.filter.update(points, sequence)
-        stored = arriving or self._is_new()
+        stored = arriving or (storing and self._is_new())
         self.error = step.error
         self._drift_on(sequence if stored else None)
         if stored:
@@ -176,7 +177,7 @@ class LiveHypothesis:
             stored,
             step.log_evidence,
             step.effective_samples,
-            self._revised(sequence) if step.history_changed else (),
+            self._revised(sequence) if step.history_changed and storing else (),
         )
 
     def _is_new(self) -> bool:

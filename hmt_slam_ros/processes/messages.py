@@ -84,6 +84,7 @@ class Keyframe:
     :ivar leaves: one estimate for every live hypothesis, ordered by hypothesis id.
     :ivar carried: whether nothing tells how the robot came there from the keyframe before.
     :ivar place: where that is as somebody says, None where nobody did.
+    :ivar mapping: whether the map may change; what a robot adds to it that may be anywhere changes nothing of it.
     """
 
     sequence: int
@@ -92,6 +93,7 @@ class Keyframe:
     leaves: tuple[LeafEstimate, ...]
     carried: bool = False
     place: Place | None = None
+    mapping: bool = True
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -95,12 +95,15 @@ class MetricSlam:
 
     Consumes Scan, Odometry, Carried, Hypotheses, Accepted, EndOfLog; produces Arriving, Keyframe, Trail, LocalEstimate,
     Notice, Finished.
+
+    :ivar mapping: whether the map grows; otherwise only a robot that may be anywhere maps what is around it.
     """
 
     def __init__(self, configuration: Configuration, state: SlamState | None = None) -> None:
         """:param state: to go on from."""
         state = state or SlamState()
         self._configuration = configuration
+        self.mapping = configuration.mode == "mapping"
         self._mapping = LocalMapping(configuration)
         self._replica = Replica.of(state.replica)
         self._motion = MotionModel(configuration.motion, state.motion)
@@ -294,10 +297,13 @@ class MetricSlam:
     def _keyframe_event(self, scan: Scan, points: NDArray[np.float64]) -> list[Message]:
         sequence = self._events
         trails: list[Message] = self._trails()
-        leaves = tuple(live.event(sequence, scan, points, arriving=self._arriving) for live in self._live.values())
+        storing = self.mapping or self._lost
+        leaves = tuple(
+            live.event(sequence, scan, points, arriving=self._arriving, storing=storing) for live in self._live.values()
+        )
         self._motion.keyframe(self._best.moved, self._best.information)
         carried, place = self._arriving and sequence > 0, self._place
-        keyframe = Keyframe(sequence, scan, self._travelled, leaves, carried, place)
+        keyframe = Keyframe(sequence, scan, self._travelled, leaves, carried, place, self.mapping)
         self._replica.add(keyframe)
         self._events += 1
         self._waiting, self._arriving, self._place = True, False, None

@@ -151,6 +151,7 @@ class Tlca:
         # The stated risk: beyond it, TSBI's probabilities are not taken at their word.
         self._least_doubt = max(1.0 - self._options.accept_probability, _LEAST_DOUBT)
         self._accepted_now: frozenset[Name] = frozenset()
+        self._mapping = True
 
     @property
     def state(self) -> TlcaState:
@@ -171,7 +172,7 @@ class Tlca:
         """Learn from a ``Keyframe``; answer ``Hypotheses``."""
         if isinstance(message, Keyframe):
             self._replica.add(message)
-            self._travelled = message.travelled
+            self._travelled, self._mapping = message.travelled, message.mapping
             self._poses |= {leaf.hypothesis: leaf.pose.mean for leaf in message.leaves}
         elif isinstance(message, Hypotheses):
             return self._judge(message)
@@ -247,7 +248,8 @@ class Tlca:
         path, hybrid_map = self._paths[hypothesis], self._replica.maps[hypothesis]
         found = [seen.pair for seen in path.observations if seen.closure]
         found += [closure.pair for closure in path.closures if closure.undo is None]
-        closed = {area for pair in found for area in pair}
+        # What is refined moves, which is a change of the map.
+        closed = {area for pair in found for area in pair} if self._mapping else set()
         poses = {k: (area, pose) for area in sorted(closed) for k, pose in hybrid_map.keyframes(area).items()}
         made = self._acceptance.of(hybrid_map, self._replica.scans, path.observations, path.witnesses, closed)
         if made.arcs:

@@ -206,15 +206,20 @@ class Tsbi:
             return arrived(self._branching, parent, keyframe, self._estimates[parent.hypothesis].pose.mean)
         if self._reopened:
             return Branches([reopened(parent, leaf, keyframe.sequence) for leaf in self._reopened])
-        if event is not None and event.kind == "cut":
-            return with_displaced(
-                self._branching, parent, event.keyframes, self._branching.cut(parent, event.keyframes)
-            )
-        if event is not None and event.into is not None:
-            return Branches([merged_into(parent, event.area, event.into, self._branching.search)])
         if event is not None:
-            return self._branching.move(parent, event.area)
+            return self._changed(parent, event)
+        if not keyframe.mapping and parent.notes.lost is None:
+            return Branches([Child(parent.hypothesis, parent.log_weight, parent.area, parent.notes)])
         return self._go_on(parent, self._estimates[parent.hypothesis], keyframe.scan)
+
+    def _changed(self, parent: Parent, event: AreaEvent) -> Branches:
+        """Areas changed, or the robot its own."""
+        if event.kind == "cut":
+            others = self._branching.cut(parent, event.keyframes)
+            return with_displaced(self._branching, parent, event.keyframes, others)
+        if event.into is not None:
+            return Branches([merged_into(parent, event.area, event.into, self._branching.search)])
+        return self._branching.move(parent, event.area)
 
     def _go_on(self, parent: Parent, estimate: LeafEstimate, scan: Scan) -> Branches:
         """No area was left; but the robot may be in known ground that area abstraction does not know to be near."""

@@ -1,0 +1,92 @@
+"""Localization: the robot finds its place in a map that stays as it was loaded, until the mode is changed."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from logs_for_nodes import PACE
+from test_nodes_localization import SCANS, Nodes, mapped_corridor
+
+pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
+
+from rcl_interfaces.srv import SetParameters
+from rclpy.parameter import Parameter
+from std_msgs.msg import String
+from std_srvs.srv import Trigger
+
+from hmt_slam_ros.nodes import qos
+from hmt_slam_ros.nodes.conversions import planar_pose
+from hmt_slam_ros.nodes.topics import KEYFRAMES
+from hmt_slam_ros.processes.documents import KeyframeHead, decode
+
+
+@pytest.fixture(scope="module")
+def corridor(tmp_path_factory):
+    return mapped_corridor(tmp_path_factory.mktemp("corridor"))
+
+
+def content(folder):
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+def set_mode(listener, mode):
+    request = SetParameters.Request(parameters=[Parameter("mode", value=mode).to_parameter_msg()])
+    return listener.call(SetParameters, "slam/set_parameters", request).results[0]
+
+
+def stored(keyframes):
+    """Whether keyframes were stored under any hypothesis."""
+    heads = [decode(message.data, KeyframeHead) for message in keyframes]
+    return [any(leaf.stored for leaf in head.leaves) for head in heads]
+
+
+def test_a_robot_is_recognized_and_tracked_in_a_map_that_is_saved_as_it_was_loaded(corridor, listener, start, tmp_path):
+    log, out = corridor
+    nodes = Nodes(start, listener, start_from=out, mode="localization", save_to=tmp_path / "saved")
+    keyframes = listener.hear(String, KEYFRAMES, qos.CHAIN)
+    nodes.drive(log, first=20, rate=8.0)
+    nodes.until(nodes.is_localized)
+    nodes.until(lambda: len(nodes.estimates) == SCANS - 20)
+    nodes.until(lambda: np.abs(planar_pose(nodes.poses[-1].pose.pose) - 4 * (SCANS - 1) * PACE).max() < 0.15)
+    while_lost = stored(keyframes)
+    # What it needs to be recognized, and nothing since.
+    assert while_lost[0]
+    assert not any(while_lost[8:])
+    assert len(while_lost) > 12
+    saved = listener.call(Trigger, "slam/save", Trigger.Request())
+    assert saved.success, saved.message
+    assert content(tmp_path / "saved") == content(out / "hmt_map")
+
+    kept = listener.call(Trigger, "slam/reset", Trigger.Request())
+    assert (kept.success, kept.message) == (
+        False, "mode = localization keeps the map: set mode of slam to mapping first"
+    )  # fmt: skip
+
+    refused = set_mode(listener, "sleeping")
+    assert not refused.successful
+    assert "mode = sleeping is not a choice: use mapping or localization" in refused.reason
+    assert set_mode(listener, "mapping").successful
+    nodes.park()
+    assert listener.call(Trigger, "slam/carried", Trigger.Request()).success
+    nodes.drive(log, first=0, robot__duration=3.0)
+    nodes.until(lambda: len(nodes.estimates) == SCANS - 20 + 15)
+    assert listener.call(Trigger, "slam/save", Trigger.Request()).success
+    assert content(tmp_path / "saved") != content(out / "hmt_map")
+
+
+def test_offline_too_the_map_stays_as_it_was(corridor, tmp_path):
+    log, out = corridor
+
+    def mapped(*arguments):
+        command = [sys.executable, "-m", "hmt_slam_ros.cli.main", "map", str(log), "--out", str(tmp_path / "out")]
+        return subprocess.run([*command, *arguments], check=False, capture_output=True, text=True, timeout=120)
+
+    found = mapped("--from", str(out), "--mode", "localization", "--start", "4.0")
+    assert found.returncode == 0, found.stderr
+    assert content(tmp_path / "out" / "hmt_map") == content(out / "hmt_map")
+    poses = np.loadtxt(tmp_path / "out" / "trajectory.tum")
+    assert np.abs(poses[-1, 1:3] - 4 * (SCANS - 1) * PACE[:2]).max() < 0.1
+    alone = mapped("--mode", "localization")
+    assert alone.returncode == 2
+    assert "mode = localization wants a map to find the robot in: give --from" in alone.stderr
