@@ -66,5 +66,4 @@ def _anywhere(known: int, where: Whereabouts | None) -> list[float]:
     areas: dict[int, float] = {}
     for located, probability in zip(where.found, where.probabilities.tolist(), strict=True):
         areas[located.area] = areas.get(located.area, 0.0) + probability
-    others = [where.unseen / where.others] * where.others if where.others else []
-    return [*areas.values(), *others, max(0.0, 1.0 - sum(areas.values()) - where.unseen)]
+    return [*areas.values(), max(0.0, 1.0 - sum(areas.values()))]

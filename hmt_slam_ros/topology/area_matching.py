@@ -47,6 +47,7 @@ class MatchSettings:
     :ivar max_modes: at most this many modes are worked out, the heaviest; some may turn out to be the same.
     :ivar sigma_floor: smallest deviation of a mode's translation, m.
     :ivar angle_floor: smallest deviation of a mode's angle, rad.
+    :ivar reverse: whether surfaces of the candidate in what is free space to the query speak against a pose.
     :ivar least: poses at which the samples' log-ratio is less than this on average are not looked for, nats.
     """
 
@@ -57,6 +58,7 @@ class MatchSettings:
     sigma_floor: float = 0.01
     angle_floor: float = math.radians(0.2)
     least: float = -math.inf
+    reverse: bool = True
 
     @classmethod
     def of(cls, options: TopologicalInference) -> MatchSettings:
@@ -141,7 +143,7 @@ def _searched(
     turn = _turn(candidate.cell, centred.points)
     window = make_window(prior.mean, prior.covariance, candidate.cell, turn, settings.gate, bounds)
     surface, log_cell = _fine(candidate), _log_cell_mass(prior, candidate.cell, turn)
-    back_points = _within_reach(candidate.points, window, centred)
+    back_points = _within_reach(candidate.points[: None if settings.reverse else 0], window, centred)
     threshold = max(
         math.log(_NEGLIGIBLE) - min(0.0, log_cell), settings.temper * settings.least * len(query.points)
     )

@@ -256,7 +256,7 @@ class ClosureSearch:
         A robot that comes back to known ground sees it before it is in it.
         """
         query, fresh = self._views.grid(candidate.fresh), candidate.fresh
-        bounds = reach_of(place, query, fresh, self._options.place_radius)
+        bounds = reach_of(place.positions, query, fresh, self._options.place_radius)
         modes = match(query, place.grid, candidate.prior, self._settings, bounds).modes
         poses = [se2.compose(mode.pose.mean, stacked(fresh)) for mode in modes]
         owners = [owner_at(place, at, self._options.place_radius) for at in poses]

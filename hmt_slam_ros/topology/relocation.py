@@ -41,6 +41,9 @@ _SHARP, _KNOWN = 0.2, 0.7
 # Of the log-ratio of a sample on a surface, as much on average at least.
 _SURE = math.log(3.0)
 _LEAST = 0.35 * _SURE
+# Likewise of a robot that may be anywhere: what it sees is in the map, or it is not. That little of the map is where it
+# sees free space is not asked, as what moved through known ground left its traces there.
+_HALF = 0.5 * _SURE
 # Where so much less of the surfaces is known than in another area, an area does not matter.
 _WORSE = 0.15
 
@@ -66,7 +69,7 @@ class Relocation:
 
     def __init__(self, views: Views, looks: Looks, settings: MatchSettings, radius: float) -> None:
         self._views, self._looks, self._radius = views, looks, radius
-        self._settings = replace(settings, margin=_MARGIN, least=_LEAST)
+        self._settings = replace(settings, margin=_MARGIN)
 
     def located(
         self, hybrid_map: HybridMap, poses: Mapping[int, Pose], before: float, here: int
@@ -78,7 +81,7 @@ class Relocation:
         :param here: an area that is looked at in any case.
         :returns: that, and the probability by their looks of the areas that were not looked at.
         """
-        found, _, unseen = self.fits(hybrid_map, poses, before, _MOST, {here})
+        found, unseen = self._fits_alike(hybrid_map, poses, before, here)
         if not found:
             return None, unseen
         masses = np.array([fit.mode.log_mass for fit in found])
@@ -87,25 +90,47 @@ class Relocation:
         known = found[best].found.share >= _KNOWN
         return found[best] if alone and known and is_certain(found[best]) else None, unseen
 
-    def fits(
-        self, hybrid_map: HybridMap, poses: Mapping[int, Pose], before: float, most: int, always: Collection[int] = ()
-    ) -> tuple[list[Located], list[int], float]:
-        """How the keyframes lie in the areas that look most like them.
+    def everywhere(
+        self,
+        hybrid_map: HybridMap,
+        poses: Mapping[int, Pose],
+        before: float,
+        among: Collection[int] | None = None,
+    ) -> tuple[list[Located], list[int]]:
+        """How the keyframes lie in all areas.
 
-        :param most: this many areas are looked at.
-        :param always: and these.
-        :returns: the fits that matter beside the best, the areas that were looked at, and the probability by their
-            looks of the others.
+        :param among: none but these, if not all.
+        :returns: the fits that matter beside the best, and the areas.
         """
         shares = self.shares(hybrid_map, list(poses), before)
-        chosen = sorted(shares, key=lambda area: (-shares[area], area))[:most]
-        unseen = max(0.0, 1.0 - sum(shares[area] for area in chosen))
-        looked_at = list(dict.fromkeys([*chosen, *sorted(shares.keys() & set(always))]))
+        known = [area for area in shares if among is None or area in among]
+        areas = sorted(known, key=lambda area: (-shares[area], area))
+        settings = replace(self._settings, reverse=False)
         found: list[Located] = []
-        for area in looked_at:
+        for area in areas:
             best = max((fit.found.share for fit in found), default=0.0)
-            found += self._fits(hybrid_map, poses, area, before, (best - _WORSE) * _SURE)
-        return found, looked_at, unseen
+            place = self._views.place(hybrid_map, area, (), before)
+            own = place.positions[place.owners == area]
+            found += self._fits(place, poses, own, replace(settings, least=max(_HALF, (best - _WORSE) * _SURE)))
+        return found, areas
+
+    def _fits_alike(
+        self, hybrid_map: HybridMap, poses: Mapping[int, Pose], before: float, here: int
+    ) -> tuple[list[Located], float]:
+        """How the keyframes lie in the areas that look most like them, and in ``here``.
+
+        :returns: the fits that matter beside the best, and the probability of the other areas by their looks.
+        """
+        shares = self.shares(hybrid_map, list(poses), before)
+        chosen = sorted(shares, key=lambda area: (-shares[area], area))[:_MOST]
+        unseen = max(0.0, 1.0 - sum(shares[area] for area in chosen))
+        found: list[Located] = []
+        for area in dict.fromkeys([*chosen, *sorted(shares.keys() & {here})]):
+            best = max((fit.found.share for fit in found), default=0.0)
+            place = self._views.place(hybrid_map, area, (), before)
+            settings = replace(self._settings, least=max(_LEAST, (best - _WORSE) * _SURE))
+            found += self._fits(place, poses, place.positions, settings)
+        return found, unseen
 
     def shares(self, hybrid_map: HybridMap, keyframes: Sequence[int], before: float) -> dict[int, float]:
         """p(gamma | phi): the probability of every area by its look alone; they sum to 1.
@@ -119,18 +144,20 @@ class Relocation:
         return dict(zip(areas, weights.tolist(), strict=True))
 
     def _fits(
-        self, hybrid_map: HybridMap, poses: Mapping[int, Pose], area: int, before: float, least: float
+        self, place: Place, poses: Mapping[int, Pose], positions: NDArray[np.float64], settings: MatchSettings
     ) -> list[Located]:
-        """How the keyframes lie in one area, where their samples' log-ratio is at least so much on average."""
+        """How the keyframes lie in an area's place.
+
+        :param positions: shape (n, 2), near which one of them is.
+        """
         query = self._views.grid(poses)
-        place = self._views.place(hybrid_map, area, (), before)
         some, known = (replace(grid, points=grid.points[::_EVERY]) for grid in (query, place.grid))
-        settings = replace(self._settings, temper=_EVERY * self._settings.temper, least=max(_LEAST, least))
-        modes = match(some, known, _FLAT, settings, reach_of(place, query, poses, self._radius)).modes
+        settings = replace(settings, temper=_EVERY * settings.temper)
+        modes = match(some, known, _FLAT, settings, reach_of(positions, query, poses, self._radius)).modes
         return [
-            Located(area, mode, place.grid.agreement(query.points, mode.pose.mean))
+            Located(place.area, mode, place.grid.agreement(query.points, mode.pose.mean))
             for mode in modes
-            if owner_at(place, se2.compose(mode.pose.mean, stacked(poses)), self._radius) == area
+            if owner_at(place, se2.compose(mode.pose.mean, stacked(poses)), self._radius) == place.area
         ]
 
 
@@ -140,14 +167,17 @@ def is_certain(located: Located) -> bool:
     return variance <= _SHARP**2
 
 
-def reach_of(place: Place, query: AreaGrid, poses: Mapping[int, Pose], radius: float) -> NDArray[np.float64]:
-    """The smallest and the largest (x, y) of the middle of the query's points where a keyframe of it is in the
-    area's place or in one beside it, shape (2, 2).
+def reach_of(
+    positions: NDArray[np.float64], query: AreaGrid, poses: Mapping[int, Pose], radius: float
+) -> NDArray[np.float64]:
+    """The smallest and the largest (x, y) of the middle of the query's points where a keyframe of it is near one of
+    some positions, shape (2, 2).
 
+    :param positions: shape (n, 2), m.
     :param poses: {keyframe: ``reference_T_base``} of the query.
-    :param radius: farthest distance to a keyframe of the place, m.
+    :param radius: how near, m.
     """
     middle = query.points.mean(axis=0) if len(query.points) else np.zeros(2)
     lever = float(np.hypot(*(stacked(poses)[:, :2] - middle).T).max())
     reach = radius + lever
-    return np.array([place.positions.min(axis=0) - reach, place.positions.max(axis=0) + reach])
+    return np.array([positions.min(axis=0) - reach, positions.max(axis=0) + reach])

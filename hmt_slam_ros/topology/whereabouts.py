@@ -27,8 +27,6 @@ from hmt_slam_ros.topology.unknown import joined
 UNMAPPED = 0.2
 """Probability that a robot that woke up somewhere is where the map does not reach."""
 
-# Areas whose surfaces are compared.
-_MOST = 16
 # Deviations of what somebody says, beyond which no place is looked at.
 _DEVIATIONS = 4.0
 
@@ -54,14 +52,10 @@ class Whereabouts(NamedTuple):
 
     :ivar found: ways in which what it saw lies in the map.
     :ivar probabilities: shape (len(found),).
-    :ivar unseen: probability of the areas that were not looked at.
-    :ivar others: their number.
     """
 
     found: tuple[Located, ...]
     probabilities: NDArray[np.float64]
-    unseen: float
-    others: int
 
     @property
     def best(self) -> tuple[Located, float] | None:
@@ -93,17 +87,12 @@ def whereabouts(
     :param radius: farthest distance to a keyframe of an area's place, m.
     """
     near = None if told is None else _near(hybrid_map, told, radius, before)
-    known = sum(any(k < before for k in hybrid_map.keyframes(area)) for area in hybrid_map.area_ids())
-    if near is None:
-        found, looked_at, unseen = relocation.fits(hybrid_map, poses, before, _MOST)
-    else:
-        found, looked_at, _ = relocation.fits(hybrid_map, poses, before, 0, near)
-        unseen = 0.0
+    found, areas = relocation.everywhere(hybrid_map, poses, before, near)
     whole: dict[int, float] = {}
     for fit in found:
         whole[fit.area] = float(np.logaddexp(whole.get(fit.area, -math.inf), fit.mode.log_mass))
-    log_flat = math.log((1.0 - UNMAPPED) / max(1, known))
-    best = {area: max((fit.found.share for fit in found if fit.area == area), default=0.0) for area in looked_at}
+    log_flat = math.log((1.0 - UNMAPPED) / max(1, len(areas)))
+    best = {area: max((fit.found.share for fit in found if fit.area == area), default=0.0) for area in areas}
     likeness = Likeness(alike)
     likeness.count(sorted(best.values())[:-1])
     logs = [
@@ -113,10 +102,8 @@ def whereabouts(
         + likeness.log_rarity(fit.found.share, foretold=False)
         for fit in found
     ]  # fmt: skip
-    weights = np.exp(np.array([*logs, math.log(UNMAPPED), math.log((1.0 - UNMAPPED) * unseen + 1e-300)]))
-    probabilities = weights / weights.sum()
-    others = max(0, known - len(looked_at))
-    return Whereabouts(tuple(found), probabilities[: len(found)], float(probabilities[-1]), others)
+    weights = np.exp(np.array([*logs, math.log(UNMAPPED)]))
+    return Whereabouts(tuple(found), (weights / weights.sum())[:-1])
 
 
 def _near(hybrid_map: HybridMap, told: Told, radius: float, before: int) -> dict[int, PoseGaussian]:
