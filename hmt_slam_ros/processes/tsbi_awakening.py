@@ -1,13 +1,15 @@
 """A robot that woke up somewhere: it maps around itself, and is joined to the map where it is recognized.
 
 It is not known how it came there, so that it begins a new area, to which an arc leads that tells nothing. From then on
-all that it saw is looked for in the whole map, again and again, until one place has nearly all of the probability; then
-a further continuation of the path closes the loop between the two maps, and TLCA decides as it does about any other.
+all that it saw is looked for in the whole map, again and again, until one place has nearly all of the probability at
+two looks in a row, or at one where somebody says that it is there; then a further continuation of the path closes the
+loop between the two maps, and TLCA decides as it does about any other.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -17,19 +19,22 @@ from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.processes.messages import Arc, Keyframe, Place
 from hmt_slam_ros.processes.tsbi_branching import Branches, Branching, Child, Parent
-from hmt_slam_ros.topology.relocation import is_certain
+from hmt_slam_ros.topology.hypothesis_tree import Sighting
+from hmt_slam_ros.topology.relocation import Located, is_certain
 from hmt_slam_ros.topology.shortest_path import reachable
 from hmt_slam_ros.topology.unknown import tells_nothing, unknown
 from hmt_slam_ros.topology.whereabouts import Told
 
 Pose = NDArray[np.float64]
 
-# Probability that the most probable place needs to have.
-_ENOUGH = 0.9
-# So many keyframes that fit nowhere near where somebody says refute it.
-_REFUTED = 5
+# Probability that a place needs to have at two looks in a row, and at one look where somebody says so.
+_TWICE, _ONCE = 0.8, 0.9
+# Two looks found the same place where they have a keyframe within so much of each other, m and rad.
+_NEAR, _TURN = 1.0, math.radians(15.0)
+# So many keyframes that fit nowhere near where somebody says, in this probability, refute it.
+_REFUTED, _NOWHERE = 5, 0.9
 # Keyframes that are laid into the map at most, the newest.
-_MOST = 25
+_MOST = 40
 
 
 def arrived(branching: Branching, parent: Parent, keyframe: Keyframe, pose: Pose) -> Branches:
@@ -100,20 +105,48 @@ def looked_for(branching: Branching, parent: Parent) -> Branches:
     keyframes = _seen_since(parent, parent.notes.lost)
     reference = next(iter(keyframes.values()))
     poses = {k: se2.between(reference, pose) for k, pose in keyframes.items()}
-    where = branching.search.everywhere(parent.hybrid_map, poses, parent.notes.lost, _told_of(parent, keyframes))
+    told = _told_of(parent, keyframes)
+    where = branching.search.everywhere(parent.hybrid_map, poses, parent.notes.lost, told)
     noted = replace(parent, notes=parent.notes.checked((), tuple(poses)))
-    if len(keyframes) >= _REFUTED and float(where.probabilities.sum()) < 1.0 - _ENOUGH:
+    if len(keyframes) >= _REFUTED and float(where.probabilities.sum()) < 1.0 - _NOWHERE:
         noted = replace(noted, notes=replace(noted.notes, told=None))
-    still = Child(parent.hypothesis, parent.log_weight, parent.area, noted.notes)
     best = where.best
-    if best is None or best[1] < _ENOUGH or not is_certain(best[0]):
-        return Branches([still], True, where=where)
+    if best is None or best[1] < _TWICE or not is_certain(best[0]):
+        unsighted = replace(noted.notes, sighted=None)
+        return Branches([Child(parent.hypothesis, parent.log_weight, parent.area, unsighted)], True, where=where)
     located, probability = best
+    sighted = replace(noted.notes, sighted=_sighting(located, poses))
+    still = Child(parent.hypothesis, parent.log_weight, parent.area, sighted)
+    if not (told is not None and probability >= _ONCE) and not _seen_again(parent, located, poses):
+        return Branches([still], True, where=where)
     arc = Arc(parent.area, located.area, PoseGaussian.exactly(reference).compose(located.mode.measured.inverse()), True)
-    log_weight, notes = parent.log_weight + math.log(probability), replace(noted.notes, lost=None, told=None)
+    log_weight, notes = parent.log_weight + math.log(probability), replace(noted.notes, lost=None, told=None, sighted=None)
     found = Child(parent.hypothesis, log_weight, parent.area, notes, arcs=(arc,), reload=True)
     still = replace(still, log_weight=parent.log_weight + math.log(max(1.0 - probability, 1e-300)))
     return Branches([still, found], True, where=where)
+
+
+def _sighting(located: Located, poses: Mapping[int, Pose]) -> Sighting:
+    newest = max(poses)
+    return Sighting(located.area, newest, se2.compose(located.mode.pose.mean, poses[newest]))
+
+
+def _seen_again(parent: Parent, located: Located, poses: Mapping[int, Pose]) -> bool:
+    """Whether the last look found the robot where this one has it.
+
+    A place that looks alike is seldom taken for the right one twice, as other things are seen next.
+
+    :param poses: {keyframe: ``reference_T_base``} of those that were located.
+    """
+    before = parent.notes.sighted
+    if before is None or before.keyframe not in poses:
+        return False
+    frames = reachable(parent.hybrid_map, located.area, until=(before.area,))
+    if before.area not in frames:
+        return False
+    now = se2.compose(located.mode.pose.mean, poses[before.keyframe])
+    away = se2.between(now, se2.compose(frames[before.area].mean, before.pose))
+    return bool(math.hypot(away[0], away[1]) <= _NEAR and abs(away[2]) <= _TURN)
 
 
 def _told_of(parent: Parent, keyframes: dict[int, Pose]) -> Told | None:

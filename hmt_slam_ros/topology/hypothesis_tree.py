@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.topology.reduction import reduce_hypotheses
 from hmt_slam_ros.topology.whereabouts import Told
@@ -22,6 +23,20 @@ _DISPLACED = 1e-5
 _DOUBTFUL, _KEPT = -2.0, 30
 # Doubts at most so many events apart are about one and the same moment.
 _TOGETHER = 3
+
+
+@dataclass(frozen=True, eq=False)
+class Sighting:
+    """Where in the map a robot that may be anywhere seems to be.
+
+    :ivar area: a known area.
+    :ivar keyframe: of what it saw.
+    :ivar pose: shape (3,), ``area_T_base`` of that.
+    """
+
+    area: int
+    keyframe: int
+    pose: Float64
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,6 +56,7 @@ class LeafNotes:
         whose scans contradicted what the robot should have seen.
     :ivar lost: the keyframe at which the robot arrived it is not known where, until that is recognized; else None.
     :ivar told: where one of the keyframes since then is, as somebody says; else None.
+    :ivar sighted: where it was recognized at the last look, if it was.
     """
 
     covariances: Mapping[int, Covariance] = field(default_factory=dict)
@@ -52,6 +68,7 @@ class LeafNotes:
     doubts: Mapping[int, float] = field(default_factory=dict)
     lost: int | None = None
     told: Told | None = None
+    sighted: Sighting | None = None
 
     def heard(self, event: int, log_evidence: float) -> LeafNotes:
         """After the scan of a keyframe event; one that was displaced before it would see a place that looks alike."""
@@ -98,7 +115,7 @@ class LeafNotes:
         """After the robot entered another area together with the keyframes of ``covariances``."""
         kept = {area: keyframes & covariances.keys() for area, keyframes in self.compared.items()}
         compared = {area: keyframes for area, keyframes in kept.items() if keyframes}
-        return LeafNotes(covariances, compared, doubts=self.doubts, lost=self.lost, told=self.told)
+        return LeafNotes(covariances, compared, doubts=self.doubts, lost=self.lost, told=self.told, sighted=self.sighted)
 
 
 def relative_covariance(

@@ -44,6 +44,9 @@ _LEAST = 0.35 * _SURE
 # Likewise of a robot that may be anywhere: what it sees is in the map, or it is not. That little of the map is where it
 # sees free space is not asked, as what moved through known ground left its traces there.
 _HALF = 0.5 * _SURE
+# Deviation of an area's position, m, up to which it is part of a place: keyframes lie across the border of two areas
+# also where their arc was travelled over once.
+_WIDE = 1.0
 # Where so much less of the surfaces is known than in another area, an area does not matter.
 _WORSE = 0.15
 
@@ -109,7 +112,7 @@ class Relocation:
         found: list[Located] = []
         for area in areas:
             best = max((fit.found.share for fit in found), default=0.0)
-            place = self._views.place(hybrid_map, area, (), before)
+            place = self._views.place(hybrid_map, area, (), before, _WIDE)
             own = place.positions[place.owners == area]
             found += self._fits(place, poses, own, replace(settings, least=max(_HALF, (best - _WORSE) * _SURE)))
         return found, areas

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import OrderedDict
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numba import njit
@@ -172,14 +172,21 @@ class Views:
         return self.grid(old)
 
     def place(
-        self, hybrid_map: HybridMap, area: int, without: Collection[int], before: float = math.inf
+        self,
+        hybrid_map: HybridMap,
+        area: int,
+        without: Collection[int],
+        before: float = math.inf,
+        sigma: float | None = None,
     ) -> Place:
         """An area with those around it, so that an overlap is not cut off at the area's edge.
 
         :param without: areas that are left out.
         :param before: keyframes from this one on are left out as well.
+        :param sigma: largest deviation of another area's position, m, if not that which counts as around elsewhere.
         """
-        around = areas_around(hybrid_map, area, self._nearness, without)
+        nearness = self._nearness if sigma is None else replace(self._nearness, sigma=sigma)
+        around = areas_around(hybrid_map, area, nearness, without)
         return self.place_of(hybrid_map, area, {other: belief.mean for other, belief in around.items()}, before)
 
     def place_of(
