@@ -100,7 +100,8 @@ def measure_awakening(settings: Settings) -> Report:
             report.data[name] = [asdict(one) for one in found]
             share = float(np.mean([one.right and one.found <= FAR and not one.wrong for one in found]))
             if name not in ALIKE:
-                report.requirements.append(Requirement(f"{name}: right within {FAR:g} m", share, 1.0, least=RIGHT_SHARE))
+                asked = Requirement(f"{name}: right within {FAR:g} m", share, 1.0, least=RIGHT_SHARE)
+                report.requirements.append(asked)
             wrong = sum(one.wrong for one in found)
             report.requirements.append(Requirement(f"{name}: confident wrong answers", wrong, 0))
     columns = ["log", "starts", f"right within {FAR:g} m", "m until known, mean", "median", "wrong", "never known"]

@@ -11,9 +11,11 @@ from hmt_slam_ros.offline.runtime import Run
 from hmt_slam_ros.processes.messages import Carried
 from hmt_slam_ros.processes.replica import Replica
 from hmt_slam_ros.sensing import Scan
+from hmt_slam_ros.topology.closure_search import ClosureSearch
 from hmt_slam_ros.topology.unknown import tells_nothing, unknown
 
 WORLD = "sim:office,seed=3,size=0.7"
+OFF = np.array([5.0, 0.0, 0.0])
 
 
 @pytest.fixture(scope="module")
@@ -53,6 +55,27 @@ def test_it_is_recognized_where_it_is(office, share):
     assert found.right
     assert not found.wrong
     assert found.found <= FAR
+
+
+def test_it_is_not_believed_to_be_where_one_look_alone_finds_it(office, monkeypatch):
+    """Every other look finds it 5 m off."""
+    looks, found = [], ClosureSearch.everywhere
+
+    def off_at_times(search, *asked):
+        looks.append(found(search, *asked))
+        if len(looks) % 2:
+            return looks[-1]
+        moved = [
+            fit._replace(mode=fit.mode._replace(pose=PoseGaussian(fit.mode.pose.mean + OFF, np.eye(3))))
+            for fit in looks[-1].found
+        ]
+        return looks[-1]._replace(found=tuple(moved))
+
+    monkeypatch.setattr(ClosureSearch, "everywhere", off_at_times)
+    run = carried(office, office.records[office.starts[60] :], 150)
+    (leaf,) = run.recorder.hypotheses[max(run.recorder.hypotheses)].leaves
+    assert sum(look.best is not None and look.best[1] > 0.9 for look in looks) >= 3
+    assert leaf.lost
 
 
 def test_in_a_building_that_it_does_not_know_it_stays_lost(office):

@@ -120,7 +120,8 @@ def looked_for(branching: Branching, parent: Parent) -> Branches:
     if not (told is not None and probability >= _ONCE) and not _seen_again(parent, located, poses):
         return Branches([still], True, where=where)
     arc = Arc(parent.area, located.area, PoseGaussian.exactly(reference).compose(located.mode.measured.inverse()), True)
-    log_weight, notes = parent.log_weight + math.log(probability), replace(noted.notes, lost=None, told=None, sighted=None)
+    log_weight = parent.log_weight + math.log(probability)
+    notes = replace(noted.notes, lost=None, told=None, sighted=None)
     found = Child(parent.hypothesis, log_weight, parent.area, notes, arcs=(arc,), reload=True)
     still = replace(still, log_weight=parent.log_weight + math.log(max(1.0 - probability, 1e-300)))
     return Branches([still, found], True, where=where)

@@ -115,7 +115,9 @@ class LeafNotes:
         """After the robot entered another area together with the keyframes of ``covariances``."""
         kept = {area: keyframes & covariances.keys() for area, keyframes in self.compared.items()}
         compared = {area: keyframes for area, keyframes in kept.items() if keyframes}
-        return LeafNotes(covariances, compared, doubts=self.doubts, lost=self.lost, told=self.told, sighted=self.sighted)
+        return LeafNotes(
+            covariances, compared, doubts=self.doubts, lost=self.lost, told=self.told, sighted=self.sighted
+        )
 
 
 def relative_covariance(
