@@ -58,7 +58,9 @@ class Nodes:
     def drive(self, log, first, rate=0.0, **robot):
         """A robot that begins with a scan of the log, and the scans that it will send."""
         begin = max(0.0, 0.2 * first - 0.001)
-        self.alive.append(self.start("robot", log=log, robot__rate=rate, robot__start=begin, **robot))
+        # Also for rtl: a drive as quick as slam is over before DDS has made them known to each other.
+        robot = {"robot__start": begin, "robot__odometry_listeners": 2, **robot}
+        self.alive.append(self.start("robot", log=log, robot__rate=rate, **robot))
 
     def park(self):
         robot = self.alive.pop()
