@@ -128,7 +128,8 @@ def test_a_robot_that_is_carried_while_the_nodes_run_is_recognized_elsewhere(cor
     assert again.success
     nodes.until(lambda: not nodes.is_localized())
     said = len(nodes.poses)
-    nodes.drive(log, first=0)
+    # As slowly as rtl needs to have been told where the robot is before the last odometry comes.
+    nodes.drive(log, first=0, rate=4.0)
     nodes.until(nodes.is_localized)
     nodes.until(lambda: len(nodes.estimates) == SCANS - 40 + SCANS)
     listener.spin(1.5)
