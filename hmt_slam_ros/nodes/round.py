@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from hmt_slam_ros.nodes.slam_node import SlamNode
 
 _PATIENCE = 20.0  # s, for the end of a keyframe event and for the answers of the others
+_DISCOVERY = 5.0  # s, until DDS has made processes known to each other that just began
 
 
 class Round(ABC):
@@ -50,7 +51,7 @@ class Round(ABC):
         self._answers: dict[str, SavedPart | BegunPart] = {}
         self._requests = node.create_publisher(String, topics[0], qos.CHAIN)
         node.create_subscription(String, topics[1], self._hear, qos.CHAIN_FROM_NOW)
-        node.create_timer(PERIOD, self._lose_patience, clock=node.figures.steady_clock)
+        node.create_timer(PERIOD, self._look_at_clock, clock=node.figures.steady_clock)
 
     @property
     def busy(self) -> bool:
@@ -68,12 +69,14 @@ class Round(ABC):
         """Begin where that is asked for and no keyframe event is under way."""
         if self._asked is None or self.holding or self._node.process.waiting:
             return
+        listening = self._requests.get_subscription_count()
+        if listening < len(PARTS) and time.monotonic() - self._since < _DISCOVERY:
+            return
         self._answers = {}
         self._number += 1
         try:
             self.holding = True
             request = self._begin(self._number, self._node.process.events)
-            listening = self._requests.get_subscription_count()
             if listening < len(PARTS):
                 raise HmtSlamError(f"{listening} of {', '.join(PARTS)} are running: start all of them")
         except (HmtSlamError, OSError) as fault:
@@ -116,7 +119,8 @@ class Round(ABC):
             else:
                 self._end(None, done)
 
-    def _lose_patience(self) -> None:
+    def _look_at_clock(self) -> None:
+        self.look()
         if self._asked is None or time.monotonic() - self._since < _PATIENCE:
             return
         missing = [name for name in PARTS if self.holding and name not in self._answers]
