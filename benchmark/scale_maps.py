@@ -20,7 +20,7 @@ from hmt_slam_ros.offline.record import EstimateTable, ProbabilityTable, Topolog
 from hmt_slam_ros.offline.runtime import Run
 from hmt_slam_ros.offline.saved_map import MapWriter, RunState, read_run_state, read_saved_map
 from hmt_slam_ros.persistence.replacing import put_in_place
-from hmt_slam_ros.processes.aam import WatchState
+from hmt_slam_ros.processes.aam_watch import WatchState
 from hmt_slam_ros.processes.closure_account import Step
 from hmt_slam_ros.processes.live_hypothesis import KeyframeCovariances
 from hmt_slam_ros.processes.messages import LocalEstimate, Trail

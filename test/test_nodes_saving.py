@@ -21,7 +21,7 @@ from hmt_slam_ros.nodes.topics import DOCUMENTS, KEYFRAMES, MAP
 from hmt_slam_ros.offline.saved_map import ChainState, read_saved_map
 from hmt_slam_ros.persistence.folder import FolderReader
 from hmt_slam_ros.persistence.hmt_map import FORMAT, VERSION
-from hmt_slam_ros.processes.aam import AamState
+from hmt_slam_ros.processes.aam_watch import AamState
 from hmt_slam_ros.processes.documents import KeyframeHead, decode
 from hmt_slam_ros.processes.messages import LocalEstimate
 from hmt_slam_ros.processes.slam import SlamState

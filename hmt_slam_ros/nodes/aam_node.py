@@ -19,7 +19,8 @@ def make() -> ProcessNode:
 
 
 def _make_process(configuration: Configuration, beginning: Beginning) -> Remembering:
-    from hmt_slam_ros.processes.aam import Aam, AamState  # noqa: PLC0415  takes time, in which a signal has to be heard
+    from hmt_slam_ros.processes.aam import Aam  # noqa: PLC0415  takes time, in which a signal has to be heard
+    from hmt_slam_ros.processes.aam_watch import AamState  # noqa: PLC0415
 
     return Aam(configuration, beginning.part("aam", AamState))
 

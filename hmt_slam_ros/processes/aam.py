@@ -5,15 +5,14 @@ A hypothesis is one topological path, so "once for every group of particles with
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.processes.aam_watch import AamState, Joint, Watch, numbered, watch_of
 from hmt_slam_ros.processes.messages import (
     Accepted,
     AreaEvent,
@@ -26,7 +25,7 @@ from hmt_slam_ros.processes.messages import (
     Merged,
     Message,
 )
-from hmt_slam_ros.processes.replica import FIRST_AREA, FIRST_HYPOTHESIS, Replica, ReplicaState
+from hmt_slam_ros.processes.replica import Replica
 from hmt_slam_ros.sensing import Scan
 from hmt_slam_ros.topology.common_map import Keyframes, Pair
 from hmt_slam_ros.topology.crowding import crowded, in_place
@@ -47,100 +46,6 @@ _NEAREST, _BEST = 8, 3
 _MOST_IN_PLACE, _RECENT = 2, 30
 # Where an arc moved keyframes by less than this share of the radius of overlap, overlaps are not measured again.
 _UNMOVED = 0.1
-
-
-class _Joint(NamedTuple):
-    """Two areas that a closure joins, as one.
-
-    :ivar arc: ``a_T_b``, shape (3,), by which overlaps between the two were measured.
-    :ivar graph: of the keyframes of both.
-    :ivar part: keyframes of area b.
-    :ivar least: least normalised cut of the graph.
-    """
-
-    arc: NDArray[np.float64]
-    graph: OverlapGraph
-    part: frozenset[int]
-    least: float
-
-    def moved(self, arc: NDArray[np.float64], placed: Keyframes) -> float:
-        """How far at most another arc has the keyframes of area b, {keyframe: pose in b}, from where they were, m."""
-        points = np.array([pose[:2] for pose in placed.values()]).reshape(-1, 2)
-        return float(np.hypot(*(se2.transform(arc, points) - se2.transform(self.arc, points)).T).max(initial=0.0))
-
-
-@dataclass(frozen=True)
-class _Watch:
-    """What the AAM remembers of one hypothesis; a value, so that the children of a hypothesis inherit it.
-
-    :ivar area: the robot's area.
-    :ivar graphs: {area: overlap graph of its keyframes} of the areas that the robot was in.
-    :ivar own: keyframes stored since the robot entered ``area``, and those that came over with it.
-    :ivar separate: at how many of the latest evaluations in a row the newest keyframes separated.
-    :ivar beyond: the known area that the robot seems to be in, and for how many keyframes in a row.
-    :ivar joints: {pair of areas: what was found when it was last asked whether they are one}.
-    """
-
-    area: int
-    graphs: dict[int, OverlapGraph] = field(default_factory=dict)
-    own: frozenset[int] = frozenset()
-    separate: int = 0
-    beyond: tuple[int, int] | None = None
-    joints: dict[Pair, _Joint] = field(default_factory=dict)
-
-
-@dataclass(frozen=True, eq=False)
-class JointState:
-    """Two areas a and b that a closure joins, as one.
-
-    :ivar arc: ``a_T_b``, shape (3,), by which overlaps between the two were measured, m and rad.
-    :ivar graph: number of the overlap graph of the keyframes of both in ``AamState.graphs``.
-    :ivar part: keyframes of area b.
-    :ivar least: least normalised cut of the graph.
-    """
-
-    arc: NDArray[np.float64]
-    graph: int
-    part: frozenset[int]
-    least: float
-
-
-@dataclass(frozen=True, eq=False)
-class WatchState:
-    """What the AAM remembers of one hypothesis.
-
-    :ivar area: the robot's area.
-    :ivar graphs: {area: number of the overlap graph of its keyframes in ``AamState.graphs``}.
-    :ivar own: keyframes stored since the robot entered ``area``, and those that came over with it.
-    :ivar separate: at how many of the latest evaluations in a row the newest keyframes separated.
-    :ivar beyond: the known area that the robot seems to be in, and for how many keyframes in a row.
-    :ivar joints: {pair of areas: what was found when it was last asked whether they are one}.
-    """
-
-    area: int
-    graphs: Mapping[int, int] = field(default_factory=dict)
-    own: frozenset[int] = frozenset()
-    separate: int = 0
-    beyond: tuple[int, int] | None = None
-    joints: Mapping[Pair, JointState] = field(default_factory=dict)
-
-
-@dataclass(frozen=True, eq=False)
-class AamState:
-    """The AAM between two keyframe events, at first before the first one.
-
-    :ivar replica: the maps of the live hypotheses.
-    :ivar graphs: overlap graphs; hypotheses share them.
-    :ivar watches: {hypothesis: what is remembered of it}.
-    :ivar asked: areas, the smaller first, of which is still to be asked whether they are one.
-    :ivar left: areas that the robot left, of which is still to be asked whether they hold too much.
-    """
-
-    replica: ReplicaState = field(default_factory=ReplicaState)
-    graphs: tuple[OverlapGraph, ...] = ()
-    watches: Mapping[int, WatchState] = field(default_factory=lambda: {FIRST_HYPOTHESIS: WatchState(FIRST_AREA)})
-    asked: frozenset[Pair] = frozenset()
-    left: frozenset[int] = frozenset()
 
 
 class Aam:
@@ -169,7 +74,7 @@ class Aam:
         self._max_range = configuration.local_map.max_range
         self._replica = Replica.of(state.replica)
         self._seen: dict[int, Sensed] = {}
-        self._watches = {hypothesis: _watch(own, state.graphs) for hypothesis, own in state.watches.items()}
+        self._watches = {hypothesis: watch_of(own, state.graphs) for hypothesis, own in state.watches.items()}
         self._asked = set(state.asked)
         self._left = set(state.left)
 
@@ -180,7 +85,7 @@ class Aam:
         graphs = {id(graph): graph for watch in known for graph in watch.graphs.values()}
         graphs |= {id(joint.graph): joint.graph for watch in known for joint in watch.joints.values()}
         numbers = {name: number for number, name in enumerate(graphs)}
-        watches = {hypothesis: _numbered(watch, numbers) for hypothesis, watch in self._watches.items()}
+        watches = {hypothesis: numbered(watch, numbers) for hypothesis, watch in self._watches.items()}
         asked, left = frozenset(self._asked), frozenset(self._left)
         return AamState(self._replica.state, tuple(graphs.values()), watches, asked, left)
 
@@ -286,7 +191,7 @@ class Aam:
         self._watches[leaf.hypothesis] = watch
         return self._cut_event(leaf.hypothesis, watch, found)
 
-    def _cut_event(self, hypothesis: int, watch: _Watch, found: Separation | None) -> AreaEvent | None:
+    def _cut_event(self, hypothesis: int, watch: Watch, found: Separation | None) -> AreaEvent | None:
         if found is None or watch.separate < self._options.persistence:
             return None
         return AreaEvent(hypothesis, "cut", found.keyframes, watch.area, found.ncut)
@@ -305,7 +210,7 @@ class Aam:
                 return AreaEvent(hypothesis, "merged", (), area, least, into)
         return None
 
-    def _joint(self, hypothesis: int, pair: Pair, arc: NDArray[np.float64]) -> _Joint:
+    def _joint(self, hypothesis: int, pair: Pair, arc: NDArray[np.float64]) -> Joint:
         """Two areas as one, whose arc is ``arc``; from what was found before, measuring only what is new."""
         watch, (into, area) = self._watches[hypothesis], pair
         other, before = self._keyframes(hypothesis, area), watch.joints.get(pair)
@@ -317,7 +222,7 @@ class Aam:
                 return before
             arc, known = before.arc, [before.graph, *known]
         graph = self._synchronised(placed, *known)
-        joint = _Joint(arc, graph, frozenset(other), least_cut(graph, other, self._options.min_cluster))
+        joint = Joint(arc, graph, frozenset(other), least_cut(graph, other, self._options.min_cluster))
         self._watches[hypothesis] = replace(watch, joints=watch.joints | {pair: joint})
         return joint
 
@@ -364,7 +269,7 @@ class Aam:
         )
         return float(np.sort(found)[-_BEST:].mean())
 
-    def _follow(self, leaf: Leaf) -> _Watch:
+    def _follow(self, leaf: Leaf) -> Watch:
         """The watch over a hypothesis after TSBI's answer."""
         watch = self._watches[leaf.parent]
         if leaf.merged is not None:
@@ -377,9 +282,9 @@ class Aam:
         beside = self._replica.maps[leaf.hypothesis].neighbours(watch.area)
         self._asked |= {(min(watch.area, other), max(watch.area, other)) for other in beside}
         self._left.add(watch.area)
-        return _Watch(leaf.area, watch.graphs | {watch.area: left, leaf.area: entered}, moved, joints=watch.joints)
+        return Watch(leaf.area, watch.graphs | {watch.area: left, leaf.area: entered}, moved, joints=watch.joints)
 
-    def _follow_merged(self, watch: _Watch, leaf: Leaf, merged: Merged) -> _Watch:
+    def _follow_merged(self, watch: Watch, leaf: Leaf, merged: Merged) -> Watch:
         """The watch with one area for two; what was the robot's own in one of them still is."""
         self._asked = {pair for pair in self._asked if merged.area not in pair}
         graphs = {area: graph for area, graph in watch.graphs.items() if area != merged.area}
@@ -388,7 +293,7 @@ class Aam:
         joints = {pair: joint for pair, joint in watch.joints.items() if merged.area not in pair}
         return replace(watch, area=leaf.area, graphs=graphs, beyond=None, joints=joints)
 
-    def _graph(self, watch: _Watch, hypothesis: int, area: int) -> OverlapGraph:
+    def _graph(self, watch: Watch, hypothesis: int, area: int) -> OverlapGraph:
         """The overlap graph of an area as it is now, from what the watch knows."""
         known = [watch.graphs.get(one, OverlapGraph()) for one in (area, watch.area)]
         return self._synchronised(self._keyframes(hypothesis, area), *known)
@@ -405,21 +310,3 @@ class Aam:
             return sensed_overlaps(self._seen_by(keyframe), placed[keyframe], seen, poses, self._options.overlap_radius)
 
         return synchronised(graph, placed, measure, *others)
-
-
-def _numbered(watch: _Watch, numbers: Mapping[int, int]) -> WatchState:
-    """A watch as a value, where its graphs have numbers by their identities."""
-    joints = {
-        pair: JointState(joint.arc, numbers[id(joint.graph)], joint.part, joint.least)
-        for pair, joint in watch.joints.items()
-    }
-    graphs = {area: numbers[id(graph)] for area, graph in watch.graphs.items()}
-    return WatchState(watch.area, graphs, watch.own, watch.separate, watch.beyond, joints)
-
-
-def _watch(state: WatchState, graphs: Sequence[OverlapGraph]) -> _Watch:
-    joints = {
-        pair: _Joint(joint.arc, graphs[joint.graph], joint.part, joint.least) for pair, joint in state.joints.items()
-    }
-    own = {area: graphs[number] for area, number in state.graphs.items()}
-    return _Watch(state.area, own, state.own, state.separate, state.beyond, joints)
