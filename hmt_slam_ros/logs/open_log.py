@@ -59,6 +59,12 @@ def is_simulated(path: str | Path) -> bool:
     return str(path).startswith(SIMULATED)
 
 
+def is_bag(path: str | Path) -> bool:
+    """Whether a log that `open_log` took is a rosbag2."""
+    path = Path(path)
+    return not is_simulated(path) and (path.is_dir() or _head(path).startswith((_MCAP, _SQLITE)))
+
+
 def _open_bag(path: Path, window: Window, scan_topic: str, odom_topic: str) -> Log:
     # Its library takes memory that the other formats need not pay for.
     from hmt_slam_ros.logs.bag import BagLog  # noqa: PLC0415

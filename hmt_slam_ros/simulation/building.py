@@ -18,6 +18,10 @@ def _no_pieces() -> NDArray[np.float64]:
     return np.empty((0, 5))
 
 
+def _no_doors() -> NDArray[np.float64]:
+    return np.empty((0, 4))
+
+
 @dataclass(frozen=True, eq=False)
 class Building:
     """A world for one robot; all in one frame, m and rad.
@@ -25,20 +29,27 @@ class Building:
     :ivar walls: shape (n, 4), x and y of both ends of each wall.
     :ivar route: shape (k, 2), way-points of the robot, k >= 2; the same one first and last for a closed route.
     :ivar furniture: shape (m, 5), x, y, heading, length and width of each piece that may be moved.
+    :ivar doors: shape (d, 4), x and y of both ends of each door that may be closed; they are open.
     :ivar places: {name: shape (3,)}, frames in which parts of the building that are the same look the same.
     """
 
     walls: NDArray[np.float64]
     route: NDArray[np.float64]
     furniture: NDArray[np.float64] = field(default_factory=_no_pieces)
+    doors: NDArray[np.float64] = field(default_factory=_no_doors)
     places: dict[str, NDArray[np.float64]] = field(default_factory=dict)
 
     def placed(self, pose: NDArray[np.float64]) -> Building:
         """The same building, its origin at a pose (3,)."""
-        ends = [se2.transform(pose, self.walls[:, :2]), se2.transform(pose, self.walls[:, 2:])]
         pieces = np.concatenate((se2.compose(pose, self.furniture[:, :3]), self.furniture[:, 3:]), axis=1)
         places = {name: se2.compose(pose, place) for name, place in self.places.items()}
-        return Building(np.concatenate(ends, axis=1), se2.transform(pose, self.route), pieces, places)
+        route = se2.transform(pose, self.route)
+        return Building(_placed(pose, self.walls), route, pieces, _placed(pose, self.doors), places)
+
+
+def _placed(pose: NDArray[np.float64], lines: NDArray[np.float64]) -> NDArray[np.float64]:
+    ends = [se2.transform(pose, lines[:, :2]), se2.transform(pose, lines[:, 2:])]
+    return np.concatenate(ends, axis=1)
 
 
 def boxes(pieces: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -61,6 +61,7 @@ class Room(NamedTuple):
     :ivar front: in the corridor's middle before the door.
     :ivar inside: where a visitor turns back.
     :ivar is_open: whether the door is.
+    :ivar door: x and y of both ends of the door, m.
     """
 
     floor: Rectangle
@@ -68,6 +69,7 @@ class Room(NamedTuple):
     front: Point
     inside: Point
     is_open: bool
+    door: tuple[float, float, float, float]
 
 
 def rooms_along(
@@ -90,8 +92,9 @@ def rooms_along(
             plan.free(*floor)
         plan.free(*side.rectangle((left, left + door), (-_OVERLAP, _WALL + _OVERLAP if is_open else 0.4 * _WALL)))
         middle = left + 0.5 * door
+        leaf = (*side.point(left, 0.5 * _WALL), *side.point(left + door, 0.5 * _WALL))
         inside = side.point(middle, _WALL + 0.5 * depth)
-        rooms.append(Room(floor, middle, side.point(middle, -0.5 * width), inside, is_open))
+        rooms.append(Room(floor, middle, side.point(middle, -0.5 * width), inside, is_open, leaf))
         begin = end + _WALL
     return rooms
 
@@ -127,8 +130,10 @@ def office(draw: np.random.Generator, settings: Settings) -> Building:
             if room.is_open and 1.0 < room.along - 0.5 * width < lengths[k] - width - 1.0 and draw.random() < 0.5:
                 route += [room.front, room.inside, room.front]
     route.append(route[0])
-    floors = [room.floor for rooms in (*outer, *inner) for room in rooms if room.is_open]
-    return Building(plan.walls(), np.array(route), furnish(draw, floors, np.array(route)))
+    offices = [room for rooms in (*outer, *inner) for room in rooms if room.is_open]
+    furniture = furnish(draw, [room.floor for room in offices], np.array(route))
+    doors = np.array([room.door for room in offices]).reshape(-1, 4)
+    return Building(plan.walls(), np.array(route), furniture, doors)
 
 
 def nested(draw: np.random.Generator, settings: Settings) -> Building:

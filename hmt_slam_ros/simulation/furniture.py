@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -13,7 +14,7 @@ from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.random_streams import Purpose, stream
 from hmt_slam_ros.simulation.building import Building, boxes
 from hmt_slam_ros.simulation.driver import Drive
-from hmt_slam_ros.simulation.raycast import WallIndex, clear_between, clearance
+from hmt_slam_ros.simulation.raycast import WallIndex, clear_between, clearance, wall_index
 from hmt_slam_ros.simulation.settings import Settings
 
 Rectangle = tuple[float, float, float, float]
@@ -74,6 +75,21 @@ def _along_a_wall(draw: np.random.Generator, room: Rectangle) -> NDArray[np.floa
     return np.array([*middle, 0.5 * np.pi * axis, length, width])
 
 
+def revisited(building: Building, settings: Settings) -> Building:
+    """The building as it is at a later visit: pieces moved, doors that are not on the way closed, some of both."""
+    if not settings.visit:
+        return building
+    way, walls = _along(building.route), wall_index(building.walls)
+    draw = stream(settings.run_seed, Purpose.CHANGES, 0)
+    pieces = building.furniture.copy()
+    for k in np.flatnonzero(draw.random(len(pieces)) < settings.changed):
+        moved = _somewhere_near(draw, walls, way, pieces[k], pieces[k])
+        pieces[k] = pieces[k] if moved is None else moved
+    aside = np.array([clearance(door[None], way).min() > _BERTH for door in building.doors], dtype=np.bool_)
+    closed = building.doors[aside & (draw.random(len(aside)) < settings.changed)]
+    return replace(building, walls=np.concatenate((building.walls, closed)), furniture=pieces)
+
+
 def furnishing(building: Building, walls: WallIndex, drive: Drive, settings: Settings) -> Furnishing:
     """Move pieces at random between two visits of the robot: out of its sight, not far, and never into its way.
 
@@ -83,7 +99,7 @@ def furnishing(building: Building, walls: WallIndex, drive: Drive, settings: Set
     eyes = drive.poses(times)[:, :2]
     moves: list[tuple[float, int, NDArray[np.float64]]] = []
     for k, piece in enumerate(building.furniture if settings.moved > 0.0 else ()):
-        draw = stream(settings.seed, Purpose.FURNITURE, k)
+        draw = stream(settings.run_seed, Purpose.FURNITURE, k)
         at = piece
         for gap in _unseen(_seen(walls, eyes, piece, settings.range)):
             time, there = times[gap], draw.random() < settings.moved

@@ -59,7 +59,7 @@ class Laser:
         :param number: of the scan, which determines its noise.
         """
         settings = self._settings
-        draw = stream(settings.seed, Purpose.LASER, number)
+        draw = stream(settings.run_seed, Purpose.LASER, number)
         ranges = distances + settings.range_noise * draw.standard_normal(distances.size)
         lost = (draw.random(distances.size) < settings.dropout) | (ranges >= settings.range)
         kept = np.where(lost, np.inf, np.maximum(ranges, 0.0))

@@ -12,8 +12,9 @@ from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.random_streams import Purpose, stream
 from hmt_slam_ros.sensing import Scan
 from hmt_slam_ros.simulation.building import Building, boxes
+from hmt_slam_ros.simulation.carried import carried
 from hmt_slam_ros.simulation.driver import Drive, drive_along
-from hmt_slam_ros.simulation.furniture import furnishing
+from hmt_slam_ros.simulation.furniture import furnishing, revisited
 from hmt_slam_ros.simulation.laser import Laser
 from hmt_slam_ros.simulation.path import path_through
 from hmt_slam_ros.simulation.people import people_on
@@ -33,11 +34,11 @@ class Scenario:
     """A robot's drive through a building.
 
     :ivar settings: what was chosen.
-    :ivar building: walls, route and furniture at the start.
-    :ivar drive: where the robot truly is.
+    :ivar building: walls, route and furniture at the start of this visit.
+    :ivar drive: the robot's way, and when it is where if it is not carried.
     :ivar laser: the robot's.
     :ivar people: who else is about.
-    :ivar walls: of the building, without furniture.
+    :ivar walls: of the building and its closed doors, without furniture.
     :ivar stamps: shape (n,), of the odometry readings, ns; every ``settings.readings``-th is a scan's as well.
     :ivar poses: shape (n, 3), ``world_T_base`` at these stamps, m and rad.
     :ivar odometry: shape (n, 3), ``odom_T_base`` as the wheels have it.
@@ -47,6 +48,7 @@ class Scenario:
     """
 
     def __init__(self, building: Building, settings: Settings) -> None:
+        building = revisited(building, settings)
         self.settings, self.building = settings, building
         route = driven_route(building.route, settings.laps)
         path = path_through(route, settings.rounding)
@@ -58,12 +60,15 @@ class Scenario:
         self._furnished = [
             wall_index(np.concatenate((building.walls, boxes(pieces)))) for pieces in self._furnishing.pieces
         ]
-        self.people = people_on(self.drive, settings.people, settings.seed)
-        scans = 1 + math.floor(self.drive.duration * settings.rate)
+        self.people = people_on(self.drive, settings.people, settings.run_seed)
+        self._carried = carried(self.drive, settings)
+        self._driven = self._carried or self.drive
+        scans = 1 + math.floor(self._driven.duration * settings.rate)
         ticks = np.arange((scans - 1) * settings.readings + 1)
         period = 1.0 / (settings.rate * settings.readings)
         self.stamps: NDArray[np.int64] = START + np.round(_SECOND * period * ticks).astype(np.int64)
         self.poses = self.true_poses(self.stamps)
+        self._rolled = self.poses if self._carried is None else self._carried.rolled(self._seconds(self.stamps))
         self.slips = self._slips()
         self.odometry = self._odometry()
 
@@ -74,13 +79,13 @@ class Scenario:
 
     def true_poses(self, stamps: NDArray[np.int64]) -> NDArray[np.float64]:
         """``world_T_base`` (n, 3), m and rad, at any stamps (n,), ns."""
-        return self.drive.poses(self._seconds(stamps))
+        return self._driven.poses(self._seconds(stamps))
 
     def scan(self, number: int) -> Scan:
         """A scan by its number, from 0."""
         stamp = int(self.scan_stamps[number])
         seconds = float(self._seconds(np.array([stamp]))[0])
-        poses = self.drive.poses(seconds + self.laser.times)
+        poses = self._driven.poses(seconds + self.laser.times)
         epoch = int(np.searchsorted(self._furnishing.times, seconds, side="right")) - 1
         distances = self.laser.distances(poses, self._furnished[epoch], self.people.discs(seconds, poses[0]))
         return self.laser.scan(number, stamp, distances)
@@ -95,17 +100,17 @@ class Scenario:
 
     def _slips(self) -> NDArray[np.float64]:
         settings = self.settings
-        steps = np.diff(self.poses[:: settings.readings, :2], axis=0)
-        random = stream(settings.seed, Purpose.WHEELS, 1)
+        steps = np.diff(self._rolled[:: settings.readings, :2], axis=0)
+        random = stream(settings.run_seed, Purpose.WHEELS, 1)
         return slips(np.hypot(steps[:, 0], steps[:, 1]), 1.0 / settings.rate, settings.slips, random)
 
     def _odometry(self) -> NDArray[np.float64]:
         settings = self.settings
-        at_scans = self.poses[:: settings.readings]
+        at_scans = self._rolled[:: settings.readings]
         true = se2.between(at_scans[:-1], at_scans[1:])
-        random = stream(settings.seed, Purpose.WHEELS, 0)
+        random = stream(settings.run_seed, Purpose.WHEELS, 0)
         measured = noisy_increments(true, settings.odometry, random) if settings.odometry > 0.0 else true
-        return readings_between(self.poses, settings.readings, se2.compose(measured, se2.exp(self.slips)))
+        return readings_between(self._rolled, settings.readings, se2.compose(measured, se2.exp(self.slips)))
 
     def _check_clear(self) -> None:
         points = self.drive.poses(np.arange(0.0, self.drive.duration + _STEP, _STEP))[:, :2].copy()

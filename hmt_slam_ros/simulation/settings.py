@@ -17,6 +17,13 @@ class Settings:
     """Building, robot, laser and company of a simulated drive."""
 
     seed: int = parameter(0, "Seed of building, noise, people and furniture.", low=0, high=2**31 - 1)
+    visit: int = parameter(
+        0, "Which visit of the building it is: from 1 on, furniture was moved and doors were closed since the first.",
+        low=0, high=1000,
+    )
+    changed: float = parameter(
+        0.5, "Probability that a piece of furniture was moved, a door closed, before a later visit.", low=0.0, high=1.0
+    )
     size: float = parameter(1.0, "Factor on the building's lengths; corridors stay as wide.", low=0.7, high=20.0)
     count: int = parameter(3, "Rings of nested loops, blocks on a side of a grid of corridors.", low=1, high=20)
     laps: int = parameter(2, "How often the route is driven.", low=1, high=100)
@@ -47,6 +54,19 @@ class Settings:
     moved: float = parameter(
         0.0, "Probability that a piece of furniture is moved while the robot does not see it.", low=0.0, high=1.0
     )
+    carried: float = parameter(
+        0.0, "Share of the drive after which the robot is carried elsewhere, unknown to its wheels; 0 for never.",
+        low=0.0, high=1.0,
+    )
+    to: float = parameter(0.0, "Share of the drive from which it goes on then.", low=0.0, high=1.0)
+    turned: float = parameter(
+        0.0, "How far to the left of its way it looks where it is put.", unit="deg", low=-180.0, high=180.0
+    )
+
+    @property
+    def run_seed(self) -> int:
+        """Seed of what is another at every visit: noise, people, what is moved."""
+        return self.seed + (self.visit << 32)
 
 
 def parse_name(log: str | Path) -> tuple[str, dict[str, Value]]:
