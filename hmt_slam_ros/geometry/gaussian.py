@@ -9,11 +9,28 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hmt_slam_ros.geometry import se2
+
+# The 95 % ellipse of a Gaussian in the plane is so many deviations large: the root of chi-square's quantile, 2 dof.
+ELLIPSE_95 = 2.4477
+
+
+class Ellipse(NamedTuple):
+    """Of a position, around it.
+
+    :ivar longer: half axis, m.
+    :ivar shorter: half axis, m.
+    :ivar angle: of the longer one, rad.
+    """
+
+    longer: float
+    shorter: float
+    angle: float
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -44,6 +61,14 @@ class PoseGaussian:
             se2.compose(self.mean, other.mean),
             ad @ self.covariance @ ad.T + other.covariance,
         )
+
+    def ellipse(self) -> Ellipse:
+        """In which the position of b lies with 95 %, in the axes of a."""
+        sin, cos = math.sin(self.mean[2]), math.cos(self.mean[2])
+        turn = np.array([[cos, -sin], [sin, cos]])
+        values, vectors = np.linalg.eigh(turn @ self.covariance[:2, :2] @ turn.T)
+        shorter, longer = (ELLIPSE_95 * np.sqrt(np.maximum(values, 0.0))).tolist()
+        return Ellipse(longer, shorter, math.atan2(vectors[1, 1], vectors[0, 1]))
 
     def mahalanobis2(self, other: PoseGaussian) -> float:
         """Squared Mahalanobis distance between two independent beliefs over the same pose; chi-square with 3 dof.
