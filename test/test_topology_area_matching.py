@@ -13,6 +13,7 @@ from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.topology import area_modes
 from hmt_slam_ros.topology.area_bounds import Surface
 from hmt_slam_ros.topology.area_grid import GridModel, build_area_grid
+from hmt_slam_ros.topology.area_ground import ground_around
 from hmt_slam_ros.topology.area_matching import MatchSettings, match
 from hmt_slam_ros.topology.area_search import Cells, search
 from hmt_slam_ros.topology.area_window import make_window
@@ -99,6 +100,19 @@ def test_the_search_finds_exactly_the_cells_that_brute_force_finds(seed, bounded
     assert len(shared) >= 0.97 * max(len(scores), len(expected))
     differences = np.array([abs(scores[cell] - expected[cell]) for cell in shared])
     assert np.mean(differences < 1e-5) > 0.97
+
+
+def test_poses_where_no_keyframe_is_on_the_ground_are_not_searched(known, visit):
+    prior, at = prior_around(TRUTH, 1.0, 6.0), TRUTH[None, :2]
+    keyframes = np.array([[0.0, 0.0], [50.0, 50.0]])
+    free = match(visit, known, prior, SETTINGS)
+    inside = match(visit, known, prior, SETTINGS, ground=ground_around(at, keyframes, 0.5, known.cell))
+    assert inside.modes[0].pose.mean == pytest.approx(free.modes[0].pose.mean, abs=1e-9)
+    assert inside.log_evidence <= free.log_evidence
+    beside = match(visit, known, prior, SETTINGS, ground=ground_around(at + 1.0, keyframes, 0.5, known.cell))
+    assert all(np.hypot(*(mode.pose.mean[:2] - TRUTH[:2] - 1.0)) < 0.8 for mode in beside.modes)
+    nowhere = ground_around(at + 30.0, keyframes[:1], 0.5, known.cell)
+    assert match(visit, known, prior, SETTINGS, ground=nowhere).modes == ()
 
 
 def test_poses_beyond_the_bounds_are_not_searched(known, visit):

@@ -95,11 +95,14 @@ def test_a_global_pose_that_contradicts_the_arcs_is_not():
     assert np.allclose(agreeing(belief(4.0, 0.1), 0, 7, poses, 16.0), [4.0, 0.0, 0.0])
 
 
+KEPT = 1_500_000
+
+
 @pytest.fixture
 def views():
     room = box(-2.0, -2.0, 10.0, 2.0)
     scans = {area: scan_in(room, np.array([4.0 * area, 0.0, 0.0])) for area in range(3)}
-    return Views(scans, GridModel(), NEAR)
+    return Views(scans, GridModel(), NEAR, KEPT)
 
 
 def test_a_place_has_the_keyframes_of_the_areas_around_in_its_frame(views):
@@ -115,10 +118,16 @@ def test_a_grid_is_built_once_for_the_same_keyframes_at_the_same_poses(views):
     assert views.grid({1: pose}) is not views.grid({1: pose + 0.01})
 
 
-def test_the_grids_that_are_kept_take_bounded_memory(views, monkeypatch):
-    monkeypatch.setattr("hmt_slam_ros.topology.surroundings._KEPT", 100_000)
+def test_the_grids_that_are_kept_take_bounded_memory(views):
     first = views.grid({0: np.zeros(3)})
+    assert views.grid({0: np.zeros(3)}) is first
     for k in range(40):
         views.grid({0: np.array([0.0, 0.0, 0.05 * k])})
-    assert sum(grid.nbytes for grid in views._grids.values()) <= max(100_000, 2 * first.nbytes)
+    assert sum(grid.nbytes for grid in views._grids.values()) <= KEPT
+    assert views.grid({0: np.zeros(3)}) is not first
+
+
+def test_the_grids_that_are_kept_are_forgotten_when_they_are_needed_no_more(views):
+    first = views.grid({0: np.zeros(3)})
+    views.forget()
     assert views.grid({0: np.zeros(3)}) is not first

@@ -13,6 +13,7 @@ from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 from numba import njit
+from scipy.special import softmax
 
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.sensing import Scan
@@ -48,6 +49,10 @@ class Looks:
         self._scans = scans
         self._known: dict[int, Float64] = {}
 
+    def clear(self) -> None:
+        """Keep no look, as scans have changed."""
+        self._known.clear()
+
     def likeness(self, keyframes: Collection[int], areas: Sequence[Collection[int]]) -> Float64:
         """How much more areas look like some keyframes than the median of them does, shape (len(areas),).
 
@@ -61,6 +66,16 @@ class Looks:
         distances = _distances(self._of(keyframes), self._of([k for area in areas for k in area]), first)
         logarithms = np.log(np.maximum(distances, _SAME))
         return np.asarray(np.median(logarithms) - logarithms, dtype=np.float64)
+
+    def shares(self, keyframes: Collection[int], areas: Mapping[int, Collection[int]]) -> dict[int, float]:
+        """p(gamma | phi): the probability of every area by its look alone; they sum to 1.
+
+        :param keyframes: those in question.
+        :param areas: {area: its keyframes, at least one}.
+        """
+        likeness = self.likeness(keyframes, list(areas.values()))
+        weights = softmax(log_ratio(likeness)) if areas else likeness
+        return dict(zip(areas, weights.tolist(), strict=True))
 
     def _of(self, keyframes: Collection[int]) -> Float64:
         for keyframe in keyframes:

@@ -22,6 +22,7 @@ from hmt_slam_ros.geometry.gaussian import PoseGaussian, moments
 from hmt_slam_ros.topology import area_modes
 from hmt_slam_ros.topology.area_bounds import Surface
 from hmt_slam_ros.topology.area_grid import AreaGrid
+from hmt_slam_ros.topology.area_ground import Ground
 from hmt_slam_ros.topology.area_search import Cells, search
 from hmt_slam_ros.topology.area_window import Window, make_window
 
@@ -98,7 +99,8 @@ class Match:
 
 
 def match(
-    query: AreaGrid, candidate: AreaGrid, prior: PoseGaussian, settings: MatchSettings, bounds: Float64 | None = None
+    query: AreaGrid, candidate: AreaGrid, prior: PoseGaussian, settings: MatchSettings, bounds: Float64 | None = None,
+    ground: Ground | None = None,
 ) -> Match:
     """Find all poses of the query in the candidate that the prior admits.
 
@@ -107,8 +109,9 @@ def match(
     :param prior: belief over ``candidate_T_query``.
     :param bounds: shape (2, 2), the smallest and the largest (x, y) in the candidate where the middle of the query's
         points may be, m; what lies beyond is not searched.
-    """
-    searched = _searched(query, candidate, prior, settings, bounds)
+    :param ground: where one of the query's keyframes has to be, if anywhere.
+    """  # fmt: skip
+    searched = _searched(query, candidate, prior, settings, bounds, ground)
     if searched is None:
         return Match()
     return Match(float(np.logaddexp.reduce(searched.masses)), lambda: tuple(_modes(searched)))
@@ -131,8 +134,9 @@ def best_pose(
 
 
 def _searched(
-    query: AreaGrid, candidate: AreaGrid, prior: PoseGaussian, settings: MatchSettings, bounds: Float64 | None = None
-) -> _Searched | None:
+    query: AreaGrid, candidate: AreaGrid, prior: PoseGaussian, settings: MatchSettings, bounds: Float64 | None = None,
+    ground: Ground | None = None,
+) -> _Searched | None:  # fmt: skip
     if not query.points.size or not candidate.points.size:
         return None
     # About the middle of the samples turns and shifts are least correlated, and the lattice of turns coarsest.
@@ -149,7 +153,7 @@ def _searched(
     )
     cells = search(
         window, _coarse(candidate), centred.points, _coarse(centred), back_points, settings.temper, threshold,
-        settings.margin,
+        settings.margin, None if ground is None else ground._replace(keyframes=ground.keyframes - middle),
     )  # fmt: skip
     if not cells.score.size:
         return None

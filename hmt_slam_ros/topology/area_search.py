@@ -24,6 +24,7 @@ from hmt_slam_ros.topology.area_bounds import (
     pyramid,
     sample_cells,
 )  # fmt: skip
+from hmt_slam_ros.topology.area_ground import Ground, Passable, anywhere, may_be, passable
 from hmt_slam_ros.topology.area_reverse import Reverse, contradiction, points_of_block, reverse_check
 from hmt_slam_ros.topology.area_window import Window, prior_bound
 
@@ -53,6 +54,7 @@ class _Task(NamedTuple):
     surface: Surface
     bounds: Pyramid
     cells: Int32
+    ground: Passable
     reverse: Reverse
     temper: float
     margin: float
@@ -60,7 +62,7 @@ class _Task(NamedTuple):
 
 def search(
     window: Window, surface: Surface, samples: Float64, back: Surface, back_samples: Float64, temper: float,
-    threshold: float, margin: float,
+    threshold: float, margin: float, ground: Ground | None = None,
 ) -> Cells:
     """All cells of the window whose score is within ``margin`` of the best and not below ``threshold``.
 
@@ -70,6 +72,7 @@ def search(
     :param back: the query's grid, for the reverse check.
     :param back_samples: shape (m, 2), the candidate's surface points, m, candidate frame.
     :param temper: factor on the summed log-ratios.
+    :param ground: where one of the query's keyframes has to be, if anywhere.
     """
     if (window.first > window.last).any():
         return Cells(np.empty((0, 3), dtype=np.int64), np.empty(0), np.empty(0))
@@ -77,7 +80,8 @@ def search(
     height = min(_HIGHEST, max(_LOWEST, int(np.ceil(np.log2(edge))) - 2))
     task = _Task(
         window, surface, pyramid(surface.log_ratio, height), sample_cells(window, surface, samples),
-        reverse_check(window, back, back_samples), temper, margin,
+        passable(ground or anywhere(window.cell), window, height), reverse_check(window, back, back_samples), temper,
+        margin,
     )  # fmt: skip
     found = _search(task, height, threshold)
     kept = found[found[:, 3] >= max(threshold, found[:, 3].max(initial=-np.inf) - margin)]
@@ -121,7 +125,7 @@ def _coarse_nodes(task: _Task, height: int) -> tuple[Int64, Float64]:
         for i in range(window.first[0], window.last[0] + 1, side):
             for j in range(window.first[1], window.last[1] + 1, side):
                 prior = prior_bound(window, k, i, j, side)
-                if prior > -np.inf:
+                if prior > -np.inf and may_be(task.ground, height, k, i, j):
                     steps = bound_of_square(task.bounds.levels[height], task.bounds.margin, task.cells[k], i, j)
                     nodes[n, 0], nodes[n, 1], nodes[n, 2] = k, i, j
                     bounds[n] = task.temper * task.bounds.step * steps + prior
@@ -142,7 +146,7 @@ def _push_quarters(
         for right in range(2):
             x, y = i + right * side, j + down * side
             bound = task.temper * task.bounds.step * steps[down][right]
-            if bound < least or x > window.last[0] or y > window.last[1]:
+            if bound < least or x > window.last[0] or y > window.last[1] or not may_be(task.ground, height, k, x, y):
                 continue
             bound += prior_bound(window, k, x, y, side)
             if bound < least:
@@ -177,7 +181,7 @@ def _take_cells(
             if score < least:
                 continue
             score += prior_bound(window, k, x, y, 1)
-            if score < least:
+            if score < least or not may_be(task.ground, 0, k, x, y):
                 continue
             if near < 0:
                 near = points_of_block(task.reverse, window, node, points)

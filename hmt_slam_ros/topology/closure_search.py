@@ -22,10 +22,11 @@ from hmt_slam_ros.topology.area_grid import GridModel, build_area_grid, surface_
 from hmt_slam_ros.topology.area_matching import MatchSettings, Mode, match
 from hmt_slam_ros.topology.hybrid_map import HybridMap
 from hmt_slam_ros.topology.likeness import Elsewhere, Likeness, best_shares
-from hmt_slam_ros.topology.relocation import Relocation, reach_of
-from hmt_slam_ros.topology.surroundings import Nearness, Views, gap, positions, stacked
+from hmt_slam_ros.topology.located import reach_of
+from hmt_slam_ros.topology.surroundings import WHOLE_MAP, Nearness, Views, gap, positions, stacked
 from hmt_slam_ros.topology.transition import Entry, Place, Transition, entry, owner_at, transition
 from hmt_slam_ros.topology.whereabouts import Told, Whereabouts, whereabouts
+from hmt_slam_ros.topology.whole_map import WholeMap
 
 Pose = NDArray[np.float64]
 
@@ -91,7 +92,9 @@ class ClosureSearch:
         self._model = GridModel.of(configuration)
         self._views = Views(scans, self._model, self.nearness)
         self._likeness = Likeness(options.alike_probability)
-        self._relocation = Relocation(self._views, Looks(scans), self._settings, options.place_radius)
+        self._looks = Looks(scans)
+        self._wide_views = Views(scans, self._model, self.nearness, WHOLE_MAP)
+        self._whole_map = WholeMap(self._wide_views, self._settings, options.place_radius, options.local_reach)
         self._counted = -1
         self._ahead: list[tuple[int, Collection[int]]] = []
 
@@ -104,6 +107,12 @@ class ClosureSearch:
         """Take over what was learnt before anything is compared."""
         self._likeness.count(state.shares)
         self._counted = state.counted
+
+    def forget_scans(self) -> None:
+        """Work out anew what is made of scans, of which some have changed."""
+        self._views.clear()
+        self._wide_views.clear()
+        self._looks.clear()
 
     def tracked_area(
         self, hybrid_map: HybridMap, area: int, around: Mapping[int, Pose], poses: NDArray[np.float64]
@@ -208,21 +217,6 @@ class ClosureSearch:
                 self._elsewhere(hybrid_map, area, excluded)
                 return
 
-    def anywhere(self, hybrid_map: HybridMap, area: int, query: Query, since: int) -> tuple[Fit | None, float]:
-        """The one place in which a robot that was displaced may be, whatever the arcs say.
-
-        :param area: the area that the arcs have it in, where it may be as well.
-        :param since: the first keyframe after that; later ones are no part of the map.
-        :returns: the fit, weighed relative to all that a displaced robot may be in, half of which is new ground, or
-            None where no place fits, or more than one; and the probability of what was not told.
-        """
-        located, unseen = self._relocation.located(hybrid_map, query.poses, since, area)
-        if located is None or located.area == area:
-            return None, 0.5
-        rarity = self._likeness.log_rarity(located.found.share, foretold=False)
-        same = MAPS.log_ratio(located.found, MAPS_USUAL) + rarity
-        return Fit(located.area, located.mode, same - math.log(2 * len(hybrid_map.area_ids()))), 0.5 * unseen
-
     def everywhere(
         self, hybrid_map: HybridMap, poses: Mapping[int, Pose], before: int, told: Told | None = None
     ) -> Whereabouts:
@@ -233,7 +227,13 @@ class ClosureSearch:
         :param told: where the reference is, if somebody says so.
         """
         alike, radius = self._options.alike_probability, self._options.place_radius
-        return whereabouts(self._relocation, alike, hybrid_map, poses, before, told, radius)
+        known = {area: [k for k in hybrid_map.keyframes(area) if k < before] for area in hybrid_map.area_ids()}
+        shares = self._looks.shares(list(poses), {area: own for area, own in known.items() if own})
+        return whereabouts(self._whole_map, shares, alike, hybrid_map, poses, before, told, radius)
+
+    def found(self) -> None:
+        """It is known where the robot is: what served to look for it everywhere is needed no more."""
+        self._whole_map.forget()
 
     def _entry(self, place: Place, candidate: Candidate) -> Entry:
         return entry(place, candidate.prior, stacked(candidate.fresh), self._options.place_radius)

@@ -17,12 +17,14 @@ from hmt_slam_ros.topology.whereabouts import Told
 
 Covariance = NDArray[np.float64]
 
-# Probability per keyframe that wheels and scans both lose the robot: once in 50 km.
-_DISPLACED = 1e-5
-# Evidence of a scan, nats, below which a doubt is kept, and for how many keyframe events.
-_DOUBTFUL, _KEPT = -2.0, 30
-# Doubts at most so many events apart are about one and the same moment.
-_TOGETHER = 3
+# Log-probability per keyframe that wheels and scans both lose the robot: once in 50 km.
+_DISPLACED = math.log(1e-5)
+# Of the nats by which a scan contradicts, so many are no news: who stands there does so at the next keyframe too.
+_LASTING = 1.0
+# Keyframe events for which a doubt is kept.
+_KEPT = 30
+# What contradicted less than so much of the most is another matter, of before the robot was displaced.
+_MATTER = 0.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,11 +54,14 @@ class LeafNotes:
     :ivar beside: known areas that the newest of them fitted beside, and in which the robot may be soon.
     :ivar astray: the area of the local map, joined to the robot's own by no arc, in whose place the robot seems to be,
         and for how many keyframe events in a row; or None.
-    :ivar doubts: {keyframe event: odds that the robot was displaced unnoticed just before it}, of the latest events
-        whose scans contradicted what the robot should have seen.
+    :ivar doubts: {keyframe event: nats by which its scan contradicted what the robot should have seen}, of the latest
+        events since the robot may have been displaced.
     :ivar lost: the keyframe at which the robot arrived it is not known where, until that is recognized; else None.
     :ivar told: where one of the keyframes since then is, as somebody says; else None.
     :ivar sighted: where it was recognized at the last look, if it was.
+    :ivar claim: where it was at ``lost`` if it was not displaced, as another hypothesis says; else None.
+    :ivar credit: nats by which what it saw since then speaks for a place elsewhere, as far as that is in the
+        hypothesis's weight; None where another one has it there since.
     """
 
     covariances: Mapping[int, Covariance] = field(default_factory=dict)
@@ -69,24 +74,34 @@ class LeafNotes:
     lost: int | None = None
     told: Told | None = None
     sighted: Sighting | None = None
+    claim: Sighting | None = None
+    credit: float | None = 0.0
 
     def heard(self, event: int, log_evidence: float) -> LeafNotes:
-        """After the scan of a keyframe event; one that was displaced before it would see a place that looks alike."""
-        doubts = {k: odds for k, odds in self.doubts.items() if k > event - _KEPT}
-        if log_evidence < _DOUBTFUL:
-            doubts[event] = min(1.0, _DISPLACED * math.exp(min(-log_evidence, -math.log(_DISPLACED))))
-        return replace(self, doubts=doubts) if doubts != self.doubts else self
+        """After the scan of a keyframe event; one that was displaced before it would see a place that looks alike.
+
+        :param log_evidence: log p(scan | the robot is there) / p(scan | it is in a place that looks alike), nats, by
+            the map of what is around.
+        """
+        told = -log_evidence - _LASTING
+        doubts = {k: nats for k, nats in self.doubts.items() if k > event - _KEPT}
+        if doubts or told > 0.0:
+            doubts[event] = told
+        if sum(doubts.values()) <= 0.0:
+            doubts = {}
+        return self if not doubts and not self.doubts else replace(self, doubts=doubts)
 
     @property
     def displaced(self) -> tuple[float, int]:
-        """The odds that the robot was displaced of late, and the first keyframe event after that."""
+        """Log-odds that the robot was displaced of late, and the first keyframe event after that.
+
+        The events since then speak for that together (the test of Page 1954).
+        """
         if not self.doubts:
-            return 0.0, 0
-        first = max(self.doubts, key=lambda event: self.doubts[event])
-        for event in sorted(self.doubts, reverse=True):
-            if first - _TOGETHER <= event < first:
-                first = event
-        return min(1.0, sum(self.doubts.values())), first
+            return -math.inf, 0
+        most = max(self.doubts.values())
+        first = min(event for event, nats in self.doubts.items() if nats >= _MATTER * most)
+        return _DISPLACED + sum(nats for event, nats in self.doubts.items() if event >= first), first
 
     def stored(self, keyframe: int, covariance: Covariance) -> LeafNotes:
         """After a keyframe entered the robot's area."""
@@ -116,8 +131,9 @@ class LeafNotes:
         kept = {area: keyframes & covariances.keys() for area, keyframes in self.compared.items()}
         compared = {area: keyframes for area, keyframes in kept.items() if keyframes}
         return LeafNotes(
-            covariances, compared, doubts=self.doubts, lost=self.lost, told=self.told, sighted=self.sighted
-        )
+            covariances, compared, doubts=self.doubts, lost=self.lost, told=self.told, sighted=self.sighted,
+            claim=self.claim, credit=self.credit,
+        )  # fmt: skip
 
 
 def relative_covariance(

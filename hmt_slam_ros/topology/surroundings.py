@@ -27,6 +27,11 @@ Pose = NDArray[np.float64]
 _MOST_AROUND = 64
 # Grids are kept up to this size, bytes: those of some ten places of a large building.
 _KEPT = 4 << 23
+
+
+WHOLE_MAP = 4 * _KEPT
+"""The same where a whole map is looked through again and again, while it is not known where the robot is, bytes."""
+
 # What the bounds on distances have in hand, m, and the smallest that is not 0.
 _ROUNDING, _SMALLEST = 1e-6, 1e-300
 
@@ -140,12 +145,22 @@ def agreeing(
 class Views:
     """Grids and places, built from the keyframes' scans and kept while they are in use."""
 
-    def __init__(self, scans: Mapping[int, Scan], model: GridModel, nearness: Nearness) -> None:
-        """:param scans: {keyframe: scan}, which may grow."""
+    def __init__(
+        self, scans: Mapping[int, Scan], model: GridModel, nearness: Nearness, kept: int = _KEPT
+    ) -> None:
+        """:param scans: {keyframe: scan}, which may grow.
+
+        :param kept: size of the grids that are kept, bytes.
+        """
         self._scans = scans
+        self._kept = kept
         self._model = model
         self._nearness = nearness
         self._grids: OrderedDict[bytes, AreaGrid] = OrderedDict()
+
+    def clear(self) -> None:
+        """Keep no grid, as scans have changed."""
+        self._grids.clear()
 
     def grid(self, keyframes: Mapping[int, Pose]) -> AreaGrid:
         """What the keyframes saw, placed at the given poses."""
@@ -160,8 +175,12 @@ class Views:
     def _drop_oldest(self) -> None:
         """Forget the grids that were not used for longest, but not the newest."""
         size = sum(grid.nbytes for grid in self._grids.values())
-        while size > _KEPT and len(self._grids) > 1:
+        while size > self._kept and len(self._grids) > 1:
             size -= self._grids.popitem(last=False)[1].nbytes
+
+    def forget(self) -> None:
+        """Forget all grids."""
+        self._grids.clear()
 
     def seen_before(self, hybrid_map: HybridMap, poses: Mapping[int, Pose], keyframe: int) -> AreaGrid:
         """What keyframes before a given one saw, of the areas that stand at ``poses``, {area: pose}."""

@@ -20,13 +20,17 @@ from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.topology.hybrid_map import HybridMap
 from hmt_slam_ros.topology.likeness import Likeness
-from hmt_slam_ros.topology.relocation import Located, Relocation
+from hmt_slam_ros.topology.located import Located
 from hmt_slam_ros.topology.surroundings import positions
 from hmt_slam_ros.topology.unknown import joined
+from hmt_slam_ros.topology.whole_map import WholeMap
 
 UNMAPPED = 0.2
 """Probability that a robot that woke up somewhere is where the map does not reach."""
 
+# Weight of what surfaces say for one area rather than another. A place where less of what the robot sees is known may
+# have holes in its map, which come in lumps, and not sample by sample.
+_BETWEEN = 0.5
 # Deviations of what somebody says, beyond which no place is looked at.
 _DEVIATIONS = 4.0
 
@@ -65,9 +69,16 @@ class Whereabouts(NamedTuple):
         n = int(self.probabilities.argmax())
         return self.found[n], float(self.probabilities[n])
 
+    def with_unmapped(self, prior: float) -> Whereabouts:
+        """The same, where the map does not reach where the robot is with another probability than ``UNMAPPED``."""
+        weights = (1.0 - prior) / prior * UNMAPPED / (1.0 - UNMAPPED) * self.probabilities
+        rest = max(0.0, 1.0 - float(self.probabilities.sum()))
+        return Whereabouts(self.found, weights / max(rest + float(weights.sum()), 1e-300))
+
 
 def whereabouts(
-    relocation: Relocation,
+    whole_map: WholeMap,
+    shares: Mapping[int, float],
     alike: float,
     hybrid_map: HybridMap,
     poses: Mapping[int, Pose],
@@ -77,9 +88,12 @@ def whereabouts(
 ) -> Whereabouts:
     """Where some keyframes are.
 
-    How rare a fit is shows in the other areas, in which the same was tried. Where somebody says where they are, the
-    prior is not flat, but as wide as that is uncertain, and areas farther off are not looked at.
+    How rare a fit is shows in the other areas, in which the same was tried. Whether they are in the map at all is asked
+    of the best fit; between those that remain, the surfaces that are known at one and not at the other count too. Where
+    somebody says where they are, the prior is not flat, but as wide as that is uncertain, and areas farther off are not
+    looked at.
 
+    :param shares: {area: probability by its look} of all known areas.
     :param alike: probability that keyframes fit into an area where they do not lie, before any was tried.
     :param poses: {keyframe: ``reference_T_base`` (3,)}.
     :param before: the map is that of the keyframes before this one.
@@ -87,17 +101,19 @@ def whereabouts(
     :param radius: farthest distance to a keyframe of an area's place, m.
     """
     near = None if told is None else _near(hybrid_map, told, radius, before)
-    found, areas = relocation.everywhere(hybrid_map, poses, before, near)
+    areas = [area for area in shares if near is None or area in near]
+    found = whole_map.fits(hybrid_map, poses, before, {area: shares[area] for area in areas})
     whole: dict[int, float] = {}
     for fit in found:
         whole[fit.area] = float(np.logaddexp(whole.get(fit.area, -math.inf), fit.mode.log_mass))
+    most = max(whole.values(), default=0.0)
     log_flat = math.log((1.0 - UNMAPPED) / max(1, len(areas)))
     best = {area: max((fit.found.share for fit in found if fit.area == area), default=0.0) for area in areas}
     likeness = Likeness(alike)
     likeness.count(sorted(best.values())[:-1])
     logs = [
         (log_flat if told is None or near is None else _log_prior(told, near[fit.area], fit))
-        + fit.mode.log_mass - whole[fit.area]
+        + fit.mode.log_mass - whole[fit.area] + _BETWEEN * (whole[fit.area] - most)
         + MAPS.log_ratio(fit.found, MAPS_USUAL)
         + likeness.log_rarity(fit.found.share, foretold=False)
         for fit in found

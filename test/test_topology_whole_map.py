@@ -1,0 +1,119 @@
+"""Keyframes of which the arcs tell nothing are laid into the whole map, at any pose."""
+
+import numpy as np
+import pytest
+from test_process_tsbi_branching import OTHER, PATH, ROOM
+from worlds import box, scan_in
+
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.topology.area_grid import GridModel
+from hmt_slam_ros.topology.area_matching import MatchSettings
+from hmt_slam_ros.topology.hybrid_map import HybridMap
+from hmt_slam_ros.topology.surroundings import Nearness, Views
+from hmt_slam_ros.topology.whole_map import WholeMap, regions
+
+REACH = 6.0
+ASKED = se2.compose(np.array([3.6, 2.6, 2.5]), np.array([[0.3 * k, 0.0, 0.05 * k] for k in range(4)]))
+
+
+def seen(walls, pose, keyframe):
+    return scan_in(walls, pose, noise=0.01, seed=keyframe, field_of_view=2 * np.pi, beams=361)
+
+
+@pytest.fixture
+def asked():
+    """Keyframes 0 to 11 in two rooms, areas 0 and 1, and 12 to 15 in the first of them."""
+    hybrid_map, scans = HybridMap(), {}
+    for area, walls in enumerate((ROOM, OTHER)):
+        for k, pose in enumerate(PATH):
+            scans[6 * area + k] = seen(walls, pose, 6 * area + k)
+            hybrid_map.place(6 * area + k, area, se2.between(PATH[0], pose))
+    scans |= {12 + k: seen(ROOM, pose, 12 + k) for k, pose in enumerate(ASKED)}
+    poses = {12 + k: se2.between(ASKED[0], pose) for k, pose in enumerate(ASKED)}
+    return hybrid_map, poses, scans
+
+
+@pytest.fixture
+def laid(asked):
+    """Lays the keyframes of ``asked`` into areas of the map."""
+    hybrid_map, poses, scans = asked
+    whole = WholeMap(Views(scans, GridModel(), Nearness(0.3, REACH)), MatchSettings(temper=0.3), 2.0, REACH)
+    return lambda areas: whole.fits(hybrid_map, poses, 1000, dict.fromkeys(areas, 1.0 / len(areas)))
+
+
+def off(fit):
+    away = se2.between(se2.between(PATH[0], ASKED[0]), fit.mode.pose.mean)
+    return np.hypot(away[0], away[1])
+
+
+def test_a_room_is_recognised_from_anywhere_in_it(laid):
+    best = max(laid([0, 1]), key=lambda fit: fit.mode.log_mass)
+    assert best.area == 0
+    assert off(best) < 0.05
+    assert abs(se2.between(se2.between(PATH[0], ASKED[0]), best.mode.pose.mean)[2]) < 0.02
+
+
+def test_what_came_after_is_no_part_of_the_map(asked):
+    hybrid_map, poses, scans = asked
+    whole = WholeMap(Views(scans, GridModel(), Nearness(0.3, REACH)), MatchSettings(temper=0.3), 2.0, REACH)
+    assert whole.fits(hybrid_map, poses, 0, {0: 1.0}) == []
+    for keyframe, pose in poses.items():
+        hybrid_map.place(keyframe, 2, pose)
+    assert {fit.area for fit in whole.fits(hybrid_map, poses, 12, {0: 0.5, 2: 0.5})} == {0}
+
+
+def test_a_room_in_which_the_map_has_traces_of_people_is_recognised(asked, laid):
+    """They stand where the robot sees free space, which is no sign of another place."""
+    hybrid_map, _, scans = asked
+    crowd = np.concatenate([box(x, y, x + 0.3, y + 0.3) for x in (0.8, 2.2, 4.3) for y in (0.9, 2.0, 3.4)])
+    walls = np.concatenate((ROOM, crowd))
+    for k, pose in enumerate(PATH):
+        scans[20 + k] = seen(walls, pose, 20 + k)
+        hybrid_map.place(20 + k, 0, se2.between(PATH[0], pose))
+    best = max(laid([0, 1]), key=lambda fit: fit.mode.log_mass)
+    assert best.area == 0
+    assert off(best) < 0.1
+
+
+def test_all_areas_are_looked_at_however_many_there_are(asked, laid):
+    hybrid_map, _, scans = asked
+    for area in range(2, 24):
+        for k, pose in enumerate(PATH):
+            keyframe = 100 + 6 * area + k
+            scans[keyframe] = seen(OTHER, pose, keyframe)
+            hybrid_map.place(keyframe, area, se2.between(PATH[0], pose))
+    assert max(laid(range(24)), key=lambda fit: fit.mode.log_mass).area == 0
+
+
+def test_none_but_the_areas_asked_for_are_looked_at(laid):
+    assert {fit.area for fit in laid([1])} <= {1}
+    assert {fit.area for fit in laid([0])} == {0}
+
+
+def test_a_fit_is_told_in_the_frame_of_its_area_wherever_that_lies_in_its_region(asked, laid):
+    hybrid_map, _, scans = asked
+    for k, pose in enumerate(PATH):
+        scans[30 + k] = seen(ROOM, pose, 30 + k)
+        hybrid_map.place(30 + k, 2, se2.between(PATH[0], pose))
+    hybrid_map.set_arc(1, 2, PoseGaussian(np.array([1.0, -5.5, 2.0]), 1e-4 * np.eye(3)), closure=False)
+    found = laid([2])
+    assert {fit.area for fit in found} == {2}
+    assert off(max(found, key=lambda fit: fit.mode.log_mass)) < 0.05
+
+
+@pytest.mark.parametrize(("deviation", "count"), [(0.05, 2), (3.0, 6)])
+def test_areas_are_searched_together_where_they_lie_for_certain_beside_each_other(deviation, count):
+    """Six areas in a row, 5 m apart: each belongs to one region, whose map reaches beyond it."""
+    hybrid_map = HybridMap()
+    for area in range(6):
+        hybrid_map.place(area, area, np.zeros(3))
+        if area:
+            arc = PoseGaussian(np.array([5.0, 0.0, 0.0]), np.diag([deviation, deviation, 0.01]) ** 2)
+            hybrid_map.set_arc(area - 1, area, arc, closure=False)
+    found = regions(hybrid_map, range(6), 10.0)
+    assert sorted(area for part in found for area in part.own) == list(range(6))
+    assert len(found) == count
+    assert all(part.own <= part.poses.keys() for part in found)
+    if count == 2:
+        assert found[0].poses.keys() == {0, 1, 2, 3, 4}
