@@ -177,8 +177,8 @@ def is_record(kind: object) -> bool:
 
 @cache
 def names_in(kind: type) -> tuple[str, ...]:
-    """The names of the fields of a dataclass or named tuple."""
-    return tuple(entry.name for entry in fields(kind)) if is_dataclass(kind) else cast(Any, kind)._fields
+    """The names of the fields of a dataclass or named tuple; one that is no argument is worked out anew."""
+    return tuple(entry.name for entry in fields(kind) if entry.init) if is_dataclass(kind) else cast(Any, kind)._fields
 
 
 _SCALARS: dict[Hashable, tuple[type, str]] = {

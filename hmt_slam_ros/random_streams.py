@@ -18,6 +18,7 @@ class Purpose(IntEnum):
     PEOPLE = 103
     WHEELS = 104
     LASER = 105
+    CHANGES = 106
 
 
 def stream(seed: int, purpose: Purpose, step: int) -> np.random.Generator:
@@ -26,7 +27,7 @@ def stream(seed: int, purpose: Purpose, step: int) -> np.random.Generator:
     All hypotheses draw the same numbers: where two have the same map and the same past they stay the same, and the
     ratio of their evidence carries no noise of sampling.
 
-    :param seed: seed of the run.
+    :param seed: seed of the run, below 2**64.
     :param purpose: what the numbers are for.
     :param step: keyframe event, scan, piece of furniture or person, from 0.
     """

@@ -17,7 +17,6 @@ from hmt_slam_ros.offline.final_map import final_map
 from hmt_slam_ros.offline.reading import LogState, Reading, goes_on
 from hmt_slam_ros.offline.runtime import Run, run_log
 from hmt_slam_ros.sensing import Scan
-from hmt_slam_ros.topology.unknown import tells_nothing
 
 WORLD = "sim:office,seed=3,size=0.7"
 BUNDLED = Path(__file__).parents[1] / "data" / "malaga_one_loop"
@@ -78,12 +77,17 @@ def test_the_poses_of_both_logs_are_in_one_frame(both, first):
     assert np.abs(away[:, 2]).max() < TURN
 
 
-def test_the_robot_was_lost_at_first_and_then_joined(both, first):
-    recording, _ = both
-    hybrid_map = recording.hybrid_map
-    own = {area for area in hybrid_map.area_ids() if min(hybrid_map.keyframes(area)) >= first.slam.events}
-    assert own
-    assert any(len({a, b} & own) == 1 and not tells_nothing(arc.pose) for a, b, arc in hybrid_map.all_arcs())
+def test_the_robot_was_lost_at_first_and_then_joined(first, second_log):
+    run, lost = Run(Configuration(), state=first), []
+    for record in run.unread(second_log):
+        run.read(record)
+        events = max(run.recorder.hypotheses, default=-1)
+        if events >= first.slam.events:
+            lost.append(all(leaf.lost for leaf in run.recorder.hypotheses[events].leaves))
+    assert lost[0]
+    assert not lost[-1]
+    joined = lost.index(False)
+    assert not any(lost[joined:])
 
 
 @pytest.mark.parametrize("by", [-3600, -60])

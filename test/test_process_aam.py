@@ -138,13 +138,15 @@ def test_the_keyframes_that_left_begin_the_new_area():
 def measured(monkeypatch):
     """The numbers of scan pairs that were compared, call by call."""
     counts = []
-    original = aam_module.sensed_overlaps
+    def counted(original):
+        def counting(one, pose, others, other_poses, radius):
+            counts.append(len(others))
+            return original(one, pose, others, other_poses, radius)
 
-    def counting(points, pose, others, other_poses, radius):
-        counts.append(len(others))
-        return original(points, pose, others, other_poses, radius)
+        return counting
 
-    monkeypatch.setattr(aam_module, "sensed_overlaps", counting)
+    for name in ("overlaps", "sensed_overlaps"):
+        monkeypatch.setattr(aam_module, name, counted(getattr(aam_module, name)))
     return counts
 
 

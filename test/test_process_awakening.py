@@ -1,26 +1,44 @@
-"""A robot that wakes up somewhere in a map maps around itself, until it is recognized where it is."""
+"""A robot that wakes up somewhere in a map, or is carried, maps around itself, until it is recognized where it is."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from benchmark.awakening import FAR, awakened, mapped
+from benchmark.kidnapping import SOON, kidnapped
 from hmt_slam_ros.configuration import Configuration
+from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.logs import open_log
 from hmt_slam_ros.offline.runtime import Run
-from hmt_slam_ros.processes.messages import Carried
+from hmt_slam_ros.processes.messages import Carried, Place
 from hmt_slam_ros.processes.replica import Replica
-from hmt_slam_ros.sensing import Scan
+from hmt_slam_ros.sensing import Odometry, Scan
+from hmt_slam_ros.simulation.scenario import START
 from hmt_slam_ros.topology.closure_search import ClosureSearch
 from hmt_slam_ros.topology.unknown import tells_nothing, unknown
 
 WORLD = "sim:office,seed=3,size=0.7"
+CARRIED = f"{WORLD},carried=0.6,to=0.75,turned=120"
 OFF = np.array([5.0, 0.0, 0.0])
 
 
 @pytest.fixture(scope="module")
-def office():
-    return mapped(WORLD)
+def maps():
+    return mapped(WORLD, Configuration())
+
+
+@pytest.fixture(scope="module")
+def office(maps):
+    return maps["whole"]
+
+
+@pytest.fixture(scope="module")
+def begin(office):
+    """The record of a keyframe's scan."""
+    known = {scan.stamp for scan in Replica.of(office.state.tsbi.replica).scans.values()}
+    return [scan for scan in office.scans if office.records[scan].measurement.stamp in known][60]
 
 
 def carried(office, records, scans):
@@ -35,9 +53,9 @@ def carried(office, records, scans):
     return run
 
 
-def test_it_begins_a_new_area_to_which_an_arc_leads_that_tells_nothing(office):
+def test_it_begins_a_new_area_to_which_an_arc_leads_that_tells_nothing(office, begin):
     before = Replica.of(office.state.tsbi.replica)
-    run = carried(office, office.records[office.starts[60] :], 10)
+    run = carried(office, office.records[begin :], 10)
     replica = Replica.of(run.state.tsbi.replica)
     (leaf,) = run.recorder.hypotheses[max(run.recorder.hypotheses)].leaves
     assert leaf.lost
@@ -49,15 +67,26 @@ def test_it_begins_a_new_area_to_which_an_arc_leads_that_tells_nothing(office):
         assert hybrid_map.keyframes(area).keys() == before.maps[before.best].keyframes(area).keys()
 
 
-@pytest.mark.parametrize("share", [0.15, 0.4, 0.7])
-def test_it_is_recognized_where_it_is(office, share):
-    found = awakened(office, office.starts[int(share * len(office.starts))])
+@pytest.mark.parametrize(("kind", "share"), [("whole", 0.15), ("whole", 0.7), ("first half", 0.5)])
+def test_it_is_recognized_where_it_is(maps, kind, share):
+    log = maps[kind]
+    found = awakened(log, log.starts[int(share * len(log.starts))])
     assert found.right
     assert not found.wrong
     assert found.found <= FAR
 
 
-def test_it_is_not_believed_to_be_where_one_look_alone_finds_it(office, monkeypatch):
+def test_in_the_map_of_the_first_half_it_wakes_up_in_the_second_near_keyframes_of_the_first(maps):
+    log, whole = maps["first half"], maps["whole"]
+    scans = Replica.of(log.state.tsbi.replica).scans.values()
+    stamps = {log.records[scan].measurement.stamp: n for n, scan in enumerate(log.scans)}
+    known = np.array([log.truth[stamps[scan.stamp], :2] for scan in scans])
+    assert max(stamps[scan.stamp] for scan in scans) < min(log.starts)
+    assert all(np.hypot(*(known - log.truth[start, :2]).T).min() < 2.1 for start in log.starts)
+    assert np.hypot(*(log.truth - whole.truth)[:, :2].T).max() < 0.5
+
+
+def test_it_is_not_believed_to_be_where_one_look_alone_finds_it(office, begin, monkeypatch):
     """Every other look finds it 5 m off."""
     looks, found = [], ClosureSearch.everywhere
 
@@ -72,7 +101,7 @@ def test_it_is_not_believed_to_be_where_one_look_alone_finds_it(office, monkeypa
         return looks[-1]._replace(found=tuple(moved))
 
     monkeypatch.setattr(ClosureSearch, "everywhere", off_at_times)
-    run = carried(office, office.records[office.starts[60] :], 150)
+    run = carried(office, office.records[begin :], 150)
     (leaf,) = run.recorder.hypotheses[max(run.recorder.hypotheses)].leaves
     assert sum(look.best is not None and look.best[1] > 0.9 for look in looks) >= 3
     assert leaf.lost
@@ -84,9 +113,61 @@ def test_in_a_building_that_it_does_not_know_it_stays_lost(office, seed):
     assert all(leaf.lost for leaf in run.recorder.hypotheses[max(run.recorder.hypotheses)].leaves)
 
 
-def test_scans_are_counted_on_and_odometry_begins_anew(office):
-    run = carried(office, office.records[office.starts[60] :], 25)
+def test_a_robot_that_stands_still_is_recognized_where_somebody_says_that_it_is(office, begin):
+    """In the place of a keyframe; what is said is 0.4 m and 6 degrees off."""
+    replica = Replica.of(office.state.tsbi.replica)
+    hybrid_map = replica.maps[replica.best]
+    scan = office.records[begin].measurement
+    (at,) = [
+        (area, pose)
+        for area in hybrid_map.area_ids()
+        for keyframe, pose in hybrid_map.keyframes(area).items()
+        if replica.scans[keyframe].stamp == scan.stamp
+    ]
+    said = PoseGaussian(se2.compose(at[1], np.array([0.3, -0.25, 0.1])), np.diag([0.5, 0.5, 0.26]) ** 2)
+    run = Run(Configuration(), state=office.state)
+    run.lock_step.feed(Carried(Place(at[0], said)))
+    for k in range(3):
+        stamp = scan.stamp + k * 200_000_000
+        run.lock_step.feed(Odometry(stamp, np.zeros(3)))
+        run.lock_step.feed(replace(scan, stamp=stamp))
+    run.lock_step.feed(Odometry(stamp + 200_000_000, np.zeros(3)))
+    leaves = run.recorder.hypotheses[max(run.recorder.hypotheses)].leaves
+    assert sum(leaf.probability for leaf in leaves if not leaf.lost) > 0.9
+
+
+def test_scans_are_counted_on_and_odometry_begins_anew(office, begin):
+    run = carried(office, office.records[begin :], 25)
     assert run.state.slam.scans == office.state.slam.scans + 25
+    assert run.state.slam.dropped == 0
+
+
+def test_one_that_is_carried_while_it_maps_notices_and_is_recognized():
+    found = kidnapped(CARRIED)
+    assert found.noticed <= SOON
+    assert found.again <= FAR
+    assert not found.confident
+    assert max(found.errors) < 0.1
+
+
+def test_one_that_is_carried_while_it_stores_nothing_notices_and_is_recognized(office):
+    run = Run(Configuration(mode="localization"), state=office.state)
+    run.lock_step.feed(Carried())
+    log = open_log(CARRIED)
+    jump = START + int(0.6e9 * log.scenario.drive.duration)
+    heard = []
+    for record in log.records():
+        since = 1e-9 * (record.measurement.stamp - jump)
+        if since > 40.0:
+            break
+        if since > -30.0:
+            run.read(record)
+        if run.recorder.hypotheses:
+            lost = all(leaf.lost for leaf in run.recorder.hypotheses[max(run.recorder.hypotheses)].leaves)
+            heard.append((since, lost))
+    assert not any(lost for since, lost in heard if -1.0 < since < 0.0)
+    assert any(lost for since, lost in heard if 0.0 < since < SOON)  # at 0.6 m/s at most
+    assert not heard[-1][1]
     assert run.state.slam.dropped == 0
 
 

@@ -1,4 +1,4 @@
-"""A robot that was displaced without notice is found in the map, where there is one place alone that it can be in."""
+"""A robot that was displaced without notice is lost from then on, as far as its scans contradict that it was not."""
 
 import math
 from dataclasses import replace
@@ -6,65 +6,115 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from test_process_tsbi_branching import OTHER, PATH, ROOM, rooms_apart
+from worlds import box, scan_in
 
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.processes.tsbi_displacement import with_displaced
+from hmt_slam_ros.processes.tsbi_awakening import UNKNOWN
+from hmt_slam_ros.processes.tsbi_displacement import displaced_or_not, with_displaced
 from hmt_slam_ros.topology.hypothesis_tree import LeafNotes
+from hmt_slam_ros.topology.unknown import tells_nothing
 
-FAR = (30.0, 20.0)
-
-
-def asked(rooms, doubts):
-    """What comes of the question in the last room, far from which the arcs have all others."""
-    parent, branching, newest = rooms_apart(rooms, [FAR] * (len(rooms) - 1), 0.1)
-    doubtful = replace(parent, notes=replace(parent.notes, doubts={newest[n]: odds for n, odds in doubts.items()}))
-    branches = branching.cut(doubtful, newest[1:])
-    return branches, with_displaced(branching, doubtful, newest[1:], branches)
+FAR, HERE = (30.0, 20.0), (0.0, 0.0)
+PRIOR = math.log(1e-5)
 
 
-def test_where_the_arcs_lied_the_robot_is_found_and_no_arc_is_bent():
-    before, after = asked((ROOM, OTHER, ROOM), {2: 0.1})
-    assert [child.area for child in before.children] == [3]
-    found = after.children[-1]
-    assert found.area == 0
-    assert found.arcs == ()
-    poses = {r.keyframe: r.pose for r in found.relabelled}
+HALL = np.concatenate((box(-3.0, 0.5, 9.0, 4.5), box(4.0, 3.0, 5.0, 4.0)))
+
+
+def asked(rooms, doubts, offset=FAR):
+    """What comes of doubts in the last room, {keyframe of it: nats}, from which the arcs have all others far away.
+
+    The robot was carried there from a hall, in which it stored two keyframes.
+    """
+    parent, branching, newest = rooms_apart(rooms, [offset] * (len(rooms) - 1), 0.1)
+    for k, keyframe in enumerate(newest[:2]):
+        branching._replica.scans[keyframe] = scan_in(
+            HALL, PATH[k], noise=0.01, seed=keyframe, field_of_view=2 * np.pi, beams=361
+        )
+    notes = replace(parent.notes, doubts={newest[n]: nats for n, nats in doubts.items()})
+    return with_displaced(branching, replace(parent, notes=notes))
+
+
+def test_the_keyframes_since_then_begin_an_area_of_which_nothing_tells_where_it_is():
+    stays, lost = asked((ROOM, OTHER, ROOM), {2: 8.0}).children
+    assert (stays.area, stays.log_weight, stays.relabelled) == (2, 0.0, ())
+    assert lost.area == 3
+    assert lost.notes.lost == 14
+    (arc,) = lost.arcs
+    assert (arc.source, arc.target) == (2, 3)
+    assert tells_nothing(arc.pose)
+    poses = {r.keyframe: r.pose for r in lost.relabelled}
     assert sorted(poses) == [14, 15, 16, 17]  # what was stored before the displacement stays
     for keyframe, pose in poses.items():
-        np.testing.assert_allclose(pose, se2.between(PATH[0], PATH[keyframe - 12]), atol=0.05)
-    assert math.log(0.1) - 4.0 < found.log_weight < math.log(0.1) + 6.0
-    assert all(not child.notes.doubts for child in after.children)
+        np.testing.assert_allclose(pose, se2.between(PATH[2], PATH[keyframe - 12]), atol=1e-9)
+    assert not stays.notes.doubts
+    assert not lost.notes.doubts
+
+
+def test_that_the_place_is_known_elsewhere_speaks_for_it_and_one_look_has_found_it():
+    _, lost = asked((ROOM, OTHER, ROOM), {2: 8.0}).children
+    assert lost.log_weight > PRIOR + 8.0 + 1.0
+    assert lost.notes.credit == pytest.approx(lost.log_weight - PRIOR - 8.0)
+    assert lost.notes.sighted.area == 0
+    np.testing.assert_allclose(lost.notes.sighted.pose, se2.between(PATH[0], PATH[5]), atol=0.05)
+
+
+def test_on_ground_that_nobody_knows_the_doubts_alone_speak_for_it():
+    _, lost = asked((OTHER, OTHER, ROOM), {2: 8.0}).children
+    assert lost.log_weight == pytest.approx(PRIOR + 8.0 + math.log(UNKNOWN), abs=0.5)
+    assert lost.notes.sighted is None
+
+
+def test_that_the_place_is_known_where_the_robot_would_be_anyway_speaks_against_it():
+    _, lost = asked((ROOM, OTHER, ROOM), {2: 8.0}, HERE).children
+    assert lost.log_weight < PRIOR + 8.0 - 2.0
 
 
 @pytest.mark.parametrize(
     "doubts",
-    [{}, {2: 1e-5}, {4: 0.1}],
+    [{}, {2: 1.0}, {4: 12.0}],
     ids=["sure", "hardly doubtful", "just now, and two keyframes are too few"],
 )
-def test_a_robot_that_is_hardly_displaced_is_not_looked_for(doubts):
-    before, after = asked((ROOM, OTHER, ROOM), doubts)
-    assert after is before
+def test_a_robot_that_is_hardly_displaced_is_not_asked_about(doubts):
+    assert asked((ROOM, OTHER, ROOM), doubts) is None
 
 
-@pytest.mark.parametrize("rooms", [(ROOM, ROOM, ROOM), (OTHER, OTHER, ROOM)], ids=["one of two alike", "a new one"])
-def test_a_robot_that_may_be_anywhere_is_not_found_and_that_is_said(rooms):
-    before, after = asked(rooms, {2: 0.1})
-    assert after.children == before.children
-    assert math.exp(after.log_skipped) == pytest.approx(0.05)
+def test_an_area_is_not_left_without_keyframes():
+    _, lost = asked((ROOM, OTHER, ROOM), {0: 8.0}).children
+    assert [r.keyframe for r in lost.relabelled] == [13, 14, 15, 16, 17]
 
 
-def test_a_scan_that_contradicts_is_remembered_for_a_while_and_in_the_next_area():
-    notes = LeafNotes().heard(5, -1.0).heard(6, -8.0).heard(7, -7.0)
+@pytest.mark.parametrize(("nats", "lost"), [(11.0, None), (12.0, 18)])
+def test_where_nothing_is_stored_it_is_lost_from_the_next_keyframe_on_if_that_is_more_probable(nats, lost):
+    parent, _, newest = rooms_apart((ROOM,), [], 0.1)
+    doubtful = replace(parent, notes=replace(parent.notes, doubts={newest[4]: nats}))
+    child = displaced_or_not(doubtful, 17)
+    assert child.notes.lost == lost
+    assert bool(child.notes.doubts) == (lost is None)
+
+
+def test_scans_that_contradict_add_up_and_are_remembered_in_the_next_area():
+    notes = LeafNotes().heard(5, 0.3).heard(6, -8.0).heard(7, -5.0).heard(8, -1.2)
     odds, since = notes.displaced
     assert since == 6
-    assert odds == pytest.approx(1e-5 * (math.exp(8.0) + math.exp(7.0)))
+    assert odds == pytest.approx(PRIOR + 7.0 + 4.0 + 0.2)
     assert notes.entered({}).displaced == (odds, since)
-    assert notes.heard(100, 0.0).displaced == (0.0, 0)
 
 
-def test_what_contradicted_long_before_is_another_matter():
-    assert LeafNotes().heard(5, -3.0).heard(20, -5.0).heard(21, -8.0).displaced[1] == 20
+def test_what_contradicts_at_every_keyframe_is_clutter():
+    notes = LeafNotes()
+    for event in range(20):
+        notes = notes.heard(event, -0.9)
+    assert not notes.doubts
+    assert notes.displaced == (-math.inf, 0)
 
 
-def test_odds_do_not_exceed_one():
-    assert LeafNotes().heard(5, -900.0).heard(6, -900.0).displaced == (1.0, 5)
+def test_a_doubt_passes_with_scans_that_fit():
+    notes = LeafNotes().heard(5, -4.0)
+    for event in range(6, 9):
+        notes = notes.heard(event, 0.3)
+    assert not notes.doubts
+
+
+def test_what_contradicted_a_little_before_is_another_matter():
+    assert LeafNotes().heard(5, -2.0).heard(6, -9.0).heard(7, -6.0).displaced[1] == 6

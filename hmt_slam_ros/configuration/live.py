@@ -12,6 +12,11 @@ class RealTimeLocalization:
     """RTL: the pose at the rate of the odometry."""
 
     publish_tf: bool = parameter(True, "Publish map -> odom on /tf.")
+    correction_time: float = parameter(
+        0.0,
+        "Time in which a correction of map -> odom falls to a third, for those who steer by it; 0 corrects at once.",
+        unit="s", low=0.0, high=60.0,
+    )
     max_speed: float = parameter(
         10.0, "Odometry that moves faster than this between two readings was reset.", unit="m/s", low=0.1, high=1000.0
     )

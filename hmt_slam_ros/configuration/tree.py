@@ -34,8 +34,9 @@ class Configuration:
     seed: int = parameter(0, "Seed of all random numbers of a run.", low=0, high=2**31 - 1)
     mode: str = parameter(
         "mapping",
-        "Whether the map grows, or the robot only finds its place in a map that stays as it was loaded.",
-        choices=("mapping", "localization"),
+        "Whether the map grows, or the robot only finds its place in a map that stays as it was loaded, or the map "
+        "follows a world that changes: it is added to only where something is new, and what is no more is left out.",
+        choices=("mapping", "localization", "lifelong"),
     )
     motion: Motion = field(default_factory=Motion)
     local_map: LocalMap = field(default_factory=LocalMap)

@@ -251,14 +251,21 @@ class AreaFilter:
         self._restart()
         return FilterStep(moved, error, information, log_evidence, effective, changed)
 
-    def _log_same(self, points: Float64, particle: int) -> float:
-        """log p(scan | this is the place) / p(scan | a place that looks alike) in the map of a particle, nats.
+    def log_same(self, points: Float64) -> float:
+        """log p(scan | this is the place) / p(scan | a place that looks alike) in the map of the leader, nats.
 
-        Learns how much contradicts usually.
+        :param points: surfels of the scan, shape (n, 4), base frame.
         """
+        return SCAN.log_ratio(self._agreement(points, self.leader), self._usual.share)
+
+    def _agreement(self, points: Float64, particle: int) -> Agreement:
         view = self.mapping.pool.view(self._tables[particle])
         near, far = self.mapping.near, 2 * self.mapping.near
-        found = Agreement(len(points), *matching.agreement(points, self.poses[particle], view, near, far))
+        return Agreement(len(points), *matching.agreement(points, self.poses[particle], view, near, far))
+
+    def _log_same(self, points: Float64, particle: int) -> float:
+        """The same for any particle; learns how much contradicts usually."""
+        found = self._agreement(points, particle)
         log_ratio = SCAN.log_ratio(found, self._usual.share)
         self._usual = self._usual.after(found, SCAN.stretch)
         return log_ratio

@@ -30,7 +30,7 @@ from hmt_slam_ros.sensing import Scan
 from hmt_slam_ros.topology.common_map import Keyframes, Pair
 from hmt_slam_ros.topology.crowding import crowded, in_place
 from hmt_slam_ros.topology.hybrid_map import HybridMap
-from hmt_slam_ros.topology.overlap import Sensed, sensed_overlaps
+from hmt_slam_ros.topology.overlap import Sensed, overlaps, sensed_overlaps
 from hmt_slam_ros.topology.overlap_graph import (
     OverlapGraph,
     Separation,
@@ -97,6 +97,8 @@ class Aam:
             self._replica.apply(message)
             self._watches = {leaf.hypothesis: self._follow(leaf) for leaf in message.leaves}
             self._forget({one.keyframe for one in message.forgotten})
+            for late in message.outdated:
+                self._seen.pop(late.keyframe, None)
         elif isinstance(message, Accepted) and message.hypothesis is not None:
             self._replica.accept(message)
             self._watches = {message.hypothesis: self._watches[message.hypothesis]}
@@ -306,7 +308,7 @@ class Aam:
 
         def measure(keyframe: int, others: tuple[int, ...]) -> NDArray[np.float64]:
             poses = np.array([placed[other] for other in others]).reshape(-1, 3)
-            seen = [self._seen_by(other) for other in others]
-            return sensed_overlaps(self._seen_by(keyframe), placed[keyframe], seen, poses, self._options.overlap_radius)
+            seen = [self._seen_by(other).points for other in others]
+            return overlaps(self._seen_by(keyframe).points, placed[keyframe], seen, poses, self._options.overlap_radius)
 
         return synchronised(graph, placed, measure, *others)

@@ -27,6 +27,7 @@ from hmt_slam_ros.processes.messages import (
     LeafEstimate,
     LocalEstimate,
     Notice,
+    Outdated,
     Place,
 )
 from hmt_slam_ros.sensing import Scan
@@ -59,6 +60,7 @@ class KeyframeHead:
     carried: bool
     place: Place | None
     mapping: bool
+    outdated: tuple[Outdated, ...]
 
     @classmethod
     def of(cls, keyframe: Keyframe) -> KeyframeHead:
@@ -67,7 +69,7 @@ class KeyframeHead:
         geometry = ScanGeometry(**{entry.name: getattr(scan, entry.name) for entry in fields(ScanGeometry)})
         return cls(
             keyframe.sequence, geometry, keyframe.travelled, keyframe.leaves, keyframe.carried, keyframe.place,
-            keyframe.mapping,
+            keyframe.mapping, keyframe.outdated,
         )  # fmt: skip
 
     def with_ranges(self, ranges: NDArray[np.float32]) -> Keyframe:
@@ -78,7 +80,8 @@ class KeyframeHead:
         geometry = {entry.name: getattr(self.scan, entry.name) for entry in fields(self.scan)}
         scan = Scan(ranges=ranges, **geometry)
         return Keyframe(
-            self.sequence, scan, self.travelled, self.leaves, self.carried, self.place, self.mapping
+            self.sequence, scan, self.travelled, self.leaves, self.carried, self.place, self.mapping,
+            self.outdated,
         )  # fmt: skip
 
 
@@ -122,7 +125,7 @@ class RobotStatus:
 class SaveRequest:
     """slam asks the others for their parts of a map.
 
-    :ivar number: of the request, from 1.
+    :ivar number: of the request, larger than those before.
     :ivar events: keyframe events after which all parts are.
     :ivar folder: into which they are written.
     :ivar last: whether all nodes end afterwards.
@@ -154,7 +157,7 @@ class SavedPart:
 class BeginRequest:
     """slam asks the others to begin anew.
 
-    :ivar number: of the request, from 1.
+    :ivar number: of the request, larger than those before.
     :ivar events: keyframe events after which all do.
     :ivar folder: the map with which they begin, empty where with none.
     """
@@ -180,9 +183,9 @@ class BegunPart:
 
 # Raise a document's version with every change of its dataclass: a receiver refuses any other.
 _DOCUMENTS: dict[type, tuple[str, int]] = {
-    KeyframeHead: ("keyframe", 5),
+    KeyframeHead: ("keyframe", 6),
     AreaEvents: ("area_events", 3),
-    Hypotheses: ("hypotheses", 5),
+    Hypotheses: ("hypotheses", 7),
     Accepted: ("accepted", 4),
     LocalEstimate: ("local_estimate", 1),
     Arriving: ("arriving", 1),
@@ -196,13 +199,16 @@ _DOCUMENTS: dict[type, tuple[str, int]] = {
 }
 
 
-def encode(message: object) -> str:
+def encode(message: object, begun: int = 0) -> str:
     """The JSON document of a message, of a :class:`KeyframeHead`, :class:`Closing` or :class:`RobotStatus`.
 
+    :param begun: number of the request after which all began anew, 0 before the first.
     :raises HmtSlamError: where a float is NaN or infinite.
     """
     name, version = _DOCUMENTS[type(message)]
     content = {"document": name, "version": version, **plain(message, {np.ndarray: np.ndarray.tolist})}
+    if begun:
+        content["begun"] = begun
     try:
         return json.dumps(content, allow_nan=False, separators=(",", ":"))
     except ValueError as error:
@@ -215,6 +221,14 @@ def decode(text: str, kind: type[Document]) -> Document:
     :param kind: what the document has to be.
     :raises HmtSlamError: where it is something else, of another version, or malformed; names the field.
     """
+    return decode_numbered(text, kind)[0]
+
+
+def decode_numbered(text: str, kind: type[Document]) -> tuple[Document, int]:
+    """The message of a JSON document, and the number of the request after which its sender had begun anew.
+
+    :raises HmtSlamError: as :func:`decode`.
+    """
     name, version = _DOCUMENTS[kind]
     try:
         content = json.loads(text)
@@ -226,7 +240,8 @@ def decode(text: str, kind: type[Document]) -> Document:
         raise HmtSlamError(
             f"a {name} document has version {found}, not {version}: run the same version of hmt_slam_ros everywhere"
         )
-    return _VALUES.value(content, kind, name)
+    begun = _VALUES.value(content.pop("begun", 0), int, f"{name}.begun")
+    return _VALUES.value(content, kind, name), begun
 
 
 def _array_reader(field: str, kind: Hashable) -> Reader:  # noqa: ARG001  all are of one kind

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
@@ -18,11 +18,14 @@ from hmt_slam_ros.local_map.area_filter import AreaFilter, FilterState, FilterSt
 from hmt_slam_ros.local_map.local_mapping import LocalMapping
 from hmt_slam_ros.local_map.match_error import MatchError
 from hmt_slam_ros.processes.messages import Leaf, LeafEstimate, Merged, Relabelled, Trail
+from hmt_slam_ros.processes.news import Look, looked
 from hmt_slam_ros.sensing import Scan
 from hmt_slam_ros.topology.crowding import Successor, in_place, successor
 
 _FIRST_COVARIANCE = np.diag([1e-8, 1e-8, 1e-8])
 _STAY = PoseGaussian.exactly(np.zeros(3))
+# Evidence of a scan, nats, below which it contradicts what the robot should see: most who drive never meet one.
+_CONTRADICTING = -4.0
 _NO_ERROR = MatchError(_FIRST_COVARIANCE, _FIRST_COVARIANCE, np.zeros((3, 3)))
 
 
@@ -62,6 +65,8 @@ class LiveState:
     :ivar placed: of the poses of keyframes in their areas' frames, of all that are known.
     :ivar drift: covariance of the pose at the last keyframe event in the area's frame, right tangent, shape (3, 3).
     :ivar trail: (stamp, anchor, ``anchor_T_base``) of the scans since the last keyframe event.
+    :ivar contradicted: whether the scan of the last keyframe event contradicted what the robot should have seen.
+    :ivar looks: the scans that the next keyframe's is compared with, in mode lifelong.
     """
 
     filter: FilterState
@@ -74,6 +79,8 @@ class LiveState:
     placed: KeyframeCovariances
     drift: NDArray[np.float64]
     trail: tuple[tuple[int, int, NDArray[np.float64]], ...]
+    contradicted: bool
+    looks: tuple[Look, ...]
 
 
 @dataclass
@@ -91,6 +98,8 @@ class LiveHypothesis:
     :ivar placed: {keyframe: covariance (3, 3) of its pose in its area's frame, right tangent}, of all that are known.
     :ivar drift: covariance of the pose at the last keyframe event in the area's frame, right tangent.
     :ivar trail: (stamp, anchor, ``anchor_T_base``) of the scans since the last keyframe event.
+    :ivar contradicted: whether the scan of the last keyframe event contradicted what the robot should have seen.
+    :ivar looks: the scans that the next keyframe's is compared with, in mode lifelong.
     """
 
     filter: AreaFilter
@@ -104,6 +113,8 @@ class LiveHypothesis:
     placed: dict[int, NDArray[np.float64]] = field(default_factory=dict)
     drift: NDArray[np.float64] = field(default_factory=_FIRST_COVARIANCE.copy)
     trail: list[tuple[int, int, NDArray[np.float64]]] = field(default_factory=list)
+    contradicted: bool = False
+    looks: tuple[Look, ...] = ()
 
     @classmethod
     def of(cls, mapping: LocalMapping, state: LiveState) -> LiveHypothesis:
@@ -111,7 +122,7 @@ class LiveHypothesis:
         return cls(
             AreaFilter.of(mapping, state.filter), mapping.configuration.filter, state.event_pose, state.moved,
             state.information, state.error, state.anchor, state.fresh.by_keyframe(), state.placed.by_keyframe(),
-            state.drift, list(state.trail),
+            state.drift, list(state.trail), state.contradicted, state.looks,
         )  # fmt: skip
 
     def state(self, tables: Int32) -> LiveState:
@@ -122,7 +133,7 @@ class LiveHypothesis:
         return LiveState(
             replace(self.filter.state, tables=tables), self.event_pose, self.moved, self.information, self.error,
             self.anchor, KeyframeCovariances.of(self.fresh), KeyframeCovariances.of(self.placed), self.drift,
-            tuple(self.trail),
+            tuple(self.trail), self.contradicted, self.looks,
         )  # fmt: skip
 
     def branch(self, hypothesis: int) -> LiveHypothesis:
@@ -139,16 +150,25 @@ class LiveHypothesis:
             dict(self.placed),
             self.drift,
             list(self.trail),
+            self.contradicted,
+            self.looks,
         )
 
-    def event_due(self) -> bool:
-        """Whether the robot moved or turned far enough since the last keyframe event."""
+    def event_due(self, points: NDArray[np.float64]) -> bool:
+        """Whether the robot moved or turned far enough since the last keyframe event, or may have been displaced.
+
+        :param points: surfels of the newest scan, shape (n, 4), base frame. Where it is the first that contradicts what
+            the robot should see, it is where the robot is now.
+        """
         moved = se2.between(self.event_pose, self.filter.pose)
         far = math.hypot(moved[0], moved[1]) >= self.settings.keyframe_distance
-        return far or abs(moved[2]) >= math.radians(self.settings.keyframe_angle)
+        if far or abs(moved[2]) >= math.radians(self.settings.keyframe_angle):
+            return True
+        return not self.contradicted and self.filter.log_same(points) < _CONTRADICTING
 
     def event(
-        self, sequence: int, scan: Scan, points: NDArray[np.float64], *, arriving: bool = False, storing: bool = True
+        self, sequence: int, scan: Scan, points: NDArray[np.float64], *, arriving: bool = False, storing: bool = True,
+        wanted: Callable[[], bool] | None = None,
     ) -> LeafEstimate:
         """One filter step with a keyframe's scan, which enters the map where it adds something new.
 
@@ -156,14 +176,17 @@ class LiveHypothesis:
         :param points: surfels of the scan, to be matched, shape (n, 4), base frame.
         :param arriving: whether nothing tells how the robot came there: the scan is matched with nothing.
         :param storing: whether the hypothesis's map may change.
-        """
+        :param wanted: asked after the filter step whether the scan adds something; a new place does if None.
+        """  # fmt: skip
         if arriving:
             unmoved, nothing = np.zeros(3), np.zeros((3, 3))
             step = FilterStep(unmoved, _NO_ERROR, nothing, 0.0, float(len(self.filter.poses)), False)
         else:
             step = self.filter.update(points, sequence)
-        stored = arriving or (storing and self._is_new())
-        self.error = step.error
+        self.looks = () if arriving else self.looks
+        self.error, self.contradicted = step.error, step.log_evidence < _CONTRADICTING
+        # Of a displaced robot it is the first of where it is now.
+        stored = arriving or (storing and ((wanted or self.is_new)() or self.contradicted))
         self._drift_on(sequence if stored else None)
         if stored:
             self.filter.add_keyframe(sequence, scan)
@@ -180,7 +203,11 @@ class LiveHypothesis:
             self._revised(sequence) if step.history_changed and storing else (),
         )
 
-    def _is_new(self) -> bool:
+    def note_look(self, scan: Scan) -> None:
+        """Compare what follows with a scan that was taken where the filter is."""
+        self.looks = looked(self.looks, Look(scan, self.filter.pose.copy()))
+
+    def is_new(self) -> bool:
         """Whether no keyframe of the local map was taken from nearby with a like heading."""
         if not self.filter.keyframes:
             return True
@@ -292,6 +319,7 @@ class LiveHypothesis:
         area_T_previous = np.zeros(3) if leaf.rebase is None else leaf.rebase.mean
         self.filter.change_area(leaf.area, area_T_previous, content)
         self.event_pose = se2.compose(area_T_previous, self.event_pose)
+        self.looks = tuple(Look(look.scan, se2.compose(area_T_previous, look.pose)) for look in self.looks)
         if entered and leaf.merged is None:
             moved = {relabelled.keyframe for relabelled in leaf.relabelled}
             self.fresh = {keyframe: step for keyframe, step in self.fresh.items() if keyframe in moved}
@@ -335,6 +363,8 @@ class LiveHypothesis:
         before = self.filter.pose
         self.filter.reload(content, self.anchor)
         self.event_pose = se2.compose(self.filter.pose, se2.between(before, self.event_pose))
+        moved = [se2.compose(self.filter.pose, se2.between(before, look.pose)) for look in self.looks]
+        self.looks = tuple(Look(look.scan, pose) for look, pose in zip(self.looks, moved, strict=True))
 
 
 def _carried(rebase: PoseGaussian, pose: NDArray[np.float64]) -> NDArray[np.float64]:

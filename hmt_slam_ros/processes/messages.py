@@ -75,6 +75,18 @@ class Place:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
+class Outdated:
+    """Beams of a keyframe that say something of the world that is not so any more.
+
+    :ivar keyframe: its number.
+    :ivar beams: their numbers in the scan, ascending.
+    """
+
+    keyframe: int
+    beams: tuple[int, ...]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
 class Keyframe:
     """A keyframe event: slam -> aam, tsbi, tlca, recorder.
 
@@ -85,6 +97,7 @@ class Keyframe:
     :ivar carried: whether nothing tells how the robot came there from the keyframe before.
     :ivar place: where that is as somebody says, None where nobody did.
     :ivar mapping: whether the map may change; what a robot adds to it that may be anywhere changes nothing of it.
+    :ivar outdated: what the one hypothesis's map holds that is no more, as the last scans see it.
     """
 
     sequence: int
@@ -94,6 +107,7 @@ class Keyframe:
     carried: bool = False
     place: Place | None = None
     mapping: bool = True
+    outdated: tuple[Outdated, ...] = ()
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -217,6 +231,8 @@ class Leaf:
     :ivar withdrawn: arcs that this hypothesis does not believe any more.
     :ivar merged: two areas that are one, where this is the only hypothesis; else None.
     :ivar lost: whether the robot may be anywhere in the map, and maps around itself until it is recognized where.
+    :ivar arriving: whether it is lost since now, and nothing was stored that it could map on from: it does from the
+        next scan on.
     """
 
     hypothesis: int
@@ -230,6 +246,7 @@ class Leaf:
     withdrawn: tuple[ArcEnds, ...] = ()
     merged: Merged | None = None
     lost: bool = False
+    arriving: bool = False
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -240,12 +257,14 @@ class Hypotheses:
     :ivar leaves: every live hypothesis, ordered by id; probabilities sum to 1 less ``unexamined``.
     :ivar unexamined: probability of topologies that the gate did not examine or the reduction dropped.
     :ivar forgotten: keyframes that are no more, in any map, after all other changes.
+    :ivar outdated: beams that are left out of keyframes' scans from now on.
     """
 
     sequence: int
     leaves: tuple[Leaf, ...]
     unexamined: float = 0.0
     forgotten: tuple[Forgotten, ...] = ()
+    outdated: tuple[Outdated, ...] = ()
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -101,6 +101,9 @@ class Replica:
         self.maps = {leaf.hypothesis: self._child(leaf) for leaf in hypotheses.leaves}
         self.probabilities = {leaf.hypothesis: leaf.probability for leaf in hypotheses.leaves}
         self.areas = {leaf.hypothesis: leaf.area for leaf in hypotheses.leaves}
+        for late in hypotheses.outdated:
+            if late.keyframe in self.scans:
+                self.scans[late.keyframe] = self.scans[late.keyframe].without(late.beams)
         for one in hypotheses.forgotten:
             for hybrid_map in self.maps.values():
                 hybrid_map.remove(one.keyframe, one.area)

@@ -10,6 +10,7 @@ import math
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,12 +34,14 @@ from hmt_slam_ros.processes.messages import (
     Notice,
     Place,
 )
+from hmt_slam_ros.processes.news import AROUND, CERTAIN, Look, News, news_of, outdated
 from hmt_slam_ros.processes.odometry_watch import OdometryWatch, OdometryWatchState
 from hmt_slam_ros.processes.replica import FIRST_AREA, FIRST_HYPOTHESIS, Replica, ReplicaState
 from hmt_slam_ros.sensing import Odometry, Scan
 from hmt_slam_ros.sensing.deskew import SweepCheck, SweepState, deskewed
 from hmt_slam_ros.sensing.motion import MotionModel, MotionState, Prediction
 from hmt_slam_ros.topology.shortest_path import reachable
+from hmt_slam_ros.topology.surroundings import Nearness, areas_around
 
 # Odometry that has come before may only be late, by more scans than a paced robot runs ahead of its acknowledgements.
 _LATE = 4
@@ -96,15 +99,16 @@ class MetricSlam:
     Consumes Scan, Odometry, Carried, Hypotheses, Accepted, EndOfLog; produces Arriving, Keyframe, Trail, LocalEstimate,
     Notice, Finished.
 
-    :ivar mapping: whether the map grows; otherwise only a robot that may be anywhere maps what is around it.
+    :ivar mode: what is done with known ground; but a robot that may be anywhere maps what is around it.
     """
 
     def __init__(self, configuration: Configuration, state: SlamState | None = None) -> None:
         """:param state: to go on from."""
         state = state or SlamState()
         self._configuration = configuration
-        self.mapping = configuration.mode == "mapping"
+        self.mode = configuration.mode
         self._mapping = LocalMapping(configuration)
+        self._in_sight = Nearness(CERTAIN, AROUND)
         self._replica = Replica.of(state.replica)
         self._motion = MotionModel(configuration.motion, state.motion)
         self._watch = OdometryWatch(state.watch)
@@ -141,6 +145,11 @@ class MetricSlam:
             self._events, self._waiting, self._patient, self._travelled, self._scans, self._dropped,
             self._first_of_trail, self._arriving, self._lost, self._place,
         )  # fmt: skip
+
+    @property
+    def mapping(self) -> bool:
+        """Whether the map may change."""
+        return self.mode != "localization"
 
     @property
     def replica(self) -> Replica:
@@ -219,10 +228,15 @@ class MetricSlam:
         self._dropped += len(self._queue)
         self._queue.clear()
         self._last_stamp = -1
-        self._patient = self._arriving = True
+        self._patient = True
+        self._lose()
+        return [Arriving(self._events, self._scans)]
+
+    def _lose(self) -> None:
+        """The next scan may be from anywhere."""
+        self._arriving = True
         for live in self._live.values():
             live.filter.forget()
-        return [Arriving(self._events, self._scans)]
 
     def _receive(self, scan: Scan) -> list[Message]:
         """Put a scan into the queue; say, once for each fault, what is wrong with it."""
@@ -275,7 +289,7 @@ class MetricSlam:
         scan = deskewed(scan, self._motion.odometry, self._configuration.rtl)
         points = self._mapping.matching_points(scan)
         said = [] if self._arriving else self._track(scan.stamp, points, prediction)
-        if self._arriving or self._place is not None or self._best.event_due():
+        if self._arriving or self._place is not None or self._best.event_due(points):
             said += self._keyframe_event(scan, points)
         for live in self._live.values():
             live.note_scan(scan.stamp)
@@ -298,16 +312,43 @@ class MetricSlam:
         sequence = self._events
         trails: list[Message] = self._trails()
         storing = self.mapping or self._lost
+        news: list[tuple[News, float]] = []
         leaves = tuple(
-            live.event(sequence, scan, points, arriving=self._arriving, storing=storing) for live in self._live.values()
-        )
+            live.event(
+                sequence, scan, points, arriving=self._arriving, storing=storing,
+                wanted=partial(self._is_news, live, scan, news) if self._lifelong else None,
+            )
+            for live in self._live.values()
+        )  # fmt: skip
         self._motion.keyframe(self._best.moved, self._best.information)
         carried, place = self._arriving and sequence > 0, self._place
-        keyframe = Keyframe(sequence, scan, self._travelled, leaves, carried, place, self.mapping)
+        keyframe = Keyframe(
+            sequence, scan, self._travelled, leaves, carried, place, self.mapping, outdated(news)
+        )  # fmt: skip
         self._replica.add(keyframe)
         self._events += 1
-        self._waiting, self._arriving, self._place = True, False, None
+        # With the scan of its arrival the robot is put where somebody says, with the next one it is looked for there,
+        # even if it stands still.
+        self._waiting, self._arriving, self._place = True, False, place if self._arriving else None
         return [*trails, keyframe, *self._tell(self._watch.judge(self._motion.noise))]
+
+    @property
+    def _lifelong(self) -> bool:
+        """Whether the map is changed only where the world is new or has changed."""
+        return self.mode == "lifelong" and not self._lost
+
+    def _is_news(self, live: LiveHypothesis, scan: Scan, found: list[tuple[News, float]]) -> bool:
+        """Whether a scan shows what a hypothesis's map does not hold; what was found is added."""
+        own, hybrid_map = live.filter, self._replica.maps[live.filter.hypothesis]
+        placed = zip(own.keyframes, own.keyframe_areas, own.leading_keyframe_poses(), strict=True)
+        known = [PlacedKeyframe(k, area, self._replica.scans[k], pose) for k, area, pose in placed]
+        # A laser sees farther than the local map reaches.
+        around = areas_around(hybrid_map, own.area, self._in_sight, own.keyframe_areas)
+        beyond = self._content(own.hypothesis, {area: belief.mean for area, belief in around.items()})
+        news = news_of(Look(scan, own.pose), live.looks, [*known, *beyond])
+        live.note_look(scan)
+        found.append((news, self._replica.probabilities[own.hypothesis]))
+        return news.new or news.changed
 
     def _trails(self) -> list[Message]:
         """The trails since the last event, of every hypothesis."""
@@ -330,6 +371,8 @@ class MetricSlam:
                 self._live[leaf.parent].merge(leaf.merged, keyframes)
         self._replica.apply(hypotheses)
         self._lost = all(leaf.lost for leaf in hypotheses.leaves)
+        if all(leaf.arriving for leaf in hypotheses.leaves):
+            self._lose()
         children = {}
         for leaf in hypotheses.leaves:
             parent = self._live[leaf.parent]
@@ -338,6 +381,10 @@ class MetricSlam:
                 areas = {local.area: local.pose for local in leaf.local}
                 live.change_area(leaf, self._content(leaf.hypothesis, areas))
             children[leaf.hypothesis] = live
+        for live in children.values() if hypotheses.outdated else ():
+            if live.filter.keyframes[-1:] == [hypotheses.sequence]:
+                # What stands there now would have to be seen many times to outweigh what was seen before.
+                live.reload(self._surroundings(live))
         self._replace_live(children)
 
     def _accept(self, accepted: Accepted) -> None:

@@ -30,7 +30,7 @@ from hmt_slam_ros.processes.messages import (
 from hmt_slam_ros.processes.replica import FIRST_HYPOTHESIS, Replica, ReplicaState
 from hmt_slam_ros.processes.tsbi_awakening import arrived, looked_for
 from hmt_slam_ros.processes.tsbi_branching import Branches, Branching, BranchingState, Child, Parent
-from hmt_slam_ros.processes.tsbi_displacement import with_displaced
+from hmt_slam_ros.processes.tsbi_displacement import displaced_or_not, with_displaced
 from hmt_slam_ros.processes.tsbi_merging import merged as merged_into
 from hmt_slam_ros.processes.tsbi_reopening import reopened
 from hmt_slam_ros.random_streams import Purpose, stream
@@ -170,11 +170,14 @@ class Tsbi:
         # What a question that is open again moves has to be there.
         arrived_now = keyframe.carried or keyframe.place is not None
         forgotten = () if self._reopened or arrived_now else events.forgotten
-        self._replica.apply(Hypotheses(events.sequence, tuple(changed), settled.unexamined, forgotten))
+        outdated = () if self._reopened or arrived_now else keyframe.outdated
+        self._replica.apply(Hypotheses(events.sequence, tuple(changed), settled.unexamined, forgotten, outdated))
+        if outdated:
+            self._branching.search.forget_scans()
         loaded = [self._loaded(changed[n], child) for n, child in enumerate(chosen)]
         self._unexamined, self._reopened = settled.unexamined, self._reopened if keyframe.carried else ()
         leaves = tuple(sorted(loaded, key=lambda leaf: leaf.hypothesis))
-        return Hypotheses(events.sequence, leaves, settled.unexamined, forgotten)
+        return Hypotheses(events.sequence, leaves, settled.unexamined, forgotten, outdated)
 
     def _parents(self, keyframe: Keyframe) -> list[Parent]:
         """The live hypotheses with their weights; of those that say the same, the heaviest, with the weight of all."""
@@ -206,17 +209,20 @@ class Tsbi:
             return arrived(self._branching, parent, keyframe, self._estimates[parent.hypothesis].pose.mean)
         if self._reopened:
             return Branches([reopened(parent, leaf, keyframe.sequence) for leaf in self._reopened])
+        if not keyframe.mapping and parent.notes.lost is None:
+            return Branches([displaced_or_not(parent, keyframe.sequence)])
+        if not any(notes.lost is not None for notes in self._notes.values()):
+            displaced = with_displaced(self._branching, parent)
+            if displaced is not None:
+                return displaced
         if event is not None:
             return self._changed(parent, event)
-        if not keyframe.mapping and parent.notes.lost is None:
-            return Branches([Child(parent.hypothesis, parent.log_weight, parent.area, parent.notes)])
         return self._go_on(parent, self._estimates[parent.hypothesis], keyframe.scan)
 
     def _changed(self, parent: Parent, event: AreaEvent) -> Branches:
         """Areas changed, or the robot its own."""
         if event.kind == "cut":
-            others = self._branching.cut(parent, event.keyframes)
-            return with_displaced(self._branching, parent, event.keyframes, others)
+            return self._branching.cut(parent, event.keyframes)
         if event.into is not None:
             return Branches([merged_into(parent, event.area, event.into, self._branching.search)])
         return self._branching.move(parent, event.area)
@@ -231,7 +237,7 @@ class Tsbi:
         if len(notes.unchecked) >= enough and notes.lost is not None:
             return looked_for(self._branching, parent)
         if len(notes.unchecked) >= self._options.recheck_keyframes:
-            return with_displaced(self._branching, parent, notes.unchecked, self._branching.recheck(parent))
+            return self._branching.recheck(parent)
         if notes.beside and len(notes.unchecked) == _SOON:
             return self._branching.recheck(parent, notes.beside)
         return Branches([Child(parent.hypothesis, parent.log_weight, parent.area, notes)])
@@ -260,6 +266,8 @@ class Tsbi:
             for child, probability in zip(chosen, probabilities, strict=True)
         ]
         self._notes = {leaf.hypothesis: child.notes for leaf, child in zip(leaves, chosen, strict=True)}
+        if all(notes.lost is None for notes in self._notes.values()):
+            self._branching.search.found()
         return leaves
 
     def _leaf(self, child: Child, branched: bool, probability: float) -> Leaf:
@@ -267,9 +275,11 @@ class Tsbi:
         if branched:
             hypothesis = self._next_hypothesis
             self._next_hypothesis += 1
+        lost, newest = child.notes.lost, -1 if self._keyframe is None else self._keyframe.sequence
         return Leaf(
             hypothesis, child.parent, probability, child.area, child.rebase, child.relabelled, child.arcs,
-            withdrawn=child.withdrawn, merged=child.merged, lost=child.notes.lost is not None,
+            withdrawn=child.withdrawn, merged=child.merged, lost=lost is not None,
+            arriving=lost is not None and lost > newest,
         )  # fmt: skip
 
     def _loaded(self, leaf: Leaf, child: Child) -> Leaf:

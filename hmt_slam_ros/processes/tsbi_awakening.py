@@ -19,20 +19,29 @@ from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.processes.messages import Arc, Keyframe, Place
 from hmt_slam_ros.processes.tsbi_branching import Branches, Branching, Child, Parent
+from hmt_slam_ros.topology.hybrid_map import HybridMap
 from hmt_slam_ros.topology.hypothesis_tree import Sighting
-from hmt_slam_ros.topology.relocation import Located, is_certain
+from hmt_slam_ros.topology.located import Located, is_certain
 from hmt_slam_ros.topology.shortest_path import reachable
 from hmt_slam_ros.topology.unknown import tells_nothing, unknown
-from hmt_slam_ros.topology.whereabouts import Told
+from hmt_slam_ros.topology.whereabouts import Told, Whereabouts
 
 Pose = NDArray[np.float64]
 
+UNKNOWN = 0.5
+"""Probability that a robot that was carried while it maps is where the map does not reach."""
+
 # Probability that a place needs to have at two looks in a row, and at one look where somebody says so.
 _TWICE, _ONCE = 0.8, 0.9
+# Share of what a robot sees that was carried while it maps, which has to be known where it is found: half a building
+# may be like the other half, which nobody has seen.
+_KNOWN = 0.7
 # Two looks found the same place where they have a keyframe within so much of each other, m and rad.
 _NEAR, _TURN = 1.0, math.radians(15.0)
 # So many keyframes that fit nowhere near where somebody says, in this probability, refute it.
 _REFUTED, _NOWHERE = 5, 0.9
+# Probability that is taken for none.
+_LEAST = 1e-12
 # Keyframes that are laid into the map at most, the newest.
 _MOST = 40
 
@@ -107,29 +116,82 @@ def looked_for(branching: Branching, parent: Parent) -> Branches:
     poses = {k: se2.between(reference, pose) for k, pose in keyframes.items()}
     told = _told_of(parent, keyframes)
     where = branching.search.everywhere(parent.hybrid_map, poses, parent.notes.lost, told)
-    noted = replace(parent, notes=parent.notes.checked((), tuple(poses)))
+    if parent.notes.claim is not None:
+        where = where.with_unmapped(UNKNOWN)
+    noted = _credited(replace(parent, notes=parent.notes.checked((), tuple(poses))), where, poses)
     if len(keyframes) >= _REFUTED and float(where.probabilities.sum()) < 1.0 - _NOWHERE:
         noted = replace(noted, notes=replace(noted.notes, told=None))
     best = where.best
-    if best is None or best[1] < _TWICE or not is_certain(best[0]):
+    if best is None or not _is_told(*best, 0.0 if parent.notes.claim is None else _KNOWN):
         unsighted = replace(noted.notes, sighted=None)
-        return Branches([Child(parent.hypothesis, parent.log_weight, parent.area, unsighted)], True, where=where)
+        return Branches([Child(parent.hypothesis, noted.log_weight, parent.area, unsighted)], True, where=where)
     located, probability = best
-    sighted = replace(noted.notes, sighted=_sighting(located, poses))
-    still = Child(parent.hypothesis, parent.log_weight, parent.area, sighted)
+    sighted = replace(noted.notes, sighted=_sighting(located, poses, max(poses)))
+    still = Child(parent.hypothesis, noted.log_weight, parent.area, sighted)
     if not (told is not None and probability >= _ONCE) and not _seen_again(parent, located, poses):
         return Branches([still], True, where=where)
     arc = Arc(parent.area, located.area, PoseGaussian.exactly(reference).compose(located.mode.measured.inverse()), True)
-    log_weight = parent.log_weight + math.log(probability)
-    notes = replace(noted.notes, lost=None, told=None, sighted=None)
+    log_weight = noted.log_weight + math.log(probability)
+    notes = replace(noted.notes, lost=None, told=None, sighted=None, claim=None, credit=0.0)
     found = Child(parent.hypothesis, log_weight, parent.area, notes, arcs=(arc,), reload=True)
-    still = replace(still, log_weight=parent.log_weight + math.log(max(1.0 - probability, 1e-300)))
+    # What speaks for the place from here on is the other's.
+    still_lost = replace(sighted, credit=None)
+    left = noted.log_weight + math.log(max(1.0 - probability, 1e-300))
+    still = replace(still, log_weight=left, notes=still_lost)
     return Branches([still, found], True, where=where)
 
 
-def _sighting(located: Located, poses: Mapping[int, Pose]) -> Sighting:
-    newest = max(poses)
-    return Sighting(located.area, newest, se2.compose(located.mode.pose.mean, poses[newest]))
+def _credited(parent: Parent, where: Whereabouts, poses: Mapping[int, Pose]) -> Parent:
+    """A hypothesis of a displaced robot, weighed by what it saw since, as far as that is not in its weight yet.
+
+    :param poses: {keyframe: ``reference_T_base``} of those that were located.
+    """
+    claim = parent.notes.claim
+    if claim is None or parent.notes.credit is None or claim.keyframe not in poses:
+        return parent
+    credit = credit_of(parent.hybrid_map, where, claim, poses)
+    notes = replace(parent.notes, credit=credit)
+    return replace(parent, log_weight=parent.log_weight + credit - parent.notes.credit, notes=notes)
+
+
+def credit_of(hybrid_map: HybridMap, where: Whereabouts, claim: Sighting, poses: Mapping[int, Pose]) -> float:
+    """log p(what a robot saw | it was displaced) / p(that | it was not), by where that lies in the map before, nats.
+
+    New ground is the measure of both.
+
+    :param claim: where it is if it was not displaced: there it is not, if it was.
+    :param poses: {keyframe: ``reference_T_base``} of those that were located.
+    """
+    there = [_agree(hybrid_map, _sighting(located, poses, claim.keyframe), claim) for located in where.found]
+    shares = where.probabilities
+    unmapped = max(1.0 - float(shares.sum()), _LEAST)
+    elsewhere = unmapped + float(shares[[not one for one in there]].sum())
+    areas = len(hybrid_map.area_ids())
+    stayed = float(shares[there].sum()) / unmapped * UNKNOWN / (1.0 - UNKNOWN) * areas
+    return math.log(elsewhere / unmapped * UNKNOWN) - math.log(max(1.0, stayed))
+
+
+def sighted_in(where: Whereabouts, poses: Mapping[int, Pose]) -> Sighting | None:
+    """Where a look found a robot that was carried while it maps, if it did.
+
+    :param poses: {keyframe: ``reference_T_base``} of those that were located.
+    """
+    best = where.best
+    if best is None or not _is_told(*best, _KNOWN):
+        return None
+    return _sighting(best[0], poses, max(poses))
+
+
+def _is_told(located: Located, probability: float, known: float) -> bool:
+    """Whether a look tells where the robot is.
+
+    :param known: share of what it sees that has to be known there.
+    """
+    return probability >= _TWICE and located.found.share >= known and is_certain(located)
+
+
+def _sighting(located: Located, poses: Mapping[int, Pose], keyframe: int) -> Sighting:
+    return Sighting(located.area, keyframe, se2.compose(located.mode.pose.mean, poses[keyframe]))
 
 
 def _seen_again(parent: Parent, located: Located, poses: Mapping[int, Pose]) -> bool:
@@ -142,11 +204,15 @@ def _seen_again(parent: Parent, located: Located, poses: Mapping[int, Pose]) -> 
     before = parent.notes.sighted
     if before is None or before.keyframe not in poses:
         return False
-    frames = reachable(parent.hybrid_map, located.area, until=(before.area,))
-    if before.area not in frames:
+    return _agree(parent.hybrid_map, _sighting(located, poses, before.keyframe), before)
+
+
+def _agree(hybrid_map: HybridMap, one: Sighting, other: Sighting) -> bool:
+    """Whether two sightings of a keyframe are of the same place."""
+    frames = reachable(hybrid_map, one.area, until=(other.area,))
+    if other.area not in frames:
         return False
-    now = se2.compose(located.mode.pose.mean, poses[before.keyframe])
-    away = se2.between(now, se2.compose(frames[before.area].mean, before.pose))
+    away = se2.between(one.pose, se2.compose(frames[other.area].mean, other.pose))
     return bool(math.hypot(away[0], away[1]) <= _NEAR and abs(away[2]) <= _TURN)
 
 

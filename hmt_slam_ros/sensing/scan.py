@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 
 import numpy as np
@@ -79,6 +79,7 @@ class Scan:
     laser_pose: NDArray[np.float64] = field(default_factory=_zeros)
     time_increment: float = 0.0
     motion: NDArray[np.float64] = field(default_factory=_zeros)
+    _without: tuple[tuple[int, ...], Scan] | None = field(default=None, init=False, repr=False)
 
     def __post_init__(self) -> None:
         for name in ("angle_min", "angle_increment", "range_min", "range_max", "time_increment"):
@@ -105,6 +106,18 @@ class Scan:
         first = self.angle_min + float(self.laser_pose[2])
         directions = _directions(self.ranges.size, first, self.angle_increment)
         return self._carried_back(_ends(self.ranges, directions, self.laser_pose, self.valid))
+
+    def without(self, beams: tuple[int, ...]) -> Scan:
+        """The same scan with beams that say nothing; one and the same object for the same beams.
+
+        :param beams: their numbers.
+        """
+        if self._without is None or self._without[0] != beams:
+            ranges = self.ranges.copy()
+            ranges[list(beams)] = np.nan
+            object.__setattr__(self, "_without", (beams, replace(self, ranges=ranges)))
+        assert self._without is not None
+        return self._without[1]
 
     @property
     def origins(self) -> NDArray[np.float64]:

@@ -1,0 +1,190 @@
+"""Mode lifelong: what stays is stored, what is gone is left out, and who walks through does neither."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from worlds import box, scan_in
+
+from benchmark.changes import OneDrive
+from hmt_slam_ros.configuration import Configuration
+from hmt_slam_ros.local_map.area_filter import PlacedKeyframe
+from hmt_slam_ros.offline.runtime import Run
+from hmt_slam_ros.offline.saved_map import MapWriter, read_run_state
+from hmt_slam_ros.processes.documents import KeyframeHead, encode
+from hmt_slam_ros.processes.messages import Outdated
+from hmt_slam_ros.processes.news import Look, looked, news_of, outdated
+from hmt_slam_ros.sensing import Scan
+from hmt_slam_ros.sensing.view import FREE, SURFACE, UNSEEN, passing, seen, view_of
+from hmt_slam_ros.simulation import open_simulated
+
+ROOM = box(-5.0, -3.0, 5.0, 3.0)
+CUPBOARD = box(2.0, 0.5, 2.6, 1.7)
+SECOND = 1_000_000_000
+WAY = np.array([[-2.0, 0.0, 0.0], [-1.5, 0.0, 0.0], [-1.0, 0.0, 0.0], [-0.5, 0.0, 0.0]])
+NOW = np.array([0.0, 0.0, 0.0])
+
+
+def room(*things):
+    return np.concatenate((ROOM, *things))
+
+
+def looks_in(*worlds, apart=SECOND):
+    """A look from each place of the way, in the world as it is at that time."""
+    pairs = enumerate(zip(worlds, WAY, strict=False))
+    return tuple(Look(scan_in(walls, pose, stamp=n * apart, beams=361), pose) for n, (walls, pose) in pairs)
+
+
+def keyframes(walls):
+    return [PlacedKeyframe(n, 0, scan_in(walls, pose, beams=361), pose) for n, pose in enumerate(WAY)]
+
+
+def news(before, now, looks=None):
+    """What a scan now says of a map of before."""
+    scan = Look(scan_in(now, NOW, stamp=10 * SECOND, beams=361), NOW)
+    return news_of(scan, looks_in(now, now, now) if looks is None else looks, keyframes(before))
+
+
+def ends(keyframe, beams):
+    """Where beams end of a keyframe's scan, map frame."""
+    points = keyframe.scan.points + keyframe.pose[:2]
+    return points[beams[keyframe.scan.valid]]
+
+
+def test_a_view_tells_surface_from_free_space_and_from_what_is_hidden():
+    view = view_of(scan_in(room(CUPBOARD), NOW, beams=361))
+    places = np.array([[2.0, 1.0], [1.0, 0.5], [4.0, 2.0], [5.0, -2.0], [-1.0, 0.0], [4.8, -1.0], [2.0, 0.45]])
+    assert seen(view, places).tolist() == [SURFACE, FREE, UNSEEN, SURFACE, UNSEEN, UNSEEN, SURFACE]
+    assert passing(view, np.array([[1.0, 0.5]])).sum() > 10
+    assert not passing(view, np.array([[4.0, 2.0]])).any()
+
+
+@pytest.mark.parametrize("increment", [1, -1])
+def test_a_view_of_a_laser_that_hangs_upside_down_or_moves_in_the_sweep_is_the_same(increment):
+    poses = np.stack((np.linspace(0.0, 0.1, 361), np.zeros(361), np.zeros(361)), axis=1)
+    swept = scan_in(room(CUPBOARD), poses, beams=361, field_of_view=increment * np.pi)
+    moving = dataclasses.replace(swept, motion=np.array([0.1, 0.0, 0.0]))
+    places = np.array([[2.0, 1.0], [1.0, 0.5], [4.0, 2.0]])
+    assert seen(view_of(moving), places).tolist() == [SURFACE, FREE, UNSEEN]
+
+
+def test_an_unchanged_room_is_no_news():
+    found = news(room(CUPBOARD), room(CUPBOARD))
+    assert (found.new, found.changed) == (False, False)
+    assert not any(beams.any() for beams in found.outdated.values())
+
+
+def test_furniture_that_came_is_stored_and_beams_that_pass_it_are_out_of_date():
+    found = news(room(), room(CUPBOARD))
+    assert found.changed
+    for keyframe in keyframes(room()):
+        passed = ends(keyframe, found.outdated[keyframe.keyframe])
+        assert len(passed) > 5
+        assert (passed[:, 0] > 2.3).all()
+
+
+def test_of_furniture_that_is_gone_every_beam_is_out_of_date():
+    found = news(room(CUPBOARD), room())
+    for keyframe in keyframes(room(CUPBOARD)):
+        gone = found.outdated[keyframe.keyframe]
+        on = np.zeros(361, dtype=bool)
+        on[keyframe.scan.valid] = np.abs(keyframe.scan.points + keyframe.pose[:2] - [2.3, 1.1]).max(axis=1) < 0.61
+        assert on.sum() > 10
+        assert (on == gone).mean() > 0.98
+
+
+def test_who_walks_through_is_no_news():
+    """A person as wide as the cupboard, elsewhere at every look."""
+    at = [box(x, -1.0, x + 0.4, -0.6) for x in (1.0, 1.6, 2.2)]
+    found = news(room(), room(box(2.8, -1.0, 3.2, -0.6)), looks_in(*(room(person) for person in at)))
+    assert (found.new, found.changed) == (False, False)
+    assert not any(beams.any() for beams in found.outdated.values())
+
+
+def test_a_robot_that_is_elsewhere_takes_nothing_for_out_of_date():
+    found = news(room(), room() * [0.6, 0.4, 0.6, 0.4])
+    assert not found.changed
+    assert not found.outdated
+
+
+def test_looks_are_a_second_apart_and_few():
+    looks = ()
+    for look in looks_in(*[room()] * 4, apart=SECOND // 2):
+        looks = looked(looks, look)
+    assert [look.scan.stamp for look in looks] == [0, SECOND]
+    for n in range(5):
+        looks = looked(looks, Look(scan_in(room(), NOW, stamp=(2 + n) * SECOND), NOW))
+    assert len(looks) == 3
+
+
+def test_hypotheses_have_to_agree_on_what_is_out_of_date():
+    one, other = news(room(CUPBOARD), room()), news(room(), room())
+    assert outdated([(one, 0.97), (other, 0.03)])
+    assert outdated([(one, 0.6), (other, 0.4)]) == ()
+    assert outdated([]) == ()
+
+
+def test_beams_are_left_out_of_a_scan_once_for_all_who_hold_it():
+    scan = scan_in(room(), NOW, beams=361)
+    less = scan.without((3, 4))
+    assert less is scan.without((3, 4))
+    assert np.flatnonzero(scan.valid & ~less.valid).tolist() == [3, 4]
+    assert len(less.points) == len(scan.points) - 2
+
+
+WORLD = "sim:office,seed=1000,size=0.7,rate=2.5,laps=1,visit={}"
+LIFELONG = dataclasses.replace(Configuration(), mode="lifelong")
+MIDDLE, END = 70, 110
+
+
+def read(run, records):
+    """What a run says of keyframes meanwhile, and its state then."""
+    for record in records:
+        run.read(record)
+    return [run.recorder.keyframes[k] for k in sorted(run.recorder.keyframes)], run.state
+
+
+@pytest.fixture(scope="module")
+def visits(tmp_path_factory):
+    """The state after a visit; of a second one the keyframes, what was read of it, in two parts, and the states."""
+    log = OneDrive([open_simulated(WORLD.format(number)) for number in (1, 2)])
+    records, first = list(log.records()), log.scan_count // 2
+    scans = np.cumsum([isinstance(record.measurement, Scan) for record in records])
+    ends = [int(np.searchsorted(scans, count, side="right")) for count in (first, first + MIDDLE, first + END)]
+    _, before = read(Run(Configuration()), records[: ends[0]])
+    run = Run(LIFELONG, state=before)
+    _, middle = read(run, records[ends[0] : ends[1]])
+    folder = tmp_path_factory.mktemp("middle") / "hmt_map"
+    writer = MapWriter(folder)
+    writer.write_state(middle)
+    writer.finish(LIFELONG)
+    rest = records[ends[1] : ends[2]]
+    said, after = read(run, rest)
+    return before, folder, rest, said, after
+
+
+def test_every_process_leaves_the_same_beams_out_and_little_is_stored(visits):
+    before, _, _, said, after = visits
+    stored = [any(leaf.stored for leaf in message.leaves) for message in said]
+    assert 0 < sum(stored) < 0.4 * len(stored)
+    assert all(message.mapping for message in said)
+    scans = after.slam.replica.scans
+    for replica in (after.aam.replica, after.tsbi.replica, after.tlca.replica, after.recorder.replica):
+        assert replica.scans.keys() == scans.keys()
+        assert all(scan is scans[keyframe] for keyframe, scan in replica.scans.items())
+    told = [one for message in said for one in message.outdated]
+    assert all(isinstance(one, Outdated) for one in told)
+    old = [one for one in told if one.keyframe in before.slam.replica.scans and one.keyframe in scans]
+    assert len(old) > 10
+    for one in old:
+        assert not scans[one.keyframe].valid[list(one.beams)].any()
+
+
+def test_a_run_that_goes_on_from_its_state_says_the_same(visits):
+    _, folder, rest, said, _ = visits
+    middle, _ = read_run_state(folder)
+    assert any(live.looks for live in middle.slam.live.values())
+    again, _ = read(Run(LIFELONG, state=middle), rest)
+    same = said[-len(again) :]
+    assert [encode(KeyframeHead.of(one)) for one in again] == [encode(KeyframeHead.of(one)) for one in same]
+    assert any(one.outdated for one in again)
