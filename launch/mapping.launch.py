@@ -2,7 +2,8 @@
 
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument
-from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
+from launch.conditions import IfCondition
+from launch.substitutions import LaunchConfiguration, LaunchLogDir, PathJoinSubstitution
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import FindPackageShare
@@ -37,9 +38,19 @@ def generate_launch_description() -> LaunchDescription:
             choices=["true", "false"],
             description="Whether the map is saved there before the nodes end.",
         ),
+        DeclareLaunchArgument(
+            "view", default_value="false", choices=["true", "false"], description="Whether the live page is served."
+        ),
+        DeclareLaunchArgument("view_port", default_value="8800", description="Port of the live page on 127.0.0.1."),
+        DeclareLaunchArgument(
+            "recovery",
+            default_value=PathJoinSubstitution([LaunchLogDir(), "recovery"]),
+            description="Folder from which a node that was killed goes on where it was.",
+        ),
         DeclareLaunchArgument("log_level", default_value="info", description="Level of the nodes' log output."),
     ]
-    saving = {name: ParameterValue(LaunchConfiguration(name), value_type=str) for name in ("start_from", "save_to")}
+    folders = ("start_from", "save_to", "recovery")
+    saving = {name: ParameterValue(LaunchConfiguration(name), value_type=str) for name in folders}
     for name in ("save_at_end", "start_carried"):
         saving[name] = ParameterValue(LaunchConfiguration(name), value_type=bool)
     nodes = [
@@ -50,7 +61,18 @@ def generate_launch_description() -> LaunchDescription:
             parameters=[LaunchConfiguration("params_file"), {"use_sim_time": use_sim_time}, saving],
             ros_arguments=["--log-level", LaunchConfiguration("log_level")],
             output="screen",
+            respawn=True,
+            respawn_delay=1.0,
+            respawn_max_retries=3,
         )
         for process in PROCESSES
     ]
-    return LaunchDescription([*arguments, *nodes])
+    view = Node(
+        package="hmt_slam_ros",
+        executable="view",
+        namespace=LaunchConfiguration("namespace"),
+        parameters=[{"port": ParameterValue(LaunchConfiguration("view_port"), value_type=int)}],
+        output="screen",
+        condition=IfCondition(LaunchConfiguration("view")),
+    )
+    return LaunchDescription([*arguments, *nodes, view])

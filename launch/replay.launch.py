@@ -26,6 +26,9 @@ def generate_launch_description() -> LaunchDescription:
                 "rviz", default_value="false", choices=["true", "false"], description="Whether RViz is started."
             ),
             DeclareLaunchArgument(
+                "view", default_value="false", choices=["true", "false"], description="Whether the live page is served."
+            ),
+            DeclareLaunchArgument(
                 "params_file",
                 default_value=PathJoinSubstitution([share, "config", "hmt_slam.yaml"]),
                 description="YAML file with the parameters.",
@@ -37,6 +40,7 @@ def generate_launch_description() -> LaunchDescription:
                     "use_sim_time": "true",
                     "params_file": LaunchConfiguration("params_file"),
                     "namespace": LaunchConfiguration("namespace"),
+                    "view": LaunchConfiguration("view"),
                 }.items(),
             ),
             # The robot makes /clock, so it alone runs on the computer's own clock.

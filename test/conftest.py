@@ -90,13 +90,16 @@ def listener(domain):
 
 @pytest.fixture
 def start(domain):
-    """Starts nodes as OS processes; at the end, each that is left has to end well when told to."""
+    """Starts nodes as OS processes, behind words such as of a command that runs them elsewhere.
+
+    At the end, each that is left has to end well when told to.
+    """
     started = []
 
-    def start(name, *arguments, **parameters):
+    def start(name, *arguments, before=(), **parameters):
         words = [word for key, value in parameters.items() for word in ("-p", f"{key.replace('__', '.')}:={value}")]
         process = subprocess.Popen(
-            [sys.executable, "-m", f"hmt_slam_ros.nodes.{name}_node", "--ros-args", *words, *arguments],
+            [*before, sys.executable, "-m", f"hmt_slam_ros.nodes.{name}_node", "--ros-args", *words, *arguments],
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,

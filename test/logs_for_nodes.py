@@ -20,15 +20,22 @@ WALLS = np.concatenate([box(-3, -3, 12, 3), box(4, 1, 5, 3)])
 
 @dataclass
 class Corridor:
-    """Scans every 0.2 s, four odometry readings to each, at 0.5 m/s; a scan's sweep takes ``sweep`` s."""
+    """Scans every 0.2 s, four odometry readings to each, at 0.5 m/s; a scan's sweep takes ``sweep`` s.
+
+    Before the scan of a number the robot is carried as far along its way as it goes in so many scans, ``carried``.
+    While the laser is ``silent``, from one scan to before another, only odometry comes.
+    """
 
     scans: int = 12
     name: str = "corridor"
     sweep: float = 0.0
+    carried: tuple[int, int] = (0, 0)
+    beams: int = BEAMS
+    silent: range = range(0)
 
     @property
     def scan_count(self):
-        return self.scans
+        return self.scans - len(self.silent)
 
     @property
     def duration(self):
@@ -38,16 +45,17 @@ class Corridor:
         for k in range(4 * (self.scans - 1) + 1):
             stamp = START + k * SECOND // 20
             yield LogRecord(stamp, Odometry(stamp, k * PACE))
-            if k % 4 == 0:
-                poses = (k + 20.0 * self.sweep * np.linspace(0.0, 1.0, BEAMS)[:, None]) * PACE
-                scan = scan_in(WALLS, poses, stamp, beams=BEAMS, laser_pose=LASER, sweep=self.sweep)
+            if k % 4 == 0 and k // 4 not in self.silent:
+                along = k + 4 * self.carried[1] * (k >= 4 * self.carried[0])
+                poses = (along + 20.0 * self.sweep * np.linspace(0.0, 1.0, self.beams)[:, None]) * PACE
+                scan = scan_in(WALLS, poses, stamp, beams=self.beams, laser_pose=LASER, sweep=self.sweep)
                 yield LogRecord(stamp, scan)
 
 
-def corridor_bag(folder, scans=12, sweep=0.0):
+def corridor_bag(folder, scans=12, **others):
     """The corridor as a rosbag2 folder."""
     path = folder / "corridor"
-    write_bag(Corridor(scans, sweep=sweep), path)
+    write_bag(Corridor(scans, **others), path)
     return path
 
 

@@ -3,6 +3,7 @@
 import math
 import subprocess
 import sys
+from itertools import groupby
 
 import numpy as np
 import pytest
@@ -23,6 +24,7 @@ from hmt_slam_ros.processes.messages import LocalEstimate, Notice
 
 NODES = ("slam", "aam", "tsbi", "tlca", "rtl")
 SCANS = 120
+CARRIED = "sim:office,seed=3,size=0.7,laps=1,carried=0.35,to=0.08,turned=120"
 
 
 def mapped_corridor(folder):
@@ -136,6 +138,15 @@ def test_a_robot_that_is_carried_while_the_nodes_run_is_recognized_elsewhere(cor
     assert len(nodes.poses) > said
     begin = stamp_of(nodes.poses[-1].header.stamp) - (SCANS - 1) * 200_000_000
     assert_true(nodes.poses[-1], begin)
+
+
+def test_a_robot_that_is_carried_while_it_drives_notices_and_is_recognized(listener, start):
+    nodes = Nodes(start, listener)
+    nodes.until(nodes.is_localized)
+    nodes.drive(CARRIED, first=0, robot__duration=62.0)
+    nodes.until(lambda: len(nodes.estimates) == 310 and nodes.is_localized())
+    assert [known for known, _ in groupby(message.data for message in nodes.localized)][-3:] == [True, False, True]
+    nodes.until(lambda: nodes.diagnosis("tsbi")["localized"] == "yes")
 
 
 def initial_pose(at, frame="map", deviations=(0.5, 0.5, 0.26)):

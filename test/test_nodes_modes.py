@@ -6,10 +6,11 @@ import sys
 import numpy as np
 import pytest
 from logs_for_nodes import PACE
-from test_nodes_localization import SCANS, Nodes, mapped_corridor
+from test_nodes_localization import SCANS, Nodes, initial_pose, mapped_corridor
 
 pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
 
+from geometry_msgs.msg import PoseWithCovarianceStamped
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
 from std_msgs.msg import String
@@ -17,7 +18,7 @@ from std_srvs.srv import Trigger
 
 from hmt_slam_ros.nodes import qos
 from hmt_slam_ros.nodes.conversions import planar_pose
-from hmt_slam_ros.nodes.topics import KEYFRAMES
+from hmt_slam_ros.nodes.topics import INITIAL_POSE, KEYFRAMES
 from hmt_slam_ros.processes.documents import KeyframeHead, decode
 
 
@@ -37,14 +38,18 @@ def set_mode(listener, mode):
 
 def stored(keyframes):
     """Whether keyframes were stored under any hypothesis."""
-    heads = [decode(message.data, KeyframeHead) for message in keyframes]
-    return [any(leaf.stored for leaf in head.leaves) for head in heads]
+    return [any(leaf.stored for leaf in head(message).leaves) for message in keyframes]
+
+
+def head(message):
+    return decode(message.data, KeyframeHead)
 
 
 def test_a_robot_is_recognized_and_tracked_in_a_map_that_is_saved_as_it_was_loaded(corridor, listener, start, tmp_path):
     log, out = corridor
     nodes = Nodes(start, listener, start_from=out, mode="localization", save_to=tmp_path / "saved")
     keyframes = listener.hear(String, KEYFRAMES, qos.CHAIN)
+    pointing = listener.node.create_publisher(PoseWithCovarianceStamped, INITIAL_POSE, qos.STREAM)
     nodes.drive(log, first=20, rate=8.0)
     nodes.until(nodes.is_localized)
     nodes.until(lambda: len(nodes.estimates) == SCANS - 20)
@@ -66,12 +71,18 @@ def test_a_robot_is_recognized_and_tracked_in_a_map_that_is_saved_as_it_was_load
 
     refused = set_mode(listener, "sleeping")
     assert not refused.successful
-    assert "mode = sleeping is not a choice: use mapping or localization" in refused.reason
-    assert set_mode(listener, "mapping").successful
+    assert "mode = sleeping is not a choice: use mapping or localization or lifelong" in refused.reason
+    assert set_mode(listener, "lifelong").successful
     nodes.park()
-    assert listener.call(Trigger, "slam/carried", Trigger.Request()).success
-    nodes.drive(log, first=0, robot__duration=3.0)
-    nodes.until(lambda: len(nodes.estimates) == SCANS - 20 + 15)
+    nodes.until(pointing.get_subscription_count)
+    pointing.publish(initial_pose(np.zeros(3)))
+    nodes.until(lambda: not nodes.is_localized())
+    nodes.drive(log, first=0, robot__duration=6.0)
+    nodes.until(nodes.is_localized)
+    nodes.until(lambda: len(nodes.estimates) == SCANS - 20 + 30)
+    # Each keyframe tells the others that the map may change from here on.
+    assert [head(message).mapping for message in keyframes][-3:] == [True] * 3
+    assert not any(head(message).mapping for message in keyframes[: len(while_lost)])
     assert listener.call(Trigger, "slam/save", Trigger.Request()).success
     assert content(tmp_path / "saved") != content(out / "hmt_map")
 

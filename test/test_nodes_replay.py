@@ -3,22 +3,27 @@
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
+from urllib.request import urlopen
 
 import numpy as np
 import pytest
 from logs_for_nodes import corridor_bag, is_alive
 
-from hmt_slam_ros.configuration import Configuration
+from hmt_slam_ros.configuration import Configuration, load_configuration
 from hmt_slam_ros.evaluation import read_tum
 from hmt_slam_ros.logs import open_log
 from hmt_slam_ros.offline.runtime import Run
 from hmt_slam_ros.offline.saved_map import read_saved_map
 
 pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
+
+from hmt_slam_ros.nodes.replay import PROCESSES, replay
 
 ROOT = Path(__file__).resolve().parent.parent
 BUNDLED = ROOT / "data" / "malaga_one_loop"
@@ -136,13 +141,52 @@ def test_the_report_accounts_for_every_scan_and_every_process(folders):
     assert report["cpu_s"] > slam["total_s"]
 
 
-@pytest.mark.parametrize("name", ["tlca", "robot"])
-def test_a_node_that_dies_ends_the_run_with_its_name_and_leaves_nothing(running, tmp_path, name):
+def test_processes_that_are_killed_one_after_the_other_go_on_to_the_same_bit(folders, tmp_path, capfd):
+    """At last all of them at once. Scans, keyframe events and checkpoints are under way wherever that happens."""
+    due = {20: ("rtl",), 45: ("tlca",), 75: ("tsbi",), 105: ("aam",), 135: ("slam",), 165: PROCESSES}
+
+    def strike(scans):
+        if due and scans >= min(due):
+            for name in due.pop(min(due)):
+                os.kill(children_of(os.getpid())[name], signal.SIGKILL)
+
+    out = tmp_path / "out"
+    replay(BUNDLED, out, load_configuration(settings=["robot.rate=0.0"]), strike)
+    assert not due
+    told = capfd.readouterr().err
+    for name in PROCESSES:
+        assert told.count(f"the node {name} was killed by signal 9: it is started again and goes on where it was") == 2
+    for name in ("trajectory.tum", "trajectory_online.tum", "graph.g2o", "pmf.csv", "map.pgm", "hmt_map/map.bin"):
+        assert (out / name).read_bytes() == (folders[1] / name).read_bytes()
+    report, undisturbed = (json.loads((folder / "report.json").read_text()) for folder in (out, folders[1]))
+    assert report["scans"] == undisturbed["scans"]
+    assert report["notices"] == undisturbed["notices"]
+
+
+def test_a_node_that_is_killed_again_and_again_ends_the_run_and_leaves_nothing(running, tmp_path):
     process, nodes = running
-    os.kill(nodes[name], signal.SIGKILL)
+    killed = set()
+    while process.poll() is None:
+        found = children_of(process.pid)
+        nodes.update(found)
+        if "tlca" in found and found["tlca"] not in killed:
+            killed.add(found["tlca"])
+            os.kill(found["tlca"], signal.SIGKILL)
+        time.sleep(0.02)
     error = process.communicate(timeout=40)[1]
     assert process.returncode == 2
-    assert f"the node {name} ended with status -9" in error
+    assert "the node tlca was killed by signal 9 for the 4th time within a minute and is not started again" in error
+    assert len(killed) == 4
+    assert not (tmp_path / "out").exists()
+    assert not any(is_alive(pid) for pid in nodes.values())
+
+
+def test_a_robot_that_dies_ends_the_run_with_its_name_and_leaves_nothing(running, tmp_path):
+    process, nodes = running
+    os.kill(nodes["robot"], signal.SIGKILL)
+    error = process.communicate(timeout=40)[1]
+    assert process.returncode == 2
+    assert "the node robot ended with status -9" in error
     assert not (tmp_path / "out").exists()
     assert {entry.name for entry in tmp_path.iterdir()} == {"corridor"}
     assert not any(is_alive(pid) for pid in nodes.values())
@@ -175,7 +219,7 @@ def test_a_run_that_stands_still_names_the_node_it_waits_for(tmp_path):
         "from hmt_slam_ros.nodes.replay import replay\n"
         "try:\n"
         f"    replay(Path({str(corridor_bag(tmp_path, 200))!r}), Path({str(tmp_path / 'out')!r}),\n"
-        "           load_configuration(settings=['robot.rate=1.0']), stall=6.0)\n"
+        "           load_configuration(settings=['robot.rate=1.0']), stall=15.0)\n"
         "except HmtSlamError as error:\n"
         "    sys.exit(str(error))\n"
     )
@@ -186,6 +230,33 @@ def test_a_run_that_stands_still_names_the_node_it_waits_for(tmp_path):
     assert process.returncode == 1
     assert "the run waits for the node aam" in error
     assert not (tmp_path / "out").exists()
+
+
+def test_the_live_page_of_a_run_is_served_while_it_lasts_unless_its_port_is_taken(tmp_path):
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        log, out = str(corridor_bag(tmp_path, 40)), str(tmp_path / "out")
+        command = [*COMMAND, "replay", log, "--out", out, "--set", "robot.rate=4", "--view", str(port)]
+        done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 2
+    assert f"the page cannot listen on 127.0.0.1, port {port}" in done.stderr.splitlines()[-1]
+
+    with subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        url = process.stderr.readline().split()[-1]
+        seen = []
+
+        def is_over():
+            with suppress(OSError), urlopen(url + "snapshot.json", timeout=5) as answer:
+                seen.append(json.load(answer))
+            time.sleep(0.1)
+            return process.poll() is not None
+
+        wait_until(is_over)
+    assert process.returncode == 0
+    assert any("robot" in known for known in seen)
+    assert set(json.loads((tmp_path / "out" / "report.json").read_text())["peak_rss_bytes"]) == NODES
+    with pytest.raises(OSError, match="refused"):
+        urlopen(url, timeout=5)
 
 
 def test_a_truncated_log_is_one_sentence_before_anything_starts(tmp_path):

@@ -12,11 +12,13 @@ from rcl_interfaces.msg import ParameterDescriptor
 from hmt_slam_ros.configuration import load_configuration
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.nodes.parameters import ConfiguredNode
+from hmt_slam_ros.nodes.recovery import CHECKPOINT
 from hmt_slam_ros.offline.going_on import differences, map_folder
 from hmt_slam_ros.persistence.folder import FolderReader
 from hmt_slam_ros.persistence.hmt_map import CONFIGURATION, FORMAT, VERSION
 
 if TYPE_CHECKING:
+    from hmt_slam_ros.nodes.recovery import Base
     from hmt_slam_ros.offline.saved_map import MapDocument
 
 State = TypeVar("State")
@@ -43,17 +45,35 @@ class Beginning:
         :param path: its folder or the output folder around it, empty for nothing.
         :raises HmtSlamError: where it is damaged, or the node's parameters do not go with it.
         """
-        self.events, self._folder, self.carried, self.scans = 0, None, carried and bool(path), scans
+        self.events, self.carried, self.scans = 0, carried and bool(path), scans
+        self._folder: FolderReader | None = None
         self.folder: Path | None = None
         if path:
-            self.folder = folder = map_folder(Path(path)).absolute()
-            self._folder = FolderReader(folder, FORMAT, VERSION)
-            saved = load_configuration(folder / CONFIGURATION)
-            told = differences(saved, replace(node.configuration, robot=saved.robot))
-            if told:
-                node.get_logger().warning(told)
+            self.folder = map_folder(Path(path)).absolute()
+            self._open(node, self.folder, FORMAT)
             # The other processes need not be loaded for it.
             self.events = self._chain_events()
+
+    @classmethod
+    def at_checkpoint(cls, node: ConfiguredNode, state: Path, base: Base) -> Beginning:
+        """Where a node that was killed goes on.
+
+        :param state: the folder of its checkpoint.
+        :param base: what it was then.
+        :raises HmtSlamError: as for a map.
+        """
+        made = cls(node, "", carried=False)
+        made._open(node, state, CHECKPOINT)
+        made.events, made.folder = base.events, Path(base.folder) if base.folder else None
+        made.map = None  # what was shown of it is part of the checkpoint
+        return made
+
+    def _open(self, node: ConfiguredNode, folder: Path, kind: str) -> None:
+        self._folder = FolderReader(folder, kind, VERSION)
+        saved = load_configuration(folder / CONFIGURATION)
+        told = differences(saved, replace(node.configuration, robot=saved.robot))
+        if told:
+            node.get_logger().warning(told)
 
     def _chain_events(self) -> int:
         from hmt_slam_ros.offline.saved_map import ChainState  # noqa: PLC0415

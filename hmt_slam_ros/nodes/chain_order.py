@@ -42,6 +42,12 @@ class ChainOrder:
         """Messages held back."""
         return sum(len(queue) for queue in self._waiting.values())
 
+    @property
+    def events(self) -> int | None:
+        """Keyframe events that were delivered to the end, None amid one."""
+        events, begun = divmod(self._delivered, len(self._kinds))
+        return None if begun else events
+
     def arrive(self, message: ChainMessage) -> list[ChainMessage]:
         """Take in a message; return those whose turn has come, in their order."""
         kind, sequence = type(message), message.sequence

@@ -7,7 +7,8 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections import defaultdict, deque
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -18,6 +19,8 @@ from hmt_slam_ros.nodes.figures import peak_rss
 from hmt_slam_ros.nodes.running import PARENT_VARIABLE
 
 _PATIENCE = 5.0  # s for a node to end when it is told to
+# A node that is killed more often within a minute would be so for ever.
+_RESTARTS, _MINUTE = 3, 60.0
 _TAIL = 3  # lines of a node's stderr that go into a message
 
 
@@ -39,15 +42,23 @@ class Children:
     :ivar processes: {node: process}.
     """
 
-    def __init__(self, folder: Path) -> None:
-        """Take the folder for what the nodes write to stderr."""
+    def __init__(self, folder: Path, restartable: Collection[str], tell: Callable[[str], None]) -> None:
+        """Start nothing yet.
+
+        :param folder: for what the nodes write to stderr.
+        :param restartable: nodes that are started again where a signal killed them.
+        :param tell: called with one sentence where that is done.
+        """
         self.processes: dict[str, subprocess.Popen[bytes]] = {}
-        self._folder = folder
+        self._folder, self._restartable, self._tell = folder, restartable, tell
+        self._begun: dict[str, tuple[Sequence[str], Mapping[str, str]]] = {}
+        self._restarts: dict[str, deque[float]] = defaultdict(lambda: deque(maxlen=_RESTARTS))
 
     def start(self, name: str, arguments: Sequence[str], environment: Mapping[str, str]) -> None:
         """Start the node ``name`` with arguments for ROS."""
+        self._begun[name] = arguments, environment
         command = [sys.executable, "-m", f"hmt_slam_ros.nodes.{name}_node", "--ros-args", *arguments]
-        with self._stderr(name, "wb") as stderr:
+        with self._stderr(name, "ab") as stderr:
             self.processes[name] = subprocess.Popen(
                 command,
                 stdin=subprocess.DEVNULL,
@@ -62,13 +73,27 @@ class Children:
         return (self._folder / f"{name}.log").open(mode)
 
     def check(self) -> None:
-        """See whether all are alive.
+        """See whether all are alive; start those again that were killed.
 
-        :raises HmtSlamError: for one that is not, with what it said last.
+        :raises HmtSlamError: for one that ended by itself or is killed again and again, with what it said last.
         """
-        for name, process in self.processes.items():
-            if (status := process.poll()) is not None:
+        for name, process in list(self.processes.items()):
+            if (status := process.poll()) is None:
+                continue
+            if status >= 0 or name not in self._restartable:
                 raise HmtSlamError(f"the node {name} ended with status {status}, it said: {self.last_words(name)}")
+            self._restart(name, -status)
+
+    def _restart(self, name: str, number: int) -> None:
+        now, before = time.monotonic(), self._restarts[name]
+        if len(before) == _RESTARTS and now - before[0] < _MINUTE:
+            raise HmtSlamError(
+                f"the node {name} was killed by signal {number} for the {_RESTARTS + 1}th time within a minute and is "
+                f"not started again, it said: {self.last_words(name)}"
+            )
+        before.append(now)
+        self._tell(f"the node {name} was killed by signal {number}: it is started again and goes on where it was")
+        self.start(name, *self._begun[name])
 
     def last_words(self, name: str) -> str:
         """The last lines that a node wrote, as one."""

@@ -42,7 +42,7 @@ _PLANAR = np.ix_((0, 1, 5), (0, 1, 5))
 # Units in the last place by which a quaternion may be off, the smallest first.
 _NUDGES = ((0, 0), (1, 0), (-1, 0), (0, 1), (0, -1), (2, 0), (-2, 0), (0, 2), (0, -2))
 _TRAIL_FRAME = re.compile(r"hypothesis_(\d+)/scan_(\d+)")
-_KEYFRAME_FRAME = re.compile(r"keyframe_(\d+)")
+_KEYFRAME_FRAME = re.compile(r"keyframe_(\d+)(?:/begun_(\d+))?")
 
 
 def time_message(stamp: int) -> Time:
@@ -169,17 +169,21 @@ def belief_from(message: PoseWithCovariance) -> PoseGaussian:
     return PoseGaussian(mean, axes.T @ np.reshape(message.covariance, (6, 6))[_PLANAR] @ axes)
 
 
-def keyframe_frame(keyframe: int) -> str:
-    """Name of a keyframe's frame."""
-    return f"keyframe_{keyframe}"
+def keyframe_frame(keyframe: int, begun: int = 0) -> str:
+    """Name of a keyframe's frame.
+
+    :param begun: number of the request after which slam began anew, 0 before the first.
+    """
+    return f"keyframe_{keyframe}/begun_{begun}" if begun else f"keyframe_{keyframe}"
 
 
-def keyframe_of(frame: str) -> int:
-    """The keyframe that a frame is named after.
+def keyframe_of(frame: str) -> tuple[int, int]:
+    """The keyframe that a frame is named after, and the request after which slam had begun anew.
 
     :raises HmtSlamError: where it is named after something else.
     """
-    return int(_matched(_KEYFRAME_FRAME, frame)[1])
+    found = _matched(_KEYFRAME_FRAME, frame)
+    return int(found[1]), int(found[2] or 0)
 
 
 def path_message(trail: Trail) -> Path:
@@ -203,7 +207,7 @@ def trail_from(message: Path) -> Trail:
         int(found[1]),
         int(found[2]),
         np.array([stamp_of(pose.header.stamp) for pose in message.poses], dtype=np.int64),
-        np.array([keyframe_of(pose.header.frame_id) for pose in message.poses], dtype=np.int64),
+        np.array([keyframe_of(pose.header.frame_id)[0] for pose in message.poses], dtype=np.int64),
         np.array([planar_pose(pose.pose) for pose in message.poses], dtype=np.float64).reshape(-1, 3),
     )
 

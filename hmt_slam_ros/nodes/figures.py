@@ -39,6 +39,8 @@ class Figures:
         self._error = ""
         self._level = DiagnosticStatus.OK
         self._moment = 0
+        self._counted: dict[str, int] = {}
+        self._counted_at = time.monotonic()
         self._costs: list[tuple[int, float]] = []
         self._handled, self._busy, self._longest = 0, 0.0, 0.0
         self._clock = Clock(clock_type=ClockType.SYSTEM_TIME)
@@ -56,11 +58,19 @@ class Figures:
         """Remember and log something that the run does not survive."""
         self._remember(sentence, DiagnosticStatus.ERROR)
 
+    def note(self, sentence: str) -> None:
+        """Log that something is well again; the last error stays to be seen."""
+        self._node.get_logger().info(sentence)
+
     def _remember(self, sentence: str, level: bytes) -> None:
         if sentence != self._error:
             self._error, self._level = sentence, max(level, self._level)
             logger = self._node.get_logger()
-            (logger.error if level == DiagnosticStatus.ERROR else logger.warning)(sentence)
+            # rclpy wants a line of the program of its own for each level, and ends the node otherwise.
+            if level == DiagnosticStatus.ERROR:
+                logger.error(sentence)
+            else:
+                logger.warning(sentence)
 
     @contextmanager
     def timed(self, message: Message, said: list[Message]) -> Iterator[None]:
@@ -80,12 +90,12 @@ class Figures:
         """Say everything now."""
         self._publish_costs()
         values = {
-            **{f"received {kind}": count for kind, count in sorted(self.received.items())},
-            **{f"sent {kind}": count for kind, count in sorted(self.sent.items())},
+            **self._counts_and_rates(),
             **self.state,
             "messages handled": self._handled,
             "busy": f"{self._busy:.3f} s",
             "longest message": f"{1e3 * self._longest:.1f} ms",
+            "memory": f"{resident() / 1e6:.0f} MB",
             "peak memory": f"{peak_rss() / 1e6:.0f} MB",
             "last error": self._error,
         }
@@ -99,6 +109,19 @@ class Figures:
         message = DiagnosticArray(status=[status])
         message.header.stamp = self._clock.now().to_msg()
         self._diagnostics.publish(message)
+
+    def _counts_and_rates(self) -> dict[str, object]:
+        """How many messages of each kind there were, and how many a second since the last time."""
+        now = time.monotonic()
+        counts = {
+            f"{verb} {kind}": count
+            for verb, counter in (("received", self.received), ("sent", self.sent))
+            for kind, count in sorted(counter.items())
+        }
+        since, self._counted_at = max(now - self._counted_at, 1e-3), now
+        last, self._counted = self._counted, counts
+        rates = {f"{name} a second": f"{(count - last.get(name, 0)) / since:.1f}" for name, count in counts.items()}
+        return {**counts, **rates}
 
     def _publish_costs(self) -> None:
         if self._costs:
@@ -125,8 +148,17 @@ def _cost_message(name: str, costs: Sequence[tuple[int, float]]) -> Float64Multi
 
 def peak_rss(process: int | str = "self") -> int:
     """Largest resident memory of an OS process, bytes; 0 where the system does not tell."""
+    return _memory(process, "VmHWM")
+
+
+def resident(process: int | str = "self") -> int:
+    """Resident memory of an OS process now, bytes; 0 where the system does not tell."""
+    return _memory(process, "VmRSS")
+
+
+def _memory(process: int | str, which: str) -> int:
     try:
-        lines = Path(f"/proc/{process}/status").read_text(encoding="ascii").splitlines()
+        lines = Path(f"/proc/{process}/status").read_text(encoding="ascii", errors="replace").splitlines()
     except OSError:
         return 0
-    return next((1024 * int(line.split()[1]) for line in lines if line.startswith("VmHWM")), 0)
+    return next((1024 * int(line.split()[1]) for line in lines if line.startswith(which)), 0)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 from nav_msgs.msg import Odometry as OdometryMessage
@@ -19,7 +19,7 @@ from hmt_slam_ros.nodes.chain_order import CHAIN, ChainOrder
 from hmt_slam_ros.nodes.figures import Figures
 from hmt_slam_ros.nodes.sensor_subscription import SensorSubscription
 from hmt_slam_ros.nodes.topics import DOCUMENTS, FINISHED, KEYFRAME_SCANS, KEYFRAMES, ODOM, TRAIL
-from hmt_slam_ros.processes.documents import Closing, KeyframeHead, decode
+from hmt_slam_ros.processes.documents import Closing, KeyframeHead, decode, decode_numbered
 from hmt_slam_ros.processes.messages import Finished, Keyframe, LocalEstimate, Message, Trail
 from hmt_slam_ros.sensing import Odometry
 
@@ -40,6 +40,8 @@ class Inbox:
         figures: Figures,
         estimates: QoSProfile = qos.CHAIN_FROM_NOW,
         first: int = 0,
+        begun: int | None = None,
+        after: Mapping[str, int] | None = None,
     ) -> None:
         """Subscribe.
 
@@ -47,7 +49,12 @@ class Inbox:
         :param deliver: called for each message in its turn.
         :param estimates: profile for LocalEstimate, of which most nodes have no use for the past.
         :param first: keyframe event with which the chain begins.
+        :param begun: number of the request after which the node began anew, 0 before the first; None where it hears
+            on, whoever begins anew.
+        :param after: {kind of measurement: stamp from which on, ns}, where past ones are wanted too.
         """
+        self._after, self._begun = after or {}, begun
+        self._ahead: list[tuple[int, Callable[[], None]]] = []
         self._heard = heard = tuple(heard)
         self._node, self._deliver, self._figures = node, deliver, figures
         self._order = ChainOrder(heard, first)
@@ -58,28 +65,50 @@ class Inbox:
         for kind in heard:
             self._subscribe(kind)
 
-    def begin_anew(self, first: int) -> None:
+    def begin_anew(self, first: int, begun: int) -> None:
         """The chain begins once more, when all of it so far was heard.
 
         :param first: keyframe event with which it begins.
+        :param begun: number of the request after which it does.
         """
-        self._order = ChainOrder(self._heard, first)
+        self._order, self._begun = ChainOrder(self._heard, first), begun
+        self._heads.clear()
+        self._ranges.clear()
+
+    def catch_up(self) -> None:
+        """Hear what others said that had begun anew before."""
+        ahead, self._ahead = self._ahead, []
+        for begun, hear in ahead:
+            self._hear_in_turn(begun, hear)
+
+    def _hear_in_turn(self, begun: int, hear: Callable[[], None]) -> None:
+        """Hear what was said since the same request to begin anew; keep what was said after a later one."""
+        if self._begun is None or begun == self._begun:
+            hear()
+        elif begun > self._begun:
+            self._ahead.append((begun, hear))
+
+    @property
+    def events(self) -> int | None:
+        """Keyframe events that were delivered to the end, None amid one."""
+        return self._order.events
 
     def _subscribe(self, kind: type) -> None:
         if kind is Keyframe:
             self._listen(LaserScan, KEYFRAME_SCANS, self._hear_ranges)
             self._listen(String, KEYFRAMES, self._hear_head)
         elif kind is Trail:
-            self._listen(Path, TRAIL, lambda message: self._receive(conversions.trail_from(message)))
+            self._listen(Path, TRAIL, lambda message: self.receive(conversions.trail_from(message)))
         elif kind is Finished:
             self._listen(String, FINISHED, self._hear_closing)
         elif kind is Odometry:
             SensorSubscription(
-                self._node, OdometryMessage, ODOM, lambda message: self._receive(conversions.odometry_from(message))
-            )
+                self._node, OdometryMessage, ODOM, lambda message: self.receive(conversions.odometry_from(message)),
+                self._after.get("Odometry"),
+            )  # fmt: skip
         elif kind in DOCUMENTS:
             profile = self._estimates if kind is LocalEstimate else qos.CHAIN
-            self._listen(String, DOCUMENTS[kind], lambda message: self._receive(decode(message.data, kind)), profile)
+            self._listen(String, DOCUMENTS[kind], lambda message: self._hear_document(message, kind), profile)
 
     def _listen(self, kind: type, topic: str, hear: Callable[[Any], None], profile: QoSProfile = qos.CHAIN) -> None:
         def callback(message: object) -> None:
@@ -90,30 +119,38 @@ class Inbox:
 
         self._node.create_subscription(kind, topic, callback, profile)
 
+    def _hear_document(self, message: String, kind: type[Any]) -> None:
+        document, begun = decode_numbered(message.data, kind)
+        self._hear_in_turn(begun, lambda: self.receive(document))
+
     def _hear_head(self, message: String) -> None:
-        self._heads.append(decode(message.data, KeyframeHead))
-        self._pair()
+        head, begun = decode_numbered(message.data, KeyframeHead)
+        self._hear_in_turn(begun, lambda: self._pair(heads=[head]))
 
     def _hear_ranges(self, message: LaserScan) -> None:
-        self._ranges.append((conversions.keyframe_of(message.header.frame_id), conversions.ranges_of(message)))
-        self._pair()
+        sequence, begun = conversions.keyframe_of(message.header.frame_id)
+        ranges = (sequence, conversions.ranges_of(message))
+        self._hear_in_turn(begun, lambda: self._pair(ranges=[ranges]))
 
-    def _pair(self) -> None:
+    def _pair(self, heads: Sequence[KeyframeHead] = (), ranges: Sequence[tuple[int, Any]] = ()) -> None:
         """Join heads and ranges of the same keyframe; one without its other half is a loss, which the order tells."""
+        self._heads += heads
+        self._ranges += ranges
         while self._heads and self._ranges:
-            head, (sequence, ranges) = self._heads[0], self._ranges[0]
+            head, (sequence, beams) = self._heads[0], self._ranges[0]
             if head.sequence <= sequence:
                 self._heads.popleft()
             if sequence <= head.sequence:
                 self._ranges.popleft()
             if head.sequence == sequence:
-                self._receive(head.with_ranges(ranges))
+                self.receive(head.with_ranges(beams))
 
     def _hear_closing(self, message: String) -> None:
         self.closing = decode(message.data, Closing)
-        self._receive(self.closing.totals)
+        self.receive(self.closing.totals)
 
-    def _receive(self, message: Message) -> None:
+    def receive(self, message: Message) -> None:
+        """Count a message, and deliver what is due."""
         self._figures.received[type(message).__name__] += 1
         if not isinstance(message, CHAIN):
             self._deliver(message)

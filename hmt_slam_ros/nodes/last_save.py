@@ -25,6 +25,17 @@ _POLL = 0.05  # s
 
 def spin(node: ProcessNode) -> None:
     """Spin a node until it is told to end and its part of the last map is saved, if one is to be."""
+    node.recover()
+    ended = False
+    try:
+        _spin(node)
+        ended = True
+    finally:
+        if ended or not rclpy.ok():
+            node.recovery.clear()
+
+
+def _spin(node: ProcessNode) -> None:
     if not node.saves_at_end:
         rclpy.spin(node)
         return

@@ -12,7 +12,7 @@ from std_srvs.srv import Trigger
 
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.nodes.beginning import Beginning
-from hmt_slam_ros.nodes.map_view import MapView
+from hmt_slam_ros.nodes.map_view import MapView, Seen
 from hmt_slam_ros.nodes.part import PARTS
 from hmt_slam_ros.nodes.round import Round
 from hmt_slam_ros.nodes.topics import BEGIN, BEGUN
@@ -70,7 +70,7 @@ class MapChanger(Round):
         done, _ = await self.ask()
         if done:
             response.result = LoadMap.Response.RESULT_SUCCESS
-            view = MapView(self._node.configuration, self._node.map_frame, known)
+            view = MapView(self._node.configuration, self._node.map_frame, Seen.of(known))
             response.map = view.grid() or response.map
         return response
 
@@ -87,7 +87,7 @@ class MapChanger(Round):
         return BeginRequest(number, events, self._folder)
 
     def _finish(self) -> str:
-        self._node.begin_anew(self._folder)
+        self._node.begin_anew(self._folder, self._number)
         return f"goes on from {self._folder}" if self._folder else "the map is forgotten, a new one begins"
 
     def _clean_up(self) -> None:

@@ -29,6 +29,9 @@ if TYPE_CHECKING:
     from hmt_slam_ros.offline.saved_map import MapWriter
 
 
+_REMEDY = "the map of before stays; make room, or set save_to of slam to another folder"
+
+
 class _Saving(NamedTuple):
     """A map that is being saved.
 
@@ -83,11 +86,14 @@ class MapSaver(Round):
             raise HmtSlamError("nothing is mapped yet, drive first")
         if self._target.exists() and not (self._target / MANIFEST).is_file():
             raise HmtSlamError("something else than a map stands there, set save_to of slam to another folder")
-        self._target.parent.mkdir(parents=True, exist_ok=True)
-        scratch = Path(tempfile.mkdtemp(prefix=f".{self._target.name}.partial-", dir=self._target.parent))
-        self._saving = _Saving(scratch, MapWriter(scratch / "new"))
-        self._saving.writer.write_slam(self._node.process.state)
-        self._node.write_map(self._saving.writer)
+        try:
+            self._target.parent.mkdir(parents=True, exist_ok=True)
+            scratch = Path(tempfile.mkdtemp(prefix=f".{self._target.name}.partial-", dir=self._target.parent))
+            self._saving = _Saving(scratch, MapWriter(scratch / "new"))
+            self._saving.writer.write_slam(self._node.process.state)
+            self._node.write_map(self._saving.writer)
+        except OSError as fault:
+            raise HmtSlamError(f"{fault.strerror}; {_REMEDY}") from fault
         return SaveRequest(number, events, str(self._saving.folder), self._ending)
 
     def _finish(self) -> str:
@@ -99,9 +105,7 @@ class MapSaver(Round):
             self._saving.writer.finish(self._node.configuration)
             put_in_place(self._kept() or self._saving.folder, self._target)
         except OSError as fault:
-            raise HmtSlamError(
-                f"{self._target} cannot be written ({fault.strerror}): set save_to of slam to another folder"
-            ) from fault
+            raise HmtSlamError(f"{self._target} cannot be saved: {fault.strerror}; {_REMEDY}") from fault
         return f"saved to {self._target}"
 
     def _kept(self) -> Path | None:

@@ -22,13 +22,21 @@ RCLError = rclpy_implementation.RCLError
 
 Writer = Callable[[Any], None]
 
+_COUNTED = (Keyframe, Trail)
+
 
 class Outbox:
-    """Publishers for the kinds of messages that a node says."""
+    """Publishers for the kinds of messages that a node says.
 
-    def __init__(self, node: Node, said: Iterable[type]) -> None:
+    :ivar sent: {kind of message: how many were published}, of those that slam's last word counts.
+    :ivar begun: number of the request after which the node began anew, 0 before the first.
+    """
+
+    def __init__(self, node: Node, said: Iterable[type], begun: int = 0) -> None:
+        """Make the publishers."""
         self._node = node
-        self._sent = {Keyframe: 0, Trail: 0}
+        self.begun = begun
+        self.sent = dict.fromkeys((kind.__name__ for kind in _COUNTED), 0)
         self._writers: dict[type, Writer] = {kind: self._writer(kind) for kind in said}
 
     def add(self, kind: type, writer: Writer) -> None:
@@ -37,10 +45,13 @@ class Outbox:
 
     def send(self, message: Message) -> None:
         """Publish a message."""
-        kind = type(message)
-        self._writers[kind](message)
-        if kind in self._sent:
-            self._sent[kind] += 1
+        self.repeat(message)
+        if isinstance(message, _COUNTED):
+            self.sent[type(message).__name__] += 1
+
+    def repeat(self, message: Message) -> None:
+        """Publish a message that was counted before."""
+        self._writers[type(message)](message)
 
     def _writer(self, kind: type) -> Writer:
         if kind is Keyframe:
@@ -52,21 +63,22 @@ class Outbox:
             closings = self._node.create_publisher(String, FINISHED, qos.CHAIN)
             return lambda totals: publish_surely(closings, String(data=encode(self._closing(totals))))
         documents = self._node.create_publisher(String, DOCUMENTS[kind], qos.CHAIN)
-        return lambda message: publish_surely(documents, String(data=encode(message)))
+        return lambda message: publish_surely(documents, String(data=encode(message, self.begun)))
 
     def _keyframe_writer(self) -> Writer:
         scans = self._node.create_publisher(LaserScan, KEYFRAME_SCANS, qos.CHAIN)
         heads = self._node.create_publisher(String, KEYFRAMES, qos.CHAIN)
 
         def write(keyframe: Keyframe) -> None:
-            frame = conversions.keyframe_frame(keyframe.sequence)
+            frame = conversions.keyframe_frame(keyframe.sequence, self.begun)
             publish_surely(scans, conversions.laser_scan(keyframe.scan, frame))
-            publish_surely(heads, String(data=encode(KeyframeHead.of(keyframe))))
+            publish_surely(heads, String(data=encode(KeyframeHead.of(keyframe), self.begun)))
 
         return write
 
     def _closing(self, totals: Finished) -> Closing:
-        return Closing(totals, self._sent[Keyframe], self._sent[Trail])
+        keyframes, trails = (self.sent[kind.__name__] for kind in _COUNTED)
+        return Closing(totals, keyframes, trails)
 
 
 def publish_surely(publisher: Any, message: Any) -> None:  # noqa: ANN401  any ROS message

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import time
+from collections import deque
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from rclpy.qos import QoSProfile
 from std_msgs.msg import String
 
 from hmt_slam_ros.errors import HmtSlamError
@@ -36,23 +38,30 @@ class Part:
         # The last message of an event that the process hears.
         self._last = [kind for kind in CHAIN if kind in HEARD_BY[name]][-1]
         self._events = node.beginning.events
-        self._request: SaveRequest | BeginRequest | None = None
+        self._requests: deque[SaveRequest | BeginRequest] = deque()
         self._gave_last: float | None = None
         self._saved = node.create_publisher(String, SAVED, qos.CHAIN)
         self._begun = node.create_publisher(String, BEGUN, qos.CHAIN)
-        for topic, kind in ((SAVE, SaveRequest), (BEGIN, BeginRequest)):
-            self._listen(topic, kind)
+        self._listen(SAVE, SaveRequest, qos.CHAIN_FROM_NOW)
+        # Who was not there hears of it all the same.
+        self._listen(BEGIN, BeginRequest, qos.CHAIN)
 
-    def _listen(self, topic: str, kind: type[SaveRequest | BeginRequest]) -> None:
+    def _listen(self, topic: str, kind: type[SaveRequest | BeginRequest], profile: QoSProfile) -> None:
         def hear(message: String) -> None:
             try:
-                self._request = decode(message.data, kind)
+                request = decode(message.data, kind)
             except HmtSlamError as error:
                 self._node.figures.fail(f"{topic}: {error}")
             else:
-                self._answer_if_due()
+                self._hear(request)
 
-        self._node.create_subscription(String, topic, hear, qos.CHAIN_FROM_NOW)
+        self._node.create_subscription(String, topic, hear, profile)
+
+    def _hear(self, request: SaveRequest | BeginRequest) -> None:
+        """Take note of a request, unless it was answered before."""
+        if isinstance(request, SaveRequest) or request.number > self._node.answered:
+            self._requests.append(request)
+            self._answer_if_due()
 
     def delivered(self, message: Message) -> None:
         """Count an event that the process has worked off; do what waits for it."""
@@ -65,15 +74,16 @@ class Part:
         return not self._events or (self._gave_last is not None and time.monotonic() - self._gave_last >= linger)
 
     def _answer_if_due(self) -> None:
-        request = self._request
-        if request is None or self._events < request.events:
-            return
-        self._request = None
+        while self._requests and self._events >= self._requests[0].events:
+            self._answer(self._requests.popleft())
+
+    def _answer(self, request: SaveRequest | BeginRequest) -> None:
         ahead = f"it is at keyframe event {self._events}, not {request.events}: restart all nodes"
         fault = ahead if self._events > request.events else ""
         if isinstance(request, BeginRequest):
             fault = fault or self._begin(request)
             self._begun.publish(String(data=encode(BegunPart(request.number, self._name, fault))))
+            self._node.inbox.catch_up()
             return
         files: tuple[File, ...] = ()
         if not fault:
@@ -85,7 +95,7 @@ class Part:
     def _begin(self, request: BeginRequest) -> str:
         """Begin anew; what went wrong."""
         try:
-            self._node.begin_anew(request.folder)
+            self._node.begin_anew(request.folder, request.number)
         except HmtSlamError as fault:
             return f"{fault}; restart all nodes"
         self._events = self._node.beginning.events

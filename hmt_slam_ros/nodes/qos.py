@@ -6,6 +6,13 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 # A reader that falls behind makes the writer wait, since the history of a reliable KEEP_ALL topic is bounded (5000).
 SENSOR = QoSProfile(history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.RELIABLE)
 
+# The same where what was sent is kept: of the robot node, and for slam that was killed and missed something.
+KEPT_SENSOR = QoSProfile(
+    history=HistoryPolicy.KEEP_ALL,
+    reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.TRANSIENT_LOCAL,
+)
+
 # Drivers of live lasers publish best effort, which a reliable reader never hears. The nodes begin with SENSOR and
 # change over to this profile when DDS reports such a writer. The depth bridges a second of a fast laser.
 LIVE_SENSOR = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -38,3 +45,14 @@ TF_STATIC = QoSProfile(
 
 # What passes by for people and other programs: /tf, /pose, /clock, /diagnostics.
 STREAM = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=100, reliability=ReliabilityPolicy.RELIABLE)
+
+# For the page, which looks at what passes by a few times a second: older ones are replaced inside of DDS.
+NEWEST = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+
+# A reader of a chain topic that wants to know its past, and for which nobody waits: what is too much is lost.
+LOOK_BACK = QoSProfile(
+    history=HistoryPolicy.KEEP_LAST,
+    depth=1000,
+    reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.TRANSIENT_LOCAL,
+)

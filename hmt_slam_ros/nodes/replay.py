@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -58,6 +59,7 @@ def replay(
     configuration: Configuration,
     progress: Callable[[int], None] | None = None,
     stall: float = STALL,
+    view: int | None = None,
 ) -> Replay:
     """Run a log through the nodes, in a domain of their own, and write the output folder.
 
@@ -65,6 +67,7 @@ def replay(
     :param output: the folder; nothing is left there unless all goes well.
     :param progress: called with the number of scans that are worked off.
     :param stall: seconds without any message after which the run is given up.
+    :param view: port on which the live page is served, None for no page.
     :raises HmtSlamError: for a log that cannot be read, a node that dies, or a run that stands still.
     """
     if configuration.robot.loop:
@@ -74,7 +77,7 @@ def replay(
         raise HmtSlamError(f"{log} has no scans in the part asked for: check --start and --duration")
     contents = _contents(opened)
     with replacing(output) as folder:
-        run = _Run(configuration, progress or (lambda _: None), stall)
+        run = _Run(configuration, progress or (lambda _: None), stall, view)
         run.play(log, _slam_settings(contents.laser_poses))
         begin = time.process_time()
         recording = run.node.recorder.finish(contents.stamps)
@@ -139,8 +142,10 @@ class _Run:
     usage: dict[str, Usage]
     wall_seconds: float
 
-    def __init__(self, configuration: Configuration, progress: Callable[[int], None], stall: float) -> None:
-        self._configuration, self._progress, self._stall = configuration, progress, stall
+    def __init__(
+        self, configuration: Configuration, progress: Callable[[int], None], stall: float, view: int | None
+    ) -> None:
+        self._configuration, self._progress, self._stall, self._view = configuration, progress, stall, view
 
     def play(self, log: Path, slam_settings: list[str]) -> None:
         """Start the nodes, listen until the end, stop them.
@@ -152,14 +157,14 @@ class _Run:
             tempfile.TemporaryDirectory(prefix="hmt_slam_replay_") as scratch,
             own_domain() as domain,
             self._listening(domain) as executor,
-            Children(Path(scratch)) as children,
+            Children(Path(scratch), PROCESSES, _tell) as children,
         ):
             begin = time.monotonic()
             self._start(children, log, slam_settings, domain, Path(scratch))
             self._listen(executor, children)
             self.wall_seconds = time.monotonic() - begin
             self._await_figures(executor)
-            self.usage = children.usage()
+            self.usage = {name: used for name, used in children.usage().items() if name != "view"}
 
     @contextmanager
     def _listening(self, domain: int) -> Iterator[SingleThreadedExecutor]:
@@ -186,9 +191,12 @@ class _Run:
         parameters = scratch / "parameters.yaml"
         parameters.write_text(ros_yaml(self._configuration), encoding="utf-8")
         environment = {**os.environ, "ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+        if self._view is not None:
+            children.start("view", ["-p", f"port:={self._view}"], environment)
         shared = ["--params-file", str(parameters)]
+        recovery = ["-p", f"recovery:={scratch / 'recovery'}"]
         for name in PROCESSES:
-            children.start(name, shared + (slam_settings if name == "slam" else []), environment)
+            children.start(name, shared + recovery + (slam_settings if name == "slam" else []), environment)
         own = {
             "log": yaml_value(str(log if is_simulated(log) else log.absolute())),
             "robot.odometry_listeners": 2,  # slam and rtl
@@ -227,6 +235,10 @@ class _Run:
         asked, deadline = time.time_ns(), time.monotonic() + _LAST_FIGURES
         while time.monotonic() < deadline and any(self.node.told.get(name, 0) < asked for name in PROCESSES):
             executor.spin_once(timeout_sec=_SPIN)
+
+
+def _tell(sentence: str) -> None:
+    print(sentence, file=sys.stderr, flush=True)
 
 
 @contextmanager

@@ -56,8 +56,8 @@ class RobotNode(ConfiguredNode):
         self._state: State = "waiting"
         self._lasers: dict[bytes, tuple[str, NDArray[np.float64]]] = {}
         self._begin = self._last_progress = time.monotonic()
-        self._scans = self.create_publisher(LaserScan, SCAN, qos.SENSOR)
-        self._readings = self.create_publisher(OdometryMessage, ODOM, qos.SENSOR)
+        self._scans = self.create_publisher(LaserScan, SCAN, qos.KEPT_SENSOR)
+        self._readings = self.create_publisher(OdometryMessage, ODOM, qos.KEPT_SENSOR)
         self._clock_times = self.create_publisher(ClockMessage, CLOCK, qos.STREAM)
         self._statuses = self.create_publisher(String, ROBOT_STATUS, qos.LATCHED)
         self._send_transforms = transform_publisher(self, "tf")

@@ -73,7 +73,8 @@ class Round(ABC):
         if listening < len(PARTS) and time.monotonic() - self._since < _DISCOVERY:
             return
         self._answers = {}
-        self._number += 1
+        # Also above those of a slam that was killed.
+        self._number = max(self._number + 1, time.time_ns())
         try:
             self.holding = True
             request = self._begin(self._number, self._node.process.events)

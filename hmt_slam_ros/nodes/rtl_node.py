@@ -9,6 +9,7 @@ from geometry_msgs.msg import PoseWithCovarianceStamped
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.nodes import conversions, qos
 from hmt_slam_ros.nodes.beginning import Beginning
+from hmt_slam_ros.nodes.correction import Correction
 from hmt_slam_ros.nodes.last_save import spin
 from hmt_slam_ros.nodes.parameters import declare_frame
 from hmt_slam_ros.nodes.process_node import ProcessNode
@@ -24,18 +25,21 @@ class RtlNode(ProcessNode):
     """The node ``rtl``."""
 
     def __init__(self) -> None:
-        super().__init__("rtl", _make_process, (), changeable=("rtl.publish_tf",))
+        super().__init__("rtl", _make_process, (), changeable=("rtl.publish_tf", "rtl.correction_time"))
         self._map, self._odom = declare_frame(self, "map", "map"), declare_frame(self, "odom", "odom")
         self._hmt_poses = self.create_publisher(PoseWithCovarianceStamped, HMT_POSE, qos.STREAM)
         self._poses = self.create_publisher(PoseWithCovarianceStamped, POSE, qos.STREAM)
+        self._correction = Correction()
         self._send_transforms = transform_publisher(self, "tf")
         self.outbox.add(RealTimePose, self._publish)
 
     def _publish(self, pose: RealTimePose) -> None:
         self._hmt_poses.publish(conversions.pose_with_covariance(pose.stamp, f"area_{pose.area}", pose.local))
         self._poses.publish(conversions.pose_with_covariance(pose.stamp, self._map, pose.map_pose))
-        if self.configuration.rtl.publish_tf:
-            joint = conversions.transform_message(pose.stamp, self._map, self._odom, pose.map_T_odom)
+        settings = self.configuration.rtl
+        if settings.publish_tf:
+            shown = self._correction.shown(pose.stamp, pose.map_T_odom, pose.odometry, settings.correction_time)
+            joint = conversions.transform_message(pose.stamp, self._map, self._odom, shown)
             self._send_transforms([joint])
 
 

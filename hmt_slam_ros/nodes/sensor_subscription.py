@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -10,6 +11,10 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
 from hmt_slam_ros.nodes import qos
+from hmt_slam_ros.nodes.conversions import stamp_of
+
+# Within this time a robot node has sent again what was missed.
+_PAST = 10.0  # s
 
 
 class SensorSubscription:
@@ -18,19 +23,44 @@ class SensorSubscription:
     :ivar live: whether it listens to a publisher that may lose messages.
     """
 
-    def __init__(self, node: Node, kind: type, topic: str, hear: Callable[[Any], None]) -> None:
+    def __init__(
+        self, node: Node, kind: type, topic: str, hear: Callable[[Any], None], after: int | None = None
+    ) -> None:
+        """Listen.
+
+        :param after: stamp of the last message that was heard before, ns, where what was missed since is wanted, from a
+            publisher that kept it.
+        """
         self.live = False
         self._node, self._kind, self._topic, self._hear = node, kind, topic, hear
-        self._subscription = self._subscribe(qos.SENSOR)
+        self._after, self._begin = after, time.monotonic()
+        self._subscription = self._subscribe(qos.SENSOR if after is None else qos.KEPT_SENSOR)
 
     def _subscribe(self, profile: QoSProfile) -> Any:  # noqa: ANN401  rclpy's subscription
+        self._profile = profile
         events = SubscriptionEventCallbacks(incompatible_qos=self._change_over)
-        return self._node.create_subscription(self._kind, self._topic, self._hear, profile, event_callbacks=events)
+        return self._node.create_subscription(self._kind, self._topic, self._hear_new, profile, event_callbacks=events)
+
+    def _hear_new(self, message: Any) -> None:  # noqa: ANN401  a ROS message with a header
+        if self._after is not None:
+            stamp = stamp_of(message.header.stamp)
+            if stamp <= self._after and time.monotonic() - self._begin < _PAST:
+                return
+            if self._profile is not qos.KEPT_SENSOR:
+                self._node.get_logger().warning(
+                    f"what came on {self._topic} between the stamps {self._after} and {stamp} ns, "
+                    f"{(stamp - self._after) / 1e9:.1f} s, is lost: the node was not there"
+                )
+            self._after = None
+        self._hear(message)
 
     def _change_over(self, _event: object) -> None:
         if self.live:
             return
+        self._node.destroy_subscription(self._subscription)
+        if self._profile is qos.KEPT_SENSOR:
+            self._subscription = self._subscribe(qos.SENSOR)
+            return
         self.live = True
         self._node.get_logger().info(f"{self._topic} comes from a live driver (best effort): messages may be lost")
-        self._node.destroy_subscription(self._subscription)
         self._subscription = self._subscribe(qos.LIVE_SENSOR)

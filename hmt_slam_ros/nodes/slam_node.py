@@ -5,7 +5,8 @@ from __future__ import annotations
 import sys
 import time
 from collections import deque
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -28,10 +29,14 @@ from hmt_slam_ros.nodes.map_changer import MapChanger
 from hmt_slam_ros.nodes.map_saver import MapSaver
 from hmt_slam_ros.nodes.parameters import declare_frame
 from hmt_slam_ros.nodes.process_node import ProcessNode
+from hmt_slam_ros.nodes.recovery import CHECKPOINT, Paused, Setting
 from hmt_slam_ros.nodes.running import run
 from hmt_slam_ros.nodes.sensor_subscription import SensorSubscription
+from hmt_slam_ros.nodes.sensor_watch import SensorWatch
 from hmt_slam_ros.nodes.topics import INITIAL_POSE, PARTICLES, ROBOT_STATUS, SCAN
 from hmt_slam_ros.nodes.transforms import LaserMounting
+from hmt_slam_ros.persistence.folder import FolderReader
+from hmt_slam_ros.persistence.hmt_map import VERSION
 from hmt_slam_ros.processes.documents import RobotStatus, decode
 from hmt_slam_ros.processes.messages import (
     Accepted,
@@ -47,15 +52,35 @@ from hmt_slam_ros.processes.messages import (
     Trail,
 )
 from hmt_slam_ros.processes.replica import FIRST_AREA
+from hmt_slam_ros.sensing import Odometry, Scan
 
 if TYPE_CHECKING:
     from hmt_slam_ros.offline.saved_map import MapWriter
     from hmt_slam_ros.processes.slam import MetricSlam
 
+_MEMORY = "node"
 # Live, scans beyond this many in the queue are dropped; a replay never drops one.
 _LIVE_QUEUE = 200
 # The last scans of a log are awaited this long, since status and scans are separate topics.
 _END_PATIENCE = 5.0  # s
+
+
+@dataclass(frozen=True, eq=False)
+class SlamMemory:
+    """What the node knows beside its process.
+
+    :ivar areas: of the most probable hypothesis, in the map.
+    :ivar estimate: the last one that was said.
+    :ivar unchanged: whether the map is as it was loaded.
+    :ivar dropped: scans that the node did not let the process hear.
+    :ivar paused: whether it passes them over.
+    """
+
+    areas: tuple[AreaPose, ...]
+    estimate: LocalEstimate | None
+    unchanged: bool
+    dropped: int
+    paused: bool
 
 
 class SlamNode(ProcessNode):
@@ -69,7 +94,8 @@ class SlamNode(ProcessNode):
         self._mounting = LaserMounting(self, self._work_off)
         self._pending: deque[LaserScan] = deque()
         self._pending_since = self._last_scan = time.monotonic()
-        self._scans, self._dropped = 0, 0
+        self._watch, self._complained = SensorWatch(self.figures), False
+        self._dropped = 0
         self._end: RobotStatus | None = None
         self._areas: dict[int, AreaPose] = {}
         self.estimate: LocalEstimate | None = None
@@ -80,7 +106,7 @@ class SlamNode(ProcessNode):
         self._changer = MapChanger(self, self._release)
         self._paused = False
         self._skipped: LaserScan | None = None
-        self._laser = SensorSubscription(self, LaserScan, SCAN, self._hear_scan)
+        self._laser = SensorSubscription(self, LaserScan, SCAN, self._hear_scan, self.after.get("Scan"))
         self._particles = self.create_publisher(PoseArray, PARTICLES, qos.STREAM)
         self.create_subscription(String, ROBOT_STATUS, self._hear_status, qos.LATCHED)
         self.create_service(Trigger, "~/carried", self._hear_carried)
@@ -100,7 +126,7 @@ class SlamNode(ProcessNode):
     def configuration_changed(self, configuration: Configuration) -> None:
         """Take note of another mode, from the next keyframe on."""
         super().configuration_changed(configuration)
-        self.process.mapping = configuration.mode == "mapping"
+        self.process.mode = configuration.mode
         self._unchanged = self._unchanged and not self.process.mapping
 
     @property
@@ -123,17 +149,17 @@ class SlamNode(ProcessNode):
         """Whether what is heard has to wait for that."""
         return self._saver.holding or self._changer.holding
 
-    def begin_anew(self, folder: str) -> None:
+    def begin_anew(self, folder: str, request: int = 0) -> None:
         """As any process node; what waits was of before, and scans are numbered on."""
-        super().begin_anew(folder)
+        super().begin_anew(folder, request)
         self._pending.clear()
         self._take_over_map()
         self._held.appendleft(Carried())
 
     def _pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         """Scans are passed over, but for the last, by which the robot is found when it goes on."""
-        self._paused = request.data
-        self.figures.state["paused"] = "yes, scans are passed over" if request.data else "no"
+        self.recovery.heard(Paused(request.data))
+        self._set_paused(request.data)
         skipped, self._skipped = self._skipped, None
         if skipped is not None and not self._paused:
             self._take(skipped)
@@ -142,8 +168,15 @@ class SlamNode(ProcessNode):
         self.get_logger().info(response.message)
         return response
 
+    def _set_paused(self, on: bool) -> None:
+        self._paused = on
+        self.figures.state["paused"] = "yes, scans are passed over" if on else "no"
+
     def _begin(self) -> None:
         """Say where the robot is in the map that the node starts from."""
+        if self.recovering:
+            declare_initial_pose(self)
+            return
         if not self.process.mapping and self.beginning.map is None:
             self.figures.warn("mode = localization, but there is no map: call load_map, or set start_from or mode")
         told = declare_initial_pose(self)
@@ -173,8 +206,8 @@ class SlamNode(ProcessNode):
         self.deliver(Carried(place))
 
     def _hear_scan(self, message: LaserScan) -> None:
-        self._scans += 1
         self._last_scan = time.monotonic()
+        self._watch.hear_scan()
         self.figures.received["Scan"] += 1
         if self._paused:
             self._dropped += self._skipped is not None
@@ -191,7 +224,7 @@ class SlamNode(ProcessNode):
             self.figures.warn("scans come faster than they can be worked off: some are dropped, lower filter.particles")
             return
         if not self._pending:
-            self._pending_since = time.monotonic()
+            self._pending_since, self._complained = time.monotonic(), False
         self._pending.append(message)
         self._work_off()
 
@@ -204,7 +237,6 @@ class SlamNode(ProcessNode):
                 return
             self._pending.popleft()
             self.deliver(conversions.scan_from(message, mounting.laser_pose, mounting.side))
-            self.figures.state["waiting scans"] = self.process.waiting_scans
         self._end_if_all_came()
 
     def _hear_status(self, message: String) -> None:
@@ -232,6 +264,10 @@ class SlamNode(ProcessNode):
         if self.holding:
             self._held.append(message)
             return
+        if isinstance(message, Carried):
+            self._watch.forget()
+        elif isinstance(message, Scan | Odometry) and self._watch.is_back(message) and not self.recovering:
+            super().deliver(Carried())
         super().deliver(message)
         if self._end is not None:
             self._end_if_all_came()
@@ -242,6 +278,38 @@ class SlamNode(ProcessNode):
         """Go on with what was held."""
         while self._held and not self.holding:
             self.deliver(self._held.popleft())
+
+    def hear_again(self, value: Message | Setting | Paused) -> None:
+        """As any process node; scans have come by another way."""
+        if isinstance(value, Paused):
+            self._set_paused(value.on)
+        elif isinstance(value, Scan | Carried | EndOfLog):
+            self.figures.received["Scan"] += isinstance(value, Scan)
+            self.deliver(value)
+        else:
+            super().hear_again(value)
+
+    @property
+    def after(self) -> Mapping[str, int]:
+        """Slam that was killed wants all scans and all odometry since, where somebody has them."""
+        return self.recovery.stamps if self.recovering else {}
+
+    @property
+    def at_rest(self) -> bool:
+        """Whether no scan waits for its laser's place, and nothing for the other nodes."""
+        return not (self._pending or self._held or self.holding or self.busy)
+
+    def memory(self) -> dict[str, object]:
+        """What the node knows beside its process."""
+        areas = tuple(self._areas.values())
+        return {_MEMORY: SlamMemory(areas, self.estimate, self._unchanged, self._dropped, self._paused)}
+
+    def remember(self, state: Path) -> None:
+        """Take it over."""
+        known = FolderReader(state, CHECKPOINT, VERSION).read(_MEMORY, SlamMemory)
+        self._areas = {entry.area: entry for entry in known.areas}
+        self.estimate, self._unchanged, self._dropped = known.estimate, known.unchanged, known.dropped
+        self._set_paused(known.paused)
 
     def saved_last(self, linger: float) -> bool:  # noqa: ARG002  all others have answered
         """Whether the last map is saved, or cannot be."""
@@ -260,7 +328,7 @@ class SlamNode(ProcessNode):
         end = self._end
         if end is None or self._pending or self._paused:
             return
-        complete = self._scans >= end.scans and self.figures.received["Odometry"] >= end.odometry
+        complete = self.figures.received["Scan"] >= end.scans and self.figures.received["Odometry"] >= end.odometry
         if complete or give_up:
             self._end = None
             self.deliver(EndOfLog())
@@ -268,11 +336,17 @@ class SlamNode(ProcessNode):
     def _look_around(self) -> None:
         """Once a second: tell what is missing, and stop waiting for scans that were lost."""
         now = time.monotonic()
+        self.figures.state["waiting scans"] = self.process.waiting_scans + len(self._pending)
+        self._watch.look(self.figures.received["Odometry"])
         if self._pending and now - self._pending_since > 2 * PERIOD:
-            self.figures.fail(self._mounting.complaint(self._pending[0], len(self._pending)))
+            # Amid a start of many nodes DDS may take that long to bring what is latched: an error where it stays so.
+            tell = self.figures.fail if self._complained else self.figures.warn
+            tell(self._mounting.complaint(self._pending[0], len(self._pending)))
+            self._complained = True
             self._pending_since = now + 10 * PERIOD
         if self._end is not None and now - self._last_scan > _END_PATIENCE:
-            self.figures.warn(f"the log ended, but only {self._scans} of its {self._end.scans} scans came")
+            came = self.figures.received["Scan"]
+            self.figures.warn(f"the log ended, but only {came} of its {self._end.scans} scans came")
             self._end_if_all_came(give_up=True)
 
     def show(self, heard: Message, said: list[Message]) -> None:
@@ -283,7 +357,15 @@ class SlamNode(ProcessNode):
             if isinstance(message, LocalEstimate):
                 self.estimate = message
             if isinstance(message, Keyframe):
+                self._tell_effective_samples(message)
                 self._publish_particles(message.scan.stamp)
+
+    def _tell_effective_samples(self, keyframe: Keyframe) -> None:
+        best = self.process.replica.best
+        for leaf in keyframe.leaves:
+            if leaf.hypothesis == best:
+                particles = len(self.process.particles[1])
+                self.figures.state["effective samples"] = f"{leaf.effective_samples:.1f} of {particles}"
 
     def _publish_particles(self, stamp: int) -> None:
         area, poses = self.process.particles

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from pathlib import Path
 
 from nav_msgs.msg import OccupancyGrid
 from nav_msgs.srv import GetMap
@@ -13,14 +14,18 @@ from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.nodes import qos
 from hmt_slam_ros.nodes.beginning import Beginning
 from hmt_slam_ros.nodes.last_save import spin
-from hmt_slam_ros.nodes.map_view import MapView
+from hmt_slam_ros.nodes.map_view import MapView, Seen
 from hmt_slam_ros.nodes.parameters import declare_frame
 from hmt_slam_ros.nodes.process_node import ProcessNode
+from hmt_slam_ros.nodes.recovery import CHECKPOINT
 from hmt_slam_ros.nodes.running import run
 from hmt_slam_ros.nodes.topics import GRAPH, MAP
+from hmt_slam_ros.persistence.folder import FolderReader
+from hmt_slam_ros.persistence.hmt_map import VERSION
 from hmt_slam_ros.processes.messages import Accepted, Message
 from hmt_slam_ros.processes.routing import Remembering
 
+_VIEW = "view"
 _PERIOD = 3.0  # s between two looks at whether the map has to be drawn anew
 
 
@@ -30,18 +35,27 @@ class TlcaNode(ProcessNode):
     def __init__(self) -> None:
         super().__init__("tlca", _make_process, (Accepted,))
         self._map = declare_frame(self, "map", "map")
-        self._view = MapView(self.configuration, self._map, self.beginning.map)
+        self._view = MapView(self.configuration, self._map, Seen.of(self.beginning.map))
         self._grids = self.create_publisher(OccupancyGrid, MAP, qos.LATCHED)
         self._graphs = self.create_publisher(MarkerArray, GRAPH, qos.LATCHED)
         self._drawn = {GRAPH: 0, MAP: 0}
         self.create_timer(_PERIOD, self._draw, clock=self.figures.steady_clock)
         self.create_service(GetMap, "~/get_map", self._get_map)
 
-    def begin_anew(self, folder: str) -> None:
+    def begin_anew(self, folder: str, request: int = 0) -> None:
         """As any process node, and draw what is known then."""
-        super().begin_anew(folder)
-        self._view = MapView(self.configuration, self._map, self.beginning.map)
+        super().begin_anew(folder, request)
+        self._view = MapView(self.configuration, self._map, Seen.of(self.beginning.map))
         self._drawn = {GRAPH: -1, MAP: -1}
+
+    def memory(self) -> dict[str, object]:
+        """What people see."""
+        return {_VIEW: self._view.seen}
+
+    def remember(self, state: Path) -> None:
+        """Go on showing it."""
+        seen = FolderReader(state, CHECKPOINT, VERSION).read(_VIEW, Seen)
+        self._view = MapView(self.configuration, self._map, seen)
 
     def _get_map(self, _request: GetMap.Request, response: GetMap.Response) -> GetMap.Response:
         """The grid as it would be published now, an empty one where nothing is mapped."""

@@ -42,9 +42,9 @@ class TsbiNode(ProcessNode):
                 self._pmf.publish(pmf_message(message))
 
 
-    def begin_anew(self, folder: str) -> None:
+    def begin_anew(self, folder: str, request: int = 0) -> None:
         """As any process node, and say that the robot's place is not known."""
-        super().begin_anew(folder)
+        super().begin_anew(folder, request)
         self._tell_whether_localized()
 
     def _tell_whether_localized(self) -> None:

@@ -1,0 +1,318 @@
+"""How a node that was killed goes on: from its last checkpoint, with what it heard since.
+
+A process is a value machine: from the same state and the same messages in the same order it goes on to the same bit. So
+a node writes down every message before its process hears it, and now and then the state of its process. Another node of
+the same name and folder begins with that state, hears the messages again and says what it said again, which the others
+recognize by its numbers. docs/architecture.md has the reasons.
+"""
+
+from __future__ import annotations
+
+import shutil
+import time
+from collections import deque
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rcl_interfaces.msg import ParameterDescriptor
+
+from hmt_slam_ros.configuration.documents import ros_yaml
+from hmt_slam_ros.nodes.journal import Entry, Journal, journal_entries
+from hmt_slam_ros.persistence.folder import FolderWriter
+from hmt_slam_ros.persistence.hmt_map import CONFIGURATION, VERSION
+from hmt_slam_ros.processes.messages import (
+    Accepted,
+    AreaEvents,
+    Arriving,
+    Carried,
+    EndOfLog,
+    Finished,
+    Hypotheses,
+    Keyframe,
+    LocalEstimate,
+    Message,
+    Notice,
+    RealTimePose,
+    Trail,
+)
+from hmt_slam_ros.sensing import Odometry, Scan
+
+if TYPE_CHECKING:
+    from hmt_slam_ros.nodes.process_node import ProcessNode
+
+CHECKPOINT = "hmt_checkpoint"
+"""The format of the folder of a checkpoint."""
+
+# A checkpoint is due when the node computed this many times as long as the last one took, which bounds what checkpoints
+# cost, and how long another node takes to catch up.
+_WORTH = 20.0
+_FIRST_COST = 0.05  # s, before one was written
+_LARGEST = 64_000_000  # bytes of a journal, for a robot that stands still
+# What the node said last may not have reached the others when it was killed: it is said again. More than DDS has under
+# way at any time.
+_SAID_AGAIN = 64
+_BASE, _SAID, _HEARD = "base", "said", "heard"
+_STATE, _PARTIAL = "state", ".partial"
+
+
+@dataclass(frozen=True, eq=False)
+class Base:
+    """What a node was when its journal began.
+
+    :ivar checkpoint: whether its state is beside the journal; else the process began with ``folder``.
+    :ivar events: keyframe events that it had heard to the end.
+    :ivar folder: of the map that it began with, empty without.
+    :ivar carried: whether the robot may be anywhere in that.
+    :ivar scans: scans that had a pose before.
+    :ivar request: number of the last request to begin anew that it answered.
+    :ivar received: {kind of message: how many it heard}.
+    :ivar sent: {kind of message: how many it said}, of those that are counted for the others.
+    :ivar stamps: {kind of measurement: stamp of the last one that it heard, ns}.
+    :ivar arriving: the last such message that it heard, if any.
+    """
+
+    checkpoint: bool = False
+    events: int = 0
+    folder: str = ""
+    carried: bool = False
+    scans: int = 0
+    request: int = 0
+    received: Mapping[str, int] = field(default_factory=dict)
+    sent: Mapping[str, int] = field(default_factory=dict)
+    stamps: Mapping[str, int] = field(default_factory=dict)
+    arriving: Arriving | None = None
+
+
+@dataclass(frozen=True)
+class Setting:
+    """A parameter that was changed while the node ran.
+
+    :ivar name: of the parameter.
+    :ivar value: the new one, in YAML.
+    """
+
+    name: str
+    value: str
+
+
+@dataclass(frozen=True)
+class Paused:
+    """Slam was told to pass scans over, or to go on.
+
+    :ivar on: whether it passes them over.
+    """
+
+    on: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """What a node of the same name left behind.
+
+    :ivar base: what it was when its journal began.
+    :ivar state: the folder of its checkpoint.
+    :ivar said: what it said last before that.
+    :ivar heard: what it heard since, in its order.
+    """
+
+    base: Base
+    state: Path
+    said: list[Message]
+    heard: list[Message | Setting | Paused]
+
+
+_HEARABLE = (
+    Scan, Odometry, Keyframe, AreaEvents, Hypotheses, Accepted, LocalEstimate, Trail, Carried, Arriving, EndOfLog,
+    Finished, Notice,
+)  # fmt: skip
+_KINDS: dict[str, type] = {kind.__name__: kind for kind in (Base, Setting, Paused, *_HEARABLE)}
+
+
+class Recovery:
+    """Checkpoints and journal of a node; nothing where the parameter ``recovery`` is not set.
+
+    A generation is a folder with a journal and mostly the checkpoint that it goes on from. The newest one that is
+    complete counts; it gets its name when it is.
+
+    :ivar found: what a node of the same name left behind, None where this one is the first.
+    """
+
+    def __init__(self, node: ProcessNode) -> None:
+        """Look for what was left behind.
+
+        :raises HmtSlamError: where it is damaged.
+        """
+        self._node = node
+        folder = str(node.declare_parameter("recovery", "", _DESCRIPTOR).value)
+        name = node.get_fully_qualified_name().strip("/").replace("/", ".")
+        self._folder = Path(folder).absolute() / name if folder else None
+        self._generation = self._segment = 0
+        self._journal: Journal | None = None
+        self._said: deque[Message] = deque(maxlen=_SAID_AGAIN)
+        self._settings: dict[str, Setting] = {}
+        self._stamps: dict[str, int] = {}
+        self._arriving: Arriving | None = None
+        self._cost, self._worked = _FIRST_COST, 0.0
+        self.found = None if self._folder is None else self._find(self._folder)
+
+    def _find(self, folder: Path) -> Found | None:
+        folders = {int(path.name): path for path in folder.glob("*") if path.name.isdecimal()}
+        if not folders:
+            return None
+        self._generation = max(folders)
+        newest = folders[self._generation]
+        self._segment = len(list(newest.glob("*.jsonl")))
+        entries = [e for number in range(self._segment) for e in journal_entries(newest, str(number), _KINDS)]
+        base = entries[0].value
+        assert isinstance(base, Base)
+        self._stamps, self._arriving = dict(base.stamps), base.arriving
+        for entry in entries:
+            self._follow(entry)
+        return Found(base, newest / _STATE, list(self._said), [e.value for e in entries if e.role == _HEARD])  # type: ignore[misc]
+
+    def _follow(self, entry: Entry) -> None:
+        """Keep what the next generation begins with."""
+        value = entry.value
+        if isinstance(value, Setting):
+            self._settings[value.name] = value
+        elif entry.role == _SAID:
+            self._said.append(value)  # type: ignore[arg-type]
+        elif isinstance(value, Arriving):
+            self._arriving = value
+        elif isinstance(value, Scan | Odometry):
+            self._stamps[type(value).__name__] = value.stamp
+
+    @property
+    def stamps(self) -> Mapping[str, int]:
+        """{kind of measurement: stamp of the last one that was heard, ns}."""
+        return dict(self._stamps)
+
+    @property
+    def arriving(self) -> Arriving | None:
+        """The last such message that was heard, if any."""
+        return self._arriving
+
+    def is_past(self, arriving: Arriving) -> bool:
+        """Whether the robot arrived so before: slam says it again when it was killed, and DDS when this node was."""
+        last = self._arriving
+        return last is not None and (arriving.scans, arriving.event) <= (last.scans, last.event)
+
+    def heard(self, value: Message | Setting | Paused) -> None:
+        """Write down what the process is about to hear."""
+        entry = Entry(_HEARD, value)
+        self._follow(entry)
+        self._write(entry)
+
+    def said(self, message: Message) -> None:
+        """Keep what the process says; a pose by dead reckoning is past when it is said again."""
+        if not isinstance(message, RealTimePose):
+            self._said.append(message)
+
+    def worked(self, seconds: float) -> None:
+        """Count the time of computing."""
+        self._worked += seconds
+
+    @property
+    def due(self) -> bool:
+        """Whether a checkpoint is worth what it costs."""
+        return self._journal is not None and (
+            self._worked > _WORTH * self._cost or self._journal.size > _LARGEST
+        )  # fmt: skip
+
+    def begin(self, base: Base) -> None:
+        """Begin a journal without a checkpoint; what was heard and said before is of no use any more."""
+        self._said.clear()
+        self._arriving = None
+        try:
+            self._next(base, lambda _: None)
+        except OSError as fault:
+            self._give_up(fault)
+
+    def checkpoint(self, base: Base, documents: Mapping[str, object]) -> None:
+        """Write the state of the node and go on with a new journal.
+
+        :param documents: {name: value} of which the state consists.
+        """
+        begin = time.perf_counter()
+
+        def write(folder: Path) -> None:
+            writer = FolderWriter(folder / _STATE)
+            for name, document in documents.items():
+                writer.write(name, document)
+            writer.write_text(CONFIGURATION, ros_yaml(self._node.configuration))
+            writer.finish(CHECKPOINT, VERSION)
+
+        with suppress(OSError):  # the journal goes on; where there is no room for that either, it tells
+            self._next(base, write)
+        self._cost, self._worked = time.perf_counter() - begin, 0.0
+
+    def resume(self) -> None:
+        """Go on with the journal that was found."""
+        assert self._folder is not None
+        newest = self._folder / str(self._generation)
+        for other in self._folder.iterdir():
+            if other != newest:
+                shutil.rmtree(other, ignore_errors=True)
+        try:
+            self._journal = Journal(newest, str(self._segment))
+        except OSError as fault:
+            self._give_up(fault)
+
+    def clear(self) -> None:
+        """Leave nothing behind, as the node ends in good order."""
+        if self._journal is not None:
+            self._journal.close()
+            self._journal = None
+        if self._folder is not None:
+            shutil.rmtree(self._folder, ignore_errors=True)
+
+    def _next(self, base: Base, write: Callable[[Path], None]) -> None:
+        """Begin the next generation, and remove the one before.
+
+        :raises OSError: where it cannot be written; the one before is as it was.
+        """
+        if self._folder is None:
+            return
+        made = self._folder / str(self._generation + 1)
+        partial = made.with_suffix(_PARTIAL)
+        shutil.rmtree(partial, ignore_errors=True)
+        partial.mkdir(parents=True)
+        write(partial)
+        journal = Journal(partial, "0")
+        journal.append(_BASE, base)
+        for setting in self._settings.values():
+            journal.append(_HEARD, setting)
+        for message in self._said:
+            journal.append(_SAID, message)
+        partial.rename(made)
+        before, self._journal = self._journal, journal
+        if before is not None:
+            before.close()
+        shutil.rmtree(self._folder / str(self._generation), ignore_errors=True)
+        self._generation, self._segment = self._generation + 1, 1
+
+    def _write(self, entry: Entry) -> None:
+        if self._journal is None:
+            return
+        try:
+            self._journal.append(*entry)
+        except OSError as fault:
+            self._give_up(fault)
+
+    def _give_up(self, fault: OSError) -> None:
+        """Go on without; what is there would lack what comes now."""
+        self.clear()
+        self._node.figures.warn(
+            f"{self._folder} cannot be written ({fault.strerror}): the node goes on, but if it is killed all have to "
+            "be restarted; make room there, or set recovery to another folder"
+        )
+
+
+_DESCRIPTOR = ParameterDescriptor(
+    description="Folder in which the node keeps what another one of its name needs to go on where it was killed; empty "
+    "for none.",
+    read_only=True,
+)

@@ -1,0 +1,89 @@
+"""What a robot's sensors do that they should not: fall silent, go back in time, have clocks of their own."""
+
+from __future__ import annotations
+
+import math
+import time
+
+from hmt_slam_ros.nodes.figures import Figures
+from hmt_slam_ros.sensing import Odometry, Scan
+
+# A laser that sends nothing for so long, while odometry comes, is silent: much longer than any sweep takes.
+_SILENCE = 3.0  # s
+# Measurements of one source come in order, or nearly; a bag that begins again or a clock that is set goes back further.
+_BACK = 1_000_000_000  # ns
+# One clock where at least one of so many scans is that close to the newest reading: scans may wait longer than readings
+# on their way, but not all of them.
+_TOGETHER = 5_000_000_000  # ns
+_SCANS = 50
+
+
+class SensorWatch:
+    """Follows the stamps of what comes from the sensors, and tells."""
+
+    def __init__(self, figures: Figures) -> None:
+        """:param figures: through which it tells."""
+        self._figures = figures
+        self._newest: dict[type, int] = {}
+        self._last_scan = time.monotonic()
+        self._readings = 0
+        self._silent = False
+        self._apart, self._scans = math.inf, 0
+
+    def forget(self) -> None:
+        """What comes next may be of any time."""
+        self._newest.clear()
+        self._apart, self._scans = math.inf, 0
+
+    def is_back(self, measurement: Scan | Odometry) -> bool:
+        """Take in a measurement; whether time went back with it, which is told."""
+        kind, stamp = type(measurement), measurement.stamp
+        newest = self._newest.get(kind, stamp)
+        self._newest[kind] = max(stamp, newest)
+        if kind is Scan:
+            self._compare(stamp)
+        if stamp > newest - _BACK:
+            return False
+        self.forget()
+        self._newest[kind] = stamp
+        self._figures.warn(
+            f"time went back by {(newest - stamp) / 1e9:.1f} s, to {stamp} ns: the robot is taken for carried, and may "
+            "be anywhere in the map; if this is another drive through a place that is new, call slam/reset"
+        )
+        return True
+
+    def _compare(self, stamp: int) -> None:
+        reading = self._newest.get(Odometry)
+        if reading is None:
+            return
+        self._apart = min(self._apart, stamp - reading, key=abs)
+        self._scans += 1
+        if self._scans == _SCANS:
+            if abs(self._apart) > _TOGETHER:
+                self._figures.warn(
+                    f"scans are stamped {abs(self._apart) / 1e9:.1f} s {'after' if self._apart > 0 else 'before'} the "
+                    "odometry that comes with them: let both computers have one clock (NTP, PTP), or correct the "
+                    "stamps; until then odometry does not help"
+                )
+            self._apart, self._scans = math.inf, 0
+
+    def hear_scan(self) -> None:
+        """A scan has come."""
+        now = time.monotonic()
+        if self._silent:
+            self._silent = False
+            self._figures.note(f"scans come again, after {now - self._last_scan:.1f} s")
+        self._last_scan = now
+
+    def look(self, readings: int) -> None:
+        """Once a second: tell of a laser that is silent.
+
+        :param readings: odometry readings that came so far.
+        """
+        moving, self._readings = readings > self._readings, readings
+        if moving and not self._silent and time.monotonic() - self._last_scan > _SILENCE:
+            self._silent = True
+            self._figures.warn(
+                f"no scan came for {_SILENCE:g} s, while odometry does: look at the laser, and at the name and the "
+                "type of the topic scan; meanwhile the pose goes on by odometry"
+            )

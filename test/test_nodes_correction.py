@@ -1,0 +1,57 @@
+"""A correction of map -> odom reaches those who steer by it at one stroke, or little by little."""
+
+import math
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
+
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.nodes.correction import Correction
+
+STEP = 10_000_000  # ns
+FAR = np.array([300.0, -200.0, 1.2])
+KNOWN, CORRECTED = np.array([0.0, 0.0, 0.0]), np.array([0.4, -0.2, 0.02])
+
+
+def driven(time, corrected=CORRECTED, steps=100):
+    """Poses in the map as they are shown and known while the robot drives, corrected before the first step."""
+    correction = Correction()
+    correction.shown(0, KNOWN, FAR, time)
+    shown, known = [], []
+    for k in range(1, steps + 1):
+        odom_T_base = se2.compose(FAR, np.array([0.006 * k, 0.0, 0.0]))
+        map_T_odom = correction.shown(k * STEP, corrected, odom_T_base, time)
+        shown.append(se2.compose(map_T_odom, odom_T_base))
+        known.append(se2.compose(corrected, odom_T_base))
+    return np.array(shown), np.array(known)
+
+
+def test_a_correction_is_made_at_once_where_no_time_is_given():
+    shown, known = driven(time=0.0)
+    np.testing.assert_allclose(shown, known, atol=1e-9)
+
+
+def test_a_correction_falls_to_a_third_in_its_time_without_a_jump():
+    near = np.array([1e-3, 2e-3, 1e-5])
+    shown, known = driven(time=0.5, corrected=near)
+    left = se2.log(se2.between(known, shown))
+    first = se2.log(se2.between(se2.compose(near, FAR), FAR))
+    # What is left turns with the robot: by 1e-5 on 0.3 m.
+    np.testing.assert_allclose(left[49], first * math.exp(-1.0), atol=5e-6)
+    steps = np.linalg.norm(np.diff(shown[:, :2], axis=0), axis=1)
+    assert steps.max() < 0.006 + 0.03 * np.linalg.norm(first[:2])
+
+
+def test_what_is_no_correction_but_another_place_is_shown_at_once():
+    # A turn of 1.1 degrees about odometry's origin, 360 m away, carries the robot by 7 m.
+    shown, known = driven(time=0.5)
+    np.testing.assert_allclose(shown, known, atol=1e-6)
+
+
+def test_time_that_jumps_back_begins_anew():
+    correction = Correction()
+    correction.shown(100 * STEP, KNOWN, FAR, 0.5)
+    near = np.array([1e-3, 2e-3, 1e-5])
+    np.testing.assert_array_equal(correction.shown(0, near, FAR, 0.5), near)

@@ -1,0 +1,213 @@
+"""What goes wrong on a robot: nodes that are killed, disks that are full, lasers that fall silent."""
+
+import resource
+import signal
+
+import numpy as np
+import pytest
+from logs_for_nodes import BEAMS, PACE, SECOND, Corridor, corridor_bag
+from test_nodes_localization import SCANS, Nodes, mapped_corridor
+
+pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
+
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from nav_msgs.msg import Odometry as OdometryMessage
+from rcl_interfaces.srv import GetParameters, SetParameters
+from rclpy.parameter import Parameter
+from sensor_msgs.msg import LaserScan
+from std_msgs.msg import String
+from std_srvs.srv import Trigger
+
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.nodes import conversions, qos
+from hmt_slam_ros.nodes.topics import DIAGNOSTICS, DOCUMENTS, KEYFRAMES, POSE, SCAN
+from hmt_slam_ros.nodes.transforms import TFMessage
+from hmt_slam_ros.persistence.folder import FolderReader
+from hmt_slam_ros.persistence.hmt_map import FORMAT, VERSION
+from hmt_slam_ros.processes.documents import encode
+from hmt_slam_ros.processes.messages import LocalEstimate
+from hmt_slam_ros.sensing import Odometry, Scan
+
+
+@pytest.fixture(scope="module")
+def corridor(tmp_path_factory):
+    return mapped_corridor(tmp_path_factory.mktemp("corridor"))
+
+
+def kill(process):
+    process.send_signal(signal.SIGKILL)
+    process.communicate()
+
+
+def restart(nodes, name, before, **parameters):
+    """Start a node that was killed; wait until it has taken over."""
+    said = len(nodes.diagnostics)
+    nodes.alive[before] = nodes.start(name, **parameters)
+    nodes.until(lambda: any(m.status[0].name == f"/{name}" for m in nodes.diagnostics[said:]))
+
+
+def test_rtl_that_is_killed_goes_on_with_the_pose_and_the_parameters_that_it_had(tmp_path, listener, start):
+    told = listener.hear(DiagnosticArray, DIAGNOSTICS, qos.STREAM)
+    odom = listener.node.create_publisher(OdometryMessage, "odom", qos.SENSOR)
+    estimates = listener.node.create_publisher(String, DOCUMENTS[LocalEstimate], qos.CHAIN)
+    placed = listener.hear(PoseWithCovarianceStamped, POSE, qos.STREAM)
+    process = start("rtl", recovery=tmp_path)
+    listener.until(lambda: odom.get_subscription_count() and estimates.get_subscription_count(), alive=[process])
+    belief = PoseGaussian(np.array([1.0, 2.0, 0.0]), 1e-4 * np.eye(3))
+    step = 0
+
+    def drive():
+        nonlocal step
+        step += 1
+        reading = Odometry(20_000_000 * step, np.array([0.01 * step, 0.0, 0.0]))
+        odom.publish(conversions.odometry_message(reading, "odom", "base_link"))
+        return reading
+
+    first = drive()
+    estimates.publish(String(data=encode(LocalEstimate(first.stamp, 0, 0, belief, first.pose, 0))))
+    while len(placed) < 3:
+        drive()
+        listener.spin(0.05)
+    parameters = [Parameter("rtl.publish_tf", value=False).to_parameter_msg()]
+    changed = listener.call(SetParameters, "rtl/set_parameters", SetParameters.Request(parameters=parameters))
+    assert changed.results[0].successful
+    kill(process)
+    assert list(tmp_path.iterdir())
+
+    said, heard = len(placed), len(told)
+    process = start("rtl", recovery=tmp_path)
+    listener.until(lambda: len(told) > heard, alive=[process])
+    assert len(placed) == said  # nothing that is past
+    while len(placed) < said + 1:
+        drive()
+        listener.spin(0.05)
+    moved = conversions.stamp_of(placed[said].header.stamp) / 20_000_000 - 1
+    assert conversions.planar_pose(placed[said].pose.pose) == pytest.approx([1.0 + 0.01 * moved, 2.0, 0.0])
+    # The answer of the dead one would be waited for.
+    client = listener.node.create_client(GetParameters, "rtl/get_parameters")
+    future = client.call_async(GetParameters.Request(names=["rtl.publish_tf"]))
+    listener.until(future.done, alive=[process])
+    assert future.result().values[0].bool_value is False
+    process.send_signal(signal.SIGINT)
+    process.communicate(timeout=20)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_process_that_was_dead_while_the_others_began_anew_begins_anew_too(corridor, listener, start, tmp_path):
+    log, out = corridor
+    parameters = {"start_from": out, "start_carried": False, "recovery": tmp_path}
+    nodes = Nodes(start, listener, **parameters)
+    nodes.drive(log, first=90, robot__duration=3.0)
+    nodes.until(lambda: len(nodes.estimates) == 15)
+    nodes.park()
+    kill(nodes.alive[1])
+    asked = listener.node.create_client(Trigger, "slam/reset").call_async(Trigger.Request())
+    listener.spin(0.5)
+    assert not asked.done()
+    restart(nodes, "aam", 1, **parameters)
+    nodes.until(asked.done)
+    assert asked.result().success, asked.result().message
+    nodes.drive(log, first=0, robot__duration=6.0)
+    nodes.until(lambda: len(nodes.estimates) == 15 + 30)
+    # Of the new map, though slam said keyframes of the same numbers before the reset.
+    kill(nodes.alive[1])
+    restart(nodes, "aam", 1, **parameters)
+    nodes.park()
+    nodes.drive(log, first=31, rate=8.0)
+    nodes.until(lambda: len(nodes.estimates) == 15 + 30 + SCANS - 31)
+    end = 4 * (SCANS - 1) * PACE
+    nodes.until(lambda: nodes.poses and np.abs(conversions.planar_pose(nodes.poses[-1].pose.pose) - end).max() < 0.3)
+
+
+def test_a_laser_falls_silent_a_disk_is_full_and_time_jumps_back(listener, start, tmp_path):
+    silent = range(10, 60)
+    log = corridor_bag(tmp_path, scans=SCANS, silent=silent)
+    nodes = Nodes(start, listener, save_to=tmp_path / "map", recovery=tmp_path / "recovery")
+    slam = nodes.alive[0]
+    nodes.drive(log, first=0, rate=2.0, robot__paced=False)
+    nodes.until(lambda: len(nodes.estimates) == 10)
+    nodes.until(lambda: "no scan came for 3 s, while odometry does" in nodes.diagnosis("slam")["last error"])
+    nodes.until(lambda: len(nodes.estimates) == SCANS - len(silent))
+    end = 4 * (SCANS - 1) * PACE
+    nodes.until(lambda: np.abs(conversions.planar_pose(nodes.poses[-1].pose.pose) - end).max() < 0.15)
+
+    def save():
+        return listener.call(Trigger, "slam/save", Trigger.Request())
+
+    assert save().success
+    before = {path.name: path.read_bytes() for path in (tmp_path / "map").iterdir()}
+    unlimited = resource.prlimit(slam.pid, resource.RLIMIT_FSIZE)
+    resource.prlimit(slam.pid, resource.RLIMIT_FSIZE, (1000, unlimited[1]))
+    full = save()
+    assert not full.success
+    assert "File too large; the map of before stays; make room, or set save_to of slam to another" in full.message
+    assert {path.name: path.read_bytes() for path in (tmp_path / "map").iterdir()} == before
+    assert {path.name for path in tmp_path.iterdir()} == {"corridor", "map", "recovery"}
+
+    # The same log once more: its stamps go back, and its odometry is elsewhere.
+    nodes.park()
+    nodes.drive(log, first=61, rate=4.0)
+    nodes.until(lambda: not nodes.is_localized())
+    nodes.until(nodes.is_localized)
+    nodes.until(lambda: len(nodes.estimates) == SCANS - len(silent) + SCANS - 61)
+    # The journal had no room either; slam went on without.
+    assert not (tmp_path / "recovery" / "slam").exists()
+    resource.prlimit(slam.pid, resource.RLIMIT_FSIZE, unlimited)
+    assert save().success
+    FolderReader(tmp_path / "map", FORMAT, VERSION)
+    for process in nodes.alive[:5]:
+        process.send_signal(signal.SIGINT)
+    told = slam.communicate(timeout=20)[1]
+    assert "scans come again, after" in told
+    assert "time went back by" in told
+    assert "the node goes on, but if it is killed all have to be restarted; make room there" in told
+
+
+@pytest.mark.skipif(TFMessage is None, reason="tf2_msgs is not installed: run scripts/test.sh, which builds it")
+def test_a_missing_transform_and_clocks_that_are_apart_are_told_with_the_remedy(listener, start):
+    told = listener.hear(DiagnosticArray, DIAGNOSTICS, qos.STREAM)
+    keyframes = listener.hear(String, KEYFRAMES, qos.CHAIN)
+    scans = listener.node.create_publisher(LaserScan, SCAN, qos.SENSOR)
+    odom = listener.node.create_publisher(OdometryMessage, "odom", qos.SENSOR)
+    static = listener.node.create_publisher(TFMessage, "tf_static", qos.LATCHED)
+    process = start("slam", filter__patience=8)
+    listener.until(lambda: scans.get_subscription_count() and odom.get_subscription_count(), alive=[process])
+    hour = 3600 * SECOND
+    measurements = [record.measurement for record in Corridor(55).records()]
+    for one in measurements:
+        if isinstance(one, Scan):
+            late = Scan(one.stamp + hour, one.ranges, one.angle_min, one.angle_increment, one.range_min, one.range_max)
+            assert late.ranges.size == BEAMS
+            scans.publish(conversions.laser_scan(late, "laser"))
+        else:
+            odom.publish(conversions.odometry_message(one, "odom", "base_link"))
+
+    def said():
+        return next((m.status[0].message for m in reversed(told) if m.status[0].name == "/slam"), "")
+
+    listener.until(lambda: "no transform" in said(), alive=[process])
+    assert said() == (
+        "no transform from 'base_link' to 'laser' on /tf_static, so 55 scans wait, the first of stamp "
+        f"{measurements[0].stamp + hour} ns: publish it, or set the parameter laser_pose"
+    )
+    assert not keyframes
+    static.publish(TFMessage(transforms=[conversions.transform_message(0, "base_link", "laser", np.zeros(3))]))
+    listener.until(lambda: keyframes and "no transform" not in said(), alive=[process])
+    process.send_signal(signal.SIGINT)
+    error = process.communicate(timeout=20)[1]
+    assert " s after the odometry that comes with them: let both computers have one clock" in error
+    assert "scans wait for odometry" in error
+
+
+def test_a_second_robot_under_a_namespace_shares_nothing_with_the_first(listener, start, tmp_path):
+    told = listener.hear(DiagnosticArray, "two/diagnostics", qos.STREAM)
+    names = ("slam", "aam", "tsbi", "tlca", "rtl")
+    processes = [start(name, "-r", "__ns:=/two", recovery=tmp_path) for name in names]
+    listener.until(lambda: {m.status[0].name for m in told} == {f"/two/{name}" for name in names}, alive=processes)
+    shared = {"/parameter_events", "/rosout"}
+    for name, _ in listener.node.get_topic_names_and_types():
+        assert name in shared or name.startswith("/two/"), name
+    for name, _ in listener.node.get_service_names_and_types():
+        assert name.startswith(("/two/", "/listener/")), name
+    assert {path.name for path in tmp_path.iterdir()} == {f"two.{name}" for name in names}
