@@ -10,7 +10,7 @@ from pathlib import Path
 from setuptools import find_packages, setup
 
 NAME = "hmt_slam_ros"
-NODES = ("slam", "aam", "tsbi", "tlca", "rtl", "robot")
+NODES = ("slam", "aam", "tsbi", "tlca", "rtl", "robot", "view")
 SHARED = ("launch", "config", "data/malaga_one_loop")
 
 
@@ -27,7 +27,7 @@ setup(
     license="BSD-3-Clause",
     python_requires=">=3.11",
     packages=find_packages(include=[NAME, f"{NAME}.*"]),
-    package_data={NAME: ["py.typed"]},
+    package_data={NAME: ["py.typed", "view/page/*"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),
@@ -43,7 +43,7 @@ setup(
         "rosbags>=0.11",
         "scipy>=1.11",
     ],
-    extras_require={"test": ["hypothesis", "mypy", "pytest", "ruff"]},
+    extras_require={"test": ["hypothesis", "mypy", "pytest", "pytest-xdist", "ruff"]},
     zip_safe=False,
     entry_points={
         "console_scripts": [

@@ -1,56 +1,253 @@
-"""What a person or another program sees of a run: map, graph, particles, poses, transforms, probabilities, health."""
+"""What a person or another program sees of a run: the topics that RViz reads, and the live page in a real browser.
 
+The screenshots stay in the folder HMT_SLAM_SCREENSHOTS, or in pytest's own.
+"""
+
+import json
+import os
+import socket
+from collections import Counter
 from pathlib import Path
+from urllib.request import urlopen
 
 import numpy as np
 import pytest
+from browser import Browser, Page, find_browser
 
 pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
 
-from diagnostic_msgs.msg import DiagnosticArray
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseArray, PoseWithCovarianceStamped
 from nav_msgs.msg import OccupancyGrid
 from rclpy.qos import HistoryPolicy, QoSProfile
-from std_msgs.msg import String
+from std_msgs.msg import Float64MultiArray, String
 from visualization_msgs.msg import MarkerArray
 
+from hmt_slam_ros.configuration import Configuration
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.nodes import qos
-from hmt_slam_ros.nodes.topics import DIAGNOSTICS, FINISHED, GRAPH, HMT_POSE, MAP, PARTICLES, POSE
+from hmt_slam_ros.nodes.map_view import MapView, Seen
+from hmt_slam_ros.nodes.topics import DIAGNOSTICS, FINISHED, GRAPH, HMT_POSE, MAP, PARTICLES, PMF, POSE
 from hmt_slam_ros.nodes.transforms import TFMessage
+from hmt_slam_ros.processes.messages import Accepted, Arc, AreaPose, Hypotheses, Keyframe, Leaf, LeafEstimate
+from hmt_slam_ros.sensing import Scan
+from hmt_slam_ros.topology.unknown import unknown
 
 BUNDLED = Path(__file__).resolve().parent.parent / "data" / "malaga_one_loop"
 PROCESSES = ("slam", "aam", "tsbi", "tlca", "rtl")
 ALL = QoSProfile(history=HistoryPolicy.KEEP_ALL)
+DESKTOP, PHONE = (1280, 800), (390, 844)
 
 
-def test_a_run_of_the_bundled_log_shows_itself_on_the_topics_that_rviz_reads(listener, start):
+@pytest.fixture
+def browser(tmp_path):
+    """None where there is none."""
+    browser = Browser(tmp_path / "profile") if find_browser() else None
+    yield browser
+    if browser is not None:
+        browser.close()
+
+
+@pytest.fixture
+def screenshots(tmp_path):
+    folder = Path(os.environ.get("HMT_SLAM_SCREENSHOTS", tmp_path))
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder
+
+
+def free_port():
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        return server.getsockname()[1]
+
+
+def is_served(port):
+    with socket.socket() as client:
+        return client.connect_ex(("127.0.0.1", port)) == 0
+
+
+def snapshot(port):
+    with urlopen(f"http://127.0.0.1:{port}/snapshot.json", timeout=20) as answer:
+        return json.load(answer)
+
+
+def test_a_run_of_the_bundled_log_shows_itself_on_the_topics_and_in_a_browser(listener, start, browser, screenshots):
     maps = listener.hear(OccupancyGrid, MAP, qos.LATCHED)
     graphs = listener.hear(MarkerArray, GRAPH, qos.LATCHED)
     particles = listener.hear(PoseArray, PARTICLES, qos.STREAM)
     poses = listener.hear(PoseWithCovarianceStamped, POSE, ALL)
     local_poses = listener.hear(PoseWithCovarianceStamped, HMT_POSE, ALL)
+    pmfs = listener.hear(Float64MultiArray, PMF, qos.LATCHED)
     health = listener.hear(DiagnosticArray, DIAGNOSTICS, qos.STREAM)
     transforms = listener.hear(TFMessage, "tf", ALL) if TFMessage else None
     finished = listener.hear(String, FINISHED, qos.CHAIN)
-    nodes = [start(name) for name in PROCESSES]
+    port = free_port()
+    nodes = [start("view", port=port)]
+    page = Page(browser, listener, nodes)
+    if browser is not None:
+        listener.until(lambda: is_served(port), alive=nodes)
+        open_before_anything_runs(page, port)
+    nodes += [start(name) for name in PROCESSES]
     nodes.append(start("robot", log=BUNDLED, robot__rate=0.0))
+    if browser is not None:
+        page.until(lambda: page.drawn.get("robot"))
+        early = page.drawn["robot"]
     listener.until(lambda: bool(finished), seconds=120.0, alive=nodes)
     listener.until(lambda: maps and len(graphs[-1].markers) > 8)
 
-    assert maps[-1].header.frame_id == "map"
-    cells = np.asarray(maps[-1].data)
-    assert maps[-1].info.width * maps[-1].info.height == cells.size
-    assert set(np.unique(cells)) == {-1, 0, 100}
-    # The loop is 20 m x 30 m, of which the laser sees most.
-    assert (cells == 0).sum() * maps[-1].info.resolution**2 > 600.0
-    assert len(graphs[-1].markers) > 8
+    assert_map(maps[-1])
+    assert_graph(graphs[-1])
     assert {len(message.poses) for message in particles} == {12}
     assert {message.header.frame_id for message in poses} == {"map"}
     assert {"area_0", "area_1", "area_2"} <= {message.header.frame_id for message in local_poses}
     assert min(len(poses), len(local_poses)) > 100
-    names = {status.name.rpartition("/")[2].partition(":")[0].strip() for array in health for status in array.status}
-    assert set(PROCESSES) <= names
+    assert_health(health)
     if transforms is not None:
         pairs = {(t.header.frame_id, t.child_frame_id) for message in transforms for t in message.transforms}
         assert ("map", "odom") in pairs
         assert ("odom", "base_link") in pairs
+    if browser is None:
+        pytest.skip("the topics are well; the page was not looked at, as there is no browser: apt install chromium")
+
+    listener.spin(3.5)  # tlca draws every 3 s
+    page.until(lambda: "ended" in page.text("replay") and page.drawn["map"])
+    page.until(lambda: page.drawn["areas"] == groups_of(graphs[-1])["areas"])
+    assert_page(page, port, graphs[-1], pmfs[-1])
+    assert page.drawn["robot"] != early
+    browser.screenshot(screenshots / "desktop.png")
+    assert_that_it_answers_clicks(page, snapshot(port)["graph"])
+    browser.dark(True)
+    listener.spin(0.5)
+    browser.screenshot(screenshots / "dark.png")
+    browser.dark(False)
+    assert_phone(page, screenshots)
+    assert browser.complaints == []
+
+
+def assert_map(grid):
+    assert grid.header.frame_id == "map"
+    cells = np.asarray(grid.data)
+    assert grid.info.width * grid.info.height == cells.size
+    assert set(np.unique(cells)) == {-1, 0, 100}
+    # The loop is 20 m x 30 m, of which the laser sees most.
+    assert (cells == 0).sum() * grid.info.resolution**2 > 600.0
+
+
+def groups_of(graph):
+    """{namespace: number of markers}."""
+    return Counter(marker.ns for marker in graph.markers)
+
+
+def assert_graph(graph):
+    groups = groups_of(graph)
+    assert groups["areas"] == groups["labels"] == groups["area_uncertainty"] >= 3
+    assert groups["arc_uncertainty"] == groups["arcs"] + groups["closures"] >= 2
+    arcs = [marker for marker in graph.markers if marker.ns == "arc_uncertainty"]
+    assert all(0.0 < arc.scale.y <= arc.scale.x < 2.0 and "±" in arc.text for arc in arcs)
+
+
+def assert_health(health):
+    told = {status.name.strip("/"): {v.key: v.value for v in status.values} for a in health for status in a.status}
+    assert set(told) == {*PROCESSES, "robot", "view"}
+    assert {"memory", "peak memory", "busy", "last error"} <= set.intersection(*map(set, told.values()))
+    assert float(told["slam"]["effective samples"].removesuffix(" of 12")) >= 1.0
+    assert float(told["slam"]["memory"].removesuffix(" MB")) > 20.0
+    values = [value for array in health for status in array.status for value in status.values]
+    assert max(float(value.value) for value in values if value.key == "sent Scan a second") > 1.0
+
+
+def open_before_anything_runs(page, port):
+    page.browser.size(*DESKTOP)
+    page.browser.open(f"http://127.0.0.1:{port}/")
+    page.until(lambda: "No node is heard." in page.text("verdict"))
+    assert "ros2 launch hmt_slam_ros mapping.launch.py" in page.text("verdict")
+    assert page.text("silent") != "all were heard"
+
+
+def assert_page(page, port, graph, pmf):
+    """The page shows what the topics say."""
+    drawn, known, groups = page.drawn, snapshot(port), groups_of(graph)
+    assert drawn["areas"] == groups["areas"]
+    assert drawn["arcs"] == groups["arcs"] + groups["closures"]
+    assert drawn["closures"] == groups["closures"]
+    leaves = zip(*[iter(pmf.data)] * 3, strict=True)
+    rows = [(hypothesis, area) for hypothesis, area, _ in leaves if hypothesis >= 0]
+    assert drawn["bars"] == len(rows)
+    assert [tuple(leaf[:2]) for leaf in known["history"]["events"][-1]["leaves"]] == rows
+    assert drawn["events"] == len(known["history"]["events"]) > 50
+    assert drawn["robot"] == known["robot"]["pose"]
+    assert page.text("position").startswith(f"{drawn['robot'][0]:.2f}")
+    assert all(name in page.text("nodes") for name in (*PROCESSES, "robot", "view"))
+    assert "samples" in page.text("nodes")
+    assert page.text("silent") == "all were heard"
+    assert page.colours("plan") > 50
+    assert page.colours("course") >= 2
+    assert page.sideways == 0
+
+
+def assert_that_it_answers_clicks(page, graph):
+    """A click on an area says how certain its place is; the robot can be followed, and the whole map be seen again."""
+    evaluate = page.browser.evaluate
+    area = graph["areas"][-1]
+    spot = next(drawn["at"] for drawn in page.drawn["spots"] if drawn["area"] == area["area"])
+    left, top = evaluate("(({left, top}) => [left, top])(document.getElementById('plan').getBoundingClientRect())")
+    page.click(left + spot[0], top + spot[1])
+    page.until(lambda: page.text("hint") == area["text"])
+    assert "±" in area["text"]
+    evaluate("document.getElementById('follow').click()")
+    page.until(lambda: page.drawn["middle"] == page.drawn["robot"][:2])
+    evaluate("document.getElementById('fit').click()")
+    page.until(lambda: page.drawn["middle"] != page.drawn["robot"][:2])
+
+
+def assert_phone(page, screenshots):
+    page.browser.size(*PHONE, mobile=True, ratio=2.0)
+    page.until(lambda: page.browser.evaluate("document.getElementById('plan').clientWidth") == PHONE[0])
+    page.until(lambda: page.colours("plan") > 50)
+    assert page.sideways == 0
+    page.browser.screenshot(screenshots / "phone.png", whole=True)
+    before = spread(page.drawn["spots"])
+    page.pinch(PHONE[0] / 2, 300.0, before=100.0, after=200.0)
+    page.until(lambda: spread(page.drawn["spots"]) == pytest.approx(2.0 * before, rel=0.1))
+
+
+def spread(spots):
+    """Pixels between the first and the last area."""
+    return np.hypot(*np.subtract(spots[0]["at"], spots[-1]["at"]))
+
+
+def test_an_arc_that_could_be_any_has_no_ellipse():
+    view = MapView(Configuration(), "map", Seen())
+    scan = Scan(5, np.ones(3, dtype=np.float32), -1.0, 1.0, 0.05, 30.0, np.zeros(3))
+    known = PoseGaussian(np.array([1.0, 2.0, 0.1]), 0.01 * np.eye(3))
+    for keyframe, area in enumerate((0, 1, 2)):
+        view.hear(Keyframe(keyframe, scan, 0.0, (LeafEstimate(0, area, known, True, 0.0, 12.0),)))
+    arcs = (Arc(0, 1, known), Arc(1, 2, unknown(np.array([3.0, 0.0, 0.0]))))
+    view.hear(Hypotheses(2, (Leaf(0, 0, 1.0, 2, arcs=arcs, lost=True),)))
+    beliefs = (known, known.compose(known), unknown(np.array([5.0, 2.0, 0.0])))
+    view.hear(Accepted(2, global_poses=tuple(AreaPose(area, belief) for area, belief in enumerate(beliefs))))
+    groups = groups_of(view.graph())
+    assert (groups["areas"], groups["arcs"]) == (3, 2)
+    assert (groups["area_uncertainty"], groups["arc_uncertainty"]) == (2, 1)
+
+
+def test_a_page_shows_the_robot_of_its_namespace_alone_and_has_its_port_alone(listener, start):
+    port = free_port()
+    view = start("view", "-r", "__ns:=/left", port=port)
+    mouths = {
+        robot: listener.node.create_publisher(DiagnosticArray, f"/{robot}/diagnostics", qos.STREAM)
+        for robot in ("left", "right")
+    }
+    listener.until(lambda: is_served(port) and mouths["left"].get_subscription_count() > 0, alive=[view])
+    second, third = start("view", port=port), start("view", port=70000)
+    for robot, mouth in mouths.items():
+        status = DiagnosticStatus(name=f"/{robot}/slam", message=f"this is {robot}", hardware_id="hmt_slam_ros")
+        mouth.publish(DiagnosticArray(status=[status]))
+    missing = "aam, tsbi, tlca and rtl are not running."
+    listener.until(lambda: snapshot(port)["verdict"]["text"] == missing, alive=[view])
+    known = snapshot(port)
+    assert known["about"]["namespace"] == "/left"
+    assert next(row for row in known["nodes"] if row["name"] == "slam")["message"] == "this is left"
+    assert second.wait(20) == 2
+    assert "cannot listen on 127.0.0.1" in second.communicate()[1]
+    assert third.wait(20) == 2
+    assert "Max: 65535, value: 70000" in third.communicate()[1]

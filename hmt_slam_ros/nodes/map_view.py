@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from array import array
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,9 +16,11 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.nodes.conversions import header, time_message
-from hmt_slam_ros.processes.messages import Accepted, Hypotheses, Keyframe, Message
-from hmt_slam_ros.processes.replica import Replica
+from hmt_slam_ros.geometry.gaussian import ELLIPSE_95, PoseGaussian
+from hmt_slam_ros.nodes.conversions import header, quaternion, time_message
+from hmt_slam_ros.processes.messages import Accepted, AreaPose, Hypotheses, Keyframe, Message
+from hmt_slam_ros.processes.replica import Replica, ReplicaState
+from hmt_slam_ros.topology.unknown import tells_nothing
 
 if TYPE_CHECKING:
     from hmt_slam_ros.offline.saved_map import MapDocument
@@ -26,6 +30,27 @@ _ROBOT_AREA = ColorRGBA(r=0.84, g=0.15, b=0.16, a=0.9)
 _ARC = ColorRGBA(r=0.3, g=0.3, b=0.3, a=0.9)
 _CLOSURE = ColorRGBA(r=1.0, g=0.5, b=0.05, a=0.9)
 _TEXT = ColorRGBA(a=1.0)
+_UNCERTAIN = 0.3  # opacity of ellipses
+_VISIBLE = 1e-3  # m, since RViz complains of what has no size
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """What there is to be drawn.
+
+    :ivar stamp: of the newest keyframe, ns, 0 before the first.
+    :ivar replica: the maps of the live hypotheses.
+    :ivar area_poses: ``map_T_area`` of the areas of the most probable hypothesis.
+    """
+
+    stamp: int = 0
+    replica: ReplicaState = field(default_factory=ReplicaState)
+    area_poses: tuple[AreaPose, ...] = ()
+
+    @classmethod
+    def of(cls, known: MapDocument | None) -> Seen:
+        """Of a saved map, or of nothing."""
+        return cls() if known is None else cls(known.robot.stamp, known.replica, known.area_poses)
 
 
 class MapView:
@@ -35,14 +60,19 @@ class MapView:
     :ivar version: number of changes so far.
     """
 
-    def __init__(self, configuration: Configuration, frame: str, known: MapDocument | None = None) -> None:
-        """:param known: the map to begin with."""
-        self.stamp = known.robot.stamp if known else 0
-        self.version = 1 if known else 0
+    def __init__(self, configuration: Configuration, frame: str, seen: Seen) -> None:
+        """:param seen: what to begin with."""
+        self.stamp = seen.stamp
+        self.version = 1 if seen.area_poses else 0
         self._settings, self._frame = configuration.local_map, frame
-        self._replica = Replica.of(known.replica) if known else Replica()
-        poses = known.area_poses if known else ()
-        self._poses = {entry.area: entry.pose.mean for entry in poses}
+        self._replica = Replica.of(seen.replica)
+        self._poses = {entry.area: entry.pose for entry in seen.area_poses}
+
+    @property
+    def seen(self) -> Seen:
+        """All that is drawn, as a value."""
+        poses = tuple(AreaPose(area, pose) for area, pose in self._poses.items())
+        return Seen(self.stamp, self._replica.state, poses)
 
     def hear(self, message: Message) -> None:
         """Take in a message of the chain."""
@@ -54,7 +84,7 @@ class MapView:
         elif isinstance(message, Accepted):
             self._replica.accept(message)
             if message.global_poses:
-                self._poses = {area.area: area.pose.mean for area in message.global_poses}
+                self._poses = {area.area: area.pose for area in message.global_poses}
             self.version += 1
 
     def _areas(self) -> list[int]:
@@ -66,7 +96,7 @@ class MapView:
 
         best = self._replica.maps[self._replica.best]
         placed = {
-            keyframe: se2.compose(self._poses[area], pose)
+            keyframe: se2.compose(self._poses[area].mean, pose)
             for area in self._areas()
             for keyframe, pose in best.keyframes(area).items()
         }
@@ -78,23 +108,46 @@ class MapView:
         return grid_message(self.stamp, self._frame, image)
 
     def graph(self) -> MarkerArray:
-        """Areas as labelled discs, arcs as lines; the robot's area and the arcs that closed a loop stand out."""
+        """Areas as labelled discs, arcs as lines, both with 95 % ellipses.
+
+        The robot's area and the arcs that closed a loop stand out. An arc's ellipse, in its middle, is that of one
+        area seen from the other; an area's, around it, that of its place in the map. Its text says it in words. There
+        is none where that could be any.
+        """
         best, areas = self._replica.maps[self._replica.best], self._areas()
         here = self._replica.areas[self._replica.best]
         markers = [Marker(action=Marker.DELETEALL)]
         for area in areas:
-            at = _point(self._poses[area])
-            disc = self._marker("areas", area, Marker.CYLINDER, (0.6, 0.6, 0.1), _ROBOT_AREA if area == here else _AREA)
+            belief, color = self._poses[area], _ROBOT_AREA if area == here else _AREA
+            disc = self._marker("areas", area, Marker.CYLINDER, (0.6, 0.6, 0.1), color)
             label = self._marker("labels", area, Marker.TEXT_VIEW_FACING, (0.0, 0.0, 0.5), _TEXT)
-            disc.pose.position, label.pose.position, label.text = at, Point(x=at.x, y=at.y, z=0.6), str(area)
-            markers += [disc, label]
+            at = disc.pose.position = _point(belief.mean)
+            label.pose.position, label.text = Point(x=at.x, y=at.y, z=0.6), str(area)
+            text = f"Area {area} in the map: {_deviations(belief)}"
+            markers += [disc, label, *self._ellipse("area_uncertainty", area, belief, at, color, text)]
         for number, (a, b, arc) in enumerate(best.all_arcs()):
             if a in self._poses and b in self._poses:
-                color = _CLOSURE if arc.closure else _ARC
-                line = self._marker("arcs", number, Marker.LINE_STRIP, (0.08, 0.0, 0.0), color)
-                line.points = [_point(self._poses[a]), _point(self._poses[b])]
-                markers.append(line)
+                color, group = (_CLOSURE, "closures") if arc.closure else (_ARC, "arcs")
+                line = self._marker(group, number, Marker.LINE_STRIP, (0.08, 0.0, 0.0), color)
+                start, end = line.points = [_point(self._poses[a].mean), _point(self._poses[b].mean)]
+                seen = PoseGaussian.exactly(self._poses[a].mean).compose(arc.pose)
+                middle = Point(x=0.5 * (start.x + end.x), y=0.5 * (start.y + end.y))
+                text = f"Area {b} seen from {a}: {_deviations(arc.pose)}{', closed a loop' * arc.closure}"
+                markers += [line, *self._ellipse("arc_uncertainty", number, seen, middle, color, text)]
         return MarkerArray(markers=markers)
+
+    def _ellipse(
+        self, group: str, number: int, belief: PoseGaussian, at: Point, color: ColorRGBA, text: str
+    ) -> list[Marker]:
+        """The ellipse; none where it would only hide the map."""
+        if tells_nothing(belief):
+            return []
+        ellipse = belief.ellipse()
+        faint = ColorRGBA(r=color.r, g=color.g, b=color.b, a=_UNCERTAIN)
+        size = (max(2.0 * ellipse.longer, _VISIBLE), max(2.0 * ellipse.shorter, _VISIBLE), 0.02)
+        marker = self._marker(group, number, Marker.CYLINDER, size, faint)
+        marker.pose.position, marker.pose.orientation, marker.text = at, quaternion(ellipse.angle), text
+        return [marker]
 
     def _marker(
         self, group: str, number: int, kind: int, size: tuple[float, float, float], color: ColorRGBA
@@ -119,6 +172,12 @@ def grid_message(stamp: int, frame: str, image: Any) -> OccupancyGrid:  # noqa: 
     info.origin.position.x, info.origin.position.y = image.origin.tolist()
     info.origin.orientation.w = 1.0
     return OccupancyGrid(header=header(stamp, frame), info=info, data=array("b", cells.tobytes()))
+
+
+def _deviations(belief: PoseGaussian) -> str:
+    """Standard deviations of a pose, that of the position where it is largest."""
+    turn = math.degrees(math.sqrt(belief.covariance[2, 2]))
+    return f"±{belief.ellipse().longer / ELLIPSE_95:.2f} m, ±{turn:.1f}°"
 
 
 def _point(pose: NDArray[np.float64]) -> Point:

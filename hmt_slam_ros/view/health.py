@@ -1,0 +1,160 @@
+"""Whether all is well: what the nodes say of themselves, and what they do not say any more."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+Level = Literal["good", "waiting", "attention", "fault"]
+
+# Nodes speak once a second; a kernel that is compiled, or a computer that has too much to do, takes longer.
+_SILENCE = 10.0  # s
+_POSE_SILENCE = 3.0  # s
+# A node's level never falls again: a warning is news for so long.
+_NEWS = 60.0  # s
+_WARN = 1
+
+
+@dataclass
+class NodeHealth:
+    """What a node said of itself last.
+
+    :ivar level: 0 all is well, 1 a warning, 2 an error, as in diagnostic_msgs/DiagnosticStatus.
+    :ivar message: "running", or the last warning or error.
+    :ivar values: {name: value}.
+    :ivar heard: when that was, seconds.
+    :ivar changed: when the message was heard first, seconds.
+    :ivar load: share of the time that it computed between the last two times, None before the second.
+    """
+
+    level: int
+    message: str
+    values: Mapping[str, str]
+    heard: float
+    changed: float
+    load: float | None = None
+
+
+@dataclass
+class Health:
+    """Of all nodes.
+
+    :ivar expected: the nodes without which there is no mapping.
+    :ivar nodes: {node: what it said last}.
+    :ivar pose_heard: when the last pose came, None before the first, seconds.
+    :ivar localized: whether the robot's place is known, None before somebody said.
+    :ivar robot_state: of the node that replays a log, None where there is none.
+    """
+
+    expected: Sequence[str]
+    nodes: dict[str, NodeHealth] = field(default_factory=dict)
+    pose_heard: float | None = None
+    localized: bool | None = None
+    robot_state: str | None = None
+
+    def hear(self, node: str, level: int, message: str, values: Mapping[str, str], now: float) -> None:
+        """Take note of what a node says of itself.
+
+        :param now: seconds of a clock that runs evenly.
+        """
+        before, load, changed = self.nodes.get(node), None, now
+        if before is not None and now > before.heard:
+            load = max(0.0, _busy(values) - _busy(before.values)) / (now - before.heard)
+        if before is not None and before.message == message:
+            changed = before.changed
+        self.nodes[node] = NodeHealth(level, message, values, now, changed, load)
+
+    def rows(self, now: float) -> list[dict[str, Any]]:
+        """A row of the page for every node, the expected ones first."""
+        names = [*self.expected, *sorted(self.nodes.keys() - set(self.expected))]
+        return [self._row(name, now) for name in names]
+
+    def _row(self, name: str, now: float) -> dict[str, Any]:
+        node = self.nodes.get(name)
+        if node is None:
+            return {"name": name, "level": "waiting", "message": "not heard yet", "values": {}}
+        age = now - node.heard
+        if age > _SILENCE:
+            return {"name": name, "level": "fault", "message": f"silent for {age:.0f} s", "values": dict(node.values)}
+        level = _level(node, now)
+        row = {"name": name, "level": level, "message": node.message, "values": dict(node.values)}
+        return row if node.load is None else {**row, "load": round(min(node.load, 1.0), 2)}
+
+    def verdict(self, now: float) -> dict[str, str]:
+        """All of it in one sentence, the worst first, and what to do."""
+        said, pose = self._said(now), self._pose(now)
+        for sentence in (self._nothing(), self._silent(now), said.get("fault"), pose, said.get("attention")):
+            if sentence is not None:
+                return sentence
+        if self.localized is False:
+            return _verdict("attention", "The robot's place is not known yet: it may be anywhere in the map.")
+        if self.robot_state == "ended":
+            return _verdict("good", "The log has ended; the nodes are well.")
+        return _verdict("good", "All is well.")
+
+    def _nothing(self) -> dict[str, str] | None:
+        if any(name in self.nodes for name in self.expected):
+            return None
+        return _verdict(
+            "waiting",
+            "No node is heard.",
+            "Start them: ros2 launch hmt_slam_ros mapping.launch.py. If they run: are ROS_DOMAIN_ID and the namespace "
+            "the same as here?",
+        )
+
+    def _silent(self, now: float) -> dict[str, str] | None:
+        never = [name for name in self.expected if name not in self.nodes]
+        if never:
+            verb = "is" if len(never) == 1 else "are"
+            return _verdict("fault", f"{_and(never)} {verb} not running.", f"ros2 run hmt_slam_ros {never[0]}")
+        silent = [name for name in self.expected if now - self.nodes[name].heard > _SILENCE]
+        if not silent:
+            return None
+        age = now - min(self.nodes[name].heard for name in silent)
+        verb, advice = "says", "Did it end? Its log tells; a first run compiles long."
+        if len(silent) > 1:
+            verb, advice = "say", "Did they end? Their logs tell; a first run compiles long."
+        return _verdict("fault", f"{_and(silent)} {verb} nothing, for {age:.0f} s.", advice)
+
+    def _said(self, now: float) -> dict[Level, dict[str, str]]:
+        """{level: what a node complains of}."""
+        levels = {name: _level(node, now) for name, node in self.nodes.items()}
+        verbs: dict[Level, str] = {"fault": "has a fault", "attention": "warns"}
+        return {
+            level: _verdict(level, f"{name} {verbs[level]}.", self.nodes[name].message)
+            for name, level in reversed(levels.items())
+            if level in verbs
+        }
+
+    def _pose(self, now: float) -> dict[str, str] | None:
+        if self.robot_state in ("ended", "paused"):
+            return None
+        advice = "Do scans and odometry arrive? ros2 topic hz scan, ros2 topic hz odom"
+        if self.pose_heard is None:
+            return _verdict("waiting", "The nodes run; no pose came yet.", advice)
+        if now - self.pose_heard > _POSE_SILENCE:
+            return _verdict("fault", f"No pose for {now - self.pose_heard:.0f} s.", advice)
+        return None
+
+
+def _verdict(level: Level, text: str, advice: str = "") -> dict[str, str]:
+    return {"level": level, "text": text, "advice": advice}
+
+
+def _level(node: NodeHealth, now: float) -> Level:
+    if node.level > _WARN:
+        return "fault"
+    return "attention" if node.level == _WARN and now - node.changed < _NEWS else "good"
+
+
+def _and(names: Sequence[str]) -> str:
+    return " and ".join((", ".join(names[:-1]), names[-1])) if len(names) > 1 else names[0]
+
+
+def _busy(values: Mapping[str, str]) -> float:
+    """Seconds of computing since the start, as /diagnostics has them."""
+    try:
+        return float(values.get("busy", "0").removesuffix(" s"))
+    except ValueError:
+        return 0.0

@@ -1,0 +1,163 @@
+"""The page's server: three files, the map's picture, and a stream of news; nothing can be changed through it."""
+
+from __future__ import annotations
+
+import ipaddress
+import json
+import threading
+import time
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from urllib.parse import urlsplit
+
+from hmt_slam_ros.errors import HmtSlamError
+from hmt_slam_ros.view.board import Board, Seen
+
+LOCAL, PORT = "127.0.0.1", 8800
+PAGE = Path(__file__).parent / "page"
+_FILES = {
+    "/": ("index.html", "text/html; charset=utf-8"),
+    "/view.css": ("view.css", "text/css; charset=utf-8"),
+    "/view.js": ("view.js", "text/javascript; charset=utf-8"),
+    "/draw.js": ("draw.js", "text/javascript; charset=utf-8"),
+}
+_LOOPBACK = ("localhost", "127.0.0.1", "::1")
+_PERIOD = 0.2  # s between two pieces of news
+# A browser that is gone is noticed when something is written to it.
+_HEARTBEAT = 5.0  # s
+_MOST_STREAMS = 20
+_SECURITY = "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; connect-src 'self'"
+
+
+class PageServer:
+    """Serves a board to browsers, in threads of its own.
+
+    :ivar url: of the page.
+    """
+
+    def __init__(self, board: Board, address: str, port: int) -> None:
+        """Listen.
+
+        :param address: IP address of the interface to listen on.
+        :param port: 0 for any that is free.
+        :raises HmtSlamError: where that cannot be.
+        """
+        try:
+            local = ipaddress.ip_address(address).is_loopback
+        except ValueError:
+            raise HmtSlamError(f"address = {address} is no IP address: give 127.0.0.1, or 0.0.0.0 for all") from None
+        own = {"board": board, "local": local, "streams": threading.Semaphore(_MOST_STREAMS)}
+        handler = type("_OwnHandler", (_Handler,), own)
+        self._server = _bound(address, port, handler)
+        self.url = f"http://{address}:{self._server.server_address[1]}/"
+        threading.Thread(target=self._server.serve_forever, name="page", daemon=True).start()
+
+    def close(self) -> None:
+        """Stop listening."""
+        self._server.shutdown()
+        self._server.server_close()
+
+
+def check_port(port: int) -> None:
+    """See whether a page could be served on a port of this computer.
+
+    :raises HmtSlamError: where it cannot.
+    """
+    _bound(LOCAL, port, _Handler).server_close()
+
+
+def _bound(address: str, port: int, handler: type[BaseHTTPRequestHandler]) -> _Server:
+    try:
+        return _Server((address, port), handler)
+    except (OSError, OverflowError) as fault:
+        raise HmtSlamError(
+            f"the page cannot listen on {address}, port {port} ({fault}): end the program that does, or give another "
+            "port: -p port:=8801 of the node, --view 8801 of a replay"
+        ) from fault
+
+
+class _Server(ThreadingHTTPServer):
+    daemon_threads = True
+    # Several pages may come at once, as after a restart.
+    request_queue_size = 64
+    block_on_close = False
+
+    def handle_error(self, _request: object, _client_address: object) -> None:
+        """A browser that went away amid an answer is no fault."""
+
+
+class _Handler(BaseHTTPRequestHandler):
+    protocol_version = "HTTP/1.1"
+    board: Board
+    local: bool
+    streams: threading.Semaphore
+
+    def do_GET(self) -> None:
+        """Answer a browser."""
+        path = urlsplit(self.path).path
+        if self.local and urlsplit(f"//{self.headers.get('Host', '')}").hostname not in _LOOPBACK:
+            # A page of another site whose name was made to lead here.
+            self._answer(HTTPStatus.FORBIDDEN, "text/plain", b"ask for 127.0.0.1 or localhost")
+        elif path in _FILES:
+            name, kind = _FILES[path]
+            self._answer(HTTPStatus.OK, kind, (PAGE / name).read_bytes())
+        elif path == "/map.png":
+            self._send_picture()
+        elif path == "/snapshot.json":
+            content = json.dumps(self.board.news(Seen()), allow_nan=False).encode()
+            self._answer(HTTPStatus.OK, "application/json", content)
+        elif path == "/news":
+            self._stream()
+        else:
+            self._answer(HTTPStatus.NOT_FOUND, "text/plain", b"there is no such page")
+
+    def _send_picture(self) -> None:
+        picture, tag = self.board.picture()
+        if not picture:
+            self._answer(HTTPStatus.NOT_FOUND, "text/plain", b"there is no map yet")
+        elif self.headers.get("If-None-Match") == f'"{tag}"':
+            self._answer(HTTPStatus.NOT_MODIFIED, "image/png", b"", tag)
+        else:
+            self._answer(HTTPStatus.OK, "image/png", picture, tag)
+
+    def _stream(self) -> None:
+        """Server-sent events: a JSON object of the sections that changed, at most five times a second."""
+        if not self.streams.acquire(blocking=False):
+            self._answer(HTTPStatus.SERVICE_UNAVAILABLE, "text/plain", b"too many pages look on: close some")
+            return
+        try:
+            self._head(HTTPStatus.OK, "text/event-stream")
+            self.send_header("Connection", "close")
+            self.end_headers()
+            seen = Seen()
+            with self.board.watching():
+                while True:
+                    news = self.board.news(seen, _HEARTBEAT)
+                    text = f"data: {json.dumps(news, allow_nan=False, separators=(',', ':'))}" if news else ":"
+                    self.wfile.write(f"{text}\n\n".encode())
+                    self.wfile.flush()
+                    time.sleep(_PERIOD)
+        except OSError:
+            self.close_connection = True
+        finally:
+            self.streams.release()
+
+    def _answer(self, status: HTTPStatus, kind: str, content: bytes, tag: str = "") -> None:
+        self._head(status, kind)
+        if tag:
+            self.send_header("ETag", f'"{tag}"')
+        if status is not HTTPStatus.NOT_MODIFIED:
+            self.send_header("Content-Length", str(len(content)))
+        self.end_headers()
+        self.wfile.write(content)
+
+    def _head(self, status: HTTPStatus, kind: str) -> None:
+        self.send_response(status)
+        self.send_header("Content-Type", kind)
+        self.send_header("Cache-Control", "no-cache")
+        self.send_header("Content-Security-Policy", _SECURITY)
+        self.send_header("X-Content-Type-Options", "nosniff")
+
+    def log_message(self, *_: object) -> None:
+        """Requests are no news."""

@@ -1,0 +1,227 @@
+"""What the live page is told, and how it is served, without ROS and without a browser."""
+
+import http.client
+import io
+import json
+import socket
+from urllib.error import HTTPError
+from urllib.request import Request, urlopen
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from hmt_slam_ros.cli.arguments import parser
+from hmt_slam_ros.errors import HmtSlamError
+from hmt_slam_ros.processes.documents import KeyframeHead
+from hmt_slam_ros.processes.messages import Hypotheses, Keyframe, Leaf
+from hmt_slam_ros.sensing import Scan
+from hmt_slam_ros.view.board import HISTORY, Board, Seen
+from hmt_slam_ros.view.health import Health
+from hmt_slam_ros.view.history import History
+from hmt_slam_ros.view.png import grid_png
+from hmt_slam_ros.view.server import PORT, PageServer
+
+NODES = ("slam", "rtl")
+
+
+@pytest.fixture
+def board():
+    return Board()
+
+
+@pytest.fixture
+def server(board):
+    server = PageServer(board, "127.0.0.1", 0)
+    yield server
+    server.close()
+
+
+def status_of(request):
+    with pytest.raises(HTTPError) as error:
+        urlopen(request, timeout=10)
+    return error.value.code
+
+
+@pytest.mark.parametrize("width", [1, 4, 7])
+def test_the_picture_of_a_grid_has_the_smallest_y_at_the_bottom_and_three_levels(width):
+    cells = np.full((3, width), -1, dtype=np.int8)
+    cells[0, 0], cells[1] = 100, 0
+    picture = np.asarray(Image.open(io.BytesIO(grid_png(cells))))
+    assert picture.shape == (3, width)
+    assert picture[2].tolist() == [255] + [0] * (width - 1)
+    assert set(picture[1]) == {85}
+    assert not picture[0].any()
+
+
+def test_a_browser_hears_of_what_changed_alone(board):
+    seen = Seen()
+    board.put("area", "3")
+    board.put("localized", True)
+    assert board.news(seen) == {"area": "3", "localized": True, "history": {"anew": True, "events": []}}
+    board.put("area", "3")
+    assert board.news(seen) == {}
+    board.put("area", "4")
+    assert board.news(seen) == {"area": "4"}
+
+
+def test_the_history_comes_once_and_whole_where_it_began_anew(board):
+    one, other = Seen(), Seen()
+    for event in range(3):
+        board.append(event)
+    assert board.news(one)["history"] == {"anew": True, "events": [0, 1, 2]}
+    board.append(3)
+    assert board.news(one)["history"] == {"anew": False, "events": [3]}
+    assert board.news(other)["history"] == {"anew": True, "events": [0, 1, 2, 3]}
+    board.forget_history()
+    board.append(7)
+    assert board.news(one)["history"] == {"anew": True, "events": [7]}
+
+
+def test_a_browser_that_missed_more_than_is_kept_gets_what_is_left(board):
+    seen = Seen()
+    board.news(seen)
+    for event in range(HISTORY + 5):
+        board.append(event)
+    assert board.news(seen)["history"]["events"] == list(range(5, HISTORY + 5))
+
+
+def head(sequence, stamp):
+    scan = Scan(stamp, np.ones(3, dtype=np.float32), -1.0, 0.1, 0.05, 30.0, np.zeros(3))
+    return KeyframeHead.of(Keyframe(sequence, scan, 0.5 * sequence, ()))
+
+
+def test_events_are_told_once_in_order_when_both_halves_are_there_and_a_new_run_begins_anew(board):
+    history, seen = History(board), Seen()
+
+    def told(*messages):
+        for message in messages:
+            history.hear(message)
+        history.tell()
+        news = board.news(seen).get("history", {"anew": False, "events": []})
+        return news["anew"], [event["event"] for event in news["events"]]
+
+    answers = [Hypotheses(k, (Leaf(3, 0, 0.25, 5), Leaf(1, 0, 0.75, 4, lost=True))) for k in range(3)]
+    assert told(answers[1], answers[0]) == (True, [])
+    assert told(head(1, 7_000_000_000), head(0, 5_500_000_000)) == (False, [0, 1])
+    assert told(head(2, 9_000_000_000), answers[0], answers[1], head(0, 5_500_000_000)) == (False, [])
+    assert told(answers[2]) == (False, [2])
+    assert told(head(0, 20_000_000_000), answers[0]) == (True, [0])
+    (event,) = board.news(Seen())["history"]["events"]
+    assert event == {
+        "event": 0, "time": 20.0, "way": 0.0, "leaves": [[1, 4, 0.75, True], [3, 5, 0.25, False]], "live": 2
+    }  # fmt: skip
+
+
+def test_the_page_its_style_and_its_scripts_are_served_and_ask_for_nothing_from_elsewhere(server):
+    for path, kind in (("", "text/html"), ("view.css", "text/css"), ("view.js", "text/javascript"),
+                       ("draw.js", "text/javascript")):  # fmt: skip
+        with urlopen(server.url + path, timeout=10) as answer:
+            assert answer.headers["Content-Type"].startswith(kind)
+            assert "default-src 'none'" in answer.headers["Content-Security-Policy"]
+            text = answer.read().decode()
+            assert "http:" not in text
+            assert "https:" not in text
+    assert status_of(server.url + "../server.py") == 404
+    assert status_of(server.url + "board.py") == 404
+
+
+def test_the_map_is_sent_to_those_who_do_not_have_it(board, server):
+    assert status_of(server.url + "map.png") == 404
+    tag = board.put_picture(grid_png(np.zeros((5, 5), dtype=np.int8)))
+    with urlopen(server.url + "map.png", timeout=10) as answer:
+        assert answer.headers["ETag"] == f'"{tag}"'
+        assert answer.read().startswith(b"\x89PNG")
+    assert status_of(Request(server.url + "map.png", headers={"If-None-Match": f'"{tag}"'})) == 304
+    board.put_picture(grid_png(np.full((5, 5), 100, dtype=np.int8)))
+    with urlopen(Request(server.url + "map.png", headers={"If-None-Match": f'"{tag}"'}), timeout=10) as answer:
+        assert answer.status == 200
+
+
+def test_news_stream_and_somebody_who_looks_is_noticed(board, server):
+    assert not board.watched
+    with urlopen(server.url + "news", timeout=10) as stream:
+        assert json.loads(stream.readline().decode().removeprefix("data: "))["history"]["anew"]
+        assert stream.readline() == b"\n"
+        board.put("area", "5")
+        assert json.loads(stream.readline().decode().removeprefix("data: ")) == {"area": "5"}
+        assert board.watched
+
+
+def test_a_page_of_another_site_gets_nothing(server):
+    assert status_of(Request(server.url + "snapshot.json", headers={"Host": "evil.example"})) == 403
+    assert status_of(Request(server.url + "snapshot.json", data=b"{}")) == 501
+    with urlopen(Request(server.url + "snapshot.json", headers={"Host": "localhost:8800"}), timeout=10) as answer:
+        assert json.load(answer) == {"history": {"anew": True, "events": []}}
+
+
+def test_the_command_line_names_the_port_of_the_node():
+    options = parser().parse_args(["replay", "log", "--out", "out", "--view"])
+    assert options.view == PORT
+    assert parser().parse_args(["replay", "log", "--out", "out"]).view is None
+
+
+def test_a_port_in_use_and_an_address_that_is_none_are_told_in_a_sentence(board):
+    sentence = r"cannot listen on 127\.0\.0\.1, port \d+ .*give another port"
+    with socket.create_server(("127.0.0.1", 0)) as taken, pytest.raises(HmtSlamError, match=sentence):
+        PageServer(board, "127.0.0.1", taken.getsockname()[1])
+    with pytest.raises(HmtSlamError, match="address = here is no IP address"):
+        PageServer(board, "here", 0)
+
+
+def test_browsers_beyond_the_twentieth_stream_are_told_so(server):
+    port = int(server.url.rsplit(":", 1)[1].strip("/"))
+    streams = [http.client.HTTPConnection("127.0.0.1", port, timeout=10) for _ in range(21)]
+    for stream in streams:
+        stream.request("GET", "/news")
+    assert sorted(stream.getresponse().status for stream in streams) == [200] * 20 + [503]
+    for stream in streams:
+        stream.close()
+
+
+def well(health, now, **messages):
+    for name in NODES:
+        level, text = messages.get(name, (0, "running"))
+        health.hear(name, level, text, {"busy": f"{0.25 * now:.3f} s"}, now)
+
+
+def test_where_no_node_runs_the_page_says_what_to_start():
+    verdict = Health(NODES).verdict(5.0)
+    assert verdict["level"] == "waiting"
+    assert "ros2 launch hmt_slam_ros mapping.launch.py" in verdict["advice"]
+
+
+def test_a_node_that_is_missing_or_fell_silent_is_named():
+    health = Health(NODES)
+    health.hear("slam", 0, "running", {}, 0.0)
+    assert health.verdict(1.0)["text"] == "rtl is not running."
+    well(health, 2.0)
+    health.hear("slam", 0, "running", {}, 20.0)
+    assert health.verdict(20.5) | {"advice": ""} == {
+        "level": "fault", "text": "rtl says nothing, for 18 s.", "advice": ""
+    }  # fmt: skip
+    assert [row["level"] for row in health.rows(20.5)] == ["good", "fault"]
+
+
+def test_no_pose_is_a_fault_but_not_after_the_end_of_a_log():
+    health = Health(NODES)
+    well(health, 0.0)
+    assert health.verdict(1.0)["level"] == "waiting"
+    health.pose_heard = 0.5
+    assert health.verdict(1.0) == {"level": "good", "text": "All is well.", "advice": ""}
+    assert health.verdict(5.0)["text"] == "No pose for 4 s."
+    health.robot_state = "ended"
+    assert health.verdict(5.0)["level"] == "good"
+
+
+def test_errors_come_before_warnings_and_warnings_grow_old():
+    health = Health(NODES, pose_heard=100.0, localized=False)
+    well(health, 0.0, slam=(1, "the wheels slip"))
+    assert health.verdict(1.0) == {"level": "attention", "text": "slam warns.", "advice": "the wheels slip"}
+    well(health, 99.0, slam=(1, "the wheels slip"))
+    assert health.rows(100.0)[0] | {"values": 0} == {
+        "name": "slam", "level": "good", "message": "the wheels slip", "values": 0, "load": 0.25
+    }  # fmt: skip
+    assert health.verdict(100.0)["text"].startswith("The robot's place is not known yet")
+    well(health, 100.0, slam=(1, "the wheels slip"), rtl=(2, "the chain has a gap"))
+    assert health.verdict(100.0) == {"level": "fault", "text": "rtl has a fault.", "advice": "the chain has a gap"}
