@@ -9,6 +9,8 @@ from typing import NoReturn
 from hmt_slam_ros import __version__
 from hmt_slam_ros.configuration import Configuration, load_configuration
 
+# That of hmt_slam_ros.view.server, which takes too long to load for a help text.
+_VIEW_PORT = 8800
 _LOG = "rosbag2 folder, .mcap or .db3 file, CARMEN log, MRPT rawlog, or sim:WORLD"
 
 
@@ -32,6 +34,7 @@ def parser() -> argparse.ArgumentParser:
     _evaluate(commands.add_parser("evaluate", help="errors of an output folder against true relations"))
     _plot(commands.add_parser("plot", help="draw map, probabilities and cost of an output folder"))
     _export(commands.add_parser("export", help="write a map's topology as GraphML, or its grid for nav2"))
+    _doctor(commands.add_parser("doctor", help="say what is wrong with a log or with the running system"))
     _parameters(commands.add_parser("parameters", help="print every parameter as a YAML file"))
     return top
 
@@ -57,13 +60,18 @@ def _map(command: argparse.ArgumentParser) -> None:
         help="output folder or hmt_map of a part of the log or of other logs, to go on from with its parameters",
     )  # fmt: skip
     command.add_argument(
-        "--mode", choices=("mapping", "localization"), help="localization leaves the map of --from as it is"
-    )
+        "--mode", choices=("mapping", "localization", "lifelong"),
+        help="localization leaves the map of --from as it is, lifelong changes it only where the world has",
+    )  # fmt: skip
 
 
 def _replay(command: argparse.ArgumentParser) -> None:
     _log_to_folder(command)
     command.add_argument("--rate", type=float, help="speed relative to real time; also --set robot.rate=F")
+    command.add_argument(
+        "--view", type=int, nargs="?", const=_VIEW_PORT, metavar="PORT",
+        help=f"serve the live page of the run on 127.0.0.1, port {_VIEW_PORT} where none is given",
+    )  # fmt: skip
 
 
 def _log_to_folder(command: argparse.ArgumentParser) -> None:
@@ -131,6 +139,18 @@ def _export(command: argparse.ArgumentParser) -> None:
     )
     command.add_argument("--resolution", type=float, metavar="M", help="side of a cell of the grid; default: as mapped")
     command.add_argument("--area", type=int, metavar="N", help="the grid of one area alone, in that area's frame")
+
+
+def _doctor(command: argparse.ArgumentParser) -> None:
+    command.add_argument("log", type=Path, nargs="?", metavar="LOG", help=_LOG)
+    command.add_argument("--live", action="store_true", help="listen to the running system instead")
+    command.add_argument("--seconds", type=float, default=10.0, metavar="S", help="how long to listen to it")
+    command.add_argument("--json", action="store_true", help="print the findings as JSON")
+    _part(command)
+    command.add_argument(
+        "--ros-args", nargs=argparse.REMAINDER, default=[], dest="ros_arguments", metavar="ARG",
+        help="with --live: namespace and remappings, such as -r __ns:=/robot1",
+    )  # fmt: skip
 
 
 def _parameters(command: argparse.ArgumentParser) -> None:

@@ -19,7 +19,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run a subcommand.
 
     :param arguments: those of the process where None.
-    :returns: exit status: 0 for a complete result, 2 where the input is at fault, 130 where the user stopped it.
+    :returns: exit status: 0 for a complete result, 1 where ``doctor`` found something wrong, 2 where the input is at
+        fault, 130 where the user stopped it.
     """
     heed_signals()
     options = parser().parse_args(arguments)
@@ -27,7 +28,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # Each subcommand loads what it needs itself, so that --help does not wait for numba and matplotlib.
         command = import_module(f"hmt_slam_ros.cli.{options.command}_command")
         tell_of_compilation(lambda text: print(f"hmt_slam {options.command}: {text}", file=sys.stderr))
-        command.run(options)
+        return command.run(options) or 0
     except HmtSlamError as fault:
         print(f"hmt_slam {options.command}: {fault}", file=sys.stderr)
         return FAULT

@@ -54,7 +54,8 @@ class Progress:
         bar = f"[{'#' * filled}{'.' * (_BAR - filled)}] " if self._moving else ""
         speed = share * self._log_seconds / max(elapsed, 1e-9)
         left = elapsed * (1.0 - share) / share if share > 0.0 else 0.0
-        return f"{bar}{done}/{self._scans} scans, {speed:.1f} x real time, {_duration(left)} left"
+        rest = f"{_duration(left)} left" if share < 1.0 else "the final map is being made"
+        return f"{bar}{done}/{self._scans} scans, {speed:.1f} x real time, {rest}"
 
     def __enter__(self) -> Progress:
         """Nothing to prepare."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 
 from hmt_slam_ros.cli.arguments import chosen_configuration
 from hmt_slam_ros.cli.progress import Progress
@@ -10,6 +11,7 @@ from hmt_slam_ros.cli.summary import summary
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.logs import open_log
 from hmt_slam_ros.offline.output_folder import check_replaceable
+from hmt_slam_ros.view.server import LOCAL, check_port
 
 
 def run(options: argparse.Namespace) -> None:
@@ -21,6 +23,9 @@ def run(options: argparse.Namespace) -> None:
         from hmt_slam_ros.nodes.replay import replay  # noqa: PLC0415  the only command that needs ROS
     except ImportError as fault:
         raise HmtSlamError(f"replay needs ROS ({fault}): source Jazzy or install its wheels, or use map") from fault
+    if options.view is not None:
+        check_port(options.view)
+        print(f"the live page is at http://{LOCAL}:{options.view}/", file=sys.stderr)
     with Progress(log.scan_count, log.duration) as progress:
-        replayed = replay(options.log, options.out, configuration, progress)
+        replayed = replay(options.log, options.out, configuration, progress, view=options.view)
     print(summary(options.out, replayed.recording, log.duration, replayed.wall_seconds))

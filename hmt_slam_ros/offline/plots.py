@@ -28,7 +28,6 @@ from hmt_slam_ros.topology.hybrid_map import HybridMap
 Colour = tuple[float, float, float]
 
 _DPI = 150
-_CHI2_95 = 5.991  # 95 % of a Gaussian in the plane, 2 degrees of freedom
 _CLOSURE, _ARC, _PATH = "#d62728", "#1f3b70", "#555555"
 _GOLDEN = 0.6180339887498949
 
@@ -122,15 +121,16 @@ def _draw_arcs(axes: Axes, hybrid_map: HybridMap, area_poses: Mapping[int, PoseG
 
 def _draw_areas(axes: Axes, saved: SavedMap, visible: float) -> None:
     """Origins with their ids and ellipses; ellipses too small to see are drawn larger by a round factor, in metres."""
-    axes_of_all = {area: _ellipse(belief) for area, belief in saved.area_poses.items()}
-    largest = max(float(lengths[0]) for lengths, _ in axes_of_all.values())
+    ellipses = {area: belief.ellipse() for area, belief in saved.area_poses.items()}
+    largest = max(ellipse.longer for ellipse in ellipses.values())
     factor = 1 if largest <= 0.0 else int(10 ** np.clip(np.ceil(np.log10(visible / largest)), 0, 2))
-    for area, (lengths, angle) in axes_of_all.items():
+    for area, ellipse in ellipses.items():
         x, y = saved.area_poses[area].mean[:2].tolist()
         axes.add_patch(
             Ellipse(
-                (x, y), *(2.0 * factor * lengths), angle=angle, zorder=5,
-                facecolor=(*_colour(area), 0.25), edgecolor=_colour(area), linewidth=1.0,
+                (x, y), 2.0 * factor * ellipse.longer, 2.0 * factor * ellipse.shorter, zorder=5,
+                angle=float(np.degrees(ellipse.angle)), facecolor=(*_colour(area), 0.25), edgecolor=_colour(area),
+                linewidth=1.0,
             )
         )  # fmt: skip
         axes.annotate(
@@ -139,16 +139,6 @@ def _draw_areas(axes: Axes, saved: SavedMap, visible: float) -> None:
         )  # fmt: skip
     enlarged = f", enlarged {factor} times" if factor > 1 else ""
     axes.plot([], [], "o", markerfacecolor="none", color="black", label=f"area, 95 % ellipse{enlarged}")
-
-
-def _ellipse(belief: PoseGaussian) -> tuple[NDArray[np.float64], float]:
-    """Half axes, shape (2,), m, longest first, of the 95 % ellipse of the position, and its angle, degrees."""
-    cos, sin = np.cos(belief.mean[2]), np.sin(belief.mean[2])
-    rotation = np.array([[cos, -sin], [sin, cos]])
-    # The covariance lives in the area's own frame; the picture is in the map's.
-    values, vectors = np.linalg.eigh(rotation @ belief.covariance[:2, :2] @ rotation.T)
-    half_axes = np.sqrt(_CHI2_95 * np.maximum(values[::-1], 0.0))
-    return half_axes, float(np.degrees(np.arctan2(vectors[1, 1], vectors[0, 1])))
 
 
 def _map_title(hybrid_map: HybridMap, path: NDArray[np.float64]) -> str:

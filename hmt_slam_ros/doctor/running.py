@@ -1,0 +1,203 @@
+"""A running system: who publishes what and is heard by whom, which of our nodes run, and what they say."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from hmt_slam_ros.doctor.finding import Finding, Severity, times
+
+OUR_NODES = ("slam", "aam", "tsbi", "tlca", "rtl")
+SCAN, ODOM, TF, TF_STATIC, CLOCK = "scan", "odom", "tf", "tf_static", "clock"
+ESTIMATES = "hmt/local_pose"
+SINGLE = (SCAN, ODOM, "map", "pose", CLOCK)
+"""Topics that have one publisher."""
+
+# Stamps that differ by this from the computer's clock, s: doubtful, and wrong.
+_AWAY = (0.5, 10.0)
+
+
+class Mismatch(NamedTuple):
+    """A publisher that a subscriber does not hear.
+
+    :ivar publisher: node.
+    :ivar subscriber: node.
+    :ivar reason: in DDS's words.
+    """
+
+    publisher: str
+    subscriber: str
+    reason: str
+
+
+@dataclass(frozen=True)
+class Topic:
+    """A topic as the graph of the system shows it.
+
+    :ivar heard: messages that came while the doctor listened, None where it did not.
+    :ivar publishers: nodes, once for each publisher.
+    :ivar mismatches: pairs that do not hear each other.
+    """
+
+    heard: int | None
+    publishers: tuple[str, ...]
+    mismatches: tuple[Mismatch, ...] = ()
+
+
+class Told(NamedTuple):
+    """What a node said on /diagnostics last: its name, level (0 all is well, 1 warning, 2 and more error), sentence."""
+
+    name: str
+    level: int
+    message: str
+
+
+@dataclass(frozen=True)
+class Running:
+    """What was seen of a running system.
+
+    :ivar seconds: how long it was listened to.
+    :ivar topics: by name, without namespace.
+    :ivar nodes: names of all nodes but the doctor's.
+    :ivar simulated: nodes with use_sim_time.
+    :ivar diagnostics: by node.
+    :ivar away: by topic, by how much its stamps are before the computer's clock as they arrive, s (median); empty where
+        a /clock runs.
+    :ivar doubled: transforms that two sources tell in turn, with how often.
+    :ivar laser: what of the laser's transform is missing, empty where nothing is.
+    """
+
+    seconds: float
+    topics: Mapping[str, Topic]
+    nodes: tuple[str, ...]
+    simulated: tuple[str, ...]
+    diagnostics: tuple[Told, ...]
+    away: Mapping[str, float]
+    doubled: Mapping[str, int]
+    laser: str
+
+
+def findings(running: Running) -> list[Finding]:
+    """All of it."""
+    return [
+        *_nodes(running),
+        *_silent(running),
+        *_mismatches(running),
+        *_several(running),
+        *_clock(running),
+        *_diagnostics(running),
+    ]
+
+
+def _nodes(running: Running) -> list[Finding]:
+    there = [name for name in OUR_NODES if name in running.nodes]
+    if not there:
+        text = "None of the nodes of hmt_slam_ros runs, so that sensors alone were looked at."
+        return [Finding("fine", "nodes", text)]
+    missing = [name for name in OUR_NODES if name not in there]
+    if missing:
+        text = f"Of the nodes, {_listed(missing)} {'is' if len(missing) == 1 else 'are'} missing: start all five, such "
+        return [Finding("wrong", "nodes", text + "as by mapping.launch.py; the others wait for them.")]
+    return [Finding("fine", "nodes", f"All five nodes run: {_listed(there)}.")]
+
+
+def _silent(running: Running) -> list[Finding]:
+    found = []
+    for name in (SCAN, ODOM):
+        topic = running.topics[name]
+        by_transform = name == ODOM and running.topics[TF].heard
+        if not topic.heard and not by_transform:
+            found.append(Finding("wrong", f"{name} silent", _silence(name, topic, running.seconds)))
+    if running.laser:
+        found.append(Finding("wrong", "laser transform", running.laser))
+    estimates = running.topics[ESTIMATES]
+    if "slam" in running.nodes and running.topics[SCAN].heard and not estimates.heard:
+        text = (
+            f"Scans come, and slam said nothing about one for {running.seconds:g} s: it is paused, or waits for "
+            "odometry, a transform or the other nodes; its own log and /diagnostics say for which."
+        )
+        found.append(Finding("doubtful", "slam silent", text))
+    return found
+
+
+def _silence(name: str, topic: Topic, seconds: float) -> str:
+    if topic.publishers:
+        return (
+            f"Nothing came on {name} for {seconds:g} s, though {_listed(topic.publishers)} publishes it: look whether "
+            "the driver has its device and whether the network lets messages through."
+        )
+    return (
+        f"Nobody publishes {name}: start the driver, or remap its topic, such as --ros-args -r {name}:=/base_{name}, "
+        "and see that ROS_DOMAIN_ID is the same everywhere."
+    )
+
+
+def _mismatches(running: Running) -> list[Finding]:
+    return [
+        Finding(
+            "wrong",
+            "QoS mismatch",
+            f"{pair.subscriber} does not hear {name} of {pair.publisher}: {pair.reason}; let both be reliable, or the "
+            "subscriber best effort, and alike for durability.",
+        )
+        for name, topic in running.topics.items()
+        for pair in topic.mismatches
+    ]
+
+
+def _several(running: Running) -> list[Finding]:
+    found = [
+        Finding(
+            "wrong",
+            "two publishers",
+            f"{name} has {len(topic.publishers)} publishers, {_listed(topic.publishers)}: stop all but one of them, or "
+            "remap the others.",
+        )
+        for name in SINGLE
+        if (topic := running.topics.get(name)) is not None and len(topic.publishers) > 1
+    ]
+    return found + [
+        Finding(
+            "wrong",
+            "two transforms",
+            f"The transform {joint} was told differently for one stamp {times(count)}: two nodes publish it, of "
+            f"{_listed(running.topics[TF].publishers)}; stop one of them (or its publish_tf).",
+        )
+        for joint, count in running.doubled.items()
+    ]
+
+
+def _clock(running: Running) -> list[Finding]:
+    clock = running.topics[CLOCK].publishers
+    found = []
+    if running.simulated and not clock:
+        text = (
+            f"{_listed(running.simulated)} {'has' if len(running.simulated) == 1 else 'have'} use_sim_time, and nobody "
+            "publishes /clock, so that time stands still: start the simulation or ros2 bag play --clock, or set "
+            "use_sim_time to false."
+        )
+        found.append(Finding("wrong", "use_sim_time", text))
+    for name, away in running.away.items():
+        severity: Severity = "wrong" if abs(away) >= _AWAY[1] else "doubtful"
+        if abs(away) >= _AWAY[0]:
+            text = (
+                f"The stamps of {name} are {abs(away):.2f} s {'before' if away > 0.0 else 'after'} the clock of this "
+                "computer when they arrive: synchronise the clocks of both computers (chrony), or, where a bag is "
+                "played, use ros2 bag play --clock and use_sim_time."
+            )
+            found.append(Finding(severity, "stamps against clock", text))
+    return found
+
+
+def _diagnostics(running: Running) -> list[Finding]:
+    return [
+        Finding("wrong" if told.level > 1 else "doubtful", "diagnostics", f"{told.name} says: {told.message}")
+        for told in running.diagnostics
+        if told.level
+    ]
+
+
+def _listed(names: tuple[str, ...] | list[str]) -> str:
+    different = sorted(set(names))
+    return different[0] if len(different) == 1 else f"{', '.join(different[:-1])} and {different[-1]}"

@@ -1,0 +1,207 @@
+"""What is gathered from a log or from running topics, as arrays, before anything is judged."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hmt_slam_ros.arrays import Bool, Float64, Int64
+
+_NANOSECOND = 1e-9
+
+
+class BeamCounts(NamedTuple):
+    """How many beams of a scan are what; shape (n,) each, over n scans.
+
+    :ivar beams: all of them.
+    :ivar returns: with a return.
+    :ivar nan: not a number.
+    :ivar infinite: inf of either sign.
+    :ivar near: finite, and below the least range.
+    :ivar far: finite, and at or beyond the largest range.
+    """
+
+    beams: Int64
+    returns: Int64
+    nan: Int64
+    infinite: Int64
+    near: Int64
+    far: Int64
+
+
+class EachBeam(NamedTuple):
+    """What each of the b beams of a laser saw, over the scans that have as many beams as the first.
+
+    :ivar returns: shape (b,), with how many returns.
+    :ivar nearest: shape (b,), the nearest of them, m.
+    :ivar farthest: shape (b,), the farthest of them, m.
+    """
+
+    returns: Int64
+    nearest: Float64
+    farthest: Float64
+
+
+@dataclass(frozen=True, eq=False)
+class ScanStatistics:
+    """All scans.
+
+    :ivar source_stamps: shape (n,), the source's own stamps, ns, in the order of arrival.
+    :ivar stamps: shape (n,), on the running clock of `LogRecord`, ns.
+    :ivar geometry: shape (n, 5): first angle, increment, rad; least and largest range, m; time from beam to beam, s.
+    :ivar laser_poses: shape (n, 3), ``base_T_laser``, m and rad.
+    :ivar counts: of beams.
+    :ivar each_beam: of the laser.
+    :ivar sweep_faults: scans whose time from beam to beam cannot be.
+    :ivar sweep_fault: what is said of the first of them.
+    """
+
+    source_stamps: Int64
+    stamps: Int64
+    geometry: Float64
+    laser_poses: Float64
+    counts: BeamCounts
+    each_beam: EachBeam
+    sweep_faults: int
+    sweep_fault: str
+
+
+@dataclass(frozen=True, eq=False)
+class OdometryStatistics:
+    """All odometry readings.
+
+    :ivar source_stamps: shape (m,), the source's own stamps, ns, in the order of arrival.
+    :ivar stamps: shape (m,), on the running clock, ns.
+    :ivar poses: shape (m, 3), ``odom_T_base``, m and rad, finite.
+    :ivar not_finite: readings that were left out since they are not.
+    """
+
+    source_stamps: Int64
+    stamps: Int64
+    poses: Float64
+    not_finite: int
+
+    @property
+    def distance(self) -> float:
+        """Length of the path, m."""
+        return float(np.hypot(*np.diff(self.poses[:, :2], axis=0).T).sum()) if len(self.poses) else 0.0
+
+    def at(self, stamps: Float64) -> Float64:
+        """Poses (k, 3) at any stamps (k,), ns: between two readings in proportion, before and after all as those.
+
+        Headings are unwrapped.
+        """
+        times = (self.stamps - self.stamps[0]).astype(np.float64)
+        wanted = stamps - float(self.stamps[0])
+        x, y, heading = self.poses[:, 0], self.poses[:, 1], np.unwrap(self.poses[:, 2])
+        return np.stack([np.interp(wanted, times, part) for part in (x, y, heading)], axis=1)
+
+
+@dataclass(frozen=True, eq=False)
+class ScanMotions:
+    """The robot's motion from scan to scan as the scans alone have it.
+
+    :ivar starts: shape (p,), stamps, ns.
+    :ivar ends: shape (p,), likewise.
+    :ivar motions: shape (p, 3), ``start_T_end``, m and rad.
+    :ivar information: shape (p, 3, 3), of the motion in the frame of its end; small where scans show nothing.
+    :ivar matched: shape (p,), share of the points of one scan that meet a wall of the other.
+    """
+
+    starts: Int64
+    ends: Int64
+    motions: Float64
+    information: Float64
+    matched: Float64
+
+    def where(self, chosen: Bool | Int64) -> ScanMotions:
+        """Some of them."""
+        return ScanMotions(
+            self.starts[chosen], self.ends[chosen], self.motions[chosen], self.information[chosen], self.matched[chosen]
+        )
+
+
+class Joint(NamedTuple):
+    """A transform as it was heard.
+
+    :ivar parent: frame.
+    :ivar child: frame.
+    :ivar topic: on which.
+    :ivar first: shape (4, 4), ``parent_T_child`` of the first message, m.
+    :ivar messages: how many.
+    :ivar moved: largest distance of any from the first, m, or m of a point at 1 m for a rotation.
+    """
+
+    parent: str
+    child: str
+    topic: str
+    first: NDArray[np.float64]
+    messages: int
+    moved: float
+
+
+class ScanHead(NamedTuple):
+    """What a LaserScan message says of itself and `Scan` does not keep.
+
+    :ivar frame: its frame.
+    :ivar angle_min: rad.
+    :ivar angle_max: rad.
+    :ivar angle_increment: rad.
+    :ivar beams: how many.
+    """
+
+    frame: str
+    angle_min: float
+    angle_max: float
+    angle_increment: float
+    beams: int
+
+
+@dataclass(frozen=True, eq=False)
+class Messages:
+    """What only messages tell, as opposed to a log of another format.
+
+    :ivar counts: messages by topic.
+    :ivar types: of the topics.
+    :ivar heads: scans that differ in what they say of themselves, each once, with how many there are.
+    :ivar odometry_frames: (frame, child frame) of the odometry; the transform's where there is no topic of it.
+    :ivar joints: all transforms.
+    """
+
+    counts: dict[str, int]
+    types: dict[str, str]
+    heads: dict[ScanHead, int]
+    odometry_frames: tuple[str, str]
+    joints: tuple[Joint, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Statistics:
+    """All that was gathered.
+
+    :ivar name: of the log.
+    :ivar scans: all of them.
+    :ivar odometry: all readings.
+    :ivar motions: from scan to scan.
+    :ivar messages: where there are some.
+    """
+
+    name: str
+    scans: ScanStatistics
+    odometry: OdometryStatistics
+    motions: ScanMotions
+    messages: Messages | None = field(default=None)
+
+    @property
+    def duration(self) -> float:
+        """From the first to the last stamp on the running clock, s."""
+        stamps = np.concatenate((self.scans.stamps, self.odometry.stamps))
+        return float(stamps.max() - stamps.min()) * _NANOSECOND if stamps.size else 0.0
+
+
+def seconds_between(stamps: Int64) -> Float64:
+    """From each stamp to the next, s, shape (n - 1,)."""
+    return np.diff(stamps) * _NANOSECOND

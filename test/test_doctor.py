@@ -1,0 +1,336 @@
+"""A fault planted into a simulated drive is found, and nothing else is."""
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hmt_slam_ros.cli.main import main
+from hmt_slam_ros.doctor.bag_messages import scan_head
+from hmt_slam_ros.doctor.examination import findings_of_log
+from hmt_slam_ros.doctor.statistics import Joint, Messages, ScanHead
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.logs import open_log
+from hmt_slam_ros.logs.records import LogRecord
+from hmt_slam_ros.logs.ros_types import LASER_SCAN, typestore
+from hmt_slam_ros.logs.writer import _header, write_bag
+from hmt_slam_ros.sensing import Scan
+
+WORLD = "sim:office,seed=3,beams=181,readings=4"
+
+
+class Faulty:
+    """A log with other records."""
+
+    name = "faulty"
+
+    def __init__(self, records):
+        self._records = list(records)
+        self.scan_count = sum(isinstance(record.measurement, Scan) for record in self._records)
+        stamps = [record.measurement.stamp for record in self._records]
+        self.duration = 1e-9 * (max(stamps) - min(stamps))
+
+    def records(self):
+        return iter(self._records)
+
+
+@pytest.fixture(scope="module")
+def drive():
+    """The records of 70 s."""
+    return list(open_log(WORLD, duration=70.0).records())
+
+
+def changed(drive, *, scan=lambda scan: scan, odometry=lambda odometry: odometry):
+    return Faulty(
+        replace(record, measurement=scan(record.measurement) if is_scan(record) else odometry(record.measurement))
+        for record in drive
+    )
+
+
+def is_scan(record):
+    return isinstance(record.measurement, Scan)
+
+
+def subjects(log, messages=None):
+    """What is not fine, {subject: severity}."""
+    return {one.subject: one.severity for one in findings_of_log(log, messages) if one.severity != "fine"}
+
+
+def text_of(log, subject):
+    return next(one.text for one in findings_of_log(log) if one.subject == subject)
+
+
+def turned(scan, angle, forward=0.0):
+    return replace(scan, laser_pose=scan.laser_pose - np.array([forward, 0.0, angle]))
+
+
+def scaled(drive, *, way=1.0, turn=1.0, between=(0.0, np.inf)):
+    """Odometry whose increments are scaled, all of them or those of some seconds."""
+    readings = [record.measurement for record in drive if not is_scan(record)]
+    seconds = 1e-9 * np.array([reading.stamp - readings[0].stamp for reading in readings[1:]])
+    poses = np.array([reading.pose for reading in readings])
+    steps = se2.log(se2.between(poses[:-1], poses[1:]))
+    steps[(between[0] <= seconds) & (seconds <= between[1])] *= np.array([way, way, turn])
+    driven = [poses[0]]
+    for step in steps:
+        driven.append(se2.compose(driven[-1], se2.exp(step)))
+    poses = iter(driven)
+    return changed(drive, odometry=lambda reading: replace(reading, pose=next(poses)))
+
+
+def without(drive, dropped):
+    """Without the records of which a condition on seconds since the first and the record holds."""
+    first = drive[0].measurement.stamp
+    return Faulty(record for record in drive if not dropped(1e-9 * (record.measurement.stamp - first), record))
+
+
+def test_in_a_sound_log_nothing_is_wrong(drive):
+    assert subjects(Faulty(drive)) == {}
+
+
+@pytest.mark.parametrize("seed", (1, 2))
+def test_nor_in_another_world_with_people_and_a_laser_ahead(seed):
+    log = open_log(f"sim:busy,seed={seed},forward=0.3,beams=181,rate=8", duration=60.0)
+    assert subjects(log) == {}
+
+
+@pytest.mark.parametrize("seed", (0, 1))
+def test_where_the_laser_reaches_nothing_only_that_is_told(seed):
+    log = open_log(f"sim:hall,seed={seed},beams=181", duration=60.0)
+    assert subjects(log) == {"few returns": "wrong"}
+
+
+def test_a_laser_that_is_turned_is_found_with_the_angle(drive):
+    log = changed(drive, scan=lambda scan: turned(scan, math.radians(12.0)))
+    assert subjects(log) == {"laser yaw": "wrong"}
+    assert "turned by 12" in text_of(log, "laser yaw") or "turned by 11" in text_of(log, "laser yaw")
+    assert "to the left" in text_of(log, "laser yaw")
+
+
+def test_a_laser_that_looks_backwards_is_found(drive):
+    assert subjects(changed(drive, scan=lambda scan: turned(scan, math.pi))) == {"laser backwards": "wrong"}
+
+
+def test_a_laser_that_is_somewhere_else_is_found_with_the_place(drive):
+    log = changed(drive, scan=lambda scan: turned(scan, 0.0, -0.4))
+    assert subjects(log) == {"laser place": "wrong"}
+    forward = float(text_of(log, "laser place").split()[3])
+    assert forward == pytest.approx(-0.4, abs=0.05)
+
+
+def test_a_mirrored_laser_is_found(drive):
+    log = changed(drive, scan=lambda scan: replace(scan, ranges=np.ascontiguousarray(scan.ranges[::-1])))
+    assert subjects(log) == {"mirrored": "wrong"}
+
+
+@pytest.mark.parametrize(("scale", "severity"), ((1.15, "doubtful"), (0.8, "wrong")))
+def test_odometry_with_a_wrong_scale_of_ways_is_found(drive, scale, severity):
+    log = scaled(drive, way=scale)
+    assert subjects(log) == {"translation scale": severity}
+    assert float(text_of(log, "translation scale").split()[3]) == pytest.approx(scale, abs=0.03)
+
+
+def test_odometry_with_a_wrong_scale_of_turns_is_found(drive):
+    log = scaled(drive, turn=1.25)
+    assert subjects(log) == {"rotation scale": "wrong"}
+    assert float(text_of(log, "rotation scale").split()[3]) == pytest.approx(1.25, abs=0.03)
+
+
+@pytest.mark.parametrize("offset", (0.2, -0.2))
+def test_clocks_that_are_apart_are_found_with_the_time(drive, offset):
+    def late(record):
+        if not is_scan(record):
+            return record
+        stamp = record.measurement.stamp + round(offset * 1e9)
+        return LogRecord(stamp, replace(record.measurement, stamp=stamp))
+
+    records = sorted(map(late, drive), key=lambda record: record.measurement.stamp)
+    log = Faulty(records)
+    assert subjects(log) == {"clock offset": "wrong"}
+    text = text_of(log, "clock offset")
+    assert f" s {'late' if offset > 0.0 else 'early'} against" in text
+    # The noise of simulated odometry is drawn from scan to scan, and so says when they were.
+    assert float(text.split()[4]) == pytest.approx(0.2, abs=0.05)
+
+
+def test_odometry_that_drops_out_is_found(drive):
+    log = without(drive, lambda seconds, record: not is_scan(record) and 20.0 < seconds < 24.0)
+    assert subjects(log) == {"odometry gaps": "doubtful", "scans without odometry": "wrong"}
+
+
+def test_odometry_that_stands_still_while_the_robot_drives_is_found(drive):
+    log = scaled(drive, way=0.0, turn=0.0, between=(20.0, 32.0))
+    assert subjects(log) == {"odometry frozen": "wrong"}
+
+
+def test_wheels_that_slip_are_found():
+    log = open_log(WORLD + ",slips=100", duration=70.0)
+    assert subjects(log) == {"slip": "doubtful"}
+
+
+def test_odometry_that_was_reset_is_found(drive):
+    first = drive[0].measurement.stamp
+    log = changed(
+        drive,
+        odometry=lambda reading: replace(reading, pose=reading.pose + np.array([9.0, 0.0, 0.0]))
+        if reading.stamp - first > 30 * 10**9
+        else reading,
+    )
+    assert subjects(log) == {"odometry jumps": "wrong"}
+
+
+def test_odometry_that_is_no_number_and_scans_without_beams_do_not_disturb(drive):
+    second = drive[0].measurement.stamp + 10**9
+    log = changed(
+        drive,
+        scan=lambda scan: replace(scan, ranges=scan.ranges[:0]) if scan.stamp < second else scan,
+        odometry=lambda reading: replace(reading, pose=np.full(3, np.nan)) if reading.stamp == second else reading,
+    )
+    assert subjects(log) == {"odometry not finite": "wrong"}
+
+
+def test_missing_scans_are_found(drive):
+    log = without(drive, lambda seconds, record: is_scan(record) and 20.0 < seconds < 23.0)
+    assert subjects(log) == {"scan gaps": "doubtful"}
+
+
+def test_scans_that_are_too_far_apart_are_found(drive):
+    log = without(drive, lambda seconds, record: is_scan(record) and seconds % 3.0 > 0.1)
+    assert subjects(log) == {"sparse scans": "doubtful"}
+
+
+def with_ranges(drive, change):
+    random = np.random.default_rng(0)
+
+    def spoilt(scan):
+        ranges = scan.ranges.copy()
+        change(ranges, random)
+        return replace(scan, ranges=ranges)
+
+    return changed(drive, scan=spoilt)
+
+
+@pytest.mark.parametrize(
+    ("value", "share", "expected"),
+    ((np.nan, 0.15, {"NaN ranges": "doubtful"}), (0.0, 0.4, {"ranges below range_min": "wrong"})),
+)
+def test_ranges_that_are_none_are_found(drive, value, share, expected):
+    def spoil(ranges, random):
+        ranges[random.random(ranges.size) < share] = value
+
+    assert subjects(with_ranges(drive, spoil)) == expected
+
+
+def test_a_laser_that_hardly_sees_anything_is_found(drive):
+    def spoil(ranges, random):
+        ranges[random.random(ranges.size) < 0.95] = np.inf
+
+    assert subjects(with_ranges(drive, spoil)) == {"few returns": "wrong"}
+
+
+def test_beams_that_see_the_robot_are_found(drive):
+    def spoil(ranges, random):
+        ranges[3:9] = 0.31 + 0.01 * random.standard_normal(6)
+
+    log = with_ranges(drive, spoil)
+    assert subjects(log) == {"beams on the robot": "doubtful"}
+    assert "6 beams, from number 3 to 8" in text_of(log, "beams on the robot")
+
+
+@pytest.mark.parametrize(
+    ("change", "subject"),
+    (
+        ({"range_max": 0.01}, "range limits"),
+        ({"angle_increment": 0.0}, "beam angles"),
+        ({"angle_increment": math.radians(3.0)}, "beam angles"),
+        ({"time_increment": 0.05}, "time_increment"),
+    ),
+)
+def test_scans_that_cannot_be_are_found(drive, change, subject):
+    found = subjects(changed(drive[:200], scan=lambda scan: replace(scan, **change)))
+    assert found[subject] == "wrong"
+
+
+def test_stamps_that_jump_back_or_stay_are_found(drive):
+    sources = [record.source_stamp for record in drive]
+    scans = [k for k, record in enumerate(drive) if is_scan(record)]
+    sources[scans[50]] -= 3 * 10**8
+    sources[scans[80]] = sources[scans[79]]
+    log = Faulty(LogRecord(source, record.measurement) for source, record in zip(sources, drive, strict=True))
+    assert subjects(log) == {"scan stamps jump back": "doubtful", "scan stamps equal": "doubtful"}
+    assert "once, by up to 0.100 s" in text_of(log, "scan stamps jump back")
+
+
+def test_a_robot_that_stands_is_not_judged(drive):
+    scan = next(record.measurement for record in drive if is_scan(record))
+    log = changed(
+        drive[:400],
+        scan=lambda other: replace(scan, stamp=other.stamp),
+        odometry=lambda reading: replace(reading, pose=np.zeros(3)),
+    )
+    assert subjects(log) == {}
+    assert "hardly went" in text_of(log, "translation not judged")
+
+
+def joint(parent, child, *, topic="/tf_static", roll=0.0, moved=0.0):
+    pose = np.eye(4)
+    pose[1:3, 1:3] = [[math.cos(roll), -math.sin(roll)], [math.sin(roll), math.cos(roll)]]
+    return Joint(parent, child, topic, pose, 1, moved)
+
+
+LASER, WHEELS = joint("base_link", "laser"), joint("odom", "base_link", topic="/tf", moved=9.0)
+HEAD = ScanHead("laser", -1.0, 1.0, 0.02, 101)
+
+
+@pytest.mark.parametrize(
+    ("expected", "changes"),
+    (
+        ({}, {}),
+        ({}, {"joints": (joint("base_link", "laser", roll=math.pi), WHEELS)}),
+        ({"tilted": "doubtful"}, {"joints": (joint("base_link", "laser", roll=math.radians(5.0)), WHEELS)}),
+        ({"two parents": "wrong"}, {"joints": (LASER, WHEELS, joint("map", "base_link"))}),
+        ({"static transform moves": "doubtful"}, {"joints": (joint("base_link", "laser", moved=0.1), WHEELS)}),
+        ({"map -> odom": "doubtful"}, {"joints": (LASER, WHEELS, joint("map", "odom", topic="/tf"))}),
+        ({"odometry frames": "doubtful"}, {"odometry_frames": ("odom", "")}),
+        ({"odometry frames": "doubtful"}, {"odometry_frames": ("map", "base_link")}),
+        ({"scan frame": "wrong"}, {"heads": {HEAD._replace(frame=""): 3}}),
+        ({"angle_max": "doubtful"}, {"heads": {HEAD: 3, HEAD._replace(angle_max=1.02): 2}}),
+        ({}, {"heads": {HEAD._replace(angle_max=1.002): 2}}),
+    ),
+)
+def test_frames_and_stated_angles_that_do_not_fit_are_found(drive, expected, changes):
+    sound = Messages({}, {}, {HEAD: 3}, ("odom", "base_link"), (LASER, WHEELS))
+    assert subjects(Faulty(drive[:300]), replace(sound, **changes)) == expected
+
+
+@pytest.mark.parametrize("frame", ("laser", "a", "base_laser_2"))
+def test_what_a_scan_says_of_itself_is_read_without_its_ranges(frame):
+    count = 7
+    message = typestore().types[LASER_SCAN](
+        header=_header(5, frame), angle_min=-1.5, angle_max=1.5, angle_increment=0.5, time_increment=0.0, scan_time=0.0,
+        range_min=0.1, range_max=9.0, ranges=np.ones(count, np.float32), intensities=np.zeros(0, np.float32),
+    )  # fmt: skip
+    content = bytes(typestore().serialize_cdr(message, LASER_SCAN))
+    assert scan_head(content) == ScanHead(frame, -1.5, 1.5, 0.5, count)
+
+
+def test_the_command_says_what_is_wrong_and_returns_it(drive, tmp_path, capsys):
+    log = changed(drive, scan=lambda scan: turned(scan, math.radians(12.0)))
+    write_bag(log, tmp_path / "bag")
+    assert main(["doctor", str(tmp_path / "bag")]) == 1
+    said = capsys.readouterr().out.splitlines()
+    assert said[0].startswith("wrong    laser yaw: The laser is turned by 1")
+    assert said[-1].startswith("1 wrong, 0 doubtful, ")
+    assert any("Odometry is odom -> base_link, scans are in laser." in line for line in said)
+    assert main(["doctor", "--json", str(tmp_path / "bag")]) == 1
+    found = json.loads(capsys.readouterr().out)["findings"]
+    assert [one["subject"] for one in found if one["severity"] == "wrong"] == ["laser yaw"]
+    assert main(["doctor", "data/malaga_one_loop"]) == 0
+
+
+@pytest.mark.parametrize("arguments", ((), ("--live", "sim:office"), ("nowhere",)))
+def test_the_command_refuses_what_it_cannot_examine(arguments, capsys):
+    assert main(["doctor", *arguments]) == 2
+    assert capsys.readouterr().err.startswith("hmt_slam doctor: ")

@@ -1,0 +1,128 @@
+"""hmt_slam doctor --live, as a process of its own, over real DDS."""
+
+import json
+import subprocess
+import sys
+import time
+
+import pytest
+
+pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
+
+from nav_msgs.msg import Odometry as OdometryMessage
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import LaserScan
+
+from hmt_slam_ros.cli.main import main
+from hmt_slam_ros.logs import open_log
+from hmt_slam_ros.nodes import conversions
+from hmt_slam_ros.nodes.transforms import TFMessage
+from hmt_slam_ros.sensing import Odometry, Scan
+
+WORLD = "sim:office,seed=3,beams=181"
+BEST_EFFORT = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
+
+
+@pytest.fixture
+def doctor(listener):
+    """Runs it for some seconds, meanwhile spins the test's own nodes, and returns status and findings."""
+
+    def examined(seconds, *arguments, meanwhile=lambda: None):
+        command = [sys.executable, "-m", "hmt_slam_ros.cli.main", "doctor", "--live", "--json"]
+        process = subprocess.Popen(
+            [*command, "--seconds", str(seconds), *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        )
+        while process.poll() is None:
+            meanwhile()
+            listener.executor.spin_once(timeout_sec=0.02)
+        said, error = process.communicate()
+        assert not error
+        return process.returncode, json.loads(said)["findings"]
+
+    return examined
+
+
+def texts(findings, *severities):
+    return [f"{one['subject']}: {one['text']}" for one in findings if one["severity"] in severities]
+
+
+def test_a_sound_robot_gets_a_clean_bill(domain, doctor, start):
+    parameters = {"robot__rate": 6.0, "robot__paced": False, "robot__scan_listeners": 0, "robot__odometry_listeners": 0}
+    start("robot", log=WORLD, **parameters)
+    status, findings = doctor(2.5)
+    assert status == 0, texts(findings, "wrong", "doubtful")
+    assert texts(findings, "wrong") == []
+    fine = texts(findings, "fine")
+    assert "nodes: None of the nodes of hmt_slam_ros runs, so that sensors alone were looked at." in fine
+    assert "frames: Odometry is odom -> base_link, scans are in laser." in fine
+    assert any("were compared with odometry" in text for text in fine)
+
+
+def test_what_is_silent_missing_or_does_not_fit_is_told(listener, doctor):
+    listener.node.create_publisher(LaserScan, "scan", BEST_EFFORT)
+    listener.node.create_subscription(LaserScan, "scan", lambda _: None, 10)
+    simulated = Node(
+        "slam", context=listener.context, parameter_overrides=[Parameter("use_sim_time", value=True)]
+    )
+    for _ in range(2):
+        simulated.create_publisher(OdometryMessage, "odom", 10)
+    listener.executor.add_node(simulated)
+    status, findings = doctor(2.5)
+    listener.executor.remove_node(simulated)
+    simulated.destroy_node()
+    assert status == 1
+    wrong = texts(findings, "wrong")
+    for begin in (
+        "nodes: Of the nodes, aam, rtl, tlca and tsbi are missing",
+        "scan silent: Nothing came on scan for 2.5 s, though listener publishes it",
+        "odom silent: Nothing came on odom for 2.5 s, though slam publishes it",
+        "QoS mismatch: listener does not hear scan of listener: ",
+        "two publishers: odom has 2 publishers, slam",
+        "use_sim_time: slam has use_sim_time, and nobody publishes /clock",
+    ):
+        assert any(text.startswith(begin) for text in wrong), (begin, wrong)
+    assert len(wrong) == 6, wrong
+
+
+@pytest.mark.skipif(TFMessage is None, reason="tf2_msgs is not installed: run scripts/test.sh, which builds it")
+def test_stamps_frames_and_doubled_transforms_are_told_under_a_namespace(listener, doctor):
+    records = iter(list(open_log(WORLD, duration=90.0).records()))
+    scans = listener.node.create_publisher(LaserScan, "robot1/scan", 10)
+    readings = listener.node.create_publisher(OdometryMessage, "robot1/base/odom", 10)
+    transforms = listener.node.create_publisher(TFMessage, "robot1/tf", 10)
+
+    def publish():
+        measurement = next(records).measurement
+        # On today's clock, three seconds late.
+        shift = time.time_ns() - 3 * 10**9 - measurement.stamp
+        if isinstance(measurement, Scan):
+            message = conversions.laser_scan(measurement, "laser")
+            message.header.stamp = conversions.time_message(measurement.stamp + shift)
+            scans.publish(message)
+            return
+        stamp = measurement.stamp + shift
+        readings.publish(conversions.odometry_message(Odometry(stamp, measurement.pose), "odom", "base_link"))
+        for pose in (measurement.pose, measurement.pose + 0.1):
+            joint = conversions.transform_message(stamp, "odom", "base_link", pose)
+            transforms.publish(TFMessage(transforms=[joint]))
+
+    status, findings = doctor(
+        2.0, "--ros-args", "-r", "__ns:=/robot1", "-r", "odom:=base/odom", meanwhile=publish
+    )
+    assert status == 1
+    wrong = texts(findings, "wrong")
+    assert any(text.startswith("laser transform: No transform leads from 'base_link' to the scans' frame 'laser'")
+               for text in wrong), wrong  # fmt: skip
+    assert any(text.startswith("two transforms: The transform odom -> base_link was told differ") for text in wrong)
+    doubtful = texts(findings, "doubtful")
+    assert any(text.startswith("stamps against clock: The stamps of scan are 3.0") for text in doubtful), doubtful
+
+
+@pytest.mark.parametrize(
+    "arguments", (("--seconds", "0"), ("--ros-args", "-r", "nonsense"), ("--ros-args", "--nonsense"))
+)
+def test_arguments_that_cannot_be_are_refused(domain, arguments, capsys):
+    assert main(["doctor", "--live", *arguments]) == 2
+    assert capsys.readouterr().err.startswith("hmt_slam doctor: --")
