@@ -26,6 +26,7 @@ from hmt_slam_ros.cli.arguments import OneSentenceParser
 from hmt_slam_ros.errors import HmtSlamError
 
 UNMET, FAULT = 1, 2
+_LEAST_MINUTES = 2.0
 
 MEASUREMENTS = {
     "accuracy": "errors at true relations, torn walls where there is no truth",
@@ -34,6 +35,7 @@ MEASUREMENTS = {
     "choices": "what each choice of the design is worth, one parameter changed at a time",
     "sessions": "whether a log mapped in two sessions is as accurate as in one go",
     "speed": "CPU time, memory, cost of a scan, start",
+    "live": "how late the nodes' poses are, a fast laser, replays at ten times real time",
     "kernels": "CPU time of the inner loops, and that they take no memory",
     "calibration": "whether the probabilities of topological paths are right, on simulated worlds",
     "loops": "precision and recall of loop closures, likewise",
@@ -45,15 +47,18 @@ MEASUREMENTS = {
     "ambiguity": "whether both answers stay alive where places are identical, until the evidence",
     "oracle": "TSBI's PMF against an exact enumeration of all topologies",
     "awakening": "whether a robot that wakes up in a saved map finds out where, and after how many metres",
+    "kidnapping": "whether a robot that is carried while it drives notices, and is right in the end",
     "laps": "whether memory, cost and errors grow where a robot drives over known ground again and again",
+    "changes": "whether a map follows furniture and doors in mode lifelong, and holds nobody who walked by",
     "scale": "time and memory in maps of up to 100,000 areas",
+    "soak": "whether nodes that run for an hour keep their memory and leave nothing behind",
     "short": "for CI, whether accuracy became worse than benchmark/expected.toml beyond noise",
 }
 _GROUPS = {
-    "all": ("accuracy", "steps", "robustness", "choices", "sessions", "speed"),
+    "all": ("accuracy", "steps", "robustness", "choices", "sessions", "speed", "live"),
     "validation": (
         "calibration", "loops", "topology", "consistency", "evidence", "appearance", "ambiguity", "table", "oracle",
-        "awakening", "laps", "scale",
+        "awakening", "kidnapping", "laps", "changes", "scale",
     ),
 }  # fmt: skip
 
@@ -76,7 +81,9 @@ def _measure(options: argparse.Namespace) -> list[Report]:
     runner = Runner(out / "runs", options.jobs)
     changes, seeds = tuple(options.set), tuple(range(options.seeds))
     records = Records(options.runs or out / "runs", options.jobs)
-    settings = Settings(options.logs, seeds, changes, out, options.write_expected, runner, records, options.training)
+    settings = Settings(
+        options.logs, seeds, changes, out, options.write_expected, runner, records, options.training, options.minutes
+    )
     reports = []
     for kind in _kinds(options):
         module = import_module(f"benchmark.{kind}")
@@ -118,7 +125,8 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--seeds", type=_count, default=0, metavar="N", help="seeds 0 to N-1; simulated: from 1000")
     parser.add_argument("--jobs", type=_count, default=2, metavar="N", help="runs at the same time; 1 for speed")
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder of the report")
-    parser.add_argument("--runs", type=Path, metavar="DIR", help="keeps the runs of simulated worlds, to go on from")
+    parser.add_argument("--runs", type=Path, metavar="DIR", help="keeps simulated runs and awakenings, to go on from")
+    parser.add_argument("--minutes", type=_minutes, default=60.0, metavar="M", help="how long soak runs")
     parser.add_argument("--training", action="store_true", help="simulated worlds of seeds 0 to N-1")
     parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help="set one parameter")
     parser.add_argument("--write-expected", action="store_true", help="put what short measures on record")
@@ -128,6 +136,13 @@ def _parser() -> argparse.ArgumentParser:
 
 def _names(text: str) -> tuple[str, ...]:
     return tuple(text.split(","))
+
+
+def _minutes(text: str) -> float:
+    minutes = float(text)
+    if not minutes >= _LEAST_MINUTES:
+        raise argparse.ArgumentTypeError(f"{text} tells nothing of memory: give {_LEAST_MINUTES:g} minutes or more")
+    return minutes
 
 
 def _count(text: str) -> int:

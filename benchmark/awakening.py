@@ -2,33 +2,44 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import math
 import multiprocessing
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass
-from functools import partial
+from dataclasses import asdict, astuple, dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
-from benchmark.logs import BUNDLED, opened
+from benchmark.logs import opened
 from benchmark.report import Report, Requirement, table
+from benchmark.runs import PARAMETERS
 from benchmark.settings import Settings
-from hmt_slam_ros.configuration import Configuration
+from benchmark.simulated.records import code
+from hmt_slam_ros.arrays import Float64
+from hmt_slam_ros.configuration import Configuration, load_configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.logs import LogRecord, open_log
+from hmt_slam_ros.logs.records import SIMULATED
+from hmt_slam_ros.offline.recorder import placed_areas
 from hmt_slam_ros.offline.runtime import Run
 from hmt_slam_ros.offline.saved_map import RunState
-from hmt_slam_ros.processes.messages import Carried
+from hmt_slam_ros.processes.messages import AreaPose, Carried
 from hmt_slam_ros.processes.replica import Replica
+from hmt_slam_ros.processes.slam import MetricSlam
 from hmt_slam_ros.sensing import Scan
 
-LOGS = ("aces", "intel", BUNDLED)
-WORLDS = ("office", "busy", "nested", "grid")
+LOGS = ("aces", "intel")
+WORLDS = ("office", "nested", "grid")
 ALIKE = ("grid",)
 """Worlds whose every place exists several times, so that where it is cannot be known."""
+
+KINDS = ("whole", "first half")
+"""The maps of a log in which the robot wakes up."""
 
 STARTS = 100
 """Places of every log at which the robot wakes up."""
@@ -39,18 +50,26 @@ FAR = 20.0
 SURE = 0.9
 RIGHT_SHARE = 0.95
 
-_RIGHT, _RIGHT_ANGLE = 0.5, math.radians(10.0)
+_RIGHT, _RIGHT_ANGLE = 1.0, math.radians(20.0)
+# m that the robot drives on once it knows its place; steps in which travel is counted, so that noise does not.
+_ON, _STEP = 5.0, 0.1
 # The log's last part is left out: a drive that ends says nothing of 20 m.
 _LAST = 0.05
+# A map holds a place where one of its keyframes was taken so near, m, and a start that much of the way from there, m.
+_HELD, _HELD_WAY = 2.0, 10.0
 _DRAWS = 2008
 
 POLICY = (
-    "The whole log is mapped; then the robot wakes up at keyframes drawn from it and drives on as it did. What it sees "
-    "is in the map already, from the same day; `python -m benchmark sessions` wakes it up where the map knows another "
-    "part of the log. In grid every place exists several times, so that only wrong answers are asked for. "
-    "It says that it knows its place when the hypotheses in which it is not lost have a probability of "
-    f"{SURE:g}; that is right within {_RIGHT:g} m and {math.degrees(_RIGHT_ANGLE):.0f} degrees of where the map has "
-    "this part of the log. A confident wrong answer is one that is off by more at any keyframe after that."
+    "The robot wakes up at scans drawn from a log and drives on as it did, in one of two maps. That of the whole log "
+    "holds the very scans that it sees, which is easy. That of the log's first half, in simulation the first of two "
+    "laps, is of another time: the robot wakes up in the second half, where a keyframe of the first was taken within "
+    f"{_HELD:g} m all along the first {_HELD_WAY:g} m of its way; after that it may leave the map. "
+    "ACES has no such place. "
+    f"It says that it knows its place when the hypotheses in which it is not lost have a probability of {SURE:g}, and "
+    f"drives on for {_ON:g} m then, else {FAR:g} m in all. That is right within {_RIGHT:g} m and "
+    f"{math.degrees(_RIGHT_ANGLE):.0f} degrees of where the run over the whole log has this scan, relative to the "
+    "nearest keyframe of the map. A confident wrong answer is one that is off by more at any time after it was known. "
+    "In grid every place exists several times, so that only wrong answers are asked for."
 )
 
 
@@ -58,104 +77,196 @@ POLICY = (
 class Awakening:
     """What came of one start.
 
+    :ivar start: number of the record.
     :ivar found: m of travel until the robot said that it knows its place; inf where it never did.
     :ivar right: whether it was right at the end of the travel.
     :ivar wrong: whether it was sure of a wrong place at any time.
     """
 
+    start: int
     found: float
     right: bool
     wrong: bool
 
+    @property
+    def good(self) -> bool:
+        """Whether it was right in time."""
+        return self.right and not self.wrong and self.found <= FAR
+
 
 @dataclass(frozen=True, eq=False)
 class Mapped:
-    """A log that was mapped, and what is known of it.
+    """A saved map, and what is known of a drive through it.
 
+    :ivar configuration: of the runs.
     :ivar records: of the log.
-    :ivar state: after the last of them.
-    :ivar truth: {stamp of a keyframe's scan: ``map_T_base`` (3,)}.
-    :ivar areas: {area: ``map_T_area`` (3,)}.
-    :ivar starts: indices of the records that are keyframes' scans.
+    :ivar state: what was saved.
+    :ivar scans: shape (n,), numbers of the records that are scans.
+    :ivar truth: shape (n, 3), ``map_T_base`` of these.
+    :ivar starts: numbers of scans at which the robot may wake up.
     """
 
+    configuration: Configuration
     records: Sequence[LogRecord]
     state: RunState
-    truth: dict[int, NDArray[np.float64]]
-    areas: dict[int, NDArray[np.float64]]
+    scans: NDArray[np.int64]
+    truth: Float64
     starts: Sequence[int]
 
 
 def measure_awakening(settings: Settings) -> Report:
     """Map the logs, and wake up in them."""
     report = Report("awakening", "Waking up in a saved map", seeds=(0,))
+    configuration = load_configuration(PARAMETERS, list(settings.changes))
     names = settings.logs_or((*LOGS, *WORLDS))
     rows = []
     with opened([name for name in names if name not in WORLDS]) as logs:
-        paths: dict[str, Path | str] = {log.name: log.path for log in logs}
-        paths |= {name: f"sim:{name},seed=0" for name in names if name in WORLDS}
-        for name, path in paths.items():
-            found = awakenings(mapped(path), len(settings.seeds_or(STARTS)), settings.runner.jobs)
-            rows.append(_row(name, found))
-            report.data[name] = [asdict(one) for one in found]
-            share = float(np.mean([one.right and one.found <= FAR and not one.wrong for one in found]))
-            if name not in ALIKE:
-                asked = Requirement(f"{name}: right within {FAR:g} m", share, 1.0, least=RIGHT_SHARE)
-                report.requirements.append(asked)
-            wrong = sum(one.wrong for one in found)
-            report.requirements.append(Requirement(f"{name}: confident wrong answers", wrong, 0))
-    columns = ["log", "starts", f"right within {FAR:g} m", "m until known, mean", "median", "wrong", "never known"]
-    report.body += [table(columns, rows), POLICY]
+        paths: dict[str, Path | str] = {name: f"{SIMULATED}{name},laps=2" for name in names if name in WORLDS}
+        paths |= {log.name: log.path for log in logs}
+        count, records = len(settings.seeds_or(STARTS)), settings.records
+        for name in names:
+            kept = Kept(records.folder / f"awakening-{name}-{_known_by(settings.changes)}.json")
+            kept.complete(paths[name], configuration, count, records.jobs)
+            for kind, found in kept.starts(count).items():
+                rows.append(_row(name, kind, found))
+                report.data[f"{name}, {kind}"] = [asdict(one) for one in found]
+                if found:
+                    report.requirements += requirements(f"{name}, map of the {kind}", found, asked=name not in ALIKE)
+    columns = ["log", "map of the", "starts", f"right within {FAR:g} m", "m until known, mean", "median", "most"]
+    report.body += [table([*columns, "wrong", "not known"], rows), POLICY]
     return report
 
 
-def mapped(path: Path | str) -> Mapped:
-    """Map a whole log."""
-    run = Run(Configuration())
+def requirements(name: str, found: Sequence[Awakening], *, asked: bool) -> list[Requirement]:
+    """What is asked for of the starts in one map.
+
+    :param asked: whether the places can be told apart.
+    """
+    wrong = Requirement(f"{name}: confident wrong answers", sum(one.wrong for one in found), 0)
+    share = float(np.mean([one.good for one in found]))
+    right = Requirement(f"{name}: right within {FAR:g} m", share, 1.0, least=RIGHT_SHARE)
+    return [right, wrong] if asked else [wrong]
+
+
+def mapped(path: Path | str, configuration: Configuration) -> dict[str, Mapped]:
+    """The maps of a whole log and of its first half, {how it is called: that}."""
     records = list(open_log(path).records())
+    scans = np.array([n for n, record in enumerate(records) if isinstance(record.measurement, Scan)])
+    middle, last = len(scans) // 2, int((1.0 - _LAST) * len(scans))
+    half = _read(Run(configuration), records[: scans[middle]]).state
+    run = _read(Run(configuration, state=half), records[scans[middle] :])
+    whole, result = run.state, run.finish()
+    truth = result.recorder.finish(result.log.stamps).trajectory
+    numbers = {records[scan].measurement.stamp: n for n, scan in enumerate(scans)}
+    placed = {numbers[stamp]: pose for stamp, pose in _keyframes(half).items()}
+    known, poses = np.array(list(placed)), np.array(list(placed.values()))
+    away, nearest = cKDTree(truth[known, :2]).query(truth[:, :2])
+    in_half = se2.compose(poses[nearest], se2.between(truth[known[nearest]], truth))
+    travel = np.array(list(_travelled(truth)))
+    ends = np.searchsorted(travel, travel + _HELD_WAY)
+    held = [n for n in range(middle, last) if (away[n : ends[n]] <= _HELD).all()]
+    easy = Mapped(configuration, records, whole, scans, truth, range(last))
+    return dict(zip(KINDS, (easy, Mapped(configuration, records, half, scans, in_half, held)), strict=True))
+
+
+def _read(run: Run, records: Sequence[LogRecord]) -> Run:
     for record in records:
         run.read(record)
-    state, areas = run.state, _area_poses(run, {})
+    return run
+
+
+def _keyframes(state: RunState) -> dict[int, Float64]:
+    """{stamp of a keyframe's scan: ``map_T_base`` (3,)} of the most probable map."""
     replica = Replica.of(state.tsbi.replica)
     hybrid_map = replica.maps[replica.best]
-    truth = {
-        replica.scans[keyframe].stamp: se2.compose(areas[area], pose)
+    areas = placed_areas(hybrid_map, state.recorder.global_poses)
+    return {
+        replica.scans[keyframe].stamp: se2.compose(areas[area].mean, pose)
         for area in hybrid_map.area_ids()
         for keyframe, pose in hybrid_map.keyframes(area).items()
     }
-    scans = [n for n, record in enumerate(records) if isinstance(record.measurement, Scan)]
-    starts = [n for n in scans[: int((1.0 - _LAST) * len(scans))] if records[n].measurement.stamp in truth]
-    return Mapped(records, state, truth, areas, starts)
 
 
-def awakenings(log: Mapped, count: int, jobs: int) -> list[Awakening]:
-    """Wake up at ``count`` places of a log."""
-    drawn = np.random.default_rng(_DRAWS).choice(len(log.starts), count)
-    # Forked, so that none has to load the map.
-    with ProcessPoolExecutor(jobs, multiprocessing.get_context("fork")) as pool:
-        return list(pool.map(partial(awakened, log), [log.starts[n] for n in drawn]))
+def _travelled(poses: Float64) -> Iterator[float]:
+    """Length of the path up to each pose, shape (n, 3), m."""
+    total, last = 0.0, poses[0]
+    for pose in poses:
+        step = math.hypot(*(pose - last)[:2])
+        if step >= _STEP:
+            total, last = total + step, pose
+        yield total
+
+
+class Kept:
+    """The starts of a log that were made, in a file, so that a measurement that was stopped goes on from there.
+
+    :ivar file: of lines, each with a start and the map in which it was.
+    """
+
+    def __init__(self, file: Path) -> None:
+        self.file = file
+
+    def starts(self, count: int) -> dict[str, list[Awakening]]:
+        """The first ``count`` starts in each map, as many as there are."""
+        lines = self.file.read_text(encoding="utf-8").splitlines() if self.file.is_file() else []
+        rows = [json.loads(line) for line in lines]
+        return {kind: [Awakening(*row[1:]) for row in rows if row[0] == kind][:count] for kind in KINDS}
+
+    def complete(self, path: Path | str, configuration: Configuration, count: int, jobs: int) -> None:
+        """Make the starts that are not there of the first ``count`` in each map."""
+        made = {kind: len(found) for kind, found in self.starts(count).items()}
+        if min(made.values()) >= count:
+            return
+        self.file.parent.mkdir(parents=True, exist_ok=True)
+        for kind, log in mapped(path, configuration).items():
+            drawn = np.random.default_rng(_DRAWS).integers(0, max(1, len(log.starts)), count).tolist()
+            starts = [log.starts[n] for n in drawn if log.starts]
+            # Forked with the map, so that none has to load it.
+            with ProcessPoolExecutor(jobs, multiprocessing.get_context("fork"), _begin, (log,)) as pool:
+                for found in pool.map(_awakened, starts[made[kind] :]):
+                    with self.file.open("a", encoding="utf-8") as target:
+                        target.write(json.dumps([kind, *astuple(found)]) + "\n")
+
+
+def _known_by(changes: Sequence[str]) -> str:
+    """What the starts of this code, with parameters that differ, are known by."""
+    own = hashlib.sha256("\n".join([code(), *changes]).encode() + Path(__file__).read_bytes())
+    return own.hexdigest()[:16]
+
+
+_LOG: list[Mapped] = []
+
+
+def _begin(log: Mapped) -> None:
+    _LOG.append(log)
+
+
+def _awakened(start: int) -> Awakening:
+    return awakened(_LOG[-1], start)
 
 
 def awakened(log: Mapped, start: int) -> Awakening:
-    """Wake up at a record of a log, and drive on from there."""
-    run = Run(Configuration(), state=log.state)
+    """Wake up at a scan of a drive, and go on from there."""
+    run = Run(log.configuration, state=log.state)
     run.lock_step.feed(Carried())
-    travelled, found, right, wrong = 0.0, math.inf, False, False
-    last: NDArray[np.float64] | None = None
-    for record in log.records[start:]:
+    found, right, wrong = math.inf, False, False
+    travel, first = _travelled(log.truth[start:]), int(log.scans[start])
+    counted, n = -_STEP, start
+    for record in log.records[first:]:
         run.read(record)
-        true = log.truth.get(record.measurement.stamp) if isinstance(record.measurement, Scan) else None
-        if true is None:
+        if not isinstance(record.measurement, Scan):
             continue
-        travelled += 0.0 if last is None else math.hypot(*(true - last)[:2])
-        last = true
-        if _known(run):
-            found = min(found, travelled)
-            right = _is_right(run, log.areas, true)
-            wrong |= not right
-        if travelled >= FAR:
+        travelled, true = next(travel), log.truth[n]
+        n += 1
+        if travelled < counted + _STEP:
+            continue
+        counted = travelled
+        now = _is_right(run, log.state.recorder.global_poses, true) if _known(run) else None
+        if now is not None:
+            found, right, wrong = min(found, travelled), now, wrong or not now
+        if travelled >= min(FAR, found + _ON):
             break
-    return Awakening(found, right, wrong)
+    return Awakening(start, found, right, wrong)
 
 
 def _known(run: Run) -> bool:
@@ -166,32 +277,27 @@ def _known(run: Run) -> bool:
     return sum(leaf.probability for leaf in told[max(told)].leaves if not leaf.lost) >= SURE
 
 
-def _is_right(run: Run, before: dict[int, NDArray[np.float64]], true: NDArray[np.float64]) -> bool:
-    """Whether the last estimate is near the truth.
+def _is_right(run: Run, before: Sequence[AreaPose], true: Float64) -> bool | None:
+    """Whether the last estimate is near the truth; None where its area became part of another since.
 
     :param before: where the areas of the map were.
     :param true: ``map_T_base``, shape (3,).
     """
-    last = run.recorder.last
-    area = None if last is None else _area_poses(run, before).get(last.area)
-    if last is None or area is None:
-        return False
-    away = se2.between(true, se2.compose(area, last.pose.mean))
+    slam, last = run.lock_step.processes["slam"], run.recorder.last
+    assert isinstance(slam, MetricSlam)
+    assert last is not None
+    told = run.recorder.accepted
+    given = next((told[n].global_poses for n in sorted(told, reverse=True) if told[n].global_poses), before)
+    area = placed_areas(slam.replica.maps[slam.replica.best], given).get(last.area)
+    if area is None:
+        return None
+    away = se2.between(true, se2.compose(area.mean, last.pose.mean))
     return bool(math.hypot(away[0], away[1]) <= _RIGHT and abs(away[2]) <= _RIGHT_ANGLE)
 
 
-def _area_poses(run: Run, before: dict[int, NDArray[np.float64]]) -> dict[int, NDArray[np.float64]]:
-    """{area: ``map_T_area`` (3,)} as TLCA told last, or before the run."""
-    told = run.recorder.accepted
-    for sequence in sorted(told, reverse=True):
-        if told[sequence].global_poses:
-            return {entry.area: entry.pose.mean for entry in told[sequence].global_poses}
-    return before
-
-
-def _row(name: str, found: Sequence[Awakening]) -> list[str]:
+def _row(name: str, kind: str, found: Sequence[Awakening]) -> list[str]:
     known = [one.found for one in found if one.right]
-    share = np.mean([one.right and one.found <= FAR and not one.wrong for one in found])
-    mean, median = (f"{of(known):.1f}" if known else "-" for of in (np.mean, np.median))
+    share = f"{np.mean([one.good for one in found]):.2f}" if found else "-"
+    figures = (f"{of(known):.1f}" if known else "-" for of in (np.mean, np.median, max))
     wrong, never = sum(one.wrong for one in found), sum(math.isinf(one.found) for one in found)
-    return [name, str(len(found)), f"{share:.2f}", mean, median, str(wrong), str(never)]
+    return [name, kind, str(len(found)), share, *figures, str(wrong), str(never)]

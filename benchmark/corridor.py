@@ -136,7 +136,7 @@ def _take(live: LiveHypothesis, motion: MotionModel, number: int, scan: Scan, po
     if number:
         tracked = live.filter.track(points, prediction)
         motion.observe(tracked.moved, tracked.information, tracked.contradicted)
-    if not number or live.event_due():
+    if not number or live.event_due(points):
         live.event(number, scan, points, arriving=number == 0)
         motion.keyframe(live.moved, live.information)
 

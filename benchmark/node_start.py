@@ -3,35 +3,21 @@
 from __future__ import annotations
 
 import os
-import signal
 import subprocess
-import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
 from rcl_interfaces.srv import ListParameters
-from rclpy.context import Context
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
 from std_msgs.msg import String
 
-from benchmark.logs import BUNDLED, ROOT, opened
-from hmt_slam_ros.errors import HmtSlamError
+from benchmark.logs import BUNDLED, opened
+from benchmark.running_nodes import Listener, Parameters
 from hmt_slam_ros.nodes import qos
-from hmt_slam_ros.nodes.domain import own_domain
 from hmt_slam_ros.nodes.topics import DOCUMENTS
 from hmt_slam_ros.processes.messages import LocalEstimate
 
 NODES = ("slam", "aam", "tsbi", "tlca", "rtl", "robot")
-
-_Parameters = Mapping[str, str | float | list[float]]
-
-_PATIENCE = 120.0  # s
-_SPIN = 0.005  # s
-
 
 class Start(NamedTuple):
     """What a start takes: seconds on the wall, and of CPU time, which other programs of the machine do not change."""
@@ -42,7 +28,7 @@ class Start(NamedTuple):
 
 def until_answer(name: str) -> Start:
     """From the start of a node's process until it answers a service call, as it does once it spins."""
-    with _Listener() as listener, opened([BUNDLED]) as (log,):
+    with Listener() as listener, opened([BUNDLED]) as (log,):
         client = listener.node.create_client(ListParameters, f"{name}/list_parameters")
         begin = time.monotonic()
         with listener.running(name, _waiting(log.path) if name == "robot" else {}) as process:
@@ -54,7 +40,7 @@ def until_answer(name: str) -> Start:
 
 def until_first_pose() -> Start:
     """From the start of metric SLAM until it has placed the first scan, with scans waiting for it."""
-    with _Listener() as listener, opened([BUNDLED]) as (log,):
+    with Listener() as listener, opened([BUNDLED]) as (log,):
         heard: list[String] = []
         listener.node.create_subscription(String, DOCUMENTS[LocalEstimate], heard.append, qos.CHAIN)
         robot = listener.node.create_client(ListParameters, "robot/list_parameters")
@@ -66,7 +52,7 @@ def until_first_pose() -> Start:
                 return Start(time.monotonic() - begin, _cpu_seconds(process))
 
 
-def _waiting(log: Path) -> _Parameters:
+def _waiting(log: Path) -> Parameters:
     """Parameters of a robot that waits for whoever listens."""
     return {"log": str(log), "robot.patience": 3600.0, "robot.rate": 0.0}
 
@@ -76,59 +62,3 @@ def _cpu_seconds(process: subprocess.Popen[bytes]) -> float:
     line = Path(f"/proc/{process.pid}/stat").read_text(encoding="utf-8")
     # Fields 14 and 15; the second, in parentheses, may hold spaces.
     return sum(map(int, line.rpartition(")")[2].split()[11:13])) / os.sysconf("SC_CLK_TCK")
-
-
-class _Listener:
-    """A node in a domain of its own, and the processes that it waits for.
-
-    :ivar node: the node.
-    """
-
-    node: Node
-
-    def __enter__(self) -> _Listener:
-        os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-        with ExitStack() as stack:
-            self._domain = stack.enter_context(own_domain())
-            context = Context()
-            context.init(domain_id=self._domain)
-            stack.callback(context.try_shutdown)
-            self.node = Node("stopwatch", context=context)
-            stack.callback(self.node.destroy_node)
-            self._executor = SingleThreadedExecutor(context=context)
-            stack.callback(self._executor.shutdown)
-            self._executor.add_node(self.node)
-            self._stack = stack.pop_all()
-        return self
-
-    def __exit__(self, *_fault: object) -> None:
-        self._stack.close()
-
-    def until(self, condition: Callable[[], bool]) -> None:
-        """Spin until a condition holds.
-
-        :raises HmtSlamError: where it does not for long.
-        """
-        deadline = time.monotonic() + _PATIENCE
-        while not condition():
-            if time.monotonic() > deadline:
-                raise HmtSlamError(f"a node did not answer within {_PATIENCE:g} s: see whether scripts/demo.sh runs")
-            self._executor.spin_once(timeout_sec=_SPIN)
-
-    @contextmanager
-    def running(self, name: str, parameters: _Parameters) -> Iterator[subprocess.Popen[bytes]]:
-        """A node as a process of its own, which ends with the context."""
-        words = [word for key, value in parameters.items() for word in ("-p", f"{key}:={value}")]
-        process = subprocess.Popen(
-            [sys.executable, "-m", f"hmt_slam_ros.nodes.{name}_node", "--ros-args", *words],
-            cwd=ROOT,
-            env=os.environ | {"ROS_DOMAIN_ID": str(self._domain)},
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-        )
-        try:
-            yield process
-        finally:
-            process.send_signal(signal.SIGINT)
-            process.wait(_PATIENCE)

@@ -21,6 +21,7 @@ class Settings:
     :ivar runner: runs what is asked for, each case once for all measurements.
     :ivar records: the same for simulated worlds.
     :ivar training: whether those are the worlds of the training seeds.
+    :ivar minutes: how long the nodes run in soak.
     """
 
     logs: tuple[str, ...]
@@ -31,6 +32,7 @@ class Settings:
     runner: Runner
     records: Records
     training: bool = False
+    minutes: float = 60.0
 
     def logs_or(self, names: tuple[str, ...]) -> tuple[str, ...]:
         """The logs asked for, or those of the measurement."""

@@ -1,0 +1,304 @@
+"""A world that changes between visits: what of it gets into the map in mode lifelong, what stays, and who walked by."""
+
+from __future__ import annotations
+
+import multiprocessing
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmark.report import Report, Requirement, table
+from benchmark.settings import Settings
+from benchmark.surfaces import Surfaces, judged, unexplained
+from hmt_slam_ros.configuration import Configuration
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.logs.records import Log, LogRecord
+from hmt_slam_ros.logs.stamps import NANOSECONDS
+from hmt_slam_ros.offline.corrected_scans import corrected_scans
+from hmt_slam_ros.offline.final_map import final_map
+from hmt_slam_ros.offline.map_image import OccupancyImage, occupancy_image
+from hmt_slam_ros.offline.recorder import Recording, keyframe_poses
+from hmt_slam_ros.offline.runtime import Run
+from hmt_slam_ros.offline.saved_map import RunState
+from hmt_slam_ros.processes.messages import Carried, Place
+from hmt_slam_ros.processes.replica import Replica
+from hmt_slam_ros.sensing import Odometry
+from hmt_slam_ros.simulation import SimulatedLog, open_simulated
+
+WORLDS = {"quiet": "office", "people": "busy"}
+"""The same buildings without and with people in the corridors."""
+
+SEEDS, FIRST_SEED, RETURNS = 3, 1000, 3
+"""Buildings of each world, the first of them, and returns to one in which nothing changes."""
+
+SIZE, RATE = 0.7, 3.0
+"""Of the buildings, as a factor on lengths, and scans a second: a visit takes seconds then."""
+
+RECALL, GHOSTS, NOBODY, ERROR, GROWTH = 0.8, 0.1, 0.002, 0.1, 0.05
+"""Least share of what is new, largest shares of what is gone and of what nothing explains, m, growth of the map."""
+
+POLICY = (
+    "Every building is mapped at one visit, of two laps, and visited again in mode `lifelong`, from the saved map; "
+    "before each of the two visits, half of the furniture was moved and half of the doors that are not on the way were "
+    "closed, so that between them doors were opened too. Without people the robot is told about where it begins, as by "
+    "`initialpose`; with people it stayed where it was and turned round, since among people it is often not "
+    "recognized. A surface counts if three of every fourth scan of the second visit had a free view of it within 8 m. "
+    "New is what was 0.2 m and more from any surface of the "
+    "first visit; it is in the map where a cell within 0.1 m is occupied. Gone is what was in the map of the first "
+    "visit, is as far from any surface of the second one, and was in free view of as many scans: it is a ghost where a "
+    "cell within 0.1 m is still occupied. Cells that are 0.2 m from every true surface of the last visit are "
+    "unexplained, but for what is gone and could not be seen to be. Errors are those of the second visit's final "
+    f"trajectory in the map of the first. The growth is that of keyframes from the second to visit {RETURNS + 1} "
+    "of a building in which nothing changes. In `localization` every keyframe, pose, scan and arc has to be the same "
+    "bit for bit afterwards."
+)
+
+
+# ns between two visits.
+_PAUSE = 2 * NANOSECONDS
+# As certain as a pose that is drawn in RViz.
+_POINTED_AT = np.diag([0.5, 0.5, np.radians(15.0)]) ** 2
+
+
+@dataclass(frozen=True)
+class Visit:
+    """What came of a building that was visited twice.
+
+    :ivar new: share of the new surfaces that is in the map.
+    :ivar gone: share of those that are gone that still is.
+    :ivar before: occupied cells that nothing explains after the first visit, as a share of all.
+    :ivar after: likewise after the second.
+    :ivar error: of the second visit's poses, mean, m.
+    :ivar worst: largest of them, m.
+    :ivar keyframes: of the map after each of the two.
+    :ivar metres: of new surface, and of surface that is gone, at 0.05 m each.
+    """
+
+    new: float
+    gone: float
+    before: float
+    after: float
+    error: float
+    worst: float
+    keyframes: tuple[int, int]
+    metres: tuple[float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class Mapped:
+    """A building after a visit.
+
+    :ivar recording: the map at its best.
+    :ivar state: from which a run goes on.
+    :ivar image: of the map.
+    """
+
+    recording: Recording
+    state: RunState
+    image: OccupancyImage
+
+    @property
+    def keyframes(self) -> int:
+        """Of the map."""
+        hybrid_map = self.recording.hybrid_map
+        return sum(len(hybrid_map.keyframes(area)) for area in hybrid_map.area_ids())
+
+
+class OneDrive:
+    """Visits of a robot that stays where it is in between, and turns to where it begins.
+
+    :ivar name: of the first visit.
+    :ivar scan_count: of all.
+    :ivar duration: of all, s.
+    """
+
+    def __init__(self, visits: Sequence[SimulatedLog]) -> None:
+        self._visits = visits
+        self.name = visits[0].name
+        self.scan_count = sum(log.scan_count for log in visits)
+        self.duration = sum(log.duration for log in visits)
+
+    def records(self) -> Iterator[LogRecord]:
+        """Those of all visits on one clock, the odometry without a jump."""
+        stamp, odometry = 0, np.zeros(3)
+        truth: NDArray[np.float64] | None = None
+        for log in self._visits:
+            records = list(log.records())
+            shift = stamp + _PAUSE - records[0].measurement.stamp if stamp else 0
+            assert records[0].truth is not None
+            turn = np.zeros(3) if truth is None else se2.between(truth, records[0].truth)
+            first = next(r.measurement for r in records if isinstance(r.measurement, Odometry)).pose
+            begin = first if truth is None else se2.compose(odometry, turn)
+            for record in records:
+                measurement = replace(record.measurement, stamp=record.measurement.stamp + shift)
+                if isinstance(measurement, Odometry):
+                    odometry = se2.compose(begin, se2.between(first, measurement.pose))
+                    measurement = replace(measurement, pose=odometry)
+                yield LogRecord(record.source_stamp + shift, measurement, record.truth)
+            stamp, truth = records[-1].measurement.stamp + shift, records[-1].truth
+
+
+def measure_changes(settings: Settings) -> Report:
+    """Visit the buildings."""
+    seeds = tuple(FIRST_SEED + seed for seed in settings.seeds_or(SEEDS))
+    report = Report("changes", "A world that changes", seeds=seeds)
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(settings.runner.jobs, context) as pool:
+        visits = {name: list(pool.map(partial(visited_twice, world), seeds)) for name, world in WORLDS.items()}
+        sizes = {name: pool.submit(visited_often, world, seeds[0]) for name, world in WORLDS.items()}
+        kept = {name: pool.submit(unchanged_by_localization, world, seeds[0]) for name, world in WORLDS.items()}
+    rows = []
+    for name, found in visits.items():
+        grown, same = sizes[name].result(), kept[name].result()
+        report.requirements += requirements(name, found, grown, same=same)
+        report.data[name] = {"visits": [asdict(one) for one in found], "keyframes": grown, "localization": same}
+        rows += [_row(f"{name}, {seed}", one) for seed, one in zip(seeds, found, strict=True)]
+        report.body.append(f"{name}, nothing changes: {', '.join(map(str, grown))} keyframes after the visits.")
+    head = ["world, seed", "new [m]", "in the map", "gone [m]", "ghosts", "unexplained before", "after"]
+    report.body = [table([*head, "error [m]", "worst [m]", "keyframes"], rows), *report.body, POLICY]
+    return report
+
+
+def requirements(name: str, found: Sequence[Visit], sizes: Sequence[int], *, same: bool) -> list[Requirement]:
+    """What is asked for of a world.
+
+    :param sizes: keyframes after each visit in which nothing changed.
+    :param same: whether localization left the map as it was.
+    """
+
+    def mean(values: Sequence[float]) -> float:
+        return float(np.mean(values))
+
+    return [
+        Requirement(f"{name}: new surfaces in the map", mean([one.new for one in found]), 1.0, least=RECALL),
+        Requirement(f"{name}: ghosts of what is gone", mean([one.gone for one in found]), GHOSTS),
+        Requirement(f"{name}: unexplained cells, mapping", mean([one.before for one in found]), NOBODY),
+        Requirement(f"{name}: unexplained cells, lifelong", mean([one.after for one in found]), NOBODY),
+        Requirement(f"{name}: worst error of the second visit", max(one.worst for one in found), ERROR, "m"),
+        Requirement(f"{name}: growth where nothing changes", sizes[-1] / sizes[1] - 1.0, GROWTH),
+        Requirement(f"{name}: maps that localization changed", float(not same), 0.0),
+    ]
+
+
+def visited_twice(world: str, seed: int, size: float = SIZE, rate: float = RATE) -> Visit:
+    """Map a building, let it change, and visit it again.
+
+    :param size: of the building.
+    :param rate: scans a second.
+    """
+    logs = [_visit(world, seed, number, changed=0.5, size=size, rate=rate) for number in (1, 2)]
+    first = mapped(logs[:1], "mapping")
+    second = mapped(logs, "lifelong", first)
+    surfaces = [Surfaces.of(log) for log in logs]
+    frames = [_frame(one.recording, logs[0]) for one in (first, second)]
+    images = [one.image for one in (first, second)]
+    judgement = judged(images, frames, surfaces)
+    recording = second.recording
+    poses = se2.compose(frames[1], recording.trajectory[-logs[1].scan_count :])
+    errors = np.hypot(*(poses - logs[1].true_poses(logs[1].scenario.scan_stamps))[:, :2].T)
+    return Visit(
+        judgement.new, judgement.gone, unexplained(images[0], frames[0], surfaces[0].walls),
+        unexplained(images[1], frames[1], np.concatenate((surfaces[1].walls, judgement.hidden))),
+        float(errors.mean()), float(errors.max()), (first.keyframes, second.keyframes), judgement.metres,
+    )  # fmt: skip
+
+
+def visited_often(world: str, seed: int, size: float = SIZE, rate: float = RATE, returns: int = RETURNS) -> list[int]:
+    """Keyframes of a building's map after each visit, where nothing changes."""
+    found: list[int] = []
+    logs: list[SimulatedLog] = []
+    after: Mapped | None = None
+    for number in range(1, returns + 2):
+        logs.append(_visit(world, seed, number, changed=0.0, size=size, rate=rate))
+        after = mapped(logs, "mapping" if after is None else "lifelong", after)
+        found.append(after.keyframes)
+    return found
+
+
+def unchanged_by_localization(world: str, seed: int, size: float = SIZE, rate: float = RATE) -> bool:
+    """Whether a second visit in mode localization leaves the map as it was, in a world that changes."""
+    logs = [_visit(world, seed, number, changed=0.5, size=size, rate=rate) for number in (1, 2)]
+    first = mapped(logs[:1], "mapping")
+    second = mapped(logs, "localization", first)
+    return _same(first.state, second.state)
+
+
+def mapped(visits: Sequence[SimulatedLog], mode: str, before: Mapped | None = None) -> Mapped:
+    """The map after the last of some visits.
+
+    :param before: after the one before it.
+    """
+    stays = visits[0].scenario.settings.people > 0
+    log: Log = OneDrive(visits) if stays else visits[-1]
+    configuration = replace(Configuration(), mode=mode)
+    run = Run(configuration, state=None if before is None else before.state)
+    records = run.unread(log)
+    if before is not None and not stays:
+        run.lock_step.feed(Carried(_begin(before.recording)))
+    for record in records:
+        run.read(record)
+    state = run.state
+    result = run.finish()
+    recording = result.recorder.finish(result.log.stamps, result.log.first_scans)
+    recording = final_map(recording, corrected_scans(log, configuration), configuration).recording
+    placed = keyframe_poses(recording.hybrid_map, recording.area_poses)
+    scans, settings = [recording.replica.scans[k] for k in placed], configuration.local_map
+    image = occupancy_image(scans, np.array(list(placed.values())), settings.cell, settings.max_range)
+    return Mapped(recording, state, image)
+
+
+def _begin(recording: Recording) -> Place:
+    """Where every visit begins, which is the origin of the map, as somebody says who points at it."""
+    placed = keyframe_poses(recording.hybrid_map, recording.area_poses)
+    nearest = min(placed, key=lambda keyframe: float(np.hypot(*placed[keyframe][:2])))
+    area = next(a for a in recording.hybrid_map.area_ids() if nearest in recording.hybrid_map.keyframes(a))
+    pose = se2.inverse(recording.area_poses[area].mean)
+    return Place(area, PoseGaussian(pose, _POINTED_AT))
+
+
+def _visit(world: str, seed: int, number: int, *, changed: float, size: float, rate: float) -> SimulatedLog:
+    # The first has two laps, so that its loop is closed; things are moved between visits alone, so that each has one
+    # truth.
+    return open_simulated(
+        f"sim:{world},seed={seed},laps={2 if number == 1 else 1},moved=0,visit={number},changed={changed:g},"
+        f"size={size:g},rate={rate:g}"
+    )
+
+
+def _frame(recording: Recording, first: SimulatedLog) -> NDArray[np.float64]:
+    """``world_T_map``, shape (3,), by all poses of the first visit."""
+    truth = first.true_poses(first.scenario.scan_stamps)
+    poses = recording.trajectory[: len(truth)]
+    turn = np.angle(np.exp(1j * (truth[:, 2] - poses[:, 2])).mean())
+    turned = se2.transform(np.array([0.0, 0.0, turn]), poses[:, :2])
+    return np.array([*(truth[:, :2] - turned).mean(axis=0), turn])
+
+
+def _same(before: RunState, after: RunState) -> bool:
+    """Whether the best map of a state is in another one as it was."""
+    one, other = Replica.of(before.slam.replica), Replica.of(after.slam.replica)
+    known, now = one.maps[one.best], other.maps[other.best]
+    areas = known.area_ids()
+    arcs = {(a, b): arc for a, b, arc in now.all_arcs()}
+    return (
+        all(_equal(known.keyframes(area), now.keyframes(area)) for area in areas)
+        and all(_equal({0: arc.pose.mean}, {0: arcs[a, b].pose.mean}) for a, b, arc in known.all_arcs())
+        and all(one.scans[k] is other.scans[k] for area in areas for k in known.keyframes(area))
+    )
+
+
+def _equal(one: Mapping[int, NDArray[np.float64]], other: Mapping[int, NDArray[np.float64]]) -> bool:
+    return one.keys() == other.keys() and all((one[k] == other[k]).all() for k in one)
+
+
+def _row(name: str, one: Visit) -> list[str]:
+    shares = [f"{100.0 * one.gone:.0f} %", f"{100.0 * one.before:.2f} %", f"{100.0 * one.after:.2f} %"]
+    return [
+        name, f"{one.metres[0]:.0f}", f"{100.0 * one.new:.0f} %", f"{one.metres[1]:.0f}", *shares,
+        f"{one.error:.3f}", f"{one.worst:.3f}", f"{one.keyframes[0]}, {one.keyframes[1]}",
+    ]  # fmt: skip

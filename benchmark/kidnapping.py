@@ -1,0 +1,321 @@
+"""A robot is carried elsewhere while it drives, and nobody says so: when does it notice, and is it right in the end?"""
+
+from __future__ import annotations
+
+import math
+import multiprocessing
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmark.logs import opened
+from benchmark.report import Report, Requirement, table
+from benchmark.settings import Settings
+from hmt_slam_ros.configuration import Configuration
+from hmt_slam_ros.evaluation import StampedPoses, evaluate_relations, true_relations
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.logs import open_log
+from hmt_slam_ros.logs.records import SIMULATED
+from hmt_slam_ros.offline.runtime import Run
+from hmt_slam_ros.processes.slam import MetricSlam
+from hmt_slam_ros.sensing import Scan
+
+WORLDS = ("office", "busy", "nested", "hall", "ring")
+LOGS = ("aces", "intel")
+ALIKE = ("hall", "ring")
+"""Worlds in which a robot may see the same where it is put as where it would be, or nothing."""
+
+KINDS = ("known", "unknown", "short")
+SEEDS = 10
+
+SOON, SHARE = 5.0, 0.95
+"""m of travel within which it is to be noticed, and in what share of the cases."""
+
+SURE, DOUBT = 0.9, 0.1
+"""Probability of its place from which on a robot is sure, and that of being lost up to which it says that it knows."""
+
+_RIGHT, _RIGHT_ANGLE, _DRIFT = 0.5, math.radians(10.0), 0.03
+_DRAWS = 2009
+_JUMP = 0.6  # m and rad, in the time between two scans
+_STEP = 2.5  # m, that a robot is carried which is only turned and put aside
+# Part of the drive after which the robot is carried, and from which it goes on.
+_AT = {"known": (0.55, 0.7), "unknown": (0.15, 0.25), "short": (0.2, 0.7)}
+_TO = {"known": (0.72, 0.85), "unknown": (0.3, 0.4)}
+
+POLICY = (
+    "Two rounds of each world. The robot is carried once, its odometry says nothing of it, and it is put down turned "
+    "by up to 180 degrees: in the second round to another part of it (known), in the first one to ground that it has "
+    f"not seen (unknown), or {_STEP:g} m farther on its way (short). It has noticed where it says "
+    "that it does not know its place, or is right. It is sure where hypotheses in which it is not lost have a "
+    f"probability of {SURE:g}, and right "
+    f"within {_RIGHT:g} m and {math.degrees(_RIGHT_ANGLE):.0f} degrees of where the map has the nearest keyframe of "
+    f"before, {100 * _DRIFT:g} % of the distance to that added. Errors are those of metric SLAM's trajectory at "
+    "relations within what was driven before and after. False alarms are metres on which a robot that nobody "
+    "carried says that it does not know its place. In hall and ring it may see the same where it is put, or nothing."
+)
+
+
+@dataclass(frozen=True)
+class Kidnapping:
+    """What came of one drive.
+
+    :ivar noticed: m of travel until the robot was not sure of its place, or right again; inf where it never was.
+    :ivar again: m of travel until it was sure of the right place and stayed so; inf where it never was.
+    :ivar confident: m of travel on which it was sure of a wrong place, after it was noticed.
+    :ivar wrong: whether it was so at the end.
+    :ivar errors: mean error of translation at the relations of what was driven before and after, m.
+    :ivar driven: m, after.
+    """
+
+    noticed: float
+    again: float
+    confident: float
+    wrong: bool
+    errors: tuple[float, float]
+    driven: float
+
+
+def drawn(world: str, kind: str, seed: int) -> str:
+    """The name of a simulated drive in which the robot is carried."""
+    random = np.random.Generator(np.random.Philox(key=[_DRAWS + seed, KINDS.index(kind)]))
+    at, turned = random.uniform(*_AT[kind]), random.uniform(-180.0, 180.0)
+    name = f"{SIMULATED}{world},seed={seed},laps=2"
+    if kind == "short":
+        log = open_log(name)
+        truth = np.array([record.truth for record in log.records()])
+        gone = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(truth[:, :2], axis=0).T))))
+        after = np.searchsorted(gone, gone[int(at * len(gone))] + _STEP)
+        to = float(after) / len(gone)
+    else:
+        to = random.uniform(*_TO[kind])
+    return f"{name},carried={at:.4f},to={to:.4f},turned={turned:.1f}"
+
+
+class Heard(NamedTuple):
+    """What a robot said of its place at a keyframe event.
+
+    :ivar travelled: m, since it was carried.
+    :ivar localized: whether it says that it knows its place.
+    :ivar sure: whether it is sure of it.
+    :ivar right: whether its estimate is right.
+    """
+
+    travelled: float
+    localized: bool
+    sure: bool
+    right: bool
+
+
+class Watched:
+    """A run, and what it says of the robot's place.
+
+    :ivar run: the five processes.
+    :ivar true: {keyframe event: ``world_T_base`` (3,)}.
+    :ivar carried: the first keyframe event after the robot was carried, -1 before.
+    """
+
+    def __init__(self) -> None:
+        self.run = Run(Configuration())
+        self.true: dict[int, NDArray[np.float64]] = {}
+        self.carried = -1
+
+    @property
+    def events(self) -> int:
+        """Keyframe events so far."""
+        return len(self.run.recorder.keyframes)
+
+    def lost(self) -> float:
+        """Probability that the robot may be anywhere."""
+        told = self.run.recorder.hypotheses
+        return sum(leaf.probability for leaf in told[max(told)].leaves if leaf.lost)
+
+    def sure(self) -> bool:
+        """Whether the robot is sure of its place."""
+        told = self.run.recorder.hypotheses
+        return sum(leaf.probability for leaf in told[max(told)].leaves if not leaf.lost) >= SURE
+
+    def right(self, true: NDArray[np.float64]) -> bool:
+        """Whether the last estimate is where the map of before has the robot.
+
+        :param true: ``world_T_base``, shape (3,).
+        """
+        slam, last = self.run.lock_step.processes["slam"], self.run.recorder.last
+        assert isinstance(slam, MetricSlam)
+        hybrid_map, areas = slam.replica.maps[slam.replica.best], self._areas()
+        if last is None or last.area not in areas:
+            return False
+        placed = {
+            keyframe: se2.compose(areas[area], pose)
+            for area in hybrid_map.area_ids()
+            for keyframe, pose in hybrid_map.keyframes(area).items()
+            if keyframe < self.carried and area in areas
+        }
+        away = {k: math.hypot(*(self.true[k] - true)[:2]) for k in placed}
+        nearest = min(away, key=lambda k: away[k])
+        expected = se2.compose(placed[nearest], se2.between(self.true[nearest], true))
+        off = se2.between(expected, se2.compose(areas[last.area], last.pose.mean))
+        near = math.hypot(off[0], off[1]) <= _RIGHT + _DRIFT * away[nearest]
+        return bool(near and abs(off[2]) <= _RIGHT_ANGLE)
+
+    def _areas(self) -> dict[int, NDArray[np.float64]]:
+        """{area: ``map_T_area``, shape (3,)} as TLCA told last."""
+        told = self.run.recorder.accepted
+        for sequence in sorted(told, reverse=True):
+            if told[sequence].global_poses:
+                return {entry.area: entry.pose.mean for entry in told[sequence].global_poses}
+        return {}
+
+    def hear(self, true: NDArray[np.float64], travelled: float) -> Heard | None:
+        """What is said at a keyframe event, None where the last scan was none or nobody carried the robot yet."""
+        if self.events - 1 in self.true:
+            return None
+        self.true[self.events - 1] = true
+        if self.carried < 0:
+            return None
+        return Heard(travelled, self.lost() <= DOUBT, self.sure(), self.right(true))
+
+
+def kidnapped(name: str) -> Kidnapping:
+    """Drive through a simulated world in which the robot is carried."""
+    watched, travelled = Watched(), 0.0
+    heard: list[Heard] = []
+    stamps, truth, parts = list[int](), list[NDArray[np.float64]](), list[bool]()
+    for record in open_log(name).records():
+        before = watched.events
+        watched.run.read(record)
+        if not isinstance(record.measurement, Scan) or record.truth is None:
+            continue
+        step = se2.between(truth[-1], record.truth) if truth else np.zeros(3)
+        if math.hypot(step[0], step[1]) > _JUMP or abs(step[2]) > _JUMP:
+            watched.carried = before
+        elif watched.carried >= 0:
+            travelled += math.hypot(step[0], step[1])
+        stamps.append(record.measurement.stamp)
+        truth.append(record.truth)
+        parts.append(watched.carried >= 0)
+        said = watched.hear(record.truth, travelled)
+        heard += [] if said is None else [said]
+    result = watched.run.finish()
+    recording = result.recorder.finish(result.log.stamps)
+    own, true = StampedPoses(recording.stamps, recording.trajectory), StampedPoses(np.array(stamps), np.array(truth))
+    errors = [_error(own, true, np.array(parts) == part) for part in (False, True)]
+    return judged(heard, (errors[0], errors[1]), travelled)
+
+
+def judged(heard: Sequence[Heard], errors: tuple[float, float], travelled: float) -> Kidnapping:
+    """What came of a drive.
+
+    :param heard: after the robot was carried, at least once.
+    :param errors: before and after, m.
+    :param travelled: after, m.
+    """
+    noticed = next((said.travelled for said in heard if not said.localized or said.right), math.inf)
+    again = math.inf
+    for said in reversed(heard):
+        if not (said.sure and said.right):
+            break
+        again = said.travelled
+    wrong = [
+        later.travelled - said.travelled
+        for said, later in pairwise(heard)
+        if said.travelled > noticed and said.sure and not said.right
+    ]
+    last = heard[-1]
+    return Kidnapping(noticed, again, sum(wrong), last.sure and not last.right, errors, travelled)
+
+
+def _error(own: StampedPoses, truth: StampedPoses, chosen: NDArray[np.bool_]) -> float:
+    """Mean error at the relations of a part of a drive, m."""
+    part = StampedPoses(truth.stamps[chosen], truth.poses[chosen])
+    return evaluate_relations(own, true_relations(part)).overall.translation.mean
+
+
+@dataclass(frozen=True)
+class Alarm:
+    """An ordinary drive.
+
+    :ivar driven: m.
+    :ivar doubted: m of that on which the robot said that it does not know its place.
+    """
+
+    driven: float
+    doubted: float
+
+
+def ordinary(path: Path | str) -> Alarm:
+    """Drive where nobody carries the robot."""
+    watched, driven, doubted = Watched(), 0.0, 0.0
+    for record in open_log(path).records():
+        before = watched.events
+        watched.run.read(record)
+        if watched.events > before:
+            travelled = watched.run.recorder.keyframes[watched.events - 1].travelled
+            doubted += (travelled - driven) * (watched.lost() > DOUBT)
+            driven = travelled
+    return Alarm(driven, doubted)
+
+
+def measure_kidnapping(settings: Settings) -> Report:
+    """Carry the robot in every world, and drive where nobody does."""
+    seeds = settings.seeds_or(SEEDS)
+    report = Report("kidnapping", "A robot that is carried while it drives", seeds=seeds)
+    names = settings.logs_or((*WORLDS, *LOGS))
+    worlds = [name for name in names if name in WORLDS]
+    cases = [(world, kind, seed) for world in worlds for kind in KINDS for seed in seeds]
+    with opened([name for name in names if name not in WORLDS]) as logs:
+        drives: list[tuple[str, Path | str]] = [(log.name, log.path) for log in logs]
+        drives += [(world, f"{SIMULATED}{world},seed={seed},laps=2") for world in worlds for seed in seeds]
+        with ProcessPoolExecutor(settings.runner.jobs, multiprocessing.get_context("spawn")) as pool:
+            found = list(pool.map(kidnapped, [drawn(*case) for case in cases]))
+            alarms = list(pool.map(ordinary, [path for _, path in drives]))
+    rows = []
+    for world in worlds:
+        for kind in KINDS:
+            own = [one for one, case in zip(found, cases, strict=True) if case[:2] == (world, kind)]
+            rows.append([world, kind, *_cells(own)])
+            report.data[f"{world} {kind}"] = [asdict(one) for one in own]
+            if world not in ALIKE:
+                report.requirements += requirements(f"{world}, {kind}", own)
+    head = ["world", "carried to", "drives", f"noticed within {SOON:g} m", "m until noticed, median"]
+    head += ["right at the end", "m until right, median", "m sure of a wrong place", "wrong at the end"]
+    head += ["error before [m]", "after [m]"]
+    report.body.append(table(head, rows))
+    rows = []
+    for name in dict.fromkeys(name for name, _ in drives):
+        told = [alarm for alarm, (drive, _) in zip(alarms, drives, strict=True) if drive == name]
+        driven, doubted = sum(alarm.driven for alarm in told), sum(alarm.doubted for alarm in told)
+        rows.append([name, str(len(told)), f"{driven / 1e3:.2f}", f"{1e3 * doubted / driven:.1f}"])
+        report.requirements.append(Requirement(f"{name}: m not sure of the place per km", 1e3 * doubted / driven, 0.0))
+        report.data[f"{name} ordinary"] = [asdict(alarm) for alarm in told]
+    report.body += [table(["ordinary drive", "drives", "km", "m not sure of the place per km"], rows), POLICY]
+    return report
+
+
+def requirements(name: str, found: Sequence[Kidnapping]) -> list[Requirement]:
+    """What is asked for: that it is noticed soon, and that no wrong place is taken for certain."""
+    noticed = float(np.mean([one.noticed <= SOON for one in found]))
+    wrong = sum(one.confident > 0.0 or one.wrong for one in found)
+    return [
+        Requirement(f"{name}: noticed within {SOON:g} m", noticed, 1.0, least=SHARE),
+        Requirement(f"{name}: drives with a confident wrong answer", wrong, 0),
+    ]
+
+
+def _cells(found: Sequence[Kidnapping]) -> list[str]:
+    again = [one.again for one in found]
+    return [
+        str(len(found)),
+        f"{np.mean([one.noticed <= SOON for one in found]):.2f}",
+        f"{np.median([one.noticed for one in found]):.1f}",
+        str(sum(not math.isinf(one) for one in again)),
+        f"{np.median(again):.1f}",
+        f"{np.mean([one.confident for one in found]):.1f}",
+        str(sum(one.wrong for one in found)),
+        *(f"{np.mean([one.errors[k] for one in found]):.3f}" for k in (0, 1)),
+    ]

@@ -1,0 +1,239 @@
+"""Whether the nodes keep time: how late a pose is, a fast laser, and replays at ten times real time."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from typing import NamedTuple
+
+import numpy as np
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from nav_msgs.msg import Odometry
+from numpy.typing import NDArray
+from rclpy.qos import QoSProfile
+from sensor_msgs.msg import LaserScan
+from std_msgs.msg import String
+
+from benchmark.logs import WITH_RELATIONS, opened
+from benchmark.report import Report, Requirement, table
+from benchmark.running_nodes import Listener
+from benchmark.settings import Settings
+from hmt_slam_ros.logs import open_log
+from hmt_slam_ros.nodes import qos
+from hmt_slam_ros.nodes.conversions import stamp_of
+from hmt_slam_ros.nodes.topics import DOCUMENTS, ODOM, POSE, ROBOT_STATUS, SCAN
+from hmt_slam_ros.processes.documents import RobotStatus, decode
+from hmt_slam_ros.processes.messages import LocalEstimate
+
+PROCESSES = ("slam", "aam", "tsbi", "tlca", "rtl")
+BUSY = "sim:office,rate=10,readings=10"
+"""A drive with 100 odometry readings a second."""
+
+FAST = "sim:office,rate=40,readings=3,beams=1080,field_of_view=270"
+"""A drive with 40 scans a second of 1080 beams."""
+
+SECONDS = 60.0
+"""Of each drive."""
+
+LATENCY = 0.010
+"""Largest time from an odometry message to its pose, at 99 of 100, s."""
+
+BEHIND = 0.5
+"""How far behind metric SLAM may be in the end with the fast laser, s."""
+
+RATE = 10.0
+"""Times real time at which logs are replayed."""
+
+LATER = 1.1
+"""How much longer a replay may take than its log at that rate."""
+
+_PATIENCE = 3600.0
+
+POLICY = (
+    f"Every node is a process of its own, and messages go over DDS. Saturated: a drive of {SECONDS:.0f} s with 100 "
+    "odometry readings a second in real time, and beside the nodes as many processes as the machine has cores that do "
+    "nothing but compute. The latency is the time from when the odometry message is published until its pose is, by "
+    f"the time stamps of DDS. Fast laser: {SECONDS:.0f} s with 40 scans a second of 1080 beams; the delay is that from "
+    f"a scan to metric SLAM's estimate of its pose. Replays: the logs at {RATE:g} times real time, paced, so that the "
+    "robot waits where 20 scans are without an answer."
+)
+
+Stamped = dict[int, float]
+
+
+class Passed(NamedTuple):
+    """When messages were published, by the stamps in their headers.
+
+    :ivar asked: {stamp, ns: s}.
+    :ivar answered: likewise.
+    """
+
+    asked: Stamped
+    answered: Stamped
+
+    @property
+    def delays(self) -> NDArray[np.float64]:
+        """Of all that were answered, s."""
+        return np.array([moment - self.asked[stamp] for stamp, moment in self.answered.items() if stamp in self.asked])
+
+
+def measure_live(settings: Settings) -> Report:
+    """Let the nodes keep up with a robot."""
+    report = Report("live", "Keeping time")
+    poses, scans = saturated(BUSY, SECONDS), fast(FAST, SECONDS)
+    asked = [
+        Requirement("odometry to pose, all else saturated, p99", float(np.quantile(poses.delays, 0.99)), LATENCY, "s"),
+        Requirement("odometry without a pose", unanswered(poses), 0),
+        Requirement("fast laser: scans without a pose", len(scans.asked) - len(scans.delays), 0),
+        Requirement("fast laser: delay at the end", float(scans.delays[-20:].mean()), BEHIND, "s"),
+    ]
+    rows = [_row("odometry to pose, saturated", poses.delays), _row("scan to pose, fast laser", scans.delays)]
+    report.body.append(table(["", "messages", "median [ms]", "p99 [ms]", "largest [ms]"], rows))
+    with opened(settings.logs_or(WITH_RELATIONS)) as logs:
+        replays = {log.name: replayed(str(log.path)) for log in logs}
+    for name, replay in replays.items():
+        asked.append(Requirement(f"{name}: scans lost", replay.scans - replay.placed, 0))
+        asked.append(Requirement(f"{name}: time / that of the log at {RATE:g} times", replay.late, LATER))
+    report.requirements += asked
+    report.body += [_replay_table(replays), POLICY]
+    report.data = {
+        "saturated": poses.delays.tolist(),
+        "fast": scans.delays.tolist(),
+        "replays": {name: replay._asdict() for name, replay in replays.items()},
+    }
+    return report
+
+
+def saturated(log: str, seconds: float) -> Passed:
+    """From odometry to pose, while the machine is busy otherwise."""
+    with _running() as listener, _burning():
+        asked = _moments(listener, Odometry, ODOM, qos.SENSOR)
+        answered = _moments(listener, PoseWithCovarianceStamped, POSE, qos.STREAM)
+        _drive(listener, log, seconds, ODOM)
+        return Passed(asked, answered)
+
+
+def fast(log: str, seconds: float) -> Passed:
+    """From scan to estimate."""
+    with _running() as listener:
+        asked = _moments(listener, LaserScan, SCAN, qos.SENSOR)
+        answered: Stamped = {}
+
+        def hear(message: String, info: dict[str, int]) -> None:
+            estimate = decode(message.data, LocalEstimate)
+            answered[estimate.stamp] = 1e-9 * info["source_timestamp"]
+
+        listener.node.create_subscription(String, DOCUMENTS[LocalEstimate], hear, qos.CHAIN)
+        _drive(listener, log, seconds, SCAN)
+        listener.until(lambda: len(answered) >= len(asked))
+        return Passed(asked, answered)
+
+
+class Replay(NamedTuple):
+    """What came of a replay.
+
+    :ivar scans: of the log.
+    :ivar placed: those that were given a pose.
+    :ivar late: its time, of that which it has at this rate.
+    """
+
+    scans: int
+    placed: int
+    late: float
+
+
+def replayed(log: str) -> Replay:
+    """A log at ten times real time."""
+    duration = open_log(log).duration / RATE
+    with _running() as listener:
+        placed = _counted(listener, DOCUMENTS[LocalEstimate])
+        begin = time.monotonic()
+        status = _drive(listener, log, 0.0, rate=RATE, paced=True)
+        seconds = time.monotonic() - begin
+        listener.until(lambda: placed() >= status.scans)
+        return Replay(status.scans, placed(), seconds / duration)
+
+
+def unanswered(passed: Passed) -> int:
+    """Messages without an answer since the first one that had one."""
+    first = min(passed.answered)
+    return sum(stamp not in passed.answered for stamp in passed.asked if stamp >= first)
+
+
+def _counted(listener: Listener, topic: str) -> Callable[[], int]:
+    """How many documents of a topic there were."""
+    heard: list[None] = []
+    listener.node.create_subscription(String, topic, lambda _message: heard.append(None), qos.CHAIN)
+    return lambda: len(heard)
+
+
+def _replay_table(replays: dict[str, Replay]) -> str:
+    head = ["log", "scans", "with a pose", f"time / that of the log at {RATE:g} times"]
+    return table(head, [[name, str(own.scans), str(own.placed), f"{own.late:.2f}"] for name, own in replays.items()])
+
+
+@contextmanager
+def _running() -> Iterator[Listener]:
+    """A listener, beside which all five nodes run."""
+    with ExitStack() as stack:
+        listener = stack.enter_context(Listener())
+        for name in PROCESSES:
+            stack.enter_context(listener.running(name, {}))
+        yield listener
+
+
+@contextmanager
+def _burning() -> Iterator[None]:
+    """As many processes as there are cores that do nothing but compute."""
+    burners = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(os.cpu_count() or 1)]
+    try:
+        yield
+    finally:
+        for burner in burners:
+            burner.kill()
+            burner.wait()
+
+
+def _drive(
+    listener: Listener, log: str, seconds: float, heard: str = "", rate: float = 1.0, *, paced: bool = False
+) -> RobotStatus:
+    """A robot that plays a log to its end; what it said then.
+
+    :param seconds: of the log that are played; 0 for all.
+    :param heard: the robot's topic that the listener hears too.
+    """
+    statuses: list[RobotStatus] = []
+    listener.node.create_subscription(
+        String, ROBOT_STATUS, lambda message: statuses.append(decode(message.data, RobotStatus)), qos.LATCHED
+    )
+    parameters: dict[str, str | float | list[float]] = {
+        "log": log,
+        "robot.duration": seconds,
+        "robot.rate": rate,
+        "robot.paced": str(paced).lower(),
+        "robot.scan_listeners": 1 + (heard == SCAN),
+        "robot.odometry_listeners": 2 + (heard == ODOM),
+        "robot.patience": 120.0,
+    }
+    with listener.running("robot", parameters):
+        listener.until(lambda: bool(statuses) and statuses[-1].state == "ended", _PATIENCE)
+    return statuses[-1]
+
+
+def _moments(listener: Listener, kind: type, topic: str, profile: QoSProfile) -> Stamped:
+    """Filled with when messages were published, by the stamps in their headers."""
+    moments: Stamped = {}
+
+    def hear(message: Odometry, info: dict[str, int]) -> None:
+        moments[stamp_of(message.header.stamp)] = 1e-9 * info["source_timestamp"]
+
+    listener.node.create_subscription(kind, topic, hear, profile)
+    return moments
+
+
+def _row(name: str, delays: NDArray[np.float64]) -> list[str]:
+    return [name, str(len(delays)), *(f"{1e3 * value:.1f}" for value in np.quantile(delays, [0.5, 0.99, 1.0]))]

@@ -1,0 +1,241 @@
+"""Do the nodes keep their memory, and leave nothing behind, where a robot drives for long at ten times real time?"""
+
+from __future__ import annotations
+
+import math
+import os
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from std_msgs.msg import String
+
+from benchmark.report import Report, Requirement, table
+from benchmark.settings import Settings
+from hmt_slam_ros.logs import open_log
+from hmt_slam_ros.logs.records import SIMULATED
+from hmt_slam_ros.nodes import qos
+from hmt_slam_ros.nodes.children import Children
+from hmt_slam_ros.nodes.departure import await_departures
+from hmt_slam_ros.nodes.domain import own_domain
+from hmt_slam_ros.nodes.replay import PROCESSES
+from hmt_slam_ros.nodes.topics import DIAGNOSTICS, ROBOT_STATUS
+from hmt_slam_ros.nodes.transforms import TFMessage
+from hmt_slam_ros.processes.documents import RobotStatus, decode
+from hmt_slam_ros.sensing import Scan
+
+WORLD = "office"
+RATE = 10.0
+"""Speed of the replay relative to real time."""
+
+GROWTH = 0.05
+"""Largest growth of a node's memory from the middle to the end."""
+
+_SHORTFALL = 0.95
+_PERIOD = 5.0  # s between two looks at memory
+_SPIN = 0.1  # s
+_DEPARTURES = 3.0  # s
+_SHARED_MEMORY = "/dev/shm/"
+# Files of ports are named by their numbers, and the next participant takes over those that are there.
+_PORT = "fastrtps_port"
+
+POLICY = (
+    f"The nodes, each an OS process of its own, map laps of `sim:{WORLD}` (seed 0), which the robot node plays at "
+    f"{RATE:g} times real time, waiting for slam where that falls behind. Resident memory is read every {_PERIOD:g} s. "
+    "In the first half the histories of DDS fill up, which have 5000 messages each; the growth is that of the mean of "
+    "the last tenth over the mean of the tenth after the middle. Segments of shared memory are those that one of the "
+    "nodes had mapped and that were still there when all had ended, but for those of ports, which the next nodes take "
+    "over; zombies are processes whose parent is a node, or "
+    "that were one, and that ended without anybody asking for their status."
+)
+
+
+@dataclass
+class Soak:
+    """What a run came to.
+
+    :ivar seconds: on the wall.
+    :ivar driven: of the log, s.
+    :ivar scans: acknowledged by slam.
+    :ivar resident: {node: memory at every look, bytes}.
+    :ivar segments: files of shared memory that the nodes had.
+    :ivar leaked: those that were there when all had ended.
+    :ivar zombies: largest number at a look.
+    :ivar errors: {node: what it said with level ERROR}.
+    :ivar dropped: scans that slam dropped.
+    :ivar statuses: {node: exit status when it was told to end}.
+    """
+
+    seconds: float = 0.0
+    driven: float = 0.0
+    scans: int = 0
+    resident: dict[str, list[int]] = field(default_factory=dict)
+    segments: set[str] = field(default_factory=set)
+    leaked: set[str] = field(default_factory=set)
+    zombies: int = 0
+    errors: dict[str, str] = field(default_factory=dict)
+    dropped: int = 0
+    statuses: dict[str, int] = field(default_factory=dict)
+
+
+def measure_soak(settings: Settings) -> Report:
+    """Drive as long as is asked for, and look."""
+    report = Report("soak", "Long runs of the nodes", seeds=(0,))
+    found = soaked(settings.minutes)
+    report.requirements += requirements(found)
+    report.data["soak"] = asdict(found) | {name: sorted(getattr(found, name)) for name in ("segments", "leaked")}
+    rows = [[name, *(f"{1e-6 * value:.0f}" for value in _shown(own))] for name, own in found.resident.items()]
+    told = f"{found.seconds / 60:.0f} minutes, {found.driven / 3600:.1f} h of driving, {found.scans} scans"
+    report.body += [told, table(["node", "at 10 % [MB]", "at 50 %", "at 75 %", "at the end", "largest"], rows), POLICY]
+    return report
+
+
+def requirements(found: Soak) -> list[Requirement]:
+    """What is asked for of a run."""
+    growths = [Requirement(f"{name}: growth of memory", growth(own), GROWTH) for name, own in found.resident.items()]
+    speed = found.driven / found.seconds
+    return [
+        *growths,
+        Requirement("speed, times real time", speed, math.inf, least=_SHORTFALL * RATE),
+        Requirement("scans dropped", found.dropped, 0),
+        Requirement("errors in /diagnostics", len(found.errors), 0),
+        Requirement("segments of shared memory left behind", len(found.leaked), 0),
+        Requirement("zombies", found.zombies, 0),
+        Requirement("nodes that did not end well", sum(status != 0 for status in found.statuses.values()), 0),
+    ]
+
+
+def growth(resident: Sequence[int]) -> float:
+    """From the tenth after the middle to the last one, as a share; NaN where there were too few looks."""
+    tenth, middle = len(resident) // 10, len(resident) // 2
+    if not tenth:
+        return math.nan
+    return float(np.mean(resident[-tenth:]) / np.mean(resident[middle : middle + tenth])) - 1.0
+
+
+def _shown(resident: Sequence[int]) -> list[int]:
+    return [*(resident[round(share * (len(resident) - 1))] for share in (0.1, 0.5, 0.75, 1.0)), max(resident)]
+
+
+def soaked(minutes: float) -> Soak:
+    """Run the nodes for some minutes.
+
+    :raises HmtSlamError: where one of them dies.
+    """
+    lap = open_log(f"{SIMULATED}{WORLD},laps=1")
+    name = f"{SIMULATED}{WORLD},laps={math.ceil(60.0 * minutes * RATE / lap.duration) + 1}"
+    laser = next(r.measurement.laser_pose for r in lap.records() if isinstance(r.measurement, Scan)).tolist()
+    found = Soak(resident={node: [] for node in (*PROCESSES, "robot")})
+    with (
+        tempfile.TemporaryDirectory(prefix="hmt_slam_soak_") as scratch,
+        own_domain() as domain,
+        _listening(domain, found) as executor,
+    ):
+        with Children(Path(scratch), (), print) as children:
+            own = [] if TFMessage is not None else ["-p", f"laser_pose:={laser}"]
+            environment = {**os.environ, "ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+            for node in PROCESSES:
+                words = ["-p", f"recovery:={scratch}/recovery", *(own if node == "slam" else [])]
+                children.start(node, words, environment)
+            robot = {"log": name, "robot.rate": RATE, "robot.odometry_listeners": 2, "robot.patience": 600.0}
+            children.start("robot", [w for k, v in robot.items() for w in ("-p", f"{k}:={v}")], environment)
+            _watch(executor, children, found, 60.0 * minutes)
+        found.statuses = {node: process.returncode for node, process in children.processes.items()}
+    found.leaked = {path for path in found.segments if Path(path).exists() and not _is_mapped(path)}
+    return found
+
+
+def _watch(executor: SingleThreadedExecutor, children: Children, found: Soak, seconds: float) -> None:
+    """Look at the nodes until so much time is over since the first scan."""
+    begin = next_look = None
+    while begin is None or time.monotonic() < begin + seconds:
+        executor.spin_once(timeout_sec=_SPIN)
+        children.check()
+        now = time.monotonic()
+        if begin is None or next_look is None:
+            begin = next_look = now if found.scans else None
+        elif now >= next_look:
+            next_look += _PERIOD
+            _look({name: process.pid for name, process in children.processes.items()}, found)
+            found.seconds = now - begin
+
+
+def _look(processes: Mapping[str, int], found: Soak) -> None:
+    for name, pid in processes.items():
+        found.resident[name].append(_resident(pid))
+        found.segments |= _segments(pid)
+    states = Counter(state for state, parent in _states() if parent in (*processes.values(), os.getpid()))
+    found.zombies = max(found.zombies, states["Z"])
+
+
+def _resident(pid: int) -> int:
+    return int(Path(f"/proc/{pid}/statm").read_text(encoding="ascii").split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+
+def _segments(pid: int) -> set[str]:
+    """Files of shared memory that a process has mapped and that are there."""
+    try:
+        lines = Path(f"/proc/{pid}/maps").read_text(encoding="utf-8", errors="replace").splitlines()
+    except OSError:  # ended meanwhile, or another user's
+        return set()
+    paths = {line.split(maxsplit=5)[-1] for line in lines if _SHARED_MEMORY in line and _PORT not in line}
+    return {path for path in paths if not path.endswith("(deleted)")}
+
+
+def _is_mapped(path: str) -> bool:
+    """Whether some process has the segment, one of another program then."""
+    return any(path in _segments(int(entry.name)) for entry in Path("/proc").iterdir() if entry.name.isdecimal())
+
+
+def _states() -> Iterator[tuple[str, int]]:
+    """State and parent of every OS process."""
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdecimal():
+            try:
+                words = (entry / "stat").read_text(encoding="utf-8", errors="replace").rpartition(")")[2].split()
+            except OSError:  # ended meanwhile
+                continue
+            yield words[0], int(words[1])
+
+
+@contextmanager
+def _listening(domain: int, found: Soak) -> Iterator[SingleThreadedExecutor]:
+    """A node that hears how far the robot is, and what goes wrong."""
+
+    def hear_status(message: String) -> None:
+        status = decode(message.data, RobotStatus)
+        if status.stamp:
+            begin = first.setdefault("stamp", status.stamp)
+            found.scans, found.driven = status.acknowledged, 1e-9 * (status.stamp - begin)
+
+    def hear_diagnostics(message: DiagnosticArray) -> None:
+        for status in message.status:
+            if status.level == DiagnosticStatus.ERROR:
+                found.errors[status.name] = status.message
+            values = {entry.key: entry.value for entry in status.values}
+            found.dropped = max(found.dropped, int(values.get("dropped scans", 0)))
+
+    first: dict[str, int] = {}
+    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    with ExitStack() as stack:
+        context = Context()
+        context.init(domain_id=domain)
+        stack.callback(context.try_shutdown)
+        node = Node("soak", context=context)
+        stack.callback(node.destroy_node)
+        stack.callback(await_departures, node, _DEPARTURES)
+        executor = SingleThreadedExecutor(context=context)
+        stack.callback(executor.shutdown)
+        executor.add_node(node)
+        node.create_subscription(String, ROBOT_STATUS, hear_status, qos.LATCHED)
+        node.create_subscription(DiagnosticArray, DIAGNOSTICS, hear_diagnostics, qos.STREAM)
+        yield executor

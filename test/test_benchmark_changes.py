@@ -1,0 +1,71 @@
+"""A world that changes: what is asked for, and that it is measured on two visits."""
+
+import numpy as np
+import pytest
+
+from benchmark.changes import Visit, requirements, unchanged_by_localization, visited_twice
+from benchmark.documents import VALIDATION, marks
+from benchmark.surfaces import Surfaces, judged, unexplained
+from hmt_slam_ros.offline.map_image import FREE, OCCUPIED, OccupancyImage
+
+FRAME = np.zeros(3)
+BEFORE = np.array([[0.0, 0.0, 4.0, 0.0], [1.0, 2.0, 2.0, 2.0]])
+AFTER = np.array([[0.0, 0.0, 4.0, 0.0], [3.0, 2.0, 4.0, 2.0]])
+LASERS = np.array([[2.0, 1.0, np.pi / 2]] * 3)
+
+
+def image_of(*walls):
+    """Walls along x as cells of 0.1 m."""
+    pixels = np.full((40, 60), FREE)
+    for x0, y0, x1, _ in walls:
+        pixels[39 - round((y0 + 1.0) / 0.1), round((x0 + 1.0) / 0.1) : round((x1 + 1.0) / 0.1)] = OCCUPIED
+    return OccupancyImage(pixels, 0.1, np.array([-1.0, -1.0]))
+
+
+def visits(lasers=LASERS):
+    return [Surfaces(walls, lasers, np.pi / 2) for walls in (BEFORE, AFTER)]
+
+
+@pytest.mark.parametrize(
+    ("after", "new", "gone"), [(AFTER, 1.0, 0.0), (BEFORE, 0.0, 1.0), ([*BEFORE, AFTER[1]], 1.0, 1.0)]
+)
+def test_a_map_is_judged_by_what_is_new_and_what_is_gone(after, new, gone):
+    found = judged([image_of(*BEFORE), image_of(*after)], [FRAME, FRAME], visits())
+    assert (found.new, found.gone) == (new, gone)
+    assert found.metres == pytest.approx((1.05, 1.05), abs=0.11)
+
+
+def test_what_could_not_be_seen_is_not_asked_for():
+    away = LASERS + np.array([0.0, 0.0, np.pi])
+    found = judged([image_of(*BEFORE), image_of(*BEFORE)], [FRAME, FRAME], visits(away))
+    assert np.isnan(found.gone)
+    assert unexplained(image_of(*BEFORE), FRAME, np.concatenate((AFTER, found.hidden))) == 0.0
+
+
+def test_cells_far_from_all_walls_are_unexplained():
+    somebody = [2.0, 1.0, 2.5, 1.0]
+    assert unexplained(image_of(*BEFORE, somebody), FRAME, BEFORE) == pytest.approx(5 / 55)
+
+
+def test_what_falls_short_is_told():
+    good = Visit(0.9, 0.05, 0.0, 0.001, 0.02, 0.08, (100, 120), (5.0, 5.0))
+    assert all(asked.met for asked in requirements("quiet", [good], [100, 110, 112], same=True))
+    bad = Visit(0.7, 0.2, 0.003, 0.01, 0.05, 0.2, (100, 120), (5.0, 5.0))
+    assert not any(asked.met for asked in requirements("quiet", [bad], [100, 110, 120], same=False))
+
+
+def test_two_visits_are_measured():
+    found = visited_twice("office", 1000, size=0.7, rate=1.5)
+    assert found.new > 0.5
+    assert found.gone < 0.4
+    assert found.keyframes[1] < 1.3 * found.keyframes[0]
+    assert found.error < 0.1
+
+
+def test_localization_leaves_the_map_as_it_was():
+    assert unchanged_by_localization("busy", 1000, size=0.7, rate=1.0)
+
+
+def test_the_document_has_a_place_for_the_tables():
+    text = VALIDATION.read_text()
+    assert all(text.count(mark) == 1 for mark in marks("changes"))

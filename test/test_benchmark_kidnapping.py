@@ -1,0 +1,50 @@
+"""What is made of what a robot says that was carried while it drove."""
+
+import math
+
+import pytest
+
+from benchmark.kidnapping import KINDS, Heard, drawn, judged, requirements
+from hmt_slam_ros.logs import open_log
+
+LOST, RIGHT, WRONG = (False, False, False), (True, True, True), (True, True, False)
+
+
+def told(*said):
+    return judged([Heard(float(k), *one) for k, one in enumerate(said)], (0.02, 0.03), float(len(said)))
+
+
+@pytest.mark.parametrize(
+    ("said", "noticed", "again", "confident", "wrong"),
+    [
+        ((WRONG, WRONG, LOST, LOST, RIGHT, RIGHT), 2.0, 4.0, 0.0, False),
+        ((WRONG, LOST, WRONG, WRONG, RIGHT), 1.0, 4.0, 2.0, False),
+        ((WRONG, WRONG, WRONG), math.inf, math.inf, 0.0, True),
+        ((LOST, RIGHT, LOST), 0.0, math.inf, 0.0, False),
+    ],
+    ids=["noticed and found", "found in a wrong place first", "never noticed", "lost again"],
+)
+def test_a_drive_is_judged_by_what_the_robot_says(said, noticed, again, confident, wrong):
+    found = told(*said)
+    assert (found.noticed, found.again, found.confident, found.wrong) == (noticed, again, confident, wrong)
+
+
+def test_a_confident_wrong_answer_and_one_that_comes_late_are_faults():
+    met = [one.met for one in requirements("office, known", [told(LOST, RIGHT), told(LOST, WRONG, WRONG, RIGHT)])]
+    assert met == [True, False]
+    assert not requirements("office, known", [told(*[WRONG] * 7, LOST)])[0].met
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_robot_is_carried_once_and_its_wheels_do_not_notice(kind):
+    log = open_log(drawn("ring", kind, 1))
+    drive = log.scenario.settings
+    assert (drive.carried > 0.5) == (kind == "known")
+    assert drive.to > drive.carried
+    poses = log.scenario.poses
+    steps = [math.hypot(*step) for step in (poses[1:, :2] - poses[:-1, :2])]
+    far = [step for step in steps if step > 0.6]
+    assert len(far) == 1
+    assert kind != "short" or far[0] < 3.0
+    wheels = log.scenario.odometry
+    assert max(math.hypot(*step) for step in wheels[1:, :2] - wheels[:-1, :2]) < 0.2
