@@ -2,6 +2,7 @@
 
 import ast
 import configparser
+import json
 import os
 import re
 import subprocess
@@ -17,7 +18,7 @@ import yaml
 import hmt_slam_ros
 
 ROOT = Path(__file__).resolve().parent.parent
-NODES = ("slam", "aam", "tsbi", "tlca", "rtl", "robot")
+NODES = ("slam", "aam", "tsbi", "tlca", "rtl", "robot", "view")
 LAUNCH_FILES = sorted((ROOT / "launch").glob("*.launch.py"))
 
 
@@ -102,10 +103,19 @@ def test_the_installed_files_exist_and_hold_marker_launch_configuration_and_the_
         f"{share}/launch/replay.launch.py",
         f"{share}/config/hmt_slam.yaml",
         f"{share}/config/hmt_slam.rviz",
+        f"{share}/config/foxglove_layout.json",
         f"{share}/data/malaga_one_loop/metadata.yaml",
         f"{share}/data/malaga_one_loop/README.md",
     }
     assert any(name.endswith(".mcap") for name in names)
+
+
+def test_the_files_of_the_page_are_installed_with_the_package(setup_arguments):
+    patterns = setup_arguments["package_data"]["hmt_slam_ros"]
+    package = ROOT / "hmt_slam_ros"
+    names = {path.name for pattern in patterns for path in package.glob(pattern)}
+    assert names >= {"py.typed", "index.html", "view.css", "view.js", "draw.js"}
+    assert {path.parent.name for path in package.rglob("*.html")} == {"page"}
 
 
 def test_every_package_with_modules_is_installed(setup_arguments):
@@ -182,7 +192,37 @@ def test_launch_file_describes_its_arguments(path):
     assert {"params_file", "namespace"} <= described
 
 
+def topics_of_the_nodes():
+    """Every topic of the nodes with a slash before it."""
+    pytest.importorskip("rclpy", reason="the nodes need rclpy, which is not installed here")
+    topics = import_module("hmt_slam_ros.nodes.topics")
+    names = {value for name, value in vars(topics).items() if name.isupper() and isinstance(value, str)}
+    return {f"/{name}" for name in names | set(topics.DOCUMENTS.values())}
+
+
 def test_rviz_shows_the_topics_the_nodes_publish():
-    displays = yaml.safe_load((ROOT / "config" / "hmt_slam.rviz").read_text())["Visualization Manager"]["Displays"]
-    topics = {display["Topic"]["Value"] for display in displays if "Topic" in display}
+    manager = yaml.safe_load((ROOT / "config" / "hmt_slam.rviz").read_text())["Visualization Manager"]
+    topics = {display["Topic"]["Value"] for display in manager["Displays"] if "Topic" in display}
     assert topics == {"/map", "/hmt/graph", "/hmt/particles", "/pose", "/scan"}
+    tools = {tool["Topic"]["Value"] for tool in manager["Tools"] if "Topic" in tool}
+    assert tools == {"/initialpose"}
+    assert topics | tools <= topics_of_the_nodes()
+    graph = next(display for display in manager["Displays"] if display["Name"] == "Areas and arcs")
+    assert set(graph["Namespaces"]) == {"areas", "labels", "arcs", "closures", "area_uncertainty", "arc_uncertainty"}
+
+
+def panels_of(layout):
+    return {layout} if isinstance(layout, str) else panels_of(layout["first"]) | panels_of(layout["second"])
+
+
+def test_foxglove_shows_the_topics_the_nodes_publish():
+    layout = json.loads((ROOT / "config" / "foxglove_layout.json").read_text())
+    panels = layout["configById"]
+    assert panels_of(layout["layout"]) == set(panels)
+    plan = panels["3D!plan"]
+    assert set(plan["topics"]) == {"/map", "/hmt/graph", "/hmt/particles", "/pose", "/scan"}
+    paths = [line["value"] for panel in panels.values() for line in panel.get("paths", ())]
+    plotted = {path.split(".")[0] for path in (*paths, panels["Indicator!localized"]["path"])}
+    assert plotted == {"/hmt/pmf", "/hmt/entropy", "/hmt/is_localized"}
+    told = {panels["DiagnosticSummary!nodes"]["topicToRender"], plan["publish"]["poseEstimateTopic"]}
+    assert plotted | set(plan["topics"]) | told <= topics_of_the_nodes()

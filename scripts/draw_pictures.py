@@ -1,0 +1,74 @@
+#!/usr/bin/env python3
+"""Make the pictures of README.md and docs/tutorial.md anew, from runs; and all in docs/images small.
+
+docs/images/malaga_map.png is the map of the bundled log, twins_pmf.png the probabilities of a simulated drive through
+two rooms that are alike. worlds.png and view.png have scripts of their own, which this one runs; for the latter a
+browser is needed, and without one the old picture stays.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+ROOT = Path(__file__).resolve().parents[1]
+IMAGES = ROOT / "docs" / "images"
+# Name of the picture: log, picture of its output folder, width in pixels.
+PICTURES = {
+    "malaga_map.png": ("data/malaga_one_loop", "map.png", 700),
+    "twins_pmf.png": ("sim:twins,seed=1", "pmf.png", 900),
+}
+OTHERS = ("draw_worlds.py", "draw_view.py")
+COLOURS = 128
+
+
+def draw(log: str, picture: str, width: int, to: Path) -> None:
+    """Map a log and keep one picture of it."""
+    with tempfile.TemporaryDirectory() as folder:
+        for command in (["map", log, "--out", f"{folder}/run"], ["plot", f"{folder}/run"]):
+            subprocess.run([sys.executable, "-m", "hmt_slam_ros.cli.main", *command], cwd=ROOT, check=True)
+        with Image.open(Path(folder) / "run" / picture) as image:
+            height = round(image.height * width / image.width)
+            image.convert("RGB").resize((width, height), Image.Resampling.LANCZOS).save(to)
+
+
+def reduce(path: Path) -> None:
+    """Keep the nearest of a few colours, which nobody sees and a repository feels; only where that is smaller."""
+    before = path.stat().st_size
+    with Image.open(path) as image:
+        if image.mode == "P":
+            return
+        true = image.convert("RGB")
+    few = true.quantize(palette=_palette(true), dither=Image.Dither.NONE)
+    few.save(path, optimize=True)
+    print(f"{path}: {before} -> {path.stat().st_size} bytes")
+
+
+def _palette(image: Image.Image) -> Image.Image:
+    """The colours of large areas, and as many that lie far apart, for thin lines."""
+    colours, counts = np.unique(np.asarray(image).reshape(-1, 3), axis=0, return_counts=True)
+    frequent = colours[np.argsort(-counts, kind="stable")[: COLOURS // 2]].ravel().tolist()
+    apart = image.quantize(COLOURS // 2, Image.Quantize.MAXCOVERAGE).getpalette() or []
+    palette = Image.new("P", (1, 1))
+    palette.putpalette([*frequent, *apart[: 3 * COLOURS // 2]])
+    return palette
+
+
+def main() -> None:
+    """Draw all of them."""
+    for name, (log, picture, width) in PICTURES.items():
+        draw(log, picture, width, IMAGES / name)
+    for script in OTHERS:
+        if subprocess.run([sys.executable, ROOT / "scripts" / script], cwd=ROOT, check=False).returncode:
+            print(f"{script} failed: its picture stays as it is", file=sys.stderr)
+    for path in sorted(IMAGES.glob("*.png")):
+        reduce(path)
+
+
+if __name__ == "__main__":
+    main()
