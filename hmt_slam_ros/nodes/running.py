@@ -6,6 +6,7 @@ import ctypes
 import os
 import signal
 import sys
+import threading
 from collections.abc import Callable
 from typing import TypeVar
 
@@ -40,8 +41,6 @@ def run(make: Callable[[], NodeType], spin: Callable[[NodeType], None] = rclpy.s
     :returns: exit status.
     """
     stop = _Stop()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, stop)
     nodes: list[NodeType] = []
     try:
         status = _live(make, spin, stop, nodes)
@@ -73,24 +72,36 @@ def _live(
     except (KeyboardInterrupt, ExternalShutdownException):
         return 0
     except HmtSlamError as error:
+        # With the error goes what is there of a node that could not be made, and with it its participant.
+        end_within(_DEPARTURE, FAULT)
         print(f"{sys.argv[0].rsplit('/', 1)[-1]}: {error}", file=sys.stderr, flush=True)
         return FAULT
     return 0
 
 
 class _Stop:
-    """Takes note of a signal; rclpy's own handler, which calls this one, shuts the context down, and spinning ends.
+    """Takes note of SIGINT and SIGTERM; rclpy's own handler shuts the context down, and spinning ends.
 
-    Nothing is raised: an exception would come up at any line, also inside of a compiler, which cannot bear it.
+    Nothing is raised: an exception would come up at any line, also inside of a compiler, which cannot bear it. A thread
+    waits for the signal, since Python's handlers run between two lines of the main thread only: a signal that another
+    thread gets, or that comes right before a long call of C, would be taken note of after that call.
     """
 
     def __init__(self) -> None:
         self.told = False
+        self._come, told = os.pipe()
+        os.set_blocking(told, False)
+        signal.set_wakeup_fd(told, warn_on_full_buffer=False)
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, self._take_note)
+        threading.Thread(target=self._end_in_time, daemon=True).start()
 
-    def __call__(self, _number: int, _frame: object) -> None:
-        if not self.told:
-            self.told = True
-            end_within(_GRACE, 0)
+    def _take_note(self, _number: int, _frame: object) -> None:
+        self.told = True
+
+    def _end_in_time(self) -> None:
+        os.read(self._come, 1)
+        end_within(_GRACE, 0)
 
 
 def _ignore_signals() -> None:
