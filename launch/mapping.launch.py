@@ -12,53 +12,50 @@ PROCESSES = ("slam", "aam", "tsbi", "tlca", "rtl")
 
 
 def generate_launch_description() -> LaunchDescription:
-    """Describe the five process nodes and their arguments."""
+    """Describe the five process nodes, the live page and their arguments."""
+    return LaunchDescription([*_arguments(), *_processes(), _view()])
+
+
+def _arguments() -> list[DeclareLaunchArgument]:
     defaults = PathJoinSubstitution([FindPackageShare("hmt_slam_ros"), "config", "hmt_slam.yaml"])
-    use_sim_time = ParameterValue(LaunchConfiguration("use_sim_time"), value_type=bool)
-    arguments = [
+    recovery = PathJoinSubstitution([LaunchLogDir(), "recovery"])
+    return [
         DeclareLaunchArgument("params_file", default_value=defaults, description="YAML file with the parameters."),
-        DeclareLaunchArgument(
-            "use_sim_time",
-            default_value="false",
-            choices=["true", "false"],
-            description="Take the time from /clock, for a replay or a simulator.",
-        ),
+        _switch("use_sim_time", "false", "Take the time from /clock, for a replay or a simulator."),
         DeclareLaunchArgument("namespace", default_value="", description="Namespace of the nodes and their topics."),
         DeclareLaunchArgument("start_from", default_value="", description="Saved map to go on from; empty for none."),
-        DeclareLaunchArgument(
-            "start_carried",
-            default_value="true",
-            choices=["true", "false"],
-            description="Whether the robot may be anywhere in that map; otherwise it is where it was.",
-        ),
+        _switch("start_carried", "true", "Whether the robot may be anywhere in that map; else it is where it was."),
         DeclareLaunchArgument("save_to", default_value="hmt_map", description="Folder for the service slam/save."),
-        DeclareLaunchArgument(
-            "save_at_end",
-            default_value="false",
-            choices=["true", "false"],
-            description="Whether the map is saved there before the nodes end.",
-        ),
-        DeclareLaunchArgument(
-            "view", default_value="false", choices=["true", "false"], description="Whether the live page is served."
-        ),
+        _switch("save_at_end", "false", "Whether the map is saved there before the nodes end."),
+        _switch("view", "false", "Whether the live page is served."),
         DeclareLaunchArgument("view_port", default_value="8800", description="Port of the live page on 127.0.0.1."),
         DeclareLaunchArgument(
-            "recovery",
-            default_value=PathJoinSubstitution([LaunchLogDir(), "recovery"]),
-            description="Folder from which a node that was killed goes on where it was.",
+            "recovery", default_value=recovery, description="Folder from which a node that was killed goes on."
         ),
         DeclareLaunchArgument("log_level", default_value="info", description="Level of the nodes' log output."),
     ]
-    folders = ("start_from", "save_to", "recovery")
-    saving = {name: ParameterValue(LaunchConfiguration(name), value_type=str) for name in folders}
-    for name in ("save_at_end", "start_carried"):
-        saving[name] = ParameterValue(LaunchConfiguration(name), value_type=bool)
-    nodes = [
+
+
+def _switch(name: str, default: str, description: str) -> DeclareLaunchArgument:
+    return DeclareLaunchArgument(name, default_value=default, choices=["true", "false"], description=description)
+
+
+def _value(name: str, kind: type) -> ParameterValue:
+    return ParameterValue(LaunchConfiguration(name), value_type=kind)
+
+
+def _processes() -> list[Node]:
+    kinds = {"use_sim_time": bool, "start_from": str, "start_carried": bool}
+    kinds |= {"save_to": str, "save_at_end": bool, "recovery": str}
+    return [
         Node(
             package="hmt_slam_ros",
             executable=process,
             namespace=LaunchConfiguration("namespace"),
-            parameters=[LaunchConfiguration("params_file"), {"use_sim_time": use_sim_time}, saving],
+            parameters=[
+                LaunchConfiguration("params_file"),
+                {name: _value(name, kind) for name, kind in kinds.items()},
+            ],
             ros_arguments=["--log-level", LaunchConfiguration("log_level")],
             output="screen",
             respawn=True,
@@ -67,12 +64,14 @@ def generate_launch_description() -> LaunchDescription:
         )
         for process in PROCESSES
     ]
-    view = Node(
+
+
+def _view() -> Node:
+    return Node(
         package="hmt_slam_ros",
         executable="view",
         namespace=LaunchConfiguration("namespace"),
-        parameters=[{"port": ParameterValue(LaunchConfiguration("view_port"), value_type=int)}],
+        parameters=[{"port": _value("view_port", int)}],
         output="screen",
         condition=IfCondition(LaunchConfiguration("view")),
     )
-    return LaunchDescription([*arguments, *nodes, view])
