@@ -28,7 +28,8 @@ from hmt_slam_ros.logs.records import SIMULATED
 from hmt_slam_ros.offline.recorder import placed_areas
 from hmt_slam_ros.offline.runtime import Run
 from hmt_slam_ros.offline.saved_map import RunState
-from hmt_slam_ros.processes.messages import AreaPose, Carried
+from hmt_slam_ros.processes.map_parts import AreaPose
+from hmt_slam_ros.processes.messages import Carried
 from hmt_slam_ros.processes.replica import Replica
 from hmt_slam_ros.processes.slam import MetricSlam
 from hmt_slam_ros.sensing import Scan

@@ -25,7 +25,8 @@ from hmt_slam_ros.offline.map_image import OccupancyImage, occupancy_image
 from hmt_slam_ros.offline.recorder import Recording, keyframe_poses
 from hmt_slam_ros.offline.runtime import Run
 from hmt_slam_ros.offline.saved_map import RunState
-from hmt_slam_ros.processes.messages import Carried, Place
+from hmt_slam_ros.processes.map_parts import Place
+from hmt_slam_ros.processes.messages import Carried
 from hmt_slam_ros.processes.replica import Replica
 from hmt_slam_ros.sensing import Odometry
 from hmt_slam_ros.simulation import SimulatedLog, open_simulated

@@ -14,11 +14,11 @@ import numpy as np
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.processes.map_parts import AreaPose
 from hmt_slam_ros.processes.messages import (
     Accepted,
     AreaEvent,
     AreaEvents,
-    AreaPose,
     Hypotheses,
     Keyframe,
     Leaf,

@@ -9,7 +9,8 @@ from hmt_slam_ros.offline.recorder import Recorder
 from hmt_slam_ros.offline.runtime import LockStep
 from hmt_slam_ros.processes.aam import Aam
 from hmt_slam_ros.processes.documents import decode, encode
-from hmt_slam_ros.processes.messages import Accepted, Arc, EndOfLog, Hypotheses
+from hmt_slam_ros.processes.map_parts import Arc
+from hmt_slam_ros.processes.messages import Accepted, EndOfLog, Hypotheses
 from hmt_slam_ros.processes.rtl import Rtl
 from hmt_slam_ros.processes.slam import MetricSlam
 from hmt_slam_ros.processes.tlca import Tlca

@@ -8,16 +8,8 @@ import worlds
 from hmt_slam_ros.configuration import Configuration, with_changes
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.processes.messages import (
-    Accepted,
-    Arc,
-    Hypotheses,
-    Keyframe,
-    Leaf,
-    LeafEstimate,
-    Notice,
-    Relabelled,
-)
+from hmt_slam_ros.processes.map_parts import Arc, Relabelled
+from hmt_slam_ros.processes.messages import Accepted, Hypotheses, Keyframe, Leaf, LeafEstimate, Notice
 from hmt_slam_ros.processes.tlca import Tlca
 
 WORLD = worlds.two_rooms()

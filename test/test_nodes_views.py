@@ -29,7 +29,8 @@ from hmt_slam_ros.nodes import qos
 from hmt_slam_ros.nodes.map_view import MapView, Seen
 from hmt_slam_ros.nodes.topics import DIAGNOSTICS, FINISHED, GRAPH, HMT_POSE, MAP, PARTICLES, PMF, POSE
 from hmt_slam_ros.nodes.transforms import TFMessage
-from hmt_slam_ros.processes.messages import Accepted, Arc, AreaPose, Hypotheses, Keyframe, Leaf, LeafEstimate
+from hmt_slam_ros.processes.map_parts import Arc, AreaPose
+from hmt_slam_ros.processes.messages import Accepted, Hypotheses, Keyframe, Leaf, LeafEstimate
 from hmt_slam_ros.sensing import Scan
 from hmt_slam_ros.topology.unknown import unknown
 

@@ -18,20 +18,16 @@ from hmt_slam_ros.offline.output_folder import replacing, write_output
 from hmt_slam_ros.offline.recorder import Recorder
 from hmt_slam_ros.offline.report import RunFigures, read_table
 from hmt_slam_ros.offline.saved_map import MapWriter, read_run_state, read_saved_map
+from hmt_slam_ros.processes.map_parts import Arc, ArcEnds, AreaPose, LocalArea, Relabelled
 from hmt_slam_ros.processes.messages import (
     Accepted,
-    Arc,
-    ArcEnds,
-    AreaPose,
     Finished,
     Hypotheses,
     Keyframe,
     Leaf,
     LeafEstimate,
-    LocalArea,
     LocalEstimate,
     Notice,
-    Relabelled,
     Trail,
 )
 from hmt_slam_ros.sensing import Scan

@@ -9,17 +9,15 @@ from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.processes import aam as aam_module
 from hmt_slam_ros.processes.aam import Aam
+from hmt_slam_ros.processes.map_parts import Arc, Merged, Relabelled
 from hmt_slam_ros.processes.messages import (
     Accepted,
-    Arc,
     AreaEvents,
     Hypotheses,
     Keyframe,
     Leaf,
     LeafEstimate,
     LocalEstimate,
-    Merged,
-    Relabelled,
 )
 
 WORLD = worlds.two_rooms()

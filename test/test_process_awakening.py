@@ -12,7 +12,8 @@ from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.logs import open_log
 from hmt_slam_ros.offline.runtime import Run
-from hmt_slam_ros.processes.messages import Carried, Place
+from hmt_slam_ros.processes.map_parts import Place
+from hmt_slam_ros.processes.messages import Carried
 from hmt_slam_ros.processes.replica import Replica
 from hmt_slam_ros.sensing import Odometry, Scan
 from hmt_slam_ros.simulation.scenario import START

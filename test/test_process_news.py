@@ -12,7 +12,7 @@ from hmt_slam_ros.local_map.area_filter import PlacedKeyframe
 from hmt_slam_ros.offline.runtime import Run
 from hmt_slam_ros.offline.saved_map import MapWriter, read_run_state
 from hmt_slam_ros.processes.documents import KeyframeHead, encode
-from hmt_slam_ros.processes.messages import Outdated
+from hmt_slam_ros.processes.map_parts import Outdated
 from hmt_slam_ros.processes.news import Look, looked, news_of, outdated
 from hmt_slam_ros.sensing import Scan
 from hmt_slam_ros.sensing.view import FREE, SURFACE, UNSEEN, passing, seen, view_of

@@ -16,8 +16,9 @@ from hmt_slam_ros.logs import open_log
 from hmt_slam_ros.offline.final_map import final_map
 from hmt_slam_ros.processes.closure_account import Account, Closure, Step, unrefined, without
 from hmt_slam_ros.processes.doubts import Doubts
+from hmt_slam_ros.processes.map_parts import Arc, ArcEnds, Merged, Relabelled
 from hmt_slam_ros.processes.merged_account import merged
-from hmt_slam_ros.processes.messages import Arc, ArcEnds, Leaf, Merged, Relabelled
+from hmt_slam_ros.processes.messages import Leaf
 from hmt_slam_ros.processes.undo import Undo
 from hmt_slam_ros.sensing import Scan
 from hmt_slam_ros.topology.common_map import ArcValue

@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.processes.messages import Accepted, AreaPose, LocalEstimate, Notice
+from hmt_slam_ros.processes.map_parts import AreaPose
+from hmt_slam_ros.processes.messages import Accepted, LocalEstimate, Notice
 from hmt_slam_ros.processes.rtl import Rtl
 from hmt_slam_ros.sensing import Odometry
 

@@ -10,19 +10,16 @@ from worlds import box, scan_in
 from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.processes.map_parts import Arc, LocalArea, Merged, Relabelled
 from hmt_slam_ros.processes.messages import (
     Accepted,
-    Arc,
     EndOfLog,
     Finished,
     Hypotheses,
     Keyframe,
     Leaf,
-    LocalArea,
     LocalEstimate,
-    Merged,
     Notice,
-    Relabelled,
     Trail,
 )
 from hmt_slam_ros.processes.slam import MetricSlam

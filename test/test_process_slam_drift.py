@@ -10,7 +10,8 @@ from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.local_map.area_filter import AreaFilter, PlacedKeyframe
 from hmt_slam_ros.local_map.local_mapping import LocalMapping
 from hmt_slam_ros.processes.live_hypothesis import LiveHypothesis
-from hmt_slam_ros.processes.messages import Leaf, Relabelled
+from hmt_slam_ros.processes.map_parts import Relabelled
+from hmt_slam_ros.processes.messages import Leaf
 from hmt_slam_ros.sensing.motion import Prediction, Step
 
 CORRIDOR = np.array([[-200.0, -1.0, 200.0, -1.0], [-200.0, 1.0, 200.0, 1.0]])

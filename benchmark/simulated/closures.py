@@ -9,7 +9,8 @@ from benchmark.simulated.examinations import Examination
 from benchmark.simulated.features import known_is_right, new_is_right
 from benchmark.simulated.truth import Claim, Truth
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.processes.messages import Arc, Hypotheses, Leaf
+from hmt_slam_ros.processes.map_parts import Arc
+from hmt_slam_ros.processes.messages import Hypotheses, Leaf
 from hmt_slam_ros.processes.replica import FIRST_HYPOTHESIS, Replica
 from hmt_slam_ros.topology.hybrid_map import HybridMap
 

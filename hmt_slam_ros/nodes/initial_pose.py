@@ -14,7 +14,7 @@ from rclpy.parameter import Parameter
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.processes.messages import AreaPose, Place
+from hmt_slam_ros.processes.map_parts import AreaPose, Place
 from hmt_slam_ros.topology.surroundings import positions
 from hmt_slam_ros.topology.unknown import joined
 

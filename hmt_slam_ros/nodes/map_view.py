@@ -18,7 +18,8 @@ from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import ELLIPSE_95, PoseGaussian
 from hmt_slam_ros.nodes.conversions import header, quaternion, time_message
-from hmt_slam_ros.processes.messages import Accepted, AreaPose, Hypotheses, Keyframe, Message
+from hmt_slam_ros.processes.map_parts import AreaPose
+from hmt_slam_ros.processes.messages import Accepted, Hypotheses, Keyframe, Message
 from hmt_slam_ros.processes.replica import Replica, ReplicaState
 from hmt_slam_ros.topology.unknown import tells_nothing
 

@@ -15,7 +15,7 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, get_args
 
 from rcl_interfaces.msg import ParameterDescriptor
 
@@ -24,19 +24,9 @@ from hmt_slam_ros.nodes.journal import Entry, Journal, journal_entries
 from hmt_slam_ros.persistence.folder import FolderWriter
 from hmt_slam_ros.persistence.hmt_map import CONFIGURATION, VERSION
 from hmt_slam_ros.processes.messages import (
-    Accepted,
-    AreaEvents,
     Arriving,
-    Carried,
-    EndOfLog,
-    Finished,
-    Hypotheses,
-    Keyframe,
-    LocalEstimate,
     Message,
-    Notice,
     RealTimePose,
-    Trail,
 )
 from hmt_slam_ros.sensing import Odometry, Scan
 
@@ -124,11 +114,7 @@ class Found:
     heard: list[Message | Setting | Paused]
 
 
-_HEARABLE = (
-    Scan, Odometry, Keyframe, AreaEvents, Hypotheses, Accepted, LocalEstimate, Trail, Carried, Arriving, EndOfLog,
-    Finished, Notice,
-)  # fmt: skip
-_KINDS: dict[str, type] = {kind.__name__: kind for kind in (Base, Setting, Paused, *_HEARABLE)}
+_KINDS: dict[str, type] = {kind.__name__: kind for kind in (Base, Setting, Paused, *get_args(Message))}
 
 
 class Recovery:

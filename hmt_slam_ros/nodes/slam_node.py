@@ -38,9 +38,9 @@ from hmt_slam_ros.nodes.transforms import LaserMounting
 from hmt_slam_ros.persistence.folder import FolderReader
 from hmt_slam_ros.persistence.hmt_map import VERSION
 from hmt_slam_ros.processes.documents import RobotStatus, decode
+from hmt_slam_ros.processes.map_parts import AreaPose, Place
 from hmt_slam_ros.processes.messages import (
     Accepted,
-    AreaPose,
     Arriving,
     Carried,
     EndOfLog,
@@ -48,7 +48,6 @@ from hmt_slam_ros.processes.messages import (
     Keyframe,
     LocalEstimate,
     Message,
-    Place,
     Trail,
 )
 from hmt_slam_ros.processes.replica import FIRST_AREA

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from hmt_slam_ros.arrays import Bool, Float64, Int64
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.offline.trajectories import OnlinePose
-from hmt_slam_ros.processes.messages import AreaPose, LocalEstimate, Notice, Trail
+from hmt_slam_ros.processes.map_parts import AreaPose
+from hmt_slam_ros.processes.messages import LocalEstimate, Notice, Trail
 from hmt_slam_ros.processes.replica import ReplicaState
 from hmt_slam_ros.topology.crowding import Successor
 

@@ -28,11 +28,10 @@ from hmt_slam_ros.offline.trajectories import (
     carried,
     of_all,
 )
+from hmt_slam_ros.processes.map_parts import AreaPose, Forgotten
 from hmt_slam_ros.processes.messages import (
     Accepted,
-    AreaPose,
     Finished,
-    Forgotten,
     Hypotheses,
     Keyframe,
     Leaf,

@@ -21,7 +21,8 @@ from hmt_slam_ros.offline.trajectories import Anchored
 from hmt_slam_ros.persistence.folder import File, FolderReader, FolderWriter
 from hmt_slam_ros.persistence.hmt_map import CONFIGURATION, FORMAT, VERSION
 from hmt_slam_ros.processes.aam_watch import AamState
-from hmt_slam_ros.processes.messages import AreaPose, LocalEstimate
+from hmt_slam_ros.processes.map_parts import AreaPose
+from hmt_slam_ros.processes.messages import LocalEstimate
 from hmt_slam_ros.processes.replica import Replica, ReplicaState
 from hmt_slam_ros.processes.rtl import RtlState
 from hmt_slam_ros.processes.slam import SlamState

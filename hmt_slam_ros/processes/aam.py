@@ -13,16 +13,15 @@ from numpy.typing import NDArray
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.processes.aam_watch import AamState, Joint, Watch, numbered, watch_of
+from hmt_slam_ros.processes.map_parts import Forgotten, Merged
 from hmt_slam_ros.processes.messages import (
     Accepted,
     AreaEvent,
     AreaEvents,
-    Forgotten,
     Hypotheses,
     Keyframe,
     Leaf,
     LeafEstimate,
-    Merged,
     Message,
 )
 from hmt_slam_ros.processes.replica import Replica

@@ -12,7 +12,7 @@ import numpy as np
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.processes.messages import Arc, Relabelled
+from hmt_slam_ros.processes.map_parts import Arc, Relabelled
 from hmt_slam_ros.processes.observation import Observation
 from hmt_slam_ros.refinement.closure import ClosureRefinement
 from hmt_slam_ros.sensing import Scan

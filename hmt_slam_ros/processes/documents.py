@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.persistence.folder import File
 from hmt_slam_ros.plain_data import Reader, Values, plain
+from hmt_slam_ros.processes.map_parts import Outdated, Place
 from hmt_slam_ros.processes.messages import (
     Accepted,
     AreaEvents,
@@ -27,8 +28,6 @@ from hmt_slam_ros.processes.messages import (
     LeafEstimate,
     LocalEstimate,
     Notice,
-    Outdated,
-    Place,
 )
 from hmt_slam_ros.sensing import Scan
 

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from operator import attrgetter
 
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.processes.messages import AreaPose
+from hmt_slam_ros.processes.map_parts import AreaPose
 
 
 class GlobalPoses(Mapping[int, PoseGaussian]):

@@ -17,7 +17,8 @@ from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.local_map.area_filter import AreaFilter, FilterState, FilterStep, PlacedKeyframe
 from hmt_slam_ros.local_map.local_mapping import LocalMapping
 from hmt_slam_ros.local_map.match_error import MatchError
-from hmt_slam_ros.processes.messages import Leaf, LeafEstimate, Merged, Relabelled, Trail
+from hmt_slam_ros.processes.map_parts import Merged, Relabelled
+from hmt_slam_ros.processes.messages import Leaf, LeafEstimate, Trail
 from hmt_slam_ros.processes.news import Look, looked
 from hmt_slam_ros.sensing import Scan
 from hmt_slam_ros.topology.crowding import Successor, in_place, successor

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from hmt_slam_ros.processes.closure_account import Account, Closure, History, Step, history_of, pair_of, steps_of
-from hmt_slam_ros.processes.messages import Merged
+from hmt_slam_ros.processes.map_parts import Merged
 from hmt_slam_ros.topology.common_map import Pair
 
 

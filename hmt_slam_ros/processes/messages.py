@@ -16,25 +16,19 @@ from numpy.typing import NDArray
 
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.processes.map_parts import (
+    Arc,
+    ArcEnds,
+    AreaPose,
+    Forgotten,
+    LocalArea,
+    Merged,
+    Outdated,
+    Place,
+    Pose,
+    Relabelled,
+)
 from hmt_slam_ros.sensing import Odometry, Scan
-
-Pose = NDArray[np.float64]
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class Relabelled:
-    """A keyframe that is in another area now, or at another pose.
-
-    :ivar keyframe: its number.
-    :ivar source: the area in which it was.
-    :ivar area: the area to which it belongs now.
-    :ivar pose: shape (3,), ``area_T_base``.
-    """
-
-    keyframe: int
-    source: int
-    area: int
-    pose: Pose
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -60,30 +54,6 @@ class LeafEstimate:
     log_evidence: float
     effective_samples: float
     revised: tuple[Relabelled, ...] = ()
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class Place:
-    """Where the robot is, as somebody says.
-
-    :ivar area: a known area.
-    :ivar pose: belief over ``area_T_base``.
-    """
-
-    area: int
-    pose: PoseGaussian
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class Outdated:
-    """Beams of a keyframe that say something of the world that is not so any more.
-
-    :ivar keyframe: its number.
-    :ivar beams: their numbers in the scan, ascending.
-    """
-
-    keyframe: int
-    beams: tuple[int, ...]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -134,18 +104,6 @@ class AreaEvent:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Forgotten:
-    """A keyframe of ground that others hold as well.
-
-    :ivar keyframe: its number.
-    :ivar area: the area in which it is.
-    """
-
-    keyframe: int
-    area: int
-
-
-@dataclass(frozen=True, eq=False, slots=True)
 class AreaEvents:
     """aam -> tsbi, one for every keyframe event, mostly without events.
 
@@ -157,60 +115,6 @@ class AreaEvents:
     sequence: int
     events: tuple[AreaEvent, ...]
     forgotten: tuple[Forgotten, ...] = ()
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class Arc:
-    """A directed arc of the topological graph.
-
-    :ivar source: area a.
-    :ivar target: area b.
-    :ivar pose: belief over ``a_T_b``, Eq. (9).
-    :ivar closure: whether the arc closed a loop, that is, led into an area that was already known.
-    """
-
-    source: int
-    target: int
-    pose: PoseGaussian
-    closure: bool = False
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class ArcEnds:
-    """Two areas between which an arc is taken out.
-
-    :ivar source: the smaller.
-    :ivar target: the larger.
-    """
-
-    source: int
-    target: int
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class LocalArea:
-    """An area that the local map must hold.
-
-    :ivar area: its id.
-    :ivar pose: shape (3,), ``current_T_area``.
-    """
-
-    area: int
-    pose: Pose
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class Merged:
-    """Two areas that are one, with all keyframes and arcs.
-
-    :ivar area: the one that becomes part of the other.
-    :ivar into: the other.
-    :ivar pose: belief over ``into_T_area``, as the arc had it that joined the two.
-    """
-
-    area: int
-    into: int
-    pose: PoseGaussian
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -265,18 +169,6 @@ class Hypotheses:
     unexamined: float = 0.0
     forgotten: tuple[Forgotten, ...] = ()
     outdated: tuple[Outdated, ...] = ()
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class AreaPose:
-    """Where an area is in the globally consistent map.
-
-    :ivar area: its id.
-    :ivar pose: belief over ``map_T_area``.
-    """
-
-    area: int
-    pose: PoseGaussian
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.processes.closure_account import Closure, pair_of
-from hmt_slam_ros.processes.messages import Arc, Leaf
+from hmt_slam_ros.processes.map_parts import Arc
+from hmt_slam_ros.processes.messages import Leaf
 from hmt_slam_ros.processes.undo import Undo
 from hmt_slam_ros.topology.common_map import Pair
 from hmt_slam_ros.topology.hybrid_map import HybridMap

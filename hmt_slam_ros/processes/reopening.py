@@ -13,7 +13,8 @@ from hmt_slam_ros.geometry.chi_square import gate
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.processes.closure_account import Account, Closure, Name, Step, steps_of
 from hmt_slam_ros.processes.doubts import Doubt, Doubts, Explanation
-from hmt_slam_ros.processes.messages import Arc, ArcEnds, Leaf, Notice, Relabelled
+from hmt_slam_ros.processes.map_parts import Arc, ArcEnds, Relabelled
+from hmt_slam_ros.processes.messages import Leaf, Notice
 from hmt_slam_ros.processes.replica import FIRST_AREA
 from hmt_slam_ros.topology.common_map import Pair
 from hmt_slam_ros.topology.hybrid_map import HybridMap

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from hmt_slam_ros.processes.messages import Accepted, Arc, ArcEnds, Hypotheses, Keyframe, Leaf, Relabelled
+from hmt_slam_ros.processes.map_parts import Arc, ArcEnds, Relabelled
+from hmt_slam_ros.processes.messages import Accepted, Hypotheses, Keyframe, Leaf
 from hmt_slam_ros.sensing import Scan
 from hmt_slam_ros.topology.common_map import CommonMap
 from hmt_slam_ros.topology.hybrid_map import HybridMap

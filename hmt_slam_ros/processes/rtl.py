@@ -19,7 +19,8 @@ from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.processes.global_poses import GlobalPoses
-from hmt_slam_ros.processes.messages import Accepted, AreaPose, Arriving, LocalEstimate, Message, Notice, RealTimePose
+from hmt_slam_ros.processes.map_parts import AreaPose
+from hmt_slam_ros.processes.messages import Accepted, Arriving, LocalEstimate, Message, Notice, RealTimePose
 from hmt_slam_ros.processes.replica import FIRST_AREA
 from hmt_slam_ros.sensing import Odometry
 from hmt_slam_ros.sensing.motion import path_covariance

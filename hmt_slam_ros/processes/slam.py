@@ -21,6 +21,7 @@ from hmt_slam_ros.local_map.area_filter import AreaFilter, PlacedKeyframe
 from hmt_slam_ros.local_map.local_mapping import LocalMapping
 from hmt_slam_ros.local_map.patch_pool import PatchState
 from hmt_slam_ros.processes.live_hypothesis import LiveHypothesis, LiveState
+from hmt_slam_ros.processes.map_parts import Place
 from hmt_slam_ros.processes.messages import (
     Accepted,
     Arriving,
@@ -32,7 +33,6 @@ from hmt_slam_ros.processes.messages import (
     LocalEstimate,
     Message,
     Notice,
-    Place,
 )
 from hmt_slam_ros.processes.news import AROUND, CERTAIN, Look, News, news_of, outdated
 from hmt_slam_ros.processes.odometry_watch import OdometryWatch, OdometryWatchState

@@ -16,18 +16,9 @@ from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.processes.acceptance import Acceptance
 from hmt_slam_ros.processes.ambiguity import Ambiguity, Frame
 from hmt_slam_ros.processes.closure_account import Account, Closure, History, Name, Step, history_of, steps_of
+from hmt_slam_ros.processes.map_parts import Arc, AreaPose, Relabelled
 from hmt_slam_ros.processes.merged_account import merged, witnesses_of
-from hmt_slam_ros.processes.messages import (
-    Accepted,
-    Arc,
-    AreaPose,
-    Hypotheses,
-    Keyframe,
-    Leaf,
-    Message,
-    Notice,
-    Relabelled,
-)
+from hmt_slam_ros.processes.messages import Accepted, Hypotheses, Keyframe, Leaf, Message, Notice
 from hmt_slam_ros.processes.observation import Observation, observed
 from hmt_slam_ros.processes.reopening import Past, Question, Reopening, ReopeningState
 from hmt_slam_ros.processes.replica import FIRST_HYPOTHESIS, Replica, ReplicaState

@@ -14,17 +14,16 @@ from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.processes.global_poses import GlobalPoses
 from hmt_slam_ros.processes.localization import Localization, Standing, localization
+from hmt_slam_ros.processes.map_parts import AreaPose, LocalArea
 from hmt_slam_ros.processes.messages import (
     Accepted,
     AreaEvent,
     AreaEvents,
-    AreaPose,
     Arriving,
     Hypotheses,
     Keyframe,
     Leaf,
     LeafEstimate,
-    LocalArea,
     Message,
 )
 from hmt_slam_ros.processes.replica import FIRST_HYPOTHESIS, Replica, ReplicaState

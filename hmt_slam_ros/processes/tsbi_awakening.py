@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.processes.messages import Arc, Keyframe, Place
+from hmt_slam_ros.processes.map_parts import Arc, Place
+from hmt_slam_ros.processes.messages import Keyframe
 from hmt_slam_ros.processes.tsbi_branching import Branches, Branching, Child, Parent
 from hmt_slam_ros.topology.hybrid_map import HybridMap
 from hmt_slam_ros.topology.hypothesis_tree import Sighting

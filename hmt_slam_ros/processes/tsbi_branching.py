@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.processes.messages import Arc, ArcEnds, Merged, Relabelled
+from hmt_slam_ros.processes.map_parts import Arc, ArcEnds, Merged, Relabelled
 from hmt_slam_ros.processes.replica import FIRST_AREA, Replica
 from hmt_slam_ros.sensing import Scan
 from hmt_slam_ros.topology.admission import Query
