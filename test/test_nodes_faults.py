@@ -5,8 +5,9 @@ import signal
 
 import numpy as np
 import pytest
-from logs_for_nodes import BEAMS, PACE, SECOND, Corridor, corridor_bag
-from test_nodes_localization import SCANS, Nodes, mapped_corridor
+from conftest import Listener
+from logs_for_nodes import BEAMS, PACE, SECOND, START, Corridor, corridor_bag
+from test_nodes_localization import NODES, SCANS, Nodes, mapped_corridor
 
 pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
 
@@ -25,7 +26,7 @@ from hmt_slam_ros.nodes.topics import DIAGNOSTICS, DOCUMENTS, KEYFRAMES, POSE, S
 from hmt_slam_ros.nodes.transforms import TFMessage
 from hmt_slam_ros.persistence.folder import FolderReader
 from hmt_slam_ros.persistence.hmt_map import FORMAT, VERSION
-from hmt_slam_ros.processes.documents import encode
+from hmt_slam_ros.processes.documents import decode, encode
 from hmt_slam_ros.processes.messages import LocalEstimate
 from hmt_slam_ros.sensing import Odometry, Scan
 
@@ -45,6 +46,36 @@ def restart(nodes, name, before, **parameters):
     said = len(nodes.diagnostics)
     nodes.alive[before] = nodes.start(name, **parameters)
     nodes.until(lambda: any(m.status[0].name == f"/{name}" for m in nodes.diagnostics[said:]))
+
+
+def corridor_measurements(scans):
+    """Scans and odometry readings along the corridor, in the order of their stamps."""
+    return [record.measurement for record in Corridor(scans).records()]
+
+
+class Driver:
+    """Laser and wheels that are drivers' own, which keep nothing for late comers, in a process that is younger."""
+
+    def __init__(self, nodes, domain):
+        self._nodes, self._own = nodes, Listener(domain)
+        self._scans = self._own.node.create_publisher(LaserScan, SCAN, qos.SENSOR)
+        self._odom = self._own.node.create_publisher(OdometryMessage, "odom", qos.SENSOR)
+        listening = (self._scans.get_subscription_count, self._odom.get_subscription_count)
+        nodes.until(lambda: [count() for count in listening] == [1, 2])
+
+    def send(self, measurement):
+        """Publish a scan or an odometry reading."""
+        if isinstance(measurement, Scan):
+            self._scans.publish(conversions.laser_scan(measurement, "laser"))
+        else:
+            self._odom.publish(conversions.odometry_message(measurement, "odom", "base_link"))
+
+    def close(self):
+        self._own.close()
+
+    def answered(self):
+        """Stamps of the scans that have a pose, ns."""
+        return [decode(message.data, LocalEstimate).stamp for message in self._nodes.estimates]
 
 
 def test_rtl_that_is_killed_goes_on_with_the_pose_and_the_parameters_that_it_had(tmp_path, listener, start):
@@ -118,6 +149,31 @@ def test_a_process_that_was_dead_while_the_others_began_anew_begins_anew_too(cor
     nodes.until(lambda: len(nodes.estimates) == 15 + 30 + SCANS - 31)
     end = 4 * (SCANS - 1) * PACE
     nodes.until(lambda: nodes.poses and np.abs(conversions.planar_pose(nodes.poses[-1].pose.pose) - end).max() < 0.3)
+
+
+@pytest.mark.skipif(TFMessage is None, reason="tf2_msgs is not installed: run scripts/test.sh, which builds it")
+def test_all_are_killed_with_what_said_where_the_laser_is_and_go_on_without_it(domain, listener, start, tmp_path):
+    nodes = Nodes(start, listener, recovery=tmp_path / "recovery")
+    nodes.drive(corridor_bag(tmp_path, scans=60), first=0, robot__duration=5.9)
+    nodes.until(lambda: len(nodes.estimates) == 30)
+    for process in nodes.alive:
+        kill(process)
+    said = len(nodes.diagnostics)
+    nodes.alive = [start(name, recovery=tmp_path / "recovery") for name in NODES]
+    nodes.until(lambda: {m.status[0].name for m in nodes.diagnostics[said:]} >= {f"/{name}" for name in NODES})
+    driver = Driver(nodes, domain)
+    for one in corridor_measurements(60)[150:]:
+        driver.send(one)
+    nodes.until(lambda: driver.answered()[-1] == START + 59 * 200_000_000)
+    # What was under way when they were killed is said again.
+    assert sorted(set(driver.answered())) == [START + k * 200_000_000 for k in range(60)]
+    nodes.until(lambda: np.abs(conversions.planar_pose(nodes.poses[-1].pose.pose) - 4 * 59 * PACE).max() < 0.1)
+    assert "no transform" not in nodes.diagnosis("slam")["last error"]
+    driver.close()
+    for process in nodes.alive:
+        process.send_signal(signal.SIGINT)
+    for process in nodes.alive:
+        assert "was killed and goes on where it was" in process.communicate(timeout=20)[1]
 
 
 def test_a_laser_falls_silent_a_disk_is_full_and_time_jumps_back(listener, start, tmp_path):

@@ -3,6 +3,7 @@
 import math
 import subprocess
 import sys
+from collections import defaultdict
 from itertools import groupby, islice
 
 import numpy as np
@@ -73,9 +74,9 @@ class Nodes:
         return bool(self.localized) and self.localized[-1].data
 
     def diagnosis(self, node):
-        """What a node said of itself last; empty while it said nothing."""
+        """What a node said of itself last, {name: value}; values are empty while it said nothing."""
         said = (m.status[0] for m in reversed(self.diagnostics) if m.status[0].name == f"/{node}")
-        return {value.key: value.value for status in islice(said, 1) for value in status.values}
+        return defaultdict(str, {value.key: value.value for status in islice(said, 1) for value in status.values})
 
 
 def assert_true(message, begin):

@@ -10,16 +10,22 @@ from hmt_slam_ros.logs.ros_types import RosMessage
 
 
 class FrameTree:
-    """Frames and the transforms that join them; the first transform of each child frame counts."""
+    """Frames and the transforms that join them.
 
-    def __init__(self) -> None:
+    Of several transforms of one child frame the first counts, as in a log, which is read from its beginning for every
+    scan, or the newest, as in a robot.
+    """
+
+    def __init__(self, *, newest: bool = False) -> None:
+        """:param newest: whether the newest counts."""
+        self._newest = newest
         self._parents: dict[str, tuple[str, NDArray[np.float64]]] = {}
 
     def add(self, message: RosMessage) -> None:
         """Take in a tf2_msgs/TFMessage."""
         for joint in message.transforms:
             child = frame_name(joint.child_frame_id)
-            if child not in self._parents:
+            if self._newest or child not in self._parents:
                 move, turn = joint.transform.translation, joint.transform.rotation
                 transform = transform_from_quaternion((move.x, move.y, move.z), (turn.x, turn.y, turn.z, turn.w))
                 self._parents[child] = (frame_name(joint.header.frame_id), transform)

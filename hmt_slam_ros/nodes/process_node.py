@@ -19,7 +19,7 @@ from hmt_slam_ros.nodes.inbox import Inbox
 from hmt_slam_ros.nodes.outbox import Outbox
 from hmt_slam_ros.nodes.parameters import ConfiguredNode
 from hmt_slam_ros.nodes.part import PARTS, Part
-from hmt_slam_ros.nodes.recovery import Base, Found, Paused, Recovery, Setting
+from hmt_slam_ros.nodes.recovery import Base, Found, Recovery, Setting, Told
 from hmt_slam_ros.processes.messages import Arriving, Message, Notice, RealTimePose
 from hmt_slam_ros.processes.routing import HEARD_BY, Remembering
 
@@ -142,11 +142,11 @@ class ProcessNode(ConfiguredNode):
             f"{len(found.heard)} messages, {time.monotonic() - begin:.1f} s"
         )
 
-    def hear_again(self, value: Message | Setting | Paused) -> None:
+    def hear_again(self, value: Message | Told) -> None:
         """Do what was done with what was heard."""
         if isinstance(value, Setting):
             self.set_parameters([Parameter(value.name, value=json.loads(value.value))])
-        elif not isinstance(value, Paused):
+        elif not isinstance(value, Told):
             self.inbox.receive(value)
 
     def memory(self) -> dict[str, object]:

@@ -17,6 +17,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, get_args
 
+import numpy as np
+from numpy.typing import NDArray
 from rcl_interfaces.msg import ParameterDescriptor
 
 from hmt_slam_ros.configuration.documents import ros_yaml
@@ -99,6 +101,24 @@ class Paused:
 
 
 @dataclass(frozen=True, eq=False)
+class Mounted:
+    """Slam heard where a laser is on the robot.
+
+    :ivar name: of the frame of its scans.
+    :ivar laser_pose: shape (3,), ``base_T_laser`` as (x, y, theta) in m and rad.
+    :ivar side: 1.0, or -1.0 for a laser mounted upside down.
+    """
+
+    name: str
+    laser_pose: NDArray[np.float64]
+    side: float
+
+
+# What a node is told beside messages, and knows until it is told otherwise.
+Told = Setting | Paused | Mounted
+
+
+@dataclass(frozen=True, eq=False)
 class Found:
     """What a node of the same name left behind.
 
@@ -111,10 +131,10 @@ class Found:
     base: Base
     state: Path
     said: list[Message]
-    heard: list[Message | Setting | Paused]
+    heard: list[Message | Told]
 
 
-_KINDS: dict[str, type] = {kind.__name__: kind for kind in (Base, Setting, Paused, *get_args(Message))}
+_KINDS: dict[str, type] = {kind.__name__: kind for kind in (Base, *get_args(Told), *get_args(Message))}
 
 
 class Recovery:
@@ -138,7 +158,7 @@ class Recovery:
         self._generation = self._segment = 0
         self._journal: Journal | None = None
         self._said: deque[Message] = deque(maxlen=_SAID_AGAIN)
-        self._settings: dict[str, Setting] = {}
+        self._told: dict[tuple[type, str], Told] = {}
         self._stamps: dict[str, int] = {}
         self._arriving: Arriving | None = None
         self._cost, self._worked = _FIRST_COST, 0.0
@@ -162,8 +182,8 @@ class Recovery:
     def _follow(self, entry: Entry) -> None:
         """Keep what the next generation begins with."""
         value = entry.value
-        if isinstance(value, Setting):
-            self._settings[value.name] = value
+        if isinstance(value, Told):
+            self._told[type(value), "" if isinstance(value, Paused) else value.name] = value
         elif entry.role == _SAID:
             self._said.append(value)  # type: ignore[arg-type]
         elif isinstance(value, Arriving):
@@ -186,7 +206,7 @@ class Recovery:
         last = self._arriving
         return last is not None and (arriving.scans, arriving.event) <= (last.scans, last.event)
 
-    def heard(self, value: Message | Setting | Paused) -> None:
+    def heard(self, value: Message | Told) -> None:
         """Write down what the process is about to hear."""
         entry = Entry(_HEARD, value)
         self._follow(entry)
@@ -269,8 +289,8 @@ class Recovery:
         write(partial)
         journal = Journal(partial, "0")
         journal.append(_BASE, base)
-        for setting in self._settings.values():
-            journal.append(_HEARD, setting)
+        for told in self._told.values():
+            journal.append(_HEARD, told)
         for message in self._said:
             journal.append(_SAID, message)
         partial.rename(made)

@@ -29,7 +29,7 @@ from hmt_slam_ros.nodes.map_changer import MapChanger
 from hmt_slam_ros.nodes.map_saver import MapSaver
 from hmt_slam_ros.nodes.parameters import declare_frame
 from hmt_slam_ros.nodes.process_node import ProcessNode
-from hmt_slam_ros.nodes.recovery import CHECKPOINT, Paused, Setting
+from hmt_slam_ros.nodes.recovery import CHECKPOINT, Mounted, Paused, Told
 from hmt_slam_ros.nodes.running import run
 from hmt_slam_ros.nodes.sensor_subscription import SensorSubscription
 from hmt_slam_ros.nodes.sensor_watch import SensorWatch
@@ -72,14 +72,12 @@ class SlamMemory:
     :ivar estimate: the last one that was said.
     :ivar unchanged: whether the map is as it was loaded.
     :ivar dropped: scans that the node did not let the process hear.
-    :ivar paused: whether it passes them over.
     """
 
     areas: tuple[AreaPose, ...]
     estimate: LocalEstimate | None
     unchanged: bool
     dropped: int
-    paused: bool
 
 
 class SlamNode(ProcessNode):
@@ -90,7 +88,7 @@ class SlamNode(ProcessNode):
     def __init__(self) -> None:
         super().__init__("slam", _make_process, (Arriving, Keyframe, Trail, LocalEstimate, Finished), ("mode",))
         self.map_frame = declare_frame(self, "map", "map")
-        self._mounting = LaserMounting(self, self._work_off)
+        self._mounting = LaserMounting(self, self._work_off, self.recovery.heard)
         self._pending: deque[LaserScan] = deque()
         self._pending_since = self._last_scan = time.monotonic()
         self._watch, self._complained = SensorWatch(self.figures), False
@@ -205,15 +203,18 @@ class SlamNode(ProcessNode):
         self.deliver(Carried(place))
 
     def _hear_scan(self, message: LaserScan) -> None:
-        self._last_scan = time.monotonic()
-        self._watch.hear_scan()
-        self.figures.received["Scan"] += 1
+        self._count_scan()
         if self._paused:
             self._dropped += self._skipped is not None
             self.figures.state["dropped scans"] = self._dropped
             self._skipped = message
             return
         self._take(message)
+
+    def _count_scan(self) -> None:
+        self._last_scan = time.monotonic()
+        self._watch.hear_scan()
+        self.figures.received["Scan"] += 1
 
     def _take(self, message: LaserScan) -> None:
         """Work on a scan as soon as its laser's place is known."""
@@ -231,11 +232,11 @@ class SlamNode(ProcessNode):
         """Deliver the scans whose laser's place is known."""
         while self._pending:
             message = self._pending[0]
-            mounting = self._mounting.of(message.header.frame_id)
-            if mounting is None:
+            mounted = self._mounting.of(message.header.frame_id)
+            if mounted is None:
                 return
             self._pending.popleft()
-            self.deliver(conversions.scan_from(message, mounting.laser_pose, mounting.side))
+            self.deliver(conversions.scan_from(message, mounted.laser_pose, mounted.side))
         self._end_if_all_came()
 
     def _hear_status(self, message: String) -> None:
@@ -278,12 +279,15 @@ class SlamNode(ProcessNode):
         while self._held and not self.holding:
             self.deliver(self._held.popleft())
 
-    def hear_again(self, value: Message | Setting | Paused) -> None:
+    def hear_again(self, value: Message | Told) -> None:
         """As any process node; scans have come by another way."""
         if isinstance(value, Paused):
             self._set_paused(value.on)
+        elif isinstance(value, Mounted):
+            self._mounting.remember(value)
         elif isinstance(value, Scan | Carried | EndOfLog):
-            self.figures.received["Scan"] += isinstance(value, Scan)
+            if isinstance(value, Scan):
+                self._count_scan()
             self.deliver(value)
         else:
             super().hear_again(value)
@@ -301,14 +305,13 @@ class SlamNode(ProcessNode):
     def memory(self) -> dict[str, object]:
         """What the node knows beside its process."""
         areas = tuple(self._areas.values())
-        return {_MEMORY: SlamMemory(areas, self.estimate, self._unchanged, self._dropped, self._paused)}
+        return {_MEMORY: SlamMemory(areas, self.estimate, self._unchanged, self._dropped)}
 
     def remember(self, state: Path) -> None:
         """Take it over."""
         known = FolderReader(state, CHECKPOINT, VERSION).read(_MEMORY, SlamMemory)
         self._areas = {entry.area: entry for entry in known.areas}
         self.estimate, self._unchanged, self._dropped = known.estimate, known.unchanged, known.dropped
-        self._set_paused(known.paused)
 
     def saved_last(self, linger: float) -> bool:  # noqa: ARG002  all others have answered
         """Whether the last map is saved, or cannot be."""

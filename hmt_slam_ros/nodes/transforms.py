@@ -9,11 +9,12 @@ from geometry_msgs.msg import TransformStamped
 from rclpy.node import Node
 from sensor_msgs.msg import LaserScan
 
-from hmt_slam_ros.logs.mounting import Mounting, planar_mounting
+from hmt_slam_ros.logs.mounting import planar_mounting
 from hmt_slam_ros.logs.transforms import FrameTree, frame_name
 from hmt_slam_ros.nodes import qos
 from hmt_slam_ros.nodes.conversions import stamp_of
 from hmt_slam_ros.nodes.parameters import declare_frame, declare_laser_pose
+from hmt_slam_ros.nodes.recovery import Mounted
 
 try:
     from tf2_msgs.msg import TFMessage as TFMessage  # noqa: PLC0414  re-exported
@@ -33,38 +34,51 @@ def transform_publisher(node: Node, topic: str) -> Callable[[list[TransformStamp
 
 
 class LaserMounting:
-    """The poses of the lasers, from the parameter ``laser_pose`` or from /tf_static."""
+    """The poses of the lasers, from the parameter ``laser_pose`` or from what came last on /tf_static."""
 
-    def __init__(self, node: Node, changed: Callable[[], None]) -> None:
+    def __init__(self, node: Node, changed: Callable[[], None], learned: Callable[[Mounted], None]) -> None:
         """Listen.
 
         :param changed: called when transforms have come.
+        :param learned: called with what is new of a laser.
         """
         self._base = declare_frame(node, "base", "base_link")
         self._given = declare_laser_pose(node)
-        self._frames = FrameTree()
-        self._known: dict[str, Mounting] = {}
-        self._changed = changed
+        self._frames = FrameTree(newest=True)
+        self._known: dict[str, Mounted] = {}
+        self._changed, self._learned = changed, learned
         if self._given is None and TFMessage is not None:
             node.create_subscription(TFMessage, "tf_static", self._hear, qos.TF_STATIC)
 
     def _hear(self, message: Any) -> None:  # noqa: ANN401  a TFMessage, where there is one
         self._frames.add(message)
+        for frame in self._known:
+            self._look_up(frame)
         self._changed()
 
-    def of(self, frame: str) -> Mounting | None:
+    def _look_up(self, frame: str) -> None:
+        transform = self._frames.pose(frame_name(self._base), frame_name(frame))
+        if transform is None:
+            return
+        mounting, known = planar_mounting(transform, f"the laser '{frame}'"), self._known.get(frame)
+        if known is None or (*known.laser_pose, known.side) != (*mounting.laser_pose, mounting.side):
+            self._known[frame] = Mounted(frame, mounting.laser_pose, mounting.side)
+            self._learned(self._known[frame])
+
+    def remember(self, mounted: Mounted) -> None:
+        """Take over what a node that was killed had heard; its transforms may not come again."""
+        self._known[mounted.name] = mounted
+
+    def of(self, frame: str) -> Mounted | None:
         """Where the laser of a frame is, None as long as no transform tells.
 
         :raises HmtSlamError: for a laser that is tilted.
         """
         if self._given is not None:
-            return Mounting(self._given, 1.0)
+            return Mounted(frame, self._given, 1.0)
         if frame not in self._known:
-            transform = self._frames.pose(frame_name(self._base), frame_name(frame))
-            if transform is None:
-                return None
-            self._known[frame] = planar_mounting(transform, f"the laser '{frame}'")
-        return self._known[frame]
+            self._look_up(frame)
+        return self._known.get(frame)
 
     def complaint(self, scan: LaserScan, waiting: int) -> str:
         """One sentence for a scan whose transform is missing."""
