@@ -73,5 +73,8 @@ def _view() -> Node:
         namespace=LaunchConfiguration("namespace"),
         parameters=[{"port": _value("view_port", int)}],
         output="screen",
+        respawn=True,
+        respawn_delay=1.0,
+        respawn_max_retries=3,
         condition=IfCondition(LaunchConfiguration("view")),
     )

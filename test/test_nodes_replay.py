@@ -232,7 +232,7 @@ def test_a_run_that_stands_still_names_the_node_it_waits_for(tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def test_the_live_page_of_a_run_is_served_while_it_lasts_unless_its_port_is_taken(tmp_path):
+def test_the_live_page_of_a_run_is_served_while_it_lasts_though_it_is_killed_unless_its_port_is_taken(tmp_path):
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         log, out = str(corridor_bag(tmp_path, 40)), str(tmp_path / "out")
@@ -243,17 +243,28 @@ def test_the_live_page_of_a_run_is_served_while_it_lasts_unless_its_port_is_take
 
     with subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
         url = process.stderr.readline().split()[-1]
-        seen = []
 
-        def is_over():
+        def shown():
+            assert process.poll() is None
             with suppress(OSError), urlopen(url + "snapshot.json", timeout=5) as answer:
-                seen.append(json.load(answer))
-            time.sleep(0.1)
-            return process.poll() is not None
+                return json.load(answer)
+            return {}
 
-        wait_until(is_over)
+        def heard_of(name):
+            rows = shown().get("nodes", ())
+            return next((row["message"] for row in rows if row["name"] == name), "not heard yet")
+
+        wait_until(lambda: "robot" in shown())
+        nodes = children_of(process.pid)
+        os.kill(nodes["robot"], signal.SIGSTOP)
+        os.kill(nodes["view"], signal.SIGKILL)
+        wait_until(lambda: nodes["view"] not in children_of(process.pid).values())
+        wait_until(lambda: heard_of("rtl") != "not heard yet")
+        os.kill(nodes["robot"], signal.SIGCONT)
+        wait_until(lambda: "robot" in shown())
+        error = process.communicate(timeout=60)[1]
     assert process.returncode == 0
-    assert any("robot" in known for known in seen)
+    assert "the node view was killed by signal 9: it is started again" in error
     assert set(json.loads((tmp_path / "out" / "report.json").read_text())["peak_rss_bytes"]) == NODES
     with pytest.raises(OSError, match="refused"):
         urlopen(url, timeout=5)

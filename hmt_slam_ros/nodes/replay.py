@@ -157,7 +157,7 @@ class _Run:
             tempfile.TemporaryDirectory(prefix="hmt_slam_replay_") as scratch,
             own_domain() as domain,
             self._listening(domain) as executor,
-            Children(Path(scratch), PROCESSES, _tell) as children,
+            Children(Path(scratch), (*PROCESSES, "view"), _tell) as children,
         ):
             begin = time.monotonic()
             self._start(children, log, slam_settings, domain, Path(scratch))
