@@ -71,12 +71,14 @@ class Judgement(NamedTuple):
 
     :ivar new: share of the new surfaces that could be seen that is in the map.
     :ivar gone: share of the surfaces in the map before that could be seen to be gone that still is.
-    :ivar metres: of both.
+    :ivar kept: share of the surfaces in the map before that still stand where they did that is in the map after.
+    :ivar metres: of the new ones and of those that could be seen to be gone.
     :ivar hidden: shape (k, 4), the surfaces that are gone and could not be seen to be, as short pieces.
     """
 
     new: float
     gone: float
+    kept: float
     metres: tuple[float, float]
     hidden: NDArray[np.float64]
 
@@ -91,13 +93,14 @@ def judged(images: Sequence[OccupancyImage], frames: Sequence[Points], visits: S
     new = points[clearance(before.walls, points) > _APART]
     new = new[after.in_view(new)]
     points = before.points()
-    gone = points[clearance(after.walls, points) > _APART]
-    gone = gone[_held(images[0], frames[0], gone)]
+    points = points[_held(images[0], frames[0], points)]
+    apart = clearance(after.walls, points)
+    gone, stands = points[apart > _APART], points[apart < _SHORT]
     shown = after.in_view(gone)
     metres = _SAMPLE * len(new), _SAMPLE * int(shown.sum())
-    found, ghosts = _held(images[1], frames[1], new), _held(images[1], frames[1], gone[shown])
+    found, ghosts, kept = (_held(images[1], frames[1], part) for part in (new, gone[shown], stands))
     hidden = np.concatenate((gone[~shown], gone[~shown] + 1e-3), axis=1)
-    return Judgement(_share(found), _share(ghosts), metres, hidden)
+    return Judgement(_share(found), _share(ghosts), _share(kept), metres, hidden)
 
 
 def unexplained(image: OccupancyImage, frame: Points, walls: NDArray[np.float64]) -> float:

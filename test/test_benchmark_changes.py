@@ -31,7 +31,7 @@ def visits(lasers=LASERS):
 )
 def test_a_map_is_judged_by_what_is_new_and_what_is_gone(after, new, gone):
     found = judged([image_of(*BEFORE), image_of(*after)], [FRAME, FRAME], visits())
-    assert (found.new, found.gone) == (new, gone)
+    assert (found.new, found.gone, found.kept) == (new, gone, 1.0)
     assert found.metres == pytest.approx((1.05, 1.05), abs=0.11)
 
 
@@ -48,9 +48,9 @@ def test_cells_far_from_all_walls_are_unexplained():
 
 
 def test_what_falls_short_is_told():
-    good = Visit(0.9, 0.05, 0.0, 0.001, 0.02, 0.08, (100, 120), (5.0, 5.0))
+    good = Visit(0.9, 0.05, 0.99, 0.0, 0.001, 0.02, 0.08, (100, 120), (5.0, 5.0))
     assert all(asked.met for asked in requirements("quiet", [good], [100, 110, 112], same=True))
-    bad = Visit(0.7, 0.2, 0.003, 0.01, 0.05, 0.2, (100, 120), (5.0, 5.0))
+    bad = Visit(0.7, 0.2, 0.9, 0.003, 0.01, 0.05, 0.2, (100, 120), (5.0, 5.0))
     assert not any(asked.met for asked in requirements("quiet", [bad], [100, 110, 120], same=False))
 
 
@@ -58,6 +58,7 @@ def test_two_visits_are_measured():
     found = visited_twice("office", 1000, size=0.7, rate=1.5)
     assert found.new > 0.5
     assert found.gone < 0.4
+    assert found.kept > 0.98
     assert found.keyframes[1] < 1.3 * found.keyframes[0]
     assert found.error < 0.1
 

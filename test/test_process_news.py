@@ -15,7 +15,8 @@ from hmt_slam_ros.processes.documents import KeyframeHead, encode
 from hmt_slam_ros.processes.map_parts import Outdated
 from hmt_slam_ros.processes.news import Look, looked, news_of, outdated
 from hmt_slam_ros.sensing import Scan
-from hmt_slam_ros.sensing.view import FREE, SURFACE, UNSEEN, passing, seen, view_of
+from hmt_slam_ros.sensing.scan import Revision
+from hmt_slam_ros.sensing.view import FREE, SURFACE, UNSEEN, behind, seen, view_of
 from hmt_slam_ros.simulation import open_simulated
 
 ROOM = box(-5.0, -3.0, 5.0, 3.0)
@@ -55,8 +56,10 @@ def test_a_view_tells_surface_from_free_space_and_from_what_is_hidden():
     view = view_of(scan_in(room(CUPBOARD), NOW, beams=361))
     places = np.array([[2.0, 1.0], [1.0, 0.5], [4.0, 2.0], [5.0, -2.0], [-1.0, 0.0], [4.8, -1.0], [2.0, 0.45]])
     assert seen(view, places).tolist() == [SURFACE, FREE, UNSEEN, SURFACE, UNSEEN, UNSEEN, SURFACE]
-    assert passing(view, np.array([[1.0, 0.5]])).sum() > 10
-    assert not passing(view, np.array([[4.0, 2.0]])).any()
+    starts = behind(view, np.array([[1.0, 0.5], [2.0, 0.45]]))
+    assert (np.abs(starts - np.hypot(1.0, 0.5) - 1.0) < 1e-9).sum() > 5
+    assert (starts[starts > 0.0] < view.ranges[starts > 0.0]).all()
+    assert not behind(view, np.array([[4.0, 2.0]])).any()
 
 
 @pytest.mark.parametrize("increment", [1, -1])
@@ -71,22 +74,24 @@ def test_a_view_of_a_laser_that_hangs_upside_down_or_moves_in_the_sweep_is_the_s
 def test_an_unchanged_room_is_no_news():
     found = news(room(CUPBOARD), room(CUPBOARD))
     assert (found.new, found.changed) == (False, False)
-    assert not any(beams.any() for beams in found.outdated.values())
+    assert not any(late.gone.any() or late.starts.any() for late in found.outdated.values())
 
 
 def test_furniture_that_came_is_stored_and_beams_that_pass_it_are_out_of_date():
     found = news(room(), room(CUPBOARD))
     assert found.changed
     for keyframe in keyframes(room()):
-        passed = ends(keyframe, found.outdated[keyframe.keyframe])
+        late = found.outdated[keyframe.keyframe]
+        passed = ends(keyframe, late.starts > 0.0)
         assert len(passed) > 5
         assert (passed[:, 0] > 2.3).all()
+        assert not late.gone.any()
 
 
 def test_of_furniture_that_is_gone_every_beam_is_out_of_date():
     found = news(room(CUPBOARD), room())
     for keyframe in keyframes(room(CUPBOARD)):
-        gone = found.outdated[keyframe.keyframe]
+        gone = found.outdated[keyframe.keyframe].gone
         on = np.zeros(361, dtype=bool)
         on[keyframe.scan.valid] = np.abs(keyframe.scan.points + keyframe.pose[:2] - [2.3, 1.1]).max(axis=1) < 0.61
         assert on.sum() > 10
@@ -98,7 +103,7 @@ def test_who_walks_through_is_no_news():
     at = [box(x, -1.0, x + 0.4, -0.6) for x in (1.0, 1.6, 2.2)]
     found = news(room(), room(box(2.8, -1.0, 3.2, -0.6)), looks_in(*(room(person) for person in at)))
     assert (found.new, found.changed) == (False, False)
-    assert not any(beams.any() for beams in found.outdated.values())
+    assert not any(late.gone.any() or late.starts.any() for late in found.outdated.values())
 
 
 def test_a_robot_that_is_elsewhere_takes_nothing_for_out_of_date():
@@ -126,10 +131,28 @@ def test_hypotheses_have_to_agree_on_what_is_out_of_date():
 
 def test_beams_are_left_out_of_a_scan_once_for_all_who_hold_it():
     scan = scan_in(room(), NOW, beams=361)
-    less = scan.without((3, 4))
-    assert less is scan.without((3, 4))
+    less = scan.revised(Revision((3, 4), (180,), (1.5,)))
+    assert less is scan.revised(Revision((3, 4), (180,), (1.5,)))
     assert np.flatnonzero(scan.valid & ~less.valid).tolist() == [3, 4]
     assert len(less.points) == len(scan.points) - 2
+
+
+@pytest.mark.parametrize("motion", [0.0, 0.1])
+def test_what_is_behind_a_thing_that_came_stays_in_the_map_and_what_is_before_it_is_not_free_any_more(motion):
+    poses = np.stack((np.linspace(0.0, motion, 361), np.zeros(361), np.zeros(361)), axis=1)
+    scan = dataclasses.replace(scan_in(room(), poses, beams=361), motion=np.array([motion, 0.0, 0.0]))
+    thing = np.array([[2.0, 0.0], [2.0, 0.1]])
+    starts = behind(view_of(scan), thing)
+    cut = np.flatnonzero(starts)
+    less = scan.revised(Revision((), tuple(cut.tolist()), tuple(starts[cut].tolist())))
+    assert (less.points == scan.points).all()
+    places = np.array([[5.0, 0.0], [2.0, 0.05], [4.0, 0.1], [1.0, -1.0]])
+    assert seen(view_of(scan), places).tolist() == [SURFACE, FREE, FREE, FREE]
+    assert seen(view_of(less), places).tolist() == [SURFACE, UNSEEN, FREE, FREE]
+    away = less.origins[np.isin(np.flatnonzero(less.valid), cut)]
+    assert (away[:, 0] > 2.9).all()
+    assert (away[:, 0] < 3.1).all()
+    assert len(away) >= 4
 
 
 WORLD = "sim:office,seed=1000,size=0.7,rate=2.5,laps=1,visit={}"
@@ -178,6 +201,11 @@ def test_every_process_leaves_the_same_beams_out_and_little_is_stored(visits):
     assert len(old) > 10
     for one in old:
         assert not scans[one.keyframe].valid[list(one.beams)].any()
+    cut = [one for one in old if one.cut]
+    assert cut
+    for one in cut:
+        starts = scans[one.keyframe].starts[list(one.cut)]
+        assert (starts >= np.float32(one.starts)).all()
 
 
 def test_a_run_that_goes_on_from_its_state_says_the_same(visits):

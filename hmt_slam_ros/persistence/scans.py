@@ -28,6 +28,8 @@ class ScanTable:
         smallest valid range and smallest range that means "no return", m, time from one beam to the next, s.
     :ivar laser_poses: shape (n, 3), ``base_T_laser``, m and rad.
     :ivar motions: shape (n, 3), the base's motion from the first beam to the last as a twist, m, m, rad.
+    :ivar cut: shape (c,), beams of all scans, counted through as in ``ranges``, that do not hold from the laser on.
+    :ivar starts: shape (c,), from where on each of these holds, m.
     """
 
     names: Int64
@@ -37,11 +39,16 @@ class ScanTable:
     geometry: Float64
     laser_poses: Float64
     motions: Float64
+    cut: Int64
+    starts: Float32
 
     @classmethod
     def of(cls, names: Iterable[int], scans: Iterable[Scan]) -> ScanTable:
         """Of some scans."""
         rows = list(scans)
+        starts = [np.zeros_like(scan.ranges) if scan.starts is None else scan.starts for scan in rows]
+        begins = np.concatenate([np.zeros(0, np.float32), *starts], dtype=np.float32)
+        cut = np.flatnonzero(begins)
         return cls(
             np.array(list(names), dtype=np.int64),
             np.array([scan.stamp for scan in rows], dtype=np.int64),
@@ -50,11 +57,15 @@ class ScanTable:
             np.array([[getattr(scan, name) for name in _GEOMETRY] for scan in rows]).reshape(-1, len(_GEOMETRY)),
             np.array([scan.laser_pose for scan in rows], dtype=np.float64).reshape(-1, 3),
             np.array([scan.motion for scan in rows], dtype=np.float64).reshape(-1, 3),
+            cut,
+            begins[cut],
         )
 
     def scans(self) -> dict[int, Scan]:
         """{name: scan}."""
         ends = np.cumsum(self.beams)
+        begins = np.zeros(self.ranges.size, dtype=np.float32)
+        begins[self.cut] = self.starts
         rows = zip(
             self.names.tolist(), self.stamps.tolist(), (ends - self.beams).tolist(), ends.tolist(),
             self.geometry.tolist(), self.laser_poses, self.motions, strict=True,
@@ -62,6 +73,7 @@ class ScanTable:
         return {
             name: Scan(
                 stamp=stamp, ranges=self.ranges[begin:end], laser_pose=laser_pose, motion=motion,
+                starts=begins[begin:end] if begins[begin:end].any() else None,
                 **dict(zip(_GEOMETRY, geometry, strict=True)),
             )
             for name, stamp, begin, end, geometry, laser_pose, motion in rows

@@ -182,9 +182,9 @@ class BegunPart:
 
 # Raise a document's version with every change of its dataclass: a receiver refuses any other.
 _DOCUMENTS: dict[type, tuple[str, int]] = {
-    KeyframeHead: ("keyframe", 6),
+    KeyframeHead: ("keyframe", 7),
     AreaEvents: ("area_events", 3),
-    Hypotheses: ("hypotheses", 7),
+    Hypotheses: ("hypotheses", 8),
     Accepted: ("accepted", 4),
     LocalEstimate: ("local_estimate", 1),
     Arriving: ("arriving", 1),

@@ -108,14 +108,18 @@ class Relabelled:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Outdated:
-    """Beams of a keyframe that say something of the world that is not so any more.
+    """What a keyframe's scan says of the world that is not so any more.
 
     :ivar keyframe: its number.
-    :ivar beams: their numbers in the scan, ascending.
+    :ivar beams: numbers of the beams whose end is gone, ascending.
+    :ivar cut: numbers of the beams in whose way something came to stand, ascending.
+    :ivar starts: from where on each of these still holds, m from the laser.
     """
 
     keyframe: int
     beams: tuple[int, ...]
+    cut: tuple[int, ...] = ()
+    starts: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -3,7 +3,7 @@
 Whatever stays is seen again a second later from somewhere else, and whoever walks through is not. So of the scan only
 surfaces count that one of the last looks saw too and none of them saw through; and of the map only those beams are out
 of date that say something else than the scan and the last looks together: their end is seen through, or they pass what
-stands there now.
+stands there now, and hold from behind it on: the room behind a door that was closed is still there.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.local_map.area_filter import PlacedKeyframe
 from hmt_slam_ros.processes.map_parts import Outdated
 from hmt_slam_ros.sensing import Scan
-from hmt_slam_ros.sensing.view import FREE, SURFACE, passing, seen, view_of
+from hmt_slam_ros.sensing.view import FREE, SURFACE, behind, seen, view_of
 
 Points = NDArray[np.float64]
 
@@ -60,12 +60,23 @@ class News(NamedTuple):
 
     :ivar new: whether it shows enough that was never seen.
     :ivar changed: whether it shows enough that stands where free space was.
-    :ivar outdated: {keyframe: which of its beams say what is so no more, shape (number of beams,)}.
+    :ivar outdated: {keyframe: what its beams say that is so no more}.
     """
 
     new: bool
     changed: bool
-    outdated: Mapping[int, Bool]
+    outdated: Mapping[int, Late]
+
+
+class Late(NamedTuple):
+    """What the beams of a keyframe, n of them, say that is so no more.
+
+    :ivar gone: shape (n,), whether their end is seen through.
+    :ivar starts: shape (n,), m from the laser, from where on they are behind what stands in their way; 0 for nothing.
+    """
+
+    gone: Bool
+    starts: Points
 
 
 class _Told(NamedTuple):
@@ -103,7 +114,7 @@ def news_of(now: Look, looks: Sequence[Look], known: Sequence[PlacedKeyframe]) -
     changed = _length(here[stays & ~held.surface & held.free]) >= _CHANGED
     against = here[stays & held.free]
     against = against[: len(against) if _length(against) >= _CHANGED else 0]
-    return News(new, changed, {one.keyframe: _gone(one, now, looks) | _passing(one, against) for one in around})
+    return News(new, changed, {one.keyframe: Late(_gone(one, now, looks), _behind(one, against)) for one in around})
 
 
 def outdated(found: Sequence[tuple[News, float]]) -> tuple[Outdated, ...]:
@@ -111,12 +122,20 @@ def outdated(found: Sequence[tuple[News, float]]) -> tuple[Outdated, ...]:
 
     :param found: of every hypothesis, and its probability.
     """
-    said: dict[int, NDArray[np.float64]] = {}
+    said: dict[int, list[tuple[Late, float]]] = {}
     for news, probability in found:
-        for keyframe, beams in news.outdated.items():
-            said[keyframe] = np.asarray(said.get(keyframe, 0.0) + probability * beams, dtype=np.float64)
-    gone = {keyframe: np.flatnonzero(share >= _SURE) for keyframe, share in sorted(said.items())}
-    return tuple(Outdated(keyframe, tuple(beams.tolist())) for keyframe, beams in gone.items() if beams.size)
+        for keyframe, late in news.outdated.items():
+            said.setdefault(keyframe, []).append((late, probability))
+    all_late = (_agreed(keyframe, said[keyframe]) for keyframe in sorted(said))
+    return tuple(one for one in all_late if one.beams or one.cut)
+
+
+def _agreed(keyframe: int, said: Sequence[tuple[Late, float]]) -> Outdated:
+    """What hypotheses say of a keyframe, of each that names it with its probability."""
+    gone = sum(probability * late.gone for late, probability in said) >= _SURE
+    cut = np.flatnonzero((sum(probability * (late.starts > 0.0) for late, probability in said) >= _SURE) & ~gone)
+    starts = np.max([late.starts for late, _ in said], axis=0)[cut]
+    return Outdated(keyframe, tuple(np.flatnonzero(gone).tolist()), tuple(cut.tolist()), tuple(starts.tolist()))
 
 
 def _near(points: Points, pose: NDArray[np.float64]) -> Points:
@@ -144,6 +163,6 @@ def _gone(one: PlacedKeyframe, now: Look, looks: Sequence[Look]) -> Bool:
     return gone
 
 
-def _passing(one: PlacedKeyframe, points: Points) -> Bool:
-    """The beams of a keyframe that pass some places, shape (number of beams,)."""
-    return passing(view_of(one.scan), se2.transform(se2.inverse(one.pose), points))
+def _behind(one: PlacedKeyframe, points: Points) -> Points:
+    """From where on the beams of a keyframe are behind the places that they pass, shape (number of beams,), m."""
+    return behind(view_of(one.scan), se2.transform(se2.inverse(one.pose), points))

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from hmt_slam_ros.processes.map_parts import Arc, ArcEnds, Relabelled
 from hmt_slam_ros.processes.messages import Accepted, Hypotheses, Keyframe, Leaf
 from hmt_slam_ros.sensing import Scan
+from hmt_slam_ros.sensing.scan import Revision
 from hmt_slam_ros.topology.common_map import CommonMap
 from hmt_slam_ros.topology.hybrid_map import HybridMap
 from hmt_slam_ros.topology.map_state import GraphState
@@ -104,7 +105,8 @@ class Replica:
         self.areas = {leaf.hypothesis: leaf.area for leaf in hypotheses.leaves}
         for late in hypotheses.outdated:
             if late.keyframe in self.scans:
-                self.scans[late.keyframe] = self.scans[late.keyframe].without(late.beams)
+                revision = Revision(late.beams, late.cut, late.starts)
+                self.scans[late.keyframe] = self.scans[late.keyframe].revised(revision)
         for one in hypotheses.forgotten:
             for hybrid_map in self.maps.values():
                 hybrid_map.remove(one.keyframe, one.area)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -47,6 +48,19 @@ def _zeros() -> NDArray[np.float64]:
     return np.zeros(3)
 
 
+class Revision(NamedTuple):
+    """What a scan does not say any more, because the world changed.
+
+    :ivar gone: numbers of the beams whose end is gone; they say nothing.
+    :ivar cut: numbers of the beams in whose way something came to stand.
+    :ivar starts: from where on each of these still holds, m from the laser.
+    """
+
+    gone: tuple[int, ...]
+    cut: tuple[int, ...]
+    starts: tuple[float, ...]
+
+
 @dataclass(frozen=True, eq=False)
 class Scan:
     """One sweep of a planar range finder.
@@ -68,6 +82,8 @@ class Scan:
     :ivar time_increment: seconds from one beam to the next, 0 where unknown.
     :ivar motion: shape (3,), the base's motion from the first beam to the last as a twist, m, m, rad: its exponential
         is the base at the last beam as seen from the base at the first. Zeros where it is not known.
+    :ivar starts: shape (n,), float32, m: nearer than this a beam says nothing any more, since something came to stand
+        in its way; smaller than its range. None where every beam says all from the laser on.
     """
 
     stamp: int
@@ -79,7 +95,8 @@ class Scan:
     laser_pose: NDArray[np.float64] = field(default_factory=_zeros)
     time_increment: float = 0.0
     motion: NDArray[np.float64] = field(default_factory=_zeros)
-    _without: tuple[tuple[int, ...], Scan] | None = field(default=None, init=False, repr=False)
+    starts: NDArray[np.float32] | None = None
+    _revised: tuple[Revision, Scan] | None = field(default=None, init=False, repr=False)
 
     def __post_init__(self) -> None:
         for name in ("angle_min", "angle_increment", "range_min", "range_max", "time_increment"):
@@ -103,32 +120,45 @@ class Scan:
     @cached_property
     def points(self) -> NDArray[np.float64]:
         """End points of the beams with a return, shape (k, 2), metres, robot base frame."""
+        return self._carried_back(self._at(self.ranges))
+
+    def _at(self, ranges: NDArray[np.float32]) -> NDArray[np.float64]:
+        """Places on the beams with a return, shape (k, 2), from the base at each beam.
+
+        :param ranges: shape (n,), how far from the laser, m.
+        """
         first = self.angle_min + float(self.laser_pose[2])
         directions = _directions(self.ranges.size, first, self.angle_increment)
-        return self._carried_back(_ends(self.ranges, directions, self.laser_pose, self.valid))
+        return _ends(ranges, directions, self.laser_pose, self.valid)
 
-    def without(self, beams: tuple[int, ...]) -> Scan:
-        """The same scan with beams that say nothing; one and the same object for the same beams.
-
-        :param beams: their numbers.
-        """
-        if self._without is None or self._without[0] != beams:
+    def revised(self, revision: Revision) -> Scan:
+        """The same scan with beams that say less; one and the same object for the same revision."""
+        if self._revised is None or self._revised[0] != revision:
             ranges = self.ranges.copy()
-            ranges[list(beams)] = np.nan
-            object.__setattr__(self, "_without", (beams, replace(self, ranges=ranges)))
-        assert self._without is not None
-        return self._without[1]
+            ranges[list(revision.gone)] = np.nan
+            starts, cut = self.starts, list(revision.cut)
+            if cut:
+                starts = np.zeros_like(ranges) if starts is None else starts.copy()
+                starts[cut] = np.maximum(starts[cut], np.array(revision.starts, dtype=np.float32))
+            object.__setattr__(self, "_revised", (revision, replace(self, ranges=ranges, starts=starts)))
+        assert self._revised is not None
+        return self._revised[1]
 
     @property
     def origins(self) -> NDArray[np.float64]:
-        """Where the laser was at each of those beams, shape (k, 2), metres, robot base frame."""
+        """Where each of those beams begins to say something, shape (k, 2), metres, robot base frame.
+
+        That is where the laser was, but for ``starts``.
+        """
+        if self.starts is not None:
+            return self._carried_back(self._at(self.starts))
         origins = np.empty((len(self.points), 2))
         origins[:] = self.laser_pose[:2]
         return self._carried_back(origins)
 
     @property
     def beams(self) -> NDArray[np.float64]:
-        """From the laser to the end point, for each of those beams, shape (k, 2), metres, robot base frame."""
+        """From there to the end point, for each of those beams, shape (k, 2), metres, robot base frame."""
         return self.points - self.origins
 
     def _carried_back(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
