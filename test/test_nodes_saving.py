@@ -103,7 +103,7 @@ def test_a_map_is_saved_while_the_robot_drives_and_others_go_on_from_it_when_all
     first.kill()
 
     # At the first scan that is not in the map.
-    begin = (stopped["slam"].last_stamp - START) / 1e9 + 0.001
+    begin = (stopped["slam"].queue.last_stamp - START) / 1e9 + 0.001
     stayed = start_with(start, start_from=folder, start_carried=False)
     second = Nodes(stayed, listener, log, folder, 0.0, robot__start=begin)
     second.until(lambda: second.estimates and second.last.scan_index == 79)

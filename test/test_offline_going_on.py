@@ -142,7 +142,7 @@ def test_scans_without_odometry_wait_in_the_saved_map_as_well(tmp_path):
         whole.read(record)
         run.read(record)
     state = run.state
-    assert len(state.slam.queue) == 3
+    assert len(state.slam.queue.scans) == 3
     run = Run(Configuration(), state=read(written(tmp_path / "waiting", state)))
     for record in scans[3:]:
         whole.read(record)

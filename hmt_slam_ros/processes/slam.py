@@ -7,7 +7,6 @@ answer a keyframe event.
 from __future__ import annotations
 
 import math
-from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import partial
@@ -37,14 +36,12 @@ from hmt_slam_ros.processes.messages import (
 from hmt_slam_ros.processes.news import AROUND, CERTAIN, Look, News, news_of, outdated
 from hmt_slam_ros.processes.odometry_watch import OdometryWatch, OdometryWatchState
 from hmt_slam_ros.processes.replica import FIRST_AREA, FIRST_HYPOTHESIS, Replica, ReplicaState
+from hmt_slam_ros.processes.scan_queue import ScanQueue, ScanQueueState
 from hmt_slam_ros.sensing import Odometry, Scan
-from hmt_slam_ros.sensing.deskew import SweepCheck, SweepState, deskewed
+from hmt_slam_ros.sensing.deskew import deskewed
 from hmt_slam_ros.sensing.motion import MotionModel, MotionState, Prediction
 from hmt_slam_ros.topology.shortest_path import reachable
 from hmt_slam_ros.topology.surroundings import Nearness, areas_around
-
-# Odometry that has come before may only be late, by more scans than a paced robot runs ahead of its acknowledgements.
-_LATE = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,15 +51,11 @@ class SlamState:
     :ivar replica: the maps of the live hypotheses.
     :ivar motion: what is known of the motion between scans.
     :ivar watch: what was heard of odometry and scans.
-    :ivar sweeps: what is known of the times between scans.
     :ivar queue: scans that wait for odometry, or for the answer to a keyframe event.
-    :ivar last_stamp: of the last scan received, ns, -1 before the first.
-    :ivar noticed: the faults of which something was said.
     :ivar patches: of the maps of all particles, None before the first scan.
     :ivar live: {hypothesis: its filter and what is remembered beside it}.
     :ivar events: keyframe events.
     :ivar waiting: whether the answer to the last one is due.
-    :ivar patient: whether scans wait for odometry.
     :ivar travelled: path length since the start, m.
     :ivar scans: scans that were given a pose.
     :ivar dropped: scans that were not.
@@ -75,15 +68,11 @@ class SlamState:
     replica: ReplicaState = field(default_factory=ReplicaState)
     motion: MotionState = field(default_factory=MotionState)
     watch: OdometryWatchState = field(default_factory=OdometryWatchState)
-    sweeps: SweepState = field(default_factory=SweepState)
-    queue: tuple[Scan, ...] = ()
-    last_stamp: int = -1
-    noticed: frozenset[str] = frozenset()
+    queue: ScanQueueState = field(default_factory=ScanQueueState)
     patches: PatchState | None = None
     live: Mapping[int, LiveState] = field(default_factory=dict)
     events: int = 0
     waiting: bool = False
-    patient: bool = True
     travelled: float = 0.0
     scans: int = 0
     dropped: int = 0
@@ -112,14 +101,11 @@ class MetricSlam:
         self._replica = Replica.of(state.replica)
         self._motion = MotionModel(configuration.motion, state.motion)
         self._watch = OdometryWatch(state.watch)
-        self._queue = deque(state.queue)
-        self._sweeps = SweepCheck(state.sweeps)
-        self._last_stamp = state.last_stamp
-        self._noticed = set(state.noticed)
+        self._queue = ScanQueue(configuration.filter.patience, self._motion.odometry, state.queue)
         self._live = self._live_in(state)
         self._events, self._arriving = state.events, state.arriving
         self._lost, self._place = state.lost, state.place
-        self._waiting, self._patient = state.waiting, state.patient
+        self._waiting = state.waiting
         self._travelled = state.travelled
         self._scans, self._dropped = state.scans, state.dropped
         self._first_of_trail = state.first_of_trail
@@ -139,11 +125,10 @@ class MetricSlam:
         patches, tables = self._mapping.pool.state(np.concatenate([own.tables for own in filters]))
         each = np.split(tables, len(filters))
         return SlamState(
-            self._replica.state, self._motion.state, self._watch.state, self._sweeps.state, tuple(self._queue),
-            self._last_stamp, frozenset(self._noticed), patches,
+            self._replica.state, self._motion.state, self._watch.state, self._queue.state, patches,
             {name: live.state(own) for (name, live), own in zip(self._live.items(), each, strict=True)},
-            self._events, self._waiting, self._patient, self._travelled, self._scans, self._dropped,
-            self._first_of_trail, self._arriving, self._lost, self._place,
+            self._events, self._waiting, self._travelled, self._scans, self._dropped, self._first_of_trail,
+            self._arriving, self._lost, self._place,
         )  # fmt: skip
 
     @property
@@ -198,10 +183,9 @@ class MetricSlam:
     def handle(self, message: Message) -> list[Message]:
         """Take in one message, work off what can be worked off, return what there is to say."""
         if isinstance(message, Odometry):
-            self._motion.odometry.add(message)
-            self._patient = True
+            self._queue.hear(message)
         elif isinstance(message, Scan):
-            return self._receive(message) + self._work()
+            return self._queue.receive(message) + self._work()
         elif isinstance(message, Hypotheses):
             self._change_hypotheses(message)
         elif isinstance(message, Accepted):
@@ -215,8 +199,8 @@ class MetricSlam:
 
     def _work(self) -> list[Message]:
         said: list[Message] = []
-        while self._queue and not self._waiting and self._odometry_known():
-            said += self._process(self._queue.popleft())
+        while not self._waiting and self._queue.ready(ended=self._ended):
+            said += self._process(self._queue.take())
         if self._ended and not self._queue and not self._waiting:
             said += self._finish()
         return said
@@ -224,11 +208,8 @@ class MetricSlam:
     def _arrive(self) -> list[Message]:
         """Forget how the robot came here; scans that still wait were taken before and are passed over."""
         self._motion, self._watch = MotionModel(self._configuration.motion), OdometryWatch()
-        self._sweeps = SweepCheck()
         self._dropped += len(self._queue)
-        self._queue.clear()
-        self._last_stamp = -1
-        self._patient = True
+        self._queue = self._queue.emptied(self._motion.odometry)
         self._lose()
         return [Arriving(self._events, self._scans)]
 
@@ -237,52 +218,6 @@ class MetricSlam:
         self._arriving = True
         for live in self._live.values():
             live.filter.forget()
-
-    def _receive(self, scan: Scan) -> list[Message]:
-        """Put a scan into the queue; say, once for each fault, what is wrong with it."""
-        said: list[Message] = []
-        scan, fault = self._sweeps.checked(scan)
-        if fault is not None:
-            said += self._notice("sweep", fault)
-        if scan.stamp <= self._last_stamp:
-            said += self._notice(
-                "order",
-                f"A scan is stamped {scan.stamp / 1e9:.6f} s, not after its predecessor "
-                f"({self._last_stamp / 1e9:.6f} s); scans are taken in the order of their arrival: check the clocks or "
-                "the order of the log.",
-            )
-        if not scan.valid.any():
-            said += self._notice(
-                "empty",
-                f"The scan at {scan.stamp / 1e9:.6f} s has no return between {scan.range_min:g} and {scan.range_max:g} "
-                "m; such scans are placed by odometry alone: check the laser and its range limits.",
-            )
-        self._queue.append(scan)
-        self._last_stamp = scan.stamp
-        return said + self._lose_patience()
-
-    def _lose_patience(self) -> list[Message]:
-        """Where enough scans wait for odometry, go on without until there is more."""
-        first = self._queue[0]
-        patience = self._configuration.filter.patience * (1 if self._motion.odometry.empty else _LATE)
-        waited = len(self._queue) > patience
-        if not waited or not self._patient or self._motion.odometry.covers(first.end):
-            return []
-        self._patient = False
-        return self._notice(
-            "odometry",
-            f"{len(self._queue)} scans wait for odometry at {first.stamp / 1e9:.6f} s and are matched without from "
-            "here on, until there is a reading: check the odometry topic and its stamps.",
-        )
-
-    def _notice(self, fault: str, text: str) -> list[Message]:
-        if fault in self._noticed:
-            return []
-        self._noticed.add(fault)
-        return [Notice("slam", text)]
-
-    def _odometry_known(self) -> bool:
-        return self._ended or not self._patient or self._motion.odometry.covers(self._queue[0].end)
 
     def _process(self, scan: Scan) -> list[Message]:
         prediction = self._motion.predict(scan.stamp)
