@@ -6,8 +6,8 @@ import signal
 import numpy as np
 import pytest
 from conftest import Listener
-from logs_for_nodes import BEAMS, PACE, SECOND, START, Corridor, corridor_bag
-from test_nodes_localization import NODES, SCANS, Nodes, mapped_corridor
+from logs_for_nodes import BEAMS, LASER, PACE, SECOND, START, Corridor, corridor_bag
+from test_nodes_localization import NODES, SCANS, Nodes, assert_true, mapped_corridor
 
 pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
 
@@ -174,6 +174,53 @@ def test_all_are_killed_with_what_said_where_the_laser_is_and_go_on_without_it(d
         process.send_signal(signal.SIGINT)
     for process in nodes.alive:
         assert "was killed and goes on where it was" in process.communicate(timeout=20)[1]
+
+
+def disturbed(measurements, period):
+    """Measurements of one kind, ``period`` ns apart, as (time of arrival, measurement).
+
+    Some come after their successor, some 0.3 s late, some twice, and one 5 s late.
+    """
+    for number, one in enumerate(measurements):
+        late = SECOND * (5 if number == 12 else 0.3 if number % 13 == 7 else 0)
+        yield one.stamp + max(late, 1.5 * period if number % 5 == 2 else 0), one
+        if number % 4 == 0:
+            yield one.stamp + 0.5 * period, one
+
+
+def in_order(stamps):
+    """Those that are greater than all before."""
+    highest = np.maximum.accumulate([0, *stamps])
+    return [stamp for stamp, before in zip(stamps, highest, strict=False) if stamp > before]
+
+
+def test_what_comes_late_twice_or_out_of_order_is_left_out_and_counted_and_all_else_is_used(domain, listener, start):
+    nodes = Nodes(start, listener, laser_pose=LASER.tolist())
+    driver = Driver(nodes, domain)
+    kinds = {Scan: SECOND // 5, Odometry: SECOND // 20}
+    sent = {kind: [one for one in corridor_measurements(60) if isinstance(one, kind)] for kind in kinds}
+    arrivals = sorted((entry for kind in kinds for entry in disturbed(sent[kind], kinds[kind])), key=lambda e: e[0])
+    came = {kind: [one.stamp for _, one in arrivals if isinstance(one, kind)] for kind in kinds}
+    used = {kind: in_order(came[kind]) for kind in kinds}
+    assert all(len(came[kind]) > len(sent[kind]) > len(used[kind]) for kind in kinds)
+    for _, one in arrivals:
+        driver.send(one)
+        # As a laser does, which waits for nobody, but no faster than slam is on a computer that is busy.
+        nodes.until(lambda now=one.stamp: now < 2 * SECOND + (driver.answered() or [START])[-1])
+    nodes.until(lambda: driver.answered() == used[Scan])
+    nodes.until(lambda: nodes.poses and conversions.stamp_of(nodes.poses[-1].header.stamp) == used[Odometry][-1])
+    for message in nodes.poses:
+        assert_true(message, START)
+    stamps = [conversions.stamp_of(message.header.stamp) for message in nodes.poses]
+    assert in_order(stamps) == stamps
+    refused = {kind: str(len(came[kind]) - len(used[kind])) for kind in kinds}
+    nodes.until(lambda: nodes.diagnosis("slam")["refused on scan"] == refused[Scan])
+    for name in ("slam", "rtl"):
+        nodes.until(lambda name=name: nodes.diagnosis(name)["refused on odom"] == refused[Odometry])
+        assert nodes.diagnosis(name)["received Odometry"] == str(len(used[Odometry]))
+        assert " came late or twice, after that of " in nodes.diagnosis(name)["last error"]
+    assert not nodes.notices
+    driver.close()
 
 
 def test_a_laser_falls_silent_a_disk_is_full_and_time_jumps_back(listener, start, tmp_path):

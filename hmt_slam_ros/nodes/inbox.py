@@ -20,7 +20,7 @@ from hmt_slam_ros.nodes.figures import Figures
 from hmt_slam_ros.nodes.sensor_subscription import SensorSubscription
 from hmt_slam_ros.nodes.topics import DOCUMENTS, FINISHED, KEYFRAME_SCANS, KEYFRAMES, ODOM, TRAIL
 from hmt_slam_ros.processes.documents import Closing, KeyframeHead, decode, decode_numbered
-from hmt_slam_ros.processes.messages import Finished, Keyframe, LocalEstimate, Message, Trail
+from hmt_slam_ros.processes.messages import Arriving, Finished, Keyframe, LocalEstimate, Message, Trail
 from hmt_slam_ros.sensing import Odometry
 
 Deliver = Callable[[Message], None]
@@ -62,8 +62,14 @@ class Inbox:
         self._heads: deque[KeyframeHead] = deque()
         self._ranges: deque[tuple[int, Any]] = deque()
         self.closing: Closing | None = None
+        self._odometry: SensorSubscription | None = None
         for kind in heard:
             self._subscribe(kind)
+
+    def forget_odometry(self) -> None:
+        """What comes next of it may be of any time."""
+        if self._odometry is not None:
+            self._odometry.forget()
 
     def begin_anew(self, first: int, begun: int) -> None:
         """The chain begins once more, when all of it so far was heard.
@@ -102,9 +108,9 @@ class Inbox:
         elif kind is Finished:
             self._listen(String, FINISHED, self._hear_closing)
         elif kind is Odometry:
-            SensorSubscription(
-                self._node, OdometryMessage, ODOM, lambda message: self.receive(conversions.odometry_from(message)),
-                self._after.get("Odometry"),
+            self._odometry = SensorSubscription(
+                self._node, self._figures, OdometryMessage, ODOM,
+                lambda message: self.receive(conversions.odometry_from(message)), self._after.get("Odometry"),
             )  # fmt: skip
         elif kind in DOCUMENTS:
             profile = self._estimates if kind is LocalEstimate else qos.CHAIN
@@ -152,6 +158,8 @@ class Inbox:
     def receive(self, message: Message) -> None:
         """Count a message, and deliver what is due."""
         self._figures.received[type(message).__name__] += 1
+        if isinstance(message, Arriving):
+            self.forget_odometry()
         if not isinstance(message, CHAIN):
             self._deliver(message)
             return

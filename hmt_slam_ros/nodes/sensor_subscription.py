@@ -12,6 +12,8 @@ from rclpy.qos import QoSProfile
 
 from hmt_slam_ros.nodes import qos
 from hmt_slam_ros.nodes.conversions import stamp_of
+from hmt_slam_ros.nodes.figures import Figures
+from hmt_slam_ros.nodes.stamp_order import StampOrder
 
 # Within this time a robot node has sent again what was missed.
 _PAST = 10.0  # s
@@ -20,20 +22,30 @@ _PAST = 10.0  # s
 class SensorSubscription:
     """Begins reliable, and changes over to best effort when a publisher offers nothing better.
 
+    Messages that come late or twice are left out; /diagnostics counts them.
+
     :ivar live: whether it listens to a publisher that may lose messages.
     """
 
     def __init__(
-        self, node: Node, kind: type, topic: str, hear: Callable[[Any], None], after: int | None = None
+        self,
+        node: Node,
+        figures: Figures,
+        kind: type,
+        topic: str,
+        hear: Callable[[Any], None],
+        after: int | None = None,
     ) -> None:
         """Listen.
 
+        :param figures: through which it tells.
         :param after: stamp of the last message that was heard before, ns, where what was missed since is wanted, from a
             publisher that kept it.
         """
         self.live = False
         self._node, self._kind, self._topic, self._hear = node, kind, topic, hear
         self._after, self._begin = after, time.monotonic()
+        self._figures, self._order = figures, StampOrder[Any](after)
         self._subscription = self._subscribe(qos.SENSOR if after is None else qos.KEPT_SENSOR)
 
     def _subscribe(self, profile: QoSProfile) -> Any:  # noqa: ANN401  rclpy's subscription
@@ -42,8 +54,8 @@ class SensorSubscription:
         return self._node.create_subscription(self._kind, self._topic, self._hear_new, profile, event_callbacks=events)
 
     def _hear_new(self, message: Any) -> None:  # noqa: ANN401  a ROS message with a header
+        stamp = stamp_of(message.header.stamp)
         if self._after is not None:
-            stamp = stamp_of(message.header.stamp)
             if stamp <= self._after and time.monotonic() - self._begin < _PAST:
                 return
             if self._profile is not qos.KEPT_SENSOR:
@@ -52,7 +64,24 @@ class SensorSubscription:
                     f"{(stamp - self._after) / 1e9:.1f} s, is lost: the node was not there"
                 )
             self._after = None
-        self._hear(message)
+        newest, refused = self._order.newest, self._order.refused
+        for due in self._order.arrive(stamp, message):
+            self._hear(due)
+        if self._order.refused > refused:
+            self._tell_of_refused(newest)
+
+    def forget(self) -> None:
+        """What comes next may be of any time."""
+        self._order.forget()
+
+    def _tell_of_refused(self, newest: int | None) -> None:
+        order = self._order
+        self._figures.state[f"refused on {self._topic}"] = order.refused
+        if order.refused == 1:
+            self._figures.warn(
+                f"on {self._topic} the message of stamp {order.last_refused} ns came late or twice, after that of "
+                f"{newest} ns, and is left out, as all such: look for a second publisher, or a link that reorders"
+            )
 
     def _change_over(self, _event: object) -> None:
         if self.live:

@@ -6,12 +6,11 @@ import math
 import time
 
 from hmt_slam_ros.nodes.figures import Figures
+from hmt_slam_ros.nodes.stamp_order import BACK
 from hmt_slam_ros.sensing import Odometry, Scan
 
 # A laser that sends nothing for so long, while odometry comes, is silent: much longer than any sweep takes.
 _SILENCE = 3.0  # s
-# Measurements of one source come in order, or nearly; a bag that begins again or a clock that is set goes back further.
-_BACK = 1_000_000_000  # ns
 # One clock where at least one of so many scans is that close to the newest reading: scans may wait longer than readings
 # on their way, but not all of them.
 _TOGETHER = 5_000_000_000  # ns
@@ -42,7 +41,7 @@ class SensorWatch:
         self._newest[kind] = max(stamp, newest)
         if kind is Scan:
             self._compare(stamp)
-        if stamp > newest - _BACK:
+        if stamp > newest - BACK:
             return False
         self.forget()
         self._newest[kind] = stamp

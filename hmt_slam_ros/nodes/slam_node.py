@@ -103,7 +103,7 @@ class SlamNode(ProcessNode):
         self._changer = MapChanger(self, self._release)
         self._paused = False
         self._skipped: LaserScan | None = None
-        self._laser = SensorSubscription(self, LaserScan, SCAN, self._hear_scan, self.after.get("Scan"))
+        self._laser = SensorSubscription(self, self.figures, LaserScan, SCAN, self._hear_scan, self.after.get("Scan"))
         self._particles = self.create_publisher(PoseArray, PARTICLES, qos.STREAM)
         self.create_subscription(String, ROBOT_STATUS, self._hear_status, qos.LATCHED)
         self.create_service(Trigger, "~/carried", self._hear_carried)
@@ -266,6 +266,8 @@ class SlamNode(ProcessNode):
             return
         if isinstance(message, Carried):
             self._watch.forget()
+            self._laser.forget()
+            self.inbox.forget_odometry()
         elif isinstance(message, Scan | Odometry) and self._watch.is_back(message) and not self.recovering:
             super().deliver(Carried())
         super().deliver(message)
