@@ -1,16 +1,23 @@
-"""A correction of map -> odom reaches those who steer by it at one stroke, or little by little."""
+"""A node that is in time; a correction reaches those who steer by it at one stroke, or little by little."""
 
 import math
+import os
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
 
+from diagnostic_msgs.msg import DiagnosticArray
+
 from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.nodes import qos
 from hmt_slam_ros.nodes.correction import Correction
+from hmt_slam_ros.nodes.topics import DIAGNOSTICS
 
 STEP = 10_000_000  # ns
+ORDINARY = ("setpriv", "--bounding-set=-sys_nice")
 FAR = np.array([300.0, -200.0, 1.2])
 KNOWN, CORRECTED = np.array([0.0, 0.0, 0.0]), np.array([0.4, -0.2, 0.02])
 
@@ -55,3 +62,21 @@ def test_time_that_jumps_back_begins_anew():
     correction.shown(100 * STEP, KNOWN, FAR, 0.5)
     near = np.array([1e-3, 2e-3, 1e-5])
     np.testing.assert_array_equal(correction.shown(0, near, FAR, 0.5), near)
+
+
+@pytest.mark.parametrize(("before", "said"), [((), "yes"), (ORDINARY, "not permitted")], ids=["permitted", "ordinary"])
+def test_rtl_comes_before_what_computes_for_long_where_that_is_permitted(listener, start, before, said):
+    told = listener.hear(DiagnosticArray, DIAGNOSTICS, qos.STREAM)
+    process = start("rtl", before=before)
+
+    def answer():
+        values = [value for message in told for status in message.status for value in status.values]
+        return next((value.value for value in values if value.key == "real-time scheduling"), None)
+
+    listener.until(answer, alive=[process])
+    if before == () and answer() == "not permitted":
+        pytest.skip("the system does not permit it: it needs root or an rtprio limit")
+    assert answer() == said
+    threads = [int(thread.name) for thread in Path(f"/proc/{process.pid}/task").iterdir()]
+    policies = {os.sched_getscheduler(thread) for thread in threads}
+    assert policies == {os.SCHED_RR if said == "yes" else os.SCHED_OTHER}

@@ -17,6 +17,9 @@ class RealTimeLocalization:
         "Time in which a correction of map -> odom falls to a third, for those who steer by it; 0 corrects at once.",
         unit="s", low=0.0, high=60.0,
     )
+    precedence: bool = parameter(
+        True, "Let the node come before all that computes for long (SCHED_RR), where the system permits it."
+    )
     max_speed: float = parameter(
         10.0, "Odometry that moves faster than this between two readings was reset.", unit="m/s", low=0.1, high=1000.0
     )

@@ -12,6 +12,7 @@ from hmt_slam_ros.nodes.beginning import Beginning
 from hmt_slam_ros.nodes.correction import Correction
 from hmt_slam_ros.nodes.last_save import spin
 from hmt_slam_ros.nodes.parameters import declare_frame
+from hmt_slam_ros.nodes.precedence import take_precedence
 from hmt_slam_ros.nodes.process_node import ProcessNode
 from hmt_slam_ros.nodes.running import run
 from hmt_slam_ros.nodes.topics import HMT_POSE, POSE
@@ -47,9 +48,15 @@ def _make_process(configuration: Configuration, beginning: Beginning) -> Remembe
     return Rtl(configuration, beginning.part("rtl", RtlState))
 
 
+def _spin(node: RtlNode) -> None:
+    if node.configuration.rtl.precedence:
+        node.figures.state["real-time scheduling"] = "yes" if take_precedence() else "not permitted"
+    spin(node)
+
+
 def main() -> None:
     """Run the node."""
-    sys.exit(run(RtlNode, spin))
+    sys.exit(run(RtlNode, _spin))
 
 
 if __name__ == "__main__":
