@@ -93,6 +93,7 @@ class SlamNode(ProcessNode):
         self._pending_since = self._last_scan = time.monotonic()
         self._watch, self._complained = SensorWatch(self.figures), False
         self._dropped = 0
+        self._status: RobotStatus | None = None
         self._end: RobotStatus | None = None
         self._areas: dict[int, AreaPose] = {}
         self.estimate: LocalEstimate | None = None
@@ -241,11 +242,12 @@ class SlamNode(ProcessNode):
 
     def _hear_status(self, message: String) -> None:
         try:
-            status = decode(message.data, RobotStatus)
+            status = replace(decode(message.data, RobotStatus), acknowledged=0)
         except HmtSlamError as error:
             self.figures.fail(f"{ROBOT_STATUS}: {error}")
             return
-        if status.state == "ended":
+        news, self._status = status != self._status, status
+        if news and status.state == "ended":
             self._end = status
             self._end_if_all_came()
 
@@ -306,8 +308,7 @@ class SlamNode(ProcessNode):
 
     def memory(self) -> dict[str, object]:
         """What the node knows beside its process."""
-        areas = tuple(self._areas.values())
-        return {_MEMORY: SlamMemory(areas, self.estimate, self._unchanged, self._dropped)}
+        return {_MEMORY: SlamMemory(tuple(self._areas.values()), self.estimate, self._unchanged, self._dropped)}
 
     def remember(self, state: Path) -> None:
         """Take it over."""
