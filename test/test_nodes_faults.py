@@ -13,6 +13,7 @@ pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, 
 
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseWithCovarianceStamped
+from nav_msgs.msg import OccupancyGrid
 from nav_msgs.msg import Odometry as OdometryMessage
 from rcl_interfaces.srv import GetParameters, SetParameters
 from rclpy.parameter import Parameter
@@ -22,7 +23,7 @@ from std_srvs.srv import Trigger
 
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.nodes import conversions, qos
-from hmt_slam_ros.nodes.topics import DIAGNOSTICS, DOCUMENTS, KEYFRAMES, POSE, SCAN
+from hmt_slam_ros.nodes.topics import DIAGNOSTICS, DOCUMENTS, KEYFRAMES, MAP, POSE, SCAN
 from hmt_slam_ros.nodes.transforms import TFMessage
 from hmt_slam_ros.persistence.folder import FolderReader
 from hmt_slam_ros.persistence.hmt_map import FORMAT, VERSION
@@ -303,14 +304,48 @@ def test_a_missing_transform_and_clocks_that_are_apart_are_told_with_the_remedy(
     assert "scans wait for odometry" in error
 
 
-def test_a_second_robot_under_a_namespace_shares_nothing_with_the_first(listener, start, tmp_path):
-    told = listener.hear(DiagnosticArray, "two/diagnostics", qos.STREAM)
-    names = ("slam", "aam", "tsbi", "tlca", "rtl")
-    processes = [start(name, "-r", "__ns:=/two", recovery=tmp_path) for name in names]
-    listener.until(lambda: {m.status[0].name for m in told} == {f"/two/{name}" for name in names}, alive=processes)
-    shared = {"/parameter_events", "/rosout"}
+def joints(messages):
+    """(parent, child) of the transforms that came."""
+    return {(joint.header.frame_id, joint.child_frame_id) for message in messages for joint in message.transforms}
+
+
+@pytest.mark.skipif(TFMessage is None, reason="tf2_msgs is not installed: run scripts/test.sh, which builds it")
+def test_two_robots_that_drive_at_once_under_namespaces_share_nothing_but_a_tf_that_is_told_to_be(
+    listener, start, tmp_path
+):
+    names = {"map": "map", "odom": "odom", "base": "base_link", "laser": "laser"}
+    frames = {f"{which}_frame": f"two/{name}" for which, name in names.items()}
+    one = Nodes(start, listener, namespace="/one", recovery=tmp_path)
+    two = Nodes(
+        start, listener, "-r", "tf:=/tf", "-r", "tf_static:=/tf_static", namespace="/two", recovery=tmp_path, **frames
+    )  # fmt: skip
+    maps = {nodes: nodes.hear(OccupancyGrid, MAP, qos.LATCHED) for nodes in (one, two)}
+    tf = {topic: listener.hear(TFMessage, topic, qos.TF_STATIC) for topic in ("/one/tf_static", "/tf_static")}
+    tf |= {topic: listener.hear(TFMessage, topic, qos.STREAM) for topic in ("/one/tf", "/tf")}
+    drives = {one: 40, two: 60}
+    for nodes, scans in drives.items():
+        folder = tmp_path / f"log_{scans}"
+        folder.mkdir()
+        nodes.drive(corridor_bag(folder, scans=scans), first=0, **(frames if nodes is two else {}))
+    for nodes, scans in drives.items():
+        nodes.until(lambda nodes=nodes, scans=scans: len(nodes.estimates) == scans)
+        end = START + (scans - 1) * SECOND // 5
+        nodes.until(lambda nodes=nodes, end=end: conversions.stamp_of(nodes.poses[-1].header.stamp) == end)
+        assert_true(nodes.poses[-1], START)
+        nodes.until(lambda nodes=nodes, scans=scans: nodes.diagnosis("slam")["received Scan"] == str(scans))
+        nodes.until(lambda nodes=nodes: maps[nodes])
+    assert {message.header.frame_id for message in [*one.poses, *maps[one]]} == {"map"}
+    assert {message.header.frame_id for message in [*two.poses, *maps[two]]} == {"two/map"}
+    assert joints(tf["/one/tf"] + tf["/one/tf_static"]) == {
+        ("map", "odom"), ("odom", "base_link"), ("base_link", "laser"),
+    }  # fmt: skip
+    assert joints(tf["/tf"] + tf["/tf_static"]) == {
+        ("two/map", "two/odom"), ("two/odom", "two/base_link"), ("two/base_link", "two/laser"),
+    }  # fmt: skip
+    shared = {"/parameter_events", "/rosout", "/tf", "/tf_static"}
     for name, _ in listener.node.get_topic_names_and_types():
-        assert name in shared or name.startswith("/two/"), name
+        assert name in shared or name.startswith(("/one/", "/two/")), name
     for name, _ in listener.node.get_service_names_and_types():
-        assert name.startswith(("/two/", "/listener/")), name
-    assert {path.name for path in tmp_path.iterdir()} == {f"two.{name}" for name in names}
+        assert name.startswith(("/one/", "/two/", "/listener/")), name
+    kept = {path.name for path in tmp_path.iterdir() if not path.name.startswith("log_")}
+    assert kept == {f"{top}.{name}" for top in ("one", "two") for name in NODES}

@@ -43,17 +43,22 @@ def corridor(tmp_path_factory):
 
 
 class Nodes:
-    """The five processes, robots one after the other, and what is heard of them."""
+    """The five processes, robots one after the other, and what is heard of them, in a namespace such as "/robot"."""
 
-    def __init__(self, start, listener, **parameters):
-        self.start, self.listener = start, listener
-        self.localized = listener.hear(Bool, IS_LOCALIZED, qos.LATCHED)
-        self.entropies = listener.hear(Float64, ENTROPY, qos.LATCHED)
-        self.estimates = listener.hear(String, DOCUMENTS[LocalEstimate], qos.CHAIN)
-        self.notices = listener.hear(String, DOCUMENTS[Notice], qos.CHAIN)
-        self.poses = listener.hear(PoseWithCovarianceStamped, POSE, qos.STREAM)
-        self.diagnostics = listener.hear(DiagnosticArray, DIAGNOSTICS, qos.STREAM)
-        self.alive = [start(name, **parameters) for name in NODES]
+    def __init__(self, start, listener, *arguments, namespace="", **parameters):
+        self.start, self.listener, self.namespace = start, listener, namespace
+        self.arguments = (*arguments, *(["-r", f"__ns:={namespace}"] if namespace else []))
+        self.localized = self.hear(Bool, IS_LOCALIZED, qos.LATCHED)
+        self.entropies = self.hear(Float64, ENTROPY, qos.LATCHED)
+        self.estimates = self.hear(String, DOCUMENTS[LocalEstimate], qos.CHAIN)
+        self.notices = self.hear(String, DOCUMENTS[Notice], qos.CHAIN)
+        self.poses = self.hear(PoseWithCovarianceStamped, POSE, qos.STREAM)
+        self.diagnostics = self.hear(DiagnosticArray, DIAGNOSTICS, qos.STREAM)
+        self.alive = [start(name, *self.arguments, **parameters) for name in NODES]
+
+    def hear(self, kind, topic, profile):
+        """What comes on a topic of these nodes."""
+        return self.listener.hear(kind, f"{self.namespace}/{topic}", profile)
 
     def until(self, condition):
         self.listener.until(condition, alive=self.alive)
@@ -63,7 +68,7 @@ class Nodes:
         begin = max(0.0, 0.2 * first - 0.001)
         # Also for rtl: a drive as quick as slam is over before DDS has made them known to each other.
         robot = {"robot__start": begin, "robot__odometry_listeners": 2, **robot}
-        self.alive.append(self.start("robot", log=log, robot__rate=rate, **robot))
+        self.alive.append(self.start("robot", *self.arguments, log=log, robot__rate=rate, **robot))
 
     def park(self):
         robot = self.alive.pop()
@@ -75,7 +80,7 @@ class Nodes:
 
     def diagnosis(self, node):
         """What a node said of itself last, {name: value}; values are empty while it said nothing."""
-        said = (m.status[0] for m in reversed(self.diagnostics) if m.status[0].name == f"/{node}")
+        said = (m.status[0] for m in reversed(self.diagnostics) if m.status[0].name == f"{self.namespace}/{node}")
         return defaultdict(str, {value.key: value.value for status in islice(said, 1) for value in status.values})
 
 

@@ -50,6 +50,7 @@ class RobotNode(ConfiguredNode):
         super().__init__("robot", _CHANGEABLE)
         self._settings = self.configuration.robot
         self._odom, self._base = declare_frame(self, "odom", "odom"), declare_frame(self, "base", "base_link")
+        self._laser = declare_frame(self, "laser", "laser")
         self.figures = Figures(self)
         self._log = self._open_log()
         self._player = Player(self._log, self._settings)
@@ -151,7 +152,7 @@ class RobotNode(ConfiguredNode):
         key = scan.laser_pose.tobytes()
         if key not in self._lasers:
             number = len(self._lasers)
-            self._lasers[key] = (f"laser_{number}" if number else "laser", scan.laser_pose)
+            self._lasers[key] = (f"{self._laser}_{number}" if number else self._laser, scan.laser_pose)
             self._send_static_transforms(
                 [
                     conversions.transform_message(scan.stamp, self._base, frame, pose)
