@@ -214,6 +214,17 @@ def test_no_pose_is_a_fault_but_not_after_the_end_of_a_log():
     assert health.verdict(5.0)["level"] == "good"
 
 
+def test_a_node_that_is_halted_is_named_rather_than_the_pose_that_does_not_come():
+    health = Health(NODES)
+    well(health, 0.0)
+    health.hear("rtl", 0, "inactive", {"state": "inactive"}, 0.0)
+    told = {"level": "waiting", "text": "rtl is inactive.", "advice": "ros2 lifecycle set /rtl activate"}
+    assert health.verdict(1.0) == told
+    assert health.rows(1.0)[1]["level"] == "waiting"
+    health.hear("rtl", 0, "running", {"state": "active"}, 1.0)
+    assert "no pose came yet" in health.verdict(2.0)["text"]
+
+
 def test_errors_come_before_warnings_and_warnings_grow_old():
     health = Health(NODES, pose_heard=100.0, localized=False)
     well(health, 0.0, slam=(1, "the wheels slip"))

@@ -114,8 +114,8 @@ def _silent(running: Running) -> list[Finding]:
     estimates = running.topics[ESTIMATES]
     if "slam" in running.nodes and running.topics[SCAN].heard and not estimates.heard:
         text = (
-            f"Scans come, and slam said nothing about one for {running.seconds:g} s: it is paused, or waits for "
-            "odometry, a transform or the other nodes; its own log and /diagnostics say for which."
+            f"Scans come, and slam said nothing about one for {running.seconds:g} s: it is paused or not active, or "
+            "waits for odometry, a transform or the other nodes; its own log and /diagnostics say for which."
         )
         found.append(Finding("doubtful", "slam silent", text))
     return found

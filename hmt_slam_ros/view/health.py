@@ -14,6 +14,9 @@ _POSE_SILENCE = 3.0  # s
 # A node's level never falls again: a warning is news for so long.
 _NEWS = 60.0  # s
 _WARN = 1
+_ACTIVE = "active"
+# From a state of a managed node towards the one in which it takes part.
+_NEXT = {"unconfigured": "configure", "inactive": "activate"}
 
 
 @dataclass
@@ -84,7 +87,8 @@ class Health:
     def verdict(self, now: float) -> dict[str, str]:
         """All of it in one sentence, the worst first, and what to do."""
         said, pose = self._said(now), self._pose(now)
-        for sentence in (self._nothing(), self._silent(now), said.get("fault"), pose, said.get("attention")):
+        halted = self._halted()
+        for sentence in (self._nothing(), self._silent(now), said.get("fault"), halted, pose, said.get("attention")):
             if sentence is not None:
                 return sentence
         if self.localized is False:
@@ -117,6 +121,14 @@ class Health:
             verb, advice = "say", "Did they end? Their logs tell; a first run compiles long."
         return _verdict("fault", f"{_and(silent)} {verb} nothing, for {age:.0f} s.", advice)
 
+    def _halted(self) -> dict[str, str] | None:
+        for name in self.nodes:
+            if (state := _state(self.nodes[name])) != _ACTIVE:
+                transition = _NEXT.get(state, "")
+                advice = f"ros2 lifecycle set /{name} {transition}" if transition else "Start it anew."
+                return _verdict("waiting", f"{name} is {state}.", advice)
+        return None
+
     def _said(self, now: float) -> dict[Level, dict[str, str]]:
         """{level: what a node complains of}."""
         levels = {name: _level(node, now) for name, node in self.nodes.items()}
@@ -145,7 +157,14 @@ def _verdict(level: Level, text: str, advice: str = "") -> dict[str, str]:
 def _level(node: NodeHealth, now: float) -> Level:
     if node.level > _WARN:
         return "fault"
+    if _state(node) != _ACTIVE:
+        return "waiting"
     return "attention" if node.level == _WARN and now - node.changed < _NEWS else "good"
+
+
+def _state(node: NodeHealth) -> str:
+    """Of a managed node; others are active."""
+    return node.values.get("state", _ACTIVE)
 
 
 def _and(names: Sequence[str]) -> str:
