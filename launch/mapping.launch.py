@@ -27,6 +27,7 @@ def _arguments() -> list[DeclareLaunchArgument]:
         _switch("start_carried", "true", "Whether the robot may be anywhere in that map; else it is where it was."),
         DeclareLaunchArgument("save_to", default_value="hmt_map", description="Folder for the service slam/save."),
         _switch("save_at_end", "false", "Whether the map is saved there before the nodes end."),
+        _switch("autostart", "true", "Whether the nodes begin by themselves; else a lifecycle manager leads them."),
         _switch("view", "false", "Whether the live page is served."),
         DeclareLaunchArgument("view_port", default_value="8800", description="Port of the live page on 127.0.0.1."),
         DeclareLaunchArgument(
@@ -46,7 +47,7 @@ def _value(name: str, kind: type) -> ParameterValue:
 
 def _processes() -> list[Node]:
     kinds = {"use_sim_time": bool, "start_from": str, "start_carried": bool}
-    kinds |= {"save_to": str, "save_at_end": bool, "recovery": str}
+    kinds |= {"save_to": str, "save_at_end": bool, "recovery": str, "autostart": bool}
     return [
         Node(
             package="hmt_slam_ros",

@@ -102,11 +102,7 @@ class Beginning:
         return self.part("map", MapDocument)
 
 
-def declare_beginning(node: ConfiguredNode) -> Beginning:
-    """What the parameters ``start_from`` and ``start_carried`` say.
-
-    :raises HmtSlamError: where the map is damaged, or the node's parameters do not go with it.
-    """
+def declare_beginning(node: ConfiguredNode) -> tuple[str, bool]:
+    """Path of the map, empty for none, and whether the robot may be anywhere in it."""
     path = str(node.declare_parameter("start_from", "", _FROM).value)
-    carried = bool(node.declare_parameter("start_carried", True, _CARRIED).value)
-    return Beginning(node, path, carried=carried)
+    return path, bool(node.declare_parameter("start_carried", True, _CARRIED).value)

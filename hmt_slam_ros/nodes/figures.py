@@ -19,6 +19,9 @@ from hmt_slam_ros.nodes.topics import COST, DIAGNOSTICS
 from hmt_slam_ros.processes.messages import Keyframe, LocalEstimate, Message
 
 PERIOD = 1.0  # s
+STATE, ACTIVE = "state", "active"
+"""The line of /diagnostics that has the state of a managed node, and the one in which it takes part."""
+
 _SECOND = 1_000_000_000
 
 
@@ -32,10 +35,20 @@ class Figures:
     """
 
     def __init__(self, node: Node) -> None:
+        self._node = node
+        self.clear()
+        self._clock = Clock(clock_type=ClockType.SYSTEM_TIME)
+        self._diagnostics = node.create_publisher(DiagnosticArray, DIAGNOSTICS, qos.STREAM)
+        self._cost = node.create_publisher(Float64MultiArray, COST, qos.CHAIN)
+        # It also runs while simulated time stands still.
+        self.steady_clock = Clock(clock_type=ClockType.STEADY_TIME)
+        node.create_timer(PERIOD, self.publish, clock=self.steady_clock)
+
+    def clear(self) -> None:
+        """Begin to count anew."""
         self.received: Counter[str] = Counter()
         self.sent: Counter[str] = Counter()
         self.state: dict[str, object] = {}
-        self._node = node
         self._error = ""
         self._level = DiagnosticStatus.OK
         self._moment = 0
@@ -43,12 +56,6 @@ class Figures:
         self._counted_at = time.monotonic()
         self._costs: list[tuple[int, float]] = []
         self._handled, self._busy, self._longest = 0, 0.0, 0.0
-        self._clock = Clock(clock_type=ClockType.SYSTEM_TIME)
-        self._diagnostics = node.create_publisher(DiagnosticArray, DIAGNOSTICS, qos.STREAM)
-        self._cost = node.create_publisher(Float64MultiArray, COST, qos.CHAIN)
-        # It also runs while simulated time stands still.
-        self.steady_clock = Clock(clock_type=ClockType.STEADY_TIME)
-        node.create_timer(PERIOD, self.publish, clock=self.steady_clock)
 
     def warn(self, sentence: str) -> None:
         """Remember and log something that the node survives; the same sentence is logged once."""
@@ -102,13 +109,19 @@ class Figures:
         status = DiagnosticStatus(
             level=self._level,
             name=self._node.get_fully_qualified_name(),
-            message=self._error or "running",
+            message=self._error or self._doing,
             hardware_id="hmt_slam_ros",
             values=[KeyValue(key=name, value=str(value)) for name, value in values.items()],
         )
         message = DiagnosticArray(status=[status])
         message.header.stamp = self._clock.now().to_msg()
         self._diagnostics.publish(message)
+
+    @property
+    def _doing(self) -> str:
+        """The state of a node that has states, unless it takes part."""
+        state = str(self.state.get(STATE, ACTIVE))
+        return "running" if state == ACTIVE else state
 
     def _counts_and_rates(self) -> dict[str, object]:
         """How many messages of each kind there were, and how many a second since the last time."""

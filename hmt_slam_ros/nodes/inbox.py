@@ -25,11 +25,14 @@ from hmt_slam_ros.sensing import Odometry
 
 Deliver = Callable[[Message], None]
 
+_KEPT = "kept until it is active"
+
 
 class Inbox:
     """Subscriptions for the kinds of messages that a node hears.
 
     :ivar closing: slam's last word with its counts, None before it.
+    :ivar waits: whether what comes is kept.
     """
 
     def __init__(
@@ -59,6 +62,8 @@ class Inbox:
         self._node, self._deliver, self._figures = node, deliver, figures
         self._order = ChainOrder(heard, first)
         self._estimates = estimates
+        self.waits = False
+        self._kept: deque[Message] = deque()
         self._heads: deque[KeyframeHead] = deque()
         self._ranges: deque[tuple[int, Any]] = deque()
         self.closing: Closing | None = None
@@ -71,6 +76,17 @@ class Inbox:
         if self._odometry is not None:
             self._odometry.forget()
 
+    def wait(self) -> None:
+        """Keep what comes from now on."""
+        self.waits = True
+
+    def go_on(self) -> None:
+        """Deliver what was kept, in the order in which it came, and what comes from now on."""
+        self.waits = False
+        self._figures.state.pop(_KEPT, None)
+        while self._kept:
+            self.receive(self._kept.popleft())
+
     def begin_anew(self, first: int, begun: int) -> None:
         """The chain begins once more, when all of it so far was heard.
 
@@ -78,6 +94,7 @@ class Inbox:
         :param begun: number of the request after which it does.
         """
         self._order, self._begun = ChainOrder(self._heard, first), begun
+        self._kept.clear()
         self._heads.clear()
         self._ranges.clear()
 
@@ -112,6 +129,7 @@ class Inbox:
                 self._node, self._figures, OdometryMessage, ODOM,
                 lambda message: self.receive(conversions.odometry_from(message)), self._after.get("Odometry"),
             )  # fmt: skip
+            self._odometry.begin()
         elif kind in DOCUMENTS:
             profile = self._estimates if kind is LocalEstimate else qos.CHAIN
             self._listen(String, DOCUMENTS[kind], lambda message: self._hear_document(message, kind), profile)
@@ -156,7 +174,11 @@ class Inbox:
         self.receive(self.closing.totals)
 
     def receive(self, message: Message) -> None:
-        """Count a message, and deliver what is due."""
+        """Count a message, and deliver what is due, unless all has to wait."""
+        if self.waits:
+            self._kept.append(message)
+            self._figures.state[_KEPT] = len(self._kept)
+            return
         self._figures.received[type(message).__name__] += 1
         if isinstance(message, Arriving):
             self.forget_odometry()

@@ -14,25 +14,24 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.signals import uninstall_signal_handlers
 
 from hmt_slam_ros.nodes.departure import end_within
-from hmt_slam_ros.nodes.process_node import ProcessNode
+from hmt_slam_ros.nodes.process_node import SAVING_PATIENCE, ProcessNode
 
-# A launch tells its nodes to end once more, and less kindly, after 5 s, and kills them after 10 s.
-_PATIENCE = 8.0  # s
-# What a node said last has to reach the others before it takes leave.
-_LINGER = 0.5  # s
 _POLL = 0.05  # s
 
 
 def spin(node: ProcessNode) -> None:
-    """Spin a node until it is told to end and its part of the last map is saved, if one is to be."""
-    node.recover()
+    """Begin and spin a node until it is told to end and its part of the last map is saved, if one is to be.
+
+    :raises HmtSlamError: where it cannot begin.
+    """
+    node.begin()
     ended = False
     try:
         _spin(node)
         ended = True
     finally:
         if ended or not rclpy.ok():
-            node.recovery.clear()
+            node.depart()
 
 
 def _spin(node: ProcessNode) -> None:
@@ -46,7 +45,7 @@ def _spin(node: ProcessNode) -> None:
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     try:
-        while rclpy.ok() and not told.over and not (told.at and node.saved_last(_LINGER)):
+        while rclpy.ok() and not told.over and not (told.at and node.saved_last()):
             executor.spin_once(timeout_sec=_POLL)
     finally:
         executor.shutdown()
@@ -64,9 +63,9 @@ class _Told:
     @property
     def over(self) -> bool:
         """Whether there is no time left."""
-        return self.at is not None and time.monotonic() - self.at > _PATIENCE
+        return self.at is not None and time.monotonic() - self.at > SAVING_PATIENCE
 
     def __call__(self, _number: int, _frame: object) -> None:
         if self.at is None:
             self.at = time.monotonic()
-            end_within(_PATIENCE + 1.0, 0)
+            end_within(SAVING_PATIENCE + 1.0, 0)

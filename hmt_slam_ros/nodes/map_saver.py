@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.node import Node
 from rclpy.task import Future
 from std_srvs.srv import Trigger
 
@@ -55,7 +56,7 @@ class MapSaver(Round):
 
         :param release: called when slam need not wait any more.
         """
-        self._target = Path(node.declare_parameter("save_to", HMT_MAP, _DESCRIPTOR).value).absolute()
+        self._target = node.save_to
         super().__init__(node, release, (SAVE, SAVED), SavedPart, f"{self._target} cannot be saved")
         self._last: Future | None = None
         self._ending = False
@@ -118,6 +119,11 @@ class MapSaver(Round):
         if self._saving is not None:
             shutil.rmtree(self._saving.scratch, ignore_errors=True)
         self._saving = None
+
+
+def declare_target(node: Node) -> Path:
+    """The folder for the map, from the parameter ``save_to``."""
+    return Path(node.declare_parameter("save_to", HMT_MAP, _DESCRIPTOR).value).absolute()
 
 
 _DESCRIPTOR = ParameterDescriptor(description="Folder into which the service save writes the map.", read_only=True)

@@ -61,25 +61,25 @@ class Part:
         """Take note of a request, unless it was answered before."""
         if isinstance(request, SaveRequest) or request.number > self._node.answered:
             self._requests.append(request)
-            self._answer_if_due()
+            self.look()
 
     def delivered(self, message: Message) -> None:
         """Count an event that the process has worked off; do what waits for it."""
         if isinstance(message, self._last):
             self._events += 1
-            self._answer_if_due()
+            self.look()
 
     def gave_last(self, linger: float) -> bool:
         """Whether the part of the last map was written, at least some seconds ago, or there is nothing to be saved."""
         return not self._events or (self._gave_last is not None and time.monotonic() - self._gave_last >= linger)
 
-    def _answer_if_due(self) -> None:
-        while self._requests and self._events >= self._requests[0].events:
+    def look(self) -> None:
+        """Answer what is due, and what would never be as nothing is heard."""
+        while self._requests and (self._events >= self._requests[0].events or self._node.inbox.waits):
             self._answer(self._requests.popleft())
 
     def _answer(self, request: SaveRequest | BeginRequest) -> None:
-        ahead = f"it is at keyframe event {self._events}, not {request.events}: restart all nodes"
-        fault = ahead if self._events > request.events else ""
+        fault = self._apart(request)
         if isinstance(request, BeginRequest):
             fault = fault or self._begin(request)
             self._begun.publish(String(data=encode(BegunPart(request.number, self._name, fault))))
@@ -91,6 +91,14 @@ class Part:
         self._saved.publish(String(data=encode(SavedPart(request.number, self._name, files, fault))))
         if request.last:
             self._gave_last = time.monotonic()
+
+    def _apart(self, request: SaveRequest | BeginRequest) -> str:
+        """What is wrong where the process heard more keyframe events than slam, or less; who forgets may lack some."""
+        if self._events > request.events:
+            return f"it is at keyframe event {self._events}, not {request.events}: restart all nodes"
+        if self._events < request.events and isinstance(request, SaveRequest):
+            return f"it is inactive, at keyframe event {self._events} of {request.events}: activate it"
+        return ""
 
     def _begin(self, request: BeginRequest) -> str:
         """Begin anew; what went wrong."""

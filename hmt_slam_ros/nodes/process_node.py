@@ -14,25 +14,34 @@ from hmt_slam_ros.compilation import tell_of_compilation
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.configuration.flat import as_flat
 from hmt_slam_ros.nodes.beginning import Beginning, declare_beginning
-from hmt_slam_ros.nodes.figures import Figures
 from hmt_slam_ros.nodes.inbox import Inbox
+from hmt_slam_ros.nodes.managed_node import ManagedNode
 from hmt_slam_ros.nodes.outbox import Outbox
-from hmt_slam_ros.nodes.parameters import ConfiguredNode
 from hmt_slam_ros.nodes.part import PARTS, Part
-from hmt_slam_ros.nodes.recovery import Base, Found, Recovery, Setting, Told
+from hmt_slam_ros.nodes.recovery import Active, Base, Found, Recovery, Setting, Told, declare_recovery
 from hmt_slam_ros.processes.messages import Arriving, Message, Notice, RealTimePose
 from hmt_slam_ros.processes.routing import HEARD_BY, Remembering
 
+SAVING_PATIENCE = 8.0
+"""Seconds for the last map: a launch tells its nodes to end once more after 5 s, and kills them after 10 s."""
+
+# What a node said last has to reach the others before it takes leave.
+_LINGER = 0.5  # s
+_POLL = 0.05  # s
 _SAVE_AT_END = ParameterDescriptor(
     description="Whether all nodes save the map to save_to of slam when they are told to end.", read_only=True
 )
 
 
-class ProcessNode(ConfiguredNode):
+class ProcessNode(ManagedNode):
     """A process of :mod:`hmt_slam_ros.processes` as a node of the same name.
 
+    :ivar hears_on: whether the process hears all the same while the node is inactive, and says what it has to.
     :ivar saves_at_end: whether it stays for that when it is told to end.
     """
+
+    hears_on = False
+    saves_at_end = False
 
     def __init__(
         self,
@@ -41,33 +50,97 @@ class ProcessNode(ConfiguredNode):
         said: Iterable[type],
         changeable: Iterable[str] = (),
     ) -> None:
-        """Make the process with the configuration from the node's parameters.
+        """Declare the parameters.
 
         :param name: one of those in ``HEARD_BY``.
         :param make_process: makes it from what the node begins with.
         :param said: kinds of messages that the process says.
         :param changeable: parameters that may change while the node runs.
-        :raises HmtSlamError: for a parameter that cannot be.
         """
+        self._make_process, self._name, self._said = make_process, name, (*said, Notice)
         super().__init__(name, changeable)
+
+    def declare(self) -> None:
+        """Declare those of all processes, and look for what a node of the same name left behind.
+
+        :raises HmtSlamError: where that is damaged.
+        """
         self.saves_at_end = bool(self.declare_parameter("save_at_end", False, _SAVE_AT_END).value)
-        self.figures = Figures(self)
-        self._make_process, self._name = make_process, name
-        self.beginning = declare_beginning(self)
-        self.recovery = Recovery(self)
-        self._answered, self._checkpoints, self._recovering = 0, 0, self.recovery.found is not None
-        if self.recovery.found is None:
-            self.recovery.begin(self._base())
+        self.start_from, self._start_carried = declare_beginning(self)
+        self._recovery_folder = declare_recovery(self)
+        self.recovery = Recovery(self, self._recovery_folder)
+
+    @property
+    def first_states(self) -> tuple[bool, bool]:
+        """Those in which a node of the same name was when it was killed, if one was."""
+        found, (configure, activate) = self.recovery.found, super().first_states
+        if found is None:
+            return configure, activate
+        return True, activate if found.active is None else found.active
+
+    def set_up(self) -> None:
+        """Make the process with what it begins with or what was left behind, and all that it hears and says.
+
+        :raises HmtSlamError: for a map that cannot be.
+        """
+        found = self.recovery.found
+        self._answered, self._checkpoints, self._recovering = 0, 0, found is not None
+        if found is None:
+            self.beginning = Beginning(self, self.start_from, carried=self._start_carried)
         else:
-            self.beginning = self._where_it_was(self.recovery.found)
+            self.beginning = self._where_it_was(found)
         self.process = self._made()
+        if found is None:
+            self.recovery.begin(self._base())
         tell_of_compilation(self.get_logger().info)
-        self.outbox = Outbox(self, (*said, Notice), self._answered)
+        self.outbox = Outbox(self, self._said, self._answered)
         self.inbox = Inbox(
-            self, HEARD_BY[name], self.deliver, self.figures, first=self.beginning.events, begun=self._answered,
+            self, HEARD_BY[self._name], self.deliver, self.figures, first=self.beginning.events, begun=self._answered,
             after=self.after,
         )  # fmt: skip
-        self._part = Part(self, name) if name in PARTS else None
+        self._part = Part(self, self._name) if self._name in PARTS else None
+
+    def take_part(self) -> None:
+        """Let the process hear what has come."""
+        self.recovery.heard(Active(True))
+        self.inbox.go_on()
+
+    def stand_still(self) -> None:
+        """Let the process hear nothing, unless it hears on."""
+        self.recovery.heard(Active(False))
+        if not self.hears_on:
+            self.inbox.wait()
+        if self._part is not None:
+            self._part.look()
+
+    def give_up(self) -> None:
+        """Leave nothing behind: what the process knows is forgotten."""
+        self.recovery.clear()
+        self.recovery = Recovery(self, self._recovery_folder)
+
+    def abandon(self) -> None:
+        """As any managed node; what another node left behind stays for the next try."""
+        super().abandon()
+        if self.recovery.found is None:
+            self.recovery.clear()
+
+    def leave(self) -> None:
+        """As when the node is told to end: after its part of the last map is saved, if one is to be."""
+        if not self.saves_at_end:
+            self.take_down()
+            return
+        begin = time.monotonic()
+
+        def look() -> None:
+            if self.saved_last() or time.monotonic() - begin > SAVING_PATIENCE:
+                self.take_down()
+
+        self.create_timer(_POLL, look, clock=self.figures.steady_clock)
+
+    def depart(self) -> None:
+        """Leave nothing behind for a node of the same name, unless it was left by another one."""
+        if self.configured:
+            self.recovery.clear()
 
     def _made(self) -> Remembering:
         """The process, made from the beginning."""
@@ -122,11 +195,15 @@ class ProcessNode(ConfiguredNode):
         """Whether the node hears again what another one of its name heard that was killed."""
         return self._recovering
 
-    def recover(self) -> None:
-        """Go on where a node of the same name was killed, if one was."""
-        found = self.recovery.found
-        if found is None:
-            return
+    def _configure(self) -> None:
+        """As any managed node, up to where a node of the same name was killed, if one was."""
+        super()._configure()
+        if self.recovery.found is not None:
+            self._recover(self.recovery.found)
+        if not self.hears_on:
+            self.inbox.wait()
+
+    def _recover(self, found: Found) -> None:
         begin = time.monotonic()
         if found.base.checkpoint:
             self.remember(found.state)
@@ -168,6 +245,8 @@ class ProcessNode(ConfiguredNode):
         """Take note of new values, also for one that goes on where this node is killed."""
         before, now = as_flat(self.configuration), as_flat(configuration)
         super().configuration_changed(configuration)
+        if not self.configured:
+            return
         for name in now:
             if now[name] != before[name]:
                 self.recovery.heard(Setting(name, json.dumps(now[name])))
@@ -190,8 +269,8 @@ class ProcessNode(ConfiguredNode):
         self._keep_checkpoint()
 
     def _say(self, answer: Message) -> None:
-        if self._recovering and isinstance(answer, RealTimePose):
-            return  # that moment is over
+        if isinstance(answer, RealTimePose) and not self.active:
+            return  # neither of a moment that is over, nor of a node that takes no part
         self.outbox.send(answer)
         self.recovery.said(answer)
         self.figures.sent[type(answer).__name__] += 1
@@ -217,9 +296,15 @@ class ProcessNode(ConfiguredNode):
         """Scans that have a pose, as far as the node gives it."""
         return 0
 
-    def saved_last(self, linger: float) -> bool:
-        """Whether the node's part of the last map is saved, and the others had some seconds to hear of it."""
-        return self._part is not None and self._part.gave_last(linger)
+    def saved_last(self) -> bool:
+        """Whether the node's part of the last map is saved, and the others had time to hear of it.
+
+        So that all come to the same keyframe event, an inactive node goes on for that.
+        """
+        if not self.configured:
+            return True
+        self.inbox.go_on()
+        return self._part is not None and self._part.gave_last(_LINGER)
 
     def show(self, _heard: Message, _said: list[Message]) -> None:
         """Publish what is for people to see; nothing, unless a node has something."""

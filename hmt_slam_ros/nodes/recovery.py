@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, get_args
 import numpy as np
 from numpy.typing import NDArray
 from rcl_interfaces.msg import ParameterDescriptor
+from rclpy.node import Node
 
 from hmt_slam_ros.configuration.documents import ros_yaml
 from hmt_slam_ros.nodes.journal import Entry, Journal, journal_entries
@@ -100,6 +101,16 @@ class Paused:
     on: bool
 
 
+@dataclass(frozen=True)
+class Active:
+    """The node was activated, or deactivated.
+
+    :ivar on: whether it takes part.
+    """
+
+    on: bool
+
+
 @dataclass(frozen=True, eq=False)
 class Mounted:
     """Slam heard where a laser is on the robot.
@@ -115,7 +126,7 @@ class Mounted:
 
 
 # What a node is told beside messages, and knows until it is told otherwise.
-Told = Setting | Paused | Mounted
+Told = Setting | Paused | Active | Mounted
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,12 +137,14 @@ class Found:
     :ivar state: the folder of its checkpoint.
     :ivar said: what it said last before that.
     :ivar heard: what it heard since, in its order.
+    :ivar active: whether it took part when it was killed, None where nobody had told it so far.
     """
 
     base: Base
     state: Path
     said: list[Message]
     heard: list[Message | Told]
+    active: bool | None
 
 
 _KINDS: dict[str, type] = {kind.__name__: kind for kind in (Base, *get_args(Told), *get_args(Message))}
@@ -146,13 +159,13 @@ class Recovery:
     :ivar found: what a node of the same name left behind, None where this one is the first.
     """
 
-    def __init__(self, node: ProcessNode) -> None:
+    def __init__(self, node: ProcessNode, folder: str) -> None:
         """Look for what was left behind.
 
+        :param folder: of all nodes, empty for none.
         :raises HmtSlamError: where it is damaged.
         """
         self._node = node
-        folder = str(node.declare_parameter("recovery", "", _DESCRIPTOR).value)
         name = node.get_fully_qualified_name().strip("/").replace("/", ".")
         self._folder = Path(folder).absolute() / name if folder else None
         self._generation = self._segment = 0
@@ -177,13 +190,16 @@ class Recovery:
         self._stamps, self._arriving = dict(base.stamps), base.arriving
         for entry in entries:
             self._follow(entry)
-        return Found(base, newest / _STATE, list(self._said), [e.value for e in entries if e.role == _HEARD])  # type: ignore[misc]
+        heard = [e.value for e in entries if e.role == _HEARD]
+        told = self._told.get((Active, ""))
+        active = told.on if isinstance(told, Active) else None
+        return Found(base, newest / _STATE, list(self._said), heard, active)  # type: ignore[arg-type]
 
     def _follow(self, entry: Entry) -> None:
         """Keep what the next generation begins with."""
         value = entry.value
         if isinstance(value, Told):
-            self._told[type(value), "" if isinstance(value, Paused) else value.name] = value
+            self._told[type(value), "" if isinstance(value, Paused | Active) else value.name] = value
         elif entry.role == _SAID:
             self._said.append(value)  # type: ignore[arg-type]
         elif isinstance(value, Arriving):
@@ -315,6 +331,11 @@ class Recovery:
             f"{self._folder} cannot be written ({fault.strerror}): the node goes on, but if it is killed all have to "
             "be restarted; make room there, or set recovery to another folder"
         )
+
+
+def declare_recovery(node: Node) -> str:
+    """The folder, from the parameter ``recovery``."""
+    return str(node.declare_parameter("recovery", "", _DESCRIPTOR).value)
 
 
 _DESCRIPTOR = ParameterDescriptor(

@@ -25,14 +25,27 @@ from hmt_slam_ros.processes.rtl import Rtl, RtlState
 class RtlNode(ProcessNode):
     """The node ``rtl``."""
 
+    # Nobody waits for it, and dead reckoning has no gap to bridge.
+    hears_on = True
+
     def __init__(self) -> None:
         super().__init__("rtl", _make_process, (), changeable=("rtl.publish_tf", "rtl.correction_time"))
+
+    def declare(self) -> None:
+        """Declare the names of the frames too."""
+        super().declare()
         self._map, self._odom = declare_frame(self, "map", "map"), declare_frame(self, "odom", "odom")
+
+    def set_up(self) -> None:
+        """As any process node, and the poses for people and other programs."""
+        super().set_up()
         self._hmt_poses = self.create_publisher(PoseWithCovarianceStamped, HMT_POSE, qos.STREAM)
         self._poses = self.create_publisher(PoseWithCovarianceStamped, POSE, qos.STREAM)
         self._correction = Correction()
         self._send_transforms = transform_publisher(self, "tf")
         self.outbox.add(RealTimePose, self._publish)
+        if self.configuration.rtl.precedence:
+            self.figures.state["real-time scheduling"] = "yes" if take_precedence() else "not permitted"
 
     def _publish(self, pose: RealTimePose) -> None:
         self._hmt_poses.publish(conversions.pose_with_covariance(pose.stamp, f"area_{pose.area}", pose.local))
@@ -48,15 +61,9 @@ def _make_process(configuration: Configuration, beginning: Beginning) -> Remembe
     return Rtl(configuration, beginning.part("rtl", RtlState))
 
 
-def _spin(node: RtlNode) -> None:
-    if node.configuration.rtl.precedence:
-        node.figures.state["real-time scheduling"] = "yes" if take_precedence() else "not permitted"
-    spin(node)
-
-
 def main() -> None:
     """Run the node."""
-    sys.exit(run(RtlNode, _spin))
+    sys.exit(run(RtlNode, spin))
 
 
 if __name__ == "__main__":

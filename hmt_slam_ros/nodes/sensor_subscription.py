@@ -36,7 +36,7 @@ class SensorSubscription:
         hear: Callable[[Any], None],
         after: int | None = None,
     ) -> None:
-        """Listen.
+        """Listen to nothing yet.
 
         :param figures: through which it tells.
         :param after: stamp of the last message that was heard before, ns, where what was missed since is wanted, from a
@@ -44,9 +44,20 @@ class SensorSubscription:
         """
         self.live = False
         self._node, self._kind, self._topic, self._hear = node, kind, topic, hear
-        self._after, self._begin = after, time.monotonic()
+        self._last = self._after = after
+        self._begin = time.monotonic()
         self._figures, self._order = figures, StampOrder[Any](after)
-        self._subscription = self._subscribe(qos.SENSOR if after is None else qos.KEPT_SENSOR)
+        self._subscription: Any = None
+
+    def begin(self) -> None:
+        """Listen; what was missed since :meth:`end` comes first, where the publisher kept it."""
+        self._after, self._begin = self._last, time.monotonic()
+        wanted = qos.SENSOR if self._after is None else qos.KEPT_SENSOR
+        self._subscription = self._subscribe(qos.LIVE_SENSOR if self.live else wanted)
+
+    def end(self) -> None:
+        """Listen no more."""
+        self._node.destroy_subscription(self._subscription)
 
     def _subscribe(self, profile: QoSProfile) -> Any:  # noqa: ANN401  rclpy's subscription
         self._profile = profile
@@ -61,11 +72,12 @@ class SensorSubscription:
             if self._profile is not qos.KEPT_SENSOR:
                 self._node.get_logger().warning(
                     f"what came on {self._topic} between the stamps {self._after} and {stamp} ns, "
-                    f"{(stamp - self._after) / 1e9:.1f} s, is lost: the node was not there"
+                    f"{(stamp - self._after) / 1e9:.1f} s, is lost: the node did not listen"
                 )
             self._after = None
         newest, refused = self._order.newest, self._order.refused
         for due in self._order.arrive(stamp, message):
+            self._last = stamp
             self._hear(due)
         if self._order.refused > refused:
             self._tell_of_refused(newest)

@@ -66,6 +66,10 @@ class SensorWatch:
                 )
             self._apart, self._scans = math.inf, 0
 
+    def begin(self) -> None:
+        """Scans are listened to from now on."""
+        self._last_scan = time.monotonic()
+
     def hear_scan(self) -> None:
         """A scan has come."""
         now = time.monotonic()

@@ -6,13 +6,12 @@ import sys
 import time
 from collections import deque
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 from geometry_msgs.msg import PoseArray, PoseWithCovarianceStamped
-from sensor_msgs.msg import LaserScan
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
@@ -25,15 +24,16 @@ from hmt_slam_ros.nodes.beginning import Beginning
 from hmt_slam_ros.nodes.figures import PERIOD
 from hmt_slam_ros.nodes.initial_pose import declare_initial_pose, place_of
 from hmt_slam_ros.nodes.last_save import spin
+from hmt_slam_ros.nodes.listeners import Listeners
 from hmt_slam_ros.nodes.map_changer import MapChanger
-from hmt_slam_ros.nodes.map_saver import MapSaver
-from hmt_slam_ros.nodes.parameters import declare_frame
+from hmt_slam_ros.nodes.map_saver import MapSaver, declare_target
+from hmt_slam_ros.nodes.parameters import declare_frame, declare_laser_pose
 from hmt_slam_ros.nodes.process_node import ProcessNode
 from hmt_slam_ros.nodes.recovery import CHECKPOINT, Mounted, Paused, Told
 from hmt_slam_ros.nodes.running import run
-from hmt_slam_ros.nodes.sensor_subscription import SensorSubscription
-from hmt_slam_ros.nodes.sensor_watch import SensorWatch
-from hmt_slam_ros.nodes.topics import INITIAL_POSE, PARTICLES, ROBOT_STATUS, SCAN
+from hmt_slam_ros.nodes.scan_intake import ScanIntake
+from hmt_slam_ros.nodes.slam_memory import SlamMemory
+from hmt_slam_ros.nodes.topics import INITIAL_POSE, PARTICLES, ROBOT_STATUS
 from hmt_slam_ros.nodes.transforms import LaserMounting
 from hmt_slam_ros.persistence.folder import FolderReader
 from hmt_slam_ros.persistence.hmt_map import VERSION
@@ -58,41 +58,42 @@ if TYPE_CHECKING:
     from hmt_slam_ros.processes.slam import MetricSlam
 
 _MEMORY = "node"
-# Live, scans beyond this many in the queue are dropped; a replay never drops one.
-_LIVE_QUEUE = 200
 # The last scans of a log are awaited this long, since status and scans are separate topics.
 _END_PATIENCE = 5.0  # s
-
-
-@dataclass(frozen=True, eq=False)
-class SlamMemory:
-    """What the node knows beside its process.
-
-    :ivar areas: of the most probable hypothesis, in the map.
-    :ivar estimate: the last one that was said.
-    :ivar unchanged: whether the map is as it was loaded.
-    :ivar dropped: scans that the node did not let the process hear.
-    """
-
-    areas: tuple[AreaPose, ...]
-    estimate: LocalEstimate | None
-    unchanged: bool
-    dropped: int
 
 
 class SlamNode(ProcessNode):
     """The node ``slam``."""
 
     process: MetricSlam
+    # What it took in is worked off while it is inactive; only scans are not listened to.
+    hears_on = True
 
     def __init__(self) -> None:
         super().__init__("slam", _make_process, (Arriving, Keyframe, Trail, LocalEstimate, Finished), ("mode",))
-        self.map_frame = declare_frame(self, "map", "map")
-        self._mounting = LaserMounting(self, self._work_off, self.recovery.heard)
-        self._pending: deque[LaserScan] = deque()
-        self._pending_since = self._last_scan = time.monotonic()
-        self._watch, self._complained = SensorWatch(self.figures), False
-        self._dropped = 0
+        self._listeners = Listeners(self)
+
+    def declare(self) -> None:
+        """Declare what slam alone has too.
+
+        :raises HmtSlamError: for what is no pose, or a pose in no map.
+        """
+        super().declare()
+        self.map_frame, self._base_frame = declare_frame(self, "map", "map"), declare_frame(self, "base", "base_link")
+        self._laser_pose, self.save_to = declare_laser_pose(self), declare_target(self)
+        self._initial_pose = declare_initial_pose(self)
+        if self._initial_pose is not None and not self.start_from:
+            raise HmtSlamError("initial_pose is set, but no map that it is a pose in: set start_from, or leave it away")
+
+    def set_up(self) -> None:
+        """As any process node, and say where the robot is in the map that it begins with.
+
+        :raises HmtSlamError: for a map that cannot be, or one that the others do not have.
+        """
+        self._listeners.check()
+        super().set_up()
+        self._mounting = LaserMounting(self, self._base_frame, self._laser_pose, self.work_off, self.recovery.heard)
+        self._scans = ScanIntake(self, self._mounting, self.after.get("Scan"))
         self._status: RobotStatus | None = None
         self._end: RobotStatus | None = None
         self._areas: dict[int, AreaPose] = {}
@@ -102,9 +103,6 @@ class SlamNode(ProcessNode):
         self._held: deque[Message] = deque()
         self._saver = MapSaver(self, self._release)
         self._changer = MapChanger(self, self._release)
-        self._paused = False
-        self._skipped: LaserScan | None = None
-        self._laser = SensorSubscription(self, self.figures, LaserScan, SCAN, self._hear_scan, self.after.get("Scan"))
         self._particles = self.create_publisher(PoseArray, PARTICLES, qos.STREAM)
         self.create_subscription(String, ROBOT_STATUS, self._hear_status, qos.LATCHED)
         self.create_service(Trigger, "~/carried", self._hear_carried)
@@ -112,6 +110,33 @@ class SlamNode(ProcessNode):
         self.create_timer(PERIOD, self._look_around, clock=self.figures.steady_clock)
         self.create_subscription(PoseWithCovarianceStamped, INITIAL_POSE, self._hear_initial_pose, qos.STREAM)
         self._begin()
+
+    def take_part(self) -> None:
+        """As any process node, and listen to scans; those that were missed come first where the robot kept them."""
+        super().take_part()
+        self._scans.begin()
+        self.work_off()
+
+    def stand_still(self) -> None:
+        """As any process node, and listen to scans no more."""
+        super().stand_still()
+        self._scans.end()
+
+    def check_clean_up(self) -> None:
+        """See whether nothing is under way.
+
+        :raises HmtSlamError: amid a save, or an exchange of the map.
+        """
+        if self.busy:
+            raise HmtSlamError("a map is being saved or loaded: clean up again after that")
+        if self.saves_at_end and self.estimate is not None:
+            self.figures.note("the map is given up; save_at_end saves it at the end alone, and slam/save before")
+
+    def give_up(self) -> None:
+        """As any process node; from then on the others have a map that slam does not."""
+        super().give_up()
+        if self.process.events > self.beginning.events or self.answered:
+            self._listeners.remember()
 
     def _take_over_map(self) -> None:
         """What the node shows of the map that it begins with."""
@@ -124,8 +149,9 @@ class SlamNode(ProcessNode):
     def configuration_changed(self, configuration: Configuration) -> None:
         """Take note of another mode, from the next keyframe on."""
         super().configuration_changed(configuration)
-        self.process.mode = configuration.mode
-        self._unchanged = self._unchanged and not self.process.mapping
+        if self.configured:
+            self.process.mode = configuration.mode
+            self._unchanged = self._unchanged and not self.process.mapping
 
     @property
     def unchanged_map(self) -> Path | None:
@@ -150,38 +176,28 @@ class SlamNode(ProcessNode):
     def begin_anew(self, folder: str, request: int = 0) -> None:
         """As any process node; what waits was of before, and scans are numbered on."""
         super().begin_anew(folder, request)
-        self._pending.clear()
+        self._scans.forget()
         self._take_over_map()
         self._held.appendleft(Carried())
 
     def _pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
-        """Scans are passed over, but for the last, by which the robot is found when it goes on."""
+        """Scans are passed over, or no more."""
         self.recovery.heard(Paused(request.data))
-        self._set_paused(request.data)
-        skipped, self._skipped = self._skipped, None
-        if skipped is not None and not self._paused:
-            self._take(skipped)
-        self._work_off()
+        self._scans.pause(on=request.data)
+        self._scans.take_skipped()
+        self.work_off()
         response.success, response.message = True, "paused, scans are passed over" if request.data else "mapping"
         self.get_logger().info(response.message)
         return response
 
-    def _set_paused(self, on: bool) -> None:
-        self._paused = on
-        self.figures.state["paused"] = "yes, scans are passed over" if on else "no"
-
     def _begin(self) -> None:
         """Say where the robot is in the map that the node starts from."""
         if self.recovering:
-            declare_initial_pose(self)
             return
         if not self.process.mapping and self.beginning.map is None:
             self.figures.warn("mode = localization, but there is no map: call load_map, or set start_from or mode")
-        told = declare_initial_pose(self)
-        if told is not None and self.beginning.map is None:
-            raise HmtSlamError("initial_pose is set, but no map that it is a pose in: set start_from, or leave it away")
-        if told is not None:
-            self.deliver(Carried(self._place(told)))
+        if self._initial_pose is not None:
+            self.deliver(Carried(self._place(self._initial_pose)))
         elif self.beginning.carried:
             self.deliver(Carried())
 
@@ -200,44 +216,12 @@ class SlamNode(ProcessNode):
         except HmtSlamError as fault:
             self.figures.warn(f"{INITIAL_POSE} is left out: {fault}")
             return
-        self._pending.clear()
+        self._scans.forget()
         self.deliver(Carried(place))
 
-    def _hear_scan(self, message: LaserScan) -> None:
-        self._count_scan()
-        if self._paused:
-            self._dropped += self._skipped is not None
-            self.figures.state["dropped scans"] = self._dropped
-            self._skipped = message
-            return
-        self._take(message)
-
-    def _count_scan(self) -> None:
-        self._last_scan = time.monotonic()
-        self._watch.hear_scan()
-        self.figures.received["Scan"] += 1
-
-    def _take(self, message: LaserScan) -> None:
-        """Work on a scan as soon as its laser's place is known."""
-        if self._laser.live and self.process.waiting_scans + len(self._pending) >= _LIVE_QUEUE:
-            self._dropped += 1
-            self.figures.state["dropped scans"] = self._dropped
-            self.figures.warn("scans come faster than they can be worked off: some are dropped, lower filter.particles")
-            return
-        if not self._pending:
-            self._pending_since, self._complained = time.monotonic(), False
-        self._pending.append(message)
-        self._work_off()
-
-    def _work_off(self) -> None:
-        """Deliver the scans whose laser's place is known."""
-        while self._pending:
-            message = self._pending[0]
-            mounted = self._mounting.of(message.header.frame_id)
-            if mounted is None:
-                return
-            self._pending.popleft()
-            self.deliver(conversions.scan_from(message, mounted.laser_pose, mounted.side))
+    def work_off(self) -> None:
+        """Deliver the scans whose laser's place is known, and the end behind the last."""
+        self._scans.work_off()
         self._end_if_all_came()
 
     def _hear_status(self, message: String) -> None:
@@ -253,7 +237,7 @@ class SlamNode(ProcessNode):
 
     def _hear_carried(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """The robot may be anywhere; scans whose laser is not known yet were taken before."""
-        self._pending.clear()
+        self._scans.forget()
         self.deliver(Carried())
         response.success, response.message = True, "the next scan may be from anywhere"
         return response
@@ -267,10 +251,9 @@ class SlamNode(ProcessNode):
             self._held.append(message)
             return
         if isinstance(message, Carried):
-            self._watch.forget()
-            self._laser.forget()
+            self._scans.forget_time()
             self.inbox.forget_odometry()
-        elif isinstance(message, Scan | Odometry) and self._watch.is_back(message) and not self.recovering:
+        elif isinstance(message, Scan | Odometry) and self._scans.watch.is_back(message) and not self.recovering:
             super().deliver(Carried())
         super().deliver(message)
         if self._end is not None:
@@ -286,12 +269,12 @@ class SlamNode(ProcessNode):
     def hear_again(self, value: Message | Told) -> None:
         """As any process node; scans have come by another way."""
         if isinstance(value, Paused):
-            self._set_paused(value.on)
+            self._scans.pause(on=value.on)
         elif isinstance(value, Mounted):
             self._mounting.remember(value)
         elif isinstance(value, Scan | Carried | EndOfLog):
             if isinstance(value, Scan):
-                self._count_scan()
+                self._scans.count()
             self.deliver(value)
         else:
             super().hear_again(value)
@@ -304,21 +287,21 @@ class SlamNode(ProcessNode):
     @property
     def at_rest(self) -> bool:
         """Whether no scan waits for its laser's place, and nothing for the other nodes."""
-        return not (self._pending or self._held or self.holding or self.busy)
+        return not (self._scans.waiting or self._held or self.holding or self.busy)
 
     def memory(self) -> dict[str, object]:
         """What the node knows beside its process."""
-        return {_MEMORY: SlamMemory(tuple(self._areas.values()), self.estimate, self._unchanged, self._dropped)}
+        return {_MEMORY: SlamMemory(tuple(self._areas.values()), self.estimate, self._unchanged, self._scans.dropped)}
 
     def remember(self, state: Path) -> None:
         """Take it over."""
         known = FolderReader(state, CHECKPOINT, VERSION).read(_MEMORY, SlamMemory)
         self._areas = {entry.area: entry for entry in known.areas}
-        self.estimate, self._unchanged, self._dropped = known.estimate, known.unchanged, known.dropped
+        self.estimate, self._unchanged, self._scans.dropped = known.estimate, known.unchanged, known.dropped
 
-    def saved_last(self, linger: float) -> bool:  # noqa: ARG002  all others have answered
+    def saved_last(self) -> bool:
         """Whether the last map is saved, or cannot be."""
-        return self._saver.saved_last()
+        return not self.configured or self._saver.saved_last()
 
     def write_map(self, writer: MapWriter) -> None:
         """Write the map as it is known now."""
@@ -331,7 +314,7 @@ class SlamNode(ProcessNode):
 
     def _end_if_all_came(self, *, give_up: bool = False) -> None:
         end = self._end
-        if end is None or self._pending or self._paused:
+        if end is None or self._scans.waiting or self._scans.paused or not self.active:
             return
         complete = self.figures.received["Scan"] >= end.scans and self.figures.received["Odometry"] >= end.odometry
         if complete or give_up:
@@ -340,16 +323,12 @@ class SlamNode(ProcessNode):
 
     def _look_around(self) -> None:
         """Once a second: tell what is missing, and stop waiting for scans that were lost."""
-        now = time.monotonic()
-        self.figures.state["waiting scans"] = self.process.waiting_scans + len(self._pending)
-        self._watch.look(self.figures.received["Odometry"])
-        if self._pending and now - self._pending_since > 2 * PERIOD:
-            # Amid a start of many nodes DDS may take that long to bring what is latched: an error where it stays so.
-            tell = self.figures.fail if self._complained else self.figures.warn
-            tell(self._mounting.complaint(self._pending[0], len(self._pending)))
-            self._complained = True
-            self._pending_since = now + 10 * PERIOD
-        if self._end is not None and now - self._last_scan > _END_PATIENCE:
+        self.figures.state["waiting scans"] = self.process.waiting_scans + self._scans.waiting
+        self._scans.complain()
+        if not self.active:
+            return
+        self._scans.watch.look(self.figures.received["Odometry"])
+        if self._end is not None and time.monotonic() - self._scans.last > _END_PATIENCE:
             came = self.figures.received["Scan"]
             self.figures.warn(f"the log ended, but only {came} of its {self._end.scans} scans came")
             self._end_if_all_came(give_up=True)

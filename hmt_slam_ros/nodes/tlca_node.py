@@ -34,7 +34,15 @@ class TlcaNode(ProcessNode):
 
     def __init__(self) -> None:
         super().__init__("tlca", _make_process, (Accepted,))
+
+    def declare(self) -> None:
+        """Declare the name of the frame too."""
+        super().declare()
         self._map = declare_frame(self, "map", "map")
+
+    def set_up(self) -> None:
+        """As any process node, and what people see of the map."""
+        super().set_up()
         self._view = MapView(self.configuration, self._map, Seen.of(self.beginning.map))
         self._grids = self.create_publisher(OccupancyGrid, MAP, qos.LATCHED)
         self._graphs = self.create_publisher(MarkerArray, GRAPH, qos.LATCHED)
@@ -69,6 +77,8 @@ class TlcaNode(ProcessNode):
 
     def _draw(self) -> None:
         """Publish map and graph where something changed and someone looks."""
+        if not self.active:
+            return
         if self._due(GRAPH, self._graphs):
             self._graphs.publish(self._view.graph())
         if self._due(MAP, self._grids) and (grid := self._view.grid()) is not None:

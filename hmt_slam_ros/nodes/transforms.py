@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 from geometry_msgs.msg import TransformStamped
+from numpy.typing import NDArray
 from rclpy.node import Node
 from sensor_msgs.msg import LaserScan
 
@@ -13,7 +15,6 @@ from hmt_slam_ros.logs.mounting import planar_mounting
 from hmt_slam_ros.logs.transforms import FrameTree, frame_name
 from hmt_slam_ros.nodes import qos
 from hmt_slam_ros.nodes.conversions import stamp_of
-from hmt_slam_ros.nodes.parameters import declare_frame, declare_laser_pose
 from hmt_slam_ros.nodes.recovery import Mounted
 
 try:
@@ -34,16 +35,24 @@ def transform_publisher(node: Node, topic: str) -> Callable[[list[TransformStamp
 
 
 class LaserMounting:
-    """The poses of the lasers, from the parameter ``laser_pose`` or from what came last on /tf_static."""
+    """The poses of the lasers, where they are given or from what came last on /tf_static."""
 
-    def __init__(self, node: Node, changed: Callable[[], None], learned: Callable[[Mounted], None]) -> None:
+    def __init__(
+        self,
+        node: Node,
+        base: str,
+        given: NDArray[np.float64] | None,
+        changed: Callable[[], None],
+        learned: Callable[[Mounted], None],
+    ) -> None:
         """Listen.
 
+        :param base: the robot's frame.
+        :param given: ``base_T_laser`` (3,) of all lasers, None where transforms tell.
         :param changed: called when transforms have come.
         :param learned: called with what is new of a laser.
         """
-        self._base = declare_frame(node, "base", "base_link")
-        self._given = declare_laser_pose(node)
+        self._base, self._given = base, given
         self._frames = FrameTree(newest=True)
         self._known: dict[str, Mounted] = {}
         self._changed, self._learned = changed, learned

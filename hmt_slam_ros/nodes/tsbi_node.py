@@ -28,6 +28,10 @@ class TsbiNode(ProcessNode):
 
     def __init__(self) -> None:
         super().__init__("tsbi", _make_process, (Hypotheses,))
+
+    def set_up(self) -> None:
+        """As any process node, and say whether the robot's place is known."""
+        super().set_up()
         self._pmf = self.create_publisher(Float64MultiArray, PMF, qos.LATCHED)
         self._localized = self.create_publisher(Bool, IS_LOCALIZED, qos.LATCHED)
         self._entropy = self.create_publisher(Float64, ENTROPY, qos.LATCHED)

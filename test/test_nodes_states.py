@@ -1,0 +1,180 @@
+"""The nodes as managed nodes: another program brings them up, halts them amid a drive and takes them down."""
+
+import shutil
+import signal
+
+import numpy as np
+import pytest
+from logs_for_nodes import SECOND, corridor_bag
+from test_nodes_localization import NODES, Nodes
+
+pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
+
+from diagnostic_msgs.msg import DiagnosticArray
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState, GetState
+from std_srvs.srv import Trigger
+
+from hmt_slam_ros.nodes import qos
+from hmt_slam_ros.nodes.conversions import stamp_of
+from hmt_slam_ros.nodes.topics import DIAGNOSTICS, KEYFRAMES, SCAN
+from hmt_slam_ros.persistence.folder import FolderReader
+from hmt_slam_ros.persistence.hmt_map import FORMAT, VERSION
+
+SCANS = 140
+SHUTDOWN = {
+    "unconfigured": Transition.TRANSITION_UNCONFIGURED_SHUTDOWN,
+    "inactive": Transition.TRANSITION_INACTIVE_SHUTDOWN,
+    "active": Transition.TRANSITION_ACTIVE_SHUTDOWN,
+}
+UP, DOWN = ("rtl", "tsbi", "slam", "aam", "tlca"), ("tlca", "slam", "rtl", "aam", "tsbi")
+
+
+class Manager:
+    """Asks nodes for transitions, as a lifecycle manager does."""
+
+    def __init__(self, listener):
+        self.listener = listener
+        self.clients = {}
+
+    def call(self, kind, name, request):
+        if name not in self.clients:
+            self.clients[name] = self.listener.node.create_client(kind, name)
+        self.listener.until(self.clients[name].service_is_ready)
+        future = self.clients[name].call_async(request)
+        self.listener.until(future.done)
+        return future.result()
+
+    def state(self, node):
+        return self.call(GetState, f"{node}/get_state", GetState.Request()).current_state.label
+
+    def change(self, node, transition):
+        """Whether the node did it; a transition is given by its name or its number."""
+        request = ChangeState.Request()
+        if isinstance(transition, str):
+            request.transition.label = transition
+        else:
+            request.transition.id = transition
+        return self.call(ChangeState, f"{node}/change_state", request).success
+
+    def lead(self, names, transition, state):
+        for name in names:
+            assert self.change(name, transition), name
+            assert self.state(name) == state, name
+
+
+def estimates_of(nodes, since):
+    return [message.data for message in nodes.estimates[since:]]
+
+
+def test_nodes_that_are_halted_and_taken_down_amid_a_drive_come_to_the_same_as_others(listener, start, tmp_path):
+    log, saved = corridor_bag(tmp_path, scans=SCANS), tmp_path / "hmt_map"
+    manager, nodes = Manager(listener), Nodes(start, listener, autostart=False, save_to=saved, save_at_end=True)
+
+    def said(node):
+        return nodes.diagnosis(node)["state"]
+
+    nodes.until(lambda: all(said(name) == "unconfigured" for name in NODES))
+    assert listener.node.count_subscribers(SCAN) == listener.node.count_publishers(KEYFRAMES) == 0
+    nodes.drive(log, first=0, rate=4.0, robot__patience=120.0)
+    manager.lead(UP, "configure", "inactive")
+    nodes.until(lambda: all(said(name) == "inactive" for name in NODES))
+    assert listener.node.count_subscribers(SCAN) == 0
+    manager.lead(DOWN, "activate", "active")
+    listener.until(lambda: nodes.estimates, seconds=150.0, alive=nodes.alive)  # a first run compiles
+
+    nodes.until(lambda: len(nodes.estimates) > 10)
+    halt(manager, nodes, "aam")
+    take_down_and_up(manager, "aam")
+    nodes.until(lambda: len(nodes.estimates) > 25)
+    halt(manager, nodes, "tsbi")
+    manager.lead(["rtl"], "deactivate", "inactive")  # nobody waits for it
+    take_down_and_up(manager, "tsbi")
+    nodes.until(lambda: len(nodes.estimates) > 70)
+    halt(manager, nodes, "tlca")
+    manager.lead(["rtl"], "activate", "active")
+    take_down_and_up(manager, "tlca")
+    nodes.until(lambda: len(nodes.estimates) > 85)
+    manager.lead(["slam"], "deactivate", "inactive")
+    stands(nodes)
+    assert not manager.change("slam", Transition.TRANSITION_CONFIGURE)
+    manager.lead(["slam"], "activate", "active")
+    nodes.until(lambda: len(nodes.estimates) == SCANS)
+    nodes.park()
+    assert np.diff([stamp_of(pose.header.stamp) for pose in nodes.poses]).max() > 2 * SECOND
+
+    manager.lead(DOWN, "deactivate", "inactive")
+    assert listener.call(Trigger, "slam/save", Trigger.Request()).success
+    FolderReader(saved, FORMAT, VERSION)
+    begun_anew(manager, nodes, log)
+    assert estimates_of(nodes, SCANS) == estimates_of(nodes, 0)[:SCANS]
+
+    shutil.rmtree(saved)
+    for name in UP:
+        assert manager.change(name, SHUTDOWN["active"])
+        assert manager.state(name) == "finalized"
+    nodes.until(lambda: listener.node.count_subscribers("hmt/accepted") == 0)
+    FolderReader(saved, FORMAT, VERSION)
+    nodes.until(lambda: all(said(name) == "finalized" for name in NODES))
+
+
+def halt(manager, nodes, name):
+    """Deactivate a node for which all others wait."""
+    manager.lead([name], "deactivate", "inactive")
+    nodes.until(lambda: int(nodes.diagnosis(name)["kept until it is active"] or 0) > 0)
+    stands(nodes)
+
+
+def take_down_and_up(manager, name):
+    """Let an inactive node begin anew; it hears the whole chain once more."""
+    for transition, state in (("cleanup", "unconfigured"), ("configure", "inactive"), ("activate", "active")):
+        manager.lead([name], transition, state)
+
+
+def stands(nodes):
+    """Nothing more is said of scans, but for what is on its way."""
+    nodes.listener.spin(0.2)
+    before = len(nodes.estimates)
+    nodes.listener.spin(0.3)
+    assert len(nodes.estimates) == before
+
+
+def begun_anew(manager, nodes, log):
+    """Slam alone does not begin anew, all five do."""
+    manager.lead(["slam"], "cleanup", "unconfigured")
+    assert not manager.change("slam", "configure")
+    assert manager.state("slam") == "unconfigured"
+    nodes.until(lambda: "still have the map that slam gave up" in nodes.diagnosis("slam")["last error"])
+    assert nodes.diagnosis("slam")["last error"].startswith("aam, rtl, tlca, tsbi still")
+    manager.lead(NODES[1:], "cleanup", "unconfigured")
+    manager.lead(NODES, "configure", "inactive")
+    manager.lead(NODES, "activate", "active")
+    nodes.until(lambda: nodes.diagnosis("slam")["last error"] == "")
+    nodes.drive(log, first=0)
+    nodes.until(lambda: len(nodes.estimates) == 2 * SCANS)
+    nodes.park()
+
+
+def test_a_node_that_cannot_be_configured_says_why_and_stays(listener, start, tmp_path):
+    manager = Manager(listener)
+    start("aam", autostart=False, filter__particles=0)
+    start("tlca", autostart=False, start_from=tmp_path / "nowhere", recovery=tmp_path / "recovery")
+    assert not manager.change("aam", "configure")
+    assert not manager.change("tlca", "configure")
+    for name in ("aam", "tlca"):
+        assert manager.state(name) == "unconfigured"
+        assert manager.change(name, SHUTDOWN["unconfigured"])
+        assert manager.state(name) == "finalized"
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_node_that_is_killed_comes_back_in_the_state_in_which_it_was(listener, start, tmp_path):
+    told = listener.hear(DiagnosticArray, DIAGNOSTICS, qos.STREAM)
+    node = start("rtl", recovery=tmp_path)
+    assert Manager(listener).change("rtl", "deactivate")
+    node.send_signal(signal.SIGKILL)
+    node.communicate()
+    heard = len(told)
+    node = start("rtl", recovery=tmp_path)
+    listener.until(lambda: len(told) > heard, alive=[node])
+    assert told[-1].status[0].message == "inactive"
