@@ -23,7 +23,7 @@ from std_srvs.srv import Trigger
 
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.nodes import conversions, qos
-from hmt_slam_ros.nodes.topics import DIAGNOSTICS, DOCUMENTS, KEYFRAMES, MAP, POSE, SCAN
+from hmt_slam_ros.nodes.topics import DIAGNOSTICS, DOCUMENTS, KEYFRAMES, MAP, POSE, ROBOT_STATUS, SCAN
 from hmt_slam_ros.nodes.transforms import TFMessage
 from hmt_slam_ros.persistence.folder import FolderReader
 from hmt_slam_ros.persistence.hmt_map import FORMAT, VERSION
@@ -334,6 +334,12 @@ def test_two_robots_that_drive_at_once_under_namespaces_share_nothing_but_a_tf_t
         assert_true(nodes.poses[-1], START)
         nodes.until(lambda nodes=nodes, scans=scans: nodes.diagnosis("slam")["received Scan"] == str(scans))
         nodes.until(lambda nodes=nodes: maps[nodes])
+        # The robot goes on to say that its log has ended.
+        statuses = nodes.hear(String, ROBOT_STATUS, qos.LATCHED)
+        nodes.until(lambda heard=statuses: len(heard) >= 8)
+        awaited = len(nodes.diagnostics) + 2 * len(NODES)
+        nodes.until(lambda nodes=nodes, awaited=awaited: len(nodes.diagnostics) > awaited)
+        assert nodes.diagnosis("slam")["sent Finished"] == "1"
     assert {message.header.frame_id for message in [*one.poses, *maps[one]]} == {"map"}
     assert {message.header.frame_id for message in [*two.poses, *maps[two]]} == {"two/map"}
     assert joints(tf["/one/tf"] + tf["/one/tf_static"]) == {

@@ -94,8 +94,8 @@ class SlamNode(ProcessNode):
         super().set_up()
         self._mounting = LaserMounting(self, self._base_frame, self._laser_pose, self.work_off, self.recovery.heard)
         self._scans = ScanIntake(self, self._mounting, self.after.get("Scan"))
-        self._status: RobotStatus | None = None
         self._end: RobotStatus | None = None
+        self._scans_at_end = -1
         self._areas: dict[int, AreaPose] = {}
         self.estimate: LocalEstimate | None = None
         self._unchanged = True
@@ -226,12 +226,11 @@ class SlamNode(ProcessNode):
 
     def _hear_status(self, message: String) -> None:
         try:
-            status = replace(decode(message.data, RobotStatus), acknowledged=0)
+            status = decode(message.data, RobotStatus)
         except HmtSlamError as error:
             self.figures.fail(f"{ROBOT_STATUS}: {error}")
             return
-        news, self._status = status != self._status, status
-        if news and status.state == "ended":
+        if status.state == "ended" and self.figures.received["Scan"] != self._scans_at_end:
             self._end = status
             self._end_if_all_came()
 
@@ -318,7 +317,7 @@ class SlamNode(ProcessNode):
             return
         complete = self.figures.received["Scan"] >= end.scans and self.figures.received["Odometry"] >= end.odometry
         if complete or give_up:
-            self._end = None
+            self._end, self._scans_at_end = None, self.figures.received["Scan"]
             self.deliver(EndOfLog())
 
     def _look_around(self) -> None:
