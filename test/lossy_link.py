@@ -64,8 +64,9 @@ class LossyLink:
             _ip("netns", "del", host)
 
     def on(self, number):
-        """The beginning of a command that runs on one of the hosts."""
-        return ["ip", "netns", "exec", self.hosts[number]]
+        """The beginning of a command that runs on one of the hosts, of which the second shares this one's memory."""
+        apart = ["sh", "-c", 'mount -t tmpfs tmpfs /dev/shm && exec "$@"', "sh"]
+        return ["ip", "netns", "exec", self.hosts[number], *([] if number else apart)]
 
 
 def _ip(*words):
