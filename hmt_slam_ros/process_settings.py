@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import os
+import signal
 
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # <malloc.h>
 _LARGE, _SPARE = 1 << 18, 1 << 21  # bytes
@@ -29,3 +30,9 @@ def settle() -> None:
     if mallopt is not None:
         mallopt(_M_MMAP_THRESHOLD, _LARGE)
         mallopt(_M_TRIM_THRESHOLD, _SPARE)
+
+
+def end_when_told() -> None:
+    """Let SIGINT and SIGTERM end this process at once and as if all was well: for a node that is still being loaded."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: os._exit(0))

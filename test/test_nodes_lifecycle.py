@@ -3,6 +3,8 @@
 import signal
 import subprocess
 import sys
+import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -51,6 +53,26 @@ def test_a_value_out_of_range_keeps_every_node_from_starting(tmp_path, start):
         assert process.returncode == 2, name
         assert "filter.particles = 0" in error, name
         assert len(error.strip().splitlines()) == 1, name
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=lambda number: number.name)
+def test_a_node_that_is_still_being_loaded_ends_well_when_told_to(start, number):
+    processes = []
+    for moment in range(6):
+        processes.append(start("slam"))
+        while not heeds_sigterm(processes[-1].pid):
+            time.sleep(0.01)
+        time.sleep(0.3 * moment)
+        processes[-1].send_signal(number)
+    for process in processes:
+        assert process.communicate(timeout=40) == ("", "")
+        assert process.returncode == 0
+
+
+def heeds_sigterm(pid):
+    """Whether a process has a handler for it, which Python alone has not."""
+    caught = next(line for line in Path(f"/proc/{pid}/status").read_text().splitlines() if line.startswith("SigCgt:"))
+    return bool(int(caught.split()[1], 16) >> signal.SIGTERM - 1 & 1)
 
 
 def test_two_signals_in_a_row_do_no_harm(listener, start):

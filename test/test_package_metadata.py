@@ -81,6 +81,7 @@ def test_ros2_run_finds_an_executable_that_runs_the_node_of_its_name(setup_argum
     assert os.access(source, os.X_OK)
     package = tmp_path / "hmt_slam_ros" / "nodes"
     package.mkdir(parents=True)
+    (package.parent / "process_settings.py").symlink_to(ROOT / "hmt_slam_ros" / "process_settings.py")
     (package / f"{node}_node.py").write_text(f"def main():\n    print('this is {node}')\n")
     executable = tmp_path / node
     executable.write_bytes(source.read_bytes())
