@@ -1,19 +1,26 @@
-"""Says that kernels are being compiled: once after an installation or a change, and for half a minute."""
+"""Kernels are compiled once after an installation or a change, which takes half a minute, and kept for later starts."""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from numba.core.caching import Cache
 
 
 def tell_of_compilation(say: Callable[[str], None]) -> None:
     """See to it that ``say`` is called when the first kernel has to be compiled, as its cache has nothing of it.
+
+    And when it cannot be kept, for which numba would end the program: where a disk is full, a node has to go on.
 
     A program that has not loaded numba by then has no kernels, and will not load it for this.
     """
     if "numba" not in sys.modules:
         return
     from numba.core import event  # noqa: PLC0415  see above
+    from numba.core.caching import Cache  # noqa: PLC0415
 
     class FirstCompilation(event.Listener):
         told = False
@@ -28,3 +35,24 @@ def tell_of_compilation(say: Callable[[str], None]) -> None:
 
     # Heard only where no cache helps.
     event.register("numba:compile", FirstCompilation())
+    Cache.save_overload = _kept_if_possible(Cache.save_overload, say)
+
+
+def _kept_if_possible(keep: Callable[..., None], say: Callable[[str], None]) -> Callable[..., None]:
+    """How numba keeps a kernel, but that it goes on without where there is no room; said once."""
+    told = False
+
+    def keep_if_possible(cache: Cache, signature: object, kernel: object) -> None:
+        nonlocal told
+        try:
+            keep(cache, signature, kernel)
+        except OSError as fault:
+            if not told:
+                told = True
+                sentence = (
+                    f"compiled kernels cannot be kept in {cache.cache_path}: {fault.strerror}; each start compiles "
+                    "them anew, which takes up to a minute: make room there, or set NUMBA_CACHE_DIR to another folder"
+                )
+                say(sentence)
+
+    return keep_if_possible

@@ -34,6 +34,14 @@ def test_a_program_says_once_that_it_compiles_and_the_next_finds_everything_in_t
     assert said(tmp_path) == []
 
 
+def test_a_disk_that_is_full_does_not_end_the_program(tmp_path):
+    full = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (100, 100))"
+    compiling, kept = said(tmp_path, use=f"{full}; {USE}")
+    assert "compiling" in compiling
+    assert kept.startswith("compiled kernels cannot be kept in ")
+    assert "File too large; each start compiles them anew" in kept
+
+
 def test_a_program_without_kernels_does_not_load_numba_for_this(tmp_path):
     assert said(tmp_path, load="", use="print('numba' in sys.modules)") == ["False"]
 
