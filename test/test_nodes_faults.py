@@ -226,6 +226,7 @@ def test_what_comes_late_twice_or_out_of_order_is_left_out_and_counted_and_all_e
     driver.close()
 
 
+@pytest.mark.usefixtures("corridor")  # with which the kernels are compiled: this laser does not wait for that
 def test_a_laser_falls_silent_a_disk_is_full_and_time_jumps_back(listener, start, tmp_path):
     silent = range(10, 60)
     log = corridor_bag(tmp_path, scans=SCANS, silent=silent)
