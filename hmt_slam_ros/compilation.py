@@ -9,16 +9,20 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from numba.core.caching import Cache
 
+_told: list[Callable[[str], None]] = []
+
 
 def tell_of_compilation(say: Callable[[str], None]) -> None:
     """See to it that ``say`` is called when the first kernel has to be compiled, as its cache has nothing of it.
 
     And when it cannot be kept, for which numba would end the program: where a disk is full, a node has to go on.
 
-    A program that has not loaded numba by then has no kernels, and will not load it for this.
+    A program that has not loaded numba by then has no kernels, and will not load it for this. The first to ask is the
+    only one to be told: a node asks as often as it is configured.
     """
-    if "numba" not in sys.modules:
+    if "numba" not in sys.modules or _told:
         return
+    _told.append(say)
     from numba.core import event  # noqa: PLC0415  see above
     from numba.core.caching import Cache  # noqa: PLC0415
 
