@@ -14,6 +14,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import LaserScan
+from test_nodes_states import SHUTDOWN, Manager
 
 from hmt_slam_ros.cli.main import main
 from hmt_slam_ros.logs import open_log
@@ -84,6 +85,25 @@ def test_what_is_silent_missing_or_does_not_fit_is_told(listener, doctor):
     ):
         assert any(text.startswith(begin) for text in wrong), (begin, wrong)
     assert len(wrong) == 6, wrong
+
+
+def test_nodes_that_are_not_active_are_named_with_what_makes_them_so(listener, start, doctor):
+    for name in ("aam", "rtl", "slam", "tlca", "tsbi"):
+        start(name, "-r", "__ns:=/robot1", autostart=name == "tsbi")
+    manager = Manager(listener)
+    assert manager.change("/robot1/rtl", "configure")
+    assert manager.change("/robot1/slam", SHUTDOWN["unconfigured"])
+    status, findings = doctor(4.0, "--ros-args", "-r", "__ns:=/robot1")
+    assert status == 1
+    assert [text for text in texts(findings, "wrong") if text.startswith("states: ")] == [
+        "states: /robot1/aam and /robot1/tlca are unconfigured and take no part: ros2 lifecycle set /robot1/aam "
+        "configure and then activate, and likewise /robot1/tlca, or start with autostart:=true.",
+        "states: /robot1/rtl is inactive and takes no part: ros2 lifecycle set /robot1/rtl activate, or start with "
+        "autostart:=true.",
+        "states: /robot1/slam is finalized and takes no part: end /robot1/slam and start it again, since no transition "
+        "leads out of that.",
+    ]
+    assert not any(text.startswith("nodes: All five") for text in texts(findings, "fine"))
 
 
 @pytest.mark.skipif(TFMessage is None, reason="tf2_msgs is not installed: run scripts/test.sh, which builds it")

@@ -9,10 +9,17 @@ from typing import NamedTuple
 from hmt_slam_ros.doctor.finding import Finding, Severity, times
 
 OUR_NODES = ("slam", "aam", "tsbi", "tlca", "rtl")
-SCAN, ODOM, TF, TF_STATIC, CLOCK = "scan", "odom", "tf", "tf_static", "clock"
+SCAN, ODOM, TF, TF_STATIC, CLOCK = "scan", "odom", "tf", "tf_static", "/clock"
 ESTIMATES = "hmt/local_pose"
 SINGLE = (SCAN, ODOM, "map", "pose", CLOCK)
 """Topics that have one publisher."""
+
+# By the state of a node that takes no part, what makes it do so.
+_REMEDY = {
+    "unconfigured": "ros2 lifecycle set {first} configure and then activate{others}, or start with autostart:=true",
+    "inactive": "ros2 lifecycle set {first} activate{others}, or start with autostart:=true",
+    "finalized": "end {first} and start it again{others}, since no transition leads out of that",
+}
 
 # Stamps that differ by this from the computer's clock, s: doubtful, and wrong.
 _AWAY = (0.5, 10.0)
@@ -46,11 +53,18 @@ class Topic:
 
 
 class Told(NamedTuple):
-    """What a node said on /diagnostics last: its name, level (0 all is well, 1 warning, 2 and more error), sentence."""
+    """What a node said on /diagnostics last.
+
+    :ivar name: of the node, with its namespace.
+    :ivar level: 0 all is well, 1 warning, 2 and more error.
+    :ivar message: a sentence.
+    :ivar state: of a managed node, such as inactive; else empty.
+    """
 
     name: str
     level: int
     message: str
+    state: str = ""
 
 
 @dataclass(frozen=True)
@@ -58,7 +72,7 @@ class Running:
     """What was seen of a running system.
 
     :ivar seconds: how long it was listened to.
-    :ivar topics: by name, without namespace.
+    :ivar topics: by name, without namespace; /clock has none.
     :ivar nodes: names of all nodes but the doctor's.
     :ivar simulated: nodes with use_sim_time.
     :ivar diagnostics: by node.
@@ -82,6 +96,7 @@ def findings(running: Running) -> list[Finding]:
     """All of it."""
     return [
         *_nodes(running),
+        *_idle(running),
         *_silent(running),
         *_mismatches(running),
         *_several(running),
@@ -99,7 +114,27 @@ def _nodes(running: Running) -> list[Finding]:
     if missing:
         text = f"Of the nodes, {_listed(missing)} {'is' if len(missing) == 1 else 'are'} missing: start all five, such "
         return [Finding("wrong", "nodes", text + "as by mapping.launch.py; the others wait for them.")]
-    return [Finding("fine", "nodes", f"All five nodes run: {_listed(there)}.")]
+    return [] if _idle(running) else [Finding("fine", "nodes", f"All five nodes run: {_listed(there)}.")]
+
+
+def _idle(running: Running) -> list[Finding]:
+    """Nodes that run and take no part, by their states."""
+    found = []
+    for state, remedy in _REMEDY.items():
+        names = _in_state(running, state)
+        if names:
+            others = f", and likewise {_listed(names[1:])}" if len(names) > 1 else ""
+            verbs = f"is {state} and takes" if len(names) == 1 else f"are {state} and take"
+            text = f"{_listed(names)} {verbs} no part: {remedy.format(first=names[0], others=others)}."
+            found.append(Finding("wrong", "states", text))
+    return found
+
+
+def _in_state(running: Running, state: str) -> list[str]:
+    """Our nodes that said that they are in it, with their namespaces."""
+    return sorted(
+        told.name for told in running.diagnostics if told.state == state and told.name.rpartition("/")[2] in OUR_NODES
+    )
 
 
 def _silent(running: Running) -> list[Finding]:
@@ -112,9 +147,9 @@ def _silent(running: Running) -> list[Finding]:
     if running.laser:
         found.append(Finding("wrong", "laser transform", running.laser))
     estimates = running.topics[ESTIMATES]
-    if "slam" in running.nodes and running.topics[SCAN].heard and not estimates.heard:
+    if "slam" in running.nodes and running.topics[SCAN].heard and not estimates.heard and not _idle(running):
         text = (
-            f"Scans come, and slam said nothing about one for {running.seconds:g} s: it is paused or not active, or "
+            f"Scans come, and slam said nothing about one for {running.seconds:g} s: it is paused, or "
             "waits for odometry, a transform or the other nodes; its own log and /diagnostics say for which."
         )
         found.append(Finding("doubtful", "slam silent", text))

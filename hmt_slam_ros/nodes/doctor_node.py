@@ -40,6 +40,7 @@ from hmt_slam_ros.logs.records import LogRecord
 from hmt_slam_ros.logs.stamps import running_stamps
 from hmt_slam_ros.logs.transforms import FrameTree, frame_name
 from hmt_slam_ros.nodes import conversions, qos
+from hmt_slam_ros.nodes.figures import STATE
 from hmt_slam_ros.nodes.topics import DIAGNOSTICS
 from hmt_slam_ros.nodes.transforms import TFMessage
 from hmt_slam_ros.sensing import Odometry, Scan
@@ -166,7 +167,8 @@ class DoctorNode(Node):
     def _hear_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
             level = status.level[0] if isinstance(status.level, bytes) else int(status.level)
-            self._told[status.name] = Told(status.name, level, status.message)
+            state = next((entry.value for entry in status.values if entry.key == STATE), "")
+            self._told[status.name] = Told(status.name, level, status.message, state)
 
     def _hear_static(self, message: Any) -> None:  # noqa: ANN401  a TFMessage, where there is one
         self._counts[running.TF_STATIC] += 1
