@@ -37,7 +37,7 @@ def heard(listener):
     made, so the others are there by then too.
     """
     return {
-        "clock": listener.hear(Clock, "clock", qos.STREAM),
+        "clock": listener.hear(Clock, "/clock", qos.STREAM),
         "tf": listener.hear(TFMessage, "tf", qos.STREAM) if TFMessage else [],
         "scan": listener.hear(LaserScan, "scan", qos.SENSOR),
         "odom": listener.hear(OdometryMessage, "odom", qos.SENSOR),
@@ -124,13 +124,14 @@ def test_a_paced_robot_waits_for_the_acknowledgement(tmp_path, listener, start, 
     listener.until(lambda: last_status(heard)["state"] == "ended" and last_status(heard)["acknowledged"] == 12)
 
 
-def test_the_robot_waits_for_those_who_have_to_hear_it(tmp_path, domain, start):
+def test_the_robot_waits_for_those_who_have_to_hear_it_and_answer(tmp_path, listener, start):
+    listener.hear(LaserScan, "scan", qos.SENSOR)  # as a recorder does
     robot = start(
-        "robot", log=corridor_bag(tmp_path), robot__patience=0.5, robot__scan_listeners=1, robot__odometry_listeners=0
+        "robot", log=corridor_bag(tmp_path), robot__patience=3.0, robot__scan_listeners=1, robot__odometry_listeners=0
     )
     error = robot.communicate(timeout=40)[1]
     assert robot.returncode == 2
-    assert "too few subscribers of scan after 0.5 s" in error
+    assert "too few subscribers of scan after 3 s" in error
     assert "robot.scan_listeners" in error
     assert "Traceback" not in error
 
@@ -152,13 +153,15 @@ def test_start_and_duration_play_a_part(tmp_path, listener, start, heard):
     assert stamps == pytest.approx([0.6, 0.8, 1.0, 1.2, 1.4])
 
 
-def test_everything_moves_into_a_namespace(tmp_path, listener, start):
+def test_everything_but_the_clock_moves_into_a_namespace(tmp_path, listener, start):
     scans = listener.hear(LaserScan, "tower/scan", qos.SENSOR)
     listener.hear(OdometryMessage, "tower/odom", qos.SENSOR)
+    times = listener.hear(Clock, "/clock", qos.STREAM)
     start(
         "robot", "-r", "__ns:=/tower", log=corridor_bag(tmp_path, 3), robot__rate=0.0, robot__paced=False
     )
     listener.until(lambda: len(scans) == 3)
+    listener.until(lambda: times and conversions.stamp_of(times[-1].clock) == SCANS[2].stamp)
 
 
 @pytest.mark.parametrize(

@@ -41,7 +41,10 @@ class Robot:
     paced: bool = parameter(True, "Wait for the acknowledgement of earlier scans, so that none is lost.")
     window: int = parameter(20, "Scans under way without an acknowledgement, when paced.", low=1, high=10000)
     scan_listeners: int = parameter(
-        1, "Start when this many subscribers of the scans are there; 0 waits for none.", low=0, high=100
+        1,
+        "Start when this many subscribers of the scans are there, when paced also slam; 0 waits for none.",
+        low=0,
+        high=100,
     )
     odometry_listeners: int = parameter(
         1, "Start when this many subscribers of the odometry are there; 0 waits for none.", low=0, high=100

@@ -28,12 +28,13 @@ from hmt_slam_ros.nodes.outbox import publish_surely
 from hmt_slam_ros.nodes.parameters import ConfiguredNode, declare_frame
 from hmt_slam_ros.nodes.player import Player
 from hmt_slam_ros.nodes.running import run
-from hmt_slam_ros.nodes.topics import CLOCK, ODOM, ROBOT_STATUS, SCAN
+from hmt_slam_ros.nodes.topics import CLOCK, DOCUMENTS, ODOM, ROBOT_STATUS, SCAN
 from hmt_slam_ros.nodes.transforms import transform_publisher
 from hmt_slam_ros.processes.documents import RobotStatus, encode
 from hmt_slam_ros.processes.messages import Arriving, LocalEstimate, Message
 from hmt_slam_ros.sensing import Odometry, Scan
 
+_ANSWERS = DOCUMENTS[LocalEstimate]
 _CHANGEABLE = ("robot.rate", "robot.paced", "robot.window")
 _STATUS_PERIOD = 0.2  # s
 _LONGEST_WAIT = 0.1  # s
@@ -108,6 +109,13 @@ class RobotNode(ConfiguredNode):
             self._send(self._player.take(now))
         return 0.0
 
+    @property
+    def _is_answered(self) -> bool:
+        """Whether one of those who hear the scans answers them; a recorder or RViz does not."""
+        hear, answer = self.get_subscriptions_info_by_topic(SCAN), self.get_publishers_info_by_topic(_ANSWERS)
+        names = [{(end.node_namespace, end.node_name) for end in ends} for ends in (hear, answer)]
+        return bool(names[0] & names[1])
+
     def _await_listeners(self) -> None:
         """Begin when everybody who needs the first scan is there.
 
@@ -122,6 +130,8 @@ class RobotNode(ConfiguredNode):
             )
             if publisher.get_subscription_count() < wanted
         ]
+        if settings.paced and settings.scan_listeners and not missing and not self._is_answered:
+            missing = [SCAN]
         if not missing:
             self._state, self._last_progress = "playing", time.monotonic()
             self.get_logger().info(f"replaying {self._log.name}: {self._log.scan_count} scans")

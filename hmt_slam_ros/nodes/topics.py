@@ -1,8 +1,8 @@
-"""The names of the topics; all relative, so that a namespace moves them together."""
+"""The names of the topics; all but that of the time are relative, so that a namespace moves them together."""
 
 from hmt_slam_ros.processes.messages import Accepted, AreaEvents, Arriving, Hypotheses, LocalEstimate, Notice
 
-SCAN, ODOM, CLOCK = "scan", "odom", "clock"
+SCAN, ODOM, CLOCK = "scan", "odom", "/clock"
 KEYFRAMES, KEYFRAME_SCANS = "hmt/keyframes", "hmt/keyframe_scans"
 TRAIL = "hmt/trail"
 FINISHED = "hmt/finished"
