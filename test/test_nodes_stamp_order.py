@@ -1,4 +1,7 @@
-"""The order of a sensor's messages."""
+"""The order of a sensor's messages, and when none come."""
+
+import time
+from types import SimpleNamespace
 
 import pytest
 
@@ -35,3 +38,24 @@ def test_the_order_goes_on_after_what_was_heard_before_and_what_comes_next_may_b
     assert order.last_refused == 2
     order.forget()
     assert order.arrive(1, "of another time") == ["of another time"]
+
+
+@pytest.mark.parametrize(
+    ("looks", "silent"),
+    [
+        pytest.param([1.0, 2.0, 3.0, 4.0], True, id="the laser"),
+        pytest.param([1.0, 30.0, 31.0, 32.0], False, id="the node was busy"),
+        pytest.param([1.0, 30.0, 31.0, 32.0, 33.0, 34.0], True, id="the laser, after the node was busy"),
+    ],
+)
+def test_a_laser_is_silent_only_where_the_node_could_hear_it(monkeypatch, looks, silent):
+    pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
+    from hmt_slam_ros.nodes.sensor_watch import SensorWatch  # noqa: PLC0415  only where there is ROS
+
+    said = []
+    monkeypatch.setattr(time, "monotonic", lambda: 0.0)
+    watch = SensorWatch(SimpleNamespace(warn=said.append))
+    for readings, moment in enumerate(looks, 1):
+        monkeypatch.setattr(time, "monotonic", lambda moment=moment: moment)
+        watch.look(readings)
+    assert bool(said) == silent

@@ -11,6 +11,8 @@ from hmt_slam_ros.sensing import Odometry, Scan
 
 # A laser that sends nothing for so long, while odometry comes, is silent: much longer than any sweep takes.
 _SILENCE = 3.0  # s
+# Who looks once a second was kept from it where the last time is this long ago.
+_BUSY = 2.0  # s
 # One clock where at least one of so many scans is that close to the newest reading: scans may wait longer than readings
 # on their way, but not all of them.
 _TOGETHER = 5_000_000_000  # ns
@@ -24,7 +26,7 @@ class SensorWatch:
         """:param figures: through which it tells."""
         self._figures = figures
         self._newest: dict[type, int] = {}
-        self._last_scan = time.monotonic()
+        self._last_scan = self._looked = time.monotonic()
         self._readings = 0
         self._silent = False
         self._apart, self._scans = math.inf, 0
@@ -81,10 +83,16 @@ class SensorWatch:
     def look(self, readings: int) -> None:
         """Once a second: tell of a laser that is silent.
 
+        A node that was busy for long itself, as by compiling, has not heard yet what came meanwhile.
+
         :param readings: odometry readings that came so far.
         """
+        now = time.monotonic()
         moving, self._readings = readings > self._readings, readings
-        if moving and not self._silent and time.monotonic() - self._last_scan > _SILENCE:
+        if now - self._looked > _BUSY and not self._silent:
+            self._last_scan = now
+        self._looked = now
+        if moving and not self._silent and now - self._last_scan > _SILENCE:
             self._silent = True
             self._figures.warn(
                 f"no scan came for {_SILENCE:g} s, while odometry does: look at the laser, and at the name and the "
