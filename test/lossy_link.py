@@ -11,6 +11,8 @@ import heapq
 import os
 import random
 import select
+import shutil
+import signal
 import struct
 import subprocess
 import sys
@@ -29,8 +31,14 @@ def reason_against():
         return "network namespaces need root"
     if not Path("/dev/net/tun").exists():
         return "the kernel has no /dev/net/tun"
-    if subprocess.run(["sh", "-c", "command -v ip"], capture_output=True, check=False).returncode:
+    if shutil.which("ip") is None:
         return "ip is not installed: apt install iproute2"
+    try:
+        with LossyLink(0.0, 0.0, 0.0) as link:
+            for number in range(2):
+                subprocess.run([*link.on(number), "true"], check=True, capture_output=True)
+    except subprocess.CalledProcessError as fault:
+        return f"two network namespaces are not permitted here: {fault.stderr.decode().strip()}"
     return ""
 
 
@@ -43,30 +51,41 @@ class LossyLink:
     def __init__(self, delay, jitter, loss):
         self.hosts = tuple(f"hmt_{os.getpid()}_{side}" for side in "ab")
         self._how = (delay, jitter, loss)
+        self._end = contextlib.ExitStack()
 
     def __enter__(self):
+        with contextlib.ExitStack() as undo:
+            self._make(undo)
+            self._end = undo.pop_all()
+        return self
+
+    def _make(self, undo):
         for host in self.hosts:
             _ip("netns", "add", host)
+            undo.callback(_ip, "netns", "del", host)
             _ip("-n", host, "link", "set", "lo", "up")
         command = [sys.executable, __file__, *self.hosts, *map(str, self._how)]
-        self._link = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
-        self._link.stdout.readline()
+        link = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+        undo.callback(_end, link)
+        link.stdout.readline()
         for number, host in enumerate(self.hosts, 1):
             _ip("-n", host, "addr", "add", f"10.77.0.{number}/24", "dev", DEVICE)
             _ip("-n", host, "link", "set", DEVICE, "up", "multicast", "on")
             _ip("-n", host, "route", "add", "224.0.0.0/4", "dev", DEVICE)
-        return self
 
     def __exit__(self, *_fault):
-        self._link.kill()
-        self._link.communicate()
-        for host in self.hosts:
-            _ip("netns", "del", host)
+        self._end.close()
 
     def on(self, number):
         """The beginning of a command that runs on one of the hosts, of which the second shares this one's memory."""
         apart = ["sh", "-c", 'mount -t tmpfs tmpfs /dev/shm && exec "$@"', "sh"]
         return ["ip", "netns", "exec", self.hosts[number], *([] if number else apart)]
+
+
+def _end(link):
+    """End the program that is the link, and print how many packets it carried."""
+    link.terminate()
+    print(link.communicate()[0])
 
 
 def _ip(*words):
@@ -97,14 +116,23 @@ def _device(host):
 def carry(hosts, delay, jitter, loss):
     """Carry packets between the hosts for ever."""
     ends = [_device(host) for host in hosts]
+    lost, number = 0, 0
+
+    def stop(*_signal):
+        print(f"the link carried {number} packets and lost {lost}")
+        sys.exit()
+
+    signal.signal(signal.SIGTERM, stop)
     print("ready", flush=True)
     draw = random.Random(1)
-    under_way, number = [], 0
+    under_way = []
     while True:
         wait = max(0.0, under_way[0][0] - time.monotonic()) if under_way else None
         for end in select.select(ends, [], [], wait)[0]:
             packet = os.read(end, _MTU)
-            if draw.random() >= loss:
+            if draw.random() < loss:
+                lost += 1
+            else:
                 number += 1
                 other = ends[1 - ends.index(end)]
                 heapq.heappush(under_way, (time.monotonic() + delay + draw.random() * jitter, number, other, packet))

@@ -1,0 +1,41 @@
+"""Beside the five processes on their host: hear all estimates, have the map saved, say what every node said last.
+
+A process of its own, as Fast DDS knows the network of the first participant of a process for all that follow.
+"""
+
+import sys
+
+from conftest import Listener
+from diagnostic_msgs.msg import DiagnosticArray
+from std_msgs.msg import String
+from std_srvs.srv import Trigger
+
+from hmt_slam_ros.nodes import qos
+from hmt_slam_ros.nodes.topics import DIAGNOSTICS, DOCUMENTS
+from hmt_slam_ros.processes.messages import LocalEstimate
+
+PATIENCE = 240.0  # s
+
+
+def main(domain, scans):
+    """Exit with a sentence where the map is not saved."""
+    listener = Listener(domain)
+    estimates = listener.hear(String, DOCUMENTS[LocalEstimate], qos.CHAIN)
+    health = listener.hear(DiagnosticArray, DIAGNOSTICS, qos.STREAM)
+    print("listens", flush=True)
+    try:
+        # What is lost may be asked for again after three seconds only, by Fast DDS's heartbeat.
+        listener.until(lambda: len(estimates) == scans, seconds=PATIENCE)
+        answer = listener.call(Trigger, "slam/save", Trigger.Request())
+    finally:
+        print(f"{len(estimates)} of {scans} estimates came")
+        for status in {message.status[0].name: message.status[0] for message in health}.values():
+            said = ", ".join(f"{entry.key} {entry.value}" for entry in status.values)
+            print(f"{status.name}: {status.message}; {said}")
+        listener.close()
+    if not answer.success:
+        sys.exit(answer.message)
+
+
+if __name__ == "__main__":
+    main(int(sys.argv[1]), int(sys.argv[2]))
