@@ -51,6 +51,11 @@ def scan_in(
     )  # fmt: skip
 
 
+def blank_scan():
+    """A scan without a return."""
+    return Scan(0, np.full(181, RANGE_MAX, dtype=np.float32), -np.pi / 2, np.pi / 180, 0.0, RANGE_MAX)
+
+
 def scan_at(walls, pose, noise=0.0, rng=None, beams=180):
     """The scan of a laser that sees all round, no angle twice."""
     angles = np.linspace(-np.pi, np.pi, beams, endpoint=False)

@@ -30,6 +30,7 @@ class Building:
     :ivar route: shape (k, 2), way-points of the robot, k >= 2; the same one first and last for a closed route.
     :ivar furniture: shape (m, 5), x, y, heading, length and width of each piece that may be moved.
     :ivar doors: shape (d, 4), x and y of both ends of each door that may be closed; they are open.
+    :ivar rooms: shape (r, 5), likewise x, y, heading, length and width of each room beside the corridors that is open.
     :ivar places: {name: shape (3,)}, frames in which parts of the building that are the same look the same.
     """
 
@@ -37,14 +38,18 @@ class Building:
     route: NDArray[np.float64]
     furniture: NDArray[np.float64] = field(default_factory=_no_pieces)
     doors: NDArray[np.float64] = field(default_factory=_no_doors)
+    rooms: NDArray[np.float64] = field(default_factory=_no_pieces)
     places: dict[str, NDArray[np.float64]] = field(default_factory=dict)
 
     def placed(self, pose: NDArray[np.float64]) -> Building:
         """The same building, its origin at a pose (3,)."""
-        pieces = np.concatenate((se2.compose(pose, self.furniture[:, :3]), self.furniture[:, 3:]), axis=1)
+        pieces, rooms = (
+            np.concatenate((se2.compose(pose, own[:, :3]), own[:, 3:]), axis=1)
+            for own in (self.furniture, self.rooms)
+        )
         places = {name: se2.compose(pose, place) for name, place in self.places.items()}
         route = se2.transform(pose, self.route)
-        return Building(_placed(pose, self.walls), route, pieces, _placed(pose, self.doors), places)
+        return Building(_placed(pose, self.walls), route, pieces, _placed(pose, self.doors), rooms, places)
 
 
 def _placed(pose: NDArray[np.float64], lines: NDArray[np.float64]) -> NDArray[np.float64]:

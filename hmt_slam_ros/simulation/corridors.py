@@ -133,7 +133,9 @@ def office(draw: np.random.Generator, settings: Settings) -> Building:
     offices = [room for rooms in (*outer, *inner) for room in rooms if room.is_open]
     furniture = furnish(draw, [room.floor for room in offices], np.array(route))
     doors = np.array([room.door for room in offices]).reshape(-1, 4)
-    return Building(plan.walls(), np.array(route), furniture, doors)
+    x0, y0, x1, y1 = np.array([room.floor for room in offices]).reshape(-1, 4).T
+    floors = np.stack((0.5 * (x0 + x1), 0.5 * (y0 + y1), 0.0 * x0, x1 - x0, y1 - y0), axis=1)
+    return Building(plan.walls(), np.array(route), furniture, doors, floors)
 
 
 def nested(draw: np.random.Generator, settings: Settings) -> Building:

@@ -83,12 +83,14 @@ class Scenario:
 
     def scan(self, number: int) -> Scan:
         """A scan by its number, from 0."""
-        stamp = int(self.scan_stamps[number])
-        seconds = float(self._seconds(np.array([stamp]))[0])
+        return self.laser.scan(number, int(self.scan_stamps[number]), self.distances(number))
+
+    def distances(self, number: int) -> NDArray[np.float64]:
+        """What the beams of a scan truly meet, shape (n,), m from the laser; inf where that is nothing."""
+        seconds = float(self._seconds(self.scan_stamps[number : number + 1])[0])
         poses = self._driven.poses(seconds + self.laser.times)
         epoch = int(np.searchsorted(self._furnishing.times, seconds, side="right")) - 1
-        distances = self.laser.distances(poses, self._furnished[epoch], self.people.discs(seconds, poses[0]))
-        return self.laser.scan(number, stamp, distances)
+        return self.laser.distances(poses, self._furnished[epoch], self.people.discs(seconds, poses[0]))
 
     def furniture(self, stamp: int) -> NDArray[np.float64]:
         """Where the furniture stands at a stamp, ns, (m, 5) as in `Building`."""

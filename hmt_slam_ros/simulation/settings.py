@@ -26,7 +26,7 @@ class Settings:
     )
     size: float = parameter(1.0, "Factor on the building's lengths; corridors stay as wide.", low=0.7, high=20.0)
     count: int = parameter(3, "Rings of nested loops, blocks on a side of a grid of corridors.", low=1, high=20)
-    laps: int = parameter(2, "How often the route is driven.", low=1, high=100)
+    laps: int = parameter(2, "How often the route is driven.", low=1, high=1000)
     speed: float = parameter(0.6, "Speed of the robot at most.", unit="m/s", low=0.05, high=5.0)
     turn_rate: float = parameter(45.0, "Turn rate of the robot at most.", unit="deg/s", low=1.0, high=360.0)
     rounding: float = parameter(0.5, "Radius of the arc at a corner of the route.", unit="m", low=0.05, high=10.0)
