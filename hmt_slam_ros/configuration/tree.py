@@ -1,9 +1,10 @@
 """Every parameter of the system: the groups, and the rules that join them.
 
-Each parameter is declared once, in ``metric``, ``topological`` or ``live``: default, unit, range and description. The
-ROS parameters, the YAML files, ``--set`` and docs/parameters.md all follow from this tree, so a new parameter is
-one line here. Angles are in degrees, for the people who set them; the code that uses one calls ``math.radians`` there.
-After a change run ``scripts/generate_docs.py``, which brings config/hmt_slam.yaml and docs/parameters.md up to date.
+Each parameter is declared once, in ``metric``, ``topological``, ``features`` or ``live``: default, unit, range and
+description. The ROS parameters, the YAML files, ``--set`` and docs/parameters.md all follow from this tree, so a new
+parameter is one line here. Angles are in degrees, for the people who set them; the code that uses one calls
+``math.radians`` there. After a change run ``scripts/generate_docs.py``, which brings config/hmt_slam.yaml and
+docs/parameters.md up to date.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
+from hmt_slam_ros.configuration.features import Features
 from hmt_slam_ros.configuration.live import RealTimeLocalization, Robot
 from hmt_slam_ros.configuration.metric import Filter, LocalMap, Matching, Motion
 from hmt_slam_ros.configuration.parameter import parameter
@@ -46,6 +48,7 @@ class Configuration:
     tsbi: TopologicalInference = field(default_factory=TopologicalInference)
     tlca: LoopClosureAcceptance = field(default_factory=LoopClosureAcceptance)
     refinement: Refinement = field(default_factory=Refinement)
+    features: Features = field(default_factory=Features)
     rtl: RealTimeLocalization = field(default_factory=RealTimeLocalization)
     robot: Robot = field(default_factory=Robot)
 
@@ -74,5 +77,10 @@ RULES: tuple[Rule, ...] = (
         lambda tree: not tree.robot.paced or tree.filter.patience < tree.robot.window,
         "filter.patience is not below robot.window, so without odometry metric SLAM would wait for scans that the "
         "paced robot holds back; lower the one or raise the other",
+    ),
+    Rule(
+        lambda tree: tree.features.opening_min < tree.features.opening_max,
+        "features.opening_min is not below features.opening_max, so that no opening is found; lower the one or raise "
+        "the other",
     ),
 )

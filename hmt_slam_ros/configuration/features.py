@@ -1,0 +1,88 @@
+"""Parameters of the lines of walls and of the maps that they make."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from hmt_slam_ros.configuration.parameter import parameter
+
+
+@dataclass(frozen=True)
+class Features:
+    """Lines: what a scan shows of walls, and what a room's map makes of it."""
+
+    range_deviation: float = parameter(
+        0.015, "Deviation of a range, which the covariance of a line follows from.", unit="m", low=1e-4, high=0.5
+    )
+    line_penalty: float = parameter(
+        14.0, "What one more line costs when beams are sorted into lines, in squared deviations of a range.",
+        low=1.0, high=1000.0,
+    )
+    stray_penalty: float = parameter(
+        12.0, "What a beam on no line costs, likewise.", low=1.0, high=1000.0
+    )
+    min_beams: int = parameter(6, "Beams of a line at least.", low=3, high=1000)
+    min_length: float = parameter(0.5, "What has to be seen of a line.", unit="m", low=0.05, high=10.0)
+    max_gap: float = parameter(
+        0.3, "A stretch of a line ends where nothing more is seen of it for this far.", unit="m", low=0.02, high=10.0
+    )
+    merge_probability: float = parameter(
+        0.99, "Share of the segments of one line, and of a map's lines of one wall, that chi-square (2 degrees of "
+        "freedom) finds to be one.",
+        low=0.5, high=0.999999,
+    )
+    merge_deviation: float = parameter(
+        0.01, "Segments, and lines of a map, are joined only where the distance of the one from the other's line is "
+        "known this well.",
+        unit="m", low=0.001, high=1.0,
+    )
+    pair_probability: float = parameter(
+        0.99999, "Share of true pairings of a scan's lines with the map's that chi-square admits, each and together.",
+        low=0.5, high=0.99999999,
+    )
+    min_overlap: float = parameter(
+        0.5, "Two lines are compared where they have this share of the shorter one in common along them.",
+        low=0.01, high=1.0,
+    )
+    min_sightings: int = parameter(
+        3, "A line of a map that fewer scans than this showed is forgotten at the first one that does not.", low=1,
+        high=100,
+    )
+    corner_angle: float = parameter(
+        15.0, "Two walls that meet make a corner up to so much from a right angle.", unit="deg", low=0.1, high=45.0
+    )
+    corner_gap: float = parameter(
+        0.2, "Both walls of a corner are seen up to so near to it.", unit="m", low=0.01, high=2.0
+    )
+    landmark_size: float = parameter(
+        0.2, "Length of each of a landmark's two walls that makes one believe in it by 1 - 1/e.", unit="m",
+        low=0.01, high=10.0,
+    )
+    opening_min: float = parameter(0.6, "Width of an opening at least.", unit="m", low=0.1, high=10.0)
+    opening_max: float = parameter(3.0, "Width of an opening at most.", unit="m", low=0.1, high=50.0)
+    opening_depth: float = parameter(
+        0.8, "So far behind the wall an opening is free; niches are less deep.", unit="m", low=0.1, high=10.0
+    )
+    opening_share: float = parameter(
+        0.1, "Share of an opening's width that is seen through which makes one believe in it by 1 - 1/e.",
+        low=0.001, high=1.0,
+    )
+    map_deviation: float = parameter(
+        0.02, "Deviation of a local map's surfaces, across them.", unit="m", low=1e-3, high=0.5
+    )
+    square_deviation: float = parameter(
+        0.3, "Deviation of walls from being parallel or square to each other.", unit="deg", low=0.0, high=10.0
+    )
+    hallway_bias: float = parameter(
+        -5.8, "Log-odds of a hallway as wide and as long as one metre.", unit="nat", low=-100.0, high=100.0
+    )
+    hallway_width: float = parameter(
+        -2.5, "How they change with the logarithm of the width.", unit="nat", low=-100.0, high=100.0
+    )
+    hallway_ratio: float = parameter(
+        5.6, "How they change with the logarithm of length by width.", unit="nat", low=-100.0, high=100.0
+    )
+    hallway_sure: float = parameter(
+        0.7, "An area that was taken for a room is taken for a hallway from this probability on, and the other way.",
+        low=0.5, high=0.999,
+    )

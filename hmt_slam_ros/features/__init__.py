@@ -1,0 +1,1 @@
+"""Features of scans: the lines of walls, with covariances, and the stochastic map of a room that they make."""

@@ -1,0 +1,91 @@
+"""Hallway or room: how long and how wide the free space around the robot is.
+
+Tomatis, Nourbakhsh and Siegwart (2003), section 3.1: thin and long open spaces are hallways, others are rooms. A chord
+is how far one sees ahead and back along an axis; a space is as wide as its shortest chord, as long as its longest. The
+log-odds of a hallway are linear in the logarithms of both. An area is what its keyframes say on average, one after the
+other, and what it is taken for changes only where that is clear (hysteresis).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import numpy as np
+
+from hmt_slam_ros.configuration.features import Features
+from hmt_slam_ros.features.openings import Rays
+
+# Sectors of the circle, an even number, in each of which the median beam counts, so that no single beam decides; and
+# how many axes have to be known.
+_SECTORS, _KNOWN = 72, 18
+# Nobody sees farther along a hallway than this, m; so a length does not depend on the laser's reach.
+_FAR = 10.0
+
+
+class FreeSpace(NamedTuple):
+    """The open space around a place.
+
+    :ivar width: shortest chord, m.
+    :ivar length: longest chord, m.
+    """
+
+    width: float
+    length: float
+
+
+class AreaClass(NamedTuple):
+    """What an area is.
+
+    :ivar probability: that it is a hallway.
+    :ivar hallway: what it is taken for.
+    """
+
+    probability: float
+    hallway: bool
+
+
+def free_space(rays: Rays) -> FreeSpace | None:
+    """The open space that beams from one place show; None where they show less than half of its axes.
+
+    :param rays: of a scan all around, real or virtual.
+    """
+    bearings = np.arctan2(rays.directions[:, 1], rays.directions[:, 0])
+    sectors = np.floor((bearings + math.pi) / (2.0 * math.pi) * _SECTORS).astype(np.int64) % _SECTORS
+    away = np.full(_SECTORS, np.nan)
+    for sector in np.unique(sectors).tolist():
+        away[sector] = min(_FAR, float(np.median(rays.free[sectors == sector])))
+    half = _SECTORS // 2
+    chords = away[:half] + away[half:]
+    chords = chords[np.isfinite(chords)]
+    if chords.size < _KNOWN:
+        return None
+    return FreeSpace(float(chords.min()), float(chords.max()))
+
+
+def log_odds(space: FreeSpace, features: Features) -> float:
+    """Log-odds of a space being a hallway, nats."""
+    width, ratio = math.log(max(space.width, 1e-3)), math.log(max(space.length / max(space.width, 1e-3), 1e-3))
+    return features.hallway_bias + features.hallway_width * width + features.hallway_ratio * ratio
+
+
+def area_class(spaces: Iterable[FreeSpace], features: Features) -> AreaClass:
+    """What an area is by the spaces around its keyframes, in the order in which they were taken.
+
+    :raises ValueError: where there is none.
+    """
+    total, count, taken, probability = 0.0, 0, None, 0.5
+    for space in spaces:
+        total, count = total + log_odds(space, features), count + 1
+        probability = 1.0 / (1.0 + math.exp(-max(-50.0, min(50.0, total / count))))
+        taken = after(taken, probability, features)
+    if taken is None:
+        raise ValueError("an area has no keyframe around which enough is known to tell a hallway from a room")
+    return AreaClass(probability, taken)
+
+
+def after(taken: bool | None, probability: float, features: Features) -> bool:
+    """What is taken for a hallway at its present probability and was ``taken`` for one before; None for not yet."""
+    bound = 0.5 if taken is None else 1.0 - features.hallway_sure if taken else features.hallway_sure
+    return probability >= bound

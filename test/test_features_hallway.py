@@ -1,0 +1,79 @@
+"""Hallway or room, of the free space around a robot and of an area."""
+
+import numpy as np
+import pytest
+from worlds import box, drive, scan_at, scan_in
+
+from benchmark.hallways import depth_in_rooms
+from hmt_slam_ros.configuration.features import Features
+from hmt_slam_ros.configuration.tree import Configuration
+from hmt_slam_ros.features.hallway import FreeSpace, after, area_class, free_space, log_odds
+from hmt_slam_ros.features.openings import rays_of
+from hmt_slam_ros.local_map.area_kind import AreaKinds
+from hmt_slam_ros.simulation import open_simulated
+
+FEATURES = Features()
+HALLWAY, ROOM = box(-12, -1, 12, 1), box(-2.5, -2, 2.5, 2)
+THIN, WIDE = FreeSpace(2.0, 15.0), FreeSpace(4.5, 6.0)
+
+
+@pytest.mark.parametrize("heading", [0.0, 0.4, 1.3])
+def test_a_space_is_as_wide_as_its_shortest_chord_and_as_long_as_its_longest(heading):
+    hallway = free_space(rays_of(scan_at(HALLWAY, (0.3, 0.2, heading), beams=720), FEATURES))
+    assert hallway.width == pytest.approx(2.0, abs=0.02)
+    # Cut off at 10 m to each side, or by the walls where the sector's median beam meets them.
+    assert 18.0 < hallway.length <= 20.0
+    room = free_space(rays_of(scan_at(ROOM, (0.3, 0.2, heading), beams=720), FEATURES))
+    assert room.width == pytest.approx(4.0, abs=0.05)
+    assert room.length == pytest.approx(np.hypot(5.0, 4.0), abs=0.4)
+
+
+def test_half_a_circle_tells_nothing():
+    assert free_space(rays_of(scan_in(ROOM, (0.0, 0.0, 0.0), beams=181), FEATURES)) is None
+
+
+def test_thin_and_long_is_a_hallway():
+    assert log_odds(THIN, FEATURES) > 3.0
+    assert log_odds(WIDE, FEATURES) < -3.0
+    longer, wider = THIN._replace(length=20.0), FreeSpace(2.5, 15.0)
+    assert log_odds(wider, FEATURES) < log_odds(THIN, FEATURES) < log_odds(longer, FEATURES)
+
+
+def test_one_keyframe_of_another_kind_does_not_change_an_area():
+    assert area_class([THIN], FEATURES).hallway
+    assert area_class([THIN] * 5 + [WIDE], FEATURES).hallway
+    assert not area_class([WIDE] * 5 + [THIN], FEATURES).hallway
+    assert not area_class([THIN] + [WIDE] * 5, FEATURES).hallway
+    assert area_class([THIN, WIDE] * 3, FEATURES).probability == pytest.approx(
+        1.0 / (1.0 + np.exp(-0.5 * (log_odds(THIN, FEATURES) + log_odds(WIDE, FEATURES))))
+    )
+    with pytest.raises(ValueError, match="keyframe"):
+        area_class([], FEATURES)
+
+
+def test_what_an_area_is_taken_for_changes_only_where_that_is_clear():
+    assert after(None, 0.6, FEATURES) and not after(None, 0.4, FEATURES)
+    assert after(True, 0.4, FEATURES) and not after(False, 0.6, FEATURES)
+    assert not after(True, 0.2, FEATURES) and after(False, 0.8, FEATURES)
+
+
+@pytest.mark.parametrize(("walls", "hallway"), [(HALLWAY, True), (ROOM, False)])
+def test_a_stored_area_is_told_from_scans_of_half_a_circle(walls, hallway):
+    poses = drive((-1.5, 0.2), (1.5, 0.2), (-1.5, 0.2))
+    scans = [scan_in(walls, pose, beams=361, noise=0.015, seed=k) for k, pose in enumerate(poses)]
+    kinds = AreaKinds(Configuration())
+    found = kinds.of(scans, poses)
+    assert found.hallway is hallway
+    assert (found.probability > 0.9) if hallway else (found.probability < 0.1)
+    assert kinds.of(scans, poses) == found
+    assert kinds.of([], np.zeros((0, 3))) is None
+
+
+def test_rooms_of_a_building_hold_its_furniture_and_no_way_in_a_corridor():
+    scenario = open_simulated("sim:office,seed=4,size=0.7").scenario
+    building = scenario.building
+    assert len(building.rooms) == len(building.doors) > 5
+    pieces = building.furniture[:, :3]
+    assert depth_in_rooms(scenario, pieces).min() > 0.0
+    doors = np.pad(building.doors.reshape(-1, 2, 2).mean(axis=1), ((0, 0), (0, 1)))
+    assert np.abs(depth_in_rooms(scenario, doors) + 0.1).max() < 1e-6
