@@ -4,13 +4,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from worlds import box, scan_in
+from worlds import blank_scan, box, scan_in
 
 from hmt_slam_ros.configuration import Configuration, with_changes
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.local_map.area_filter import AreaFilter, PlacedKeyframe
+from hmt_slam_ros.local_map.area_filter import AreaFilter
+from hmt_slam_ros.local_map.local_filter import PlacedKeyframe
 from hmt_slam_ros.local_map.local_mapping import LocalMapping
 from hmt_slam_ros.local_map.matching import matched_fraction
+from hmt_slam_ros.local_map.sighting import Sighting
 from hmt_slam_ros.sensing.motion import Prediction, Step
 
 ROOM = np.concatenate((box(-6.02, -4.03, 6.03, 7.01), box(3.51, 1.02, 4.53, 2.52), box(-4.02, 3.03, -3.52, 7.01)))
@@ -34,11 +36,11 @@ def driven(mapping, odometry_error=(0.0, 0.0, 0.0), steps=60, hypothesis=0):
     for k in range(1, steps):
         truth = se2.compose(truth, STEP)
         scan = scan_in(ROOM, truth, noise=0.01, seed=k)
-        points = mapping.matching_points(scan)
-        area_filter.track(points, predicted(STEP + np.asarray(odometry_error)))
+        sighting = Sighting(mapping, scan)
+        area_filter.track(sighting, predicted(STEP + np.asarray(odometry_error)))
         if k % 5 == 0:
             events += 1
-            area_filter.update(points, events)
+            area_filter.update(sighting, events)
             area_filter.add_keyframe(events, scan)
     return area_filter, truth
 
@@ -66,8 +68,8 @@ def test_a_branch_goes_its_own_way():
     child = parent.branch(1)
     before = parent.poses.copy(), parent.keyframe_poses.copy()
     scan = scan_in(ROOM, (1.0, 0.5, 0.3))
-    child.track(mapping.matching_points(scan), predicted(STEP))
-    child.update(mapping.matching_points(scan), 99)
+    child.track(Sighting(mapping, scan), predicted(STEP))
+    child.update(Sighting(mapping, scan), 99)
     child.add_keyframe(99, scan)
     np.testing.assert_array_equal(parent.poses, before[0])
     np.testing.assert_array_equal(parent.keyframe_poses, before[1])
@@ -85,7 +87,7 @@ def test_resampling_keeps_the_leader_and_drops_what_has_no_weight():
     area_filter.log_weights[count - 1] = 0.0
     leading = area_filter.keyframe_poses[count - 1].copy()
     scan = scan_in(ROOM, (0.8, 0.1, 0.35))
-    step = area_filter.update(mapping.matching_points(scan), 50)
+    step = area_filter.update(Sighting(mapping, scan), 50)
     assert step.effective_samples == pytest.approx(1.0, abs=0.1)
     assert step.history_changed
     assert area_filter.leader == 0
@@ -102,8 +104,8 @@ def test_the_leader_stays_until_another_is_clearly_more_likely():
         area_filter.log_weights = np.full(count, -5.0)
         area_filter.log_weights[leader], area_filter.log_weights[other] = -advantage, 0.0
         # A scan without returns makes none likelier.
-        area_filter.track(np.empty((0, 4)), predicted(STEP))
-        area_filter.update(np.empty((0, 4)), 50)
+        area_filter.track(Sighting(area_filter.mapping, blank_scan()), predicted(STEP))
+        area_filter.update(Sighting(area_filter.mapping, blank_scan()), 50)
         np.testing.assert_array_equal(area_filter.pose, area_filter.poses[area_filter.leader])
         assert area_filter.leader == leads
 
@@ -115,7 +117,7 @@ def test_a_leader_that_is_less_likely_though_not_clearly_is_kept_by_resampling()
     area_filter.log_weights = np.full(count, -50.0)
     area_filter.log_weights[heaviest], area_filter.log_weights[leader] = 0.0, -2.9
     histories = area_filter.keyframe_poses[[leader, heaviest]]
-    step = area_filter.update(np.empty((0, 4)), 50)
+    step = area_filter.update(Sighting(area_filter.mapping, blank_scan()), 50)
     assert not step.history_changed
     np.testing.assert_array_equal(area_filter.log_weights, 0.0)
     np.testing.assert_array_equal(area_filter.leading_keyframe_poses(), histories[0])
@@ -130,19 +132,19 @@ def test_a_particle_that_is_clearly_more_likely_takes_the_lead_and_it_is_told():
     area_filter.log_weights = np.full(count, -50.0)
     area_filter.log_weights[heaviest] = 0.0
     leading = area_filter.keyframe_poses[heaviest].copy()
-    assert area_filter.update(np.empty((0, 4)), 50).history_changed
+    assert area_filter.update(Sighting(area_filter.mapping, blank_scan()), 50).history_changed
     np.testing.assert_array_equal(area_filter.leading_keyframe_poses(), leading)
 
 
 def test_the_motion_of_a_step_is_that_of_one_particle_also_where_the_lead_changes():
     area_filter, _ = driven(LocalMapping(Configuration()), steps=8)
-    area_filter.update(np.empty((0, 4)), 49)
+    area_filter.update(Sighting(area_filter.mapping, blank_scan()), 49)
     other = (area_filter.leader + 1) % len(area_filter.poses)
     area_filter.poses[other] = area_filter._last_poses[other] = area_filter._priors[other] = (1.0, 2.0, 0.5)
     area_filter.log_weights = np.full(len(area_filter.poses), -10.0)
     area_filter.log_weights[other] = 0.0
-    area_filter.track(np.empty((0, 4)), predicted(STEP))
-    step = area_filter.update(np.empty((0, 4)), 50)
+    area_filter.track(Sighting(area_filter.mapping, blank_scan()), predicted(STEP))
+    step = area_filter.update(Sighting(area_filter.mapping, blank_scan()), 50)
     assert step.history_changed
     np.testing.assert_allclose(step.moved, STEP, atol=1e-9)
 
@@ -150,18 +152,18 @@ def test_the_motion_of_a_step_is_that_of_one_particle_also_where_the_lead_change
 def test_effective_samples_equal_the_particles_where_all_weigh_the_same():
     mapping = LocalMapping(Configuration())
     area_filter = AreaFilter(mapping, 0, 0)
-    area_filter.track(np.empty((0, 4)), predicted(STEP))
-    step = area_filter.update(np.empty((0, 4)), 1)
+    area_filter.track(Sighting(area_filter.mapping, blank_scan()), predicted(STEP))
+    step = area_filter.update(Sighting(area_filter.mapping, blank_scan()), 1)
     assert step.effective_samples == pytest.approx(len(area_filter.poses))
-    assert step.log_evidence == pytest.approx(0.0, abs=1e-9)
 
 
 def test_without_returns_the_particles_spread_as_odometry_says():
     configuration = Configuration()
     configuration = replace(configuration, filter=replace(configuration.filter, particles=400))
     area_filter = AreaFilter(LocalMapping(configuration), 0, 0)
-    area_filter.track(np.empty((0, 4)), predicted([1.0, 0.0, 0.0], np.diag([0.2, 0.1, 0.05]) ** 2))
-    area_filter.update(np.empty((0, 4)), 1)
+    blank = Sighting(area_filter.mapping, blank_scan())
+    area_filter.track(blank, predicted([1.0, 0.0, 0.0], np.diag([0.2, 0.1, 0.05]) ** 2))
+    area_filter.update(blank, 1)
     spread = area_filter.poses[1:].std(axis=0)
     np.testing.assert_allclose(spread, [0.2, 0.1, 0.05], rtol=0.1)
 
@@ -170,7 +172,7 @@ def test_a_lost_robot_is_found_by_the_search():
     mapping = LocalMapping(Configuration())
     area_filter, truth = driven(mapping, steps=30)
     scan = scan_in(ROOM, se2.compose(truth, (0.3, 0.2, np.radians(12))))
-    area_filter.track(mapping.matching_points(scan), predicted(np.zeros(3), np.diag([0.1, 0.1, 0.1]) ** 2))
+    area_filter.track(Sighting(mapping, scan), predicted(np.zeros(3), np.diag([0.1, 0.1, 0.1]) ** 2))
     error = se2.between(se2.compose(truth, (0.3, 0.2, np.radians(12))), area_filter.pose)
     assert np.hypot(*error[:2]) < 0.05
     assert abs(error[2]) < np.radians(1.0)
@@ -188,7 +190,7 @@ def test_a_change_of_area_moves_frame_and_map_together():
     ]
     area_filter.change_area(7, new_T_old, content)
     truth = se2.compose(truth, STEP)
-    area_filter.track(mapping.matching_points(scan_in(ROOM, truth)), predicted(STEP))
+    area_filter.track(Sighting(mapping, scan_in(ROOM, truth)), predicted(STEP))
     error = se2.between(se2.compose(new_T_old, truth), area_filter.pose)
     assert np.hypot(*error[:2]) < 0.03
     assert area_filter.area == 7

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from worlds import drive, scan_in, two_rooms
+from worlds import blank_scan, drive, scan_in, two_rooms
 
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
@@ -10,6 +10,7 @@ from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.local_map.area_filter import AreaFilter
 from hmt_slam_ros.local_map.local_mapping import LocalMapping
 from hmt_slam_ros.local_map.match_error import match_error
+from hmt_slam_ros.local_map.sighting import Sighting
 from hmt_slam_ros.sensing.motion import Prediction, Step
 
 CORRIDOR = np.array([[-200.0, -1.0, 200.0, -1.0], [-200.0, 1.0, 200.0, 1.0]])
@@ -28,9 +29,9 @@ def driven(walls, truth, seed):
         noise = se2.exp(np.sqrt(np.diag(ODOMETRY)) * random.standard_normal(3))
         step = Step(se2.compose(se2.between(truth[k - 1], truth[k]), noise), ODOMETRY)
         scan = scan_in(walls, truth[k], noise=0.015, seed=1000 * seed + k)
-        points = mapping.matching_points(scan)
-        area_filter.track(points, Prediction(step, step, step))
-        steps.append(area_filter.update(points, k))
+        sighting = Sighting(mapping, scan)
+        area_filter.track(sighting, Prediction(step, step, step))
+        steps.append(area_filter.update(sighting, k))
         area_filter.add_keyframe(k, scan)
     return area_filter.leading_keyframe_poses(), steps
 
@@ -92,8 +93,8 @@ def test_beams_that_err_together_make_a_match_less_certain():
 
 
 def test_without_returns_odometry_alone_tells():
-    nothing = np.empty((0, 4))
     mapping = LocalMapping(Configuration())
+    nothing = Sighting(mapping, blank_scan())
     area_filter = AreaFilter(mapping, 0, area=0)
     step = Step(np.zeros(3), ODOMETRY)
     area_filter.track(nothing, Prediction(step, step, step))

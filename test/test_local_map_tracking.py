@@ -2,12 +2,13 @@
 
 import numpy as np
 import pytest
-from worlds import box, scan_in
+from worlds import blank_scan, box, scan_in
 
 from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.local_map.area_filter import AreaFilter
 from hmt_slam_ros.local_map.local_mapping import LocalMapping
+from hmt_slam_ros.local_map.sighting import Sighting
 from hmt_slam_ros.sensing.motion import Prediction, Step
 
 ROOM = np.concatenate((box(-6.02, -4.03, 6.03, 7.01), box(3.51, 1.02, 4.53, 2.52), box(-4.02, 3.03, -3.52, 7.01)))
@@ -40,8 +41,8 @@ def predicted(odometry, inertia=STILL):
 
 
 def track(area_filter, walls, truth, odometry, inertia=STILL):
-    points = area_filter.mapping.matching_points(scan_in(walls, truth, noise=0.01))
-    return area_filter.track(points, predicted(odometry, inertia))
+    sighting = Sighting(area_filter.mapping, scan_in(walls, truth, noise=0.01))
+    return area_filter.track(sighting, predicted(odometry, inertia))
 
 
 def error_of(pose, truth):
@@ -86,8 +87,8 @@ def test_in_a_corridor_that_looks_the_same_all_along_odometry_tells_how_far(mapp
         # The velocity has it that the robot stands; and people hide a third of the walls.
         scan = scan_in(CORRIDOR, truth, noise=0.01, seed=k)
         scan.ranges[60:120] = 0.9
-        points = mapping.matching_points(scan)
-        tracked = area_filter.track(points, predicted(Step(np.array([0.3, 0.0, 0.0]), SURE)))
+        sighting = Sighting(mapping, scan)
+        tracked = area_filter.track(sighting, predicted(Step(np.array([0.3, 0.0, 0.0]), SURE)))
         assert not tracked.contradicted
     assert area_filter.pose[0] == pytest.approx(3.0, abs=0.1)
 
@@ -96,8 +97,8 @@ def test_a_scan_that_shows_nothing_of_the_map_is_placed_by_odometry(mapping):
     area_filter = mapped(mapping, ROOM, [(0, 0, 0)])
     elsewhere = box(-1.0, -0.6, 14.0, 0.9)
     area_filter.poses[:] = area_filter._priors[:] = (40.0, 0.0, 0.0)
-    points = mapping.matching_points(scan_in(elsewhere, np.zeros(3)))
-    tracked = area_filter.track(points, predicted(Step(np.array([0.3, 0.0, 0.1]), SURE)))
+    sighting = Sighting(mapping, scan_in(elsewhere, np.zeros(3)))
+    tracked = area_filter.track(sighting, predicted(Step(np.array([0.3, 0.0, 0.1]), SURE)))
     np.testing.assert_allclose(area_filter.pose, [40.3, 0.0, 0.1], atol=1e-6)
     np.testing.assert_allclose(tracked.information, 0.0, atol=1e-9)
     assert not tracked.contradicted
@@ -118,7 +119,7 @@ def test_without_odometry_the_scan_is_searched_for_around_what_the_velocity_pred
 
 def test_a_certain_prediction_stands_where_there_is_nothing_to_match(mapping):
     area_filter = AreaFilter(mapping, 0, 0)
-    area_filter.track(np.empty((0, 4)), predicted(Step(np.array([0.1, 0.0, 0.0]), SURE)))
+    area_filter.track(Sighting(mapping, blank_scan()), predicted(Step(np.array([0.1, 0.0, 0.0]), SURE)))
     np.testing.assert_allclose(area_filter.pose, [0.1, 0.0, 0.0], atol=1e-12)
 
 
@@ -160,7 +161,7 @@ def test_what_the_scans_leave_open_is_carried_on_until_the_next_keyframe(mapping
         assert deviations[2] < 0.01
     assert (np.diff(along) > 0).all()
     assert along[-1] == pytest.approx(np.sqrt(8) * 0.02, rel=0.2)
-    area_filter.update(mapping.matching_points(scan_in(CORRIDOR, truth)), 1)
+    area_filter.update(Sighting(mapping, scan_in(CORRIDOR, truth)), 1)
     np.testing.assert_array_equal(area_filter.left_open, 0.0)
 
 
@@ -168,9 +169,9 @@ def test_what_the_scans_leave_open_is_carried_on_until_the_next_keyframe(mapping
 def test_a_turn_that_odometry_missed_in_a_pause_is_found_by_a_scan_that_fits_there_and_not_here(mapping, beams):
     area_filter = mapped(mapping, ROOM, [(0, 0, 0)])
     truth = np.array([0.0, -0.45, -1.4])
-    points = mapping.matching_points(scan_in(ROOM, truth, beams=beams, noise=0.01))
+    sighting = Sighting(mapping, scan_in(ROOM, truth, beams=beams, noise=0.01))
     prediction = predicted(Step(np.array([0.0, 0.0, -0.4]), SURE), Step(np.array([0.0, -0.2, -1.6]), 16.0 * VAGUE))
-    tracked = area_filter.track(points, prediction)
+    tracked = area_filter.track(sighting, prediction)
     distance, angle = error_of(area_filter.pose, truth)
     assert distance < 0.1
     assert angle < 2.0

@@ -47,8 +47,12 @@ class Motion:
 
 @dataclass(frozen=True)
 class LocalMap:
-    """Metric map of one area: occupancy grid and distance field, built from the keyframes' scans."""
+    """Metric map of one area: occupancy grid and distance field, or lines, built from the keyframes' scans."""
 
+    kind: str = parameter(
+        "grid", "What maps of areas are made of: occupancy grids under particles, or lines in a Kalman filter.",
+        choices=("grid", "lines"),
+    )
     cell: float = parameter(0.05, "Side of a grid cell.", unit="m", low=0.005, high=1.0)
     max_range: float = parameter(
         30.0, "Beams longer than this are ignored when the map is built.", unit="m", low=0.5, high=200.0

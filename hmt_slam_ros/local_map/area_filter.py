@@ -7,96 +7,29 @@ entered. The map frame is the frame of the current area.
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
-from hmt_slam_ros.agreement import SCAN, Agreement, Usual
-from hmt_slam_ros.arrays import Float64, Int32
+from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.covariance import inverse, turned
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.local_map import batch, matching
+from hmt_slam_ros.local_map import batch
+from hmt_slam_ros.local_map.filter_state import FilterState
+from hmt_slam_ros.local_map.judgement import Compared, Experience, compared
+from hmt_slam_ros.local_map.local_filter import FilterStep, PlacedKeyframe, Tracked
 from hmt_slam_ros.local_map.local_mapping import LocalMapping
-from hmt_slam_ros.local_map.match_error import MatchError, match_error
+from hmt_slam_ros.local_map.match_error import match_error
 from hmt_slam_ros.local_map.matching import Prior
 from hmt_slam_ros.local_map.patches import MapView
-from hmt_slam_ros.local_map.tracking import ScanMatcher, Tracked, map_information
+from hmt_slam_ros.local_map.sighting import Sighting
+from hmt_slam_ros.local_map.tracking import ScanMatcher, map_information
 from hmt_slam_ros.random_streams import Purpose, stream
 from hmt_slam_ros.sensing import Scan
-from hmt_slam_ros.sensing.motion import NO_STEP, Prediction, Step
+from hmt_slam_ros.sensing.motion import NO_STEP, Prediction
 
 # Another particle takes the lead when it is more likely by this much, nats.
 _CLEARLY = 3.0
-
-
-@dataclass(frozen=True, eq=False)
-class PlacedKeyframe:
-    """A keyframe of the local map: its id, its area, its scan and ``map_T_base``, shape (3,)."""
-
-    keyframe: int
-    area: int
-    scan: Scan
-    pose: Float64
-
-
-@dataclass(frozen=True, eq=False)
-class FilterStep:
-    """What a filter step found.
-
-    :ivar moved: the leading particle's motion since the last step, ``start_T_end``, shape (3,).
-    :ivar error: of that motion.
-    :ivar information: of the match alone, for correlated beams, in the frame of the pose, shape (3, 3).
-    :ivar log_evidence: log p(z_t | past), relative to a place that looks alike, nats.
-    :ivar effective_samples: ESS before resampling.
-    :ivar history_changed: whether another particle leads than before, so that keyframe poses differ from those told.
-    """
-
-    moved: Float64
-    error: MatchError
-    information: Float64
-    log_evidence: float
-    effective_samples: float
-    history_changed: bool
-
-
-@dataclass(frozen=True, eq=False)
-class FilterState:
-    """M particles of one hypothesis in one area; the map frame is that of the area.
-
-    :ivar hypothesis: id of the hypothesis.
-    :ivar area: the current area.
-    :ivar poses: shape (M, 3), ``map_T_base``, m and rad.
-    :ivar log_weights: shape (M,), nats, the largest is 0.
-    :ivar keyframes: the local map's keyframes, ids.
-    :ivar keyframe_areas: their areas.
-    :ivar keyframe_poses: shape (M, K, 3), ``map_T_base`` of each under each particle.
-    :ivar tables: shape (M, T, T), of each particle's map the numbers of its patches, [row, column], -1 for one never
-        seen; the origin lies at the corner between the four middle ones.
-    :ivar priors: shape (M, 3), the poses as predicted by odometry and inertia since the last filter step.
-    :ivar last_poses: shape (M, 3), those at the last filter step.
-    :ivar since_update: the predicted motion since then.
-    :ivar leader: the particle whose pose is the filter's.
-    :ivar tracking_covariance: of the leader's motion since the last filter step, shape (3, 3), right tangent frame.
-    :ivar left_open: covariance of the leader's pose that the scans since the last filter step leave, likewise.
-    :ivar usual: what contradicted the map so far.
-    """
-
-    hypothesis: int
-    area: int
-    poses: Float64
-    log_weights: Float64
-    keyframes: tuple[int, ...]
-    keyframe_areas: tuple[int, ...]
-    keyframe_poses: Float64
-    tables: Int32
-    priors: Float64
-    last_poses: Float64
-    since_update: Step
-    leader: int
-    tracking_covariance: Float64
-    left_open: Float64
-    usual: Usual
 
 
 class AreaFilter:
@@ -112,6 +45,7 @@ class AreaFilter:
     :ivar leader: the particle whose pose is the filter's.
     :ivar tracking_covariance: of the leader's motion since the last filter step, shape (3, 3), right tangent frame.
     :ivar left_open: covariance of the leader's pose that the scans since the last filter step leave, likewise.
+    :ivar experience: of the scans so far.
     """
 
     def __init__(self, mapping: LocalMapping, hypothesis: int, area: int) -> None:
@@ -132,7 +66,7 @@ class AreaFilter:
         self._matcher = ScanMatcher(mapping)
         self.tracking_covariance = np.zeros((3, 3))
         self.left_open = NO_STEP.covariance
-        self._usual = Usual()
+        self.experience = Experience()
 
     @classmethod
     def of(cls, mapping: LocalMapping, state: FilterState) -> AreaFilter:
@@ -144,7 +78,7 @@ class AreaFilter:
         found._priors, found._last_poses = state.priors, state.last_poses
         found._since_update = state.since_update
         found.leader, found.tracking_covariance = state.leader, state.tracking_covariance
-        found.left_open, found._usual = state.left_open, state.usual
+        found.left_open, found.experience = state.left_open, state.experience
         return found
 
     @property
@@ -153,7 +87,7 @@ class AreaFilter:
         return FilterState(
             self.hypothesis, self.area, self.poses, self.log_weights, tuple(self.keyframes),
             tuple(self.keyframe_areas), self.keyframe_poses, self._tables, self._priors, self._last_poses,
-            self._since_update, self.leader, self.tracking_covariance, self.left_open, self._usual,
+            self._since_update, self.leader, self.tracking_covariance, self.left_open, self.experience,
         )  # fmt: skip
 
     @property
@@ -176,7 +110,7 @@ class AreaFilter:
         child._since_update = self._since_update
         child.leader, child.tracking_covariance = self.leader, self.tracking_covariance
         child.left_open = self.left_open
-        child._usual = self._usual
+        child.experience = self.experience
         return child
 
     def release(self) -> None:
@@ -184,11 +118,9 @@ class AreaFilter:
         for table in self._tables:
             self.mapping.pool.release(table)
 
-    def track(self, points: Float64, prediction: Prediction) -> Tracked:
-        """Move all particles by the leader's matched increment: a pose for a scan between two keyframes.
-
-        :param points: surfels of the scan, shape (n, 4), base frame.
-        """
+    def track(self, sighting: Sighting, prediction: Prediction) -> Tracked:
+        """Move all particles by the leader's matched increment: a pose for a scan between two keyframes."""
+        points = sighting.surfels
         before, view = PoseGaussian(self.pose, self.left_open), self._leading_view()
         match = self._matcher.match(points, before, prediction, view)
         self._priors = se2.compose(self._priors, match.step.increment)
@@ -206,13 +138,13 @@ class AreaFilter:
     def _leading_view(self) -> MapView:
         return self.mapping.pool.view(self._tables[self.leader])
 
-    def update(self, points: Float64, step: int) -> FilterStep:
+    def update(self, sighting: Sighting, step: int) -> FilterStep:
         """Draw every particle from its optimal proposal, weigh it, resample where ESS fell below its bound.
 
-        :param points: surfels of the keyframe's scan, shape (n, 4), base frame.
+        :param sighting: of the keyframe's scan.
         :param step: number of the keyframe event, for the random streams.
         """
-        settings = self.mapping.configuration
+        points, settings = sighting.surfels, self.mapping.configuration
         prior = map_information(self._since_update.covariance, self.pose[2])
         view, predicted = self._leading_view(), Prior(self._priors[self.leader], prior)
         still = self._matcher.still(points, predicted, self._since_update.covariance, view)
@@ -237,7 +169,6 @@ class AreaFilter:
         # The leader keeps the mode, so that the published path has no sampling noise.
         self.poses[leader] = drawn.modes[leader]
         self.poses[:, 2] = se2.wrap(self.poses[:, 2])
-        log_evidence = self._log_same(points, leader)
         error = match_error(
             still, self.poses[leader], drawn.hessians[leader], prior, self.mapping.pool.view(self._tables[leader]),
             self.mapping.alignment, self.mapping.noise,
@@ -249,26 +180,11 @@ class AreaFilter:
         if effective < settings.filter.ess_fraction * len(self.poses):
             self._resample(step)
         self._restart()
-        return FilterStep(moved, error, information, log_evidence, effective, changed)
+        return FilterStep(moved, error, information, effective, changed)
 
-    def log_same(self, points: Float64) -> float:
-        """log p(scan | this is the place) / p(scan | a place that looks alike) in the map of the leader, nats.
-
-        :param points: surfels of the scan, shape (n, 4), base frame.
-        """
-        return SCAN.log_ratio(self._agreement(points, self.leader), self._usual.share)
-
-    def _agreement(self, points: Float64, particle: int) -> Agreement:
-        view = self.mapping.pool.view(self._tables[particle])
-        near, far = self.mapping.near, 2 * self.mapping.near
-        return Agreement(len(points), *matching.agreement(points, self.poses[particle], view, near, far))
-
-    def _log_same(self, points: Float64, particle: int) -> float:
-        """The same for any particle; learns how much contradicts usually."""
-        found = self._agreement(points, particle)
-        log_ratio = SCAN.log_ratio(found, self._usual.share)
-        self._usual = self._usual.after(found, SCAN.stretch)
-        return log_ratio
+    def compared(self, sighting: Sighting) -> Compared:
+        """A scan in the map of the leader, where that has the robot."""
+        return compared(sighting.surfels, sighting.laser, self.pose, self._leading_view(), self.mapping.near)
 
     def _elected(self) -> int:
         """The particle of largest weight; where none is clearly more likely, the one that led before.

@@ -59,19 +59,6 @@ class Match(NamedTuple):
     contradicted: bool = False
 
 
-class Tracked(NamedTuple):
-    """What tracking made of a prediction.
-
-    :ivar moved: the matched motion, ``start_T_end``, shape (3,).
-    :ivar information: of the match, for correlated beams, in the frame of its end, shape (3, 3).
-    :ivar contradicted: whether there was odometry and the scan contradicts it.
-    """
-
-    moved: Float64
-    information: Float64
-    contradicted: bool
-
-
 class ScanMatcher:
     """Matches scans against one map after another, with the settings of a process."""
 

@@ -1,0 +1,146 @@
+"""What a filter of one hypothesis in its current area is to metric SLAM, whatever its map is made of."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
+
+from hmt_slam_ros.arrays import Float64
+from hmt_slam_ros.local_map.filter_state import FilterState, LineFilterState
+from hmt_slam_ros.local_map.judgement import Compared, Experience
+from hmt_slam_ros.local_map.match_error import MatchError
+from hmt_slam_ros.local_map.sighting import Sighting
+from hmt_slam_ros.sensing import Scan
+from hmt_slam_ros.sensing.motion import Prediction
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedKeyframe:
+    """A keyframe of the local map: its id, its area, its scan and ``map_T_base``, shape (3,)."""
+
+    keyframe: int
+    area: int
+    scan: Scan
+    pose: Float64
+
+
+class Tracked(NamedTuple):
+    """What tracking made of a prediction.
+
+    :ivar moved: the matched motion, ``start_T_end``, shape (3,).
+    :ivar information: of the match, for correlated beams, in the frame of its end, shape (3, 3).
+    :ivar contradicted: whether there was odometry and the scan contradicts it.
+    """
+
+    moved: Float64
+    information: Float64
+    contradicted: bool
+
+
+@dataclass(frozen=True, eq=False)
+class FilterStep:
+    """What a filter step found.
+
+    :ivar moved: the motion of what leads since the last step, ``start_T_end``, shape (3,).
+    :ivar error: of that motion.
+    :ivar information: of the match alone, for correlated beams, in the frame of the pose, shape (3, 3).
+    :ivar effective_samples: ESS before resampling.
+    :ivar history_changed: whether keyframe poses differ from those told.
+    """
+
+    moved: Float64
+    error: MatchError
+    information: Float64
+    effective_samples: float
+    history_changed: bool
+
+
+class LocalFilter(Protocol):
+    """The belief over the robot's pose and the map of what is around it; the map frame is that of the area.
+
+    :ivar hypothesis: id of the hypothesis.
+    :ivar area: the current area.
+    :ivar keyframes: the local map's keyframes, ids.
+    :ivar keyframe_areas: their areas.
+    :ivar tracking_covariance: of the motion since the last filter step, shape (3, 3), right tangent frame.
+    :ivar experience: of the scans so far.
+    """
+
+    hypothesis: int
+    area: int
+    keyframes: list[int]
+    keyframe_areas: list[int]
+    tracking_covariance: Float64
+    experience: Experience
+
+    @property
+    def state(self) -> FilterState | LineFilterState:
+        """All that the filter remembers."""
+        ...
+
+    @property
+    def pose(self) -> Float64:
+        """``map_T_base``, shape (3,)."""
+        ...
+
+    @property
+    def poses(self) -> Float64:
+        """``map_T_base`` of its samples, shape (M, 3)."""
+        ...
+
+    def leading_keyframe_poses(self) -> Float64:
+        """``map_T_base`` of the local map's keyframes, shape (K, 3)."""
+        ...
+
+    def branch(self, hypothesis: int) -> LocalFilter:
+        """A filter of the same state for a child hypothesis."""
+        ...
+
+    def release(self) -> None:
+        """Give up the map; the filter is not used any more."""
+        ...
+
+    def forget(self) -> None:
+        """The robot stands where it is, as if that were known, and is predicted from there."""
+        ...
+
+    def track(self, sighting: Sighting, prediction: Prediction) -> Tracked:
+        """A pose for a scan between two keyframes."""
+        ...
+
+    def update(self, sighting: Sighting, step: int) -> FilterStep:
+        """The filter step with a keyframe's scan, which was tracked before.
+
+        :param step: number of the keyframe event, for the random streams.
+        """
+        ...
+
+    def compared(self, sighting: Sighting) -> Compared:
+        """A scan in the map, where that has the robot."""
+        ...
+
+    def add_keyframe(self, keyframe: int, scan: Scan) -> None:
+        """Enter a scan into the map where the robot is."""
+        ...
+
+    def drop(self, keyframes: Collection[int]) -> None:
+        """Forget keyframes, but not what the map holds of them."""
+        ...
+
+    def change_area(self, area: int, area_T_previous: Float64, content: Sequence[PlacedKeyframe]) -> None:
+        """Go over to the frame of another area and load its local map.
+
+        :param area: the area now.
+        :param area_T_previous: shape (3,).
+        :param content: all keyframes of the local map, in the new frame.
+        """
+        ...
+
+    def reload(self, content: Sequence[PlacedKeyframe], anchor: int) -> None:
+        """Build the local map anew after its keyframes moved; the robot stays where it is from one of them.
+
+        :param content: all keyframes of the local map.
+        :param anchor: the keyframe by which the robot's place is known.
+        """
+        ...

@@ -1,0 +1,158 @@
+"""The filter whose local map is one of lines: as good as its odometry is not, and behind the same interface."""
+
+import numpy as np
+import pytest
+from worlds import blank_scan, box, scan_in
+
+from hmt_slam_ros.agreement import SIGHT
+from hmt_slam_ros.configuration import Configuration, with_changes
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.local_map.filters import filter_of, new_filter
+from hmt_slam_ros.local_map.line_filter import LineFilter
+from hmt_slam_ros.local_map.local_filter import PlacedKeyframe
+from hmt_slam_ros.local_map.local_mapping import LocalMapping
+from hmt_slam_ros.local_map.sighting import Sighting
+from hmt_slam_ros.sensing.motion import Prediction, Step
+
+ROOM = np.concatenate((box(-6.02, -4.03, 6.03, 7.01), box(3.51, 1.02, 4.53, 2.52), box(-4.02, 3.03, -3.52, 7.01)))
+STEP = np.array([0.1, 0.0, 0.05])
+SURE = np.diag([0.03, 0.03, 0.015]) ** 2
+INERTIA = Step(STEP, np.diag([0.1, 0.1, 0.15]) ** 2)
+CONFIGURATION = with_changes(Configuration(), {"local_map.kind": "lines"})
+
+
+@pytest.fixture(scope="module")
+def mapping():
+    return LocalMapping(CONFIGURATION)
+
+
+def predicted(increment, inertia=INERTIA):
+    odometry = Step(np.asarray(increment), SURE)
+    return Prediction(odometry, inertia, together=odometry)
+
+
+def driven(mapping, odometry_error=(0.0, 0.0, 0.0), steps=60):
+    """A filter after a drive on a circle, the true pose and the keyframes' scans."""
+    own, truth = new_filter(mapping, 0, 0), np.zeros(3)
+    scans = [scan_in(ROOM, truth, noise=0.01)]
+    own.add_keyframe(0, scans[0])
+    for k in range(1, steps):
+        truth = se2.compose(truth, STEP)
+        scan = scan_in(ROOM, truth, noise=0.01, seed=k)
+        own.track(Sighting(mapping, scan), predicted(STEP + np.asarray(odometry_error)))
+        if k % 5 == 0:
+            own.update(Sighting(mapping, scan), k // 5)
+            own.add_keyframe(k // 5, scan)
+            scans.append(scan)
+    return own, truth, scans
+
+
+def placed(own, scans, frame=(0.0, 0.0, 0.0), area=0):
+    poses = se2.compose(np.asarray(frame), own.leading_keyframe_poses())
+    return [PlacedKeyframe(k, area, scans[k], pose) for k, pose in zip(own.keyframes, poses, strict=True)]
+
+
+def test_the_parameter_chooses_the_kind(mapping):
+    assert isinstance(new_filter(mapping, 0, 0), LineFilter)
+    assert not isinstance(new_filter(LocalMapping(Configuration()), 0, 0), LineFilter)
+
+
+def test_the_robot_is_found_though_odometry_drifts_and_knows_how_well(mapping):
+    own, truth, _ = driven(mapping, odometry_error=(0.02, 0.01, 0.01))
+    error = se2.log(se2.between(own.pose, truth))
+    assert np.hypot(*error[:2]) < 0.02
+    assert abs(error[2]) < np.radians(0.3)
+    assert error @ np.linalg.solve(own.room.pose.covariance, error) < 16.0
+
+
+def test_a_step_tells_what_the_match_determines(mapping):
+    own, truth, _ = driven(mapping, steps=9)
+    scan = Sighting(mapping, scan_in(ROOM, se2.compose(truth, STEP), noise=0.01, seed=90))
+    tracked = own.track(scan, predicted(STEP))
+    assert not tracked.contradicted
+    assert np.linalg.eigvalsh(tracked.information)[0] > 1e4
+    before = own.pose
+    step = own.update(scan, 9)
+    np.testing.assert_allclose(own.pose, before)
+    np.testing.assert_allclose(step.error.gain, np.eye(3), atol=0.1)
+    assert np.sqrt(np.diag(step.error.matched)[:2]).max() < 0.01
+    assert np.linalg.eigvalsh(step.error.lasting).min() > -1e-12
+    # Without a line nothing is known but the prediction.
+    blank = Sighting(mapping, blank_scan())
+    own.track(blank, predicted(STEP))
+    step = own.update(blank, 10)
+    np.testing.assert_allclose(step.error.gain, 0.0, atol=1e-12)
+    np.testing.assert_allclose(step.error.matched, SURE, atol=1e-12)
+    assert np.sqrt(np.diag(step.error.lasting)[:2]).min() > 0.02
+
+
+@pytest.mark.parametrize("slip", [-35.0, 35.0])
+def test_a_heading_slip_is_found_by_inertia_and_told(mapping, slip):
+    own, truth, _ = driven(mapping, steps=21)
+    truth = se2.compose(truth, STEP)
+    slipped = se2.compose(STEP, (0.0, 0.0, np.radians(slip)))
+    tracked = own.track(Sighting(mapping, scan_in(ROOM, truth, noise=0.01)), predicted(slipped))
+    assert tracked.contradicted
+    error = se2.between(truth, own.pose)
+    assert np.hypot(*error[:2]) < 0.03
+    assert abs(error[2]) < np.radians(0.5)
+
+
+def test_a_change_of_area_is_one_of_the_frame_and_loads_its_lines(mapping):
+    own, truth, scans = driven(mapping, steps=31)
+    new_T_old = np.array([2.0, -1.0, 0.7])
+    own.change_area(7, new_T_old, placed(own, scans, new_T_old, 7))
+    assert (own.area, own.keyframe_areas) == (7, [7] * 7)
+    assert len(own.room) >= 6
+    truth = se2.compose(truth, STEP)
+    tracked = own.track(Sighting(mapping, scan_in(ROOM, truth, noise=0.01, seed=77)), predicted(STEP))
+    assert not tracked.contradicted
+    np.testing.assert_allclose(own.pose, se2.compose(new_T_old, truth), atol=0.02)
+
+
+def test_where_keyframes_moved_the_robot_moves_with_one_of_them(mapping):
+    own, _, scans = driven(mapping, steps=31)
+    anchor = own.leading_keyframe_poses()[4]
+    seen = se2.between(anchor, own.pose)
+    content = placed(own, scans, (0.1, 0.0, 0.02))
+    own.reload(content, 4)
+    np.testing.assert_allclose(se2.between(content[4].pose, own.pose), seen, atol=1e-9)
+
+
+def test_a_branch_goes_its_own_way_and_a_state_goes_on_to_the_bit(mapping):
+    parent, truth, _ = driven(mapping, steps=20)
+    before, child = parent.room.covariance.copy(), parent.branch(1)
+    again = filter_of(mapping, parent.state)
+    sighting = Sighting(mapping, scan_in(ROOM, se2.compose(truth, STEP), noise=0.01, seed=3))
+    child.track(sighting, predicted(STEP))
+    child.add_keyframe(99, sighting.scan)
+    np.testing.assert_array_equal(parent.room.covariance, before)
+    assert (child.hypothesis, parent.hypothesis) == (1, 0)
+    assert 99 not in parent.keyframes
+    again.track(sighting, predicted(STEP))
+    np.testing.assert_array_equal(again.room.covariance, child.room.covariance)
+    np.testing.assert_array_equal(again.pose, child.pose)
+
+
+def test_walls_are_met_where_the_robot_is_and_passed_where_it_is_not(mapping):
+    own, truth, _ = driven(mapping)
+    found = own.compared(Sighting(mapping, scan_in(ROOM, truth, noise=0.01, seed=5)))
+    assert found.ends.share > 0.7
+    assert found.ends.free == found.walls.free == 0
+    assert found.walls.on > 30
+    elsewhere = own.compared(Sighting(mapping, scan_in(box(-9.0, -9.0, 12.0, 9.0), np.zeros(3), noise=0.01)))
+    assert elsewhere.walls.free > 30
+    assert SIGHT.log_ratio(elsewhere.walls, own.experience.walls.share) < -10.0
+
+
+def test_keyframes_are_dropped_and_what_was_known_is_forgotten(mapping):
+    own, _, _ = driven(mapping, steps=21)
+    kept = own.leading_keyframe_poses()[[0, 2, 4]]
+    own.drop({1, 3})
+    assert own.keyframes == [0, 2, 4]
+    np.testing.assert_array_equal(own.leading_keyframe_poses(), kept)
+    own.forget()
+    np.testing.assert_array_equal(own.room.pose.covariance, 0.0)
+    np.testing.assert_array_equal(own.tracking_covariance, 0.0)
+    own.track(Sighting(mapping, blank_scan()), predicted(STEP))
+    np.testing.assert_allclose(own.room.pose.covariance, SURE, atol=1e-12)
