@@ -19,7 +19,7 @@ class Agreement(NamedTuple):
 
     :ivar samples: how many there are.
     :ivar on: how many are on known surfaces.
-    :ivar free: how many are in space that is known to be free.
+    :ivar free: how many contradict: they are in space that is known to be free, or behind a wall that is known.
     """
 
     samples: int
@@ -68,6 +68,14 @@ KNOWN = Contradiction(extra=0.03, strength=500.0, stretch=10.0)
 SCAN = Contradiction(extra=0.03, strength=500.0, stretch=20.0)
 """The beams of one scan in the map of what the robot saw around: the scans before and after see the same."""
 
+SIGHT = Contradiction(extra=0.1, strength=500.0, stretch=5.0)
+"""The known walls that the beams of one scan end on or pass, one sample every 0.2 m, seen from there or from anywhere
+else."""
+
+WALLS = Contradiction(extra=0.01, strength=500.0, stretch=20.0)
+"""The same of two maps, the walls of each and the scans of the other, where the surfaces fit: most scans of a map see
+the same walls, and where another place fits, hardly a wall is not where it should be."""
+
 
 class Usual(NamedTuple):
     """What contradicted so far where a hypothesis has the robot: some buildings are full of clutter.
@@ -75,7 +83,7 @@ class Usual(NamedTuple):
     One that is wrong learns from its own contradictions too, but a few scans weigh little against all before.
 
     :ivar on: stretches on known surfaces.
-    :ivar free: stretches in space that is known to be free.
+    :ivar free: stretches that contradicted.
     """
 
     on: float = 100.0
@@ -90,6 +98,23 @@ class Usual(NamedTuple):
         """With one more scan counted."""
         return Usual(self.on + found.on / stretch, self.free + found.free / stretch)
 
+
+class Clutter(NamedTuple):
+    """What speaks against the place in which a hypothesis has the robot, usually.
+
+    :ivar ends: share of the beams that contradict its map.
+    :ivar walls: share of the known walls that they pass.
+    """
+
+    ends: float = 0.0
+    walls: float = 0.0
+
+
+NO_CLUTTER = Clutter()
+
+
+WALLS_USUAL = 0.001
+"""Share of the walls that are passed in another map of the same place, at least."""
 
 MAPS_USUAL = Usual().share
 """Share of a map's surfaces that contradict another map of the same place: as a run begins, since maps are compared too

@@ -5,12 +5,14 @@ import pytest
 from test_process_tsbi_branching import OTHER, PATH, ROOM
 from worlds import box, scan_in
 
+from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.topology.area_grid import GridModel
 from hmt_slam_ros.topology.area_matching import MatchSettings
 from hmt_slam_ros.topology.hybrid_map import HybridMap
 from hmt_slam_ros.topology.surroundings import Nearness, Views
+from hmt_slam_ros.topology.walls import Walls
 from hmt_slam_ros.topology.whole_map import WholeMap, regions
 
 REACH = 6.0
@@ -34,11 +36,16 @@ def asked():
     return hybrid_map, poses, scans
 
 
+def whole_map(scans):
+    views = Views(scans, GridModel(), Nearness(0.3, REACH))
+    return WholeMap(views, Walls(scans, Configuration()), MatchSettings(temper=0.3), 2.0, REACH)
+
+
 @pytest.fixture
 def laid(asked):
     """Lays the keyframes of ``asked`` into areas of the map."""
     hybrid_map, poses, scans = asked
-    whole = WholeMap(Views(scans, GridModel(), Nearness(0.3, REACH)), MatchSettings(temper=0.3), 2.0, REACH)
+    whole = whole_map(scans)
     return lambda areas: whole.fits(hybrid_map, poses, 1000, dict.fromkeys(areas, 1.0 / len(areas)))
 
 
@@ -56,7 +63,7 @@ def test_a_room_is_recognised_from_anywhere_in_it(laid):
 
 def test_what_came_after_is_no_part_of_the_map(asked):
     hybrid_map, poses, scans = asked
-    whole = WholeMap(Views(scans, GridModel(), Nearness(0.3, REACH)), MatchSettings(temper=0.3), 2.0, REACH)
+    whole = whole_map(scans)
     assert whole.fits(hybrid_map, poses, 0, {0: 1.0}) == []
     for keyframe, pose in poses.items():
         hybrid_map.place(keyframe, 2, pose)
@@ -84,6 +91,19 @@ def test_all_areas_are_looked_at_however_many_there_are(asked, laid):
             scans[keyframe] = seen(OTHER, pose, keyframe)
             hybrid_map.place(keyframe, area, se2.between(PATH[0], pose))
     assert max(laid(range(24)), key=lambda fit: fit.mode.log_mass).area == 0
+
+
+def test_walls_tell_where_keyframes_lie(asked, laid):
+    """As they were found, no wall is seen through; half a metre aside, the robot would see through some."""
+    hybrid_map, poses, scans = asked
+    best = max(laid([0]), key=lambda fit: fit.mode.log_mass)
+    found = whole_map(scans).walls(hybrid_map, best, poses, 1000)
+    assert found.on > 100
+    assert found.free == 0
+    aside = PoseGaussian(best.mode.pose.mean + np.array([0.5, 0.5, 0.0]), best.mode.pose.covariance)
+    moved = best._replace(mode=best.mode._replace(pose=aside))
+    assert whole_map(scans).walls(hybrid_map, moved, poses, 1000).free > 20
+    assert whole_map(scans).walls(hybrid_map, best, poses, 0).samples == 0
 
 
 def test_none_but_the_areas_asked_for_are_looked_at(laid):

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hmt_slam_ros.agreement import KNOWN, MAPS, MAPS_USUAL
+from hmt_slam_ros.agreement import KNOWN, MAPS, MAPS_USUAL, Clutter
 from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
@@ -25,6 +25,7 @@ from hmt_slam_ros.topology.likeness import Elsewhere, Likeness, best_shares
 from hmt_slam_ros.topology.located import reach_of
 from hmt_slam_ros.topology.surroundings import WHOLE_MAP, Nearness, Views, gap, positions, stacked
 from hmt_slam_ros.topology.transition import Entry, Place, Transition, entry, owner_at, transition
+from hmt_slam_ros.topology.walls import Walls
 from hmt_slam_ros.topology.whereabouts import Told, Whereabouts, whereabouts
 from hmt_slam_ros.topology.whole_map import WholeMap
 
@@ -94,7 +95,9 @@ class ClosureSearch:
         self._likeness = Likeness(options.alike_probability)
         self._looks = Looks(scans)
         self._wide_views = Views(scans, self._model, self.nearness, WHOLE_MAP)
-        self._whole_map = WholeMap(self._wide_views, self._settings, options.place_radius, options.local_reach)
+        self._whole_map = WholeMap(
+            self._wide_views, Walls(scans, configuration), self._settings, options.place_radius, options.local_reach
+        )
         self._counted = -1
         self._ahead: list[tuple[int, Collection[int]]] = []
 
@@ -218,18 +221,19 @@ class ClosureSearch:
                 return
 
     def everywhere(
-        self, hybrid_map: HybridMap, poses: Mapping[int, Pose], before: int, told: Told | None = None
+        self, hybrid_map: HybridMap, poses: Mapping[int, Pose], before: int, clutter: Clutter, told: Told | None = None
     ) -> Whereabouts:
         """Where in the map keyframes lie of which the arcs tell nothing.
 
         :param poses: {keyframe: ``reference_T_base``}.
         :param before: the map is that of the keyframes before this one.
+        :param clutter: what contradicts the robot's map usually.
         :param told: where the reference is, if somebody says so.
         """
         alike, radius = self._options.alike_probability, self._options.place_radius
         known = {area: [k for k in hybrid_map.keyframes(area) if k < before] for area in hybrid_map.area_ids()}
         shares = self._looks.shares(list(poses), {area: own for area, own in known.items() if own})
-        return whereabouts(self._whole_map, shares, alike, hybrid_map, poses, before, told, radius)
+        return whereabouts(self._whole_map, shares, alike, hybrid_map, poses, before, clutter, told, radius)
 
     def found(self) -> None:
         """It is known where the robot is: what served to look for it everywhere is needed no more."""

@@ -28,7 +28,7 @@ _MATTER = 0.2
 
 
 @dataclass(frozen=True, eq=False)
-class Sighting:
+class Spot:
     """Where in the map a robot that may be anywhere seems to be.
 
     :ivar area: a known area.
@@ -73,17 +73,17 @@ class LeafNotes:
     doubts: Mapping[int, float] = field(default_factory=dict)
     lost: int | None = None
     told: Told | None = None
-    sighted: Sighting | None = None
-    claim: Sighting | None = None
+    sighted: Spot | None = None
+    claim: Spot | None = None
     credit: float | None = 0.0
 
-    def heard(self, event: int, log_evidence: float) -> LeafNotes:
-        """After the scan of a keyframe event; one that was displaced before it would see a place that looks alike.
+    def heard(self, event: int, doubt: float) -> LeafNotes:
+        """After the scan of a keyframe event.
 
-        :param log_evidence: log p(scan | the robot is there) / p(scan | it is in a place that looks alike), nats, by
-            the map of what is around.
+        :param doubt: log p(scan | the robot was displaced before it) / p(scan | the robot is there), nats, by the map
+            of what is around.
         """
-        told = -log_evidence - _LASTING
+        told = doubt - _LASTING
         doubts = {k: nats for k, nats in self.doubts.items() if k > event - _KEPT}
         if doubts or told > 0.0:
             doubts[event] = told

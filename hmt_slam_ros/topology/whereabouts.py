@@ -8,14 +8,14 @@ all headings. Every scan counts once, since at every look the probability is wor
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hmt_slam_ros.agreement import MAPS, MAPS_USUAL
+from hmt_slam_ros.agreement import MAPS, MAPS_USUAL, WALLS, WALLS_USUAL, Clutter
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.topology.hybrid_map import HybridMap
@@ -31,6 +31,10 @@ UNMAPPED = 0.2
 # Weight of what surfaces say for one area rather than another. A place where less of what the robot sees is known may
 # have holes in its map, which come in lumps, and not sample by sample.
 _BETWEEN = 0.5
+# Probability from which on the walls of a place are looked at.
+_PROBABLE = 0.05
+# Walls are passed as often as this in a map of long before, relative to one of just before: people stood elsewhere.
+_LONG_AGO = 2.0
 # Deviations of what somebody says, beyond which no place is looked at.
 _DEVIATIONS = 4.0
 
@@ -83,20 +87,22 @@ def whereabouts(
     hybrid_map: HybridMap,
     poses: Mapping[int, Pose],
     before: int,
+    clutter: Clutter,
     told: Told | None = None,
     radius: float = 0.0,
 ) -> Whereabouts:
     """Where some keyframes are.
 
     How rare a fit is shows in the other areas, in which the same was tried. Whether they are in the map at all is asked
-    of the best fit; between those that remain, the surfaces that are known at one and not at the other count too. Where
-    somebody says where they are, the prior is not flat, but as wide as that is uncertain, and areas farther off are not
-    looked at.
+    of the best fit; between those that remain, the surfaces that are known at one and not at the other count too, and
+    where these make a place probable, the walls that either side sees through. Where somebody says where they are, the
+    prior is not flat, but as wide as that is uncertain, and areas farther off are not looked at.
 
     :param shares: {area: probability by its look} of all known areas.
     :param alike: probability that keyframes fit into an area where they do not lie, before any was tried.
     :param poses: {keyframe: ``reference_T_base`` (3,)}.
     :param before: the map is that of the keyframes before this one.
+    :param clutter: what contradicts the robot's map usually, where that is more than of maps.
     :param told: of the reference.
     :param radius: farthest distance to a keyframe of an area's place, m.
     """
@@ -109,17 +115,28 @@ def whereabouts(
     most = max(whole.values(), default=0.0)
     log_flat = math.log((1.0 - UNMAPPED) / max(1, len(areas)))
     best = {area: max((fit.found.share for fit in found if fit.area == area), default=0.0) for area in areas}
+    usual = max(MAPS_USUAL, clutter.ends)
     likeness = Likeness(alike)
     likeness.count(sorted(best.values())[:-1])
     logs = [
         (log_flat if told is None or near is None else _log_prior(told, near[fit.area], fit))
         + fit.mode.log_mass - whole[fit.area] + _BETWEEN * (whole[fit.area] - most)
-        + MAPS.log_ratio(fit.found, MAPS_USUAL)
+        + MAPS.log_ratio(fit.found, usual)
         + likeness.log_rarity(fit.found.share, foretold=False)
         for fit in found
     ]  # fmt: skip
+    first = _probabilities(logs)
+    passed = max(WALLS_USUAL, _LONG_AGO * clutter.walls)
+    for n in np.flatnonzero(first >= _PROBABLE):
+        # That none is passed says no more than the surfaces, which count already.
+        logs[n] += min(0.0, WALLS.log_ratio(whole_map.walls(hybrid_map, found[n], poses, before), passed))
+    return Whereabouts(tuple(found), _probabilities(logs))
+
+
+def _probabilities(logs: Sequence[float]) -> NDArray[np.float64]:
+    """Of fits with some log-weights, beside that the map does not reach there, shape (len(logs),)."""
     weights = np.exp(np.array([*logs, math.log(UNMAPPED)]))
-    return Whereabouts(tuple(found), (weights / weights.sum())[:-1])
+    return (weights / weights.sum())[:-1]
 
 
 def _near(hybrid_map: HybridMap, told: Told, radius: float, before: int) -> dict[int, PoseGaussian]:

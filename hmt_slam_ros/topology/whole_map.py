@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from hmt_slam_ros.agreement import Agreement
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.topology.area_ground import ground_around
@@ -22,6 +23,7 @@ from hmt_slam_ros.topology.hybrid_map import HybridMap
 from hmt_slam_ros.topology.located import Located, reach_of
 from hmt_slam_ros.topology.surroundings import Nearness, Views, areas_around, gap, positions, stacked
 from hmt_slam_ros.topology.transition import Place, owner_at
+from hmt_slam_ros.topology.walls import Walls
 
 Pose = NDArray[np.float64]
 
@@ -61,8 +63,8 @@ class WholeMap:
     :param reach: as far as that from an area's keyframes, m, others are part of what is seen there.
     """
 
-    def __init__(self, views: Views, settings: MatchSettings, radius: float, reach: float) -> None:
-        self._views, self._settings, self._radius, self._reach = views, settings, radius, reach
+    def __init__(self, views: Views, walls: Walls, settings: MatchSettings, radius: float, reach: float) -> None:
+        self._views, self._walls, self._settings, self._radius, self._reach = views, walls, settings, radius, reach
 
     def fits(
         self, hybrid_map: HybridMap, poses: Mapping[int, Pose], before: float, shares: Mapping[int, float]
@@ -83,6 +85,20 @@ class WholeMap:
             here = self._fits(place, poses, own, max(_HALF, (best - _WORSE) * _SURE))
             found += [fit._replace(mode=_seen_from(fit.mode, part.poses[fit.area])) for fit in here]
         return found
+
+    def walls(self, hybrid_map: HybridMap, located: Located, poses: Mapping[int, Pose], before: float) -> Agreement:
+        """Walls of the map and of the keyframes that beams of the other end on or pass, if these lie there.
+
+        :param poses: {keyframe: ``reference_T_base``}.
+        :param before: the map is that of the keyframes before this one.
+        """
+        known = {
+            keyframe: se2.compose(belief.mean, pose)
+            for area, belief in areas_around(hybrid_map, located.area, Nearness(_WIDE, 2.0 * self._reach)).items()
+            for keyframe, pose in hybrid_map.keyframes(area).items()
+            if keyframe < before
+        }
+        return self._walls.between(known, {k: se2.compose(located.mode.pose.mean, pose) for k, pose in poses.items()})
 
     def forget(self) -> None:
         """Forget the maps of the regions, which take as much memory as a large building's local maps."""
