@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import worlds
 
+from hmt_slam_ros.agreement import Clutter
 from hmt_slam_ros.configuration import Configuration, with_changes
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
@@ -41,7 +42,9 @@ class Play:
             replica = self.process._replica
             places = [(h, area, np.zeros(3)) for h, area in replica.areas.items()]
             leaves = [self._with_first_keyframe(leaf, replica) for leaf in leaves]
-        estimates = tuple(LeafEstimate(h, area, belief(pose), True, 0.0, 12.0) for h, area, pose in places)
+        estimates = tuple(
+            LeafEstimate(h, area, belief(pose), True, 0.0, 0.0, Clutter(), 12.0) for h, area, pose in places
+        )
         travelled = 0.5 * self.k if travelled is None else travelled
         assert self.process.handle(Keyframe(self.k, worlds.scan_at(WORLD, world), travelled, estimates)) == []
         said = self.process.handle(Hypotheses(self.k, tuple(leaves) or (Leaf(0, 0, 1.0, 0),)))

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from worlds import box, scan_in
 
+from hmt_slam_ros.agreement import Clutter
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
@@ -69,7 +70,7 @@ class Run:
         leaves = tuple(
             LeafEstimate(
                 h, self.replica.areas[h], PoseGaussian(self.poses[h], self.covariances[h]), self.stored,
-                self.evidence.get(h, 0.0), 12.0,
+                self.evidence.get(h, 0.0), -self.evidence.get(h, 0.0), Clutter(), 12.0,
             )
             for h in sorted(self.poses)
         )  # fmt: skip

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import worlds
 
+from hmt_slam_ros.agreement import Clutter
 from hmt_slam_ros.configuration import Configuration, with_changes
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
@@ -34,7 +35,7 @@ def exact(pose):
 
 
 def estimate(hypothesis, area, pose, stored=True):
-    return LeafEstimate(hypothesis, area, exact(pose), stored, 0.0, 12.0)
+    return LeafEstimate(hypothesis, area, exact(pose), stored, 0.0, 0.0, Clutter(), 12.0)
 
 
 def keyframe(k, world_pose, *leaves):

@@ -12,8 +12,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from hmt_slam_ros.agreement import Clutter
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.plain_data import is_record, names_in
 from hmt_slam_ros.processes.documents import (
     BeginRequest,
     BegunPart,
@@ -68,9 +70,9 @@ def values(kind, name=""):
         return st.lists(values(arguments[0]), max_size=3).map(tuple)
     if origin in (Union, types.UnionType):
         return st.none() | values(arguments[0])
-    if is_dataclass(kind):
+    if is_record(kind):
         hints = get_type_hints(kind)
-        return st.builds(kind, **{entry.name: values(hints[entry.name], entry.name) for entry in fields(kind)})
+        return st.builds(kind, **{name: values(hints[name], name) for name in names_in(kind)})
     return {bool: st.booleans(), int: st.integers(-(2**63), 2**63 - 1), float: NUMBERS, str: st.text()}[kind]
 
 
@@ -112,7 +114,8 @@ def test_numpy_scalars_in_a_message_become_plain_numbers():
 def test_a_keyframe_is_whole_again_with_its_ranges():
     ranges = np.array([1.0, np.nan, np.inf, 0.1], dtype=np.float32)
     scan = Scan(5, ranges, -1.1, 0.1, 0.05, 30.0, np.array([0.1, 0.2, 0.3]), 1e-5)
-    leaf = LeafEstimate(3, 4, PoseGaussian(np.array([1.0, 2.0, 0.1]), np.eye(3)), True, -0.3, 11.5)
+    pose = PoseGaussian(np.array([1.0, 2.0, 0.1]), np.eye(3))
+    leaf = LeafEstimate(3, 4, pose, True, -0.3, 0.2, Clutter(0.01, 0.002), 11.5)
     keyframe = Keyframe(2, scan, 1.25, (leaf,))
     assert_same(decode(encode(KeyframeHead.of(keyframe)), KeyframeHead).with_ranges(ranges), keyframe)
 

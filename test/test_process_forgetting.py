@@ -78,7 +78,7 @@ def test_what_is_forgotten_was_stored_before_and_is_gone_in_every_process(rounds
         assert replica.scans.keys() == state.slam.replica.scans.keys()
     assert not gone & rounds.placed
     for live in state.slam.live.values():
-        assert not gone & {*live.filter.keyframes, *live.placed.by_keyframe(), *live.fresh.by_keyframe(), live.anchor}
+        assert not gone & {*live.grid.keyframes, *live.placed.by_keyframe(), *live.fresh.by_keyframe(), live.anchor}
     assert not gone & {keyframe for graph in state.aam.graphs for keyframe in graph.keyframes}
 
 

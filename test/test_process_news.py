@@ -8,7 +8,7 @@ from worlds import box, scan_in
 
 from benchmark.changes import OneDrive
 from hmt_slam_ros.configuration import Configuration
-from hmt_slam_ros.local_map.area_filter import PlacedKeyframe
+from hmt_slam_ros.local_map.local_filter import PlacedKeyframe
 from hmt_slam_ros.offline.runtime import Run
 from hmt_slam_ros.offline.saved_map import MapWriter, read_run_state
 from hmt_slam_ros.processes.documents import KeyframeHead, encode

@@ -7,8 +7,10 @@ from worlds import drive, scan_in
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.local_map.area_filter import AreaFilter, PlacedKeyframe
+from hmt_slam_ros.local_map.area_filter import AreaFilter
+from hmt_slam_ros.local_map.local_filter import PlacedKeyframe
 from hmt_slam_ros.local_map.local_mapping import LocalMapping
+from hmt_slam_ros.local_map.sighting import Sighting
 from hmt_slam_ros.processes.live_hypothesis import LiveHypothesis
 from hmt_slam_ros.processes.map_parts import Relabelled
 from hmt_slam_ros.processes.messages import Leaf
@@ -35,10 +37,10 @@ class Drive:
         step = Step(se2.between(self.truth, pose), ODOMETRY)
         sequence, self.truth = len(self.scans), pose
         scan = self.scans[sequence] = scan_in(CORRIDOR, pose, noise=0.01, seed=sequence)
-        points = self.mapping.matching_points(scan)
+        sighting = Sighting(self.mapping, scan)
         if sequence:
-            self.live.filter.track(points, Prediction(step, step, step))
-        return self.live.event(sequence, scan, points, arriving=sequence == 0)
+            self.live.filter.track(sighting, Prediction(step, step, step))
+        return self.live.event(sequence, sighting, arriving=sequence == 0)
 
     def along(self, poses):
         return [self.to(pose) for pose in poses]

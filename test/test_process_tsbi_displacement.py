@@ -9,9 +9,10 @@ from test_process_tsbi_branching import OTHER, PATH, ROOM, rooms_apart
 from worlds import box, scan_in
 
 from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.processes import tsbi_awakening
 from hmt_slam_ros.processes.tsbi_awakening import UNKNOWN
 from hmt_slam_ros.processes.tsbi_displacement import displaced_or_not, with_displaced
-from hmt_slam_ros.topology.hypothesis_tree import LeafNotes
+from hmt_slam_ros.topology.hypothesis_tree import LeafNotes, Spot
 from hmt_slam_ros.topology.unknown import tells_nothing
 
 FAR, HERE = (30.0, 20.0), (0.0, 0.0)
@@ -21,13 +22,13 @@ PRIOR = math.log(1e-5)
 HALL = np.concatenate((box(-3.0, 0.5, 9.0, 4.5), box(4.0, 3.0, 5.0, 4.0)))
 
 
-def asked(rooms, doubts, offset=FAR):
-    """What comes of doubts in the last room, {keyframe of it: nats}, from which the arcs have all others far away.
+def asked(rooms, doubts, first=FAR, hall=2):
+    """What comes of doubts in the last room, {keyframe of it: nats}; arcs have the others far off but the first.
 
-    The robot was carried there from a hall, in which it stored two keyframes.
+    The robot was carried there from a hall, in which it stored ``hall`` keyframes.
     """
-    parent, branching, newest = rooms_apart(rooms, [offset] * (len(rooms) - 1), 0.1)
-    for k, keyframe in enumerate(newest[:2]):
+    parent, branching, newest = rooms_apart(rooms, [first, *[FAR] * (len(rooms) - 2)], 0.1)
+    for k, keyframe in enumerate(newest[:hall]):
         branching._replica.scans[keyframe] = scan_in(
             HALL, PATH[k], noise=0.01, seed=keyframe, field_of_view=2 * np.pi, beams=361
         )
@@ -59,6 +60,16 @@ def test_that_the_place_is_known_elsewhere_speaks_for_it_and_one_look_has_found_
     np.testing.assert_allclose(lost.notes.sighted.pose, se2.between(PATH[0], PATH[5]), atol=0.05)
 
 
+def test_it_is_believed_to_be_where_two_looks_find_it():
+    parent, branching, newest = rooms_apart((ROOM, OTHER, ROOM), [FAR, FAR], 0.1)
+    notes = replace(parent.notes, lost=newest[0], claim=Spot(2, newest[0], np.zeros(3)), credit=None)
+    (still,) = tsbi_awakening.looked_for(branching, replace(parent, notes=notes)).children
+    assert still.notes.sighted.area == 0
+    _, found = tsbi_awakening.looked_for(branching, replace(parent, notes=still.notes)).children
+    assert (found.notes.lost, found.notes.claim) == (None, None)
+    assert (found.arcs[0].source, found.arcs[0].target) == (2, 0)
+
+
 def test_on_ground_that_nobody_knows_the_doubts_alone_speak_for_it():
     _, lost = asked((OTHER, OTHER, ROOM), {2: 8.0}).children
     assert lost.log_weight == pytest.approx(PRIOR + 8.0 + math.log(UNKNOWN), abs=0.5)
@@ -66,7 +77,7 @@ def test_on_ground_that_nobody_knows_the_doubts_alone_speak_for_it():
 
 
 def test_that_the_place_is_known_where_the_robot_would_be_anyway_speaks_against_it():
-    _, lost = asked((ROOM, OTHER, ROOM), {2: 8.0}, HERE).children
+    _, lost = asked((ROOM, OTHER, ROOM), {2: 8.0}, HERE, hall=0).children
     assert lost.log_weight < PRIOR + 8.0 - 2.0
 
 
@@ -94,7 +105,7 @@ def test_where_nothing_is_stored_it_is_lost_from_the_next_keyframe_on_if_that_is
 
 
 def test_scans_that_contradict_add_up_and_are_remembered_in_the_next_area():
-    notes = LeafNotes().heard(5, 0.3).heard(6, -8.0).heard(7, -5.0).heard(8, -1.2)
+    notes = LeafNotes().heard(5, -0.3).heard(6, 8.0).heard(7, 5.0).heard(8, 1.2)
     odds, since = notes.displaced
     assert since == 6
     assert odds == pytest.approx(PRIOR + 7.0 + 4.0 + 0.2)
@@ -104,17 +115,17 @@ def test_scans_that_contradict_add_up_and_are_remembered_in_the_next_area():
 def test_what_contradicts_at_every_keyframe_is_clutter():
     notes = LeafNotes()
     for event in range(20):
-        notes = notes.heard(event, -0.9)
+        notes = notes.heard(event, 0.9)
     assert not notes.doubts
     assert notes.displaced == (-math.inf, 0)
 
 
 def test_a_doubt_passes_with_scans_that_fit():
-    notes = LeafNotes().heard(5, -4.0)
+    notes = LeafNotes().heard(5, 4.0)
     for event in range(6, 9):
-        notes = notes.heard(event, 0.3)
+        notes = notes.heard(event, -0.3)
     assert not notes.doubts
 
 
 def test_what_contradicted_a_little_before_is_another_matter():
-    assert LeafNotes().heard(5, -2.0).heard(6, -9.0).heard(7, -6.0).displaced[1] == 6
+    assert LeafNotes().heard(5, 2.0).heard(6, 9.0).heard(7, 6.0).displaced[1] == 6

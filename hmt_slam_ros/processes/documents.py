@@ -182,7 +182,7 @@ class BegunPart:
 
 # Raise a document's version with every change of its dataclass: a receiver refuses any other.
 _DOCUMENTS: dict[type, tuple[str, int]] = {
-    KeyframeHead: ("keyframe", 7),
+    KeyframeHead: ("keyframe", 9),
     AreaEvents: ("area_events", 3),
     Hypotheses: ("hypotheses", 8),
     Accepted: ("accepted", 4),

@@ -4,19 +4,23 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hmt_slam_ros.arrays import Int32, Int64
+from hmt_slam_ros.arrays import Int64
 from hmt_slam_ros.configuration.metric import Filter
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.local_map.area_filter import AreaFilter, FilterState, FilterStep, PlacedKeyframe
+from hmt_slam_ros.local_map.filter_state import FilterState, LineFilterState
+from hmt_slam_ros.local_map.filters import filter_of
+from hmt_slam_ros.local_map.judgement import NOTHING_SAID, Judgement
+from hmt_slam_ros.local_map.local_filter import FilterStep, LocalFilter, PlacedKeyframe
 from hmt_slam_ros.local_map.local_mapping import LocalMapping
 from hmt_slam_ros.local_map.match_error import MatchError
+from hmt_slam_ros.local_map.sighting import Sighting
 from hmt_slam_ros.processes.map_parts import Merged, Relabelled
 from hmt_slam_ros.processes.messages import Leaf, LeafEstimate, Trail
 from hmt_slam_ros.processes.news import Look, looked
@@ -25,8 +29,8 @@ from hmt_slam_ros.topology.crowding import Successor, in_place, successor
 
 _FIRST_COVARIANCE = np.diag([1e-8, 1e-8, 1e-8])
 _STAY = PoseGaussian.exactly(np.zeros(3))
-# Evidence of a scan, nats, below which it contradicts what the robot should see: most who drive never meet one.
-_CONTRADICTING = -4.0
+# Doubt of a scan, nats, above which it contradicts what the robot should see: most who drive never meet one.
+_CONTRADICTING = 4.0
 _NO_ERROR = MatchError(_FIRST_COVARIANCE, _FIRST_COVARIANCE, np.zeros((3, 3)))
 
 
@@ -56,7 +60,8 @@ class KeyframeCovariances:
 class LiveState:
     """One live hypothesis inside metric SLAM.
 
-    :ivar filter: its particles.
+    :ivar grid: its particles, where its local map is a grid.
+    :ivar lines: its filter, where its local map is one of lines.
     :ivar event_pose: ``area_T_base`` at the last keyframe event, shape (3,), m and rad.
     :ivar moved: the motion between the last two keyframe events, as matched, shape (3,).
     :ivar information: of the last keyframe event's match alone, in the frame of its pose, shape (3, 3).
@@ -70,7 +75,8 @@ class LiveState:
     :ivar looks: the scans that the next keyframe's is compared with, in mode lifelong.
     """
 
-    filter: FilterState
+    grid: FilterState | None
+    lines: LineFilterState | None
     event_pose: NDArray[np.float64]
     moved: NDArray[np.float64]
     information: NDArray[np.float64]
@@ -103,7 +109,7 @@ class LiveHypothesis:
     :ivar looks: the scans that the next keyframe's is compared with, in mode lifelong.
     """
 
-    filter: AreaFilter
+    filter: LocalFilter
     settings: Filter
     event_pose: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
     moved: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
@@ -120,19 +126,20 @@ class LiveHypothesis:
     @classmethod
     def of(cls, mapping: LocalMapping, state: LiveState) -> LiveHypothesis:
         """The hypothesis of a state, whose patches are in the pool."""
+        own = state.grid or state.lines
+        assert own is not None
         return cls(
-            AreaFilter.of(mapping, state.filter), mapping.configuration.filter, state.event_pose, state.moved,
+            filter_of(mapping, own), mapping.configuration.filter, state.event_pose, state.moved,
             state.information, state.error, state.anchor, state.fresh.by_keyframe(), state.placed.by_keyframe(),
             state.drift, list(state.trail), state.contradicted, state.looks,
         )  # fmt: skip
 
-    def state(self, tables: Int32) -> LiveState:
-        """All that is remembered.
-
-        :param tables: of the filter, shape (M, T, T), by the numbers that patches have in the state.
-        """
+    def state(self) -> LiveState:
+        """All that is remembered; tables of grids name patches by their numbers in the pool."""
+        own = self.filter.state
         return LiveState(
-            replace(self.filter.state, tables=tables), self.event_pose, self.moved, self.information, self.error,
+            own if isinstance(own, FilterState) else None, None if isinstance(own, FilterState) else own,
+            self.event_pose, self.moved, self.information, self.error,
             self.anchor, KeyframeCovariances.of(self.fresh), KeyframeCovariances.of(self.placed), self.drift,
             tuple(self.trail), self.contradicted, self.looks,
         )  # fmt: skip
@@ -155,42 +162,45 @@ class LiveHypothesis:
             self.looks,
         )
 
-    def event_due(self, points: NDArray[np.float64]) -> bool:
+    def event_due(self, sighting: Sighting) -> bool:
         """Whether the robot moved or turned far enough since the last keyframe event, or may have been displaced.
 
-        :param points: surfels of the newest scan, shape (n, 4), base frame. Where it is the first that contradicts what
-            the robot should see, it is where the robot is now.
+        :param sighting: the newest one. Where it is the first that contradicts what the robot should see, it is where
+            the robot is now.
         """
         moved = se2.between(self.event_pose, self.filter.pose)
         far = math.hypot(moved[0], moved[1]) >= self.settings.keyframe_distance
         if far or abs(moved[2]) >= math.radians(self.settings.keyframe_angle):
             return True
-        return not self.contradicted and self.filter.log_same(points) < _CONTRADICTING
+        if self.contradicted:
+            return False
+        return self.filter.experience.judge(self.filter.compared(sighting)).doubt > _CONTRADICTING
 
     def event(
-        self, sequence: int, scan: Scan, points: NDArray[np.float64], *, arriving: bool = False, storing: bool = True,
+        self, sequence: int, sighting: Sighting, *, arriving: bool = False, storing: bool = True,
         wanted: Callable[[], bool] | None = None,
     ) -> LeafEstimate:
         """One filter step with a keyframe's scan, which enters the map where it adds something new.
 
         :param sequence: number of the keyframe event.
-        :param points: surfels of the scan, to be matched, shape (n, 4), base frame.
+        :param sighting: of the scan.
         :param arriving: whether nothing tells how the robot came there: the scan is matched with nothing.
         :param storing: whether the hypothesis's map may change.
         :param wanted: asked after the filter step whether the scan adds something; a new place does if None.
         """  # fmt: skip
         if arriving:
             unmoved, nothing = np.zeros(3), np.zeros((3, 3))
-            step = FilterStep(unmoved, _NO_ERROR, nothing, 0.0, float(len(self.filter.poses)), False)
+            step = FilterStep(unmoved, _NO_ERROR, nothing, float(len(self.filter.poses)), False)
         else:
-            step = self.filter.update(points, sequence)
+            step = self.filter.update(sighting, sequence)
+        judgement = NOTHING_SAID if arriving else self._judge(sighting)
         self.looks = () if arriving else self.looks
-        self.error, self.contradicted = step.error, step.log_evidence < _CONTRADICTING
+        self.error, self.contradicted = step.error, judgement.doubt > _CONTRADICTING
         # Of a displaced robot it is the first of where it is now.
         stored = arriving or (storing and ((wanted or self.is_new)() or self.contradicted))
         self._drift_on(sequence if stored else None)
         if stored:
-            self.filter.add_keyframe(sequence, scan)
+            self.filter.add_keyframe(sequence, sighting.scan)
         self.moved, self.information = step.moved, step.information
         self.event_pose = self.filter.pose
         self._relate()
@@ -199,10 +209,19 @@ class LiveHypothesis:
             self.filter.area,
             PoseGaussian(self.filter.pose, self.drift),
             stored,
-            step.log_evidence,
+            judgement.log_evidence,
+            judgement.doubt,
+            self.filter.experience.clutter,
             step.effective_samples,
             self._revised(sequence) if step.history_changed and storing else (),
         )
+
+    def _judge(self, sighting: Sighting) -> Judgement:
+        """What the scan says of whether the robot is where the filter has it; learns from it what is usual."""
+        found = self.filter.compared(sighting)
+        judgement = self.filter.experience.judge(found)
+        self.filter.experience = self.filter.experience.after(found)
+        return judgement
 
     def note_look(self, scan: Scan) -> None:
         """Compare what follows with a scan that was taken where the filter is."""

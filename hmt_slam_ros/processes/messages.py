@@ -14,6 +14,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from hmt_slam_ros.agreement import Clutter
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.processes.map_parts import (
@@ -42,6 +43,8 @@ class LeafEstimate:
     :ivar stored: whether the keyframe enters this hypothesis's map; False where it would add nothing new.
     :ivar log_evidence: log-likelihood of the keyframe's scan where it is in the place that this hypothesis has it in,
         relative to a place that looks alike; nats, not accumulated over keyframes.
+    :ivar doubt: by how much likelier the scan is where the robot was displaced before it, nats, likewise.
+    :ivar clutter: what contradicts the hypothesis's map usually.
     :ivar effective_samples: ESS of the hypothesis's particles, in [1, number of particles].
     :ivar revised: earlier keyframes of the area whose pose changed because another particle leads now; ``source`` and
         ``area`` are equal.
@@ -52,6 +55,8 @@ class LeafEstimate:
     pose: PoseGaussian
     stored: bool
     log_evidence: float
+    doubt: float
+    clutter: Clutter
     effective_samples: float
     revised: tuple[Relabelled, ...] = ()
 

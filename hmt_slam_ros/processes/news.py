@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from hmt_slam_ros.arrays import Bool
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.local_map.area_filter import PlacedKeyframe
+from hmt_slam_ros.local_map.local_filter import PlacedKeyframe
 from hmt_slam_ros.processes.map_parts import Outdated
 from hmt_slam_ros.sensing import Scan
 from hmt_slam_ros.sensing.view import FREE, SURFACE, behind, seen, view_of

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.local_map.tracking import Tracked
+from hmt_slam_ros.local_map.local_filter import Tracked
 from hmt_slam_ros.sensing.motion import NO_STEP, NOISY, OdometryNoise, Step
 
 # An episode ends when for so long the scans contradicted no more, s.

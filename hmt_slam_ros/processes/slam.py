@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
@@ -16,9 +16,11 @@ from numpy.typing import NDArray
 
 from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.local_map.area_filter import AreaFilter, PlacedKeyframe
+from hmt_slam_ros.local_map.filters import new_filter
+from hmt_slam_ros.local_map.local_filter import PlacedKeyframe
 from hmt_slam_ros.local_map.local_mapping import LocalMapping
 from hmt_slam_ros.local_map.patch_pool import PatchState
+from hmt_slam_ros.local_map.sighting import Sighting
 from hmt_slam_ros.processes.live_hypothesis import LiveHypothesis, LiveState
 from hmt_slam_ros.processes.map_parts import Place
 from hmt_slam_ros.processes.messages import (
@@ -52,7 +54,7 @@ class SlamState:
     :ivar motion: what is known of the motion between scans.
     :ivar watch: what was heard of odometry and scans.
     :ivar queue: scans that wait for odometry, or for the answer to a keyframe event.
-    :ivar patches: of the maps of all particles, None before the first scan.
+    :ivar patches: of the grids of all particles, None where there is none.
     :ivar live: {hypothesis: its filter and what is remembered beside it}.
     :ivar events: keyframe events.
     :ivar waiting: whether the answer to the last one is due.
@@ -112,24 +114,34 @@ class MetricSlam:
         self._ended = False
 
     def _live_in(self, state: SlamState) -> dict[int, LiveHypothesis]:
-        if state.patches is None:
-            first = AreaFilter(self._mapping, FIRST_HYPOTHESIS, FIRST_AREA)
+        if not state.live:
+            first = new_filter(self._mapping, FIRST_HYPOTHESIS, FIRST_AREA)
             return {FIRST_HYPOTHESIS: LiveHypothesis(first, self._configuration.filter)}
-        self._mapping.pool.load(state.patches, np.concatenate([live.filter.tables for live in state.live.values()]))
+        grids = [live.grid.tables for live in state.live.values() if live.grid is not None]
+        if state.patches is not None and grids:
+            self._mapping.pool.load(state.patches, np.concatenate(grids))
         return {hypothesis: LiveHypothesis.of(self._mapping, live) for hypothesis, live in state.live.items()}
 
     @property
     def state(self) -> SlamState:
         """All that metric SLAM knows, as a value."""
-        filters = [live.filter.state for live in self._live.values()]
-        patches, tables = self._mapping.pool.state(np.concatenate([own.tables for own in filters]))
-        each = np.split(tables, len(filters))
+        live, patches = self._without_pool()
         return SlamState(
             self._replica.state, self._motion.state, self._watch.state, self._queue.state, patches,
-            {name: live.state(own) for (name, live), own in zip(self._live.items(), each, strict=True)},
-            self._events, self._waiting, self._travelled, self._scans, self._dropped, self._first_of_trail,
+            live, self._events, self._waiting, self._travelled, self._scans, self._dropped, self._first_of_trail,
             self._arriving, self._lost, self._place,
         )  # fmt: skip
+
+    def _without_pool(self) -> tuple[dict[int, LiveState], PatchState | None]:
+        """The live hypotheses, with the patches of their grids, whose numbers are those in the tables."""
+        states = {name: live.state() for name, live in self._live.items()}
+        grids = {name: state.grid for name, state in states.items() if state.grid is not None}
+        if not grids:
+            return states, None
+        patches, tables = self._mapping.pool.state(np.concatenate([grid.tables for grid in grids.values()]))
+        for (name, grid), own in zip(grids.items(), np.split(tables, len(grids)), strict=True):
+            states[name] = replace(states[name], grid=replace(grid, tables=own))
+        return states, patches
 
     @property
     def mapping(self) -> bool:
@@ -221,36 +233,35 @@ class MetricSlam:
 
     def _process(self, scan: Scan) -> list[Message]:
         prediction = self._motion.predict(scan.stamp)
-        scan = deskewed(scan, self._motion.odometry, self._configuration.rtl)
-        points = self._mapping.matching_points(scan)
-        said = [] if self._arriving else self._track(scan.stamp, points, prediction)
-        if self._arriving or self._place is not None or self._best.event_due(points):
-            said += self._keyframe_event(scan, points)
+        sighting = Sighting(self._mapping, deskewed(scan, self._motion.odometry, self._configuration.rtl))
+        said = [] if self._arriving else self._track(sighting, prediction)
+        if self._arriving or self._place is not None or self._best.event_due(sighting):
+            said += self._keyframe_event(sighting)
         for live in self._live.values():
             live.note_scan(scan.stamp)
         self._scans += 1
         return [*said, self._estimate(scan.stamp)]
 
-    def _track(self, stamp: int, points: NDArray[np.float64], prediction: Prediction) -> list[Message]:
+    def _track(self, sighting: Sighting, prediction: Prediction) -> list[Message]:
         """Move every hypothesis on to the scan, and learn from what the best one found."""
-        tracked = {hypothesis: live.filter.track(points, prediction) for hypothesis, live in self._live.items()}
+        tracked = {hypothesis: live.filter.track(sighting, prediction) for hypothesis, live in self._live.items()}
         best = tracked[self._replica.best]
         self._motion.observe(best.moved, best.information, best.contradicted)
         self._travelled += math.hypot(best.moved[0], best.moved[1])
-        return self._tell(self._watch.hear(stamp, prediction.odometry, best))
+        return self._tell(self._watch.hear(sighting.scan.stamp, prediction.odometry, best))
 
     @staticmethod
     def _tell(text: str | None) -> list[Message]:
         return [] if text is None else [Notice("slam", text)]
 
-    def _keyframe_event(self, scan: Scan, points: NDArray[np.float64]) -> list[Message]:
-        sequence = self._events
+    def _keyframe_event(self, sighting: Sighting) -> list[Message]:
+        sequence, scan = self._events, sighting.scan
         trails: list[Message] = self._trails()
         storing = self.mapping or self._lost
         news: list[tuple[News, float]] = []
         leaves = tuple(
             live.event(
-                sequence, scan, points, arriving=self._arriving, storing=storing,
+                sequence, sighting, arriving=self._arriving, storing=storing,
                 wanted=partial(self._is_news, live, scan, news) if self._lifelong else None,
             )
             for live in self._live.values()

@@ -143,7 +143,7 @@ class Tsbi:
         self._estimates = {leaf.hypothesis: leaf for leaf in keyframe.leaves}
         for leaf in keyframe.leaves:
             if leaf.hypothesis in self._notes:
-                notes = self._notes[leaf.hypothesis].heard(keyframe.sequence, leaf.log_evidence)
+                notes = self._notes[leaf.hypothesis].heard(keyframe.sequence, leaf.doubt)
                 stored = notes.stored(keyframe.sequence, leaf.pose.covariance) if leaf.stored else notes
                 self._notes[leaf.hypothesis] = stored
 
@@ -198,9 +198,16 @@ class Tsbi:
     def _parent(self, hypothesis: int) -> Parent:
         estimate = self._estimates[hypothesis]
         probability = self._replica.probabilities[hypothesis]
-        log_weight = math.log(max(probability, 1e-300)) + estimate.log_evidence
+        # Where it is asked whether the robot was displaced, the walls that its beams pass tell.
+        log_evidence = -estimate.doubt if self._displaced else estimate.log_evidence
+        log_weight = math.log(max(probability, 1e-300)) + log_evidence
         area, hybrid_map = self._replica.areas[hypothesis], self._replica.maps[hypothesis]
-        return Parent(hypothesis, area, hybrid_map, self._notes[hypothesis], log_weight, probability)
+        return Parent(hypothesis, area, hybrid_map, self._notes[hypothesis], log_weight, probability, estimate.clutter)
+
+    @property
+    def _displaced(self) -> bool:
+        """Whether the robot was displaced under one of the hypotheses, and is not found yet."""
+        return any(notes.claim is not None for notes in self._notes.values())
 
     def _branch(self, parent: Parent, event: AreaEvent | None, keyframe: Keyframe) -> Branches:
         """The continuations of one hypothesis, each with its weight."""

@@ -21,7 +21,7 @@ from hmt_slam_ros.processes.map_parts import Arc, Place
 from hmt_slam_ros.processes.messages import Keyframe
 from hmt_slam_ros.processes.tsbi_branching import Branches, Branching, Child, Parent
 from hmt_slam_ros.topology.hybrid_map import HybridMap
-from hmt_slam_ros.topology.hypothesis_tree import Sighting
+from hmt_slam_ros.topology.hypothesis_tree import Spot
 from hmt_slam_ros.topology.located import Located, is_certain
 from hmt_slam_ros.topology.shortest_path import reachable
 from hmt_slam_ros.topology.unknown import tells_nothing, unknown
@@ -116,18 +116,18 @@ def looked_for(branching: Branching, parent: Parent) -> Branches:
     reference = next(iter(keyframes.values()))
     poses = {k: se2.between(reference, pose) for k, pose in keyframes.items()}
     told = _told_of(parent, keyframes)
-    where = branching.search.everywhere(parent.hybrid_map, poses, parent.notes.lost, told)
+    where = branching.search.everywhere(parent.hybrid_map, poses, parent.notes.lost, parent.clutter, told)
     if parent.notes.claim is not None:
         where = where.with_unmapped(UNKNOWN)
     noted = _credited(replace(parent, notes=parent.notes.checked((), tuple(poses))), where, poses)
     if len(keyframes) >= _REFUTED and float(where.probabilities.sum()) < 1.0 - _NOWHERE:
         noted = replace(noted, notes=replace(noted.notes, told=None))
     best = where.best
-    if best is None or not _is_told(*best, 0.0 if parent.notes.claim is None else _KNOWN):
+    if best is None or not _is_told(*best, mapping=parent.notes.claim is not None):
         unsighted = replace(noted.notes, sighted=None)
         return Branches([Child(parent.hypothesis, noted.log_weight, parent.area, unsighted)], True, where=where)
     located, probability = best
-    sighted = replace(noted.notes, sighted=_sighting(located, poses, max(poses)))
+    sighted = replace(noted.notes, sighted=_spot(located, poses, max(poses)))
     still = Child(parent.hypothesis, noted.log_weight, parent.area, sighted)
     if not (told is not None and probability >= _ONCE) and not _seen_again(parent, located, poses):
         return Branches([still], True, where=where)
@@ -155,7 +155,7 @@ def _credited(parent: Parent, where: Whereabouts, poses: Mapping[int, Pose]) -> 
     return replace(parent, log_weight=parent.log_weight + credit - parent.notes.credit, notes=notes)
 
 
-def credit_of(hybrid_map: HybridMap, where: Whereabouts, claim: Sighting, poses: Mapping[int, Pose]) -> float:
+def credit_of(hybrid_map: HybridMap, where: Whereabouts, claim: Spot, poses: Mapping[int, Pose]) -> float:
     """log p(what a robot saw | it was displaced) / p(that | it was not), by where that lies in the map before, nats.
 
     New ground is the measure of both.
@@ -163,7 +163,7 @@ def credit_of(hybrid_map: HybridMap, where: Whereabouts, claim: Sighting, poses:
     :param claim: where it is if it was not displaced: there it is not, if it was.
     :param poses: {keyframe: ``reference_T_base``} of those that were located.
     """
-    there = [_agree(hybrid_map, _sighting(located, poses, claim.keyframe), claim) for located in where.found]
+    there = [_agree(hybrid_map, _spot(located, poses, claim.keyframe), claim) for located in where.found]
     shares = where.probabilities
     unmapped = max(1.0 - float(shares.sum()), _LEAST)
     elsewhere = unmapped + float(shares[[not one for one in there]].sum())
@@ -172,27 +172,28 @@ def credit_of(hybrid_map: HybridMap, where: Whereabouts, claim: Sighting, poses:
     return math.log(elsewhere / unmapped * UNKNOWN) - math.log(max(1.0, stayed))
 
 
-def sighted_in(where: Whereabouts, poses: Mapping[int, Pose]) -> Sighting | None:
+def sighted_in(where: Whereabouts, poses: Mapping[int, Pose]) -> Spot | None:
     """Where a look found a robot that was carried while it maps, if it did.
 
     :param poses: {keyframe: ``reference_T_base``} of those that were located.
     """
     best = where.best
-    if best is None or not _is_told(*best, _KNOWN):
+    if best is None or not _is_told(*best, mapping=True):
         return None
-    return _sighting(best[0], poses, max(poses))
+    return _spot(best[0], poses, max(poses))
 
 
-def _is_told(located: Located, probability: float, known: float) -> bool:
+def _is_told(located: Located, probability: float, *, mapping: bool) -> bool:
     """Whether a look tells where the robot is.
 
-    :param known: share of what it sees that has to be known there.
+    :param mapping: whether it was carried while it maps.
     """
+    known = _KNOWN if mapping else 0.0
     return probability >= _TWICE and located.found.share >= known and is_certain(located)
 
 
-def _sighting(located: Located, poses: Mapping[int, Pose], keyframe: int) -> Sighting:
-    return Sighting(located.area, keyframe, se2.compose(located.mode.pose.mean, poses[keyframe]))
+def _spot(located: Located, poses: Mapping[int, Pose], keyframe: int) -> Spot:
+    return Spot(located.area, keyframe, se2.compose(located.mode.pose.mean, poses[keyframe]))
 
 
 def _seen_again(parent: Parent, located: Located, poses: Mapping[int, Pose]) -> bool:
@@ -205,10 +206,10 @@ def _seen_again(parent: Parent, located: Located, poses: Mapping[int, Pose]) -> 
     before = parent.notes.sighted
     if before is None or before.keyframe not in poses:
         return False
-    return _agree(parent.hybrid_map, _sighting(located, poses, before.keyframe), before)
+    return _agree(parent.hybrid_map, _spot(located, poses, before.keyframe), before)
 
 
-def _agree(hybrid_map: HybridMap, one: Sighting, other: Sighting) -> bool:
+def _agree(hybrid_map: HybridMap, one: Spot, other: Spot) -> bool:
     """Whether two sightings of a keyframe are of the same place."""
     frames = reachable(hybrid_map, one.area, until=(other.area,))
     if other.area not in frames:

@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from hmt_slam_ros.agreement import NO_CLUTTER, Clutter
 from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
@@ -43,6 +44,7 @@ class Parent:
 
     :ivar log_weight: log of its probability, the newest scan's evidence included.
     :ivar share: its probability before, by which hypotheses share the areas that are examined at an event.
+    :ivar clutter: what contradicts its map usually.
     """
 
     hypothesis: int
@@ -51,6 +53,7 @@ class Parent:
     notes: LeafNotes
     log_weight: float
     share: float = 1.0
+    clutter: Clutter = NO_CLUTTER
 
     def around(self) -> dict[int, NDArray[np.float64]]:
         """{area: ``area_T_other``} of the local map's other areas."""

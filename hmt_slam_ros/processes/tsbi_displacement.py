@@ -18,12 +18,12 @@ import numpy as np
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.processes.tsbi_awakening import UNKNOWN, credit_of, sighted_in
 from hmt_slam_ros.processes.tsbi_branching import Branches, Branching, Child, Parent
-from hmt_slam_ros.topology.hypothesis_tree import Sighting
+from hmt_slam_ros.topology.hypothesis_tree import Spot
 from hmt_slam_ros.topology.unknown import unknown
 
 # Log-odds of a displacement from which on it is a hypothesis, of hypotheses of at least such a probability, with at
 # least so many keyframes.
-_LOG_ODDS, _PROBABILITY, _KEYFRAMES = math.log(1e-4), 0.05, 3
+_LOG_ODDS, _PROBABILITY, _KEYFRAMES = math.log(3e-5), 0.05, 3
 
 
 def with_displaced(branching: Branching, parent: Parent) -> Branches | None:
@@ -57,8 +57,9 @@ def _since(parent: Parent, event: int) -> list[int]:
 def _displaced(branching: Branching, parent: Parent, keyframes: Sequence[int], log_odds: float) -> Child:
     """The robot was displaced before the first of some keyframes of its area, which are a new one."""
     query = branching.query(parent, keyframes)
-    where = branching.search.everywhere(parent.hybrid_map, query.poses, keyframes[0]).with_unmapped(UNKNOWN)
-    claim = Sighting(parent.area, keyframes[0], query.belief.mean)
+    where = branching.search.everywhere(parent.hybrid_map, query.poses, keyframes[0], parent.clutter)
+    where = where.with_unmapped(UNKNOWN)
+    claim = Spot(parent.area, keyframes[0], query.belief.mean)
     credit = credit_of(parent.hybrid_map, where, claim, query.poses)
     origin = PoseGaussian.exactly(np.zeros(3))
     area = branching.new_area(parent, query)
