@@ -58,14 +58,15 @@ def beginning(configuration, branching):
     return run
 
 
-def compared(log, folder, stops, branching=lambda: Branching):
+def compared(log, folder, stops, branching=lambda: Branching, configuration=None):
     """Compare a run that stops after some records with one that does not.
 
     :param stops: (number of the record, state of TSBI) -> whether it is saved then, and another goes on.
     :param branching: makes what makes the children of hypotheses until it stops for the first time.
+    :param configuration: of both.
     :returns: the states of TSBI where it stopped.
     """
-    configuration = Configuration()
+    configuration = configuration or Configuration()
     whole, run, stopped = beginning(configuration, branching()), beginning(configuration, branching()), []
     for number, record in enumerate(log.records()):
         whole.read(record)
@@ -126,6 +127,18 @@ def test_a_run_in_which_a_closure_is_doubted_can_stop_before_the_question_is_ans
     log = open_log("sim:ring,seed=3,size=1.5", duration=165.0)
     (stopped,) = compared(log, tmp_path, once(lambda state: state.reopened), lambda: misled(2, 0, 3.8))
     assert [ends.source for ends in stopped.reopened[0].withdrawn] == [0]
+
+
+def test_a_run_whose_local_maps_are_of_lines_can_stop(tmp_path):
+    """Also after the change into a second area."""
+    configuration = with_changes(Configuration(), {"local_map.kind": "lines"})
+    second = once(lambda state: len(state.replica.common.areas) > 1)
+    log = open_log("sim:office,seed=3,size=0.7,rate=2.5", duration=80.0)
+    stopped = compared(
+        log, tmp_path, lambda number, state: number % 301 == 300 or second(number, state), configuration=configuration
+    )
+    assert len(stopped) > 2
+    assert max(len(state.replica.common.areas) for state in stopped) > 1
 
 
 def test_before_the_first_scan_and_after_the_last_a_run_can_stop_as_well(tmp_path):

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hmt_slam_ros.agreement import Clutter
 from hmt_slam_ros.configuration import Configuration, with_changes
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.evaluation import read_tum
@@ -57,7 +58,7 @@ def keyframe(sequence: int, leaves: dict[int, int]) -> Keyframe:
     """Keyframe event with {hypothesis: area}; poses are exact in each hypothesis."""
     index = EVERY * sequence
     estimates = tuple(
-        LeafEstimate(hypothesis, area, belief(se2.between(frame(area), TRUTH[index])), True, 0.0, 12.0)
+        LeafEstimate(hypothesis, area, belief(se2.between(frame(area), TRUTH[index])), True, 0.0, 0.0, Clutter(), 12.0)
         for hypothesis, area in leaves.items()
     )
     return Keyframe(sequence, scan(index), 6.0 * index / (SCANS - 1), estimates)

@@ -9,6 +9,7 @@ import pytest
 from test_output_folder import COVARIANCE, MAP_T_AREA_1, recorded, write
 
 from hmt_slam_ros.errors import HmtSlamError
+from hmt_slam_ros.local_map.area_kind import AreaKinds
 from hmt_slam_ros.offline.output_folder import check_replaceable
 from hmt_slam_ros.offline.saved_map import read_saved_map
 from hmt_slam_ros.offline.topology_file import export_topology
@@ -35,12 +36,16 @@ def test_areas_and_arcs_read_back_as_the_map_has_them(folder: Path) -> None:
     graph = nx.read_graphml(export_topology(folder), node_type=int)
     saved = read_saved_map(folder / "hmt_map")
     hybrid_map = saved.replica.maps[saved.replica.best]
+    kinds = AreaKinds(saved.configuration)
     assert graph.is_directed()
     assert sorted(graph) == hybrid_map.area_ids() == [0, 1]
     for area, attributes in graph.nodes.items():
         assert numbers(attributes) == of(saved.area_poses[area])
         assert attributes["keyframes"] == len(hybrid_map.keyframes(area))
         assert attributes["robot"] is (area == 1)
+        keyframes = hybrid_map.keyframes(area)
+        kind = kinds.of([saved.replica.scans[k] for k in keyframes], np.array(list(keyframes.values())))
+        assert attributes.get("hallway") == (None if kind is None else kind.probability)
     arcs = {(a, b): arc for a, b, arc in hybrid_map.all_arcs()}
     assert set(graph.edges) == set(arcs) == {(0, 1)}
     attributes = graph.edges[0, 1]

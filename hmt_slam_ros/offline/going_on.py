@@ -15,7 +15,7 @@ _FREE = ("robot.", "mode")
 # Where a log begins that goes on.
 _START = "robot.start"
 # What the numbers in the state mean depends on these.
-SHAPING = ("filter.particles", "local_map.cell", "local_map.extent", "local_map.field_radius")
+SHAPING = ("filter.particles", "local_map.kind", "local_map.cell", "local_map.extent", "local_map.field_radius")
 
 
 def map_folder(path: Path) -> Path:

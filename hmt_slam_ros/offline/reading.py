@@ -75,6 +75,11 @@ class Reading:
         """Scans of the newest log that were read."""
         return len(self._stamps) - self._first_scans[-1]
 
+    @property
+    def stamp_bytes(self) -> int:
+        """What the stamps of the scans take."""
+        return sum(len(stamps) * stamps.itemsize for stamps in (self._stamps, self._source_stamps))
+
     def begin(self, log: Log) -> None:
         """Begin a further log, on a clock that goes on."""
         self._first_scans = (*self._first_scans, len(self._stamps))

@@ -238,6 +238,13 @@ class Record:
     last: LocalEstimate | None = None
     notices: tuple[Notice, ...] = ()
 
+    @property
+    def table_bytes(self) -> int:
+        """What the tables take, which grow with every scan and every keyframe event."""
+        tables = (self.probabilities, self.trails, self.estimates)
+        columns = [getattr(table, entry.name) for table in tables for entry in fields(table)]
+        return self.online.nbytes + sum(column.nbytes for column in columns)
+
     def lineage(self, hypothesis: int) -> list[int]:
         """A hypothesis and its ancestors; ids are never used twice."""
         found = [hypothesis]

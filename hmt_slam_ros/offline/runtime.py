@@ -118,6 +118,12 @@ class Run:
         return self._reading.scans
 
     @property
+    def recorded_bytes(self) -> int:
+        """What is kept of every scan for the output: where it was taken, its stamps, and what it cost."""
+        costs = sum(len(spent) * spent.itemsize for spent in self._spent.values())
+        return costs + self._reading.stamp_bytes + self.recorder.past.table_bytes
+
+    @property
     def state(self) -> RunState:
         """All that is known, between two records of the log."""
         return RunState(
