@@ -43,6 +43,12 @@ MEASUREMENTS = {
     "consistency": "whether covariances are as large as errors, on simulated worlds",
     "evidence": "how far the evidence for a closure is to be believed, on simulated worlds of training seeds",
     "appearance": "how well the look of a place tells it from others, on simulated worlds of training seeds",
+    "lines": "whether the lines of scans are on walls, as far off as they say, and how much is found of walls",
+    "heading": "whether the heading that walls tell is as far off as it says, against odometry alone",
+    "linemap": "whether a room's map of lines and the robot in it are as far off as they say, and its bytes",
+    "landmarks": "whether corners and openings are there, where they are said to be, and how sure one may be of them",
+    "hallways": "whether hallways and rooms are told apart",
+    "localmaps": "maps of areas by lines beside grids, on simulated worlds",
     "table": "time and memory against a global metric RBPF at equal accuracy, the paper's Table II",
     "ambiguity": "whether both answers stay alive where places are identical, until the evidence",
     "oracle": "TSBI's PMF against an exact enumeration of all topologies",
@@ -57,8 +63,9 @@ MEASUREMENTS = {
 _GROUPS = {
     "all": ("accuracy", "steps", "robustness", "choices", "sessions", "speed", "live"),
     "validation": (
-        "calibration", "loops", "topology", "consistency", "evidence", "appearance", "ambiguity", "table", "oracle",
-        "awakening", "kidnapping", "laps", "changes", "scale",
+        "calibration", "loops", "topology", "consistency", "evidence", "appearance", "lines", "linemap", "heading",
+        "landmarks", "hallways", "localmaps", "ambiguity", "table", "oracle", "awakening", "kidnapping", "laps",
+        "changes", "scale",
     ),
 }  # fmt: skip
 

@@ -20,6 +20,7 @@ from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.local_map.area_filter import AreaFilter
 from hmt_slam_ros.local_map.local_mapping import LocalMapping
+from hmt_slam_ros.local_map.sighting import Sighting
 from hmt_slam_ros.processes.live_hypothesis import LiveHypothesis
 from hmt_slam_ros.sensing import Odometry, Scan
 from hmt_slam_ros.sensing.motion import MotionModel, increment_covariance
@@ -106,7 +107,7 @@ def drive(seed: int, length: float = _LENGTH) -> Drive:
             odometry_errors[k] = error
         motion.odometry.add(Odometry(k * _PERIOD, odometry))
         scan = _scan(k * _PERIOD, truth, random)
-        _take(live, motion, k, scan, mapping.matching_points(scan))
+        _take(live, motion, k, Sighting(mapping, scan))
     kept = live.filter.keyframes
     covariances = np.array([live.fresh[keyframe] for keyframe in kept])
     floor = configuration.tlca.arc_sigma_floor, configuration.tlca.arc_angle_floor
@@ -130,14 +131,14 @@ def _scan(stamp: int, pose: NDArray[np.float64], random: np.random.Generator) ->
     return Scan(stamp, seen, _BEARINGS[0], _BEARINGS[1] - _BEARINGS[0], 0.05, _REACH + 1.0)
 
 
-def _take(live: LiveHypothesis, motion: MotionModel, number: int, scan: Scan, points: NDArray[np.float64]) -> None:
+def _take(live: LiveHypothesis, motion: MotionModel, number: int, sighting: Sighting) -> None:
     """What metric SLAM does with a scan where no other process has anything to say."""
-    prediction = motion.predict(scan.stamp)
+    prediction = motion.predict(sighting.scan.stamp)
     if number:
-        tracked = live.filter.track(points, prediction)
+        tracked = live.filter.track(sighting, prediction)
         motion.observe(tracked.moved, tracked.information, tracked.contradicted)
-    if not number or live.event_due(points):
-        live.event(number, scan, points, arriving=number == 0)
+    if not number or live.event_due(sighting):
+        live.event(number, sighting, arriving=number == 0)
         motion.keyframe(live.moved, live.information)
 
 

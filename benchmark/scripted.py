@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from hmt_slam_ros.agreement import Clutter
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
@@ -103,7 +104,7 @@ class Script:
     def _event(self, scan: Scan, events: Sequence[AreaEvent], *, stored: bool = True) -> Hypotheses:
         self.sequence += 1
         leaves = tuple(
-            LeafEstimate(hypothesis, robot.area, robot.pose, stored, 0.0, 1.0)
+            LeafEstimate(hypothesis, robot.area, robot.pose, stored, 0.0, 0.0, Clutter(), 1.0)
             for hypothesis, robot in sorted(self.robots.items())
         )
         self._tell(Keyframe(self.sequence, scan, 0.0, leaves))

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from benchmark.kidnapping import KINDS, Heard, drawn, judged, requirements
+from benchmark.kidnapping import KINDS, SOON, Heard, drawn, judged, kidnapped, requirements
 from hmt_slam_ros.logs import open_log
 
 LOST, RIGHT, WRONG = (False, False, False), (True, True, True), (True, True, False)
@@ -48,3 +48,15 @@ def test_the_robot_is_carried_once_and_its_wheels_do_not_notice(kind):
     assert kind != "short" or far[0] < 3.0
     wheels = log.scenario.odometry
     assert max(math.hypot(*step) for step in wheels[1:, :2] - wheels[:-1, :2]) < 0.2
+
+
+@pytest.mark.parametrize(
+    ("world", "kind", "seed"),
+    [("busy", "known", 1000), ("office", "unknown", 8)],
+    ids=["among people", "where little but passed walls contradicts, keyframe by keyframe"],
+)
+def test_a_robot_notices_that_it_was_carried_and_finds_itself(world, kind, seed):
+    found = kidnapped(drawn(world, kind, seed))
+    assert found.noticed <= SOON
+    assert not found.wrong
+    assert max(found.errors) < 0.1

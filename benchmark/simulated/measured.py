@@ -16,6 +16,19 @@ def chosen_seeds(settings: Settings, count: int = SEEDS) -> tuple[int, ...]:
     return seeds(len(settings.seeds_or(count)), training=settings.training)
 
 
+def chosen_families(settings: Settings, families: tuple[str, ...], known: tuple[str, ...] = ()) -> tuple[str, ...]:
+    """Those that are asked for, else ``families``.
+
+    :param known: all that may be asked for, if there are more.
+    :raises HmtSlamError: for a name that is none of them.
+    """
+    chosen, known = settings.logs_or(families), known or families
+    for name in chosen:
+        if name not in known:
+            raise HmtSlamError(f"there is no family {name!r}: choose from {', '.join(known)}")
+    return tuple(chosen)
+
+
 def records_of(
     settings: Settings, families: tuple[str, ...] = FAMILIES, count: int = SEEDS, others: tuple[str, ...] = ()
 ) -> list[Record]:
@@ -26,10 +39,7 @@ def records_of(
 
     :raises HmtSlamError: for a name that is no family, or a run that failed.
     """
-    chosen, known = settings.logs_or(families), (*FAMILIES, *others)
-    for name in chosen:
-        if name not in known:
-            raise HmtSlamError(f"there is no family {name!r}: choose from {', '.join(known)}")
+    chosen = chosen_families(settings, families, (*FAMILIES, *others))
     mapped, numbers = (family for family in (*families, *others) if family in chosen), chosen_seeds(settings, count)
     worlds = [World(family, seed) for family in mapped for seed in numbers]
     return settings.records.of(worlds, settings.changes)

@@ -1,0 +1,90 @@
+"""True walls of a simulated scan as lines, and which of them each beam met."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.sensing import Scan
+from hmt_slam_ros.simulation.building import boxes
+from hmt_slam_ros.simulation.scenario import Scenario
+
+Array = NDArray[np.float64]
+
+_ON = 1e-4  # m, from a wall, of what met it
+_DECIMALS = 6  # of radians and metres: walls that agree to these lie on one line
+
+
+class Seen(NamedTuple):
+    """A scan and what there was to be seen in it.
+
+    :ivar scan: as the laser has it, corrected for the true motion during its sweep.
+    :ivar lines: shape (n, 2), alpha and r of the lines on which walls and furniture lie, in the robot's frame, rad, m;
+        numbered alike at all times at which the furniture stands alike.
+    :ivar met: shape (k,), the line that each beam with a return met, -1 for a person.
+    :ivar ends: shape (k, 2), where it truly ended, m, in that frame.
+    """
+
+    scan: Scan
+    lines: Array
+    met: NDArray[np.int64]
+    ends: Array
+
+
+def lines_of(walls: Array) -> Array:
+    """alpha in [-pi, pi) and r >= 0, shape (n, 2), rad and m, of the lines through walls (n, 4)."""
+    alpha = np.arctan2(walls[:, 2] - walls[:, 0], walls[:, 1] - walls[:, 3])
+    r = walls[:, 0] * np.cos(alpha) + walls[:, 1] * np.sin(alpha)
+    return np.stack((se2.wrap(np.where(r < 0.0, alpha + np.pi, alpha)), np.abs(r)), axis=1)
+
+
+def difference(line: Array, other: Array) -> Array:
+    """other - line, both (..., 2), in that representation of the other whose angle is nearer."""
+    turn = se2.wrap(other[..., 0] - line[..., 0])
+    opposite = np.abs(turn) > 0.5 * np.pi
+    away = np.where(opposite, -other[..., 1], other[..., 1]) - line[..., 1]
+    return np.stack((np.where(opposite, se2.wrap(turn - np.pi), turn), away), axis=-1)
+
+
+def seen_in(scenario: Scenario, number: int) -> Seen:
+    """A scan of a drive by its number, and the truth about it."""
+    scan, laser = scenario.scan(number), scenario.laser
+    poses = scenario.true_poses(scan.stamp + np.round(1e9 * laser.times).astype(np.int64))
+    scan = replace(scan, motion=se2.log(se2.between(poses[0], poses[-1])))
+    distances = scenario.distances(number)[scan.valid]
+    angles = laser.angles[scan.valid]
+    local = np.stack((distances * np.cos(angles), distances * np.sin(angles)), axis=1)
+    at_beams = poses[scan.valid] if len(poses) > 1 else poses
+    ends = se2.transform(se2.compose(se2.between(poses[0], at_beams), laser.pose), local)
+    walls, numbers, lines = _surfaces(scenario, scan.stamp, poses[0])
+    wall = _met(walls, ends)
+    return Seen(scan, lines, np.where(wall < 0, -1, numbers[wall]), ends)
+
+
+def true_lines(scenario: Scenario, stamp: int, pose: Array) -> Array:
+    """alpha and r (n, 2), rad and m, of the lines of `Seen` at a stamp, in the frame of a pose (3,)."""
+    return _surfaces(scenario, stamp, pose)[2]
+
+
+def _surfaces(scenario: Scenario, stamp: int, pose: Array) -> tuple[Array, NDArray[np.int64], Array]:
+    """Walls and furniture (m, 4) in a frame, the number of the line of each, (m,), and those lines, (n, 2)."""
+    world = np.concatenate((scenario.building.walls, boxes(scenario.furniture(stamp))))
+    _, numbers = np.unique(np.round(lines_of(world), _DECIMALS), axis=0, return_inverse=True)
+    walls, numbers = se2.transform(se2.inverse(pose), world.reshape(-1, 2)).reshape(-1, 4), numbers.reshape(-1)
+    lines = np.empty((numbers.max() + 1, 2))
+    lines[numbers] = lines_of(walls)
+    return walls, numbers, lines
+
+
+def _met(walls: Array, ends: Array) -> NDArray[np.int64]:
+    """The wall (n, 4) on which each point (k, 2) lies, -1 for none."""
+    starts, along = walls[:, :2], walls[:, 2:] - walls[:, :2]
+    away = ends[:, None] - starts[None]
+    share = np.clip((away * along).sum(axis=2) / (along**2).sum(axis=1), 0.0, 1.0)
+    off = np.linalg.norm(away - share[..., None] * along, axis=2)
+    nearest = np.argmin(off, axis=1)
+    return np.where(off[np.arange(len(ends)), nearest] < _ON, nearest, -1)
