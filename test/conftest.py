@@ -115,6 +115,7 @@ def start(domain):
     try:
         for process in left:
             error = process.communicate(timeout=WAIT)[1]
+            print(process.args, error)  # shown where the test failed
             assert process.returncode == 0, error
             assert "Traceback" not in error, error
     finally:

@@ -149,8 +149,8 @@ def test_a_robot_that_is_carried_while_the_nodes_run_is_recognized_elsewhere(cor
 def test_a_robot_that_is_carried_while_it_drives_notices_and_is_recognized(listener, start):
     nodes = Nodes(start, listener)
     nodes.until(nodes.is_localized)
-    nodes.drive(CARRIED, first=0, robot__duration=62.0)
-    nodes.until(lambda: len(nodes.estimates) == 310 and nodes.is_localized())
+    nodes.drive(CARRIED, first=0, robot__duration=84.0)
+    nodes.until(lambda: len(nodes.estimates) == 420 and nodes.is_localized())
     assert [known for known, _ in groupby(message.data for message in nodes.localized)][-3:] == [True, False, True]
     nodes.until(lambda: nodes.diagnosis("tsbi")["localized"] == "yes")
 

@@ -1,6 +1,8 @@
 """Services by which the map is asked for, exchanged and forgotten, and mapping pauses, while the nodes run."""
 
+import re
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,14 +13,25 @@ pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, 
 
 from nav_msgs.msg import OccupancyGrid
 from nav_msgs.srv import GetMap, LoadMap
+from recording import Recording
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
-from hmt_slam_ros.nodes import qos
+from hmt_slam_ros.logs import open_log
+from hmt_slam_ros.nodes import qos, topics
 from hmt_slam_ros.nodes.conversions import planar_pose
 from hmt_slam_ros.nodes.topics import KEYFRAMES, MAP
+from hmt_slam_ros.nodes.transforms import TFMessage
 from hmt_slam_ros.processes.documents import KeyframeHead, decode
 from hmt_slam_ros.processes.messages import LocalEstimate
+
+TRANSFORMS = {"tf", "tf_static"} if TFMessage else set()
+NAMED = {value for name, value in vars(topics).items() if name.isupper() and isinstance(value, str)}
+MESSAGES = Path(__file__).parent.parent / "docs" / "messages.md"
+SAID = {f"/{topic.lstrip('/')}" for topic in {*NAMED, *topics.DOCUMENTS.values(), *TRANSFORMS}} - {
+    "/initialpose",  # which is only heard
+    "/hmt/notices",  # as there is nothing to complain of
+}
 
 
 @pytest.fixture(scope="module")
@@ -67,42 +80,73 @@ def test_a_map_is_loaded_while_the_nodes_run_and_the_robot_recognized_in_it(corr
     nodes.until(lambda: np.abs(planar_pose(nodes.poses[-1].pose.pose) - 4 * (SCANS - 1) * PACE).max() < 0.15)
 
 
-def test_after_a_reset_a_new_map_begins_where_the_robot_is(corridor, listener, start):
+def test_after_a_reset_a_new_map_begins_where_the_robot_is_and_all_that_is_said_can_be_recorded(
+    corridor, listener, start, tmp_path
+):
     log, out = corridor
-    nodes = Nodes(start, listener, start_from=out, start_carried=False)
+    recording = Recording(listener, tmp_path / "bag")
+    nodes = Nodes(start, listener, start_from=out, start_carried=False, save_to=tmp_path / "saved")
     keyframes = listener.hear(String, KEYFRAMES, qos.CHAIN)
     nodes.until(lambda: {m.status[0].name for m in nodes.diagnostics} == {f"/{name}" for name in NODES})
     answer = listener.call(Trigger, "slam/reset", Trigger.Request())
     assert (answer.success, answer.message) == (True, "the map is forgotten, a new one begins")
     assert listener.call(GetMap, "tlca/get_map", GetMap.Request()).map.info.width == 0
-    nodes.drive(log, first=40, rate=8.0, robot__duration=8.0)
+    # Slam, rtl, and the recording.
+    nodes.drive(log, first=40, rate=8.0, robot__duration=8.0, robot__odometry_listeners=3)
     nodes.until(lambda: len(nodes.estimates) == 40)
     assert decode(keyframes[0].data, KeyframeHead).sequence == 0
     nodes.until(nodes.is_localized)
     # In the frame of the first scan after it.
     nodes.until(lambda: nodes.poses and abs(planar_pose(nodes.poses[-1].pose.pose)[0] - 4 * 39 * PACE[0]) < 0.3)
     assert occupied(listener.call(GetMap, "tlca/get_map", GetMap.Request()).map) > 20
+    assert listener.call(Trigger, "slam/save", Trigger.Request()).success
+    nodes.until(lambda: set(recording.counts) >= SAID)
+    recording.close()
+    assert_documented(recording.offered)
+    assert TFMessage is None or open_log(recording.folder).scan_count == 40
+
+
+def assert_documented(offered):
+    """Type and profile of each topic, beside ROS's own, are those in docs/messages.md."""
+    row = re.compile(r"^\| (/?[\w/]+)[^|]*\| (\w+)/(\w+)[^|]*\| (?:\w+; robot: )?([A-Z_]+)[^|]*\|", re.MULTILINE)
+    tables = {f"/{topic.lstrip('/')}": rest for topic, *rest in row.findall(MESSAGES.read_text())}
+    for topic, (kind, profiles) in offered.items():
+        if topic in {"/rosout", "/parameter_events"} or topic.endswith("/transition_event"):
+            continue
+        package, name, profile = tables[topic]
+        assert kind == f"{package}/msg/{name}", topic
+        promised = getattr(qos, profile)
+        for told in profiles:
+            assert (told.reliability, told.durability) == (promised.reliability, promised.durability), topic
 
 
 def test_while_paused_scans_are_passed_over_and_odometry_is_not(corridor, listener, start):
+    # Not to the end of the corridor, where the laser sees little but the wall before it.
+    scans = 90
     nodes = Nodes(start, listener)
-    nodes.drive(corridor[0], first=0, rate=2.0)
+    nodes.drive(corridor[0], first=0, rate=2.0, robot__duration=0.2 * scans)
     nodes.until(lambda: len(nodes.estimates) > 10)
     paused = listener.call(SetBool, "slam/pause", SetBool.Request(data=True))
     assert (paused.success, paused.message) == (True, "paused, scans are passed over")
-    listener.spin(2.0)
+
+    def stands():
+        """What came before is worked off."""
+        said = nodes.diagnosis("slam")
+        return said["waiting scans"] == "0" and int(said["dropped scans"] or 0) >= 10
+
+    nodes.until(stands)
     said = len(nodes.estimates)
     listener.spin(1.0)
     assert len(nodes.estimates) == said
     nodes.until(lambda: nodes.diagnosis("slam").get("paused", "").startswith("yes"))
     assert listener.call(SetBool, "slam/pause", SetBool.Request(data=False)).success
     # The robot, which waited for an acknowledgement, goes on.
-    end = 4 * (SCANS - 1) * PACE
+    end = 4 * (scans - 1) * PACE
     nodes.until(lambda: np.abs(last(nodes).pose.mean - end).max() < 0.1)
     nodes.until(lambda: nodes.diagnosis("slam").get("paused") == "no")
     dropped = int(nodes.diagnosis("slam")["dropped scans"])
     assert dropped >= 5
-    nodes.until(lambda: len(nodes.estimates) == SCANS - dropped)
+    nodes.until(lambda: len(nodes.estimates) == scans - dropped)
 
 
 def test_nothing_is_exchanged_where_not_all_processes_run(listener, start):

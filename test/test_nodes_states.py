@@ -5,7 +5,7 @@ import signal
 
 import numpy as np
 import pytest
-from logs_for_nodes import SECOND, corridor_bag
+from logs_for_nodes import PACE, SECOND, corridor_bag
 from test_nodes_localization import NODES, Nodes
 
 pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
@@ -16,12 +16,12 @@ from lifecycle_msgs.srv import ChangeState, GetState
 from std_srvs.srv import Trigger
 
 from hmt_slam_ros.nodes import qos
-from hmt_slam_ros.nodes.conversions import stamp_of
-from hmt_slam_ros.nodes.topics import DIAGNOSTICS, KEYFRAMES, SCAN
+from hmt_slam_ros.nodes.conversions import planar_pose, stamp_of
+from hmt_slam_ros.nodes.topics import DIAGNOSTICS, KEYFRAMES, ODOM, POSE, SCAN
 from hmt_slam_ros.persistence.folder import FolderReader
 from hmt_slam_ros.persistence.hmt_map import FORMAT, VERSION
 
-SCANS = 140
+SCANS = 110  # so that some are left when the last node comes back, whatever came while the others were away
 SHUTDOWN = {
     "unconfigured": Transition.TRANSITION_UNCONFIGURED_SHUTDOWN,
     "inactive": Transition.TRANSITION_INACTIVE_SHUTDOWN,
@@ -83,25 +83,29 @@ def test_nodes_that_are_halted_and_taken_down_amid_a_drive_come_to_the_same_as_o
     manager.lead(DOWN, "activate", "active")
     listener.until(lambda: nodes.estimates, seconds=150.0, alive=nodes.alive)  # a first run compiles
 
-    nodes.until(lambda: len(nodes.estimates) > 10)
+    nodes.until(lambda: len(nodes.estimates) > 8)
     halt(manager, nodes, "aam")
     take_down_and_up(manager, "aam")
-    nodes.until(lambda: len(nodes.estimates) > 25)
+    nodes.until(lambda: len(nodes.estimates) > 18)
     halt(manager, nodes, "tsbi")
     manager.lead(["rtl"], "deactivate", "inactive")  # nobody waits for it
+    away = len(nodes.estimates)
     take_down_and_up(manager, "tsbi")
-    nodes.until(lambda: len(nodes.estimates) > 70)
+    nodes.until(lambda: len(nodes.estimates) > away + 12)  # 2.4 s of the log
     halt(manager, nodes, "tlca")
     manager.lead(["rtl"], "activate", "active")
     take_down_and_up(manager, "tlca")
-    nodes.until(lambda: len(nodes.estimates) > 85)
+    nodes.until(lambda: len(nodes.estimates) > 40)
     manager.lead(["slam"], "deactivate", "inactive")
     stands(nodes)
     assert not manager.change("slam", Transition.TRANSITION_CONFIGURE)
+    renew_rtl(manager, nodes)
     manager.lead(["slam"], "activate", "active")
     nodes.until(lambda: len(nodes.estimates) == SCANS)
     nodes.park()
     assert np.diff([stamp_of(pose.header.stamp) for pose in nodes.poses]).max() > 2 * SECOND
+    end = 4 * (SCANS - 1) * PACE
+    nodes.until(lambda: np.abs(planar_pose(nodes.poses[-1].pose.pose) - end).max() < 0.15)
 
     manager.lead(DOWN, "deactivate", "inactive")
     assert listener.call(Trigger, "slam/save", Trigger.Request()).success
@@ -129,6 +133,17 @@ def take_down_and_up(manager, name):
     """Let an inactive node begin anew; it hears the whole chain once more."""
     for transition, state in (("cleanup", "unconfigured"), ("configure", "inactive"), ("activate", "active")):
         manager.lead([name], transition, state)
+
+
+def renew_rtl(manager, nodes):
+    """Let rtl begin anew, until all know of it that it hears odometry and says where the robot is."""
+    node = nodes.listener.node
+    manager.lead(["rtl"], "deactivate", "inactive")
+    manager.lead(["rtl"], "cleanup", "unconfigured")
+    nodes.until(lambda: (node.count_publishers(POSE), node.count_subscribers(ODOM)) == (0, 1))
+    manager.lead(["rtl"], "configure", "inactive")
+    manager.lead(["rtl"], "activate", "active")
+    nodes.until(lambda: (node.count_publishers(POSE), node.count_subscribers(ODOM)) == (1, 2))
 
 
 def stands(nodes):

@@ -23,6 +23,7 @@ from rclpy.qos import HistoryPolicy, QoSProfile
 from std_msgs.msg import Float64MultiArray, String
 from visualization_msgs.msg import MarkerArray
 
+from hmt_slam_ros.agreement import Clutter
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.nodes import qos
@@ -93,7 +94,8 @@ def test_a_run_of_the_bundled_log_shows_itself_on_the_topics_and_in_a_browser(li
         page.until(lambda: page.drawn.get("robot"))
         early = page.drawn["robot"]
     listener.until(lambda: bool(finished), seconds=120.0, alive=nodes)
-    listener.until(lambda: maps and len(graphs[-1].markers) > 8)
+    # What tlca draws, every 3 s, may be of before the end.
+    listener.until(lambda: maps and graphs and groups_of(graphs[-1])["areas"] >= 3, alive=nodes)
 
     assert_map(maps[-1])
     assert_graph(graphs[-1])
@@ -221,7 +223,7 @@ def test_an_arc_that_could_be_any_has_no_ellipse():
     scan = Scan(5, np.ones(3, dtype=np.float32), -1.0, 1.0, 0.05, 30.0, np.zeros(3))
     known = PoseGaussian(np.array([1.0, 2.0, 0.1]), 0.01 * np.eye(3))
     for keyframe, area in enumerate((0, 1, 2)):
-        view.hear(Keyframe(keyframe, scan, 0.0, (LeafEstimate(0, area, known, True, 0.0, 12.0),)))
+        view.hear(Keyframe(keyframe, scan, 0.0, (LeafEstimate(0, area, known, True, 0.0, 0.0, Clutter(), 12.0),)))
     arcs = (Arc(0, 1, known), Arc(1, 2, unknown(np.array([3.0, 0.0, 0.0]))))
     view.hear(Hypotheses(2, (Leaf(0, 0, 1.0, 2, arcs=arcs, lost=True),)))
     beliefs = (known, known.compose(known), unknown(np.array([5.0, 2.0, 0.0])))

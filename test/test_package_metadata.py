@@ -198,7 +198,7 @@ def topics_of_the_nodes():
     pytest.importorskip("rclpy", reason="the nodes need rclpy, which is not installed here")
     topics = import_module("hmt_slam_ros.nodes.topics")
     names = {value for name, value in vars(topics).items() if name.isupper() and isinstance(value, str)}
-    return {f"/{name}" for name in names | set(topics.DOCUMENTS.values())}
+    return {f"/{name.lstrip('/')}" for name in names | set(topics.DOCUMENTS.values())}
 
 
 def test_rviz_shows_the_topics_the_nodes_publish():
