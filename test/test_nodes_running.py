@@ -12,6 +12,7 @@ import rclpy
 from rclpy.node import Node
 
 from hmt_slam_ros.errors import HmtSlamError
+from hmt_slam_ros.nodes import last_save
 from hmt_slam_ros.nodes.outbox import RCLError
 from hmt_slam_ros.nodes.running import run
 
@@ -22,15 +23,37 @@ def shut_down_while_made():
     return Node("late")
 
 
+class ToldAtTheBeginning(Node):
+    """A node that is told to end before it is spun, whether its map is then to be saved or not."""
+
+    def __init__(self, saves_at_end):
+        super().__init__("early")
+        self.saves_at_end = saves_at_end
+
+    def begin(self):
+        rclpy.shutdown()
+
+    def depart(self):
+        assert not rclpy.ok()
+
+
 def fail_in_rcl():
     raise RCLError("the middleware is broken")
 
 
 def status_of(make):
-    raise SystemExit(run(make))
+    raise SystemExit(run(make, last_save.spin))
 
 
-@pytest.mark.parametrize(("make", "status"), [(shut_down_while_made, 0), (fail_in_rcl, 1)])
+@pytest.mark.parametrize(
+    ("make", "status"),
+    [
+        (shut_down_while_made, 0),
+        (partial(ToldAtTheBeginning, False), 0),
+        (partial(ToldAtTheBeginning, True), 0),
+        (fail_in_rcl, 1),
+    ],
+)
 def test_a_signal_amid_the_making_of_a_node_is_no_fault_but_a_broken_middleware_is(make, status):
     process = multiprocessing.get_context("spawn").Process(target=status_of, args=(make,))
     process.start()

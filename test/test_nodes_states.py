@@ -147,11 +147,12 @@ def renew_rtl(manager, nodes):
 
 
 def stands(nodes):
-    """Nothing more is said of scans, but for what is on its way."""
-    nodes.listener.spin(0.2)
-    before = len(nodes.estimates)
-    nodes.listener.spin(0.3)
-    assert len(nodes.estimates) == before
+    """Nothing more is said of scans before the end of the log, but for what is on its way."""
+    before = -1
+    while before < len(nodes.estimates):
+        before = len(nodes.estimates)
+        nodes.listener.spin(1.0)  # 20 scans of a drive that goes on
+    assert before < SCANS
 
 
 def begun_anew(manager, nodes, log):

@@ -35,30 +35,30 @@ def spin(node: ProcessNode) -> None:
 
 
 def _spin(node: ProcessNode) -> None:
-    if not node.saves_at_end:
-        rclpy.spin(node)
+    """By an executor of its own: ``rclpy.spin`` shares one, and fails where the signal comes before it has it."""
+    if not rclpy.ok():
         return
-    told = _Told()
-    uninstall_signal_handlers()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, told)
     executor = SingleThreadedExecutor()
-    executor.add_node(node)
+    told = _Told() if node.saves_at_end else None
     try:
-        while rclpy.ok() and not told.over and not (told.at and node.saved_last()):
-            executor.spin_once(timeout_sec=_POLL)
+        executor.add_node(node)
+        while rclpy.ok() and not (told and (told.over or (told.at and node.saved_last()))):
+            executor.spin_once(timeout_sec=_POLL if told else None)
     finally:
         executor.shutdown()
 
 
 class _Told:
-    """Takes note of the first signal; more of them change nothing.
+    """Takes note of the first signal in place of rclpy's handler; more of them change nothing.
 
     :ivar at: when that was, by the monotonic clock, None before.
     """
 
     def __init__(self) -> None:
         self.at: float | None = None
+        uninstall_signal_handlers()
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, self)
 
     @property
     def over(self) -> bool:

@@ -28,12 +28,19 @@ _PR_SET_PDEATHSIG = 1
 _GRACE = 8.0  # s
 # How long taking leave of the other nodes may take.
 _DEPARTURE = 2.0  # s
-_CONTEXT_LOST = (NotInitializedException, rclpy_implementation.InvalidHandle, rclpy_implementation.RCLError)
+# What calls of rclpy raise whose context is gone; the last two where they find None in its place.
+_CONTEXT_LOST = (
+    NotInitializedException,
+    rclpy_implementation.InvalidHandle,
+    rclpy_implementation.RCLError,
+    AttributeError,
+    TypeError,
+)
 
 NodeType = TypeVar("NodeType", bound=Node)
 
 
-def run(make: Callable[[], NodeType], spin: Callable[[NodeType], None] = rclpy.spin) -> int:
+def run(make: Callable[[], NodeType], spin: Callable[[NodeType], None]) -> int:
     """Make a node, spin it until SIGINT or SIGTERM, and take it down.
 
     :param make: makes the node, and imports what takes time.
