@@ -15,6 +15,18 @@ os.environ["ROS_PYTHON_CHECK_FIELDS"] = "1"
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 WAIT = 40.0  # s, for what normally takes less than one
+NODES = ("test_nodes_", "test_view_page")
+
+
+def pytest_collection_modifyitems(items):
+    """Files in which nodes run come first and one after the other, beside files that only compute.
+
+    Nodes wait for each other, and are told to do things within a time; six of them at once are enough for two cores.
+    """
+    with_nodes = {item.path for item in items if "domain" in item.fixturenames or item.path.stem.startswith(NODES)}
+    for item in items:
+        item.add_marker(pytest.mark.xdist_group("nodes" if item.path in with_nodes else item.path.stem))
+    items.sort(key=lambda item: item.path not in with_nodes)
 
 
 @pytest.fixture
