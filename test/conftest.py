@@ -14,7 +14,7 @@ os.environ["ROS_PYTHON_CHECK_FIELDS"] = "1"
 # A shell that runs the tests in the background has SIGINT ignored, and all programs that they start would inherit it.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
-WAIT = 40.0  # s, for what normally takes less than one
+WAIT = 120.0  # s, for what normally takes less than one; a machine may be busy
 NODES = ("test_nodes_", "test_view_page")
 
 
