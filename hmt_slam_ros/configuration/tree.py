@@ -1,8 +1,8 @@
 """Every parameter of the system: the groups, and the rules that join them.
 
-Each parameter is declared once, in ``metric``, ``topological``, ``features`` or ``live``: default, unit, range and
-description. The ROS parameters, the YAML files, ``--set`` and docs/parameters.md all follow from this tree, so a new
-parameter is one line here. Angles are in degrees, for the people who set them; the code that uses one calls
+Each parameter is declared once, in ``metric``, ``topological``, ``features``, ``places`` or ``live``: default, unit,
+range and description. The ROS parameters, the YAML files, ``--set`` and docs/parameters.md all follow from this tree,
+so a new parameter is one line here. Angles are in degrees, for the people who set them; the code that uses one calls
 ``math.radians`` there. After a change run ``scripts/generate_docs.py``, which brings config/hmt_slam.yaml and
 docs/parameters.md up to date.
 """
@@ -17,6 +17,7 @@ from hmt_slam_ros.configuration.features import Features
 from hmt_slam_ros.configuration.live import RealTimeLocalization, Robot
 from hmt_slam_ros.configuration.metric import Filter, LocalMap, Matching, Motion
 from hmt_slam_ros.configuration.parameter import parameter
+from hmt_slam_ros.configuration.places import Places
 from hmt_slam_ros.configuration.topological import (
     AreaAbstraction,
     LoopClosureAcceptance,
@@ -49,6 +50,7 @@ class Configuration:
     tlca: LoopClosureAcceptance = field(default_factory=LoopClosureAcceptance)
     refinement: Refinement = field(default_factory=Refinement)
     features: Features = field(default_factory=Features)
+    places: Places = field(default_factory=Places)
     rtl: RealTimeLocalization = field(default_factory=RealTimeLocalization)
     robot: Robot = field(default_factory=Robot)
 
