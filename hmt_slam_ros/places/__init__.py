@@ -1,0 +1,1 @@
+"""Places: landmarks along hallways, their graph, and the robot's belief over where in it it is."""

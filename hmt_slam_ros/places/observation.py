@@ -1,0 +1,224 @@
+"""The observation function OS(o, s): how probable is an observation graph in a state.
+
+Tomatis, Nourbakhsh and Siegwart (2003), section 3.3, Eq. (1); the paper does not say how OS is computed. Here o is a
+finite set of landmarks, and OS its density under this model, track by track (observation_graph.py), each independent:
+
+- The robot is ``delta`` beyond where it is taken to be along the axis, delta ~ N(0, tau^2).
+- Landmark i of the map, at x_i - delta, is extracted within reach with probability q_i = p_lmap p_det P(within reach).
+  It is then measured at N(x_i - delta, .), with a form (heading or width) of N(f_i, .): together g_ij.
+- What is not in the map is a Poisson process over the reach: landmarks of density lambda_new, and such that are none,
+  of density lambda_false. Forms are uniform there, of density u.
+- Confidences p_l are calibrated: among all extracted landmarks they have some density h of mean pi, and are the
+  probability of being there. By Bayes those that are there have the density h p_l / pi, the others h (1 - p_l) /
+  (1 - pi).
+
+So what is extra has e_j = u [lambda_false (1 - p_l,j) / (1 - pi) + lambda_new p_l,j / pi], and
+
+    OS(o, s) = h's exp(-Lambda) prod_j e_j  E_delta[ sum_A prod_missed (1 - q_i) prod_matched q_i g_ij p_l,j / (pi e_j)]
+
+over all pairings A of expected with observed landmarks of which none crosses another one. What stands before E is the
+same in all states, is the density of o where the map expects nothing, and is left out: the functions here return the
+logarithm of the *ratio* E. The sum is that of a forward algorithm in O(n m), exact for the tracks; E over delta is a
+sum over a grid whose weights add up to 1, which is a model itself.
+
+Integrated over all o, OS gives the probability that no two landmarks of a track are measured in the wrong order:
+1 where they lie apart by several deviations, as the two jambs of a door do, and less where they do not. There, the
+map holds as two what can hardly be told from one.
+
+Unknown ground shows landmarks of density lambda_usual, a Poisson process too.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from hmt_slam_ros.arrays import Float64, Int64
+from hmt_slam_ros.configuration.features import Features
+from hmt_slam_ros.configuration.places import Places
+from hmt_slam_ros.places.observation_graph import OPENINGS, TRACKS, Landmarks
+
+# Beyond so many deviations nothing is matched, and a landmark is not within reach.
+_FAR = 9.0
+# The grid over the robot's place: so many of its deviations to both sides, in steps of so much of a landmark's.
+_SIDES, _STEP = 4.0, 0.5
+
+
+class ObservationModel(NamedTuple):
+    """What is known of how landmarks are seen.
+
+    :ivar reach: m.
+    :ivar detection: p_det.
+    :ivar along: variance of a place along the axis beyond what map and measurement say, m^2.
+    :ivar heading: that of a corner's heading, rad^2.
+    :ivar width: that of an opening's width, m^2.
+    :ivar false: lambda_false, 1/m.
+    :ivar new: lambda_new, 1/m.
+    :ivar usual: lambda_usual, 1/m.
+    :ivar true_share: pi.
+    :ivar corner_form: u of corners, 1/rad.
+    :ivar opening_form: u of openings, 1/m.
+    """
+
+    reach: float
+    detection: float
+    along: float
+    heading: float
+    width: float
+    false: float
+    new: float
+    usual: float
+    true_share: float
+    corner_form: float
+    opening_form: float
+
+
+class Expected(NamedTuple):
+    """What is to be seen in every state.
+
+    :ivar starts: shape (states + 1,), where the list of each state begins.
+    :ivar landmarks: the lists, one after the other, each as from the state's node.
+    """
+
+    starts: Int64
+    landmarks: Landmarks
+
+
+def observation_model(places: Places, features: Features) -> ObservationModel:
+    """The model that parameters say."""
+    return ObservationModel(
+        places.reach, places.detection, places.position_deviation**2, math.radians(places.heading_deviation) ** 2,
+        places.width_deviation**2, places.false_density, places.new_density, places.usual_density, places.true_share,
+        0.5 / math.pi, 1.0 / (features.opening_max - features.opening_min),
+    )  # fmt: skip
+
+
+def log_observation(
+    observed: Landmarks, expected: Expected, away: float, variance: float, model: ObservationModel
+) -> Float64:
+    """Log-likelihood ratios log OS(o, s) of all states against a place where nothing is expected, shape (states,).
+
+    :param away: how far the robot is beyond the state's node, m.
+    :param variance: of that, m^2.
+    """
+    shifts, weights = _places_along(variance, model)
+    tracks = np.searchsorted(observed.tracks, np.arange(TRACKS + 1))
+    return _log_ratios(observed, tracks, _matched(observed, model), expected, away + shifts, weights, model)
+
+
+def log_unknown_ground(observed: Landmarks, model: ObservationModel) -> float:
+    """The same of unknown ground: one Poisson process against another."""
+    there = observed.probabilities / model.true_share
+    none = model.false * (1.0 - observed.probabilities) / (1.0 - model.true_share)
+    more = (model.usual - model.new) * 2.0 * model.reach * TRACKS
+    return float(np.log((model.usual * there + none) / (model.new * there + none)).sum() - more)
+
+
+def _matched(observed: Landmarks, model: ObservationModel) -> Float64:
+    """What a match counts, p_l / (pi e), shape (m,)."""
+    form = np.where(observed.tracks < OPENINGS, model.corner_form, model.opening_form)
+    there = observed.probabilities / model.true_share
+    none = model.false * (1.0 - observed.probabilities) / (1.0 - model.true_share)
+    return there / (form * (none + model.new * there))
+
+
+def _places_along(variance: float, model: ObservationModel) -> tuple[Float64, Float64]:
+    """A grid over delta, m, and the weights of its points."""
+    deviation = math.sqrt(variance)
+    count = math.ceil(_SIDES * deviation / (_STEP * math.sqrt(model.along)))
+    if not count:
+        return np.zeros(1), np.ones(1)
+    points = np.linspace(-_SIDES, _SIDES, 2 * count + 1)
+    weights = np.exp(-0.5 * points**2)
+    return deviation * points, weights / weights.sum()
+
+
+@njit(cache=True)
+def _log_ratios(
+    observed: Landmarks, tracks: Int64, matched: Float64, expected: Expected, aways: Float64, weights: Float64,
+    model: ObservationModel,
+) -> Float64:
+    states = len(expected.starts) - 1
+    logs, found = np.empty(len(aways)), np.empty(states)
+    row = np.empty(len(observed.along) + 1)
+    for state in range(states):
+        begin, end = expected.starts[state], expected.starts[state + 1]
+        for k in range(len(aways)):
+            logs[k] = math.log(weights[k])
+            logs[k] += _log_pairings(observed, tracks, matched, expected.landmarks, begin, end, aways[k], model, row)
+        top = logs.max()
+        found[state] = top + math.log(np.exp(logs - top).sum()) if top > -np.inf else -np.inf
+    return found
+
+
+@njit(cache=True)
+def _log_pairings(
+    observed: Landmarks, tracks: Int64, matched: Float64, landmarks: Landmarks, begin: int, end: int, away: float,
+    model: ObservationModel, row: Float64,
+) -> float:
+    """Log of the sum over all pairings, the product over the tracks."""
+    total, own = 0.0, begin
+    for track in range(TRACKS):
+        first, count = tracks[track], tracks[track + 1] - tracks[track]
+        row[: count + 1] = 1.0
+        while own < end and landmarks.tracks[own] == track:
+            total += _forward(observed, matched, landmarks, own, first, count, away, model, row)
+            own += 1
+        total += math.log(row[count]) if row[count] > 0.0 else -np.inf
+    return total
+
+
+@njit(cache=True)
+def _forward(
+    observed: Landmarks, matched: Float64, landmarks: Landmarks, own: int, first: int, count: int, away: float,
+    model: ObservationModel, row: Float64,
+) -> float:
+    """Take one more expected landmark into the sums over pairings of it and those before; return what was scaled off.
+
+    ``row[j]`` is the sum over the pairings with the first j observed landmarks of the track, of which the others are
+    extra. The new one is missed, or matched with any of them.
+    """
+    place, variance = landmarks.along[own] - away, landmarks.variances[own, 0] + model.along
+    form_variance = landmarks.variances[own, 1] + (model.heading if landmarks.tracks[own] < OPENINGS else model.width)
+    seen = landmarks.probabilities[own] * model.detection
+    missed = 1.0 - seen * _within(place, math.sqrt(variance), model.reach)
+    before, paired = row[0], 0.0
+    row[0] *= missed
+    for j in range(count):
+        k = first + j
+        here = _fit(observed.along[k] - place, variance + observed.variances[k, 0])
+        if here > 0.0:
+            off = observed.forms[k] - landmarks.forms[own]
+            if landmarks.tracks[own] < OPENINGS:
+                off = (off + math.pi) % (2.0 * math.pi) - math.pi
+            here *= _fit(off, form_variance + observed.variances[k, 1])
+        paired += before * seen * here * matched[k]
+        before = row[j + 1]
+        row[j + 1] = missed * before + paired
+    top = row[: count + 1].max()
+    if not top > 0.0:
+        return 0.0
+    row[: count + 1] /= top
+    return math.log(top)
+
+
+@njit(cache=True)
+def _fit(off: float, variance: float) -> float:
+    """Density of a difference; 0 far out."""
+    if off * off > _FAR * _FAR * variance:
+        return 0.0
+    return math.exp(-0.5 * off * off / variance) / math.sqrt(2.0 * math.pi * variance)
+
+
+@njit(cache=True)
+def _within(place: float, deviation: float, reach: float) -> float:
+    """Probability that a landmark is measured within reach."""
+    if abs(place) < reach - _FAR * deviation:
+        return 1.0
+    if abs(place) > reach + _FAR * deviation:
+        return 0.0
+    scale = 1.0 / (math.sqrt(2.0) * deviation)
+    return 0.5 * (math.erf((reach - place) * scale) - math.erf((-reach - place) * scale))
