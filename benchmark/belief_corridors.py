@@ -1,0 +1,145 @@
+"""Random corridors with landmarks: a map of places, and the building that it is a map of."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+
+from hmt_slam_ros.arrays import Float64
+from hmt_slam_ros.places.observation_graph import OPENINGS, Landmarks, chosen, joined, no_landmarks
+from hmt_slam_ros.places.place_graph import EAST, NORTH, Edge, Node
+
+ROUGH = 0.03
+"""Deviation of a distance in the map by its length."""
+
+_DOOR, _HALLWAY = (0.7, 1.2), (1.5, 2.5)  # widths, m
+_DOORS, _LEAST = 3.0, 1.5  # mean distance between doors beyond the least, m
+_BETWEEN, _END = (10.0, 20.0), (6.0, 15.0)  # of hallways from each other and beyond the last crossing, m
+_APART = 0.6  # landmarks of a track, m, at least
+_EXISTENCE = (0.6, 1.0)
+_PLACED, _FORM = 0.05**2, 0.03**2  # variances of a landmark of the map: along, m^2, and of its form, rad^2 or m^2
+_CORNER, _LEFT, _RIGHT = 4, OPENINGS + 1, OPENINGS + 3
+
+
+class Corridors(NamedTuple):
+    """Nodes and the edges between them in one direction each."""
+
+    nodes: list[Node]
+    ways: list[Edge]
+
+    @property
+    def edges(self) -> list[Edge]:
+        """In both directions."""
+        return [edge for way in self.ways for edge in (way, way.back)]
+
+
+def random_corridors(random: np.random.Generator, rows: int, columns: int, density: float) -> Corridors:
+    """Hallways from west to east that cross others from south to north, with doors and corners.
+
+    :param density: of the corners of a kind, 1/m.
+    """
+    across, up = _crossings(random, columns), _crossings(random, rows)
+    corridors = Corridors([_crossing(random) for _ in range(rows * columns)], [])
+    for row in range(rows):
+        _hallway(random, corridors, [row * columns + k for k in range(columns)], across, EAST, density)
+    for column in range(columns):
+        _hallway(random, corridors, [k * columns + column for k in range(rows)], up, NORTH, density)
+    return corridors
+
+
+def drawn_building(random: np.random.Generator, corridors: Corridors) -> Corridors:
+    """A building that the corridors may be a map of: what stands there, and where exactly."""
+    nodes = [
+        Node(float(random.random() < node.existence), _stands(random, node.north), _stands(random, node.east))
+        for node in corridors.nodes
+    ]
+    ways = [
+        way._replace(
+            distance=(random.normal(way.distance[0], math.sqrt(way.distance[1])), 0.0),
+            turn=(random.normal(way.turn[0], math.sqrt(way.turn[1])), 0.0),
+            landmarks=_stands(random, way.landmarks),
+        )
+        for way in corridors.ways
+    ]
+    return Corridors(nodes, ways)
+
+
+def _stands(random: np.random.Generator, landmarks: Landmarks) -> Landmarks:
+    there = random.random(len(landmarks.tracks)) < landmarks.probabilities
+    kept = chosen(landmarks, there)
+    along, forms = (random.normal(mean, np.sqrt(kept.variances[:, k])) for k, mean in enumerate(kept[1:3]))
+    certain = np.zeros_like(kept.variances)
+    return joined((Landmarks(kept.tracks, along, forms, certain, np.ones(len(along))),))
+
+
+def _crossings(random: np.random.Generator, count: int) -> Float64:
+    """Where hallways cross another one, between its two ends, which are the first and the last, m."""
+    steps = [*random.uniform(*_END, 1), *random.uniform(*_BETWEEN, count - 1), *random.uniform(*_END, 1)]
+    return np.concatenate(([0.0], np.cumsum(steps)))
+
+
+def _hallway(
+    random: np.random.Generator, corridors: Corridors, crossings: Sequence[int], places: Float64, heading: int,
+    density: float,
+) -> None:
+    """Add the doors and the two ends of a hallway, and its edges."""
+    stops = list(zip(places[1:-1].tolist(), crossings, strict=True))
+    for begin, end in zip(places[:-1].tolist(), places[1:].tolist(), strict=True):
+        at = begin + _LEAST + random.exponential(_DOORS)
+        while at < end - _LEAST:
+            stops.append((at, _added(corridors, _side(random, heading, _opening(random, _DOOR, (_LEFT, _RIGHT))))))
+            at += _LEAST + random.exponential(_DOORS)
+    stops += [(at, _added(corridors, _side(random, heading, no_landmarks()))) for at in places[[0, -1]].tolist()]
+    stops.sort()
+    for (at, start), (then, end) in pairwise(stops):
+        length = then - at
+        distance = (length, (ROUGH * length) ** 2)
+        landmarks = _corners(random, length, density)
+        corridors.ways.append(Edge(start, heading, end, heading, distance, (0.0, 0.01**2), landmarks))
+
+
+def _added(corridors: Corridors, node: Node) -> int:
+    corridors.nodes.append(node)
+    return len(corridors.nodes) - 1
+
+
+def _side(random: np.random.Generator, heading: int, landmarks: Landmarks) -> Node:
+    existence = float(random.uniform(*_EXISTENCE))
+    none = no_landmarks()
+    return Node(existence, landmarks, none) if heading == NORTH else Node(existence, none, landmarks)
+
+
+def _crossing(random: np.random.Generator) -> Node:
+    both = [joined((_opening(random, _HALLWAY, (_LEFT,)), _opening(random, _HALLWAY, (_RIGHT,)))) for _ in range(2)]
+    return Node(float(random.uniform(*_EXISTENCE)), *both)
+
+
+def _opening(random: np.random.Generator, widths: tuple[float, float], tracks: Sequence[int]) -> Landmarks:
+    return _landmarks(random, random.choice(tracks, 1).tolist(), [0.0], [float(random.uniform(*widths))])
+
+
+def _corners(random: np.random.Generator, length: float, density: float) -> Landmarks:
+    """Corners along a stretch of hallway, which head for one of its four diagonals."""
+    tracks, along, forms = [], [], []
+    for track in range(_CORNER):
+        at = 0.5 * _APART + random.exponential(1.0 / density)
+        while at < length - 0.5 * _APART:
+            tracks.append(track)
+            along.append(at)
+            forms.append(0.5 * math.pi * random.integers(4) - 0.75 * math.pi)
+            at += _APART + random.exponential(1.0 / density)
+    return _landmarks(random, tracks, along, forms)
+
+
+def _landmarks(
+    random: np.random.Generator, tracks: Sequence[int], along: Sequence[float], forms: Sequence[float]
+) -> Landmarks:
+    count = len(tracks)
+    variances = np.tile((_PLACED, _FORM), (count, 1))
+    existence = random.uniform(*_EXISTENCE, count)
+    own = np.array(tracks, dtype=np.int64), np.array(along, dtype=np.float64), np.array(forms, dtype=np.float64)
+    return joined((Landmarks(*own, variances, existence),))

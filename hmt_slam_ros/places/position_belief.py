@@ -1,0 +1,166 @@
+"""The position estimator of Tomatis, Nourbakhsh and Siegwart (2003), section 3.3: a belief over the states of a map.
+
+Eq. (1), in log space: ``SE_s'(k+1) = OS(o, s', a) sum_s T(s, a, s') SE_s(k) / P(o | a, SE(k))``, where the action a is
+to go on, to turn at a node, or to arrive at the next opening. The paper's T has 0.99 for the state that the action
+leads to, and 0.01 (``slip``) for all others; here these share it evenly, so that T is a probability. Which state an
+arrival leads to is no yes or no: the travelled distance d and the turn on the way are observed too, with
+N(d; d_arc, sigma_arc^2 + sigma_d^2) for an arc of the map, and with what is usual in buildings for other transitions.
+
+One more state is ground that the map does not hold. It is where hallways lead that the map does not follow, and where
+landmarks come as they do anywhere (observation.py). So the belief stays true in a map that is known in part.
+
+A belief is a value; an update costs O(states + arcs), and what OS costs.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from hmt_slam_ros.arrays import Float64
+from hmt_slam_ros.configuration.places import Places
+from hmt_slam_ros.places.observation import ObservationModel, log_observation, log_unknown_ground
+from hmt_slam_ros.places.observation_graph import QUARTERS, Landmarks
+from hmt_slam_ros.places.place_graph import Arcs, PlaceGraph
+
+
+class Travel(NamedTuple):
+    """The way to an opening, from the last one.
+
+    :ivar distance: m, by odometry.
+    :ivar turn: how far the robot turned on the way, counterclockwise, rad.
+    :ivar variances: of both, m^2 and rad^2.
+    """
+
+    distance: float
+    turn: float
+    variances: tuple[float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class PositionBelief:
+    """A belief over the states of a map and unknown ground.
+
+    :ivar graph: the map.
+    :ivar places: parameters.
+    :ivar logs: shape (states + 1,), the log of each state's probability, of unknown ground the last.
+    """
+
+    graph: PlaceGraph
+    places: Places
+    logs: Float64
+
+    @property
+    def probabilities(self) -> Float64:
+        """SE, shape (states + 1,); the sum is 1."""
+        return np.exp(self.logs)
+
+    @property
+    def entropy(self) -> float:
+        """The unconfidence U(SE), Eq. (3), nats."""
+        return float(-(self.probabilities * np.maximum(self.logs, -1e300)).sum())
+
+    @property
+    def confident(self) -> bool:
+        """Whether U(SE) < U_max, Eq. (3)."""
+        return self.entropy < self.places.max_entropy
+
+    @property
+    def most_likely(self) -> int | None:
+        """The most likely state; None for unknown ground."""
+        best = int(np.argmax(self.logs))
+        return best if best < self.graph.states else None
+
+    def gone_on(self) -> PositionBelief:
+        """After a stretch on which no opening was noticed: T(s, a, s) = 1 - slip."""
+        return self._predicted(self.logs)
+
+    def turned(self, quarters: int) -> PositionBelief:
+        """After so many quarters of a turn to the right at a node."""
+        by_node = self.logs[:-1].reshape(-1, QUARTERS)
+        return self._predicted(np.append(np.roll(by_node, quarters, axis=1).ravel(), self.logs[-1]))
+
+    def _predicted(self, logs: Float64) -> PositionBelief:
+        """Each state keeps all but ``slip``, of which every other one gets its share."""
+        slip, others = self.places.slip, len(logs) - 1
+        probabilities = np.exp(logs)
+        predicted = (1.0 - slip) * probabilities + slip / others * (probabilities.sum() - probabilities)
+        return replace(self, logs=_normalised(_log(predicted)))
+
+    def arrived(self, travel: Travel) -> PositionBelief:
+        """After the next opening was noticed, Eq. (1) with d as a part of o."""
+        usual = -math.log(2.0 * math.pi * self.places.spacing) - travel.distance / self.places.spacing
+        predicted = _arrived(
+            np.exp(self.logs), self.graph.arcs, np.array((travel.distance, travel.turn)), np.array(travel.variances),
+            usual, self.places.slip, self.places.discovery,
+        )  # fmt: skip
+        return replace(self, logs=_normalised(_log(predicted)))
+
+    def observed(
+        self, graph: Landmarks, model: ObservationModel, away: float = 0.0, variance: float = 0.0
+    ) -> PositionBelief:
+        """After an observation graph was seen, Eq. (1).
+
+        :param away: how far the robot is beyond the node of its state, m.
+        :param variance: of that, m^2.
+        """
+        told = log_observation(graph, self.graph.expected, away, variance, model)
+        return replace(self, logs=_normalised(self.logs + np.append(told, log_unknown_ground(graph, model))))
+
+
+def flat_belief(graph: PlaceGraph, places: Places) -> PositionBelief:
+    """Nothing is known of where the robot is."""
+    logs = np.full(graph.states + 1, math.log1p(-places.unmapped) - math.log(graph.states))
+    logs[-1] = math.log(places.unmapped)
+    return PositionBelief(graph, places, logs)
+
+
+def certain_belief(graph: PlaceGraph, places: Places, state: int) -> PositionBelief:
+    """The robot is in a state for certain."""
+    logs = np.full(graph.states + 1, -np.inf)
+    logs[state] = 0.0
+    return PositionBelief(graph, places, logs)
+
+
+def _log(probabilities: Float64) -> Float64:
+    """With -inf for 0."""
+    return np.log(probabilities, out=np.full(len(probabilities), -np.inf), where=probabilities > 0.0)
+
+
+def _normalised(logs: Float64) -> Float64:
+    """:raises ValueError: where no state can be."""
+    top = logs.max()
+    if not top > -np.inf:
+        raise ValueError("what was observed is impossible in every state: no probability of the model may be 0")
+    return logs - top - math.log(np.exp(logs - top).sum())
+
+
+@njit(cache=True)
+def _arrived(
+    belief: Float64, arcs: Arcs, way: Float64, noise: Float64, usual: float, slip: float, discovery: float
+) -> Float64:
+    """sum_s T(s, a, s') p(d | s, s') SE_s up to a factor: densities are relative to what is usual, given as a log.
+
+    What no arc of a state accounts for leads to unknown ground.
+    """
+    states = len(belief) - 1
+    mapped, unmapped = belief[:states].sum(), belief[states]
+    predicted = slip / states * (mapped - belief) + discovery / states * unmapped
+    predicted[states] = slip / states * mapped + (1.0 - discovery) * unmapped + (1.0 - slip) * mapped
+    for k in range(len(arcs.sources)):
+        share = (1.0 - slip) * arcs.probabilities[k] * belief[arcs.sources[k]]
+        log_density = -usual
+        for axis in range(2):
+            variance = arcs.variances[k, axis] + noise[axis]
+            off = way[axis] - arcs.means[k, axis]
+            if axis == 1:
+                off = (off + math.pi) % (2.0 * math.pi) - math.pi
+            log_density -= 0.5 * (off * off / variance + math.log(2.0 * math.pi * variance))
+        predicted[states] -= share
+        predicted[arcs.targets[k]] += share * math.exp(log_density)
+    predicted[states] = max(predicted[states], slip / states * mapped + (1.0 - discovery) * unmapped)
+    return predicted

@@ -1,0 +1,250 @@
+"""The graph of places, and the position estimator against enumeration and against robots of its own model."""
+
+import dataclasses
+import itertools
+import math
+
+import numpy as np
+import pytest
+
+from benchmark.belief_corridors import random_corridors
+from benchmark.belief_world import drawn_anywhere, drawn_observation
+from hmt_slam_ros.configuration.features import Features
+from hmt_slam_ros.configuration.places import Places
+from hmt_slam_ros.places.observation import log_observation, log_unknown_ground, observation_model
+from hmt_slam_ros.places.observation_graph import Landmarks, joined, no_landmarks
+from hmt_slam_ros.places.place_graph import EAST, NORTH, SOUTH, WEST, Edge, Node, place_graph, state_of
+from hmt_slam_ros.places.position_belief import Travel, certain_belief, flat_belief
+
+PLACES = Places()
+MODEL = observation_model(PLACES, Features())
+EMPTY = no_landmarks()
+QUARTER = 0.5 * math.pi
+
+
+def corner(along, track=0, heading=0.5):
+    return Landmarks(
+        np.array([track]), np.array([along]), np.array([heading]), np.array([[0.01, 0.01]]), np.array([0.9])
+    )
+
+
+def straight(start, end, length, landmarks=EMPTY, heading=EAST):
+    return Edge(start, heading, end, heading, (length, 0.04), (0.0, 0.01), landmarks)
+
+
+def chain(lengths, existence=0.5):
+    """A hallway from west to east."""
+    ways = [straight(k, k + 1, length, corner(1.0 + 0.1 * k)) for k, length in enumerate(lengths)]
+    edges = [edge for way in ways for edge in (way, way.back)]
+    return place_graph([Node(existence, EMPTY, EMPTY)] * (len(lengths) + 1), edges, PLACES)
+
+
+def random_graph(seed, rows=1, columns=1, density=0.1):
+    corridors = random_corridors(np.random.default_rng(seed), rows, columns, density)
+    return place_graph(corridors.nodes, corridors.edges, PLACES)
+
+
+def test_the_next_opening_is_at_the_end_of_the_edge_or_behind_those_that_are_missed():
+    graph = chain([3.0, 4.0, 5.0])
+    own = graph.arcs.sources == state_of(0, EAST)
+    seen = 0.5 * PLACES.detection
+    assert list(graph.arcs.targets[own]) == [state_of(k, EAST) for k in (1, 2, 3)]
+    np.testing.assert_allclose(graph.arcs.probabilities[own], [seen, (1 - seen) * seen, (1 - seen) ** 2])
+    np.testing.assert_allclose(graph.arcs.means[own], [(3, 0), (7, 0), (12, 0)])
+    np.testing.assert_allclose(graph.arcs.variances[own, 0], [0.04, 0.08, 0.12])
+    assert graph.following[state_of(3, WEST)] == state_of(2, WEST)
+    assert graph.following[state_of(3, EAST)] == -1
+
+
+def test_a_state_sees_ahead_and_back_what_the_map_has_there():
+    graph = chain([3.0, 4.0, 5.0])
+
+    def seen(state):
+        own = slice(*graph.expected.starts[state : state + 2])
+        return graph.expected.landmarks.tracks[own], graph.expected.landmarks.along[own]
+
+    tracks, along = seen(state_of(1, EAST))
+    np.testing.assert_allclose(along, [-2.0, 1.1, 5.2])
+    assert not tracks.any()
+    tracks, along = seen(state_of(1, WEST))
+    np.testing.assert_allclose(along, [-5.2, -1.1, 2.0])
+    assert (tracks == 1).all()
+    assert not len(seen(state_of(1, NORTH))[0])
+
+
+def test_behind_a_bend_nothing_is_in_sight():
+    bend = Edge(0, EAST, 1, SOUTH, (3.0, 0.04), (-QUARTER, 0.01), corner(1.0))
+    graph = place_graph([Node(1.0, EMPTY, EMPTY)] * 3, [bend, straight(1, 2, 2.0, corner(0.5), SOUTH)], PLACES)
+    starts = graph.expected.starts
+    np.testing.assert_allclose(graph.expected.landmarks.along[starts[EAST] : starts[EAST + 1]], [1.0])
+    np.testing.assert_allclose(graph.arcs.means[graph.arcs.sources == EAST], [(3, -QUARTER), (5, -QUARTER)])
+
+
+def test_two_ways_in_one_direction_are_refused():
+    with pytest.raises(ValueError, match="same direction"):
+        place_graph([Node(1.0, EMPTY, EMPTY)] * 3, [straight(0, 1, 2.0), straight(0, 2, 3.0)], PLACES)
+
+
+def transition(graph, places, action):
+    """T(s, a, s') times the density of what was travelled, by the book, shape (states + 1, states + 1)."""
+    n = graph.states
+    if not isinstance(action, Travel):
+        quarters = action
+        table = np.full((n + 1, n + 1), places.slip / n)
+        for s in range(n + 1):
+            target = n if s == n else s // 4 * 4 + (s % 4 + quarters) % 4
+            table[s, s] = places.slip / n
+            table[s, target] = 1.0 - places.slip
+        return table
+    usual = math.exp(-action.distance / places.spacing) / places.spacing / (2 * math.pi)
+    table = np.full((n + 1, n + 1), places.slip / n * usual)
+    table[n], table[n, n] = places.discovery / n * usual, (1 - places.discovery) * usual
+    for s in range(n):
+        table[s, s], rest = 0.0, 1.0
+        for k in np.flatnonzero(graph.arcs.sources == s):
+            variance = graph.arcs.variances[k] + action.variances
+            off = np.array(action[:2]) - graph.arcs.means[k]
+            off[1] = math.remainder(off[1], 2 * math.pi)
+            density = np.exp(-0.5 * off**2 / variance) / np.sqrt(2 * math.pi * variance)
+            table[s, graph.arcs.targets[k]] += (1 - places.slip) * graph.arcs.probabilities[k] * density.prod()
+            rest -= graph.arcs.probabilities[k]
+        table[s, n] += (1 - places.slip) * rest * usual
+    return table
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_the_belief_is_that_of_an_enumeration_of_all_paths(seed):
+    random = np.random.default_rng(seed)
+    places = dataclasses.replace(PLACES, slip=0.1, discovery=0.2, unmapped=0.3)
+    lengths = random.uniform(2.0, 4.0, 2)
+    edges = [straight(0, 1, lengths[0], corner(1.0)), straight(1, 2, lengths[1], corner(0.7, 1))]
+    edges += [edges[0].back] + ([edges[1].back] if seed % 2 else [])
+    graph = place_graph([Node(0.7, EMPTY, corner(0.0, 5, 1.0))] * 3, edges, places)
+    belief, factors = flat_belief(graph, places), []
+    for _ in range(3):
+        action = random.choice(4)
+        action = Travel(*random.normal((3.0, 0.0), (0.5, 0.1)), (0.01, 0.01)) if action in (0, 1) else int(action - 2)
+        away, variance = random.uniform(0.0, 1.0), 0.02
+        graph_seen = drawn_anywhere(random, 0.1, 0.1, MODEL)
+        if isinstance(action, Travel):
+            belief = belief.arrived(action)
+        elif action:
+            belief = belief.turned(action)
+        else:
+            belief = belief.gone_on()
+        belief = belief.observed(graph_seen, MODEL, away, variance)
+        told = np.append(
+            log_observation(graph_seen, graph.expected, away, variance, MODEL), log_unknown_ground(graph_seen, MODEL)
+        )
+        factors.append(transition(graph, places, action) * np.exp(told))
+    start = np.exp(flat_belief(graph, places).logs)
+    ends = np.zeros(graph.states + 1)
+    for path in itertools.product(range(graph.states + 1), repeat=3):
+        steps = factors[1][path[0], path[1]] * factors[2][path[1], path[2]]
+        ends[path[2]] += float(start @ factors[0][:, path[0]]) * steps
+    np.testing.assert_allclose(belief.probabilities, ends / ends.sum(), rtol=1e-12, atol=1e-300)
+
+
+def test_every_transition_is_a_probability():
+    graph = random_graph(3)
+    for action in (0, 1, 2):
+        np.testing.assert_allclose(transition(graph, PLACES, action).sum(axis=1), 1.0, atol=1e-12)
+    for source in (0, 5, graph.states):
+        logs = np.full(graph.states + 1, -np.inf)
+        logs[source] = 0.0
+        belief = dataclasses.replace(flat_belief(graph, PLACES), logs=logs)
+        for after in (belief.gone_on(), belief.turned(1), belief.arrived(Travel(4.0, 0.0, (0.1, 0.1)))):
+            assert after.probabilities.sum() == pytest.approx(1.0, abs=1e-12)
+
+
+def test_entropy_says_whether_the_belief_is_confident():
+    graph = random_graph(1)
+    certain = certain_belief(graph, PLACES, 7)
+    assert certain.entropy == 0.0
+    assert certain.confident
+    assert certain.most_likely == 7
+    flat = flat_belief(graph, dataclasses.replace(PLACES, unmapped=1.0 / (graph.states + 1)))
+    assert flat.entropy == pytest.approx(math.log(graph.states + 1))
+    assert not flat.confident
+    lost = dataclasses.replace(flat, logs=np.log(np.append(np.full(graph.states, 1e-9), 1.0)))
+    assert lost.most_likely is None
+
+
+def test_where_the_map_ends_unknown_ground_begins():
+    graph = chain([3.0, 4.0])
+    there = certain_belief(graph, PLACES, state_of(2, EAST)).arrived(Travel(4.0, 0.0, (0.01, 0.01)))
+    assert there.most_likely is None
+    assert there.probabilities[-1] > 0.98
+
+
+def test_the_travelled_distance_tells_openings_apart():
+    graph = chain([3.0, 4.0])
+    start = certain_belief(graph, PLACES, state_of(0, EAST))
+    assert start.arrived(Travel(3.1, 0.0, (0.01, 0.01))).most_likely == state_of(1, EAST)
+    assert start.arrived(Travel(6.9, 0.0, (0.01, 0.01))).most_likely == state_of(2, EAST)
+
+
+def simulated(seed, places, steps=6):
+    """Beliefs and true states of a robot that moves and sees exactly as the model says."""
+    random = np.random.default_rng(seed)
+    graph = random_graph(seed % 7, density=0.02)
+    belief = flat_belief(graph, places)
+    state = int(random.choice(graph.states + 1, p=belief.probabilities))
+    for _ in range(steps):
+        action = int(random.choice(4, p=(0.1, 0.1, 0.1, 0.7)))
+        state, travel = drawn_transition(random, graph, places, state, action)
+        belief = belief.turned(action) if travel is None else belief.arrived(travel)
+        yield belief, state
+        belief = belief.observed(drawn_seen(random, graph, state), MODEL, 0.0, 0.01)
+        yield belief, state
+
+
+def drawn_transition(random, graph, places, state, action):
+    n = graph.states
+    others = [s for s in range(n + 1) if s != state]
+    if action < 3:
+        target = n if state == n else state // 4 * 4 + (state % 4 + action) % 4
+        others = [s for s in range(n + 1) if s != target]
+        return (int(random.choice(others)) if random.random() < places.slip else target), None
+    usual = Travel(random.exponential(places.spacing), random.uniform(-math.pi, math.pi), (0.01, 0.001))
+    if state == n:
+        return (int(random.integers(n)) if random.random() < places.discovery else n), usual
+    if random.random() < places.slip:
+        return int(random.choice(others)), usual
+    own = np.flatnonzero(graph.arcs.sources == state)
+    shares = np.cumsum(graph.arcs.probabilities[own])
+    k = int(np.searchsorted(shares, random.random()))
+    if k == len(own):
+        return n, usual
+    way = random.normal(graph.arcs.means[own[k]], np.sqrt(graph.arcs.variances[own[k]] + usual.variances))
+    return int(graph.arcs.targets[own[k]]), Travel(*way, usual.variances)
+
+
+def drawn_seen(random, graph, state):
+    if state == graph.states:
+        return drawn_anywhere(random, MODEL.usual, MODEL.false, MODEL)
+    own = slice(*graph.expected.starts[state : state + 2])
+    return drawn_observation(random, Landmarks(*(f[own] for f in graph.expected.landmarks)), 0.0, 0.01, MODEL)
+
+
+def test_beliefs_about_robots_of_the_model_are_calibrated():
+    places = dataclasses.replace(PLACES, slip=0.05, discovery=0.2, unmapped=0.2)
+    peaks, right = [], []
+    for seed in range(250):
+        for belief, state in simulated(seed, places):
+            peaks.append(belief.probabilities.max())
+            right.append(int(np.argmax(belief.logs)) == state)
+    peaks, right = np.array(peaks), np.array(right)
+    bins = np.minimum(9, (10 * peaks).astype(int))
+    error = np.abs(np.bincount(bins, peaks - right)).sum() / len(peaks)
+    assert len(set(bins)) > 6
+    assert error < 0.03
+
+
+def test_a_hallway_may_be_joined_from_lists_of_both_directions():
+    there = joined((corner(1.0), corner(2.0, 3)))
+    way = straight(0, 1, 3.0, there)
+    np.testing.assert_allclose(way.back.landmarks.along, [2.0, 1.0])
+    assert list(way.back.landmarks.tracks) == [1, 2]
+    for one, other in zip(way.back.back.landmarks, there, strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-12)
