@@ -1,0 +1,155 @@
+"""Loops that two peaks of the belief propose."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+from benchmark.belief_corridors import Corridors, drawn_building, random_corridors
+from benchmark.belief_world import drawn_of_present
+from hmt_slam_ros.configuration.features import Features
+from hmt_slam_ros.configuration.places import Places
+from hmt_slam_ros.places.observation import observation_model
+from hmt_slam_ros.places.observation_graph import Landmarks, no_landmarks
+from hmt_slam_ros.places.place_graph import EAST, Edge, Node, heading_of, place_graph, state_of
+from hmt_slam_ros.places.position_belief import PositionBelief, Travel, certain_belief, flat_belief
+from hmt_slam_ros.places.twin_peaks import TwinPeaks
+
+PLACES = Places()
+MODEL = observation_model(PLACES, Features())
+NOISE = (0.01, 0.001)
+ROUND = 5  # nodes of the loop
+
+
+def lap(random):
+    """The edges of a straight hallway with many landmarks, all of which are extracted in every lap."""
+    ways = [way for way in random_corridors(random, 1, 3, 0.2).ways if way.leaving == EAST][:ROUND]
+    return [way._replace(landmarks=sure(way.landmarks)) for way in ways]
+
+
+def sure(landmarks):
+    return landmarks._replace(probabilities=np.ones(len(landmarks.tracks)))
+
+
+def mapped_twice(random, edges, turned=0):
+    """The building, and the chain that is made of it by one who goes round twice, as if there were no loop."""
+    nodes = [Node(1.0, no_landmarks(), no_landmarks())] * (2 * ROUND + 1)
+    twice = []
+    for k in range(2 * ROUND):
+        there = drawn_building(random, Corridors([], [edges[k % ROUND]])).ways[0]
+        known = edges[k % ROUND].landmarks
+        listed = there.landmarks._replace(
+            variances=np.full((len(there.landmarks.tracks), 2), known.variances[0] if len(known.tracks) else 0.0),
+            probabilities=np.full(len(there.landmarks.tracks), 0.9),
+        )
+        heading = EAST if k < ROUND else EAST + turned
+        length = edges[k % ROUND].distance[0]
+        twice.append(Edge(k, heading, k + 1, heading, (length, (0.03 * length) ** 2), (0.0, 1e-4), listed))
+    if turned:
+        last = twice[ROUND - 1]
+        twice[ROUND - 1] = last._replace(arriving=EAST + turned, turn=(-0.5 * math.pi * turned, 1e-4))
+    return place_graph(nodes, twice, PLACES)
+
+
+def driven(random, belief, detector, edges, start, count):
+    """Proposals of a robot that goes round in the loop."""
+    for k in range(start, start + count):
+        own = edges[k % ROUND]
+        length = random.normal(own.distance[0], 0.05)
+        belief = belief.arrived(Travel(length, random.normal(0.0, 0.02), NOISE))
+        ahead = edges[(k + 1) % ROUND].landmarks
+        seen = drawn_of_present(random, ahead, np.ones(len(ahead.tracks), bool), 0.0, MODEL)
+        belief = belief.observed(ahead_only(seen), MODEL, 0.0, 0.01)
+        yield detector.after_transition(belief), belief
+
+
+def ahead_only(seen):
+    return Landmarks(*(field[seen.along > 0.0] for field in seen))
+
+
+@pytest.mark.parametrize("turned", [0, 1])
+def test_a_loop_that_was_mapped_twice_is_proposed_with_the_places_that_are_one(turned):
+    found = 0
+    for seed in range(12):
+        random = np.random.default_rng(seed)
+        edges = lap(random)
+        graph = mapped_twice(random, edges, turned)
+        belief = flat_belief(graph, dataclasses.replace(PLACES, unmapped=0.01))
+        for loop, _ in driven(random, belief, TwinPeaks(), edges, 0, ROUND - 1):
+            if loop is not None:
+                found += 1
+                assert abs(loop.node - loop.other) == ROUND
+                assert loop.quarters in ((0,) if not turned else (1, 3))
+                break
+    assert found >= 9
+
+
+def test_no_loop_is_proposed_where_there_is_none():
+    for seed in range(40):
+        random = np.random.default_rng(seed)
+        corridors = random_corridors(random, 1, 2, 0.1)
+        graph = place_graph(corridors.nodes, corridors.edges, PLACES)
+        building = drawn_building(random, corridors)
+        truth = place_graph(building.nodes, building.edges, PLACES)
+        state = int(random.choice(np.flatnonzero(graph.following >= 0)))
+        belief, detector = flat_belief(graph, PLACES), TwinPeaks()
+        while graph.following[state] >= 0:
+            travel = Travel(random.normal(truth.lengths[state], 0.05), random.normal(0.0, 0.02), NOISE)
+            state = int(graph.following[state])
+            own = slice(*truth.expected.starts[state : state + 2])
+            there = Landmarks(*(field[own] for field in truth.expected.landmarks))
+            seen = drawn_of_present(random, there, np.ones(len(there.tracks), bool), 0.0, MODEL)
+            belief = belief.arrived(travel).observed(seen, MODEL, 0.0, 0.01)
+            assert detector.after_transition(belief) is None
+
+
+def two_peaks(graph, first, second, shares=(0.6, 0.4)):
+    logs = np.full(graph.states + 1, -60.0)
+    logs[[first, second]] = np.log(shares)
+    return PositionBelief(graph, PLACES, logs)
+
+
+@pytest.fixture
+def hallway():
+    edges = [Edge(k, EAST, k + 1, EAST, (4.0, 0.1), (0.0, 0.01), no_landmarks()) for k in range(11)]
+    back = [edge.back for edge in edges]
+    return place_graph([Node(1.0, no_landmarks(), no_landmarks())] * 12, edges + back, PLACES)
+
+
+def proposals(graph, places):
+    detector = TwinPeaks()
+    return [detector.after_transition(two_peaks(graph, *states)) for states in places]
+
+
+def test_three_transitions_in_the_same_way_make_a_loop_whichever_peak_is_higher(hallway):
+    def pair(k):
+        return state_of(k, EAST), state_of(k + 6, EAST)
+
+    found = proposals(hallway, [pair(0), pair(1), pair(2)[::-1], pair(3)])
+    assert found[:3] == [None, None, None]
+    assert found[3] is not None
+    assert (found[3].node, found[3].other, found[3].quarters) == (3, 9, 0)
+
+
+def test_peaks_may_head_for_different_sides_but_have_to_move_alike_and_apart(hallway):
+    opposite_ways = [(state_of(k, EAST), state_of(11 - k, heading_of(3))) for k in range(4)]
+    assert proposals(hallway, opposite_ways)[3].quarters == 2
+    chase = [(state_of(k, EAST), state_of(k + 1, EAST)) for k in range(5)]
+    assert proposals(hallway, chase) == [None] * 5
+    stuck = [(state_of(k, EAST), state_of(8, EAST)) for k in range(5)]
+    assert proposals(hallway, stuck) == [None] * 5
+
+
+def test_a_confident_belief_and_one_of_many_peaks_begin_anew(hallway):
+    pairs = [(state_of(k, EAST), state_of(k + 6, EAST)) for k in range(5)]
+    detector = TwinPeaks()
+    for k, pair in enumerate(pairs):
+        belief = two_peaks(hallway, *pair)
+        if k == 2:
+            belief = certain_belief(hallway, PLACES, pair[0])
+        assert detector.after_transition(belief) is None
+    detector = TwinPeaks()
+    for k, pair in enumerate(pairs):
+        belief = flat_belief(hallway, PLACES) if k == 2 else two_peaks(hallway, *pair)
+        assert detector.after_transition(belief) is None
