@@ -48,6 +48,7 @@ MEASUREMENTS = {
     "linemap": "whether a room's map of lines and the robot in it are as far off as they say, and its bytes",
     "landmarks": "whether corners and openings are there, where they are said to be, and how sure one may be of them",
     "hallways": "whether hallways and rooms are told apart",
+    "belief": "how soon a lost robot knows at which place it is, in corridors of the belief's own model",
     "localmaps": "maps of areas by lines beside grids, on simulated worlds",
     "table": "time and memory against a global metric RBPF at equal accuracy, the paper's Table II",
     "ambiguity": "whether both answers stay alive where places are identical, until the evidence",
@@ -64,8 +65,8 @@ _GROUPS = {
     "all": ("accuracy", "steps", "robustness", "choices", "sessions", "speed", "live"),
     "validation": (
         "calibration", "loops", "topology", "consistency", "evidence", "appearance", "lines", "linemap", "heading",
-        "landmarks", "hallways", "localmaps", "ambiguity", "table", "oracle", "awakening", "kidnapping", "laps",
-        "changes", "scale",
+        "landmarks", "hallways", "belief", "localmaps", "ambiguity", "table", "oracle", "awakening", "kidnapping",
+        "laps", "changes", "scale",
     ),
 }  # fmt: skip
 
