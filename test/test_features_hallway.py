@@ -10,6 +10,7 @@ from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.features.hallway import FreeSpace, after, area_class, free_space, log_odds
 from hmt_slam_ros.features.openings import rays_of
 from hmt_slam_ros.local_map.area_kind import AreaKinds
+from hmt_slam_ros.local_map.local_mapping import LocalMapping
 from hmt_slam_ros.simulation import open_simulated
 
 FEATURES = Features()
@@ -61,7 +62,7 @@ def test_what_an_area_is_taken_for_changes_only_where_that_is_clear():
 def test_a_stored_area_is_told_from_scans_of_half_a_circle(walls, hallway):
     poses = drive((-1.5, 0.2), (1.5, 0.2), (-1.5, 0.2))
     scans = [scan_in(walls, pose, beams=361, noise=0.015, seed=k) for k, pose in enumerate(poses)]
-    kinds = AreaKinds(Configuration())
+    kinds = AreaKinds(LocalMapping(Configuration()))
     found = kinds.of(scans, poses)
     assert found.hallway is hallway
     assert (found.probability > 0.9) if hallway else (found.probability < 0.1)

@@ -8,7 +8,6 @@ from hmt_slam_ros.agreement import SIGHT
 from hmt_slam_ros.configuration import Configuration, with_changes
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.local_map.filters import filter_of, new_filter
-from hmt_slam_ros.local_map.line_filter import LineFilter
 from hmt_slam_ros.local_map.local_filter import PlacedKeyframe
 from hmt_slam_ros.local_map.local_mapping import LocalMapping
 from hmt_slam_ros.local_map.sighting import Sighting
@@ -50,11 +49,6 @@ def driven(mapping, odometry_error=(0.0, 0.0, 0.0), steps=60):
 def placed(own, scans, frame=(0.0, 0.0, 0.0), area=0):
     poses = se2.compose(np.asarray(frame), own.leading_keyframe_poses())
     return [PlacedKeyframe(k, area, scans[k], pose) for k, pose in zip(own.keyframes, poses, strict=True)]
-
-
-def test_the_parameter_chooses_the_kind(mapping):
-    assert isinstance(new_filter(mapping, 0, 0), LineFilter)
-    assert not isinstance(new_filter(LocalMapping(Configuration()), 0, 0), LineFilter)
 
 
 def test_the_robot_is_found_though_odometry_drifts_and_knows_how_well(mapping):
@@ -151,7 +145,7 @@ def test_keyframes_are_dropped_and_what_was_known_is_forgotten(mapping):
     own.drop({1, 3})
     assert own.keyframes == [0, 2, 4]
     np.testing.assert_array_equal(own.leading_keyframe_poses(), kept)
-    own.forget()
+    own.stand(own.pose)
     np.testing.assert_array_equal(own.room.pose.covariance, 0.0)
     np.testing.assert_array_equal(own.tracking_covariance, 0.0)
     own.track(Sighting(mapping, blank_scan()), predicted(STEP))

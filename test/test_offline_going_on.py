@@ -129,9 +129,10 @@ def test_a_run_in_which_a_closure_is_doubted_can_stop_before_the_question_is_ans
     assert [ends.source for ends in stopped.reopened[0].withdrawn] == [0]
 
 
-def test_a_run_whose_local_maps_are_of_lines_can_stop(tmp_path):
+@pytest.mark.parametrize("kind", ["lines", "by_class"])
+def test_a_run_whose_local_maps_are_of_lines_can_stop(tmp_path, kind):
     """Also after the change into a second area."""
-    configuration = with_changes(Configuration(), {"local_map.kind": "lines"})
+    configuration = with_changes(Configuration(), {"local_map.kind": kind})
     second = once(lambda state: len(state.replica.common.areas) > 1)
     log = open_log("sim:office,seed=3,size=0.7,rate=2.5", duration=80.0)
     stopped = compared(

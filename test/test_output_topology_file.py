@@ -10,6 +10,7 @@ from test_output_folder import COVARIANCE, MAP_T_AREA_1, recorded, write
 
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.local_map.area_kind import AreaKinds
+from hmt_slam_ros.local_map.local_mapping import LocalMapping
 from hmt_slam_ros.offline.output_folder import check_replaceable
 from hmt_slam_ros.offline.saved_map import read_saved_map
 from hmt_slam_ros.offline.topology_file import export_topology
@@ -36,7 +37,7 @@ def test_areas_and_arcs_read_back_as_the_map_has_them(folder: Path) -> None:
     graph = nx.read_graphml(export_topology(folder), node_type=int)
     saved = read_saved_map(folder / "hmt_map")
     hybrid_map = saved.replica.maps[saved.replica.best]
-    kinds = AreaKinds(saved.configuration)
+    kinds = AreaKinds(LocalMapping(saved.configuration))
     assert graph.is_directed()
     assert sorted(graph) == hybrid_map.area_ids() == [0, 1]
     for area, attributes in graph.nodes.items():

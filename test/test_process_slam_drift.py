@@ -8,6 +8,7 @@ from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.local_map.area_filter import AreaFilter
+from hmt_slam_ros.local_map.filters import Kinds
 from hmt_slam_ros.local_map.local_filter import PlacedKeyframe
 from hmt_slam_ros.local_map.local_mapping import LocalMapping
 from hmt_slam_ros.local_map.sighting import Sighting
@@ -92,7 +93,7 @@ def test_a_robot_that_enters_an_area_is_as_uncertain_in_it_as_the_newest_keyfram
     rebase = entry.compose(PoseGaussian(se2.inverse(newest), np.zeros((3, 3))))
     leaf, poses = entered(live, (12, 13, 14, 15), rebase)
     content = [PlacedKeyframe(k, 1, driven.scans[k], se2.compose(rebase.mean, poses[k])) for k in range(16)]
-    live.change_area(leaf, content)
+    live.change_area(leaf, content, Kinds(live.filter.mapping))
     np.testing.assert_allclose(live.filter.pose, entry.mean, atol=1e-9)
     np.testing.assert_allclose(live.drift, entry.covariance, atol=1e-6)
     assert live.belief().covariance[0, 0] >= 0.9 * sigma**2
@@ -105,6 +106,6 @@ def test_a_robot_that_goes_back_into_an_area_is_as_far_off_as_the_map_there_and_
     before = live.drift
     leaf, poses = entered(live, (), rebase)
     content = [PlacedKeyframe(k, 1, drive_.scans[k], se2.compose(rebase.mean, poses[k])) for k in range(16)]
-    live.change_area(leaf, content)
+    live.change_area(leaf, content, Kinds(live.filter.mapping))
     assert live.drift[0, 0] == pytest.approx(before[0, 0] + 0.16, rel=0.2)
     assert live.drift[1, 1] < 0.05

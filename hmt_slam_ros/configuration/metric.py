@@ -50,8 +50,9 @@ class LocalMap:
     """Metric map of one area: occupancy grid and distance field, or lines, built from the keyframes' scans."""
 
     kind: str = parameter(
-        "grid", "What maps of areas are made of: occupancy grids under particles, or lines in a Kalman filter.",
-        choices=("grid", "lines"),
+        "grid", "What maps of areas are made of: occupancy grids under particles, lines in a Kalman filter, or by what "
+        "an area is, grids in hallways and lines in rooms.",
+        choices=("grid", "lines", "by_class"),
     )
     cell: float = parameter(0.05, "Side of a grid cell.", unit="m", low=0.005, high=1.0)
     max_range: float = parameter(

@@ -202,9 +202,9 @@ class AreaFilter:
         self._since_update = NO_STEP
         self.left_open = NO_STEP.covariance
 
-    def forget(self) -> None:
-        """All particles stand where the leader does, as if that were known, and predict from there."""
-        self.poses = np.repeat(self.pose[None], len(self.poses), axis=0)
+    def stand(self, pose: Float64) -> None:
+        """All particles stand at ``map_T_base``, shape (3,), as if that were known, and predict from there."""
+        self.poses = np.repeat(pose[None], len(self.poses), axis=0)
         self.log_weights = np.zeros(len(self.poses))
         self.tracking_covariance = np.zeros((3, 3))
         self._restart()

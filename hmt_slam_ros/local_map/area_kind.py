@@ -7,7 +7,6 @@ from collections.abc import Iterable
 import numpy as np
 
 from hmt_slam_ros.arrays import Float64
-from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.features.hallway import AreaClass, area_class, free_space
 from hmt_slam_ros.local_map.local_mapping import LocalMapping
 from hmt_slam_ros.local_map.virtual_lines import rays_of_map
@@ -21,8 +20,8 @@ _BEAMS, _REACH = 360, 10.0
 class AreaKinds:
     """Tells areas apart, one after the other; what it needs to do so is made once."""
 
-    def __init__(self, configuration: Configuration) -> None:
-        self._mapping, self._features = LocalMapping(configuration), configuration.features
+    def __init__(self, mapping: LocalMapping) -> None:
+        self._mapping, self._features = mapping, mapping.configuration.features
 
     def of(self, scans: Iterable[Scan], poses: Float64) -> AreaClass | None:
         """What an area is; None where too little is known around its keyframes.

@@ -112,9 +112,9 @@ class LineFilter:
     def release(self) -> None:
         """There is nothing to give back."""
 
-    def forget(self) -> None:
-        """The robot stands where it is, as if that were known, and is predicted from there."""
-        self.room.put(PoseGaussian.exactly(self.pose))
+    def stand(self, pose: Float64) -> None:
+        """The robot stands at ``map_T_base``, shape (3,), as if that were known, and is predicted from there."""
+        self.room.put(PoseGaussian.exactly(pose))
         self.tracking_covariance = np.zeros((3, 3))
         self._restart()
 

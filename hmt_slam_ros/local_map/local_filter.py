@@ -101,8 +101,8 @@ class LocalFilter(Protocol):
         """Give up the map; the filter is not used any more."""
         ...
 
-    def forget(self) -> None:
-        """The robot stands where it is, as if that were known, and is predicted from there."""
+    def stand(self, pose: Float64) -> None:
+        """The robot stands at ``map_T_base``, shape (3,), as if that were known, and is predicted from there."""
         ...
 
     def track(self, sighting: Sighting, prediction: Prediction) -> Tracked:

@@ -8,6 +8,7 @@ import numpy as np
 
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.local_map.area_kind import AreaKinds
+from hmt_slam_ros.local_map.local_mapping import LocalMapping
 from hmt_slam_ros.offline.saved_map import read_saved_map
 from hmt_slam_ros.topology.surroundings import stacked
 
@@ -32,7 +33,7 @@ def export_topology(directory: Path) -> Path:
     saved = read_saved_map(directory / "hmt_map")
     best = saved.replica.best
     hybrid_map = saved.replica.maps[best]
-    kinds = AreaKinds(saved.configuration)
+    kinds = AreaKinds(LocalMapping(saved.configuration))
     # Takes a fifth of a second and a dozen megabytes, for this command alone.
     import networkx as nx  # noqa: PLC0415
 

@@ -15,7 +15,7 @@ from hmt_slam_ros.configuration.metric import Filter
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.local_map.filter_state import FilterState, LineFilterState
-from hmt_slam_ros.local_map.filters import filter_of
+from hmt_slam_ros.local_map.filters import Kinds, filter_of
 from hmt_slam_ros.local_map.judgement import NOTHING_SAID, Judgement
 from hmt_slam_ros.local_map.local_filter import FilterStep, LocalFilter, PlacedKeyframe
 from hmt_slam_ros.local_map.local_mapping import LocalMapping
@@ -330,12 +330,15 @@ class LiveHypothesis:
         ad = se2.adjoint(se2.between(self.filter.pose, self.event_pose))
         return PoseGaussian(self.filter.pose, ad @ self.drift @ ad.T + self.filter.tracking_covariance)
 
-    def change_area(self, leaf: Leaf, content: Sequence[PlacedKeyframe]) -> None:
+    def change_area(self, leaf: Leaf, content: Sequence[PlacedKeyframe], kinds: Kinds) -> None:
         """Change the reference frame and load the local map, as TSBI decided.
 
         :param content: the keyframes of the areas that it names, in the frame of the robot's area.
+        :param kinds: chooses the kind of local map of an area that is entered.
         """
         entered = leaf.area != self.filter.area
+        if entered:
+            self.filter = kinds.entering(self.filter, leaf.area, content)
         area_T_previous = np.zeros(3) if leaf.rebase is None else leaf.rebase.mean
         self.filter.change_area(leaf.area, area_T_previous, content)
         self.event_pose = se2.compose(area_T_previous, self.event_pose)

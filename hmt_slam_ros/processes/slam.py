@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.local_map.filters import new_filter
+from hmt_slam_ros.local_map.filters import Kinds, new_filter
 from hmt_slam_ros.local_map.local_filter import PlacedKeyframe
 from hmt_slam_ros.local_map.local_mapping import LocalMapping
 from hmt_slam_ros.local_map.patch_pool import PatchState
@@ -99,6 +99,7 @@ class MetricSlam:
         self._configuration = configuration
         self.mode = configuration.mode
         self._mapping = LocalMapping(configuration)
+        self._kinds = Kinds(self._mapping)
         self._in_sight = Nearness(CERTAIN, AROUND)
         self._replica = Replica.of(state.replica)
         self._motion = MotionModel(configuration.motion, state.motion)
@@ -229,7 +230,7 @@ class MetricSlam:
         """The next scan may be from anywhere."""
         self._arriving = True
         for live in self._live.values():
-            live.filter.forget()
+            live.filter.stand(live.filter.pose)
 
     def _process(self, scan: Scan) -> list[Message]:
         prediction = self._motion.predict(scan.stamp)
@@ -325,7 +326,7 @@ class MetricSlam:
             live = parent if leaf.hypothesis == leaf.parent else parent.branch(leaf.hypothesis)
             if leaf.local:
                 areas = {local.area: local.pose for local in leaf.local}
-                live.change_area(leaf, self._content(leaf.hypothesis, areas))
+                live.change_area(leaf, self._content(leaf.hypothesis, areas), self._kinds)
             children[leaf.hypothesis] = live
         for live in children.values() if hypotheses.outdated else ():
             if live.filter.keyframes[-1:] == [hypotheses.sequence]:
