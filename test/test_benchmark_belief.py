@@ -5,6 +5,7 @@ import pytest
 
 from benchmark.belief import FAMILIES, Estimate, calibration_error, recovery, run_of, world_of
 from benchmark.belief_corridors import drawn_building, random_corridors
+from benchmark.documents import VALIDATION, marks
 from hmt_slam_ros.configuration import Configuration
 
 CONFIGURATION = Configuration()
@@ -55,3 +56,8 @@ def test_only_what_stands_is_drawn_once():
         alike = np.array_equal(world.truth.expected.starts, world.graph.expected.starts)
         assert alike == (name == "model"), name
         assert world.truth.states == world.graph.states
+
+
+def test_the_document_has_a_place_for_it():
+    text = VALIDATION.read_text()
+    assert all(text.count(mark) == 1 for mark in marks("belief"))
