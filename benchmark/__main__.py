@@ -47,6 +47,7 @@ MEASUREMENTS = {
     "heading": "whether the heading that walls tell is as far off as it says, against odometry alone",
     "linemap": "whether a room's map of lines and the robot in it are as far off as they say, and its bytes",
     "landmarks": "whether corners and openings are there, where they are said to be, and how sure one may be of them",
+    "landmarkmaps": "landmarks of areas, at two visits, against the true ones",
     "hallways": "whether hallways and rooms are told apart",
     "belief": "how soon a lost robot knows at which place it is, in corridors of the belief's own model",
     "localmaps": "maps of areas by lines beside grids, on simulated worlds",
@@ -65,8 +66,8 @@ _GROUPS = {
     "all": ("accuracy", "steps", "robustness", "choices", "sessions", "speed", "live"),
     "validation": (
         "calibration", "loops", "topology", "consistency", "evidence", "appearance", "lines", "linemap", "heading",
-        "landmarks", "hallways", "belief", "localmaps", "ambiguity", "table", "oracle", "awakening", "kidnapping",
-        "laps", "changes", "scale",
+        "landmarks", "landmarkmaps", "hallways", "belief", "localmaps", "ambiguity", "table", "oracle", "awakening",
+        "kidnapping", "laps", "changes", "scale",
     ),
 }  # fmt: skip
 

@@ -16,7 +16,8 @@ from benchmark.simulated.worlds import World as Drive
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.features.corners import Corners, corners_of
 from hmt_slam_ros.features.extraction import extract_lines
-from hmt_slam_ros.features.openings import Openings, openings_of, rays_of
+from hmt_slam_ros.features.openings import Openings, openings_of
+from hmt_slam_ros.features.rays import rays_of
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.local_map.local_mapping import LocalMapping
 from hmt_slam_ros.local_map.virtual_lines import lines_of_map, rays_of_map
@@ -41,7 +42,7 @@ BEAMS, FAR, AROUND = 720, 10.0, 12.0
 UNKNOWN = 0.25
 """Share of the beams to a landmark that may come into unknown ground before it."""
 
-_POSES = np.array([0.01, 0.01, math.radians(0.2)])  # deviations of the keyframes' poses, m, m, rad
+POSES = np.array([0.01, 0.01, math.radians(0.2)])  # deviations of the keyframes' poses, m, m, rad
 _TURN = 0.5  # rad, of a landmark that is a true one, at most
 _WITHIN = {CORNERS: 0.3, OPENINGS: 0.5}  # m, likewise
 
@@ -133,19 +134,19 @@ def cast_in_map(scenario: Scenario, number: int, configuration: Configuration) -
     """The virtual scan where the robot is at a scan, and the time that it took."""
     poses = scenario.true_poses(scenario.scan_stamps[: number + 1])
     placed = se2.between(poses[-1], poses)
-    keyframes = [k for k in _keyframes(poses, configuration) if math.hypot(*placed[k, :2]) <= AROUND]
+    keyframes = [k for k in keyframes_of(poses, configuration) if math.hypot(*placed[k, :2]) <= AROUND]
     draw = np.random.default_rng([scenario.settings.seed, number])
     mapping = LocalMapping(configuration)
     table_of_patches = mapping.pool.empty_table()
     for k in keyframes:
-        pose = placed[k] + _POSES * draw.standard_normal(3)
+        pose = placed[k] + POSES * draw.standard_normal(3)
         mapping.insert(table_of_patches[None], pose[None], scenario.scan(k))
     begin = time.process_time()
     virtual = virtual_scan(mapping.pool.view(table_of_patches), np.zeros(3), BEAMS, FAR)
     return virtual, time.process_time() - begin
 
 
-def _keyframes(poses: Array, configuration: Configuration) -> list[int]:
+def keyframes_of(poses: Array, configuration: Configuration) -> list[int]:
     """Numbers of the scans of a drive that are keyframes, by the distances of metric SLAM."""
     options, found = configuration.filter, [0]
     for k in range(1, len(poses)):

@@ -1,73 +1,54 @@
-"""Existence of landmarks, Eqs. (4) and (5) of Tomatis, Nourbakhsh and Siegwart."""
+"""Existence of landmarks."""
 
-import numpy as np
 import pytest
 
-from hmt_slam_ros.features.existence import Existence, after_visit
+from hmt_slam_ros.configuration.features import Features
+from hmt_slam_ros.features.existence import Existence
 
-LEAST = 0.6
+FEATURES = Features(landmark_detected=0.9, landmark_by_chance=0.1, landmark_lasting=0.99)
 
 
-def visited(times, existence=None, confidence=0.9):
-    existence = existence or Existence(confidence)
+def visited(existence, times, confidence=0.9):
     for _ in range(times):
-        existence = existence.observed(confidence)
+        existence = existence.after_sight(confidence, FEATURES)
     return existence
 
 
-def test_it_is_the_mean_of_what_all_visits_said():
-    """Eq. (4) over the whole history, with Eq. (5) for the visits at which nothing was seen."""
-    draw = np.random.default_rng(3)
-    existence, said = Existence(0.8), [0.8]
-    for _ in range(50):
-        if draw.random() < 0.6:
-            confidence = float(draw.random())
-            existence = existence.observed(confidence)
-            said.append(confidence)
-        else:
-            said.append(1.0 - float(np.mean(said)))
-            existence = existence.missed()
-        assert existence.probability == pytest.approx(np.mean(said))
-        assert existence.visits == len(said)
-        assert 0.0 <= existence.probability <= 1.0
+def missed(existence, times):
+    for _ in range(times):
+        existence = existence.after_miss(FEATURES)
+    return existence
 
 
-def test_what_is_missed_for_ever_comes_near_to_one_half_from_above():
-    existence = visited(10)
-    before = existence.probability
-    for _ in range(1000):
-        existence = existence.missed()
-        assert 0.5 <= existence.probability < before
-        before = existence.probability
-    assert existence.probability == pytest.approx(0.5, abs=0.01)
+def test_one_visit_is_bayes_rule():
+    """By hand: r- = 0.99 * 0.5 = 0.495; seen 0.9 * 0.495 / (0.9 * 0.495 + 0.1 * 0.505)."""
+    half = Existence(0.8, presence=0.5)
+    assert half.after_sight(0.8, FEATURES).presence == pytest.approx(0.4455 / (0.4455 + 0.0505))
+    assert half.after_miss(FEATURES).presence == pytest.approx(0.0495 / (0.0495 + 0.4545))
+    assert half.probability == pytest.approx(0.4)
 
 
-def test_what_is_gone_is_deleted_and_what_is_there_stays():
-    """A thing that was seen at 20 visits is taken away; another, which is missed once in four visits, is not."""
-    known = {0: visited(20), 1: visited(20)}
-    visits = 0
-    while 0 in known:
-        visits += 1
-        seen = {} if visits % 4 == 0 else {1: 0.9}
-        known = after_visit(known, [0, 1], seen, LEAST)
-        assert visits < 40
-    assert visits > 10
-    assert known[1].probability > 0.75
+def test_that_it_is_a_landmark_is_the_mean_of_what_the_scans_say_that_show_it():
+    """Eq. (4): one that is hardly believed in is no more believed in for being seen again and again."""
+    existence = Existence(0.1).after_sight(0.4, FEATURES).after_miss(FEATURES).after_sight(0.1, FEATURES)
+    assert existence.confidence == pytest.approx(0.2)
+    assert visited(Existence(0.1), 100, confidence=0.1).probability < 0.1
 
 
-def test_what_was_seen_once_is_deleted_at_the_first_miss():
-    assert after_visit({7: Existence(0.95)}, [7], {}, LEAST) == {}
+def test_what_was_seen_a_hundred_times_is_gone_after_a_few_misses():
+    existence = visited(Existence(0.9), 100)
+    assert existence.probability > 0.89
+    assert missed(existence, 4).probability < 0.05
 
 
-def test_what_was_not_expected_stays_as_it_is_but_counts_where_it_is_seen():
-    known = {1: Existence(0.7, 3), 2: Existence(0.7, 3)}
-    after = after_visit(known, [], {2: 1.0}, LEAST)
-    assert after[1] == known[1]
-    assert after[2] == Existence(pytest.approx(0.775), 4)
-    assert known[2] == Existence(0.7, 3)
+def test_what_is_missed_once_in_ten_visits_stays():
+    existence = Existence(0.9)
+    for _ in range(20):
+        existence = missed(visited(existence, 9), 1)
+        assert existence.probability > 0.75
+    assert visited(existence, 2).probability > 0.89
 
 
-@pytest.mark.parametrize("least", [0.5, 0.2, 1.0])
-def test_a_minimum_that_deletes_nothing_is_refused(least):
-    with pytest.raises(ValueError, match=f"{least:g}.*above 0.5"):
-        after_visit({}, [], {}, least)
+def test_visits_are_counted():
+    existence = missed(visited(Existence(0.9), 3), 2)
+    assert (existence.seen, existence.missed) == (4, 2)

@@ -8,7 +8,7 @@ from benchmark.hallways import depth_in_rooms
 from hmt_slam_ros.configuration.features import Features
 from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.features.hallway import FreeSpace, after, area_class, free_space, log_odds
-from hmt_slam_ros.features.openings import rays_of
+from hmt_slam_ros.features.rays import rays_of
 from hmt_slam_ros.local_map.area_kind import AreaKinds
 from hmt_slam_ros.local_map.local_mapping import LocalMapping
 from hmt_slam_ros.simulation import open_simulated

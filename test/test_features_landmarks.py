@@ -8,7 +8,8 @@ from benchmark.landmark_truth import World
 from hmt_slam_ros.configuration.features import Features
 from hmt_slam_ros.features.corners import corners_of
 from hmt_slam_ros.features.extraction import Lines, extract_lines
-from hmt_slam_ros.features.openings import openings_of, rays_of
+from hmt_slam_ros.features.openings import openings_of
+from hmt_slam_ros.features.rays import rays_of
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.simulation import open_simulated
 
@@ -125,6 +126,18 @@ def test_a_niche_and_a_closed_door_are_no_openings():
     assert not np.any(np.abs(se2.wrap(headings - 0.5 * np.pi)) < 0.3)
     deep = openings_in(closed, (2.8, -0.2, 0.1), features=Features(range_deviation=NOISE, opening_max=1.5))
     assert not len(deep.poses)
+
+
+def test_a_gap_beside_furniture_is_hardly_an_opening():
+    """Between the end of a cupboard in the room and its wall."""
+    cupboard = np.concatenate((HALLWAY, box(0.6, 3.4, 2.2, 3.8)))
+    openings = openings_in(cupboard, (1.0, 2.3, 0.2))
+    placed = se2.compose((1.0, 2.3, 0.2), openings.poses)
+    beside = placed[:, 1] > 3.0
+    assert beside.any()
+    assert openings.confidences[beside].max() < 0.5
+    (door,), away = by_place(placed, [(2.0, 1.2)])
+    assert away.max() < 0.05 and openings.confidences[door] > 0.8
 
 
 def test_openings_are_as_far_off_as_they_say():

@@ -63,9 +63,42 @@ class Features:
     opening_depth: float = parameter(
         0.8, "So far behind the wall an opening is free; niches are less deep.", unit="m", low=0.1, high=10.0
     )
+    opening_bias: float = parameter(
+        3.3, "Log-odds of an opening of which a metre of the wall, a metre at either jamb and all behind is seen.",
+        unit="nat", low=-100.0, high=100.0,
+    )
+    opening_wall: float = parameter(
+        0.8, "How they change with the logarithm of what is seen of the wall.", unit="nat", low=-100.0, high=100.0
+    )
+    opening_jambs: float = parameter(
+        1.3, "How they change with the logarithm of what is seen of the wall up to either jamb.", unit="nat",
+        low=-100.0, high=100.0,
+    )
     opening_share: float = parameter(
-        0.1, "Share of an opening's width that is seen through which makes one believe in it by 1 - 1/e.",
-        low=0.001, high=1.0,
+        1.3, "How they change with the logarithm of the share of the width that is seen through.", unit="nat",
+        low=-100.0, high=100.0,
+    )
+    landmark_reach: float = parameter(
+        6.0, "Landmarks that are known and farther away do not have to be seen.", unit="m", low=0.5, high=100.0
+    )
+    landmark_apart: float = parameter(
+        0.3, "Landmarks of one kind and heading are farther apart, or one.", unit="m", low=0.01, high=2.0
+    )
+    landmark_detected: float = parameter(
+        0.9, "Probability that a landmark which should be seen is, if it is there.", low=0.01, high=0.999
+    )
+    landmark_by_chance: float = parameter(
+        0.05, "Probability that it is seen if it is there no more.", low=0.001, high=0.99
+    )
+    landmark_lasting: float = parameter(
+        0.99, "Probability that a landmark is still there at the next scan that should show it.", low=0.5, high=1.0
+    )
+    landmark_least: float = parameter(
+        0.1, "Landmarks that are less probable are deleted.", low=0.0, high=0.9
+    )
+    portal_reach: float = parameter(
+        2.0, "An opening is a portal between two areas where the path passes it so near to where the area changes.",
+        unit="m", low=0.1, high=20.0,
     )
     map_deviation: float = parameter(
         0.02, "Deviation of a local map's surfaces, across them.", unit="m", low=1e-3, high=0.5

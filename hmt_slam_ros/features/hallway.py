@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hmt_slam_ros.configuration.features import Features
-from hmt_slam_ros.features.openings import Rays
+from hmt_slam_ros.features.rays import Rays
 
 # Sectors of the circle, an even number, in each of which the median beam counts, so that no single beam decides; and
 # how many axes have to be known.

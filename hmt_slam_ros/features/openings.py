@@ -4,54 +4,35 @@ Tomatis, Nourbakhsh and Siegwart (2003), section 2.1: large steps across a wall.
 on it, or passes it, by a little or by more than a niche is deep. The beams that pass a line between two jambs are an
 opening where some of them go deep. A jamb is an end of the wall, or another wall that crosses its line, as at the end
 of a hallway that another one leaves to the side; one of the two is an end of the wall.
+
+Furniture has ends, too, and so have people who stand in an opening. The log-odds of an opening are linear in the
+logarithms of what was seen of its wall, of its jambs, and of what is behind it.
 """
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 
-from hmt_slam_ros.arrays import Bool, Float64, Int8, Int64
+from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration.features import Features
-from hmt_slam_ros.features.corners import size_confidence
 from hmt_slam_ros.features.extraction import Lines
-from hmt_slam_ros.features.line_fit import variance_at
+from hmt_slam_ros.features.jambs import SUPPORT, VARIANCE, crossing_wall, wall_end
+from hmt_slam_ros.features.rays import Rays
+from hmt_slam_ros.features.told import DEEP, ON, Told, last_behind, sort_out, told_of
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.sensing import Scan
 
-_NOTHING, _ON, _SHALLOW, _DEEP, _BEFORE = range(5)  # what a beam says of a line
-# A beam ends on a wall within so many deviations of its line, which has to be known so well there, m.
-_STRAY, _KNOWN = 3.5, 0.06
-# A beam flatter to a line than this (sine) says nothing of it.
-_GRAZING = 0.05
 # Beams that go deep, at least.
 _BEAMS = 3
+# A jamb with less support, m, and a lesser share that is seen through count as this much.
+_LEAST_JAMB, _LEAST_SHARE = 0.1, 0.01
 # Two openings this near to each other (m, rad) are one, seen in both faces of a wall.
 _SAME, _SAME_HEADING = 0.6, 0.5
 
-# Columns of a gap that was found: its line, then place, variance and support of the first jamb and of the last.
+# Columns of a gap that was found: its line, the first jamb, the last one, and the share that is seen through.
 _LINE, _FIRST, _LAST, _SHARE, _SIZE = 0, 1, 4, 7, 8
-_PLACE, _VARIANCE, _SUPPORT = 0, 1, 2
-
-
-class Rays(NamedTuple):
-    """How far beams go through free space, in the order of their bearing.
-
-    :ivar origins: shape (n, 2), where they begin, m.
-    :ivar directions: shape (n, 2), unit vectors.
-    :ivar free: shape (n,), m.
-    :ivar deviations: shape (n,), of these, m.
-    :ivar met: shape (n,), whether there is a surface; else it is not known how the beam goes on.
-    """
-
-    origins: Float64
-    directions: Float64
-    free: Float64
-    deviations: Float64
-    met: Bool
 
 
 class Openings(NamedTuple):
@@ -71,30 +52,6 @@ class Openings(NamedTuple):
     confidences: Float64
 
 
-def rays_of(scan: Scan, features: Features) -> Rays:
-    """The beams of a scan with a return."""
-    beams = scan.beams
-    lengths = np.hypot(*beams.T)
-    deviations = np.full(len(beams), features.range_deviation)
-    directions = beams / np.maximum(lengths, 1e-9)[:, None]
-    return Rays(scan.origins, directions, lengths, deviations, np.ones(len(beams), np.bool_))
-
-
-class Told(NamedTuple):
-    """What beams say of a line, in the order of their bearing.
-
-    :ivar kinds: shape (n,), one of the constants above.
-    :ivar along: shape (n,), where on the line they meet it, m.
-    :ivar behind: shape (n,), how far they go behind it, m.
-    :ivar beams: shape (n,), their numbers.
-    """
-
-    kinds: Int8
-    along: Float64
-    behind: Float64
-    beams: Int64
-
-
 def openings_of(lines: Lines, rays: Rays, features: Features) -> Openings:
     """The openings in the walls that lines show."""
     parameters = np.ascontiguousarray(lines.parameters)
@@ -104,7 +61,7 @@ def openings_of(lines: Lines, rays: Rays, features: Features) -> Openings:
     own = found[:, _LINE].astype(np.int64)
     alpha, r = lines.parameters[own].T
     middles = 0.5 * (found[:, _FIRST] + found[:, _LAST])
-    variances = found[:, _FIRST + _VARIANCE] + found[:, _LAST + _VARIANCE]
+    variances = found[:, _FIRST + VARIANCE] + found[:, _LAST + VARIANCE]
     cos, sin = np.cos(alpha), np.sin(alpha)
     poses = np.stack((r * cos - middles * sin, r * sin + middles * cos, alpha), axis=1)
     # In the frame of the opening: r moves it ahead, and alpha turns it about the origin.
@@ -112,10 +69,20 @@ def openings_of(lines: Lines, rays: Rays, features: Features) -> Openings:
     by_line[:, 0, 0], by_line[:, 0, 1], by_line[:, 1, 0], by_line[:, 2, 0] = -middles, 1.0, r, 1.0
     covariances = by_line @ lines.covariances[own] @ by_line.transpose(0, 2, 1)
     covariances[:, 1, 1] += 0.25 * variances
-    support = found[:, _FIRST + _SUPPORT] + found[:, _LAST + _SUPPORT]
-    confidences = size_confidence(support, features) * (1.0 - np.exp(-found[:, _SHARE] / features.opening_share))
+    confidences = 1.0 / (1.0 + np.exp(-_log_odds(found, lines, features)))
     widths = found[:, _LAST] - found[:, _FIRST]
     return _without_repetitions(Openings(poses, covariances, widths, np.sqrt(variances), confidences))
+
+
+def _log_odds(found: Float64, lines: Lines, features: Features) -> Float64:
+    """Of gaps (n, 8) being openings, nats, shape (n,)."""
+    seen = np.zeros(len(lines))
+    np.add.at(seen, lines.owners, lines.pieces[:, 1] - lines.pieces[:, 0])
+    walls = np.log(seen[found[:, _LINE].astype(np.int64)])
+    jambs = np.log(np.maximum(found[:, [_FIRST + SUPPORT, _LAST + SUPPORT]], _LEAST_JAMB)).sum(axis=1)
+    shares = np.log(np.maximum(found[:, _SHARE], _LEAST_SHARE))
+    odds = features.opening_bias + features.opening_wall * walls + features.opening_jambs * jambs
+    return np.asarray(odds + features.opening_share * shares)
 
 
 def _without_repetitions(openings: Openings) -> Openings:
@@ -133,86 +100,37 @@ def _without_repetitions(openings: Openings) -> Openings:
 def _openings(lines: Float64, covariances: Float64, rays: Rays, depth: float, max_gap: float) -> Float64:
     """All gaps between two jambs in the lines that beams go deep through, (n, 8)."""
     beams, count = len(rays.free), 0
-    found = np.empty((len(lines) * (beams // _BEAMS) + 1, _SIZE))
-    told = Told(np.empty(beams, np.int8), np.empty(beams), np.empty(beams), np.empty(beams, np.int64))
-    for line in range(len(lines)):
-        last, end = -1, _sort_out(lines[line], covariances[line], rays, depth, told)
+    found, room = np.empty((len(lines) * (beams // _BEAMS) + 1, _SIZE)), told_of(beams)
+    for own in range(len(lines)):
+        last, end = -1, sort_out(lines[own], covariances[own], rays, depth, room)
+        told = Told(room.kinds[:end], room.along[:end], room.behind[:end], room.beams[:end])
         while last + 1 < end:
             first = last + 1
-            last = _last_behind(told, first, end)
+            last = last_behind(told, first, end)
             if last < first:
                 last = first
-            elif _gap(lines[line], covariances[line], rays, told, first, last, end, max_gap, found[count]):
-                found[count, _LINE] = line
+            elif _gap(lines[own], covariances[own], rays, told, first, last, max_gap, found[count]):
+                found[count, _LINE] = own
                 count += 1
     return found[:count]
 
 
 @njit(cache=True)
-def _sort_out(line: Float64, covariance: Float64, rays: Rays, depth: float, told: Told) -> int:
-    """Write what beams say of a line, and return how many say something."""
-    cos, sin = math.cos(line[0]), math.sin(line[0])
-    beams, count, start, least = len(rays.free), 0, 0, 0.0
-    for k in range(beams):
-        facing = cos * rays.directions[k, 0] + sin * rays.directions[k, 1]
-        if facing < least:
-            start, least = k, facing
-    for n in range(beams):
-        k = (start + n) % beams
-        facing = cos * rays.directions[k, 0] + sin * rays.directions[k, 1]
-        if facing < _GRAZING:
-            continue
-        x, y = rays.origins[k, 0], rays.origins[k, 1]
-        way = (line[1] - cos * x - sin * y) / facing
-        along = cos * (y + way * rays.directions[k, 1]) - sin * (x + way * rays.directions[k, 0])
-        behind = (rays.free[k] - way) * facing
-        variance = variance_at(covariance[0, 0], covariance[0, 1], covariance[1, 1], along)
-        near = _STRAY * math.sqrt(variance + (rays.deviations[k] * facing) ** 2)
-        kind = _kind(behind, near, rays.met[k], depth)
-        if variance <= _KNOWN * _KNOWN and kind != _NOTHING:
-            told.kinds[count], told.along[count], told.behind[count], told.beams[count] = kind, along, behind, k
-            count += 1
-    return count
-
-
-@njit(cache=True)
-def _kind(behind: float, near: float, met: bool, depth: float) -> int:
-    """What a beam says of a line that it goes ``behind`` it, m, where within ``near`` is on it."""
-    if behind >= depth:
-        return _DEEP
-    if not met:
-        return _NOTHING
-    if behind > near:
-        return _SHALLOW
-    return _ON if behind >= -near else _BEFORE
-
-
-@njit(cache=True)
-def _last_behind(told: Told, first: int, end: int) -> int:
-    """The last of the beams from the first on that all go behind the line; before the first where that does not."""
-    last = first - 1
-    while last + 1 < end and (told.kinds[last + 1] == _SHALLOW or told.kinds[last + 1] == _DEEP):
-        last += 1
-    return last
-
-
-@njit(cache=True)
 def _gap(
-    line: Float64, covariance: Float64, rays: Rays, told: Told, first: int, last: int, end: int, max_gap: float,
-    found: Float64,
+    line: Float64, covariance: Float64, rays: Rays, told: Told, first: int, last: int, max_gap: float, found: Float64
 ) -> bool:
     """Write the gap that beams from the first to the last pass; False where it is none."""
     before, after = first - 1, last + 1
-    if before < 0 or after >= end or (told.kinds[before] != _ON and told.kinds[after] != _ON):
+    if before < 0 or after >= len(told.kinds) or (told.kinds[before] != ON and told.kinds[after] != ON):
         return False
-    for own, step, jamb in ((before, -1, found[_FIRST:_LAST]), (after, 1, found[_LAST:_SHARE])):
-        if told.kinds[own] == _ON:
-            _wall_end(line, covariance, rays, told, own, step, end, max_gap, jamb)
-        elif not _crossing_wall(line, rays, told, own, step, max_gap, jamb):
+    for beam, step, jamb in ((before, -1, found[_FIRST:_LAST]), (after, 1, found[_LAST:_SHARE])):
+        if told.kinds[beam] == ON:
+            wall_end(line, covariance, rays, told, beam, step, max_gap, jamb)
+        elif not crossing_wall(line, rays, told, beam, step, max_gap, jamb):
             return False
     deep, clear = 0, 0.0
     for k in range(first, last + 1):
-        if told.kinds[k] == _DEEP:
+        if told.kinds[k] == DEEP:
             deep, clear = deep + 1, clear + 0.5 * abs(told.along[k + 1] - told.along[k - 1])
     if found[_FIRST] > found[_LAST]:
         for column in range(_SHARE - _LAST):
@@ -220,66 +138,3 @@ def _gap(
             found[one], found[other] = found[other], found[one]
     found[_SHARE] = clear / max(found[_LAST] - found[_FIRST], clear)
     return deep >= _BEAMS
-
-
-@njit(cache=True)
-def _wall_end(
-    line: Float64, covariance: Float64, rays: Rays, told: Told, k: int, step: int, end: int, max_gap: float,
-    jamb: Float64,
-) -> None:
-    """Write the jamb where the wall ends on which the beams from ``k`` on lie, away from the gap.
-
-    The first of them may lie on its other side, in the thickness of the wall.
-    """
-    while 0 <= k + step < end and told.kinds[k + step] == _ON and told.behind[k] > _across(line, rays, told.beams[k]):
-        k += step
-    spacing, beam = told.along[k - step] - told.along[k], told.beams[k]
-    jamb[_PLACE] = told.along[k] + 0.5 * spacing
-    # Where the end is between two beams, and how far the line's error moves it along the beam.
-    facing = math.cos(line[0]) * rays.directions[beam, 0] + math.sin(line[0]) * rays.directions[beam, 1]
-    slant = (1.0 - facing * facing) / (facing * facing)
-    uncertain = abs(spacing) + 2.0 * _STRAY * rays.deviations[beam]
-    jamb[_VARIANCE] = uncertain * uncertain / 12.0
-    jamb[_VARIANCE] += slant * variance_at(covariance[0, 0], covariance[0, 1], covariance[1, 1], told.along[k])
-    last = k
-    while 0 <= last + step < end and told.kinds[last + step] == _ON:
-        if abs(told.along[last + step] - told.along[last]) > max_gap:
-            break
-        last += step
-    jamb[_SUPPORT] = abs(told.along[last] - told.along[k])
-
-
-@njit(cache=True)
-def _across(line: Float64, rays: Rays, beam: int) -> float:
-    """Deviation of the end of a beam across a line, m."""
-    facing = math.cos(line[0]) * rays.directions[beam, 0] + math.sin(line[0]) * rays.directions[beam, 1]
-    return rays.deviations[beam] * facing
-
-
-@njit(cache=True)
-def _crossing_wall(
-    line: Float64, rays: Rays, told: Told, k: int, step: int, max_gap: float, jamb: Float64
-) -> bool:
-    """Write the jamb where another wall crosses the line before beam ``k``; False where none does."""
-    before = told.beams[k - step]
-    x, y = _end(rays, told.beams[k])
-    from_x, from_y = _end(rays, before)
-    if not rays.met[before] or math.hypot(x - from_x, y - from_y) > max_gap:
-        return False
-    cos, sin = math.cos(line[0]), math.sin(line[0])
-    share = told.behind[k - step] / (told.behind[k - step] - told.behind[k])
-    crossing_x, crossing_y = from_x + share * (x - from_x), from_y + share * (y - from_y)
-    jamb[_PLACE] = cos * crossing_y - sin * crossing_x
-    beam = told.beams[k]
-    slanted = cos * rays.directions[beam, 1] - sin * rays.directions[beam, 0]
-    jamb[_VARIANCE] = (rays.deviations[beam] * slanted) ** 2
-    jamb[_SUPPORT] = 0.0
-    return True
-
-
-@njit(cache=True)
-def _end(rays: Rays, beam: int) -> tuple[float, float]:
-    """Where a beam ends."""
-    away = rays.free[beam]
-    x = rays.origins[beam, 0] + away * rays.directions[beam, 0]
-    return x, rays.origins[beam, 1] + away * rays.directions[beam, 1]

@@ -15,7 +15,7 @@ import numpy as np
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration.features import Features
 from hmt_slam_ros.features.extraction import Lines, extract_lines
-from hmt_slam_ros.features.openings import Rays
+from hmt_slam_ros.features.rays import Rays
 from hmt_slam_ros.local_map.virtual_scan import VirtualScan
 
 # Beams that err alike; what one more line explains has to be so many times as much.

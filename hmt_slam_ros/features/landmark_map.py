@@ -1,0 +1,140 @@
+"""The landmarks of one area in its frame, gathered over many scans.
+
+Tomatis, Nourbakhsh and Siegwart (2003), section 3.3: a landmark that a scan shows is one of the map where the distance
+of the two is within chi-square's gate and they are of one kind, else it is new. Poses that a scan's landmarks have in
+common, as its own error, and the errors of the map that virtual scans are cast in make observations of one landmark
+depend on each other, in a way that nobody knows. So they are fused by covariance intersection (Julier and Uhlmann,
+1997), with a weight of 1/n for the n-th: what is known of a landmark is what its observations say on average.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from hmt_slam_ros.arrays import Bool, Float64
+from hmt_slam_ros.configuration.features import Features
+from hmt_slam_ros.features.existence import Existence
+from hmt_slam_ros.features.landmarks import Landmarks, due
+from hmt_slam_ros.features.rays import Rays
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.geometry.chi_square import gate
+from hmt_slam_ros.geometry.gaussian import PoseGaussian, fuse
+
+# Beyond this distance, m, nothing is compared.
+_FAR = 2.0
+
+
+@dataclass(frozen=True, eq=False)
+class Landmark:
+    """A landmark of an area.
+
+    :ivar kind: ``INNER``, ``OUTER`` or ``OPENING`` of `features.landmarks`.
+    :ivar pose: the belief over its pose in the area's frame; that of an opening is the middle between its jambs, with
+        the heading through it, away from where it was seen from.
+    :ivar width: of an opening, m; 0 of a corner.
+    :ivar width_deviation: of this, m.
+    :ivar existence: whether it is there.
+    """
+
+    kind: int
+    pose: PoseGaussian
+    width: float
+    width_deviation: float
+    existence: Existence
+
+
+class LandmarkMap:
+    """The landmarks of an area.
+
+    :ivar landmarks: all, in the order in which they were found.
+    """
+
+    def __init__(self, features: Features, begin: Callable[[float], Existence] = Existence) -> None:
+        """:param begin: what is known of a landmark's existence at first, by its extraction confidence."""
+        self._features, self._begin = features, begin
+        self._gate = gate(features.pair_probability)
+        self.landmarks: list[Landmark] = []
+
+    def observe(self, pose: PoseGaussian, seen: Landmarks, rays: Rays) -> None:
+        """Learn what a scan shows, and what it does not show though it should.
+
+        :param pose: the belief over ``area_T_base``.
+        :param seen: the landmarks of the scan, in the frame of the base.
+        :param rays: its beams, likewise.
+        """
+        expected = self._due(pose.mean, rays)
+        placed = [pose.compose(PoseGaussian(*each)) for each in zip(seen.poses, seen.covariances, strict=True)]
+        pairs = dict(self._paired(placed, seen))
+        known = len(self.landmarks)
+        for k, landmark in enumerate(self.landmarks):
+            if k in pairs:
+                self.landmarks[k] = self._seen_again(landmark, placed[pairs[k]], seen, pairs[k])
+            elif expected[k]:
+                existence = landmark.existence.after_miss(self._features)
+                self.landmarks[k] = replace(landmark, existence=existence)
+        for i in sorted(set(range(len(placed))).difference(pairs.values())):
+            if not self._beside_known(placed[i], int(seen.kinds[i]), known):
+                self.landmarks.append(self._new(placed[i], seen, i))
+        least = self._features.landmark_least
+        self.landmarks = [one for one in self.landmarks if one.existence.probability >= least]
+
+    def _due(self, pose: Float64, rays: Rays) -> Bool:
+        """Which landmarks the scan from a pose should show."""
+        kinds = np.array([landmark.kind for landmark in self.landmarks], dtype=np.int64)
+        poses = np.array([landmark.pose.mean for landmark in self.landmarks]).reshape(-1, 3)
+        widths = np.array([landmark.width for landmark in self.landmarks])
+        return due(kinds, se2.between(pose, poses), widths, rays, self._features)
+
+    def _paired(self, placed: list[PoseGaussian], seen: Landmarks) -> Iterator[tuple[int, int]]:
+        """Landmarks of the map and of the scan that are one, the nearest first."""
+        near = sorted(
+            (distance2, k, i)
+            for i, pose in enumerate(placed)
+            for k, landmark in enumerate(self.landmarks)
+            if landmark.kind == seen.kinds[i] and _apart(landmark.pose, pose) < _FAR
+            if (distance2 := landmark.pose.mahalanobis2(pose)) <= self._gate
+        )
+        taken: tuple[set[int], set[int]] = set(), set()
+        for _, k, i in near:
+            if k not in taken[0] and i not in taken[1]:
+                taken[0].add(k)
+                taken[1].add(i)
+                yield k, i
+
+    def _seen_again(self, landmark: Landmark, pose: PoseGaussian, seen: Landmarks, i: int) -> Landmark:
+        """A landmark after one more observation of it."""
+        n = landmark.existence.seen + 1
+        width, deviation = seen.widths[i], seen.width_deviations[i]
+        return replace(
+            landmark,
+            pose=_intersected(landmark.pose, pose, 1.0 / n),
+            width=landmark.width + float(width - landmark.width) / n,
+            width_deviation=landmark.width_deviation + float(deviation - landmark.width_deviation) / n,
+            existence=landmark.existence.after_sight(float(seen.confidences[i]), self._features),
+        )
+
+    def _new(self, pose: PoseGaussian, seen: Landmarks, i: int) -> Landmark:
+        existence = self._begin(float(seen.confidences[i]))
+        return Landmark(int(seen.kinds[i]), pose, float(seen.widths[i]), float(seen.width_deviations[i]), existence)
+
+    def _beside_known(self, pose: PoseGaussian, kind: int, known: int) -> bool:
+        """Whether a landmark is so near to a known one of its kind that it is no other one."""
+        return any(
+            landmark.kind == kind
+            and _apart(landmark.pose, pose) < self._features.landmark_apart
+            and abs(float(se2.wrap(landmark.pose.mean[2] - pose.mean[2]))) < 0.5
+            for landmark in self.landmarks[:known]
+        )
+
+
+def _apart(one: PoseGaussian, other: PoseGaussian) -> float:
+    return float(np.hypot(*(one.mean[:2] - other.mean[:2])))
+
+
+def _intersected(known: PoseGaussian, seen: PoseGaussian, weight: float) -> PoseGaussian:
+    """Covariance intersection of two beliefs over one pose, the second with a weight."""
+    parts = ((known, 1.0 - weight), (seen, weight))
+    return fuse([PoseGaussian(part.mean, part.covariance / share) for part, share in parts])

@@ -1,0 +1,79 @@
+"""The landmarks of a stored area, from its keyframes alone."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from hmt_slam_ros.arrays import Float64
+from hmt_slam_ros.configuration.tree import Configuration
+from hmt_slam_ros.features.extraction import extract_lines
+from hmt_slam_ros.features.landmark_map import Landmark, LandmarkMap
+from hmt_slam_ros.features.landmarks import Landmarks, landmarks_of
+from hmt_slam_ros.features.rays import Rays, rays_of
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.local_map.local_mapping import LocalMapping
+from hmt_slam_ros.local_map.virtual_lines import lines_of_map, rays_of_map
+from hmt_slam_ros.local_map.virtual_scan import virtual_scan
+from hmt_slam_ros.sensing import Scan
+
+# Beams of the virtual scans, and how far they go, m.
+_BEAMS, _REACH = 720, 10.0
+# A scan from so much of a circle on shows what is all around.
+_AROUND = math.radians(330.0)
+
+
+class Sighting(NamedTuple):
+    """What a keyframe shows.
+
+    :ivar pose: the belief over ``area_T_base``.
+    :ivar seen: its landmarks, in the frame of the base.
+    :ivar rays: its beams, likewise.
+    """
+
+    pose: PoseGaussian
+    seen: Landmarks
+    rays: Rays
+
+
+class AreaLandmarks:
+    """Gathers the landmarks of areas, one after the other; what it needs to do so is made once."""
+
+    def __init__(self, configuration: Configuration) -> None:
+        self._mapping, self._features = LocalMapping(configuration), configuration.features
+
+    def of(self, scans: Iterable[Scan], poses: Float64) -> tuple[Landmark, ...]:
+        """The landmarks of an area.
+
+        :param scans: of its keyframes, in the order in which they were taken.
+        :param poses: shape (n, 3), their ``area_T_base``, m and rad.
+        """
+        found = LandmarkMap(self._features)
+        for sighting in self.sightings(scans, poses):
+            found.observe(*sighting)
+        return tuple(found.landmarks)
+
+    def sightings(self, scans: Iterable[Scan], poses: Float64) -> Iterator[Sighting]:
+        """What each of an area's keyframes, as in `of`, shows of its landmarks.
+
+        A keyframe whose laser sees all around shows that itself; else a virtual scan from its place does, in the map of
+        the keyframes up to there.
+        """
+        table = self._mapping.pool.empty_table()
+        for scan, pose in zip(scans, np.ascontiguousarray(poses), strict=True):
+            self._mapping.insert(table[None], pose[None], scan)
+            if scan.angle_increment * (scan.ranges.size - 1) >= _AROUND:
+                lines, rays = extract_lines(scan, self._features), rays_of(scan, self._features)
+            else:
+                virtual = virtual_scan(self._mapping.pool.view(table), pose, _BEAMS, _REACH)
+                lines, rays = lines_of_map(virtual, self._features), rays_of_map(virtual, self._features)
+            yield Sighting(self._place(pose), landmarks_of(lines, rays, self._features), rays)
+        self._mapping.pool.release(table)
+
+    def _place(self, pose: Float64) -> PoseGaussian:
+        """Where a keyframe was taken; the map there, which is made of such keyframes, is as far off."""
+        off = self._features.map_deviation
+        return PoseGaussian(pose, np.diag([off, off, math.radians(self._features.square_deviation)]) ** 2)

@@ -1,0 +1,111 @@
+"""Landmarks that a scan should show, and the map of those of an area."""
+
+import numpy as np
+import pytest
+from worlds import box, scan_at
+
+from hmt_slam_ros.configuration.features import Features
+from hmt_slam_ros.features.extraction import extract_lines
+from hmt_slam_ros.features.landmark_map import LandmarkMap
+from hmt_slam_ros.features.landmarks import INNER, OPENING, OUTER, due, landmarks_of
+from hmt_slam_ros.features.rays import rays_of
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
+
+NOISE = 0.01
+FEATURES = Features(range_deviation=NOISE)
+ROOM, PILLAR = box(-3, -2, 5, 4), box(2.0, 1.0, 3.0, 2.0)
+# Below the room a hallway, and a door of 1 m to it.
+DOOR = np.array([
+    [-3, -2, 0.5, -2], [1.5, -2, 5, -2], [0.5, -2, 0.5, -2.2], [1.5, -2, 1.5, -2.2], [-3, -2.2, 0.5, -2.2],
+    [1.5, -2.2, 5, -2.2], [-3, -4.5, 5, -4.5], [5, -2, 5, 4], [5, 4, -3, 4], [-3, 4, -3, -2],
+], dtype=float)  # fmt: skip
+PLACES = [np.array([0.1 * k, 0.05 * k, 0.3 * k]) for k in range(8)]
+
+
+def shown(walls, pose, seed=0):
+    scan = scan_at(walls, pose, NOISE, np.random.default_rng(seed), 720)
+    rays = rays_of(scan, FEATURES)
+    return landmarks_of(extract_lines(scan, FEATURES), rays, FEATURES), rays
+
+
+def gathered(found, walls, places, first=0):
+    for k, pose in enumerate(places):
+        found.observe(PoseGaussian(pose, np.diag([0.01, 0.01, 0.002]) ** 2), *shown(walls, pose, first + k))
+    return found
+
+
+def of_kind(found, kind):
+    return [one for one in found.landmarks if one.kind == kind]
+
+
+def is_due(walls, pose, kind, landmark, width=0.0):
+    rays = shown(walls, pose)[1]
+    local = se2.between(np.asarray(pose, dtype=float), np.array([landmark], dtype=float))
+    return bool(due(np.array([kind]), local, np.array([width]), rays, FEATURES)[0])
+
+
+def test_a_corner_should_be_seen_where_both_its_walls_are_in_sight():
+    corner = (5.0, 4.0, -0.75 * np.pi)
+    assert is_due(ROOM, (2.0, 1.5, 0.0), INNER, corner)
+    assert not is_due(ROOM, (0.0, 0.0, 0.0), INNER, corner)
+    screen = np.array([[4.0, 3.9, 4.0, 1.0]])
+    assert not is_due(np.concatenate((ROOM, screen)), (2.0, 1.5, 0.0), INNER, corner)
+
+
+def test_the_corner_of_a_pillar_should_be_seen_from_before_it_alone():
+    corner = (2.0, 1.0, -0.75 * np.pi)
+    walls = np.concatenate((ROOM, PILLAR))
+    assert is_due(walls, (0.0, -0.5, 0.3), OUTER, corner)
+    assert not is_due(walls, (4.0, 3.0, 0.3), OUTER, corner)
+    # Where the pillar was, beams pass: it should be seen, and is not.
+    assert is_due(ROOM, (0.0, -0.5, 0.3), OUTER, corner)
+
+
+def test_an_opening_should_be_seen_from_before_it_open_or_closed():
+    opening = (1.0, -2.0, -0.5 * np.pi)
+    closed = np.concatenate((DOOR, [[0.5, -2.0, 1.5, -2.0]]))
+    assert is_due(DOOR, (0.5, 0.5, 0.0), OPENING, opening, 1.0)
+    assert is_due(closed, (0.5, 0.5, 0.0), OPENING, opening, 1.0)
+    assert not is_due(DOOR, (0.5, -3.5, 0.0), OPENING, opening, 1.0)
+    cupboard = np.concatenate((DOOR, box(0.0, -1.5, 2.0, -0.5)))
+    assert not is_due(cupboard, (0.5, 0.5, 0.0), OPENING, opening, 1.0)
+
+
+def test_what_many_scans_show_is_one_landmark_each():
+    inner = of_kind(gathered(LandmarkMap(FEATURES), ROOM, PLACES), INNER)
+    assert len(inner) == 4
+    outer = of_kind(gathered(LandmarkMap(FEATURES), np.concatenate((ROOM, PILLAR)), PLACES), OUTER)
+    places = np.array([one.pose.mean[:2] for one in inner])
+    away = np.hypot(*(places[None] - np.array([(-3, -2), (5, -2), (5, 4), (-3, 4)])[:, None]).transpose(2, 0, 1))
+    assert away.min(axis=1).max() < 0.03
+    assert any(np.hypot(*(one.pose.mean[:2] - (2.0, 1.0))) < 0.03 for one in outer)
+    assert min(one.existence.probability for one in inner) > 0.9
+
+
+def test_what_scans_have_in_common_makes_no_landmark_more_certain():
+    """Covariance intersection: of like observations the covariance stays that of one."""
+    certain = [
+        np.trace(of_kind(gathered(LandmarkMap(FEATURES), ROOM, [PLACES[0]] * count), INNER)[0].pose.covariance)
+        for count in (1, 10)
+    ]
+    assert certain[1] == pytest.approx(certain[0], rel=0.2)
+
+
+def test_a_door_has_its_width_and_is_gone_when_it_was_closed():
+    found = gathered(LandmarkMap(FEATURES), DOOR, PLACES)
+    (door,) = of_kind(found, OPENING)
+    np.testing.assert_allclose(door.pose.mean, [1.0, -2.0, -0.5 * np.pi], atol=0.05)
+    assert door.width == pytest.approx(1.0, abs=0.05)
+    assert door.existence.probability > 0.9
+    gathered(found, np.concatenate((DOOR, [[0.5, -2.0, 1.5, -2.0]])), PLACES, first=20)
+    assert not of_kind(found, OPENING)
+    assert len(of_kind(found, INNER)) >= 4
+
+
+def test_what_is_hidden_is_not_missed():
+    found = gathered(LandmarkMap(FEATURES), DOOR, PLACES)
+    (before,) = of_kind(found, OPENING)
+    gathered(found, np.concatenate((DOOR, box(-0.5, -1.8, 2.5, -0.8))), PLACES, first=20)
+    (after,) = (one for one in of_kind(found, OPENING) if one.pose is before.pose)
+    assert after.existence == before.existence

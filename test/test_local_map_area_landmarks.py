@@ -1,0 +1,34 @@
+"""The landmarks of a stored area."""
+
+import numpy as np
+import pytest
+from worlds import box, scan_at, scan_in
+
+from hmt_slam_ros.configuration.tree import Configuration
+from hmt_slam_ros.features.landmarks import INNER
+from hmt_slam_ros.local_map.area_landmarks import AreaLandmarks
+
+ROOM = box(-2.02, -1.51, 2.53, 2.02)
+POSES = np.array([(0.2 * k, 0.1, 0.8 * k) for k in range(9)])
+
+
+def half(pose, seed):
+    return scan_in(ROOM, pose, beams=361, noise=0.01, seed=seed)
+
+
+def whole(pose, seed):
+    return scan_at(ROOM, pose, 0.01, np.random.default_rng(seed), 720)
+
+
+@pytest.mark.parametrize("look", [half, whole])
+def test_a_room_has_its_four_corners_whatever_the_laser_sees_at_once(look):
+    landmarks = AreaLandmarks(Configuration())
+    scans = [look(pose, k) for k, pose in enumerate(POSES)]
+    found = landmarks.of(scans, POSES)
+    corners = np.array([one.pose.mean[:2] for one in found if one.kind == INNER and one.existence.probability > 0.5])
+    true = np.array([(-2.02, -1.51), (2.53, -1.51), (2.53, 2.02), (-2.02, 2.02)])
+    assert corners.shape == (4, 2)
+    assert np.hypot(*(corners[None] - true[:, None]).transpose(2, 0, 1)).min(axis=1).max() < 0.05
+    # It keeps nothing of one area for the next.
+    again = landmarks.of(scans, POSES)
+    assert [one.pose.mean.tolist() for one in again] == [one.pose.mean.tolist() for one in found]
