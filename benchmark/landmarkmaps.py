@@ -25,6 +25,7 @@ from hmt_slam_ros.features.landmark_map import Landmark, LandmarkMap
 from hmt_slam_ros.features.landmarks import OPENING
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.local_map.area_landmarks import AreaLandmarks
+from hmt_slam_ros.local_map.local_mapping import LocalMapping
 
 Array = NDArray[np.float64]
 
@@ -157,7 +158,7 @@ def _area(
         for name, (begin, least) in TREATMENTS.items()
     }
     before: dict[str, list[Landmark]] = {}
-    for k, sighting in enumerate(AreaLandmarks(configuration).sightings(scans, placed)):
+    for k, sighting in enumerate(AreaLandmarks(LocalMapping(configuration)).sightings(scans, placed)):
         if k == len(keyframes[0]):
             before = {name: list(found.landmarks) for name, found in maps.items()}
         for found in maps.values():

@@ -7,6 +7,7 @@ from worlds import box, scan_at, scan_in
 from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.features.landmarks import INNER
 from hmt_slam_ros.local_map.area_landmarks import AreaLandmarks
+from hmt_slam_ros.local_map.local_mapping import LocalMapping
 
 ROOM = box(-2.02, -1.51, 2.53, 2.02)
 POSES = np.array([(0.2 * k, 0.1, 0.8 * k) for k in range(9)])
@@ -22,7 +23,7 @@ def whole(pose, seed):
 
 @pytest.mark.parametrize("look", [half, whole])
 def test_a_room_has_its_four_corners_whatever_the_laser_sees_at_once(look):
-    landmarks = AreaLandmarks(Configuration())
+    landmarks = AreaLandmarks(LocalMapping(Configuration()))
     scans = [look(pose, k) for k, pose in enumerate(POSES)]
     found = landmarks.of(scans, POSES)
     corners = np.array([one.pose.mean[:2] for one in found if one.kind == INNER and one.existence.probability > 0.5])

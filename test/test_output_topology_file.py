@@ -1,5 +1,6 @@
 """The topology as GraphML, read back by networkx and by the standard library."""
 
+import json
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -9,11 +10,18 @@ import pytest
 from test_output_folder import COVARIANCE, MAP_T_AREA_1, recorded, write
 
 from hmt_slam_ros.errors import HmtSlamError
+from hmt_slam_ros.features.existence import Existence
+from hmt_slam_ros.features.landmark_map import Landmark
+from hmt_slam_ros.features.landmarks import INNER, OPENING
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.local_map.area_kind import AreaKinds
+from hmt_slam_ros.local_map.area_landmarks import AreaLandmarks
 from hmt_slam_ros.local_map.local_mapping import LocalMapping
+from hmt_slam_ros.offline import topology_file
 from hmt_slam_ros.offline.output_folder import check_replaceable
 from hmt_slam_ros.offline.saved_map import read_saved_map
 from hmt_slam_ros.offline.topology_file import export_topology
+from hmt_slam_ros.topology.portals import Portal
 
 NUMBERS = ("x", "y", "theta", "xx", "xy", "xt", "yy", "yt", "tt")
 
@@ -34,7 +42,7 @@ def of(belief) -> list[float]:
 
 
 def test_areas_and_arcs_read_back_as_the_map_has_them(folder: Path) -> None:
-    graph = nx.read_graphml(export_topology(folder), node_type=int)
+    graph = nx.read_graphml(export_topology(folder)[0], node_type=int)
     saved = read_saved_map(folder / "hmt_map")
     hybrid_map = saved.replica.maps[saved.replica.best]
     kinds = AreaKinds(LocalMapping(saved.configuration))
@@ -54,11 +62,36 @@ def test_areas_and_arcs_read_back_as_the_map_has_them(folder: Path) -> None:
     assert numbers(attributes)[:3] == pytest.approx(MAP_T_AREA_1)
     assert [attributes[name] for name in ("xx", "yy", "tt")] == pytest.approx(np.diag(COVARIANCE))
     assert attributes["closure"] is True
+    assert attributes["portals"] == 0
+
+
+def test_portals_stand_at_their_arcs_and_landmarks_in_a_file_of_their_own(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    belief = PoseGaussian(np.array([1.0, 2.0, 0.5]), np.diag([0.01, 0.02, 0.03]))
+    portal = Portal((0, 1), belief, belief.inverse(), 0.9, 0.05, 0.8, 2)
+    door = Landmark(OPENING, belief, 0.9, 0.05, Existence(0.8, seen=4, missed=1))
+    corner = Landmark(INNER, belief, 0.0, 0.0, Existence(0.7))
+    monkeypatch.setattr(AreaLandmarks, "of", lambda *_: (door, corner))
+    monkeypatch.setattr(topology_file, "portals_of", lambda *_: (portal,))
+    graph_file, landmarks_file = export_topology(folder)
+    attributes = nx.read_graphml(graph_file, node_type=int).edges[0, 1]
+    assert [attributes[f"portal_{name}"] for name in NUMBERS] == of(belief)
+    assert (attributes["portals"], attributes["portal_width"], attributes["portal_existence"]) == (1, 0.9, 0.8)
+    document = json.loads(landmarks_file.read_text())
+    assert set(document["areas"]) == {"0", "1"}
+    first, second = document["areas"]["1"]
+    assert (first["kind"], numbers(first), first["width"]) == ("opening", of(belief), 0.9)
+    assert (first["existence"], first["seen"], first["missed"]) == (0.8, 4, 1)
+    assert second["kind"] == "corner" and "width" not in second
+    (only,) = document["portals"]
+    assert (only["areas"], only["passages"], only["existence"]) == ([0, 1], 2, 0.8)
+    assert (numbers(only["in_first"]), numbers(only["in_second"])) == (of(belief), of(belief.inverse()))
 
 
 def test_the_file_is_graphml_and_the_same_every_time(folder: Path) -> None:
-    written = export_topology(folder).read_bytes()
-    assert export_topology(folder).read_bytes() == written
+    written, landmarks = (path.read_bytes() for path in export_topology(folder))
+    assert [path.read_bytes() for path in export_topology(folder)] == [written, landmarks]
     assert ElementTree.fromstring(written).tag == "{http://graphml.graphdrawing.org/xmlns}graphml"
 
 

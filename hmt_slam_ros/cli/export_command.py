@@ -15,7 +15,8 @@ def run(options: argparse.Namespace) -> None:
     if options.to is None:
         if asked:
             raise HmtSlamError("--resolution and --area are of a grid: say with --grid into which folder")
-        print(export_topology(options.directory))
+        for path in export_topology(options.directory):
+            print(path)
         return
     for path in export_grid(options.directory, options.to, options.resolution, options.area):
         print(path)

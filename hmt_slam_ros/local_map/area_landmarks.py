@@ -9,7 +9,6 @@ from typing import NamedTuple
 import numpy as np
 
 from hmt_slam_ros.arrays import Float64
-from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.features.extraction import extract_lines
 from hmt_slam_ros.features.landmark_map import Landmark, LandmarkMap
 from hmt_slam_ros.features.landmarks import Landmarks, landmarks_of
@@ -42,8 +41,8 @@ class Sighting(NamedTuple):
 class AreaLandmarks:
     """Gathers the landmarks of areas, one after the other; what it needs to do so is made once."""
 
-    def __init__(self, configuration: Configuration) -> None:
-        self._mapping, self._features = LocalMapping(configuration), configuration.features
+    def __init__(self, mapping: LocalMapping) -> None:
+        self._mapping, self._features = mapping, mapping.configuration.features
 
     def of(self, scans: Iterable[Scan], poses: Float64) -> tuple[Landmark, ...]:
         """The landmarks of an area.

@@ -21,7 +21,7 @@ from hmt_slam_ros.offline.map_image import occupancy_image, write_map
 from hmt_slam_ros.offline.recorder import Recording, keyframe_poses
 from hmt_slam_ros.offline.report import RunFigures, report, write_cost, write_probabilities, write_report
 from hmt_slam_ros.offline.saved_map import MapWriter
-from hmt_slam_ros.offline.topology_file import TOPOLOGY
+from hmt_slam_ros.offline.topology_file import LANDMARKS, TOPOLOGY
 from hmt_slam_ros.persistence.folder import MANIFEST
 from hmt_slam_ros.persistence.hmt_map import HMT_MAP
 from hmt_slam_ros.persistence.replacing import put_in_place
@@ -42,6 +42,7 @@ OWN_NAMES = frozenset(
         HMT_MAP,
         "graph.g2o",
         TOPOLOGY,
+        LANDMARKS,
         "report.json",
         "pmf.csv",
         "pmf.png",

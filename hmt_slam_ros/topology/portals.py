@@ -1,0 +1,144 @@
+"""Portals: openings through which the robot's path passed from one area into another.
+
+What Tomatis, Nourbakhsh and Siegwart (2003), section 2.1, have as nodes of a graph, is an annotation of arcs here. An
+area ends where sensed space overlaps least (AAM), which may be a step or two beside the door; so the stretch of the
+path around the change of areas counts, and of the openings that it passes the one that is nearest to the change.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from hmt_slam_ros.arrays import Float64
+from hmt_slam_ros.configuration.features import Features
+from hmt_slam_ros.features.landmark_map import Landmark
+from hmt_slam_ros.features.landmarks import OPENING
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.topology.hybrid_map import HybridMap
+from hmt_slam_ros.topology.unknown import telling_arc
+
+# Keyframes that are farther apart than this, m, are no step of a path; openings nearer than that, m, are one portal.
+_STEP, _SAME = 1.5, 0.6
+# An opening that is less probable is no portal.
+_LEAST = 0.5
+
+_TURNED = PoseGaussian.exactly(np.array([0.0, 0.0, np.pi]))
+
+
+@dataclass(frozen=True, eq=False)
+class Portal:
+    """An opening between two areas a < b.
+
+    :ivar areas: a and b.
+    :ivar pose_in_a: the belief over ``a_T_portal``, the middle between the jambs, with the heading from a to b.
+    :ivar pose_in_b: the belief over ``b_T_portal``, likewise.
+    :ivar width: m.
+    :ivar width_deviation: of this, m.
+    :ivar existence: probability that it is there.
+    :ivar passages: how often the path changes areas there.
+    """
+
+    areas: tuple[int, int]
+    pose_in_a: PoseGaussian
+    pose_in_b: PoseGaussian
+    width: float
+    width_deviation: float
+    existence: float
+    passages: int = 1
+
+
+def portals_of(
+    hybrid_map: HybridMap, landmarks: Mapping[int, Sequence[Landmark]], features: Features
+) -> tuple[Portal, ...]:
+    """All portals of a map, ordered by their areas.
+
+    :param landmarks: {area: its landmarks}, of all areas.
+    """
+    found: list[Portal] = []
+    for portal in _passed(hybrid_map, landmarks, features):
+        k = next((k for k, known in enumerate(found) if _same(known, portal)), None)
+        if k is None:
+            found.append(portal)
+        else:
+            better = max(found[k], portal, key=lambda one: one.existence)
+            found[k] = replace(better, passages=found[k].passages + 1)
+    return tuple(sorted(found, key=lambda portal: portal.areas))
+
+
+def _same(one: Portal, other: Portal) -> bool:
+    """Whether two portals are one, seen in both faces of a wall or at two passages."""
+    away = one.pose_in_a.mean[:2] - other.pose_in_a.mean[:2]
+    return one.areas == other.areas and float(np.hypot(*away)) < _SAME
+
+
+def _passed(
+    hybrid_map: HybridMap, landmarks: Mapping[int, Sequence[Landmark]], features: Features
+) -> Iterator[Portal]:
+    """The portal at every change of areas along the path that passes one."""
+    area_of = {keyframe: area for area in hybrid_map.area_ids() for keyframe in hybrid_map.keyframes(area)}
+    keyframes = sorted(area_of)
+    for n in range(1, len(keyframes)):
+        left, entered = areas = area_of[keyframes[n - 1]], area_of[keyframes[n]]
+        arc = telling_arc(hybrid_map, left, entered) if left != entered else None
+        if arc is None:
+            continue
+        back = np.array([hybrid_map.keyframes(left)[k] for k in reversed(keyframes[:n]) if area_of[k] == left])
+        ahead = np.array([hybrid_map.keyframes(entered)[k] for k in keyframes[n:] if area_of[k] == entered])
+        ways = [_near(way[:, :2], features) for way in (back, se2.compose(arc.mean, ahead))]
+        if np.hypot(*(ways[0][0] - ways[1][0])) <= _STEP:
+            path = np.concatenate((ways[0][::-1], ways[1]))
+            yield from _nearest(path, len(ways[0]) - 0.5, areas, arc, landmarks)
+
+
+def _near(way: Float64, features: Features) -> Float64:
+    """The part of a way (n, 2) that is near to its begin, up to the first step that is no step."""
+    steps = np.hypot(*np.diff(way, axis=0).T)
+    near = (steps <= _STEP) & (np.cumsum(steps) <= features.portal_reach)
+    return way[: 1 + int(np.argmin(np.append(near, False)))]
+
+
+def _nearest(
+    path: Float64, change: float, areas: tuple[int, int], arc: PoseGaussian, landmarks: Mapping[int, Sequence[Landmark]]
+) -> list[Portal]:
+    """The portal that a path (n, 2) in the frame of the area that it leaves passes nearest to the change; none or one.
+
+    :param change: where the areas change, in steps from the path's begin.
+    """
+    passed: list[tuple[float, float, Portal]] = []
+    for own, area in enumerate(areas):
+        frame = arc.mean if own else np.zeros(3)
+        for opening in landmarks[area]:
+            if opening.kind != OPENING or opening.existence.probability < _LEAST:
+                continue
+            for at, forwards in _crossings(path, se2.compose(frame, opening.pose.mean), opening.width):
+                portal = _portal(opening, forwards, areas, own, arc)
+                passed.append((abs(at - change), -portal.existence, portal))
+    return [min(passed, key=lambda each: each[:2])[2]] if passed else []
+
+
+def _crossings(path: Float64, opening: Float64, width: float) -> Iterator[tuple[float, bool]]:
+    """Where a path (n, 2) passes an opening (3,), in steps from its begin; and whether it goes ahead there."""
+    local = se2.transform(se2.inverse(opening), path)
+    for k in np.flatnonzero((local[:-1, 0] < 0.0) != (local[1:, 0] < 0.0)).tolist():
+        share = local[k, 0] / (local[k, 0] - local[k + 1, 0])
+        if abs(local[k, 1] + share * (local[k + 1, 1] - local[k, 1])) <= 0.5 * width:
+            yield k + float(share), bool(local[k, 0] < 0.0)
+
+
+def _portal(opening: Landmark, forwards: bool, areas: tuple[int, int], own: int, arc: PoseGaussian) -> Portal:
+    """An opening of one of two areas as the portal between them.
+
+    :param forwards: whether the path goes through it in its own heading, from the first of the areas to the second.
+    :param own: which of the two areas knows it.
+    :param arc: the belief over the second area's pose in the first.
+    """
+    towards = forwards == (areas[0] < areas[1])
+    pose = opening.pose if towards else opening.pose.compose(_TURNED)
+    poses = (pose, arc.inverse().compose(pose)) if own == 0 else (arc.compose(pose), pose)
+    if areas[0] > areas[1]:
+        areas, poses = (areas[1], areas[0]), (poses[1], poses[0])
+    return Portal(areas, *poses, opening.width, opening.width_deviation, opening.existence.probability)
