@@ -13,7 +13,8 @@ from hmt_slam_ros.configuration.features import Features
 from hmt_slam_ros.configuration.places import Places
 from hmt_slam_ros.features.corners import Corners, corners_of
 from hmt_slam_ros.features.extraction import extract_lines
-from hmt_slam_ros.features.openings import Openings, openings_of, rays_of
+from hmt_slam_ros.features.openings import Openings, openings_of
+from hmt_slam_ros.features.rays import rays_of
 from hmt_slam_ros.places.observation import Expected, log_observation, log_unknown_ground, observation_model
 from hmt_slam_ros.places.observation_graph import (
     OPENINGS,
