@@ -6,7 +6,12 @@ import subprocess
 import sys
 import time
 
+import hypothesis
 import pytest
+
+# The same examples at every run, however long one takes where the machine is busy.
+hypothesis.settings.register_profile("repeatable", deadline=None, derandomize=True)
+hypothesis.settings.load_profile("repeatable")
 
 # Messages check the names and types of their fields, which they do not by default.
 os.environ["ROS_PYTHON_CHECK_FIELDS"] = "1"

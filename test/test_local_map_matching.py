@@ -61,7 +61,7 @@ def plain_log_ratio(points, pose, view):
     return total
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.tuples(st.floats(-2, 2), st.floats(-2, 2), st.floats(-3, 3)))
 def test_the_likelihood_ratio_equals_the_plain_sum(room, pose):
     points = scan_in(ROOM, (0.2, 0.1, 0.3), beams=31).points

@@ -97,7 +97,7 @@ def assert_same(a, b):
 
 @pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.__name__)
 def test_every_document_comes_back_bit_for_bit(kind):
-    @settings(max_examples=40, deadline=None)
+    @settings(max_examples=40)
     @given(values(kind))
     def round_trip(message):
         assert_same(decode(encode(message), kind), message)

@@ -164,7 +164,7 @@ def test_an_older_estimate_does_not_replace_a_newer_one(rtl):
 STEPS = st.lists(st.tuples(st.floats(-0.4, 0.4), st.floats(-0.4, 0.4), st.floats(-0.4, 0.4)), min_size=2, max_size=12)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(STEPS, st.integers(0, 11))
 def test_when_an_estimate_arrives_does_not_matter_only_which_scan_it_is_of(steps, late):
     poses = [np.zeros(3)]
