@@ -22,6 +22,34 @@ def _no_doors() -> NDArray[np.float64]:
     return np.empty((0, 4))
 
 
+class States(NamedTuple):
+    """Where a robot in the hallways passes what topological localization has to tell apart.
+
+    After Tomatis, Nourbakhsh and Siegwart (2003), section 2.1: openings from a hallway to an open room, and crossings.
+
+    :ivar poses: shape (s, 3), in the middle of a hallway, looking through the opening to its side, m and rad; at a
+        crossing where both hallways meet, looking along the one that ends there.
+    :ivar ahead: shape (s,), from there to the opening in the hallway's side, m.
+    :ivar widths: shape (s,), of the openings, m.
+    :ivar crossings: shape (s,), whether it is a crossing of hallways; else it is an open room's door.
+    """
+
+    poses: NDArray[np.float64]
+    ahead: NDArray[np.float64]
+    widths: NDArray[np.float64]
+    crossings: NDArray[np.bool_]
+
+    @property
+    def openings(self) -> NDArray[np.float64]:
+        """The middles of the openings, shape (s, 3), m, each with the heading through it, rad."""
+        zeros = np.zeros_like(self.ahead)
+        return se2.compose(self.poses, np.stack((self.ahead, zeros, zeros), axis=1))
+
+
+def _no_states() -> States:
+    return States(np.empty((0, 3)), np.empty(0), np.empty(0), np.empty(0, dtype=np.bool_))
+
+
 @dataclass(frozen=True, eq=False)
 class Building:
     """A world for one robot; all in one frame, m and rad.
@@ -32,6 +60,7 @@ class Building:
     :ivar doors: shape (d, 4), x and y of both ends of each door that may be closed; they are open.
     :ivar rooms: shape (r, 5), likewise x, y, heading, length and width of each room beside the corridors that is open.
     :ivar places: {name: shape (3,)}, frames in which parts of the building that are the same look the same.
+    :ivar states: the topological states of the hallways, of a building in which they are counted.
     """
 
     walls: NDArray[np.float64]
@@ -40,6 +69,7 @@ class Building:
     doors: NDArray[np.float64] = field(default_factory=_no_doors)
     rooms: NDArray[np.float64] = field(default_factory=_no_pieces)
     places: dict[str, NDArray[np.float64]] = field(default_factory=dict)
+    states: States = field(default_factory=_no_states)
 
     def placed(self, pose: NDArray[np.float64]) -> Building:
         """The same building, its origin at a pose (3,)."""
@@ -48,8 +78,9 @@ class Building:
             for own in (self.furniture, self.rooms)
         )
         places = {name: se2.compose(pose, place) for name, place in self.places.items()}
+        states = self.states._replace(poses=se2.compose(pose, self.states.poses))
         route = se2.transform(pose, self.route)
-        return Building(_placed(pose, self.walls), route, pieces, _placed(pose, self.doors), rooms, places)
+        return Building(_placed(pose, self.walls), route, pieces, _placed(pose, self.doors), rooms, places, states)
 
 
 def _placed(pose: NDArray[np.float64], lines: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -12,7 +13,9 @@ from hmt_slam_ros.simulation.building import Building, FloorPlan, Point, Side, s
 from hmt_slam_ros.simulation.furniture import Rectangle, furnish
 from hmt_slam_ros.simulation.settings import Settings
 
-_WALL = 0.2  # m, between two rooms
+WALL = 0.2
+"""Between two rooms, m."""
+
 _OVERLAP = 0.05  # m, by which an opening reaches into what it opens to
 
 
@@ -53,6 +56,23 @@ class Ring(NamedTuple):
         return [self.point(along) for along in (start, *(c for c in corners if start < c < end), end)]
 
 
+class Plot(NamedTuple):
+    """Where a room and its door are to be, along one side of a corridor, m.
+
+    :ivar begin: of the room.
+    :ivar end: of the room.
+    :ivar depth: of the room.
+    :ivar left: where its door begins.
+    :ivar door: width of the door.
+    """
+
+    begin: float
+    end: float
+    depth: float
+    left: float
+    door: float
+
+
 class Room(NamedTuple):
     """A room beside a corridor.
 
@@ -82,21 +102,29 @@ def rooms_along(
     :param width: of the corridor, m.
     """
     rooms = []
-    begin = _WALL
-    while (end := begin + draw.uniform(3.0, 5.5)) <= length - _WALL:
+    begin = WALL
+    while (end := begin + draw.uniform(3.0, 5.5)) <= length - WALL:
         depth, door = draw.uniform(*depths), draw.uniform(0.9, 1.1)
-        left = draw.uniform(begin + 0.4, end - 0.4 - door)
-        is_open = bool(draw.random() < 0.6)
-        floor = side.rectangle((begin, end), (_WALL, _WALL + depth))
-        if is_open:
-            plan.free(*floor)
-        plan.free(*side.rectangle((left, left + door), (-_OVERLAP, _WALL + _OVERLAP if is_open else 0.4 * _WALL)))
-        middle = left + 0.5 * door
-        leaf = (*side.point(left, 0.5 * _WALL), *side.point(left + door, 0.5 * _WALL))
-        inside = side.point(middle, _WALL + 0.5 * depth)
-        rooms.append(Room(floor, middle, side.point(middle, -0.5 * width), inside, is_open, leaf))
-        begin = end + _WALL
+        plot = Plot(begin, end, depth, draw.uniform(begin + 0.4, end - 0.4 - door), door)
+        rooms.append(cut_room(plan, side, plot, width, is_open=bool(draw.random() < 0.6)))
+        begin = end + WALL
     return rooms
+
+
+def cut_room(plan: FloorPlan, side: Side, plot: Plot, width: float, *, is_open: bool) -> Room:
+    """Cut a room with its door out of one side of a corridor; of a closed one, the niche before its door.
+
+    :param width: of the corridor, m.
+    """
+    left, right = plot.left, plot.left + plot.door
+    floor = side.rectangle((plot.begin, plot.end), (WALL, WALL + plot.depth))
+    if is_open:
+        plan.free(*floor)
+    plan.free(*side.rectangle((left, right), (-_OVERLAP, WALL + _OVERLAP if is_open else 0.4 * WALL)))
+    middle = left + 0.5 * plot.door
+    leaf = (*side.point(left, 0.5 * WALL), *side.point(right, 0.5 * WALL))
+    inside = side.point(middle, WALL + 0.5 * plot.depth)
+    return Room(floor, middle, side.point(middle, -0.5 * width), inside, is_open, leaf)
 
 
 def niches_along(draw: np.random.Generator, plan: FloorPlan, side: Side, length: float) -> None:
@@ -118,7 +146,7 @@ def office(draw: np.random.Generator, settings: Settings) -> Building:
         rooms_along(draw, plan, side, length, (3.0, 5.0), width)
         for side, length in zip(sides_of_ring(*ring, width, outer=True), lengths, strict=True)
     ]
-    depth = ring.half_y - 0.5 * width - 1.5 * _WALL
+    depth = ring.half_y - 0.5 * width - 1.5 * WALL
     inner = [
         rooms_along(draw, plan, side, 2.0 * ring.half_x - width, (0.8 * depth, depth), width)
         for side in sides_of_ring(*ring, width, outer=False)[::2]
@@ -132,10 +160,14 @@ def office(draw: np.random.Generator, settings: Settings) -> Building:
     route.append(route[0])
     offices = [room for rooms in (*outer, *inner) for room in rooms if room.is_open]
     furniture = furnish(draw, [room.floor for room in offices], np.array(route))
-    doors = np.array([room.door for room in offices]).reshape(-1, 4)
-    x0, y0, x1, y1 = np.array([room.floor for room in offices]).reshape(-1, 4).T
-    floors = np.stack((0.5 * (x0 + x1), 0.5 * (y0 + y1), 0.0 * x0, x1 - x0, y1 - y0), axis=1)
-    return Building(plan.walls(), np.array(route), furniture, doors, floors)
+    return Building(plan.walls(), np.array(route), furniture, *doors_and_floors(offices))
+
+
+def doors_and_floors(rooms: Sequence[Room]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """``doors`` (n, 4) and ``rooms`` (n, 5) of a `Building` with these open rooms."""
+    doors = np.array([room.door for room in rooms]).reshape(-1, 4)
+    x0, y0, x1, y1 = np.array([room.floor for room in rooms]).reshape(-1, 4).T
+    return doors, np.stack((0.5 * (x0 + x1), 0.5 * (y0 + y1), 0.0 * x0, x1 - x0, y1 - y0), axis=1)
 
 
 def nested(draw: np.random.Generator, settings: Settings) -> Building:

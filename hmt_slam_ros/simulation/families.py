@@ -10,6 +10,7 @@ import numpy as np
 from hmt_slam_ros.configuration.flat import Value
 from hmt_slam_ros.simulation import corridors, halls
 from hmt_slam_ros.simulation.building import Building
+from hmt_slam_ros.simulation.institute import institute
 from hmt_slam_ros.simulation.settings import Settings
 
 
@@ -48,5 +49,11 @@ FAMILIES: dict[str, Family] = {
     "twins": Family(
         halls.twins, "Two identical rooms; lost in a hall in between, the robot enters one of them again.",
         {"range": 4.0, "laps": 1},
+    ),
+    "institute": Family(
+        institute,
+        "Hallways of 50 m x 25 m with crossings, offices and meeting rooms, of which 9 are open, and people; a visit "
+        "finds others open.",
+        {"laps": 1, "people": 4, "field_of_view": 360.0, "beams": 720},
     ),
 }  # fmt: skip
