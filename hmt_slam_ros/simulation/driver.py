@@ -10,8 +10,11 @@ from numpy.typing import NDArray
 
 from hmt_slam_ros.simulation.path import Path
 
-_ACCELERATION = 0.5  # m/s^2
-_TURN_ACCELERATION = math.radians(90.0)  # rad/s^2
+ACCELERATION = 0.5
+"""Of the robot at most, m/s^2."""
+
+TURN_ACCELERATION = math.radians(90.0)
+"""Likewise, rad/s^2."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +59,7 @@ def drive_along(path: Path, speed: float, turn_rate: float) -> Drive:
     sizes, spots = path.sizes, path.on_the_spot
     limits = np.minimum(speed, turn_rate * path.lengths / np.maximum(np.abs(path.turns), 1e-12))
     limits = np.where(spots, turn_rate, limits)
-    accelerations = np.where(spots, _TURN_ACCELERATION, _ACCELERATION)
+    accelerations = np.where(spots, TURN_ACCELERATION, ACCELERATION)
     joints = _speeds_at_joints(sizes, spots, limits, accelerations)
     phases: list[tuple[float, ...]] = []
     for k, (size, limit, acceleration) in enumerate(zip(sizes, limits, accelerations, strict=True)):

@@ -14,6 +14,7 @@ _RADIUS = 0.2  # m
 _BERTH = 0.8  # m, from the robot's middle to a person's
 _SLOW, _FAST = 0.7, 1.4  # m/s
 _SPAN = 20.0  # m, that a person walks at most before turning back
+_PATIENCE = 2.0  # s, that a person waits for the robot to go away
 _ASIDE = 0.25  # m, of the robot's way at most
 
 
@@ -38,19 +39,56 @@ class People:
 
     def discs(self, seconds: float, robot: NDArray[np.float64]) -> NDArray[np.float64]:
         """Where they are, (k, 3) as x, y and radius, m; whoever is too near the robot, (3,), is beside it."""
+        places = self.places(self.phases + self.speeds * seconds)
+        away = places - robot[:2]
+        distances = np.maximum(np.hypot(away[:, 0], away[:, 1]), 1e-6)
+        return _discs(robot[:2] + away * np.maximum(1.0, _BERTH / distances)[:, None])
+
+    def places(self, walked: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Where they are after walking so far, m, to and fro, shape (k,); shape (k, 2), m."""
         path = self.drive.path
-        walked = np.mod(self.phases + self.speeds * seconds, 2.0 * self.spans)
+        walked = np.mod(walked, 2.0 * self.spans)
         along = self.begins + np.minimum(walked, 2.0 * self.spans - walked)
         ends = np.cumsum(path.lengths)
         along = np.clip(along, 0.0, ends[-1] * (1.0 - 1e-12))
         stretch = np.searchsorted(ends, along, side="right")
         poses = path.pose(stretch, along - (ends - path.lengths)[stretch])
         left = np.stack((-np.sin(poses[:, 2]), np.cos(poses[:, 2])), axis=1)
-        places = poses[:, :2] + self.asides[:, None] * left
-        away = places - robot[:2]
-        distances = np.maximum(np.hypot(away[:, 0], away[:, 1]), 1e-6)
-        places = robot[:2] + away * np.maximum(1.0, _BERTH / distances)[:, None]
-        return np.concatenate((places, np.full((len(places), 1), _RADIUS)), axis=1)
+        return poses[:, :2] + self.asides[:, None] * left
+
+
+class Walkers:
+    """The same persons before a robot of which nobody knows where it will go: nobody steps aside through a wall.
+
+    Whoever would come too near the robot stops, and turns back where it does not go away.
+
+    :ivar discs: shape (k, 3), where they are now, x, y and radius, m.
+    """
+
+    def __init__(self, people: People) -> None:
+        self._people = people
+        self._walked = people.phases.copy()
+        self._waited = np.zeros_like(self._walked)
+        self.discs = _discs(people.places(self._walked))
+
+    def walk(self, seconds: float, robot: NDArray[np.float64]) -> None:
+        """Walk for a while in which they do not look again.
+
+        :param robot: its pose, (3,).
+        """
+        people = self._people
+        ahead = self._walked + people.speeds * seconds
+        distances = [np.hypot(*(p[:, :2] - robot[:2]).T) for p in (self.discs, people.places(ahead))]
+        stop = (distances[1] < _BERTH) & (distances[1] < distances[0])
+        self._walked = np.where(stop, self._walked, ahead)
+        self._waited = np.where(stop, self._waited + seconds, 0.0)
+        back = self._waited > _PATIENCE
+        self._walked, self._waited = np.where(back, -self._walked, self._walked), np.where(back, 0.0, self._waited)
+        self.discs = _discs(people.places(self._walked))
+
+
+def _discs(places: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.concatenate((places, np.full((len(places), 1), _RADIUS)), axis=1)
 
 
 def people_on(drive: Drive, count: int, seed: int) -> People:

@@ -77,6 +77,11 @@ class Scenario:
         """Stamps of the scans, shape (k,), ns."""
         return self.stamps[:: self.settings.readings]
 
+    @property
+    def surfaces(self) -> WallIndex:
+        """Walls, closed doors and furniture as they are at first."""
+        return self._furnished[0]
+
     def true_poses(self, stamps: NDArray[np.int64]) -> NDArray[np.float64]:
         """``world_T_base`` (n, 3), m and rad, at any stamps (n,), ns."""
         return self._driven.poses(self._seconds(stamps))

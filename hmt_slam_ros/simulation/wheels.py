@@ -28,8 +28,14 @@ def noisy_increments(
     :param factor: on all deviations.
     :returns: shape (n, 3).
     """
+    return noised(increments, factor, random.standard_normal(increments.shape))
+
+
+def noised(
+    increments: NDArray[np.float64], factor: float, draws: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """What `noisy_increments` makes of standard normal draws (n, 3)."""
     motion = Motion()
-    draws = random.standard_normal(increments.shape)
     measured = increments
     for _ in range(_ITERATIONS):
         deviations = factor * _deviations(measured, motion)
