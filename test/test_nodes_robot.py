@@ -10,13 +10,14 @@ from logs_for_nodes import LASER, START, Corridor, corridor_bag
 
 pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
 
-from geometry_msgs.msg import TransformStamped
+from geometry_msgs.msg import PoseStamped, TransformStamped, Twist
 from nav_msgs.msg import Odometry as OdometryMessage
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import LaserScan
 from std_msgs.msg import String
 from std_srvs.srv import SetBool
 
+from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.logs import open_log
 from hmt_slam_ros.nodes import conversions, qos
@@ -186,3 +187,104 @@ def test_a_simulated_robot_drives_live(listener, start, heard):
     for message, scan in zip(heard["scan"], scans, strict=True):
         assert conversions.stamp_of(message.header.stamp) == scan.stamp
         assert np.array_equal(conversions.ranges_of(message), scan.ranges)
+
+
+class Driver:
+    """Drives the robot node's robot and listens to where it truly is."""
+
+    def __init__(self, listener, heard):
+        self.truths = listener.hear(PoseStamped, "ground_truth", qos.STREAM)
+        self._publisher = listener.node.create_publisher(Twist, "cmd_vel", 1)
+        self._listener, self._heard = listener, heard
+
+    @property
+    def poses(self):
+        return np.array([conversions.planar_pose(message.pose) for message in self.truths])
+
+    def until(self, condition, speed, turn_rate=0.0, **options):
+        """Command velocities until a condition holds."""
+
+        def told():
+            command = Twist()
+            command.linear.x, command.angular.z = speed, turn_rate
+            self._publisher.publish(command)
+            return condition()
+
+        self._listener.until(told, **options)
+
+    def stands(self):
+        """Whether it has not moved for a second of its time, in which there were scans."""
+        return len(self.truths) > 15 and len(self._heard["scan"]) > 5 and not np.ptp(self.poses[-15:], axis=0).any()
+
+
+@pytest.fixture
+def driver(listener, heard):
+    return Driver(listener, heard)
+
+
+def start_driven(start, log="sim:institute,seed=3,people=0,beams=90", rate=2.0, **parameters):
+    return start("robot", log=log, robot__drive="commands", robot__rate=rate, robot__paced=False, **parameters)
+
+
+def test_commands_drive_the_robot_and_silence_stops_it(listener, start, heard, driver):
+    robot = start_driven(start)
+    listener.until(driver.stands, alive=[robot])
+    begin = driver.poses[-1]
+    driver.until(lambda: np.hypot(*(driver.poses[-1] - begin)[:2]) > 0.5, 0.3, alive=[robot])
+    ahead = se2.between(begin, driver.poses[-1])
+    assert ahead[0] > 0.5
+    assert abs(ahead[1]) < 0.01
+    driver.until(lambda: se2.between(begin, driver.poses[-1])[2] > 0.5, 0.0, 0.6, alive=[robot])
+    listener.until(driver.stands, alive=[robot])
+    # Half a second after the last command it begins to brake.
+    moved = se2.between(begin, driver.poses[-1])
+    assert moved[0] < 1.5
+    readings = [conversions.odometry_from(message) for message in heard["odom"]]
+    assert all(a < b for a, b in pairwise([reading.stamp for reading in readings]))
+    wheels = {reading.stamp: reading.pose for reading in readings}
+    stamps = [conversions.stamp_of(message.header.stamp) for message in driver.truths]
+    shared = [(wheels[stamp], pose) for stamp, pose in zip(stamps, driver.poses, strict=True) if stamp in wheels]
+    assert len(shared) > 20
+    errors = se2.between(se2.between(shared[0][0], shared[-1][0]), se2.between(shared[0][1], shared[-1][1]))
+    assert 0.0 < np.abs(errors).max() < 0.5
+    assert driver.truths[0].header.frame_id == "world"
+    assert heard["clock"]
+
+
+def test_the_driven_robot_does_not_pass_a_wall(listener, start, driver):
+    # It begins a metre before the end of a hallway, with its back to it.
+    robot = start_driven(start)
+    listener.until(driver.stands, alive=[robot])
+    begin = driver.poses[-1]
+    back = lambda: -se2.between(begin, driver.poses[-1])[0]  # noqa: E731
+    driver.until(lambda: back() > 1.0 - 0.25 - 0.02, -0.4, alive=[robot])
+    count = len(driver.truths)
+    driver.until(lambda: len(driver.truths) > count + 20, -0.4, alive=[robot])
+    assert back() <= 1.0 - 0.25
+
+
+def test_a_driven_robot_ends_after_its_duration_and_begins_where_the_drive_is_after_its_start(
+    listener, start, heard, driver
+):
+    robot = start_driven(start, rate=20.0, robot__duration=2.0, robot__start=30.0)
+    listener.until(ended(heard), alive=[robot])
+    assert last_status(heard)["scans"] == 11
+    simulated = open_log("sim:institute,seed=3,people=0,beams=90")
+    there = simulated.true_poses(np.array([simulated.scenario.stamps[0] + 30_000_000_000]))[0]
+    np.testing.assert_allclose(driver.poses, np.tile(there, (len(driver.truths), 1)), atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("parameters", "sentence"),
+    [
+        ({"log": "data/malaga_one_loop"}, "is no simulated world"),
+        ({"log": "sim:busy"}, "knows no moved: set moved=0"),
+        ({"rate": 0.0}, "robot.drive is commands and robot.rate is 0"),
+    ],
+)
+def test_what_cannot_be_driven_is_one_sentence(domain, start, parameters, sentence):
+    robot = start_driven(start, **parameters)
+    error = robot.communicate(timeout=40)[1]
+    assert robot.returncode == 2
+    assert sentence in error
+    assert len(error.strip().splitlines()) == 1

@@ -30,8 +30,14 @@ class RealTimeLocalization:
 
 @dataclass(frozen=True)
 class Robot:
-    """The simulated robot that replays a log."""
+    """The simulated robot that replays a log, or drives."""
 
+    drive: str = parameter(
+        "log",
+        "What the robot node does: it replays its log, a simulated drive as it is scripted, or is driven through a "
+        "simulated world by the velocities on cmd_vel.",
+        choices=("log", "commands"),
+    )
     rate: float = parameter(
         1.0, "Speed of the replay relative to real time; 0 is as fast as possible.", low=0.0, high=1000.0
     )

@@ -81,6 +81,11 @@ RULES: tuple[Rule, ...] = (
         "paced robot holds back; lower the one or raise the other",
     ),
     Rule(
+        lambda tree: tree.robot.drive != "commands" or tree.robot.rate > 0.0,
+        "robot.drive is commands and robot.rate is 0, so that time would pass before any command is there; raise the "
+        "rate",
+    ),
+    Rule(
         lambda tree: tree.features.opening_min < tree.features.opening_max,
         "features.opening_min is not below features.opening_max, so that no opening is found; lower the one or raise "
         "the other",

@@ -46,7 +46,8 @@ TF_STATIC = QoSProfile(
 # What passes by for people and other programs: /tf, /pose, /clock, /diagnostics.
 STREAM = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=100, reliability=ReliabilityPolicy.RELIABLE)
 
-# For the page, which looks at what passes by a few times a second: older ones are replaced inside of DDS.
+# For the page, which looks at what passes by a few times a second, and for commands to a robot: older ones are
+# replaced inside of DDS.
 NEWEST = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 # A reader of a chain topic that wants to know its past, and for which nobody waits: what is too much is lost.

@@ -70,6 +70,8 @@ def replay(
     :param view: port on which the live page is served, None for no page.
     :raises HmtSlamError: for a log that cannot be read, a node that dies, or a run that stands still.
     """
+    if configuration.robot.drive == "commands":
+        raise HmtSlamError("robot.drive = commands is for the robot node alone: set it to log for a replay")
     if configuration.robot.loop:
         raise HmtSlamError("robot.loop = true has no end to wait for: set it to false for a replay into a folder")
     opened = open_log(log, start=configuration.robot.start, duration=configuration.robot.duration or None)

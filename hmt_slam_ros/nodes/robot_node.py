@@ -1,11 +1,14 @@
-"""A simulated robot: replays a log, or drives through a world, as /scan, /odom, /tf, /tf_static and /clock."""
+"""A simulated robot: replays a log, or drives through a world, as /scan, /odom, /tf, /tf_static and /clock.
+
+Where `robot.drive` says so it is driven by what comes on /cmd_vel, and tells where it is on /ground_truth.
+"""
 
 from __future__ import annotations
 
 import sys
 import time
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import rclpy
@@ -34,6 +37,9 @@ from hmt_slam_ros.processes.documents import RobotStatus, encode
 from hmt_slam_ros.processes.messages import Arriving, LocalEstimate, Message
 from hmt_slam_ros.sensing import Odometry, Scan
 
+if TYPE_CHECKING:
+    from hmt_slam_ros.nodes.driving import Driving
+
 _ANSWERS = DOCUMENTS[LocalEstimate]
 _CHANGEABLE = ("robot.rate", "robot.paced", "robot.window")
 _STATUS_PERIOD = 0.2  # s
@@ -53,6 +59,7 @@ class RobotNode(ConfiguredNode):
         self._odom, self._base = declare_frame(self, "odom", "odom"), declare_frame(self, "base", "base_link")
         self._laser = declare_frame(self, "laser", "laser")
         self.figures = Figures(self)
+        self._driving: Driving | None = None
         self._log = self._open_log()
         self._player = Player(self._log, self._settings)
         self._state: State = "waiting"
@@ -74,6 +81,12 @@ class RobotNode(ConfiguredNode):
         path = str(self.declare_parameter("log", "", descriptor).value)
         if not path:
             raise HmtSlamError("no log is given: set the parameter log, such as -p log:=data/malaga_one_loop")
+        if self._settings.drive == "commands":
+            # The kernels of the simulation are for those who simulate.
+            from hmt_slam_ros.nodes.driving import Driving  # noqa: PLC0415
+
+            self._driving = Driving(self, path, self._settings)
+            return self._driving
         log = open_log(Path(path), start=self._settings.start, duration=self._settings.duration or None)
         if not log.scan_count:
             raise HmtSlamError(f"{path} has no scans in the part asked for: check robot.start and robot.duration")
@@ -134,7 +147,8 @@ class RobotNode(ConfiguredNode):
             missing = [SCAN]
         if not missing:
             self._state, self._last_progress = "playing", time.monotonic()
-            self.get_logger().info(f"replaying {self._log.name}: {self._log.scan_count} scans")
+            told = f"replaying {self._log.name}: {self._log.scan_count} scans"
+            self.get_logger().info(told if self._driving is None else f"driving through {self._log.name} by cmd_vel")
             return
         if time.monotonic() - self._begin > settings.patience:
             name = "scan" if missing[0] == SCAN else "odometry"
@@ -153,6 +167,8 @@ class RobotNode(ConfiguredNode):
             self._send_transforms([joint])
             publish_surely(self._readings, conversions.odometry_message(measurement, self._odom, self._base))
         self.figures.sent[type(measurement).__name__] += 1
+        if self._driving is not None:
+            self._driving.tell_truth(measurement.stamp)
         if self._player.ended:
             self._report()
             self.get_logger().info(f"end of the log after {self._player.scans} scans")

@@ -3,6 +3,7 @@
 from hmt_slam_ros.processes.messages import Accepted, AreaEvents, Arriving, Hypotheses, LocalEstimate, Notice
 
 SCAN, ODOM, CLOCK = "scan", "odom", "/clock"
+COMMANDS, GROUND_TRUTH = "cmd_vel", "ground_truth"
 KEYFRAMES, KEYFRAME_SCANS = "hmt/keyframes", "hmt/keyframe_scans"
 TRAIL = "hmt/trail"
 FINISHED = "hmt/finished"
