@@ -14,6 +14,7 @@ _RADIUS = 0.2  # m
 _BERTH = 0.8  # m, from the robot's middle to a person's
 _SLOW, _FAST = 0.7, 1.4  # m/s
 _SPAN = 20.0  # m, that a person walks at most before turning back
+_STOP = 1.0  # m, likewise where they cannot step aside
 _PATIENCE = 2.0  # s, that a person waits for the robot to go away
 _ASIDE = 0.25  # m, of the robot's way at most
 
@@ -79,7 +80,7 @@ class Walkers:
         people = self._people
         ahead = self._walked + people.speeds * seconds
         distances = [np.hypot(*(p[:, :2] - robot[:2]).T) for p in (self.discs, people.places(ahead))]
-        stop = (distances[1] < _BERTH) & (distances[1] < distances[0])
+        stop = (distances[1] < _STOP) & (distances[1] < distances[0])
         self._walked = np.where(stop, self._walked, ahead)
         self._waited = np.where(stop, self._waited + seconds, 0.0)
         back = self._waited > _PATIENCE
