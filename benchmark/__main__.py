@@ -50,6 +50,7 @@ MEASUREMENTS = {
     "landmarkmaps": "landmarks of areas, at two visits, against the true ones",
     "hallways": "whether hallways and rooms are told apart",
     "belief": "how soon a lost robot knows at which place it is, in corridors of the belief's own model",
+    "driving": "whether a robot that avoids obstacles reaches its goals, and touches nothing",
     "localmaps": "maps of areas by lines beside grids, on simulated worlds",
     "table": "time and memory against a global metric RBPF at equal accuracy, the paper's Table II",
     "ambiguity": "whether both answers stay alive where places are identical, until the evidence",
@@ -66,8 +67,8 @@ _GROUPS = {
     "all": ("accuracy", "steps", "robustness", "choices", "sessions", "speed", "live"),
     "validation": (
         "calibration", "loops", "topology", "consistency", "evidence", "appearance", "lines", "linemap", "heading",
-        "landmarks", "landmarkmaps", "hallways", "belief", "localmaps", "ambiguity", "table", "oracle", "awakening",
-        "kidnapping", "laps", "changes", "scale",
+        "landmarks", "landmarkmaps", "hallways", "belief", "driving", "localmaps", "ambiguity", "table", "oracle",
+        "awakening", "kidnapping", "laps", "changes", "scale",
     ),
 }  # fmt: skip
 

@@ -1,0 +1,133 @@
+"""The dynamic window drives to goals around what the scan shows, and touches nothing."""
+
+import math
+
+import numpy as np
+import pytest
+
+from benchmark.driving import driven, scenario_of
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.motion import Limits, command_towards
+from hmt_slam_ros.motion.driver import _FAR, _free
+from hmt_slam_ros.motion.local_path import path_ahead
+from hmt_slam_ros.sensing import Scan
+
+LIMITS = Limits(0.6, math.radians(45.0), 0.5, math.radians(90.0), 0.25)
+NOTHING = np.empty((0, 2))
+
+
+def scan_of(points, beams=720):
+    """What a laser that sees all around would see of points (n, 2), one return for each."""
+    ranges = np.full(beams, np.inf, dtype=np.float32)
+    for x, y in points:
+        beam = round((math.atan2(y, x) + math.pi) / (2.0 * math.pi) * beams) % beams
+        ranges[beam] = min(ranges[beam], math.hypot(x, y))
+    return Scan(0, ranges, -math.pi, 2.0 * math.pi / beams, 0.02, 20.0)
+
+
+def wall(start, end):
+    return start + np.linspace(0.0, 1.0, 200)[:, None] * (np.subtract(end, start))
+
+
+def test_at_the_goal_it_stands():
+    assert command_towards(scan_of(NOTHING), np.array([0.1, 0.1]), (0.3, 0.0), LIMITS) == (0.0, 0.0, True)
+
+
+def test_with_nothing_in_the_way_it_speeds_up_straight_ahead():
+    command = command_towards(scan_of(NOTHING), np.array([5.0, 0.0]), (0.4, 0.0), LIMITS)
+    assert command.speed == pytest.approx(0.5)
+    assert abs(command.turn_rate) < 0.05
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_it_turns_to_the_side_of_the_goal(side):
+    command = command_towards(scan_of(NOTHING), np.array([-2.0, 1.0 * side]), (0.0, 0.0), LIMITS)
+    assert command.turn_rate * side > 0.2
+
+
+@pytest.mark.parametrize("velocity", [(0.0, 0.0), (0.6, 0.5), (0.3, -0.7), (-0.2, 0.0), (0.9, 2.0)])
+def test_commands_can_be_reached_and_keep_the_limits(velocity):
+    for goal in ([4.0, 0.0], [0.3, 0.3], [-1.0, 0.2], [0.0, -3.0]):
+        command = command_towards(scan_of(wall([1.0, -1.0], [1.0, 1.0])), np.array(goal), velocity, LIMITS)
+        assert 0.0 <= command.speed <= LIMITS.speed
+        assert abs(command.turn_rate) <= LIMITS.turn_rate
+        assert command.speed - velocity[0] <= LIMITS.acceleration * LIMITS.period + 0.2 + 1e-9
+
+
+def test_before_a_wall_it_brakes_in_time():
+    """From full speed, with the brakes that it has, it stands before its margin, whatever the goal."""
+    speed, away = 0.6, 3.0
+    for _ in range(60):
+        points = wall([away, -4.0], [away, 4.0])
+        command = command_towards(scan_of(points), np.array([away + 2.0, 0.0]), (speed, 0.0), LIMITS)
+        change = LIMITS.acceleration * LIMITS.period
+        now = speed + max(-change, min(change, command.speed - speed))
+        away -= 0.5 * (speed + now) * LIMITS.period
+        speed = now
+    assert speed < 0.02
+    assert LIMITS.radius + LIMITS.margin - 0.01 <= away < 0.8
+
+
+def test_the_way_to_a_contact_is_that_of_a_walk_in_small_steps():
+    draw = np.random.default_rng(5)
+    step, radius = 0.001, 0.3
+    for _ in range(60):
+        point = draw.uniform(-1.5, 1.5, 2)
+        if np.hypot(*point) <= radius:
+            continue
+        v, omega = draw.uniform(0.05, 0.6), draw.choice([0.0, draw.uniform(-0.8, 0.8)])
+        ways = np.arange(0.0, _FAR, step)
+        poses = se2.exp(np.stack((ways, 0.0 * ways, ways / v * omega), axis=1))
+        touching = np.hypot(*(poses[:, :2] - point).T) < radius
+        walked = ways[touching.argmax()] if touching.any() else _FAR
+        assert _free(point[None], v, omega, radius) == pytest.approx(walked, abs=0.01)
+
+
+def test_what_is_too_near_keeps_it_from_nearing_but_not_from_leaving():
+    assert _free(np.array([[0.2, 0.1]]), 0.3, 0.1, 0.3) == 0.0
+    assert _free(np.array([[-0.2, 0.1]]), 0.3, 0.1, 0.3) == _FAR
+    assert _free(np.array([[0.2, 0.1]]), 0.0, 0.5, 0.3) == _FAR
+
+
+def test_the_path_goes_straight_where_nothing_is_and_around_what_is_there():
+    np.testing.assert_allclose(path_ahead(NOTHING, np.array([0.5, 0.2]), 0.3), [0.5, 0.2])
+    assert path_ahead(NOTHING, np.array([9.0, 0.0]), 0.3) == pytest.approx([4.0, 0.0], abs=0.11)
+    # A wall with an open end on the left.
+    ahead = path_ahead(wall([0.8, -4.0], [0.8, 0.5]), np.array([2.0, 0.0]), 0.3)
+    assert ahead[1] > 0.3
+    assert np.hypot(*ahead) >= 0.6
+
+
+def test_the_path_leads_out_of_a_dead_end():
+    ends = [([1.0, -1.0], [1.0, 1.0]), ([-1.0, 1.0], [1.0, 1.0]), ([-1.0, -1.0], [1.0, -1.0])]
+    ahead = path_ahead(np.concatenate([wall(*two) for two in ends]), np.array([2.5, 0.0]), 0.3)
+    assert ahead[0] < -0.3
+
+
+def test_the_path_goes_through_the_middle_of_a_door_and_not_through_a_gap_that_is_too_narrow():
+    for gap, through in ((0.9, True), (0.5, False)):
+        sides = [wall([0.6, 0.5 * gap], [0.6, 6.0]), wall([0.6, -6.0], [0.6, -0.5 * gap])]
+        points = np.concatenate(sides)
+        place, goal = np.zeros(3), np.array([2.0, 0.0])
+        for _ in range(12):
+            local = se2.transform(se2.inverse(place), points)
+            ahead = path_ahead(local, se2.transform(se2.inverse(place), goal[None])[0], 0.3)
+            place[:2] += 0.3 * ahead
+        assert (place[0] > 1.0) == through
+        assert abs(place[1]) < 0.15 or not through
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_it_reaches_goals_in_floors_with_people_without_contact(seed):
+    legs = list(driven(scenario_of("institute", seed, "360°"), 17))
+    assert len(legs) == 17
+    assert all(leg.reached for leg in legs)
+    assert sum(leg.contacts for leg in legs) == 0
+    assert sum(leg.metres for leg in legs) > 50.0
+
+
+@pytest.mark.parametrize("laser", ["360°", "180°"])
+def test_it_passes_doors_of_ninety_centimetres(laser):
+    legs = list(driven(scenario_of("doors", 4, laser), 8))
+    assert all(leg.reached for leg in legs)
+    assert sum(leg.contacts for leg in legs) == 0
