@@ -40,10 +40,7 @@ class People:
 
     def discs(self, seconds: float, robot: NDArray[np.float64]) -> NDArray[np.float64]:
         """Where they are, (k, 3) as x, y and radius, m; whoever is too near the robot, (3,), is beside it."""
-        places = self.places(self.phases + self.speeds * seconds)
-        away = places - robot[:2]
-        distances = np.maximum(np.hypot(away[:, 0], away[:, 1]), 1e-6)
-        return _discs(robot[:2] + away * np.maximum(1.0, _BERTH / distances)[:, None])
+        return _discs(_beside(self.places(self.phases + self.speeds * seconds), robot))
 
     def places(self, walked: NDArray[np.float64]) -> NDArray[np.float64]:
         """Where they are after walking so far, m, to and fro, shape (k,); shape (k, 2), m."""
@@ -59,9 +56,10 @@ class People:
 
 
 class Walkers:
-    """The same persons before a robot of which nobody knows where it will go: nobody steps aside through a wall.
+    """The same persons before a robot of which nobody knows where it will go.
 
-    Whoever would come too near the robot stops, and turns back where it does not go away.
+    Whoever would come too near the robot stops, turns back where it does not go away, and squeezes past it, be it
+    through a wall, where it is in the way back as well.
 
     :ivar discs: shape (k, 3), where they are now, x, y and radius, m.
     """
@@ -70,6 +68,7 @@ class Walkers:
         self._people = people
         self._walked = people.phases.copy()
         self._waited = np.zeros_like(self._walked)
+        self._turned = self._squeezing = np.zeros(len(self._walked), dtype=np.bool_)
         self.discs = _discs(people.places(self._walked))
 
     def walk(self, seconds: float, robot: NDArray[np.float64]) -> None:
@@ -80,12 +79,25 @@ class Walkers:
         people = self._people
         ahead = self._walked + people.speeds * seconds
         distances = [np.hypot(*(p[:, :2] - robot[:2]).T) for p in (self.discs, people.places(ahead))]
-        stop = (distances[1] < _STOP) & (distances[1] < distances[0])
+        near = distances[1] < _STOP
+        stop = near & (distances[1] < distances[0]) & ~self._squeezing
         self._walked = np.where(stop, self._walked, ahead)
         self._waited = np.where(stop, self._waited + seconds, 0.0)
-        back = self._waited > _PATIENCE
-        self._walked, self._waited = np.where(back, -self._walked, self._walked), np.where(back, 0.0, self._waited)
-        self.discs = _discs(people.places(self._walked))
+        tired = self._waited > _PATIENCE
+        back = tired & ~self._turned
+        self._walked, self._waited = np.where(back, -self._walked, self._walked), np.where(tired, 0.0, self._waited)
+        self._squeezing = near & (self._squeezing | (tired & self._turned))
+        self._turned = near & (self._turned | back)
+        places = people.places(self._walked)
+        self.discs = _discs(np.where(self._squeezing[:, None], _beside(places, robot), places))
+
+
+def _beside(places: NDArray[np.float64], robot: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Places (k, 2), m, moved away from the robot, (3,), where they are too near."""
+    away = places - robot[:2]
+    distances = np.maximum(np.hypot(away[:, 0], away[:, 1]), 1e-6)
+    moved: NDArray[np.float64] = robot[:2] + away * np.maximum(1.0, _BERTH / distances)[:, None]
+    return moved
 
 
 def _discs(places: NDArray[np.float64]) -> NDArray[np.float64]:
