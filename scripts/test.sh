@@ -28,7 +28,7 @@ fi
 # Misspelled message fields and wrong types fail; nodes of other machines on the network are not seen.
 export ROS_PYTHON_CHECK_FIELDS=1 ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST
 # The tests of nodes mostly wait, one at a time (test/conftest.py), beside those that only compute.
-[ "$#" != 0 ] || set_of_all=(-n 2 --dist loadgroup --no-loadscope-reorder)
+[ "$#" != 0 ] || set_of_all=(-n 2 --no-loadscope-reorder)
 check pytest ${set_of_all[@]+"${set_of_all[@]}"} "$@"
 [ "$#" != 0 ] || check benchmark short
 exit "$status"

@@ -20,18 +20,31 @@ os.environ["ROS_PYTHON_CHECK_FIELDS"] = "1"
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 WAIT = 120.0  # s, for what normally takes less than one; a machine may be busy
-NODES = ("test_nodes_", "test_view_page")
+NODES = ("test_nodes_", "test_view_page", "test_package_compilation")  # files in which nodes run
 
 
-def pytest_collection_modifyitems(items):
-    """Files in which nodes run come first and one after the other, beside files that only compute.
+def with_nodes(nodeid):
+    return nodeid.partition("::")[0].rpartition("/")[2].startswith(NODES)
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config, log):
+    """Tests in which nodes run go one after the other, beside tests that only compute, file by file.
 
     Nodes wait for each other, and are told to do things within a time; six of them at once are enough for two cores.
     """
-    with_nodes = {item.path for item in items if "domain" in item.fixturenames or item.path.stem.startswith(NODES)}
-    for item in items:
-        item.add_marker(pytest.mark.xdist_group("nodes" if item.path in with_nodes else item.path.stem))
-    items.sort(key=lambda item: item.path not in with_nodes)
+    from xdist.scheduler import LoadScopeScheduling  # noqa: PLC0415  only where it is installed
+
+    class NodesInTurn(LoadScopeScheduling):
+        def _split_scope(self, nodeid):
+            return "nodes" if with_nodes(nodeid) else nodeid.partition("::")[0]
+
+    return NodesInTurn(config, log)
+
+
+def pytest_collection_modifyitems(items):
+    """Nodes come first: the other tests go on beside them, and neither waits for the other at the end."""
+    items.sort(key=lambda item: not with_nodes(item.nodeid))
 
 
 @pytest.fixture
