@@ -1,6 +1,8 @@
 """The robot node as an OS process over DDS."""
 
 import json
+import math
+import signal
 import time
 from itertools import pairwise
 
@@ -261,6 +263,17 @@ def test_the_driven_robot_does_not_pass_a_wall(listener, start, driver):
     count = len(driver.truths)
     driver.until(lambda: len(driver.truths) > count + 20, -0.4, alive=[robot])
     assert back() <= 1.0 - 0.25
+
+
+def test_a_command_that_is_no_number_stops_the_robot_and_is_told(listener, start, driver):
+    robot = start_driven(start)
+    listener.until(driver.stands, alive=[robot])
+    begin, count = driver.poses[-1], len(driver.truths)
+    driver.until(lambda: len(driver.truths) > count + 10, math.nan, alive=[robot])
+    np.testing.assert_array_equal(driver.poses[-1], begin)
+    robot.send_signal(signal.SIGINT)
+    error = robot.communicate()[1]
+    assert error.count("cmd_vel has nan m/s and 0 rad/s, and the robot stops: send finite velocities") == 1
 
 
 def test_a_driven_robot_ends_after_its_duration_and_begins_where_the_drive_is_after_its_start(

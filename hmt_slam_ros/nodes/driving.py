@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Iterator
 
@@ -22,6 +23,8 @@ from hmt_slam_ros.sensing import Odometry
 from hmt_slam_ros.simulation import open_simulated
 from hmt_slam_ros.simulation.driven_robot import DrivenLog, DrivenRobot
 from hmt_slam_ros.simulation.scenario import START
+
+_AGAIN = 10.0  # s, after which a fault is told again
 
 
 class Driving:
@@ -44,6 +47,7 @@ class Driving:
         self._log = DrivenLog(simulated.name, self._robot, settings.duration)
         self.name, self.scan_count, self.duration = simulated.name, self._log.scan_count, self._log.duration
         self._truths: deque[tuple[int, NDArray[np.float64]]] = deque()
+        self._node = node
         self._poses = node.create_publisher(PoseStamped, GROUND_TRUTH, qos.STREAM)
         node.create_subscription(Twist, COMMANDS, self._told, qos.NEWEST)
 
@@ -65,4 +69,11 @@ class Driving:
             self._poses.publish(PoseStamped(header=header, pose=conversions.pose_message(pose)))
 
     def _told(self, command: Twist) -> None:
-        self._robot.command(command.linear.x, command.angular.z)
+        speed, turn_rate = command.linear.x, command.angular.z
+        if not (math.isfinite(speed) and math.isfinite(turn_rate)):
+            self._node.get_logger().warning(
+                f"cmd_vel has {speed:g} m/s and {turn_rate:g} rad/s, and the robot stops: send finite velocities",
+                throttle_duration_sec=_AGAIN,
+            )
+            speed = turn_rate = 0.0
+        self._robot.command(speed, turn_rate)
