@@ -23,28 +23,24 @@ WAIT = 120.0  # s, for what normally takes less than one; a machine may be busy
 NODES = ("test_nodes_", "test_view_page", "test_package_compilation")  # files in which nodes run
 
 
-def with_nodes(nodeid):
-    return nodeid.partition("::")[0].rpartition("/")[2].startswith(NODES)
-
-
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config, log):
-    """Tests in which nodes run go one after the other, beside tests that only compute, file by file.
+    """One worker takes the files in which nodes run, the others what only computes, until nothing else is left.
 
     Nodes wait for each other, and are told to do things within a time; six of them at once are enough for two cores.
     """
-    from xdist.scheduler import LoadScopeScheduling  # noqa: PLC0415  only where it is installed
+    from xdist.scheduler import LoadFileScheduling  # noqa: PLC0415  only where it is installed
 
-    class NodesInTurn(LoadScopeScheduling):
-        def _split_scope(self, nodeid):
-            return "nodes" if with_nodes(nodeid) else nodeid.partition("::")[0]
+    class NodesInTurn(LoadFileScheduling):
+        def _assign_work_unit(self, node):
+            runs_nodes = node is self.nodes[0]
+            for file in self.workqueue:
+                if file.rpartition("/")[2].startswith(NODES) == runs_nodes:
+                    self.workqueue.move_to_end(file, last=False)
+                    break
+            super()._assign_work_unit(node)
 
     return NodesInTurn(config, log)
-
-
-def pytest_collection_modifyitems(items):
-    """Nodes come first: the other tests go on beside them, and neither waits for the other at the end."""
-    items.sort(key=lambda item: not with_nodes(item.nodeid))
 
 
 @pytest.fixture
