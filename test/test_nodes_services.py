@@ -29,7 +29,8 @@ TRANSFORMS = {"tf", "tf_static"} if TFMessage else set()
 NAMED = {value for name, value in vars(topics).items() if name.isupper() and isinstance(value, str)}
 MESSAGES = Path(__file__).parent.parent / "docs" / "messages.md"
 SAID = {f"/{topic.lstrip('/')}" for topic in {*NAMED, *topics.DOCUMENTS.values(), *TRANSFORMS}} - {
-    "/initialpose",  # which is only heard
+    *("/initialpose", "/cmd_vel"),  # which are only heard
+    "/ground_truth",  # of a robot that is driven
     "/hmt/notices",  # as there is nothing to complain of
 }
 
