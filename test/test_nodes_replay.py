@@ -235,7 +235,7 @@ def test_a_run_that_stands_still_names_the_node_it_waits_for(tmp_path):
 def test_the_live_page_of_a_run_is_served_while_it_lasts_though_it_is_killed_unless_its_port_is_taken(tmp_path):
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
-        log, out = str(corridor_bag(tmp_path, 40)), str(tmp_path / "out")
+        log, out = str(corridor_bag(tmp_path, 200)), str(tmp_path / "out")
         command = [*COMMAND, "replay", log, "--out", out, "--set", "robot.rate=4", "--view", str(port)]
         done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == 2
