@@ -7,8 +7,11 @@ path around the change of areas counts, and of the openings that it passes the o
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+import math
+from bisect import bisect_left
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -79,26 +82,32 @@ def _passed(
     hybrid_map: HybridMap, landmarks: Mapping[int, Sequence[Landmark]], features: Features
 ) -> Iterator[Portal]:
     """The portal at every change of areas along the path that passes one."""
-    area_of = {keyframe: area for area in hybrid_map.area_ids() for keyframe in hybrid_map.keyframes(area)}
-    keyframes = sorted(area_of)
-    for n in range(1, len(keyframes)):
-        left, entered = areas = area_of[keyframes[n - 1]], area_of[keyframes[n]]
+    poses = {area: hybrid_map.keyframes(area) for area in hybrid_map.area_ids()}
+    own = {area: sorted(within) for area, within in poses.items()}
+    path = sorted((keyframe, area) for area, within in own.items() for keyframe in within)
+    for (_, left), (keyframe, entered) in pairwise(path):
         arc = telling_arc(hybrid_map, left, entered) if left != entered else None
         if arc is None:
             continue
-        back = np.array([hybrid_map.keyframes(left)[k] for k in reversed(keyframes[:n]) if area_of[k] == left])
-        ahead = np.array([hybrid_map.keyframes(entered)[k] for k in keyframes[n:] if area_of[k] == entered])
-        ways = [_near(way[:, :2], features) for way in (back, se2.compose(arc.mean, ahead))]
+        back = (poses[left][k] for k in reversed(own[left][: bisect_left(own[left], keyframe)]))
+        ahead = (se2.compose(arc.mean, poses[entered][k]) for k in own[entered][bisect_left(own[entered], keyframe) :])
+        ways = [_near(way, features) for way in (back, ahead)]
         if np.hypot(*(ways[0][0] - ways[1][0])) <= _STEP:
-            path = np.concatenate((ways[0][::-1], ways[1]))
-            yield from _nearest(path, len(ways[0]) - 0.5, areas, arc, landmarks)
+            around = np.concatenate((ways[0][::-1], ways[1]))
+            yield from _nearest(around, len(ways[0]) - 0.5, (left, entered), arc, landmarks)
 
 
-def _near(way: Float64, features: Features) -> Float64:
-    """The part of a way (n, 2) that is near to its begin, up to the first step that is no step."""
-    steps = np.hypot(*np.diff(way, axis=0).T)
-    near = (steps <= _STEP) & (np.cumsum(steps) <= features.portal_reach)
-    return way[: 1 + int(np.argmin(np.append(near, False)))]
+def _near(way: Iterable[Float64], features: Features) -> Float64:
+    """The places (n, 2) of a way of poses that are near to its begin, up to the first step that is no step."""
+    near: list[Float64] = []
+    far = 0.0
+    for pose in way:
+        step = math.dist(pose[:2], near[-1]) if near else 0.0
+        far += step
+        if step > _STEP or far > features.portal_reach:
+            break
+        near.append(pose[:2])
+    return np.array(near)
 
 
 def _nearest(
