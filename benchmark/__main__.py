@@ -49,6 +49,7 @@ MEASUREMENTS = {
     "landmarks": "whether corners and openings are there, where they are said to be, and how sure one may be of them",
     "landmarkmaps": "landmarks of areas, at two visits, against the true ones",
     "hallways": "whether hallways and rooms are told apart",
+    "places": "whether the doors and crossings of an institute are in the charts of its maps",
     "belief": "how soon a lost robot knows at which place it is, in corridors of the belief's own model",
     "driving": "whether a robot that avoids obstacles reaches its goals, and touches nothing",
     "localmaps": "maps of areas by lines beside grids, on simulated worlds",
@@ -67,8 +68,8 @@ _GROUPS = {
     "all": ("accuracy", "steps", "robustness", "choices", "sessions", "speed", "live"),
     "validation": (
         "calibration", "loops", "topology", "consistency", "evidence", "appearance", "lines", "linemap", "heading",
-        "landmarks", "landmarkmaps", "hallways", "belief", "driving", "localmaps", "ambiguity", "table", "oracle",
-        "awakening", "kidnapping", "laps", "changes", "scale",
+        "landmarks", "landmarkmaps", "hallways", "places", "belief", "driving", "localmaps", "ambiguity", "table",
+        "oracle", "awakening", "kidnapping", "laps", "changes", "scale",
     ),
 }  # fmt: skip
 

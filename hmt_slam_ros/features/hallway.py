@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from hmt_slam_ros.arrays import Float64, Int64
 from hmt_slam_ros.configuration.features import Features
 from hmt_slam_ros.features.rays import Rays
 
@@ -51,11 +52,26 @@ def free_space(rays: Rays) -> FreeSpace | None:
 
     :param rays: of a scan all around, real or virtual.
     """
+    return space_within(distances_around(rays))
+
+
+def distances_around(rays: Rays) -> Float64:
+    """How far one sees in every sector of the circle from -pi on, m, shape (72,); nan where no beam tells."""
     bearings = np.arctan2(rays.directions[:, 1], rays.directions[:, 0])
-    sectors = np.floor((bearings + math.pi) / (2.0 * math.pi) * _SECTORS).astype(np.int64) % _SECTORS
+    sectors = sector_of(bearings)
     away = np.full(_SECTORS, np.nan)
     for sector in np.unique(sectors).tolist():
         away[sector] = min(_FAR, float(np.median(rays.free[sectors == sector])))
+    return away
+
+
+def sector_of(bearings: Float64) -> Int64:
+    """The sectors that bearings of any shape, rad, lie in."""
+    return np.floor((bearings + math.pi) / (2.0 * math.pi) * _SECTORS).astype(np.int64) % _SECTORS
+
+
+def space_within(away: Float64) -> FreeSpace | None:
+    """The open space by how far one sees around, as `distances_around` has it."""
     half = _SECTORS // 2
     chords = away[:half] + away[half:]
     chords = chords[np.isfinite(chords)]

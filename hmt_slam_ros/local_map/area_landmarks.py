@@ -50,8 +50,12 @@ class AreaLandmarks:
         :param scans: of its keyframes, in the order in which they were taken.
         :param poses: shape (n, 3), their ``area_T_base``, m and rad.
         """
+        return self.gathered(self.sightings(scans, poses))
+
+    def gathered(self, sightings: Iterable[Sighting]) -> tuple[Landmark, ...]:
+        """The landmarks that sightings of an area show."""
         found = LandmarkMap(self._features)
-        for sighting in self.sightings(scans, poses):
+        for sighting in sightings:
             found.observe(*sighting)
         return tuple(found.landmarks)
 

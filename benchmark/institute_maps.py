@@ -1,0 +1,72 @@
+"""Maps that SLAM makes of scripted drives through a simulated institute, and their charts beside what is true."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from hmt_slam_ros.arrays import Float64
+from hmt_slam_ros.configuration import Configuration
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.local_map.area_landmarks import AreaLandmarks
+from hmt_slam_ros.local_map.local_mapping import LocalMapping
+from hmt_slam_ros.offline.runtime import run_log
+from hmt_slam_ros.places.chart import Chart, chart_of
+from hmt_slam_ros.places.floor import AreaView, views_of
+from hmt_slam_ros.simulation import open_simulated
+from hmt_slam_ros.simulation.scenario import Scenario
+from hmt_slam_ros.topology.hybrid_map import HybridMap
+from hmt_slam_ros.topology.surroundings import stacked
+
+LASER = "field_of_view=360,beams=720"
+"""As the paper's robot has it."""
+
+PEOPLE = 4
+"""Who walk about."""
+
+
+class InstituteMap(NamedTuple):
+    """A map of a drive through all hallways and open rooms.
+
+    :ivar scenario: the drive.
+    :ivar hybrid_map: the map at its end.
+    :ivar views: {area: what its keyframes show}.
+    :ivar chart: of the map.
+    :ivar frames: {area: ``world_T_area`` (3,)}, that in which the area's keyframes are nearest to where they were.
+    """
+
+    scenario: Scenario
+    hybrid_map: HybridMap
+    views: Mapping[int, AreaView]
+    chart: Chart
+    frames: dict[int, Float64]
+
+    @property
+    def nodes(self) -> Float64:
+        """True poses of the chart's nodes, shape (n, 3)."""
+        poses = [se2.compose(self.frames[node.area], node.pose) for node in self.chart.nodes]
+        return np.array(poses).reshape(-1, 3)
+
+
+def scenario_of(seed: int, visit: int = 0, changed: float = 0.0, people: int = PEOPLE) -> Scenario:
+    """An institute at a visit before which some doors may have been closed and others opened."""
+    own = f"seed={seed},visit={visit},changed={changed:g},laps=1,people={people},{LASER}"
+    return open_simulated(f"sim:institute,{own}").scenario
+
+
+def mapped(seed: int, configuration: Configuration, visit: int = 0, people: int = PEOPLE) -> InstituteMap:
+    """Map the scripted drive."""
+    own = f"seed={seed},visit={visit},changed=0,laps=1,people={people},{LASER}"
+    log = open_simulated(f"sim:institute,{own}")
+    result = run_log(log, configuration, lasting=True)
+    recording = result.recorder.finish(result.log.stamps, result.log.first_scans, result.log.earlier)
+    hybrid_map, scans = recording.hybrid_map, recording.replica.scans
+    views = views_of(hybrid_map, scans, AreaLandmarks(LocalMapping(configuration)))
+    frames = {}
+    for area in hybrid_map.area_ids():
+        own_poses = hybrid_map.keyframes(area)
+        true = log.true_poses(np.array([scans[keyframe].stamp for keyframe in own_poses]))
+        frames[area] = se2.best_fit(stacked(own_poses), true)
+    return InstituteMap(log.scenario, hybrid_map, views, chart_of(hybrid_map, views, configuration.features), frames)

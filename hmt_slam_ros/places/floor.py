@@ -1,0 +1,162 @@
+"""What the keyframes around an area show of a building's floor, along the building's axes.
+
+Tomatis, Nourbakhsh and Siegwart (2003), sections 2.1 and 3.3: a building is rectilinear, and four directions of travel
+are told apart, N, E, S, W. North is the same one in all areas: that which is next to the north of a neighbouring area.
+Areas that lie for certain beside each other are put into one frame, in which x is east and y is north; nothing is
+asked of how areas lie that are far from each other.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from hmt_slam_ros.arrays import Bool, Float64, Int64
+from hmt_slam_ros.configuration.features import Features
+from hmt_slam_ros.features.hallway import distances_around, log_odds, sector_of, space_within
+from hmt_slam_ros.features.landmark_map import Landmark
+from hmt_slam_ros.features.landmarks import OPENING
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.local_map.area_landmarks import AreaLandmarks
+from hmt_slam_ros.places.observation_graph import QUARTERS
+from hmt_slam_ros.sensing import Scan
+from hmt_slam_ros.topology.hybrid_map import HybridMap
+from hmt_slam_ros.topology.surroundings import Nearness, areas_around, stacked
+
+# Areas whose place is known this well, m, and whose keyframes are this near, m, are put into one frame.
+_NEARNESS = Nearness(1.0, 25.0)
+# A chord along an axis that is this share of the longest one is as long as the hallway.
+_LONG = 0.5
+
+_QUARTER = 0.5 * math.pi
+
+DIRECTIONS: Float64 = np.array([[0.0, 1.0], [1.0, 0.0], [0.0, -1.0], [-1.0, 0.0]])
+"""Unit vectors of the directions of travel, north, east, south and west, in a frame whose x is east."""
+
+
+class AreaView(NamedTuple):
+    """What an area's keyframes show, in its frame.
+
+    :ivar landmarks: of the area.
+    :ivar poses: shape (n, 3), ``area_T_base`` of its keyframes.
+    :ivar around: shape (n, 72), how far one sees around each, m, in the frame of the base.
+    """
+
+    landmarks: tuple[Landmark, ...]
+    poses: Float64
+    around: Float64
+
+
+class Floor(NamedTuple):
+    """What is around an area, in the frame at its origin whose x is east.
+
+    :ivar area: it.
+    :ivar origin: shape (3,), pose of that frame in the area's.
+    :ivar areas: {other area: the belief over its pose in the frame}.
+    :ivar owners: shape (n,), the area of every keyframe.
+    :ivar places: shape (n, 2), where they were taken, m.
+    :ivar clear: shape (n, 4), how far one sees from there to the north, east, south and west, m.
+    :ivar along: shape (n, 2), whether they were taken in a hallway from south to north, and from west to east.
+    """
+
+    area: int
+    origin: Float64
+    areas: dict[int, PoseGaussian]
+    owners: Int64
+    places: Float64
+    clear: Float64
+    along: Bool
+
+
+def views_of(hybrid_map: HybridMap, scans: Mapping[int, Scan], known: AreaLandmarks) -> dict[int, AreaView]:
+    """{area: what it shows}, of all areas of a map.
+
+    :param scans: {keyframe: scan}.
+    """
+    return {area: view_of(hybrid_map.keyframes(area), scans, known) for area in hybrid_map.area_ids()}
+
+
+def view_of(keyframes: Mapping[int, Float64], scans: Mapping[int, Scan], known: AreaLandmarks) -> AreaView:
+    """What an area shows.
+
+    :param keyframes: {keyframe: ``area_T_base`` (3,)}.
+    :param scans: {keyframe: scan}.
+    """
+    poses = stacked(keyframes)
+    sightings = list(known.sightings([scans[keyframe] for keyframe in keyframes], poses))
+    around = np.array([distances_around(sighting.rays) for sighting in sightings])
+    return AreaView(known.gathered(sightings), poses, around)
+
+
+def floors(hybrid_map: HybridMap, views: Mapping[int, AreaView], features: Features) -> dict[int, Floor]:
+    """{area: what is around it}, of all areas around which landmarks tell the building's axes."""
+    around = {area: areas_around(hybrid_map, area, _NEARNESS) for area in hybrid_map.area_ids()}
+    norths = _norths(around, views)
+    return {area: _floor(area, north, around[area], views, features) for area, north in norths.items()}
+
+
+def quarter_of(headings: Float64) -> Int64:
+    """The directions of travel that headings (n,), rad, in a frame whose x is east are next to."""
+    return np.round(1.0 - headings / _QUARTER).astype(np.int64) % QUARTERS
+
+
+def off_axes(headings: Float64) -> Float64:
+    """How far headings, rad, are from the next one of four axes."""
+    return np.abs((headings + 0.5 * _QUARTER) % _QUARTER - 0.5 * _QUARTER)
+
+
+def _norths(around: Mapping[int, Mapping[int, PoseGaussian]], views: Mapping[int, AreaView]) -> dict[int, float]:
+    """{area: direction of north in its frame, rad}, one after the other from neighbour to neighbour."""
+    found: dict[int, float] = {}
+    for begin in around:
+        pending = [] if begin in found else [(begin, 0.0)]
+        while pending:
+            area, guess = pending.pop()
+            axis = None if area in found else _axis(around[area], views)
+            if axis is None:
+                continue
+            found[area] = guess + (axis - guess + 0.5 * _QUARTER) % _QUARTER - 0.5 * _QUARTER
+            others = ((other, found[area] - float(pose.mean[2])) for other, pose in around[area].items())
+            pending += [each for each in others if each[0] not in found]
+    return found
+
+
+def _axis(areas: Mapping[int, PoseGaussian], views: Mapping[int, AreaView]) -> float | None:
+    """The direction of the walls around an area, in its frame, up to quarters of a turn; None where none is known."""
+    total = 0.0j
+    for area, pose in areas.items():
+        for landmark in views[area].landmarks:
+            # A corner looks between its two walls.
+            off = 0.0 if landmark.kind == OPENING else 0.5 * _QUARTER
+            heading = float(pose.mean[2] + landmark.pose.mean[2]) + off
+            weight = landmark.existence.probability / float(landmark.pose.covariance[2, 2])
+            total += weight * complex(math.cos(QUARTERS * heading), math.sin(QUARTERS * heading))
+    return math.atan2(total.imag, total.real) / QUARTERS if total else None
+
+
+def _floor(
+    area: int, north: float, around: Mapping[int, PoseGaussian], views: Mapping[int, AreaView], features: Features
+) -> Floor:
+    origin = np.array([0.0, 0.0, north - _QUARTER])
+    into = PoseGaussian.exactly(se2.inverse(origin))
+    areas = {other: into.compose(pose) for other, pose in around.items()}
+    poses = np.concatenate([se2.compose(pose.mean, views[other].poses) for other, pose in areas.items()])
+    owners = np.concatenate([np.full(len(views[other].poses), other) for other in areas])
+    around_each = np.concatenate([views[other].around for other in areas])
+    bearings = np.arctan2(DIRECTIONS[:, 1], DIRECTIONS[:, 0]) - poses[:, 2:]
+    clear = np.take_along_axis(around_each, sector_of(bearings), axis=1)
+    return Floor(area, origin, areas, owners, poses[:, :2], clear, _along(around_each, clear, features))
+
+
+def _along(around: Float64, clear: Float64, features: Features) -> Bool:
+    """Along which axes places lie in a hallway, shape (n, 2)."""
+    found = np.zeros((len(around), 2), np.bool_)
+    for k, away in enumerate(around):
+        space = space_within(away)
+        if space is not None and log_odds(space, features) > 0.0:
+            found[k] = clear[k, :2] + clear[k, 2:] >= _LONG * space.length
+    return found

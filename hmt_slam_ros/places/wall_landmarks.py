@@ -1,0 +1,146 @@
+"""The landmarks of a hallway's walls, along a stretch of it, as a robot sees them that travels there.
+
+What is behind the walls, in rooms and in other hallways, is seen through openings alone, and is left out; so is the
+face of an opening's wall that looks into the room.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Mapping
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from hmt_slam_ros.arrays import Bool, Float64
+from hmt_slam_ros.configuration.places import Places
+from hmt_slam_ros.features.corners import Corners
+from hmt_slam_ros.features.landmark_map import Landmark
+from hmt_slam_ros.features.landmarks import OPENING, OUTER
+from hmt_slam_ros.features.openings import Openings
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.places.floor import DIRECTIONS, AreaView, Floor
+from hmt_slam_ros.places.observation_graph import QUARTERS, Landmarks, observation_graph
+
+# Landmarks of one kind that are so near to each other, m and rad, are one that several areas know.
+_TWICE, _TURN = 0.4, 0.5
+# A landmark so far behind a hallway's wall, m, is of the wall; the hallway is as wide as seen from keyframes so near to
+# its middle and to the stretch, m, or, where there are none, half as wide as this, m.
+_WALL, _MIDDLE, _BESIDE, _HALF = 0.4, 0.9, 2.0, 1.2
+# A stretch without an end is this long, m.
+_FAR = 10.0
+
+# All that is on the stretch counts, however far away.
+_EVERYTHING = replace(Places(), reach=100.0, aside=100.0)
+
+
+class Stretch(NamedTuple):
+    """Of a hallway, in the frame of a floor.
+
+    :ivar at: shape (2,), a place in its middle, m.
+    :ivar direction: of travel.
+    :ivar begin: from there, m.
+    :ivar end: likewise.
+    """
+
+    at: Float64
+    direction: int
+    begin: float
+    end: float
+
+
+class Known(NamedTuple):
+    """The landmarks of a floor, each once.
+
+    :ivar landmarks: as the area knows them in which they were looked at most often.
+    :ivar poses: shape (n, 3), in the frame of the floor.
+    :ivar members: which landmarks (area, number) each is.
+    """
+
+    landmarks: list[Landmark]
+    poses: Float64
+    members: list[set[tuple[int, int]]]
+
+
+def known_around(floor: Floor, views: Mapping[int, AreaView]) -> Known:
+    """The landmarks of all areas of a floor."""
+    every = [
+        (landmark, se2.compose(pose.mean, landmark.pose.mean), (area, number))
+        for area, pose in floor.areas.items()
+        for number, landmark in enumerate(views[area].landmarks)
+    ]
+    known = Known([], np.empty((len(every), 3)), [])
+    for landmark, pose, member in sorted(every, key=lambda each: (-looks(each[0]), each[2])):
+        same = [k for k in range(len(known.landmarks)) if _one(known, k, landmark, pose)]
+        if same:
+            known.members[same[0]].add(member)
+        else:
+            known.poses[len(known.landmarks)] = pose
+            known.landmarks.append(landmark)
+            known.members.append({member})
+    return known._replace(poses=known.poses[: len(known.landmarks)])
+
+
+def looks(landmark: Landmark) -> int:
+    """How often one looked at a landmark, or for it."""
+    return landmark.existence.seen + landmark.existence.missed
+
+
+def of_stretch(
+    known: Known,
+    floor: Floor,
+    stretch: Stretch,
+    without: Collection[tuple[int, int]],
+    always: Collection[tuple[int, int]] = (),
+) -> Landmarks:
+    """The landmarks of a stretch, as seen from its place.
+
+    :param without: landmarks (area, number) that are left out,
+    :param always: but for these, wherever they are.
+    """
+    lead = DIRECTIONS[stretch.direction]
+    frame = np.array((*stretch.at, math.atan2(lead[1], lead[0])))
+    local = se2.between(frame, known.poses)
+    begin, end = max(stretch.begin, -_FAR), min(stretch.end, _FAR) if math.isinf(stretch.end) else stretch.end
+    walls = np.abs(local[:, 1]) <= _half(floor, stretch, begin, end) + _WALL
+    on = (begin <= local[:, 0]) & (local[:, 0] < end) & walls & _faced(known, local)
+    on &= np.array([not own.intersection(without) for own in known.members], dtype=np.bool_)
+    on |= np.array([bool(own.intersection(always)) for own in known.members], dtype=np.bool_)
+    return _as_seen([known.landmarks[k] for k in np.flatnonzero(on).tolist()], local[on])
+
+
+def _one(known: Known, k: int, landmark: Landmark, pose: Float64) -> bool:
+    away = known.poses[k] - pose
+    near = math.hypot(away[0], away[1]) < _TWICE and abs(float(se2.wrap(away[2]))) < _TURN
+    return near and known.landmarks[k].kind == landmark.kind
+
+
+def _half(floor: Floor, stretch: Stretch, begin: float, end: float) -> float:
+    """Half the width of the hallway, m."""
+    away = floor.places - stretch.at
+    side = (stretch.direction + 1) % QUARTERS
+    ahead, beside = away @ DIRECTIONS[stretch.direction], away @ DIRECTIONS[side]
+    own = floor.along[:, stretch.direction % 2] & (np.abs(beside) <= _MIDDLE)
+    own &= (begin - _BESIDE <= ahead) & (ahead <= end + _BESIDE)
+    widths = floor.clear[own, side] + floor.clear[own, (side + 2) % QUARTERS]
+    return 0.5 * float(np.nanmedian(widths)) if np.isfinite(widths).any() else _HALF
+
+
+def _faced(known: Known, local: Float64) -> Bool:
+    """Which landmarks look as they do from the hallway's middle: an opening to a side leads away from it."""
+    opening = np.array([landmark.kind == OPENING for landmark in known.landmarks], dtype=np.bool_)
+    aside = np.sin(local[:, 2])
+    return ~opening | (np.abs(aside) < math.sqrt(0.5)) | (aside * local[:, 1] > 0.0)
+
+
+def _as_seen(landmarks: list[Landmark], poses: Float64) -> Landmarks:
+    """Landmarks at poses in the frame of a robot that looks along the hallway."""
+    opening = np.array([landmark.kind == OPENING for landmark in landmarks], dtype=np.bool_)
+    convex = np.array([landmark.kind == OUTER for landmark in landmarks], dtype=np.bool_)
+    covariances = np.array([landmark.pose.covariance for landmark in landmarks]).reshape(-1, 3, 3)
+    existence = np.array([landmark.existence.probability for landmark in landmarks])
+    widths = np.array([(landmark.width, landmark.width_deviation) for landmark in landmarks]).reshape(-1, 2)[opening]
+    corners = Corners(poses[~opening], covariances[~opening], convex[~opening], existence[~opening])
+    openings = Openings(poses[opening], covariances[opening], widths[:, 0], widths[:, 1], existence[opening])
+    return observation_graph(corners, openings, 0.0, _EVERYTHING)

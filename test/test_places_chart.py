@@ -1,0 +1,200 @@
+"""The chart of a small floor: a hallway with two doors, one opposite the other, a third one, and a crossing."""
+
+import dataclasses
+import itertools
+import math
+
+import numpy as np
+import pytest
+from worlds import scan_at
+
+from hmt_slam_ros.configuration import Configuration
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.local_map.area_landmarks import AreaLandmarks
+from hmt_slam_ros.local_map.local_mapping import LocalMapping
+from hmt_slam_ros.places.chart import CROSSING, DOOR, END, chart_of
+from hmt_slam_ros.places.floor import views_of
+from hmt_slam_ros.places.observation_graph import OPENINGS
+from hmt_slam_ros.places.place_graph import EAST, WEST
+from hmt_slam_ros.simulation.building import FloorPlan
+from hmt_slam_ros.topology.hybrid_map import HybridMap
+
+CONFIGURATION = Configuration()
+# The world's pose of the second area, which begins behind the first door, and where the building stands.
+AREAS = {0: np.zeros(3), 1: np.array([9.0, 0.3, 2.0])}
+BUILDING = np.array([3.0, -2.0, 0.4])
+
+
+def walls():
+    """A hallway along x from 0 to 22 m, doors to the north at 5 m, on both sides at 10 m, another hallway at 16 m."""
+    plan = FloorPlan()
+    plan.free(0.0, -1.0, 22.0, 1.0)
+    plan.free(15.0, 1.0, 17.0, 12.0)
+    for x, side in ((5.0, 1.0), (10.1, 1.0), (9.9, -1.0)):
+        plan.free(x - 0.5, min(side, 1.3 * side), x + 0.5, max(side, 1.3 * side))
+        plan.free(x - 2.0, min(1.2 * side, 5.0 * side), x + 2.0, max(1.2 * side, 5.0 * side))
+    found = plan.walls()
+    return np.concatenate([se2.transform(BUILDING, found[:, k : k + 2]) for k in (0, 2)], axis=1)
+
+
+def keyframes(crossing_driven=True):
+    """Along the hallway, into the first room and up the other hallway."""
+    places = [(x, 0.1, 0.0) for x in np.arange(1.0, 21.2, 0.5)]
+    places += [(5.0, y, 0.5 * math.pi) for y in np.arange(0.5, 3.2, 0.5)]
+    if crossing_driven:
+        places += [(16.0, y, 0.5 * math.pi) for y in np.arange(0.5, 11.2, 0.5)]
+    return np.array(places)
+
+
+@pytest.fixture(scope="module")
+def known():
+    return AreaLandmarks(LocalMapping(CONFIGURATION))
+
+
+def charted(known, crossing_driven=True):
+    hybrid_map, scans, rng = HybridMap(), {}, np.random.default_rng(1)
+    for k, pose in enumerate(keyframes(crossing_driven)):
+        area = int(pose[0] > 8.0)
+        hybrid_map.place(k, area, se2.between(AREAS[area], pose))
+        scans[k] = scan_at(walls(), se2.compose(BUILDING, pose), 0.01, rng, 720)
+    arc = se2.between(AREAS[0], AREAS[1])
+    hybrid_map.set_arc(0, 1, PoseGaussian(arc, np.diag([0.03, 0.03, 0.003]) ** 2), closure=False)
+    views = views_of(hybrid_map, scans, known)
+    return chart_of(hybrid_map, views, CONFIGURATION.features), hybrid_map, views
+
+
+@pytest.fixture(scope="module")
+def charts(known):
+    return charted(known)
+
+
+def true_places(chart):
+    return np.array([se2.compose(AREAS[node.area], node.pose) for node in chart.nodes])
+
+
+def at(chart, x, y=0.0):
+    """The node there."""
+    (found,) = np.flatnonzero(np.hypot(*(true_places(chart)[:, :2] - (x, y)).T) < 0.3)
+    return int(found)
+
+
+def test_doors_crossings_and_ends_are_nodes_each_once(charts):
+    chart = charts[0]
+    kinds = {DOOR: 2, CROSSING: 1, END: 3}
+    assert {kind: sum(node.kind == kind for node in chart.nodes) for kind in kinds} == kinds
+    assert [chart.nodes[at(chart, x)].kind for x in (1.0, 5.0, 10.0, 16.0, 21.0)] == [END, DOOR, DOOR, CROSSING, END]
+    assert chart.nodes[at(chart, 16.0, 11.0)].kind == END
+    # All look along one of the building's axes.
+    headings = true_places(chart)[:, 2] - true_places(chart)[0, 2]
+    assert np.abs(se2.wrap(headings)).max() < 0.02
+    assert all(node.existence > 0.8 for node in chart.nodes)
+
+
+def test_opposite_doors_are_one_node_with_an_opening_on_either_side(charts):
+    chart = charts[0]
+    pair, single = chart.nodes[at(chart, 10.0)], chart.nodes[at(chart, 5.0)]
+    directions = sorted(one.direction for one in pair.openings)
+    assert directions[1] - directions[0] == 2
+    assert len(single.openings) == 1
+    assert single.openings[0].landmark.width == pytest.approx(1.0, abs=0.1)
+    assert not any(one.hallway for one in (*pair.openings, *single.openings))
+
+
+def test_the_mouth_of_a_hallway_leads_to_a_hallway_and_so_does_what_is_on_both_sides_of_it(charts):
+    crossing = charts[0].nodes[at(charts[0], 16.0)]
+    assert len(crossing.openings) == 3
+    assert all(one.hallway for one in crossing.openings)
+
+
+def test_edges_are_as_long_as_the_ways_between_their_nodes_and_lead_both_ways(charts):
+    chart = charts[0]
+    places = true_places(chart)
+    ways = {(edge.start, edge.end): edge for edge in chart.edges}
+    wanted = [at(chart, x) for x in (1.0, 5.0, 10.0, 16.0, 21.0)]
+    pairs = set(itertools.pairwise(wanted)) | {(at(chart, 16.0), at(chart, 16.0, 11.0))}
+    assert set(ways) == pairs | {(b, a) for a, b in pairs}
+    for (a, b), edge in ways.items():
+        assert edge.distance[0] == pytest.approx(math.dist(places[a, :2], places[b, :2]), abs=0.05)
+        assert 0.0 < edge.distance[1] < 0.3**2
+        assert edge.turn[0] == 0.0
+    # An arc between two areas makes the way longer known the less.
+    assert ways[wanted[1], wanted[2]].distance[1] > ways[wanted[2], wanted[3]].distance[1]
+
+
+def test_a_node_shows_its_openings_to_the_side_on_which_they_are(charts):
+    chart = charts[0]
+    node = at(chart, 5.0)
+    seen = chart.seen[node]
+    axis = seen.north if chart.nodes[node].openings[0].direction in {EAST, WEST} else seen.east
+    openings = axis.tracks >= OPENINGS
+    assert openings.sum() == 1
+    assert axis.tracks[openings][0] in {OPENINGS + 1, OPENINGS + 3}
+    np.testing.assert_allclose(axis.along[openings], 0.0, atol=0.05)
+
+
+def test_landmarks_of_rooms_are_not_those_of_the_hallway(charts):
+    chart, _, views = charts
+    listed = sum(len(edge.landmarks.tracks) for edge in chart.edges[::2])
+    assert 0 < listed < sum(len(view.landmarks) for view in views.values())
+    for edge in chart.edges:
+        assert np.all((edge.landmarks.along >= -1e-9) & (edge.landmarks.along <= edge.distance[0] + 1e-9))
+
+
+def test_a_wide_opening_behind_which_one_sees_far_is_a_crossing_before_anyone_drove_there(known):
+    chart, *_ = charted(known, crossing_driven=False)
+    crossing = chart.nodes[at(chart, 16.0)]
+    assert crossing.kind == CROSSING
+    assert len(crossing.openings) == 1
+    # The way into it is not known.
+    leaving = {edge.leaving for edge in chart.edges if edge.start == at(chart, 16.0)}
+    assert len(leaving) == 2
+    assert crossing.openings[0].direction not in leaving
+
+
+def test_the_chart_makes_a_graph_of_places(charts):
+    chart = charts[0]
+    graph = chart.graph(CONFIGURATION.places)
+    assert graph.states == 4 * len(chart.nodes)
+    assert (graph.following >= 0).sum() == len(chart.edges)
+
+
+def test_areas_that_lie_anywhere_to_each_other_share_no_node(charts):
+    """The same floor, but nothing is known of how the two areas lie to each other."""
+    _, hybrid_map, views = charts
+    parted = hybrid_map.branch()
+    parted.remove_arc(0, 1)
+    apart = chart_of(parted, views, CONFIGURATION.features)
+    places = {0: 0, 1: 0}
+    for node in apart.nodes:
+        places[node.area] += node.kind != END
+        assert all(one.area == node.area for one in node.openings)
+    # The pair of doors is seen from both.
+    assert places == {0: 2, 1: 2}
+    between = {apart.nodes[edge.start].area == apart.nodes[edge.end].area for edge in apart.edges}
+    assert between == {True}
+
+
+def test_openings_that_are_hardly_believed_in_are_no_nodes(charts):
+    chart, hybrid_map, views = charts
+    doubted = {
+        area: view._replace(
+            landmarks=tuple(
+                dataclasses.replace(one, existence=dataclasses.replace(one.existence, confidence=0.3))
+                for one in view.landmarks
+            )
+        )
+        for area, view in views.items()
+    }
+    assert chart.nodes
+    assert chart_of(hybrid_map, doubted, CONFIGURATION.features).nodes == ()
+
+
+def test_north_is_one_direction_in_all_areas(charts):
+    chart = charts[0]
+    assert {node.area for node in chart.nodes} == {0, 1}
+    for edge in chart.edges:
+        away = se2.between(true_places(chart)[edge.start], true_places(chart)[edge.end])
+        # From a pose that looks north, east is to the right.
+        off = math.atan2(away[1], away[0]) + 0.5 * math.pi * edge.leaving
+        assert abs(float(se2.wrap(off))) < 0.05
