@@ -164,6 +164,14 @@ def test_scans_without_odometry_wait_in_the_saved_map_as_well(tmp_path):
     same_outcome(*(end.recorder.finish(end.log.stamps) for end in (run.finish(), whole.finish())))
 
 
+def test_a_run_whose_areas_end_at_doors_goes_on_with_the_openings_that_it_saw(tmp_path):
+    several = once(lambda state: len(state.notes) > 1)
+    configuration = with_changes(Configuration(), {"aam.area_policy": "both"})
+    log = open_log("sim:office,size=0.7,rate=2.5,laps=1")
+    stopped = compared(log, tmp_path, lambda k, state: k % 150 == 149 or several(k, state), configuration=configuration)
+    assert len(stopped) > 3
+
+
 def mapped(folder, *options):
     command = [sys.executable, "-m", "hmt_slam_ros.cli.main", "map", str(LOG), "--out", str(folder), *options]
     return subprocess.run(command, check=False, timeout=300, capture_output=True, text=True)

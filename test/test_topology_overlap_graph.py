@@ -3,7 +3,13 @@
 import numpy as np
 import pytest
 
-from hmt_slam_ros.topology.overlap_graph import OverlapGraph, separation, synchronised
+from hmt_slam_ros.topology.overlap_graph import (
+    OverlapGraph,
+    bisection,
+    separation,
+    separation_by_chambers,
+    synchronised,
+)
 
 
 def graph_of(similarity, first=0):
@@ -104,3 +110,29 @@ def test_a_robot_back_on_known_ground_does_not_separate():
 def test_without_overlap_to_the_old_ground_the_value_is_nought():
     found = separation(rooms(5, 5, between=0.0), range(5, 10), 9, 0.35, 5)
     assert found == (tuple(range(5, 10)), 0.0)
+
+
+def test_overlaps_between_chambers_are_weakened_and_no_others():
+    graph = graph_of(np.full((4, 4), 0.8), first=3)
+    weak = graph.weakened({3: 0, 4: 1, 5: 1}, 0.25)
+    assert weak.keyframes == graph.keyframes
+    apart = np.array([[0, 1, 1, 0], [1, 0, 0, 1], [1, 0, 0, 1], [0, 1, 1, 0]], dtype=bool)
+    np.testing.assert_allclose(weak.similarity, np.where(apart, 0.25, 1.0) * graph.similarity)
+
+
+def test_the_chamber_of_the_newest_keyframe_separates_however_much_it_overlaps():
+    graph = graph_of(np.full((10, 10), 0.8))
+    chambers = {k: int(k >= 6) for k in range(3, 10)}
+    found = separation_by_chambers(graph, chambers, 9, 4)
+    assert found.keyframes == (6, 7, 8, 9)
+    assert separation_by_chambers(graph, chambers, 9, 5) is None
+    assert separation_by_chambers(graph, dict.fromkeys(range(3, 10), 0), 9, 1) is None
+    # Back in the chamber in which the area began.
+    assert separation_by_chambers(graph, chambers | {9: 0}, 9, 1) is None
+
+
+def test_the_best_of_all_bisections_separates_new_ground_from_old():
+    graph = rooms(6, 6, between=0.5)
+    assert separation(graph, range(3, 12), 11, 0.3, 2) is None
+    assert bisection(graph, range(3, 12), 11, 2).keyframes == tuple(range(6, 12))
+    assert bisection(graph, range(3, 12), 5, 2) is None

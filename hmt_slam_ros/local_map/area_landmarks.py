@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hmt_slam_ros.arrays import Float64
+from hmt_slam_ros.arrays import Float64, Int32
 from hmt_slam_ros.features.extraction import extract_lines
 from hmt_slam_ros.features.landmark_map import Landmark, LandmarkMap
 from hmt_slam_ros.features.landmarks import Landmarks, landmarks_of
@@ -23,6 +23,11 @@ from hmt_slam_ros.sensing import Scan
 _BEAMS, _REACH = 720, 10.0
 # A scan from so much of a circle on shows what is all around.
 _AROUND = math.radians(330.0)
+
+
+def sees_around(scan: Scan) -> bool:
+    """Whether a scan shows what is all around by itself."""
+    return scan.angle_increment * (scan.ranges.size - 1) >= _AROUND
 
 
 class Sighting(NamedTuple):
@@ -68,13 +73,32 @@ class AreaLandmarks:
         table = self._mapping.pool.empty_table()
         for scan, pose in zip(scans, np.ascontiguousarray(poses), strict=True):
             self._mapping.insert(table[None], pose[None], scan)
-            if scan.angle_increment * (scan.ranges.size - 1) >= _AROUND:
-                lines, rays = extract_lines(scan, self._features), rays_of(scan, self._features)
-            else:
-                virtual = virtual_scan(self._mapping.pool.view(table), pose, _BEAMS, _REACH)
-                lines, rays = lines_of_map(virtual, self._features), rays_of_map(virtual, self._features)
-            yield Sighting(self._place(pose), landmarks_of(lines, rays, self._features), rays)
+            yield self._sighting(table, scan, pose)
         self._mapping.pool.release(table)
+
+    def sighting(self, scan: Scan, pose: Float64, around: Iterable[Scan], poses: Float64) -> Sighting:
+        """What one keyframe shows, in the map of it and of others around it where its laser does not see all around.
+
+        :param pose: its ``area_T_base``, shape (3,), m and rad.
+        :param around: scans of the others.
+        :param poses: shape (n, 3), theirs.
+        """
+        table = self._mapping.pool.empty_table()
+        if not sees_around(scan):
+            for other, at in zip((*around, scan), np.concatenate((poses, pose[None])), strict=True):
+                self._mapping.insert(table[None], at[None], other)
+        found = self._sighting(table, scan, pose)
+        self._mapping.pool.release(table)
+        return found
+
+    def _sighting(self, table: Int32, scan: Scan, pose: Float64) -> Sighting:
+        """What is around a keyframe, in its own scan or else in the map of a table."""
+        if sees_around(scan):
+            lines, rays = extract_lines(scan, self._features), rays_of(scan, self._features)
+        else:
+            virtual = virtual_scan(self._mapping.pool.view(table), pose, _BEAMS, _REACH)
+            lines, rays = lines_of_map(virtual, self._features), rays_of_map(virtual, self._features)
+        return Sighting(self._place(pose), landmarks_of(lines, rays, self._features), rays)
 
     def _place(self, pose: Float64) -> PoseGaussian:
         """Where a keyframe was taken; the map there, which is made of such keyframes, is as far off."""

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.processes.aam_policy import AreaPolicy
 from hmt_slam_ros.processes.aam_watch import AamState, Joint, Watch, numbered, watch_of
 from hmt_slam_ros.processes.map_parts import Forgotten, Merged
 from hmt_slam_ros.processes.messages import (
@@ -30,13 +31,8 @@ from hmt_slam_ros.topology.common_map import Keyframes, Pair
 from hmt_slam_ros.topology.crowding import crowded, in_place
 from hmt_slam_ros.topology.hybrid_map import HybridMap
 from hmt_slam_ros.topology.overlap import Sensed, overlaps, sensed_overlaps
-from hmt_slam_ros.topology.overlap_graph import (
-    OverlapGraph,
-    Separation,
-    least_cut,
-    separation,
-    synchronised,
-)
+from hmt_slam_ros.topology.overlap_graph import OverlapGraph, Separation, least_cut, synchronised
+from hmt_slam_ros.topology.passages import Way
 from hmt_slam_ros.topology.unknown import telling_arc
 
 # An area's overlap with a scan is that of the best few keyframes among those taken nearest to it.
@@ -71,6 +67,7 @@ class Aam:
         self._options = configuration.aam
         self._filter = configuration.filter
         self._max_range = configuration.local_map.max_range
+        self._policy = AreaPolicy(configuration)
         self._replica = Replica.of(state.replica)
         self._seen: dict[int, Sensed] = {}
         self._watches = {hypothesis: watch_of(own, state.graphs) for hypothesis, own in state.watches.items()}
@@ -101,6 +98,8 @@ class Aam:
         elif isinstance(message, Accepted) and message.hypothesis is not None:
             self._replica.accept(message)
             self._watches = {message.hypothesis: self._watches[message.hypothesis]}
+            if message.relabelled:
+                self._interrupt(message.hypothesis)
             self._asked |= {(min(arc.source, arc.target), max(arc.source, arc.target)) for arc in message.arcs}
             if message.reopened:
                 self._asked = set()
@@ -111,6 +110,7 @@ class Aam:
         self._replica.add(keyframe)
         self._seen[keyframe.sequence] = self._sensed(keyframe.scan)
         known = [leaf for leaf in keyframe.leaves if leaf.hypothesis in self._watches]
+        self._watches |= self._policy.seen(keyframe, known, self._replica, self._watches)
         events = [
             self._cut(leaf, keyframe.sequence)
             or (self._merged(leaf.hypothesis) if keyframe.mapping else None)
@@ -185,7 +185,7 @@ class Aam:
         watch = self._watches[leaf.hypothesis]
         graph = self._graph(watch, leaf.hypothesis, watch.area)
         own = watch.own | {newest}
-        found = separation(graph, own, newest, self._options.ncut_threshold, self._options.min_cluster)
+        found = self._policy.separation(graph, own, newest, watch.way, self._keyframes(leaf.hypothesis, watch.area))
         watch = replace(
             watch, graphs=watch.graphs | {watch.area: graph}, own=own, separate=watch.separate + 1 if found else 0
         )
@@ -206,7 +206,8 @@ class Aam:
             arc = hybrid_map.arc_value(into, area)
             if arc is None or not arc.closure:
                 continue
-            least = self._joint(hypothesis, pair, arc.pose.mean).least
+            joint = self._joint(hypothesis, pair, arc.pose.mean)
+            least = self._policy.least_cut(joint) if pair in self._watches[hypothesis].parted else joint.least
             if least > self._options.ncut_threshold:
                 return AreaEvent(hypothesis, "merged", (), area, least, into)
         return None
@@ -276,14 +277,19 @@ class Aam:
         if leaf.merged is not None:
             return self._follow_merged(watch, leaf, leaf.merged)
         if leaf.area == watch.area:
-            return watch
+            return replace(watch, way=watch.way.interrupted()) if leaf.withdrawn else watch
         moved = frozenset(r.keyframe for r in leaf.relabelled if r.area == leaf.area)
         entered = self._graph(watch, leaf.hypothesis, leaf.area)
         left = watch.graphs.get(watch.area, OverlapGraph()).only(self._keyframes(leaf.hypothesis, watch.area))
         beside = self._replica.maps[leaf.hypothesis].neighbours(watch.area)
         self._asked |= {(min(watch.area, other), max(watch.area, other)) for other in beside}
         self._left.add(watch.area)
-        return Watch(leaf.area, watch.graphs | {watch.area: left, leaf.area: entered}, moved, joints=watch.joints)
+        graphs = watch.graphs | {watch.area: left, leaf.area: entered}
+        way, parted = Way() if leaf.rebase is None else watch.way.in_frame(leaf.rebase.mean), watch.parted
+        if moved and watch.way.chambers(moved)[max(moved)] != 0:
+            parted |= {(min(watch.area, leaf.area), max(watch.area, leaf.area))}
+        way = way.since(min(moved, default=None))
+        return Watch(leaf.area, graphs, moved, joints=watch.joints, way=way, parted=parted)
 
     def _follow_merged(self, watch: Watch, leaf: Leaf, merged: Merged) -> Watch:
         """The watch with one area for two; what was the robot's own in one of them still is."""
@@ -292,7 +298,15 @@ class Aam:
         one, other = (watch.graphs.get(area, OverlapGraph()) for area in (merged.into, merged.area))
         graphs[merged.into] = self._synchronised(self._keyframes(leaf.hypothesis, merged.into), one, other)
         joints = {pair: joint for pair, joint in watch.joints.items() if merged.area not in pair}
-        return replace(watch, area=leaf.area, graphs=graphs, beyond=None, joints=joints)
+        way = watch.way if leaf.area == watch.area else watch.way.in_frame(merged.pose.mean)
+        named = ({merged.into if area == merged.area else area for area in pair} for pair in watch.parted)
+        parted = frozenset((min(pair), max(pair)) for pair in named if len(pair) == 2)
+        return replace(watch, area=leaf.area, graphs=graphs, beyond=None, joints=joints, way=way, parted=parted)
+
+    def _interrupt(self, hypothesis: int) -> None:
+        """Keyframes of a hypothesis moved, and the robot with them."""
+        watch = self._watches[hypothesis]
+        self._watches[hypothesis] = replace(watch, way=watch.way.interrupted())
 
     def _graph(self, watch: Watch, hypothesis: int, area: int) -> OverlapGraph:
         """The overlap graph of an area as it is now, from what the watch knows."""

@@ -13,6 +13,7 @@ from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.processes.replica import FIRST_AREA, FIRST_HYPOTHESIS, ReplicaState
 from hmt_slam_ros.topology.common_map import Keyframes, Pair
 from hmt_slam_ros.topology.overlap_graph import OverlapGraph
+from hmt_slam_ros.topology.passages import Way
 
 
 class Joint(NamedTuple):
@@ -45,6 +46,8 @@ class Watch:
     :ivar separate: at how many of the latest evaluations in a row the newest keyframes separated.
     :ivar beyond: the known area that the robot seems to be in, and for how many keyframes in a row.
     :ivar joints: {pair of areas: what was found when it was last asked whether they are one}.
+    :ivar way: the openings that the robot passes, where the policy asks for them.
+    :ivar parted: areas, the smaller first, between which the path went through an opening, likewise.
     """
 
     area: int
@@ -53,6 +56,8 @@ class Watch:
     separate: int = 0
     beyond: tuple[int, int] | None = None
     joints: dict[Pair, Joint] = field(default_factory=dict)
+    way: Way = field(default_factory=Way)
+    parted: frozenset[Pair] = frozenset()
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,6 +86,8 @@ class WatchState:
     :ivar separate: at how many of the latest evaluations in a row the newest keyframes separated.
     :ivar beyond: the known area that the robot seems to be in, and for how many keyframes in a row.
     :ivar joints: {pair of areas: what was found when it was last asked whether they are one}.
+    :ivar way: the openings that the robot passes, where the policy asks for them.
+    :ivar parted: areas, the smaller first, between which the path went through an opening, likewise.
     """
 
     area: int
@@ -89,6 +96,8 @@ class WatchState:
     separate: int = 0
     beyond: tuple[int, int] | None = None
     joints: Mapping[Pair, JointState] = field(default_factory=dict)
+    way: Way = field(default_factory=Way)
+    parted: frozenset[Pair] = frozenset()
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,7 +125,9 @@ def numbered(watch: Watch, numbers: Mapping[int, int]) -> WatchState:
         for pair, joint in watch.joints.items()
     }
     graphs = {area: numbers[id(graph)] for area, graph in watch.graphs.items()}
-    return WatchState(watch.area, graphs, watch.own, watch.separate, watch.beyond, joints)
+    return WatchState(
+        watch.area, graphs, watch.own, watch.separate, watch.beyond, joints, watch.way, watch.parted
+    )  # fmt: skip
 
 
 def watch_of(state: WatchState, graphs: Sequence[OverlapGraph]) -> Watch:
@@ -125,4 +136,4 @@ def watch_of(state: WatchState, graphs: Sequence[OverlapGraph]) -> Watch:
         pair: Joint(joint.arc, graphs[joint.graph], joint.part, joint.least) for pair, joint in state.joints.items()
     }
     own = {area: graphs[number] for area, number in state.graphs.items()}
-    return Watch(state.area, own, state.own, state.separate, state.beyond, joints)
+    return Watch(state.area, own, state.own, state.separate, state.beyond, joints, state.way, state.parted)

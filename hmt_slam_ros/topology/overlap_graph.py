@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -33,6 +33,14 @@ class OverlapGraph:
     def without(self, gone: Collection[int]) -> OverlapGraph:
         """The graph without those of its keyframes that are in ``gone``."""
         return self.only(set(self.keyframes).difference(gone))
+
+    def weakened(self, chambers: Mapping[int, int], factor: float) -> OverlapGraph:
+        """The graph with the similarities of keyframes in different chambers multiplied by a factor.
+
+        :param chambers: {keyframe: number of its chamber}, 0 of those that are not in it.
+        """
+        own = np.array([chambers.get(keyframe, 0) for keyframe in self.keyframes])
+        return OverlapGraph(self.keyframes, np.where(own[:, None] == own, 1.0, factor) * self.similarity)
 
     def between(self, keyframe: int, others: Sequence[int]) -> NDArray[np.float64]:
         """Overlaps of a keyframe with others, NaN where either is not in this graph."""
@@ -109,6 +117,29 @@ def separation(
         if side[at] and not side[0] and value <= threshold:
             return Separation(tuple(int(nodes[i]) for i in np.flatnonzero(side)), value)
     return None
+
+
+def separation_by_chambers(
+    graph: OverlapGraph, chambers: Mapping[int, int], newest: int, min_size: int
+) -> Separation | None:
+    """The keyframes in the chamber of the newest one, where that is another than the one in which the area began.
+
+    :param chambers: {keyframe: number of its chamber}, 0 of those that are not in it.
+    :param min_size: keyframes on each side at least.
+    """
+    side = np.array([chambers.get(keyframe, 0) == chambers[newest] for keyframe in graph.keyframes])
+    if chambers[newest] == 0 or min(side.sum(), (~side).sum()) < min_size:
+        return None
+    return Separation(tuple(graph.keyframes[i] for i in np.flatnonzero(side)), ncut(graph.similarity, side))
+
+
+def bisection(graph: OverlapGraph, own: Collection[int], newest: int, min_size: int) -> Separation | None:
+    """The part of the newest keyframe at the best cut of an area in two, however much it cuts; as `separation`."""
+    similarity, sizes, nodes = _contracted(graph, own)
+    first = normalized_cut(similarity, min_size, sizes)
+    if first is None or not first.side[nodes.index(newest)]:
+        return None
+    return Separation(tuple(int(nodes[i]) for i in np.flatnonzero(first.side)), first.value)
 
 
 def least_cut(graph: OverlapGraph, part: Collection[int], min_size: int) -> float:

@@ -24,10 +24,14 @@ from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.topology.hybrid_map import HybridMap
 from hmt_slam_ros.topology.unknown import telling_arc
 
-# Keyframes that are farther apart than this, m, are no step of a path; openings nearer than that, m, are one portal.
-_STEP, _SAME = 1.5, 0.6
-# An opening that is less probable is no portal.
-_LEAST = 0.5
+STEP = 1.5
+"""Keyframes that are farther apart than this, m, are no step of a path."""
+
+SAME = 0.6
+"""Openings that are nearer to each other than this, m, are one."""
+
+LEAST = 0.5
+"""An opening that is less probable is none that one passes."""
 
 _TURNED = PoseGaussian.exactly(np.array([0.0, 0.0, np.pi]))
 
@@ -75,7 +79,7 @@ def portals_of(
 def _same(one: Portal, other: Portal) -> bool:
     """Whether two portals are one, seen in both faces of a wall or at two passages."""
     away = one.pose_in_a.mean[:2] - other.pose_in_a.mean[:2]
-    return one.areas == other.areas and float(np.hypot(*away)) < _SAME
+    return one.areas == other.areas and float(np.hypot(*away)) < SAME
 
 
 def _passed(
@@ -92,7 +96,7 @@ def _passed(
         back = (poses[left][k] for k in reversed(own[left][: bisect_left(own[left], keyframe)]))
         ahead = (se2.compose(arc.mean, poses[entered][k]) for k in own[entered][bisect_left(own[entered], keyframe) :])
         ways = [_near(way, features) for way in (back, ahead)]
-        if np.hypot(*(ways[0][0] - ways[1][0])) <= _STEP:
+        if np.hypot(*(ways[0][0] - ways[1][0])) <= STEP:
             around = np.concatenate((ways[0][::-1], ways[1]))
             yield from _nearest(around, len(ways[0]) - 0.5, (left, entered), arc, landmarks)
 
@@ -104,7 +108,7 @@ def _near(way: Iterable[Float64], features: Features) -> Float64:
     for pose in way:
         step = math.dist(pose[:2], near[-1]) if near else 0.0
         far += step
-        if step > _STEP or far > features.portal_reach:
+        if step > STEP or far > features.portal_reach:
             break
         near.append(pose[:2])
     return np.array(near)
@@ -121,16 +125,19 @@ def _nearest(
     for own, area in enumerate(areas):
         frame = arc.mean if own else np.zeros(3)
         for opening in landmarks[area]:
-            if opening.kind != OPENING or opening.existence.probability < _LEAST:
+            if opening.kind != OPENING or opening.existence.probability < LEAST:
                 continue
-            for at, forwards in _crossings(path, se2.compose(frame, opening.pose.mean), opening.width):
+            for at, forwards in crossings(path, se2.compose(frame, opening.pose.mean), opening.width):
                 portal = _portal(opening, forwards, areas, own, arc)
                 passed.append((abs(at - change), -portal.existence, portal))
     return [min(passed, key=lambda each: each[:2])[2]] if passed else []
 
 
-def _crossings(path: Float64, opening: Float64, width: float) -> Iterator[tuple[float, bool]]:
-    """Where a path (n, 2) passes an opening (3,), in steps from its begin; and whether it goes ahead there."""
+def crossings(path: Float64, opening: Float64, width: float) -> Iterator[tuple[float, bool]]:
+    """Where a path (n, 2) passes an opening (3,), in steps from its begin; and whether it goes ahead there.
+
+    :param width: of the opening, m.
+    """
     local = se2.transform(se2.inverse(opening), path)
     for k in np.flatnonzero((local[:-1, 0] < 0.0) != (local[1:, 0] < 0.0)).tolist():
         share = local[k, 0] / (local[k, 0] - local[k + 1, 0])
