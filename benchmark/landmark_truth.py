@@ -49,12 +49,14 @@ _NOTHING = Truth(np.zeros((0, 3)), np.zeros(0), np.zeros(0, np.bool_))
 
 
 class World:
-    """Walls and furniture around the robot, in its frame."""
+    """Walls, the leaves of closed doors, and furniture around the robot, in its frame."""
 
     def __init__(self, scenario: Scenario, stamp: int, pose: Array) -> None:
         building = scenario.building.walls
         everything = np.concatenate((building, boxes(scenario.furniture(stamp))))
-        self.building, self.surfaces = _near(building, pose), _near(everything, pose)
+        leaf = (building[:, None] == scenario.building.doors[None]).all(axis=2).any(axis=1)
+        self.building, self._leaves = _near(building[~leaf], pose), _near(building[leaf], pose)
+        self.surfaces = _near(everything, pose)
         self.index: WallIndex = wall_index(self.surfaces)
 
     def sees(self, points: Array) -> NDArray[np.bool_]:
@@ -123,7 +125,7 @@ class World:
         places = end + (np.arange(_SAMPLES) + 0.5)[:, None] / _SAMPLES * width * along
         free = np.stack((places - beside, places + beside, np.tile(end - 0.1 * along - beside, (_SAMPLES, 1))))
         behind = middle + features.opening_depth * normal
-        if not self.free(np.concatenate((free.reshape(-1, 2), behind[None]))).all():
+        if not self.free(np.concatenate((free.reshape(-1, 2), behind[None]))).all() or self._closed(middle, behind):
             return None
         facing = places @ normal / np.hypot(*places.T)
         beyond = places * (1.0 + features.opening_depth / np.maximum(places @ normal, 1e-6))[:, None]
@@ -144,6 +146,16 @@ class World:
         crossed = at[crossing, 0] + share * (at[crossing, 1] - at[crossing, 0])
         first = [part[part > _ON].min(initial=np.inf) for part in (collinear, crossed)]
         return float(min(first)), bool(first[0] <= first[1] + _ON)
+
+    def _closed(self, before: Array, behind: Array) -> bool:
+        """Whether a door's leaf is between two points."""
+        ends, way = self._leaves.reshape(-1, 2, 2) - before, behind - before
+        sides = ends[..., 1] * way[0] - ends[..., 0] * way[1]
+        across = sides[:, 0] * sides[:, 1] < 0.0
+        a, b = ends[across, 0], ends[across, 1]
+        share = sides[across, 0] / (sides[across, 0] - sides[across, 1])
+        met = (a + share[:, None] * (b - a)) @ way / (way @ way)
+        return bool(((met > 0.0) & (met < 1.0)).any())
 
     def free(self, points: Array) -> NDArray[np.bool_]:
         """Which points (n, 2) are on the free side of the walls, (n,): from there one meets an odd number of them."""

@@ -178,3 +178,20 @@ def test_the_truth_of_a_drive_has_the_doors_of_its_building():
             assert truth.kinds[np.argmin(away)] == pytest.approx(widths[k], abs=0.01)
             checked += 1
     assert checked > 5
+
+
+def test_a_door_that_is_closed_at_a_later_visit_is_no_true_opening():
+    """And those that are still open are the same as before."""
+    before, after = (open_simulated(f"sim:office,seed=3,size=0.7,changed=1,visit={k}").scenario for k in (0, 1))
+    doors, walls = before.building.doors, after.building.walls
+    closed = (doors[:, None] == walls[None]).all(axis=2).any(axis=1)
+    open_before, checked = 0, 0
+    for stamp in before.scan_stamps[100:600:25]:
+        pose = before.true_poses(np.array([stamp]))[0]
+        local = se2.transform(se2.inverse(pose), doors.reshape(-1, 2)).reshape(-1, 2, 2).mean(axis=1)
+        seen = [World(scenario, int(stamp), pose).openings(FEATURES).poses[:, :2] for scenario in (before, after)]
+        for k in np.flatnonzero(np.hypot(*local.T) < 4.0):
+            there = [bool(np.any(np.hypot(*(places - local[k]).T) < 0.12)) for places in seen]
+            checked, open_before = checked + closed[k], open_before + there[0]
+            assert there[1] == (there[0] and not closed[k])
+    assert checked > 5 and open_before > checked
