@@ -1,5 +1,7 @@
 """The landmarks of a stored area."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from worlds import box, scan_at, scan_in
@@ -33,3 +35,16 @@ def test_a_room_has_its_four_corners_whatever_the_laser_sees_at_once(look):
     # It keeps nothing of one area for the next.
     again = landmarks.of(scans, POSES)
     assert [one.pose.mean.tolist() for one in again] == [one.pose.mean.tolist() for one in found]
+
+
+def test_what_is_gone_at_a_later_visit_is_not_believed_in_because_the_map_held_it():
+    landmarks = AreaLandmarks(LocalMapping(Configuration()))
+    bigger = box(-2.02, -1.51, 4.03, 2.02)
+    first = [half(pose, k) for k, pose in enumerate(POSES)]
+    then = [scan_in(bigger, pose, beams=361, noise=0.01, seed=k) for k, pose in enumerate(POSES)]
+    later = [replace(scan, stamp=scan.stamp + 100_000_000_000) for scan in then]
+    found = landmarks.of(first + later, np.concatenate((POSES, POSES)))
+    believed = np.array([one.pose.mean[:2] for one in found if one.kind == INNER and one.existence.probability > 0.5])
+    true = np.array([(-2.02, -1.51), (4.03, -1.51), (4.03, 2.02), (-2.02, 2.02)])
+    assert believed.shape == (4, 2)
+    assert np.hypot(*(believed[None] - true[:, None]).transpose(2, 0, 1)).min(axis=1).max() < 0.1

@@ -23,6 +23,8 @@ from hmt_slam_ros.sensing import Scan
 _BEAMS, _REACH = 720, 10.0
 # A scan from so much of a circle on shows what is all around.
 _AROUND = math.radians(330.0)
+# Keyframes that are farther apart in time, ns, are of different visits.
+_VISIT = 60_000_000_000
 
 
 def sees_around(scan: Scan) -> bool:
@@ -68,10 +70,14 @@ class AreaLandmarks:
         """What each of an area's keyframes, as in `of`, shows of its landmarks.
 
         A keyframe whose laser sees all around shows that itself; else a virtual scan from its place does, in the map of
-        the keyframes up to there.
+        the keyframes of the same visit up to there: what earlier visits saw may be gone.
         """
-        table = self._mapping.pool.empty_table()
+        table, before = self._mapping.pool.empty_table(), None
         for scan, pose in zip(scans, np.ascontiguousarray(poses), strict=True):
+            if before is not None and not 0 <= scan.stamp - before <= _VISIT:
+                self._mapping.pool.release(table)
+                table = self._mapping.pool.empty_table()
+            before = scan.stamp
             self._mapping.insert(table[None], pose[None], scan)
             yield self._sighting(table, scan, pose)
         self._mapping.pool.release(table)
