@@ -16,7 +16,7 @@ from benchmark.simulated.worlds import World as Drive
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.features.corners import Corners, corners_of
 from hmt_slam_ros.features.extraction import extract_lines
-from hmt_slam_ros.features.openings import Openings, openings_of
+from hmt_slam_ros.features.openings import Openings, openings_and_evidence
 from hmt_slam_ros.features.rays import rays_of
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.local_map.local_mapping import LocalMapping
@@ -55,6 +55,7 @@ class Landmark(NamedTuple):
     :ivar nees: of its pose, NaN where there is none.
     :ivar error: of its position, m, likewise.
     :ivar turn: of its heading, rad, likewise.
+    :ivar evidence: what the confidence in an opening follows from; nothing for a corner.
     """
 
     confidence: float
@@ -62,6 +63,7 @@ class Landmark(NamedTuple):
     nees: float
     error: float
     turn: float
+    evidence: tuple[float, ...]
 
 
 class Found(NamedTuple):
@@ -105,16 +107,25 @@ def _warm_up(scenario: Scenario, configuration: Configuration) -> None:
     _extracted_from_map(cast_in_map(scenario, 0, configuration)[0], configuration)
 
 
-def _extracted(scenario: Scenario, number: int, configuration: Configuration) -> tuple[Corners, Openings]:
+class Extracted(NamedTuple):
+    """The landmarks of a scan, and what the confidences of its openings follow from."""
+
+    corners: Corners
+    openings: Openings
+    evidence: Array
+
+
+def _extracted(scenario: Scenario, number: int, configuration: Configuration) -> Extracted:
     features, scan = configuration.features, scenario.scan(number)
     lines = extract_lines(scan, features)
-    return corners_of(lines, features), openings_of(lines, rays_of(scan, features), features)
+    return Extracted(corners_of(lines, features), *openings_and_evidence(lines, rays_of(scan, features), features))
 
 
-def _extracted_from_map(virtual: VirtualScan, configuration: Configuration) -> tuple[Corners, Openings]:
+def _extracted_from_map(virtual: VirtualScan, configuration: Configuration) -> Extracted:
     features = configuration.features
     lines = lines_of_map(virtual, features)
-    return corners_of(lines, features), openings_of(lines, rays_of_map(virtual, features), features)
+    openings = openings_and_evidence(lines, rays_of_map(virtual, features), features)
+    return Extracted(corners_of(lines, features), *openings)
 
 
 def _in_scan(scenario: Scenario, number: int, world: World, configuration: Configuration) -> Scanned:
@@ -158,20 +169,21 @@ def keyframes_of(poses: Array, configuration: Configuration) -> list[int]:
 
 
 def _judged(
-    found: tuple[Corners, Openings], world: World, configuration: Configuration, virtual: VirtualScan | None,
+    found: Extracted, world: World, configuration: Configuration, virtual: VirtualScan | None,
     cast: float, seconds: float,
 ) -> Scanned:
-    corners, openings = found
+    corners, openings, evidence = found
     features = configuration.features
     true_corners, true_openings = world.corners(features), world.openings(features)
     parts: Scanned = {}
-    for kind, own, kinds, truth in (
-        (CORNERS, corners, corners.convex.astype(np.float64), true_corners),
-        (OPENINGS, openings, np.zeros(len(openings.poses)), true_openings._replace(kinds=0.0 * true_openings.kinds)),
+    any_width = true_openings._replace(kinds=0.0 * true_openings.kinds)
+    for kind, own, kinds, said, truth in (
+        (CORNERS, corners, corners.convex.astype(np.float64), np.empty((len(corners.poses), 0)), true_corners),
+        (OPENINGS, openings, np.zeros(len(openings.poses)), evidence, any_width),
     ):
         within = _WITHIN[kind]
         landmarks = tuple(
-            _compared(own.poses[k], own.covariances[k], float(own.confidences[k]), kinds[k], truth, within)
+            _compared(own, k, kinds[k], truth, within)._replace(evidence=tuple(said[k].tolist()))
             for k in range(len(own.poses))
         )
         halves = np.full(len(truth.due), 0.5) if kind == CORNERS else 0.5 * true_openings.kinds
@@ -186,16 +198,15 @@ def _same(poses: Array, kinds: Array, pose: Array, kind: float, within: float) -
     return np.asarray(alike(poses, pose, within, _TURN) & (kinds == kind))
 
 
-def _compared(
-    pose: Array, covariance: Array, confidence: float, kind: float, truth: Truth, within: float
-) -> Landmark:
+def _compared(own: Corners | Openings, k: int, kind: float, truth: Truth, within: float) -> Landmark:
+    pose, confidence = own.poses[k], float(own.confidences[k])
     there = _same(truth.poses, truth.kinds, pose, kind, within)
     if not there.any():
-        return Landmark(confidence, False, math.nan, math.nan, math.nan)
+        return Landmark(confidence, False, math.nan, math.nan, math.nan, ())
     away = np.where(there, np.hypot(*(truth.poses[:, :2] - pose[:2]).T), np.inf)
     error = se2.log(se2.between(pose, truth.poses[int(np.argmin(away))]))
-    nees = float(error @ np.linalg.solve(covariance, error))
-    return Landmark(confidence, True, nees, math.hypot(error[0], error[1]), abs(float(error[2])))
+    nees = float(error @ np.linalg.solve(own.covariances[k], error))
+    return Landmark(confidence, True, nees, math.hypot(error[0], error[1]), abs(float(error[2])), ())
 
 
 def _known(virtual: VirtualScan, pose: Array, half: float) -> bool:

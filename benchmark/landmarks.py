@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from benchmark.evidence import fitted
 from benchmark.landmark_scans import (
     AROUND,
     BEAMS,
@@ -77,6 +78,9 @@ def measure_landmarks(settings: Settings) -> Report:
     ]
     report.body += [_table(kind, drives) for kind in (CORNERS, OPENINGS)]
     report.body += [_calibration(kind, drives) for kind in (CORNERS, OPENINGS)]
+    if settings.training:
+        openings = [one for scans in drives.values() for scan in scans for one in scan[OPENINGS].landmarks]
+        report.body.append(_fit(openings))
     report.body.append(POLICY)
     return report
 
@@ -133,7 +137,7 @@ def _table(kind: str, drives: dict[tuple[str, str], list[Scanned]]) -> str:
         found = [scan[kind] for scan in scans]
         every = [landmark for one in found for landmark in one.landmarks]
         sure = [landmark for landmark in every if landmark.confidence >= _CONFIDENT]
-        values = np.array([one[2:] for one in sure if one.is_true]).reshape(-1, 3)
+        values = np.array([one[2:5] for one in sure if one.is_true]).reshape(-1, 3)
         rows.append([
             laser, family, str(len(every)), _percent([one.is_true for one in every]), str(len(sure)),
             _percent([one.is_true for one in sure]), str(sum(one.due for one in found)),
@@ -153,6 +157,16 @@ def _calibration(kind: str, drives: dict[tuple[str, str], list[Scanned]]) -> str
         mean = float(np.mean([one.confidence for one in own]))
         rows.append([f"0.{low} on", str(len(own)), f"{mean:.2f}", _percent([one.is_true for one in own])])
     return table(head, rows)
+
+
+def _fit(openings: Sequence[Landmark]) -> str:
+    """The parameters that explain best which openings are true, all scans weighing alike."""
+    evidence, right = np.array([one.evidence for one in openings]), np.array([one.is_true for one in openings])
+    weights, surprise = fitted(evidence, right)
+    names = ("opening_bias", "opening_wall", "opening_jambs", "opening_share")
+    return f"Fitted to {len(openings)} openings, log score {surprise:.3f}: " + ", ".join(
+        f"features.{name} {weight:.2f}" for name, weight in zip(names, weights, strict=True)
+    )
 
 
 def _percent(values: Sequence[bool]) -> str:

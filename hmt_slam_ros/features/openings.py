@@ -54,6 +54,15 @@ class Openings(NamedTuple):
 
 def openings_of(lines: Lines, rays: Rays, features: Features) -> Openings:
     """The openings in the walls that lines show."""
+    return openings_and_evidence(lines, rays, features)[0]
+
+
+def openings_and_evidence(lines: Lines, rays: Rays, features: Features) -> tuple[Openings, Float64]:
+    """The openings, and what their confidences follow from.
+
+    :returns: the second of shape (n, 3), logarithms of what was seen of the wall, m, of both jambs, m, together, and of
+        the share of the width that is seen through.
+    """
     parameters = np.ascontiguousarray(lines.parameters)
     found = _openings(parameters, lines.covariances, rays, features.opening_depth, features.max_gap)
     widths = found[:, _LAST] - found[:, _FIRST]
@@ -69,31 +78,34 @@ def openings_of(lines: Lines, rays: Rays, features: Features) -> Openings:
     by_line[:, 0, 0], by_line[:, 0, 1], by_line[:, 1, 0], by_line[:, 2, 0] = -middles, 1.0, r, 1.0
     covariances = by_line @ lines.covariances[own] @ by_line.transpose(0, 2, 1)
     covariances[:, 1, 1] += 0.25 * variances
-    confidences = 1.0 / (1.0 + np.exp(-_log_odds(found, lines, features)))
+    evidence = _evidence(found, lines)
+    weights = np.array([features.opening_wall, features.opening_jambs, features.opening_share])
+    confidences = 1.0 / (1.0 + np.exp(-features.opening_bias - evidence @ weights))
     widths = found[:, _LAST] - found[:, _FIRST]
-    return _without_repetitions(Openings(poses, covariances, widths, np.sqrt(variances), confidences))
+    every = Openings(poses, covariances, widths, np.sqrt(variances), confidences)
+    kept = _without_repetitions(every)
+    return Openings(*(field[kept] for field in every)), evidence[kept]
 
 
-def _log_odds(found: Float64, lines: Lines, features: Features) -> Float64:
-    """Of gaps (n, 8) being openings, nats, shape (n,)."""
+def _evidence(found: Float64, lines: Lines) -> Float64:
+    """What speaks for gaps (n, 8) being openings, shape (n, 3)."""
     seen = np.zeros(len(lines))
     np.add.at(seen, lines.owners, lines.pieces[:, 1] - lines.pieces[:, 0])
     walls = np.log(seen[found[:, _LINE].astype(np.int64)])
     jambs = np.log(np.maximum(found[:, [_FIRST + SUPPORT, _LAST + SUPPORT]], _LEAST_JAMB)).sum(axis=1)
     shares = np.log(np.maximum(found[:, _SHARE], _LEAST_SHARE))
-    odds = features.opening_bias + features.opening_wall * walls + features.opening_jambs * jambs
-    return np.asarray(odds + features.opening_share * shares)
+    return np.stack((walls, jambs, shares), axis=1)
 
 
-def _without_repetitions(openings: Openings) -> Openings:
-    """Of those that are one the most confident to a tenth, and of these the one whose wall is known best."""
+def _without_repetitions(openings: Openings) -> list[int]:
+    """Numbers of those that are one the most confident to a tenth, and of these the one whose wall is known best."""
     kept: list[int] = []
     for k in np.lexsort((openings.covariances[:, 0, 0], -np.round(openings.confidences, 1))).tolist():
         near = np.hypot(*(openings.poses[kept, :2] - openings.poses[k, :2]).T) < _SAME
         turn = np.abs(se2.wrap(openings.poses[kept, 2] - openings.poses[k, 2]))
         if not np.any(near & (turn < _SAME_HEADING)):
             kept.append(k)
-    return Openings(*(field[kept] for field in openings))
+    return kept
 
 
 @njit(cache=True)
