@@ -18,6 +18,7 @@ from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.evaluation import StampedPoses, write_tum
 from hmt_slam_ros.offline.final_map import FinalMap
 from hmt_slam_ros.offline.map_image import occupancy_image, write_map
+from hmt_slam_ros.offline.places_file import PLACES
 from hmt_slam_ros.offline.recorder import Recording, keyframe_poses
 from hmt_slam_ros.offline.report import RunFigures, report, write_cost, write_probabilities, write_report
 from hmt_slam_ros.offline.saved_map import MapWriter
@@ -43,6 +44,7 @@ OWN_NAMES = frozenset(
         "graph.g2o",
         TOPOLOGY,
         LANDMARKS,
+        PLACES,
         "report.json",
         "pmf.csv",
         "pmf.png",

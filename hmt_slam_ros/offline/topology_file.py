@@ -1,4 +1,4 @@
-"""The topology of a saved map as GraphML, which programs and libraries for graphs read, and its landmarks."""
+"""The topology of a saved map as GraphML, which programs and libraries for graphs read, its landmarks and places."""
 
 from __future__ import annotations
 
@@ -14,7 +14,10 @@ from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.local_map.area_kind import AreaKinds
 from hmt_slam_ros.local_map.area_landmarks import AreaLandmarks
 from hmt_slam_ros.local_map.local_mapping import LocalMapping
+from hmt_slam_ros.offline.places_file import write_places
 from hmt_slam_ros.offline.saved_map import read_saved_map
+from hmt_slam_ros.places.chart import chart_of
+from hmt_slam_ros.places.floor import views_of
 from hmt_slam_ros.topology.portals import Portal, portals_of
 from hmt_slam_ros.topology.surroundings import stacked
 
@@ -24,8 +27,8 @@ _POSE = ("x", "y", "theta")
 _COVARIANCE = ("xx", "xy", "xt", "yy", "yt", "tt")
 
 
-def export_topology(directory: Path) -> tuple[Path, Path]:
-    """Write the most probable hypothesis into an output folder as ``topology.graphml`` and ``landmarks.json``.
+def export_topology(directory: Path) -> tuple[Path, Path, Path]:
+    """Write ``topology.graphml``, ``landmarks.json`` and ``places.json`` of the most probable hypothesis.
 
     In the graph a node is an area with ``map_T_area``, the number of its ``keyframes``, whether the ``robot`` was in it
     at the end, and the probability that it is a ``hallway`` and no room, which is missing where too little is known
@@ -35,15 +38,15 @@ def export_topology(directory: Path) -> tuple[Path, Path]:
     ``a_T_portal`` with the heading from a to b, ``portal_width``, m, and the probability of its ``portal_existence``.
 
     :param directory: output folder of a run.
-    :returns: the two files.
+    :returns: the three files.
     :raises HmtSlamError: where the folder holds no complete map.
     """
     saved = read_saved_map(directory / "hmt_map")
     best = saved.replica.best
     hybrid_map = saved.replica.maps[best]
     mapping = LocalMapping(saved.configuration)
-    kinds, known = AreaKinds(mapping), AreaLandmarks(mapping)
-    landmarks: dict[int, tuple[Landmark, ...]] = {}
+    kinds, views = AreaKinds(mapping), views_of(hybrid_map, saved.replica.scans, AreaLandmarks(mapping))
+    landmarks = {area: view.landmarks for area, view in views.items()}
     # Takes a fifth of a second and a dozen megabytes, for this command alone.
     import networkx as nx  # noqa: PLC0415
 
@@ -52,8 +55,7 @@ def export_topology(directory: Path) -> tuple[Path, Path]:
         here = area == saved.replica.areas[best]
         numbers = _numbers(saved.area_poses[area])
         keyframes = hybrid_map.keyframes(area)
-        scans, poses = [saved.replica.scans[k] for k in keyframes], stacked(keyframes)
-        kind, landmarks[area] = kinds.of(scans, poses), known.of(scans, poses)
+        kind = kinds.of([saved.replica.scans[k] for k in keyframes], stacked(keyframes))
         hallway = {} if kind is None else {"hallway": kind.probability}
         graph.add_node(area, **numbers, keyframes=len(keyframes), robot=here, **hallway)
     portals = portals_of(hybrid_map, landmarks, saved.configuration.features)
@@ -65,7 +67,8 @@ def export_topology(directory: Path) -> tuple[Path, Path]:
         "portals": [_portal(portal) for portal in portals],
     }
     (directory / LANDMARKS).write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
-    return directory / TOPOLOGY, directory / LANDMARKS
+    chart = chart_of(hybrid_map, views, saved.configuration.features)
+    return directory / TOPOLOGY, directory / LANDMARKS, write_places(directory, saved.area_poses, chart)
 
 
 def _annotation(portals: Sequence[Portal], areas: tuple[int, int]) -> dict[str, float]:

@@ -24,6 +24,12 @@ TRACKS = 8
 """Corners: 0 left and concave, 1 right and concave, 2 left and convex, 3 right and convex; openings that lead 4 ahead,
 5 left, 6 back, 7 right."""
 
+TRACK_NAMES = (
+    "left corner", "right corner", "left convex corner", "right convex corner", "opening ahead", "opening left",
+    "opening back", "opening right",
+)  # fmt: skip
+"""What the tracks are called."""
+
 OPENINGS = 4
 """The first track of openings."""
 

@@ -31,6 +31,9 @@ from hmt_slam_ros.places.observation_graph import (
 NORTH, EAST, SOUTH, WEST = range(QUARTERS)
 """Directions of travel. One more is a quarter to the right."""
 
+DIRECTION_NAMES = ("north", "east", "south", "west")
+"""Their names."""
+
 # So many openings in a row are passed without notice, at most.
 _PASSED = 3
 
