@@ -18,7 +18,7 @@ from benchmark.simulated.worlds import SETTINGS, World
 from hmt_slam_ros.evaluation import RelationErrors, evaluate_relations, read_tum, true_relations, truth_of
 from hmt_slam_ros.logs import open_log
 
-SEEDS = 1
+SEEDS = 4
 """Of the worlds of every family."""
 
 FAMILIES = ("office", "busy", "hall")
