@@ -20,7 +20,7 @@ from benchmark.report import Report
 from benchmark.runs import Runner
 from benchmark.settings import Settings
 from benchmark.simulated.records import Records
-from benchmark.simulated.worlds import FAMILIES, LONG
+from benchmark.simulated.worlds import FAMILIES, INSTITUTE, LONG
 from benchmark.table_runs import CAMPUS
 from hmt_slam_ros.cli.arguments import OneSentenceParser
 from hmt_slam_ros.errors import HmtSlamError
@@ -52,6 +52,7 @@ MEASUREMENTS = {
     "places": "whether the doors and crossings of an institute are in the charts of its maps",
     "belief": "how soon a lost robot knows at which place it is, in corridors of the belief's own model",
     "driving": "whether a robot that avoids obstacles reaches its goals, and touches nothing",
+    "policies": "what areas that end at doors cost and gain, and portals against true doors",
     "localmaps": "maps of areas by lines beside grids, on simulated worlds",
     "table": "time and memory against a global metric RBPF at equal accuracy, the paper's Table II",
     "ambiguity": "whether both answers stay alive where places are identical, until the evidence",
@@ -68,8 +69,8 @@ _GROUPS = {
     "all": ("accuracy", "steps", "robustness", "choices", "sessions", "speed", "live"),
     "validation": (
         "calibration", "loops", "topology", "consistency", "evidence", "appearance", "lines", "linemap", "heading",
-        "landmarks", "landmarkmaps", "hallways", "places", "belief", "driving", "localmaps", "ambiguity", "table",
-        "oracle", "awakening", "kidnapping", "laps", "changes", "scale",
+        "landmarks", "landmarkmaps", "hallways", "places", "belief", "driving", "localmaps", "policies", "ambiguity",
+        "table", "oracle", "awakening", "kidnapping", "laps", "changes", "scale",
     ),
 }  # fmt: skip
 
@@ -131,7 +132,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = OneSentenceParser(prog="python -m benchmark", description="Measurements of hmt_slam_ros on logs.")
     told = "; ".join(f"{name}: {text}" for name, text in MEASUREMENTS.items())
     parser.add_argument("measurements", nargs="+", choices=(*MEASUREMENTS, *_GROUPS), metavar="KIND", help=told)
-    names = ", ".join((*LOGS, *FAMILIES, LONG, CAMPUS))
+    names = ", ".join((*LOGS, *FAMILIES, INSTITUTE, LONG, CAMPUS))
     parser.add_argument("--logs", type=_names, default=(), metavar="A,B", help=f"of {names}")
     parser.add_argument("--seeds", type=_count, default=0, metavar="N", help="seeds 0 to N-1; simulated: from 1000")
     parser.add_argument("--jobs", type=_count, default=2, metavar="N", help="runs at the same time; 1 for speed")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -25,7 +25,9 @@ from hmt_slam_ros.processes.rtl import Rtl
 from hmt_slam_ros.processes.slam import MetricSlam
 from hmt_slam_ros.processes.tlca import Tlca
 from hmt_slam_ros.processes.tsbi import Tsbi
+from hmt_slam_ros.sensing import Scan
 from hmt_slam_ros.simulation import SimulatedLog
+from hmt_slam_ros.topology.hybrid_map import HybridMap
 
 Entry = dict[str, Any]
 
@@ -163,6 +165,10 @@ class Watch:
         for closure in self._paths.accepted(accepted.hypothesis, chosen):
             self.accepted.append(self._entry(closure, accepted.sequence, probabilities[accepted.hypothesis]))
         self.loops.definite(accepted.sequence, chosen, self._replica.areas[accepted.hypothesis])
+
+    def mapped(self) -> tuple[HybridMap, Mapping[int, Scan]]:
+        """The most probable map, and the scans of its keyframes."""
+        return self._replica.maps[self._replica.best], self._replica.scans
 
     def pending(self) -> list[Entry]:
         """The closures of the most probable path that are not definite."""

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmark.runs import PARAMETERS
+from benchmark.simulated.doors import doors
 from benchmark.simulated.features import Row
 from benchmark.simulated.loops import Loop
 from benchmark.simulated.records import code
@@ -51,6 +52,7 @@ def watched(world: World, changes: Sequence[str] = ()) -> dict[str, Any]:
         "rivalries": [
             vars(found) for found in rivalries(watch.log, watch.truth, watch.loops.found, watch.travelled)
         ],
+        "doors": doors(watch.truth, *watch.mapped(), watch.configuration),
         "cpu_s": time.process_time() - begin,
     }
 

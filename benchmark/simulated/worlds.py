@@ -30,14 +30,17 @@ FAMILIES = tuple(SETTINGS)
 LONG = "long"
 """2 km of nested loops; it is mapped only where it is asked for by its name."""
 
-_LONG_SETTINGS = "size=3.3"
+INSTITUTE = "institute"
+"""Hallways with open and closed doors and crossings, for what is measured there alone."""
+
+_OTHERS = {LONG: "sim:nested,seed={},size=3.3", INSTITUTE: "sim:institute,seed={}"}
 
 
 @dataclass(frozen=True)
 class World:
     """A simulated drive, and the seed of building, noise and run alike.
 
-    :ivar family: one of ``FAMILIES``, or ``LONG``.
+    :ivar family: one of ``FAMILIES``, or ``LONG``, or ``INSTITUTE``.
     """
 
     family: str
@@ -46,8 +49,9 @@ class World:
     @property
     def log(self) -> str:
         """The name that ``open_simulated`` takes."""
-        family, own = ("nested", _LONG_SETTINGS) if self.family == LONG else (self.family, SETTINGS[self.family])
-        return ",".join(filter(None, (f"sim:{family},seed={self.seed}", own)))
+        if self.family in _OTHERS:
+            return _OTHERS[self.family].format(self.seed)
+        return ",".join(filter(None, (f"sim:{self.family},seed={self.seed}", SETTINGS[self.family])))
 
     @property
     def name(self) -> str:

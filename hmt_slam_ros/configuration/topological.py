@@ -21,7 +21,7 @@ class AreaAbstraction:
         0.1, "By both: factor on the overlap of keyframes with an opening between them.", low=0.0, high=1.0
     )
     area_limit: float = parameter(
-        20.0, "By portal: an area in which two keyframes are farther apart is cut where overlap is least.", unit="m",
+        10.0, "By portal: an area in which two keyframes are farther apart is cut where overlap is least.", unit="m",
         low=1.0, high=1000.0,
     )
 
