@@ -162,7 +162,7 @@ def _area(
         if k == len(keyframes[0]):
             before = {name: list(found.landmarks) for name, found in maps.items()}
         for found in maps.values():
-            found.observe(*sighting)
+            sighting.add_to(found)
     worlds = [(visits[1].world(k), visits[1].poses[k]) for k in keyframes[1][::_TRUTH]]
     for name, found in maps.items():
         own = before.get(name, found.landmarks)

@@ -85,7 +85,10 @@ class Features:
         0.3, "Landmarks of one kind and heading are farther apart, or one.", unit="m", low=0.01, high=2.0
     )
     landmark_detected: float = parameter(
-        0.9, "Probability that a landmark which should be seen is, if it is there.", low=0.01, high=0.999
+        0.9, "Probability that a landmark which a scan should show is shown, if it is there.", low=0.01, high=0.999
+    )
+    landmark_detected_in_map: float = parameter(
+        0.8, "The same of a virtual scan.", low=0.01, high=0.999
     )
     landmark_by_chance: float = parameter(
         0.05, "Probability that it is seen if it is there no more.", low=0.001, high=0.99

@@ -58,22 +58,26 @@ class LandmarkMap:
         self._gate = gate(features.pair_probability)
         self.landmarks: list[Landmark] = []
 
-    def observe(self, pose: PoseGaussian, seen: Landmarks, rays: Rays) -> None:
+    def observe(self, pose: PoseGaussian, seen: Landmarks, rays: Rays, *, in_map: bool = False) -> None:
         """Learn what a scan shows, and what it does not show though it should.
 
         :param pose: the belief over ``area_T_base``.
         :param seen: the landmarks of the scan, in the frame of the base.
         :param rays: its beams, likewise.
+        :param in_map: whether the scan is a virtual one.
         """
+        features = self._features
+        if in_map:
+            features = replace(features, landmark_detected=features.landmark_detected_in_map)
         expected = self._due(pose.mean, rays)
         placed = [pose.compose(PoseGaussian(*each)) for each in zip(seen.poses, seen.covariances, strict=True)]
         pairs = dict(self._paired(placed, seen))
         known = len(self.landmarks)
         for k, landmark in enumerate(self.landmarks):
             if k in pairs:
-                self.landmarks[k] = self._seen_again(landmark, placed[pairs[k]], seen, pairs[k])
+                self.landmarks[k] = _seen_again(landmark, placed[pairs[k]], seen, pairs[k], features)
             elif expected[k]:
-                existence = landmark.existence.after_miss(self._features)
+                existence = landmark.existence.after_miss(features)
                 self.landmarks[k] = replace(landmark, existence=existence)
         for i in sorted(set(range(len(placed))).difference(pairs.values())):
             if not self._beside_known(placed[i], int(seen.kinds[i]), known):
@@ -104,18 +108,6 @@ class LandmarkMap:
                 taken[1].add(i)
                 yield k, i
 
-    def _seen_again(self, landmark: Landmark, pose: PoseGaussian, seen: Landmarks, i: int) -> Landmark:
-        """A landmark after one more observation of it."""
-        n = landmark.existence.seen + 1
-        width, deviation = seen.widths[i], seen.width_deviations[i]
-        return replace(
-            landmark,
-            pose=_intersected(landmark.pose, pose, 1.0 / n),
-            width=landmark.width + float(width - landmark.width) / n,
-            width_deviation=landmark.width_deviation + float(deviation - landmark.width_deviation) / n,
-            existence=landmark.existence.after_sight(float(seen.confidences[i]), self._features),
-        )
-
     def _new(self, pose: PoseGaussian, seen: Landmarks, i: int) -> Landmark:
         existence = self._begin(float(seen.confidences[i]))
         return Landmark(int(seen.kinds[i]), pose, float(seen.widths[i]), float(seen.width_deviations[i]), existence)
@@ -128,6 +120,19 @@ class LandmarkMap:
             and abs(float(se2.wrap(landmark.pose.mean[2] - pose.mean[2]))) < 0.5
             for landmark in self.landmarks[:known]
         )
+
+
+def _seen_again(landmark: Landmark, pose: PoseGaussian, seen: Landmarks, i: int, features: Features) -> Landmark:
+    """A landmark after one more observation of it."""
+    n = landmark.existence.seen + 1
+    width, deviation = seen.widths[i], seen.width_deviations[i]
+    return replace(
+        landmark,
+        pose=_intersected(landmark.pose, pose, 1.0 / n),
+        width=landmark.width + float(width - landmark.width) / n,
+        width_deviation=landmark.width_deviation + float(deviation - landmark.width_deviation) / n,
+        existence=landmark.existence.after_sight(float(seen.confidences[i]), features),
+    )
 
 
 def _apart(one: PoseGaussian, other: PoseGaussian) -> float:

@@ -38,11 +38,17 @@ class Sighting(NamedTuple):
     :ivar pose: the belief over ``area_T_base``.
     :ivar seen: its landmarks, in the frame of the base.
     :ivar rays: its beams, likewise.
+    :ivar in_map: whether these are those of a virtual scan.
     """
 
     pose: PoseGaussian
     seen: Landmarks
     rays: Rays
+    in_map: bool
+
+    def add_to(self, found: LandmarkMap) -> None:
+        """Have a map of landmarks learn it."""
+        found.observe(self.pose, self.seen, self.rays, in_map=self.in_map)
 
 
 class AreaLandmarks:
@@ -63,7 +69,7 @@ class AreaLandmarks:
         """The landmarks that sightings of an area show."""
         found = LandmarkMap(self._features)
         for sighting in sightings:
-            found.observe(*sighting)
+            sighting.add_to(found)
         return tuple(found.landmarks)
 
     def sightings(self, scans: Iterable[Scan], poses: Float64) -> Iterator[Sighting]:
@@ -99,12 +105,13 @@ class AreaLandmarks:
 
     def _sighting(self, table: Int32, scan: Scan, pose: Float64) -> Sighting:
         """What is around a keyframe, in its own scan or else in the map of a table."""
-        if sees_around(scan):
+        in_map = not sees_around(scan)
+        if not in_map:
             lines, rays = extract_lines(scan, self._features), rays_of(scan, self._features)
         else:
             virtual = virtual_scan(self._mapping.pool.view(table), pose, _BEAMS, _REACH)
             lines, rays = lines_of_map(virtual, self._features), rays_of_map(virtual, self._features)
-        return Sighting(self._place(pose), landmarks_of(lines, rays, self._features), rays)
+        return Sighting(self._place(pose), landmarks_of(lines, rays, self._features), rays, in_map)
 
     def _place(self, pose: Float64) -> PoseGaussian:
         """Where a keyframe was taken; the map there, which is made of such keyframes, is as far off."""
