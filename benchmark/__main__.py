@@ -53,6 +53,7 @@ MEASUREMENTS = {
     "belief": "how soon a lost robot knows at which place it is, in corridors of the belief's own model",
     "driving": "whether a robot that avoids obstacles reaches its goals, and touches nothing",
     "policies": "what areas that end at doors cost and gain, and portals against true doors",
+    "explore": "whether a robot explores an institute by itself, and goes on missions to rooms on its own map",
     "localmaps": "maps of areas by lines beside grids, on simulated worlds",
     "table": "time and memory against a global metric RBPF at equal accuracy, the paper's Table II",
     "ambiguity": "whether both answers stay alive where places are identical, until the evidence",
@@ -69,7 +70,8 @@ _GROUPS = {
     "all": ("accuracy", "steps", "robustness", "choices", "sessions", "speed", "live"),
     "validation": (
         "calibration", "loops", "topology", "consistency", "evidence", "appearance", "lines", "linemap", "heading",
-        "landmarks", "landmarkmaps", "hallways", "places", "belief", "driving", "localmaps", "policies", "ambiguity",
+        "landmarks", "landmarkmaps", "hallways", "places", "belief", "driving", "explore", "localmaps", "policies",
+        "ambiguity",
         "table", "oracle", "awakening", "kidnapping", "laps", "changes", "scale",
     ),
 }  # fmt: skip

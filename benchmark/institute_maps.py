@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import numpy as np
 
-from hmt_slam_ros.arrays import Float64
+from hmt_slam_ros.arrays import Float64, Int64
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.local_map.area_landmarks import AreaLandmarks
@@ -15,6 +15,7 @@ from hmt_slam_ros.local_map.local_mapping import LocalMapping
 from hmt_slam_ros.offline.runtime import run_log
 from hmt_slam_ros.places.chart import Chart, chart_of
 from hmt_slam_ros.places.floor import AreaView, views_of
+from hmt_slam_ros.sensing import Scan
 from hmt_slam_ros.simulation import open_simulated
 from hmt_slam_ros.simulation.scenario import Scenario
 from hmt_slam_ros.topology.hybrid_map import HybridMap
@@ -62,11 +63,25 @@ def mapped(seed: int, configuration: Configuration, visit: int = 0, people: int 
     log = open_simulated(f"sim:institute,{own}")
     result = run_log(log, configuration, lasting=True)
     recording = result.recorder.finish(result.log.stamps, result.log.first_scans, result.log.earlier)
-    hybrid_map, scans = recording.hybrid_map, recording.replica.scans
+    return charted(log.scenario, recording.hybrid_map, recording.replica.scans, log.true_poses, configuration)
+
+
+def charted(
+    scenario: Scenario,
+    hybrid_map: HybridMap,
+    scans: Mapping[int, Scan],
+    true_poses: Callable[[Int64], Float64],
+    configuration: Configuration,
+) -> InstituteMap:
+    """A map and its chart.
+
+    :param scans: {keyframe: scan}.
+    :param true_poses: gives ``world_T_base`` (n, 3) at stamps (n,), ns.
+    """
     views = views_of(hybrid_map, scans, AreaLandmarks(LocalMapping(configuration)))
     frames = {}
     for area in hybrid_map.area_ids():
         own_poses = hybrid_map.keyframes(area)
-        true = log.true_poses(np.array([scans[keyframe].stamp for keyframe in own_poses]))
+        true = true_poses(np.array([scans[keyframe].stamp for keyframe in own_poses]))
         frames[area] = se2.best_fit(stacked(own_poses), true)
-    return InstituteMap(log.scenario, hybrid_map, views, chart_of(hybrid_map, views, configuration.features), frames)
+    return InstituteMap(scenario, hybrid_map, views, chart_of(hybrid_map, views, configuration.features), frames)

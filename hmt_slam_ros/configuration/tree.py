@@ -1,10 +1,10 @@
 """Every parameter of the system: the groups, and the rules that join them.
 
-Each parameter is declared once, in ``metric``, ``topological``, ``features``, ``places`` or ``live``: default, unit,
-range and description. The ROS parameters, the YAML files, ``--set`` and docs/parameters.md all follow from this tree,
-so a new parameter is one line here. Angles are in degrees, for the people who set them; the code that uses one calls
-``math.radians`` there. After a change run ``scripts/generate_docs.py``, which brings config/hmt_slam.yaml and
-docs/parameters.md up to date.
+Each parameter is declared once, in ``metric``, ``topological``, ``features``, ``places``, ``live`` or ``explorer``:
+default, unit, range and description. The ROS parameters, the YAML files, ``--set`` and docs/parameters.md all follow
+from this tree, so a new parameter is one line here. Angles are in degrees, for the people who set them; the code that
+uses one calls ``math.radians`` there. After a change run ``scripts/generate_docs.py``, which brings
+config/hmt_slam.yaml and docs/parameters.md up to date.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
+from hmt_slam_ros.configuration.explorer import Exploration
 from hmt_slam_ros.configuration.features import Features
 from hmt_slam_ros.configuration.live import RealTimeLocalization, Robot
 from hmt_slam_ros.configuration.metric import Filter, LocalMap, Matching, Motion
@@ -53,6 +54,7 @@ class Configuration:
     places: Places = field(default_factory=Places)
     rtl: RealTimeLocalization = field(default_factory=RealTimeLocalization)
     robot: Robot = field(default_factory=Robot)
+    explorer: Exploration = field(default_factory=Exploration)
 
 
 class Rule(NamedTuple):

@@ -87,10 +87,12 @@ class Run:
         configuration: Configuration,
         abstraction: Callable[[Configuration], Process] | None = None,
         state: RunState | None = None,
+        others: Mapping[str, Process] | None = None,
     ) -> None:
         """:param abstraction: what makes areas of keyframes instead of the AAM, such as nothing.
 
         :param state: to go on from.
+        :param others: {name: process}, which listen as well.
         """
         state = state or RunState()
         self._slam = MetricSlam(configuration, state.slam)
@@ -107,6 +109,7 @@ class Run:
                 "tlca": self._tlca,
                 "rtl": self._rtl,
                 "recorder": self.recorder,
+                **(others or {}),
             }
         )
         self._reading = Reading(state.log)

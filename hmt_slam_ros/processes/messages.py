@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from hmt_slam_ros.agreement import Clutter
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.processes.errands import Errand, Heading, Outcome, Steering
 from hmt_slam_ros.processes.map_parts import (
     Arc,
     ArcEnds,
@@ -350,4 +351,8 @@ Message = (
     | EndOfLog
     | Finished
     | Notice
+    | Errand
+    | Heading
+    | Outcome
+    | Steering
 )

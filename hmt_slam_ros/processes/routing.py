@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Protocol
 
+from hmt_slam_ros.processes.errands import Errand, Outcome, Steering
 from hmt_slam_ros.processes.messages import (
     Accepted,
     AreaEvents,
@@ -16,6 +17,7 @@ from hmt_slam_ros.processes.messages import (
     LocalEstimate,
     Message,
     Notice,
+    RealTimePose,
     Trail,
 )
 from hmt_slam_ros.sensing import Odometry, Scan
@@ -42,5 +44,7 @@ HEARD_BY: dict[str, tuple[type, ...]] = {
     "tsbi": (Arriving, Keyframe, AreaEvents, Accepted),
     "tlca": (Keyframe, Hypotheses),
     "rtl": (Odometry, Arriving, LocalEstimate, Hypotheses, Accepted),
+    "explorer": (Errand, Scan, RealTimePose, Keyframe, Hypotheses, Accepted),
+    "robot": (Steering, Outcome),
     "recorder": (Keyframe, Hypotheses, Accepted, Trail, LocalEstimate, Finished, Notice),
 }

@@ -1,0 +1,68 @@
+"""A simulated robot that the explorer drives by what the package's own processes say, all in lock-step."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hmt_slam_ros.configuration import Configuration
+from hmt_slam_ros.exploration.explorer import Explorer
+from hmt_slam_ros.logs.stamps import NANOSECONDS
+from hmt_slam_ros.offline.runtime import Run
+from hmt_slam_ros.processes.errands import Errand, Outcome, Steering
+from hmt_slam_ros.processes.messages import Message
+from hmt_slam_ros.sensing import Scan
+from hmt_slam_ros.simulation.driven_robot import DrivenLog, DrivenRobot
+
+
+class _Ears:
+    """The robot as a process: it does what it is told, and notes how errands end."""
+
+    def __init__(self, robot: DrivenRobot) -> None:
+        self._robot = robot
+        self.outcome: Outcome | None = None
+
+    def handle(self, message: Message) -> list[Message]:
+        """Take in one message."""
+        if isinstance(message, Steering):
+            self._robot.command(message.speed, message.turn_rate)
+        elif isinstance(message, Outcome):
+            self.outcome = message
+        return []
+
+
+class DrivenRun:
+    """Robot, SLAM and explorer.
+
+    :ivar robot: in its world.
+    :ivar explorer: that drives it.
+    """
+
+    def __init__(self, robot: DrivenRobot, configuration: Configuration) -> None:
+        self.robot, self.explorer = robot, Explorer(configuration)
+        self._ears = _Ears(robot)
+        self._run = Run(configuration, others={"explorer": self.explorer, "robot": self._ears})
+        self._records = DrivenLog("driven", robot).records()
+
+    def do(self, errand: Errand, seconds: float) -> Outcome | None:
+        """What comes of an errand, None where it takes longer.
+
+        :param seconds: that it may take.
+        """
+        self._ears.outcome = None
+        self._run.lock_step.feed(errand)
+        end = self.robot.stamp + round(seconds * NANOSECONDS)
+        for record in self._records:
+            self._run.read(record)
+            if isinstance(record.measurement, Scan):
+                self._run.recorder.fold()
+                if self._ears.outcome is not None or self.robot.stamp >= end:
+                    break
+        return self._ears.outcome
+
+    def true_place(self, name: str) -> NDArray[np.float64]:
+        """Where the robot truly was when it took the keyframe in the middle of a named place, ``world_T_base`` (3,)."""
+        atlas = self.explorer.atlas
+        stamp = atlas.replica.scans[atlas.places()[name]].stamp
+        true: NDArray[np.float64] = self.robot.true_poses(np.array([stamp]))[0]
+        return true

@@ -1,0 +1,198 @@
+"""A robot that explores the floors of institutes by its own map, and then goes to rooms that it names."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from benchmark.driven_run import DrivenRun
+from benchmark.institute_maps import PEOPLE, charted, scenario_of
+from benchmark.places import Judged, judged
+from benchmark.report import Report, Requirement, table
+from benchmark.runs import PARAMETERS
+from benchmark.settings import Settings
+from benchmark.simulated.measured import chosen_seeds
+from hmt_slam_ros.arrays import Float64
+from hmt_slam_ros.configuration import Configuration, load_configuration
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.logs.stamps import NANOSECONDS
+from hmt_slam_ros.processes.errands import Errand
+from hmt_slam_ros.simulation.driven_robot import DrivenRobot
+from hmt_slam_ros.simulation.scenario import START
+
+SEEDS = 5
+"""Buildings, each explored once."""
+
+MISSIONS = 5
+"""In each of them."""
+
+_TIME, _MISSION = 2000.0, 300.0  # s, of the simulation, for an exploration and for a mission
+_PASSED = 1.0  # m, from a state's place
+_OFF = 0.3  # m, from a place, where a mission is a success
+_STATES, _CONFUSED, _PAPER_SPEED = 0.98, 0.092, 0.31  # paper, tables 1 and 2
+
+POLICY = (
+    f"An institute of 13 states with {PEOPLE} people and a laser that sees all around. The robot knows nothing of it, "
+    "and is driven by the explorer by what the package's own SLAM says, all in lock-step. Passed: states to whose "
+    f"place the robot came within {_PASSED:g} m. On the chart, confused: as of the scripted drives, see the places of "
+    "an institute. Rooms entered: true ones that the robot was in. "
+    f"Then {MISSIONS} missions one after the other, each to another one, drawn by chance, of the rooms that the "
+    "explorer found and named, with mapping going on. A mission is a success where the robot says that it is there, in "
+    f"{_MISSION:g} s and is within {_OFF:g} m of where it truly was when it took the keyframe that stands for the "
+    "place. A contact is counted where a step would bring the robot's disc, 0.25 m, into a surface or a person. The "
+    "paper's five explorations, 343 m in all, end before the rooms, which are entered by backtracking afterwards."
+)
+
+
+class Explored(NamedTuple):
+    """An exploration.
+
+    :ivar finished: whether the explorer said that it is at its end.
+    :ivar metres: driven.
+    :ivar seconds: of the simulation.
+    :ivar contacts: how often the robot came upon something.
+    :ivar passed: states that the robot passed.
+    :ivar entered: rooms in which it was.
+    :ivar rooms: open rooms of the building.
+    :ivar named: rooms that the explorer found.
+    :ivar chart: of the map, against the truth.
+    """
+
+    finished: bool
+    metres: float
+    seconds: float
+    contacts: int
+    passed: int
+    entered: int
+    rooms: int
+    named: int
+    chart: Judged
+
+
+class Mission(NamedTuple):
+    """A mission.
+
+    :ivar success: whether the robot is where it was to go, and knows it.
+    :ivar off: distance from there, m.
+    :ivar metres: driven.
+    :ivar seconds: of the simulation.
+    :ivar contacts: how often the robot came upon something.
+    """
+
+    success: bool
+    off: float
+    metres: float
+    seconds: float
+    contacts: int
+
+
+def measure_explore(settings: Settings) -> Report:
+    """Explore institutes, and go on missions there."""
+    seeds = chosen_seeds(settings, SEEDS)
+    configuration = load_configuration(PARAMETERS, list(settings.changes))
+    explorations: list[Explored] = []
+    missions: list[list[Mission]] = []
+    for seed in seeds:
+        robot = DrivenRobot(scenario_of(seed))
+        run = DrivenRun(robot, configuration)
+        explorations.append(_explored(run, configuration))
+        missions.append(_missions(run, seed))
+    report = Report("explore", "Exploration of an institute, and missions", seeds=seeds)
+    report.requirements = _requirements(explorations, [one for own in missions for one in own])
+    report.body += [_table_of_explorations(seeds, explorations), _table_of_missions(seeds, missions), POLICY]
+    return report
+
+
+def _explored(run: DrivenRun, configuration: Configuration) -> Explored:
+    """Explore, and compare with the truth."""
+    robot, scenario = run.robot, run.robot.scenario
+    outcome = run.do(Errand("explore"), _TIME)
+    path = robot.true_poses(np.arange(START, robot.stamp, NANOSECONDS // 5))[:, :2]
+    states, rooms = scenario.building.states, scenario.building.rooms
+    away = [float(np.hypot(*(path - state[:2]).T).min()) for state in states.poses]
+    atlas = run.explorer.atlas
+    institute = charted(scenario, atlas.hybrid_map, atlas.replica.scans, robot.true_poses, configuration)
+    return Explored(
+        outcome is not None, robot.travelled, (robot.stamp - START) / NANOSECONDS, robot.contacts,
+        sum(distance <= _PASSED for distance in away), sum(_within(room, path) for room in rooms), len(rooms),
+        sum(name.startswith("room ") for name in atlas.places()), judged(institute),
+    )  # fmt: skip
+
+
+def _within(room: Float64, path: Float64) -> bool:
+    """Whether any of some places (n, 2) is in a room (5,)."""
+    local = se2.transform(se2.inverse(room[:3]), path)
+    return bool(np.any((np.abs(local[:, 0]) < 0.5 * room[3]) & (np.abs(local[:, 1]) < 0.5 * room[4])))
+
+
+def _missions(run: DrivenRun, seed: int) -> list[Mission]:
+    """Go to rooms drawn by chance, never twice in a row to the same."""
+    draw, robot = np.random.default_rng(seed), run.robot
+    found: list[Mission] = []
+    last = ""
+    for _ in range(MISSIONS):
+        names = [name for name in run.explorer.atlas.places() if name.startswith("room ") and name != last]
+        if not names:
+            found.append(Mission(False, math.inf, 0.0, 0.0, 0))
+            continue
+        last = names[int(draw.integers(len(names)))]
+        metres, begin, contacts = robot.travelled, robot.stamp, robot.contacts
+        place = run.true_place(last)
+        outcome = run.do(Errand("go", last), _MISSION)
+        off = float(np.hypot(*(robot.pose - place)[:2]))
+        success = outcome is not None and outcome.reached and off <= _OFF
+        seconds = (robot.stamp - begin) / NANOSECONDS
+        found.append(Mission(success, off, robot.travelled - metres, seconds, robot.contacts - contacts))
+    return found
+
+
+def _requirements(explorations: Sequence[Explored], missions: Sequence[Mission]) -> list[Requirement]:
+    charts = [one.chart for one in explorations]
+    states, rooms = sum(one.states for one in charts), sum(one.rooms for one in explorations)
+    contacts = sum(one.contacts for one in explorations) + sum(one.contacts for one in missions)
+    speed = sum(one.metres for one in missions) / max(1e-9, sum(one.seconds for one in missions))
+    return [
+        Requirement("explorations that end", float(np.mean([one.finished for one in explorations])), 1.0, least=1.0),
+        Requirement("states passed", sum(one.passed for one in explorations) / states, 1.0, least=_STATES),
+        Requirement("rooms entered", sum(one.entered for one in explorations) / rooms, 1.0, least=_STATES),
+        Requirement("states on the chart", sum(one.detected for one in charts) / states, 1.0, least=_STATES),
+        Requirement("nodes confused, of the states", sum(one.confused for one in charts) / states, _CONFUSED),
+        Requirement("missions that succeed", float(np.mean([one.success for one in missions])), 1.0, least=1.0),
+        Requirement("mean speed of missions", speed, math.inf, "m/s", least=_PAPER_SPEED),
+        Requirement("contacts", float(contacts), 0.0),
+    ]
+
+
+def _table_of_explorations(seeds: Sequence[int], explorations: Sequence[Explored]) -> str:
+    head = [
+        "exploration", "way [m]", "time [s]", "states", "passed", "on the chart", "confused", "rooms entered",
+        "rooms named", "contacts",
+    ]  # fmt: skip
+    rows = [
+        [
+            str(seed), f"{one.metres:.0f}", f"{one.seconds:.0f}", str(one.chart.states), str(one.passed),
+            str(one.chart.detected), str(one.chart.confused), f"{one.entered} of {one.rooms}", str(one.named),
+            str(one.contacts),
+        ]
+        for seed, one in zip(seeds, explorations, strict=True)
+    ]  # fmt: skip
+    return table(head, rows)
+
+
+def _table_of_missions(seeds: Sequence[int], missions: Sequence[Sequence[Mission]]) -> str:
+    head = ["missions", "number", "success", "way [m]", "mean speed [m/s]", "off, median [m]", "most", "contacts"]
+    every = [one for own in missions for one in own]
+    rows = [[name, *_cells(own)] for name, own in (*zip(map(str, seeds), missions, strict=True), ("all", every))]
+    return table(head, rows)
+
+
+def _cells(missions: Sequence[Mission]) -> list[str]:
+    metres, off = sum(one.metres for one in missions), np.array([one.off for one in missions])
+    speed = metres / max(1e-9, sum(one.seconds for one in missions))
+    return [
+        str(len(missions)), str(sum(one.success for one in missions)), f"{metres:.0f}", f"{speed:.2f}",
+        f"{np.median(off):.2f}", f"{off.max():.2f}", str(sum(one.contacts for one in missions)),
+    ]  # fmt: skip

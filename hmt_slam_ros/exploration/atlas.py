@@ -1,0 +1,99 @@
+"""Where the robot is in its map, and what is known of that."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hmt_slam_ros.arrays import Float64
+from hmt_slam_ros.configuration import Configuration
+from hmt_slam_ros.exploration.route import Frames, Route
+from hmt_slam_ros.exploration.survey import Here, Survey
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.processes.messages import Accepted, Hypotheses, Keyframe, Message, RealTimePose
+from hmt_slam_ros.processes.replica import Replica
+from hmt_slam_ros.topology.hybrid_map import HybridMap
+
+
+class Atlas:
+    """Follows the map of the most probable hypothesis, and the robot in it.
+
+    :ivar survey: what of the building is known.
+    :ivar replica: maps and scans.
+    """
+
+    def __init__(self, configuration: Configuration, replica: Replica | None = None) -> None:
+        """:param replica: what is known at first."""
+        own = configuration.explorer
+        self.survey = Survey(configuration.features, own.radius + own.margin, own.door)
+        self.replica = replica or Replica()
+        self._pose: RealTimePose | None = None
+        self._frames: Frames | None = None
+
+    def hear(self, message: Message) -> None:
+        """Take in a message of the chain, or a pose."""
+        match message:
+            case Keyframe():
+                self.replica.add(message)
+            case Hypotheses():
+                self.replica.apply(message)
+            case Accepted():
+                self.replica.accept(message)
+                self._frames = None
+            case RealTimePose():
+                self._pose = message
+
+    @property
+    def hybrid_map(self) -> HybridMap:
+        """The map of the most probable hypothesis."""
+        return self.replica.maps[self.replica.best]
+
+    @property
+    def ready(self) -> bool:
+        """Whether it is known where in the map the robot is."""
+        return self._pose is not None and self.hybrid_map.has_area(self._pose.area)
+
+    @property
+    def changed(self) -> bool:
+        """Whether map or area changed since the last question of where something is."""
+        return self._frames is None or self._pose is None or self._frames.area != self._pose.area
+
+    @property
+    def pose(self) -> RealTimePose:
+        """Where the robot is, once the atlas is ready."""
+        assert self._pose is not None
+        return self._pose
+
+    @property
+    def frames(self) -> Frames:
+        """Where keyframes are, seen from the robot's area."""
+        if self._frames is None or self.changed:
+            self._frames = Frames(self.hybrid_map, self.pose.area)
+        return self._frames
+
+    def look(self) -> Here | None:
+        """Bring all around the robot up to date; how it gets to the roadmap, None where it does not."""
+        pose = self.pose
+        return self.survey.look(self.hybrid_map, self.replica.scans, pose.area, pose.local.mean)
+
+    def way(self, route: Route) -> Float64:
+        """The places of a route (n, 2) as the robot sees them now, m."""
+        return self.frames.way(route, self.pose.local.mean)
+
+    def goal(self, route: Route) -> tuple[int, Float64]:
+        """The end of a route as an HMT pose: its area, and ``area_T_goal`` (3,) with the heading of the way there."""
+        last = route.points[-2:]
+        towards = last[-1] - last[0]
+        area, pose = self.frames.placed(route.keyframes[-1])
+        return area, se2.compose(pose, np.array([*last[-1], np.arctan2(towards[1], towards[0])]))
+
+    def places(self) -> dict[str, int]:
+        """{name: keyframe that is taken for its middle} of all places that have a name: rooms, and areas."""
+        named = {f"room {number}": keyframe for number, keyframe in enumerate(self.survey.rooms(), 1)}
+        hybrid_map = self.hybrid_map
+        for area in hybrid_map.area_ids():
+            own = {k: pose for k, pose in hybrid_map.keyframes(area).items() if k in self.survey.roadmap}
+            if own:
+                places = np.array(list(own.values()))[:, :2]
+                away = np.hypot(*(places - places.mean(axis=0)).T)
+                named[f"area {area}"] = list(own)[int(np.argmin(away))]
+        return named

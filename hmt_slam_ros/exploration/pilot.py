@@ -1,0 +1,69 @@
+"""Driving along a way of places in sight of each other."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from hmt_slam_ros.arrays import Float64
+from hmt_slam_ros.motion import Command, Limits, command_towards
+from hmt_slam_ros.sensing import Scan
+
+# How far ahead on the way the robot looks, m.
+_AHEAD = 2.0
+# Within so much of the way ahead it takes the nearest place for its own, in steps of so much, m.
+_PASSED, _STEP = 3.0, 0.1
+# Progress is this much less that is left, m.
+_PROGRESS = 0.3
+
+
+class Pilot:
+    """Keeps track of how far the robot has come on a way.
+
+    :ivar left: of the way, m, inf before the first step.
+    """
+
+    def __init__(self, limits: Limits, tolerance: float) -> None:
+        """:param tolerance: distance from the end of the way at which the robot has arrived, m."""
+        self._limits, self._tolerance = replace(limits, tolerance=tolerance), tolerance
+        self._passed, self._least, self._since = 0.0, math.inf, 0
+        self.left = math.inf
+
+    def steer(self, scan: Scan, way: Float64, velocity: tuple[float, float]) -> Command:
+        """The velocities until the next scan.
+
+        :param way: shape (n, 2), where the same places are as the robot sees them now, m.
+        :param velocity: of the robot now, m/s and rad/s.
+        """
+        steps = np.hypot(*np.diff(way, axis=0).T)
+        along = np.concatenate(([0.0], np.cumsum(steps)))
+        end = float(along[-1])
+        ahead = np.append(np.arange(min(self._passed, end), min(self._passed + _PASSED, end), _STEP), end)
+        ahead = ahead[ahead <= self._passed + _PASSED]
+        away = np.hypot(*_at(way, along, ahead).T)
+        self._passed = float(ahead[np.argmin(away)])
+        self.left = float(away.min()) + end - self._passed
+        if self.left < self._least - _PROGRESS:
+            self._least, self._since = self.left, scan.stamp
+        goal = _at(way, along, np.array([min(self._passed + _AHEAD, end)]))[0]
+        return command_towards(scan, goal, velocity, self._limits)
+
+    @property
+    def arrived(self) -> bool:
+        """Whether the robot is at the end of the way."""
+        return self.left <= self._tolerance
+
+    def stuck(self, stamp: int, patience: int) -> bool:
+        """Whether it has not come nearer for long.
+
+        :param stamp: now, ns.
+        :param patience: ns.
+        """
+        return self._since > 0 and stamp - self._since > patience
+
+
+def _at(way: Float64, along: Float64, places: Float64) -> Float64:
+    """The points (k, 2) on a way (n, 2) that are so far along it, (k,), m."""
+    return np.stack([np.interp(places, along, way[:, axis]) for axis in (0, 1)], axis=1)

@@ -1,0 +1,212 @@
+"""What of a building is known, on top of its HMT map: a roadmap of keyframes, and the frontiers beside them.
+
+Where a keyframe was taken the robot has been, so it can get there again. The roadmap joins keyframes between which it
+can go straight. Both are kept up to date around the robot's area alone; what is farther away stays as it was seen.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import networkx as nx
+import numpy as np
+
+from hmt_slam_ros.arrays import Float64
+from hmt_slam_ros.configuration.features import Features
+from hmt_slam_ros.exploration.ground import REACH, Ground
+from hmt_slam_ros.exploration.outlook import Outlook, crosses, outlook_of
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.sensing import Scan
+from hmt_slam_ros.topology.hybrid_map import HybridMap
+from hmt_slam_ros.topology.surroundings import Nearness, areas_around
+
+# How certain the place of an area has to be for its scans to be laid over those of the robot's area, m.
+_SIGMA = 1.0
+# What is up to this distance from the robot is found anew, by all that keyframes up to that distance show, m.
+_UP_TO_DATE = 8.0
+_SEEN = _UP_TO_DATE + REACH
+# Keyframes of the roadmap are joined up to this distance, m; from one to the next the robot drove up to this one.
+_JOINED, _DROVE = 8.0, 1.5
+# A room has so many keyframes at least.
+_ROOM = 3
+
+
+@dataclass(frozen=True, eq=False)
+class Opened:
+    """Where known ground ends.
+
+    :ivar keyframe: from which the way there is shortest.
+    :ivar way: shape (n, 2), from there to a place at the frontier, m, in the frame of the keyframe's base.
+    :ivar hallway: whether it is expected to be in a hallway; else it is in a room.
+    """
+
+    keyframe: int
+    way: Float64
+    hallway: bool
+
+    @property
+    def length(self) -> float:
+        """Of the way, m."""
+        return float(np.hypot(*np.diff(self.way, axis=0).T).sum())
+
+
+class Here(NamedTuple):
+    """How the robot gets to the roadmap.
+
+    :ivar keyframe: the nearest.
+    :ivar way: shape (n, 2), from beside the robot to there, m, in the frame of the keyframe's base.
+    """
+
+    keyframe: int
+    way: Float64
+
+
+class Survey:
+    """Roadmap and frontiers.
+
+    :ivar roadmap: its nodes are keyframes, its edges have a ``length``, m, and whether a ``door`` is passed.
+    :ivar frontiers: all that are known.
+    """
+
+    def __init__(self, features: Features, keep: float, door: float) -> None:
+        """:param keep: that the robot's middle keeps from surfaces, m.
+
+        :param door: an opening up to so wide is a door, m.
+        """
+        self._features, self._keep, self._door = features, keep, door
+        self._outlooks: dict[int, Outlook] = {}
+        self.roadmap = nx.Graph()
+        self.frontiers: list[Opened] = []
+
+    def look(self, hybrid_map: HybridMap, scans: Mapping[int, Scan], area: int, pose: Float64) -> Here | None:
+        """Bring all around the robot up to date.
+
+        :param area: the robot's.
+        :param pose: ``area_T_base`` (3,).
+        :returns: how the robot gets to the roadmap, None where nothing is known around it.
+        """
+        poses = {
+            keyframe: placed
+            for other, belief in areas_around(hybrid_map, area, Nearness(_SIGMA, _SEEN)).items()
+            for keyframe, own in hybrid_map.keyframes(other).items()
+            if math.dist((placed := se2.compose(belief.mean, own))[:2], pose[:2]) <= _SEEN
+        }
+        names = sorted(poses)
+        if not names:
+            return None
+        placed = np.array([poses[keyframe] for keyframe in names])
+        ground = Ground([scans[keyframe] for keyframe in names], placed, self._keep)
+        doors = self._doors(names, placed, scans)
+        self._forget(hybrid_map, poses, pose)
+        self._join(names, placed, ground, pose, doors)
+        self._find(names, placed, ground, pose, doors)
+        return self._here(names, placed, ground, pose)
+
+    def _here(self, names: list[int], placed: Float64, ground: Ground, pose: Float64) -> Here:
+        """How the robot gets to the roadmap; straight to the nearest keyframe where no other way is seen."""
+        way = ground.way_to(pose[:2])
+        if way is not None:
+            row, points = way.keyframe, way.points[::-1]
+        else:
+            away = np.hypot(*(placed[:, :2] - pose[:2]).T)
+            row, points = int(np.argmin(away)), placed[:0, :2]
+        return Here(names[row], se2.transform(se2.inverse(placed[row]), points))
+
+    def _forget(self, hybrid_map: HybridMap, poses: Mapping[int, Float64], pose: Float64) -> None:
+        """Forget what is no more, and what is near to the robot and will be found anew.
+
+        :param poses: {keyframe: pose (3,)} around the robot.
+        """
+        known = {keyframe for area in hybrid_map.area_ids() for keyframe in hybrid_map.keyframes(area)}
+        self.roadmap.remove_nodes_from([keyframe for keyframe in self.roadmap if keyframe not in known])
+        near = {keyframe for keyframe, placed in poses.items() if _is_near(placed, pose)}
+        self.roadmap.remove_edges_from([edge for edge in self.roadmap.edges if edge[0] in near and edge[1] in near])
+        self.frontiers = [
+            one
+            for one in self.frontiers
+            if one.keyframe in known
+            and not (one.keyframe in poses and _is_near(se2.transform(poses[one.keyframe], one.way[-1]), pose))
+        ]
+
+    def _doors(self, names: list[int], placed: Float64, scans: Mapping[int, Scan]) -> Float64:
+        """All doors that keyframes show, (n, 4), in the frame of their poses."""
+        found = [np.empty((0, 4))]
+        for keyframe, pose in zip(names, placed, strict=True):
+            if keyframe not in self._outlooks:
+                self._outlooks[keyframe] = outlook_of(scans[keyframe], self._features, self._door)
+            doors = self._outlooks[keyframe].doors
+            found.append(np.concatenate([se2.transform(pose, doors[:, end : end + 2]) for end in (0, 2)], axis=1))
+        return np.concatenate(found)
+
+    def _join(self, names: list[int], placed: Float64, ground: Ground, pose: Float64, doors: Float64) -> None:
+        """Join keyframes between which the robot can go straight."""
+        near = np.array([_is_near(own, pose) for own in placed])
+        self.roadmap.add_nodes_from(keyframe for keyframe, own in zip(names, near.tolist(), strict=True) if own)
+        apart = np.hypot(*(placed[:, None, :2] - placed[None, :, :2]).transpose(2, 0, 1))
+        firsts, seconds = np.nonzero(np.triu(apart <= _JOINED, 1))
+        starts, ends = placed[firsts, :2], placed[seconds, :2]
+        numbers = np.array(names)
+        driven = (numbers[seconds] == numbers[firsts] + 1) & (apart[firsts, seconds] <= _DROVE)
+        joined = (near[firsts] & near[seconds]) & (driven | ground.clear(starts, ends))
+        passed = crosses(np.concatenate((starts, ends), axis=1), doors)
+        for i, k, door in zip(firsts[joined].tolist(), seconds[joined].tolist(), passed[joined].tolist(), strict=True):
+            self.roadmap.add_edge(names[i], names[k], length=float(apart[i, k]), door=door)
+
+    def _find(self, names: list[int], placed: Float64, ground: Ground, pose: Float64, doors: Float64) -> None:
+        """Find the frontiers."""
+        for frontier in ground.frontiers():
+            if not _is_near(frontier.points[-1], pose):
+                continue
+            keyframe = names[frontier.keyframe]
+            ways = np.concatenate((frontier.points[:-1], frontier.points[1:]), axis=1)
+            # Who looks from one through a door looks into the other.
+            hallway = self._outlooks[keyframe].hallway != bool(crosses(ways, doors).any())
+            way = se2.transform(se2.inverse(placed[frontier.keyframe]), frontier.points)
+            self.frontiers.append(Opened(keyframe, way, hallway))
+
+    def distances(self, start: int) -> dict[int, float]:
+        """{keyframe: how far it is to there from ``start``, m}, of those that can be reached."""
+        return dict(nx.single_source_dijkstra_path_length(self.roadmap, start, weight="length"))
+
+    def path(self, start: int, end: int) -> list[int]:
+        """The shortest way over keyframes, both ends included.
+
+        :raises networkx.NetworkXNoPath: where there is none.
+        """
+        return list(nx.dijkstra_path(self.roadmap, start, end, weight="length"))
+
+    def way_back(self, start: int) -> list[int]:
+        """Over the keyframes before one, the newest first; where the robot came from elsewhere, the shortest way."""
+        way = [start]
+        for keyframe in sorted((one for one in self.distances(start) if one < start), reverse=True):
+            way += self.path(way[-1], keyframe)[1:]
+        return way
+
+    def rooms(self) -> list[int]:
+        """A keyframe in the middle of every room, the room that was entered first before the others.
+
+        A room is what is left of the roadmap without hallways and doors, if most ways out of it pass a door.
+        """
+        inside = [keyframe for keyframe in self.roadmap if not self._outlooks[keyframe].hallway]
+        within = nx.subgraph_view(
+            self.roadmap.subgraph(inside), filter_edge=lambda a, b: not self.roadmap.edges[a, b]["door"]
+        )
+        rooms = sorted((sorted(room) for room in nx.connected_components(within)), key=min)
+        return [self._middle(within, room) for room in rooms if len(room) >= _ROOM and self._behind_door(room)]
+
+    def _behind_door(self, room: list[int]) -> bool:
+        out = [edge["door"] for _, _, edge in nx.edge_boundary(self.roadmap, room, data=True)]
+        return sum(out) > 0.5 * len(out)
+
+    @staticmethod
+    def _middle(within: nx.Graph, room: list[int]) -> int:
+        """The keyframe from which the others are nearest."""
+        spans = {one: nx.single_source_dijkstra_path_length(within, one, weight="length") for one in room}
+        return min(room, key=lambda one: (max(spans[one].values()), one))
+
+
+def _is_near(place: Float64, pose: Float64) -> bool:
+    return math.dist(place[:2], pose[:2]) <= _UP_TO_DATE

@@ -1,0 +1,149 @@
+"""Exploration of a small building with the package's own SLAM in the loop, and missions in it."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from benchmark.driven_run import DrivenRun
+from hmt_slam_ros.arrays import Float64
+from hmt_slam_ros.configuration import Configuration
+from hmt_slam_ros.exploration.outlook import crosses, outlook_of
+from hmt_slam_ros.exploration.pilot import Pilot
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.logs.stamps import NANOSECONDS
+from hmt_slam_ros.motion import Limits
+from hmt_slam_ros.processes.errands import Errand, Outcome
+from hmt_slam_ros.sensing import Scan
+from hmt_slam_ros.simulation.building import Building, FloorPlan
+from hmt_slam_ros.simulation.driven_robot import DrivenRobot
+from hmt_slam_ros.simulation.laser import Laser
+from hmt_slam_ros.simulation.raycast import wall_index
+from hmt_slam_ros.simulation.scenario import START, Scenario
+from hmt_slam_ros.simulation.settings import Settings
+
+ROOMS = np.array([[3.0, -3.2], [9.0, -3.2]])
+"""Middles of the rooms, m."""
+
+LASER = Settings(field_of_view=360.0, beams=720)
+
+
+def small_floor() -> Building:
+    """A hallway along x with an arm to the north, and two rooms to the south; the robot begins at its western end."""
+    plan = FloorPlan()
+    plan.free(0.0, -1.0, 12.0, 1.0)
+    plan.free(5.0, 1.0, 7.0, 6.0)
+    for x, y in ROOMS:
+        plan.free(x - 1.5, y - 2.0, x + 1.5, y + 2.0)
+        plan.free(x - 0.5, y + 1.9, x + 0.5, -0.9)
+    return Building(plan.walls(), np.array([[1.0, 0.0], [11.0, 0.0]]))
+
+
+def scan_at(pose: tuple[float, float, float]) -> Scan:
+    """What a laser all around sees of that floor."""
+    laser = Laser(LASER)
+    return laser.scan(0, 0, laser.distances(np.array([pose]), wall_index(small_floor().walls), np.empty((0, 3))))
+
+
+class _Explored:
+    """The floor after a robot explored it."""
+
+    def __init__(self) -> None:
+        scenario = Scenario(small_floor(), Settings(seed=5, laps=1, field_of_view=360.0, beams=720))
+        self.robot = DrivenRobot(scenario)
+        self.run = DrivenRun(self.robot, Configuration())
+        self.outcome = self.run.do(Errand("explore"), 400.0)
+        self.length = len(path_of(self))
+
+
+@cache
+def explored(number: int = 0) -> _Explored:
+    """One and the same exploration for all tests that ask for this number."""
+    del number
+    return _Explored()
+
+
+def path_of(own: _Explored) -> Float64:
+    """True poses of the robot up to now, (n, 3), five a second."""
+    return own.robot.true_poses(np.arange(START, own.robot.stamp, NANOSECONDS // 5))
+
+
+def done(outcome: Outcome | None) -> Outcome:
+    """An outcome that is there."""
+    assert outcome is not None
+    return outcome
+
+
+def test_explores_all_of_a_floor_hallways_first() -> None:
+    own = explored()
+    path = path_of(own)[:, :2]
+    assert done(own.outcome).reached
+    assert own.robot.contacts == 0
+    entered = [int(np.argmax(np.hypot(*(path - room).T) < 1.9)) for room in ROOMS]
+    arm, end = (int(np.argmax(np.hypot(*(path - place).T) < 3.5)) for place in ((6.0, 5.0), (11.0, 0.0)))
+    assert min(entered) > max(arm, end) > 0
+
+
+def test_rooms_have_names_and_the_robot_goes_there() -> None:
+    own = explored()
+    names = [name for name in own.run.explorer.atlas.places() if name.startswith("room")]
+    assert names == ["room 1", "room 2"]
+    for name in names:
+        assert done(own.run.do(Errand("go", name), 120.0)).reached
+        place = own.run.true_place(name)
+        assert np.hypot(*(own.robot.pose - place)[:2]) < 0.3
+        assert np.abs(ROOMS - place[:2]).max(axis=1).min() < 2.0
+    assert own.robot.contacts == 0
+
+
+def test_backtracking_goes_along_its_own_path_until_told_to_stop() -> None:
+    own = explored(1)
+    at = len(path_of(own))
+    assert own.run.do(Errand("backtrack"), 12.0) is None
+    back = path_of(own)[at:, :2]
+    assert np.hypot(*(back[-1] - back[0])) > 1.0
+    before = path_of(own)[:at, :2]
+    assert max(np.hypot(*(before - place).T).min() for place in back) < 0.6
+    assert own.run.do(Errand("stop"), 3.0) is None
+    assert own.robot.velocity == (0.0, 0.0)
+
+
+def test_unknown_places_are_told() -> None:
+    outcome = done(explored().run.do(Errand("go", "cellar"), 5.0))
+    assert not outcome.reached
+    assert "choose from room 1, room 2, area 0" in outcome.text
+
+
+def test_same_seed_same_path_bit_for_bit() -> None:
+    one, other = path_of(explored()), path_of(explored(1))
+    known = min(explored(number).length for number in (0, 1))
+    assert known > 100
+    assert np.array_equal(one[:known], other[:known])
+
+
+def test_hallways_and_doors_of_a_scan() -> None:
+    features = Configuration().features
+    for pose, is_hallway in (((3.0, 0.0, 0.3), True), ((3.0, -3.0, 0.0), False)):
+        outlook = outlook_of(scan_at(pose), features, 1.75)
+        assert outlook.hallway == is_hallway
+        way = se2.transform(se2.inverse(np.array(pose)), np.array([[3.0, -0.2], [3.0, -2.0]])).reshape(1, 4)
+        assert crosses(way, outlook.doors).all()
+        beside = se2.transform(se2.inverse(np.array(pose)), np.array([[1.0, 0.0], [5.0, 0.0]])).reshape(1, 4)
+        assert not crosses(beside, outlook.doors).any()
+
+
+def test_an_arm_as_wide_as_a_hallway_is_no_door() -> None:
+    doors = outlook_of(scan_at((6.0, 0.0, 0.0)), Configuration().features, 1.75).doors
+    assert not crosses(np.array([[0.0, 0.0, 0.0, 2.5]]), doors).any()
+
+
+@pytest.mark.parametrize(("seconds", "stuck"), [(4.0, False), (20.0, True)])
+def test_no_progress_for_long_is_noticed(seconds: float, stuck: bool) -> None:
+    pilot = Pilot(Limits(0.6, 0.8, 0.5, 1.5, 0.25), 0.15)
+    scan, way = scan_at((6.0, 0.0, 0.0)), np.array([[0.0, 0.0], [3.0, 0.0]])
+    begin = Scan(1, scan.ranges, scan.angle_min, scan.angle_increment, scan.range_min, scan.range_max)
+    assert pilot.steer(begin, way, (0.0, 0.0)).speed > 0.0
+    assert not pilot.arrived
+    assert pilot.stuck(1 + round(seconds * NANOSECONDS), 15 * NANOSECONDS) == stuck
