@@ -50,6 +50,7 @@ MEASUREMENTS = {
     "landmarkmaps": "landmarks of areas, at two visits, against the true ones",
     "hallways": "whether hallways and rooms are told apart",
     "places": "whether the doors and crossings of an institute are in the charts of its maps",
+    "institute": "whether robots in an institute know at which place they are, on missions and when they are lost",
     "belief": "how soon a lost robot knows at which place it is, in corridors of the belief's own model",
     "driving": "whether a robot that avoids obstacles reaches its goals, and touches nothing",
     "policies": "what areas that end at doors cost and gain, and portals against true doors",
@@ -70,8 +71,8 @@ _GROUPS = {
     "all": ("accuracy", "steps", "robustness", "choices", "sessions", "speed", "live"),
     "validation": (
         "calibration", "loops", "topology", "consistency", "evidence", "appearance", "lines", "linemap", "heading",
-        "landmarks", "landmarkmaps", "hallways", "places", "belief", "driving", "explore", "localmaps", "policies",
-        "ambiguity",
+        "landmarks", "landmarkmaps", "hallways", "places", "institute", "belief", "driving", "explore", "localmaps",
+        "policies", "ambiguity",
         "table", "oracle", "awakening", "kidnapping", "laps", "changes", "scale",
     ),
 }  # fmt: skip

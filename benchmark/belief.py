@@ -154,7 +154,7 @@ class Drive:
             yield from self._along_edge(at)
             at = int(self._world.truth.following[at])
             end = self._world.truth.following[at] < 0
-            noticed = end or self._random.random() < self._world.existence[node_of(at)] * self._places.detection
+            noticed = end or self._random.random() < self._world.existence[node_of(at)] * self._places.noticed
         self._arrive(at)
         yield self._estimate()
 
@@ -166,7 +166,7 @@ class Drive:
         for _ in range(looks):
             self._go(_BETWEEN)
             if self._world.family.looks:
-                self._belief = self._belief.gone_on()
+                self._belief = self._belief.gone_on(_BETWEEN)
                 self._look()
                 yield self._estimate()
         self._go(length - looks * _BETWEEN)

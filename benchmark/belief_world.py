@@ -8,7 +8,7 @@ import numpy as np
 
 from hmt_slam_ros.arrays import Bool, Float64, Int64
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.places.observation import ObservationModel
+from hmt_slam_ros.places.observation import ObservationModel, reach_of
 from hmt_slam_ros.places.observation_graph import OPENINGS, TRACKS, Landmarks, chosen, joined
 
 SURENESS = 2.0
@@ -41,7 +41,9 @@ def drawn_of_present(
     along = seen.along - away + random.normal(0.0, np.sqrt(seen.variances[:, 0] + model.along))
     forms = seen.forms + random.normal(0.0, np.sqrt(form_variances))
     found = _observed(seen.tracks, along, np.where(corner, se2.wrap(forms), forms), _true(random, len(along), model))
-    within = chosen(found, np.abs(found.along) <= model.reach)
+    sight = (reach_of(track, form, model.reach) for track, form in zip(seen.tracks, seen.forms, strict=True))
+    low, high = np.array(list(sight)).reshape(-1, 2).T
+    within = chosen(found, (low <= found.along) & (found.along <= high))
     return joined((within, drawn_anywhere(random, model.new, model.false, model)))
 
 

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from benchmark.institute_maps import PEOPLE, InstituteMap, mapped
+from benchmark.places_fit import fit
 from benchmark.report import Report, Requirement, table
 from benchmark.runs import PARAMETERS
 from benchmark.settings import Settings
@@ -63,7 +64,8 @@ def measure_places(settings: Settings) -> Report:
     """Map institutes twice and compare their charts with their states, and with each other."""
     seeds = chosen_seeds(settings, SEEDS)
     configuration = load_configuration(PARAMETERS, list(settings.changes))
-    pairs = [[judged(mapped(seed, configuration, visit)) for visit in (0, 1)] for seed in seeds]
+    maps = [[mapped(seed, configuration, visit) for visit in (0, 1)] for seed in seeds]
+    pairs = [[judged(institute) for institute in own] for own in maps]
     every = [one for pair in pairs for one in pair]
     states = sum(one.states for one in every)
     constant = [share for pair in pairs for share in (_constant(*pair), _constant(*pair[::-1]))]
@@ -74,6 +76,8 @@ def measure_places(settings: Settings) -> Report:
         Requirement("corners that are constant", float(np.mean(constant)), 1.0, least=_CONSTANT),
     ]
     report.body += [_table(seeds, pairs), POLICY]
+    if settings.training:
+        report.body.append(fit([own[0] for own in maps], configuration))
     return report
 
 

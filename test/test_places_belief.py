@@ -6,17 +6,17 @@ import math
 
 import numpy as np
 import pytest
+from rough_places import ROUGH
 
 from benchmark.belief_corridors import random_corridors
 from benchmark.belief_world import drawn_anywhere, drawn_observation
 from hmt_slam_ros.configuration.features import Features
-from hmt_slam_ros.configuration.places import Places
 from hmt_slam_ros.places.observation import log_observation, log_unknown_ground, observation_model
 from hmt_slam_ros.places.observation_graph import Landmarks, joined, no_landmarks
 from hmt_slam_ros.places.place_graph import EAST, NORTH, SOUTH, WEST, Edge, Node, place_graph, state_of
 from hmt_slam_ros.places.position_belief import Travel, certain_belief, flat_belief
 
-PLACES = Places()
+PLACES = ROUGH
 MODEL = observation_model(PLACES, Features())
 EMPTY = no_landmarks()
 QUARTER = 0.5 * math.pi
@@ -47,7 +47,7 @@ def random_graph(seed, rows=1, columns=1, density=0.1):
 def test_the_next_opening_is_at_the_end_of_the_edge_or_behind_those_that_are_missed():
     graph = chain([3.0, 4.0, 5.0])
     own = graph.arcs.sources == state_of(0, EAST)
-    seen = 0.5 * PLACES.detection
+    seen = 0.5 * PLACES.noticed
     assert list(graph.arcs.targets[own]) == [state_of(k, EAST) for k in (1, 2, 3)]
     np.testing.assert_allclose(graph.arcs.probabilities[own], [seen, (1 - seen) * seen, (1 - seen) ** 2])
     np.testing.assert_allclose(graph.arcs.means[own], [(3, 0), (7, 0), (12, 0)])
@@ -131,7 +131,7 @@ def test_the_belief_is_that_of_an_enumeration_of_all_paths(seed):
         elif action:
             belief = belief.turned(action)
         else:
-            belief = belief.gone_on()
+            belief = belief.gone_on(places.spacing)
         belief = belief.observed(graph_seen, MODEL, away, variance)
         told = np.append(
             log_observation(graph_seen, graph.expected, away, variance, MODEL), log_unknown_ground(graph_seen, MODEL)
@@ -153,7 +153,7 @@ def test_every_transition_is_a_probability():
         logs = np.full(graph.states + 1, -np.inf)
         logs[source] = 0.0
         belief = dataclasses.replace(flat_belief(graph, PLACES), logs=logs)
-        for after in (belief.gone_on(), belief.turned(1), belief.arrived(Travel(4.0, 0.0, (0.1, 0.1)))):
+        for after in (belief.gone_on(2.0), belief.turned(1), belief.arrived(Travel(4.0, 0.0, (0.1, 0.1)))):
             assert after.probabilities.sum() == pytest.approx(1.0, abs=1e-12)
 
 
@@ -163,11 +163,39 @@ def test_entropy_says_whether_the_belief_is_confident():
     assert certain.entropy == 0.0
     assert certain.confident
     assert certain.most_likely == 7
-    flat = flat_belief(graph, dataclasses.replace(PLACES, unmapped=1.0 / (graph.states + 1)))
-    assert flat.entropy == pytest.approx(math.log(graph.states + 1))
+    states = int(graph.travelled.sum())
+    flat = flat_belief(graph, dataclasses.replace(PLACES, unmapped=1.0 / (states + 1)))
+    assert flat.entropy == pytest.approx(math.log(states + 1))
     assert not flat.confident
     lost = dataclasses.replace(flat, logs=np.log(np.append(np.full(graph.states, 1e-9), 1.0)))
     assert lost.most_likely is None
+
+
+def test_a_lost_robot_is_where_a_hallway_leads_on_or_back():
+    flat = flat_belief(chain([3.0, 4.0]), PLACES).probabilities[:-1].reshape(-1, 4)
+    np.testing.assert_allclose(flat[:, [EAST, WEST]], (1.0 - PLACES.unmapped) / 6)
+    assert not flat[:, [NORTH, SOUTH]].any()
+    with pytest.raises(ValueError, match="no place"):
+        flat_belief(place_graph([Node(1.0, EMPTY, EMPTY)], [], PLACES), PLACES)
+
+
+def test_to_look_often_on_the_way_leaks_no_more_than_to_look_once():
+    start = certain_belief(chain([30.0]), PLACES, state_of(0, EAST))
+    often = start
+    for _ in range(50):
+        often = often.gone_on(0.1)
+    once = start.gone_on(5.0)
+    assert once.probabilities[state_of(0, EAST)] == pytest.approx(1.0 - PLACES.slip)
+    np.testing.assert_allclose(often.probabilities, once.probabilities, atol=1e-4)
+
+
+def test_an_opening_far_from_where_the_map_has_one_is_none_of_it():
+    graph, noise = chain([3.0, 4.0]), (0.01, 0.01)
+    sure = certain_belief(graph, PLACES, state_of(0, EAST))
+    assert [sure.is_listed(Travel(d, 0.0, noise)) for d in (1.5, 2.9, 4.5, 7.1)] == [False, True, False, True]
+    # A robot that may be anywhere takes it for one of the map.
+    assert flat_belief(graph, PLACES).is_listed(Travel(3.5, 0.0, noise))
+    assert certain_belief(graph, PLACES, graph.states).is_listed(Travel(1.5, 0.0, noise))
 
 
 def test_where_the_map_ends_unknown_ground_begins():

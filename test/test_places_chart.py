@@ -1,4 +1,4 @@
-"""The chart of a small floor: a hallway with two doors, one opposite the other, a third one, and a crossing."""
+"""The chart of a small floor."""
 
 import dataclasses
 import itertools
@@ -6,67 +6,17 @@ import math
 
 import numpy as np
 import pytest
-from worlds import scan_at
+from small_floor import AREAS, CONFIGURATION, charted
 
-from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.local_map.area_landmarks import AreaLandmarks
-from hmt_slam_ros.local_map.local_mapping import LocalMapping
 from hmt_slam_ros.places.chart import CROSSING, DOOR, END, chart_of
-from hmt_slam_ros.places.floor import views_of
 from hmt_slam_ros.places.observation_graph import OPENINGS
 from hmt_slam_ros.places.place_graph import EAST, WEST
-from hmt_slam_ros.simulation.building import FloorPlan
-from hmt_slam_ros.topology.hybrid_map import HybridMap
-
-CONFIGURATION = Configuration()
-# The world's pose of the second area, which begins behind the first door, and where the building stands.
-AREAS = {0: np.zeros(3), 1: np.array([9.0, 0.3, 2.0])}
-BUILDING = np.array([3.0, -2.0, 0.4])
-
-
-def walls():
-    """A hallway along x from 0 to 22 m, doors to the north at 5 m, on both sides at 10 m, another hallway at 16 m."""
-    plan = FloorPlan()
-    plan.free(0.0, -1.0, 22.0, 1.0)
-    plan.free(15.0, 1.0, 17.0, 12.0)
-    for x, side in ((5.0, 1.0), (10.1, 1.0), (9.9, -1.0)):
-        plan.free(x - 0.5, min(side, 1.3 * side), x + 0.5, max(side, 1.3 * side))
-        plan.free(x - 2.0, min(1.2 * side, 5.0 * side), x + 2.0, max(1.2 * side, 5.0 * side))
-    found = plan.walls()
-    return np.concatenate([se2.transform(BUILDING, found[:, k : k + 2]) for k in (0, 2)], axis=1)
-
-
-def keyframes(crossing_driven=True):
-    """Along the hallway, into the first room and up the other hallway."""
-    places = [(x, 0.1, 0.0) for x in np.arange(1.0, 21.2, 0.5)]
-    places += [(5.0, y, 0.5 * math.pi) for y in np.arange(0.5, 3.2, 0.5)]
-    if crossing_driven:
-        places += [(16.0, y, 0.5 * math.pi) for y in np.arange(0.5, 11.2, 0.5)]
-    return np.array(places)
 
 
 @pytest.fixture(scope="module")
-def known():
-    return AreaLandmarks(LocalMapping(CONFIGURATION))
-
-
-def charted(known, crossing_driven=True):
-    hybrid_map, scans, rng = HybridMap(), {}, np.random.default_rng(1)
-    for k, pose in enumerate(keyframes(crossing_driven)):
-        area = int(pose[0] > 8.0)
-        hybrid_map.place(k, area, se2.between(AREAS[area], pose))
-        scans[k] = scan_at(walls(), se2.compose(BUILDING, pose), 0.01, rng, 720)
-    arc = se2.between(AREAS[0], AREAS[1])
-    hybrid_map.set_arc(0, 1, PoseGaussian(arc, np.diag([0.03, 0.03, 0.003]) ** 2), closure=False)
-    views = views_of(hybrid_map, scans, known)
-    return chart_of(hybrid_map, views, CONFIGURATION.features), hybrid_map, views
-
-
-@pytest.fixture(scope="module")
-def charts(known):
-    return charted(known)
+def charts():
+    return charted()
 
 
 def true_places(chart):
@@ -141,8 +91,8 @@ def test_landmarks_of_rooms_are_not_those_of_the_hallway(charts):
         assert np.all((edge.landmarks.along >= -1e-9) & (edge.landmarks.along <= edge.distance[0] + 1e-9))
 
 
-def test_a_wide_opening_behind_which_one_sees_far_is_a_crossing_before_anyone_drove_there(known):
-    chart, *_ = charted(known, crossing_driven=False)
+def test_a_wide_opening_behind_which_one_sees_far_is_a_crossing_before_anyone_drove_there():
+    chart, *_ = charted(crossing_driven=False)
     crossing = chart.nodes[at(chart, 16.0)]
     assert crossing.kind == CROSSING
     assert len(crossing.openings) == 1

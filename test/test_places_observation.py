@@ -6,11 +6,11 @@ import math
 
 import numpy as np
 import pytest
+from rough_places import ROUGH
 from worlds import scan_at
 
 from benchmark.belief_world import drawn_anywhere, drawn_observation
 from hmt_slam_ros.configuration.features import Features
-from hmt_slam_ros.configuration.places import Places
 from hmt_slam_ros.features.corners import Corners, corners_of
 from hmt_slam_ros.features.extraction import extract_lines
 from hmt_slam_ros.features.openings import Openings, openings_of
@@ -28,7 +28,7 @@ from hmt_slam_ros.places.observation_graph import (
 )
 
 FEATURES = Features(range_deviation=0.01)
-PLACES = Places()
+PLACES = ROUGH
 MODEL = observation_model(PLACES, FEATURES)
 # A hallway of 2 m with a door of 1 m to a room on the left, and at its end another hallway to the right.
 HALLWAY = np.array([
@@ -58,7 +58,7 @@ def landmarks(*rows):
     return joined((Landmarks(table[:, 0].astype(np.int64), table[:, 1], table[:, 2], table[:, 3:5], table[:, 5]),))
 
 
-def random_landmarks(random, count, tracks=(0, 1, 5), spread=1.0):
+def random_landmarks(random, count, tracks=(0, 2, 5), spread=1.0):
     chosen = random.choice(tracks, count)
     forms = np.where(chosen < OPENINGS, random.uniform(-np.pi, np.pi, count), random.uniform(0.7, 2.5, count))
     variances = random.uniform(0.0, 0.2, (count, 2))
@@ -118,12 +118,15 @@ def product(observed, expected, pairs, away, model):
         seen = expected.probabilities[i] * model.detection
         place, variance = expected.along[i] - away, expected.variances[i, 0] + model.along
         scale = math.sqrt(2.0 * variance)
-        within = 0.5 * (math.erf((model.reach - place) / scale) + math.erf((model.reach + place) / scale))
+        low, high = -model.reach, model.reach
+        if expected.tracks[i] == 2:
+            low, high = (low, 0.0) if math.cos(expected.forms[i]) > 0.0 else (0.0, high)
+        within = 0.5 * (math.erf((high - place) / scale) - math.erf((low - place) / scale))
         if i not in pairs:
             value *= 1.0 - seen * within
             continue
         j = pairs[i]
-        if observed.tracks[j] != expected.tracks[i]:
+        if observed.tracks[j] != expected.tracks[i] or not low <= observed.along[j] <= high:
             return 0.0
         corner = expected.tracks[i] < OPENINGS
         form_variance = expected.variances[i, 1] + observed.variances[j, 1] + (model.heading if corner else model.width)

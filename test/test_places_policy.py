@@ -12,7 +12,7 @@ from hmt_slam_ros.places.observation import observation_model
 from hmt_slam_ros.places.observation_graph import Landmarks, joined, no_landmarks
 from hmt_slam_ros.places.place_graph import EAST, NORTH, SOUTH, WEST, Edge, Node, place_graph, state_of
 from hmt_slam_ros.places.policy import most_informative_turn, next_turn, turn_towards
-from hmt_slam_ros.places.position_belief import PositionBelief, certain_belief, flat_belief
+from hmt_slam_ros.places.position_belief import PositionBelief, certain_belief
 
 PLACES = Places()
 MODEL = observation_model(PLACES, Features())
@@ -68,6 +68,6 @@ def test_a_robot_that_is_not_sure_goes_where_places_differ():
 
 def test_without_a_way_there_is_no_turn():
     graph = place_graph([Node(1.0, EMPTY, EMPTY)], [], PLACES)
-    assert most_informative_turn(flat_belief(graph, PLACES), MODEL) is None
-    lost = dataclasses.replace(flat_belief(graph, PLACES), logs=np.log([0.05] * 4 + [0.8]))
+    assert most_informative_turn(certain_belief(graph, PLACES, 0), MODEL) is None
+    lost = dataclasses.replace(certain_belief(graph, PLACES, 0), logs=np.log([0.05] * 4 + [0.8]))
     assert most_informative_turn(lost, MODEL) is None

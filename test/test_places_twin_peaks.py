@@ -5,18 +5,18 @@ import math
 
 import numpy as np
 import pytest
+from rough_places import ROUGH
 
 from benchmark.belief_corridors import Corridors, drawn_building, random_corridors
 from benchmark.belief_world import drawn_of_present
 from hmt_slam_ros.configuration.features import Features
-from hmt_slam_ros.configuration.places import Places
 from hmt_slam_ros.places.observation import observation_model
 from hmt_slam_ros.places.observation_graph import Landmarks, no_landmarks
 from hmt_slam_ros.places.place_graph import EAST, Edge, Node, heading_of, place_graph, state_of
 from hmt_slam_ros.places.position_belief import PositionBelief, Travel, certain_belief, flat_belief
 from hmt_slam_ros.places.twin_peaks import TwinPeaks
 
-PLACES = Places()
+PLACES = ROUGH
 MODEL = observation_model(PLACES, Features())
 NOISE = (0.01, 0.001)
 ROUND = 5  # nodes of the loop

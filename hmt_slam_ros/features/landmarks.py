@@ -14,9 +14,9 @@ import numpy as np
 
 from hmt_slam_ros.arrays import Bool, Float64, Int64
 from hmt_slam_ros.configuration.features import Features
-from hmt_slam_ros.features.corners import corners_of
+from hmt_slam_ros.features.corners import Corners, corners_of
 from hmt_slam_ros.features.extraction import Lines
-from hmt_slam_ros.features.openings import openings_of
+from hmt_slam_ros.features.openings import Openings, openings_of
 from hmt_slam_ros.features.rays import Rays
 from hmt_slam_ros.geometry import se2
 
@@ -57,7 +57,11 @@ class Landmarks(NamedTuple):
 
 def landmarks_of(lines: Lines, rays: Rays, features: Features) -> Landmarks:
     """All that the lines and beams of a scan show."""
-    corners, openings = corners_of(lines, features), openings_of(lines, rays, features)
+    return both(corners_of(lines, features), openings_of(lines, rays, features))
+
+
+def both(corners: Corners, openings: Openings) -> Landmarks:
+    """Corners and openings as landmarks, in this order."""
     none = np.zeros(len(corners.poses))
     return Landmarks(
         np.concatenate((np.where(corners.convex, OUTER, INNER), np.full(len(openings.poses), OPENING))),

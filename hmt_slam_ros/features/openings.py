@@ -52,6 +52,10 @@ class Openings(NamedTuple):
     confidences: Float64
 
 
+NO_OPENINGS = Openings(np.empty((0, 3)), np.empty((0, 3, 3)), np.empty(0), np.empty(0), np.empty(0))
+"""What a scan shows before the first one."""
+
+
 def openings_of(lines: Lines, rays: Rays, features: Features) -> Openings:
     """The openings in the walls that lines show."""
     return openings_and_evidence(lines, rays, features)[0]

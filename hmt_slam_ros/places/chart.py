@@ -29,7 +29,7 @@ from hmt_slam_ros.places.floor import DIRECTIONS, AreaView, Floor, floors
 from hmt_slam_ros.places.leading_off import LeadingOff, leading_off
 from hmt_slam_ros.places.observation_graph import QUARTERS
 from hmt_slam_ros.places.place_graph import EAST, NORTH, Edge, Node, PlaceGraph, opposite, place_graph
-from hmt_slam_ros.places.wall_landmarks import Known, Stretch, known_around, looks, of_stretch
+from hmt_slam_ros.places.wall_landmarks import Known, Stretch, known_around, of_stretch, with_hallways
 from hmt_slam_ros.topology.hybrid_map import HybridMap
 
 DOOR, CROSSING, END = range(3)
@@ -38,14 +38,18 @@ DOOR, CROSSING, END = range(3)
 NAMES = ("door", "crossing", "end")
 """Their names."""
 
+BEFORE = 1.0
+"""So far before the wall at the end of a hallway, m, is the node there, where a robot turns."""
+
 # Places nearer to each other than this, m, are one node.
 _SAME = 0.6
 # A hallway was driven along without a gap longer than this, m, within so much of its middle, m; and its end is so far
 # behind the last keyframe at most, m.
 _GAP, _MIDDLE, _END = 3.0, 0.9, 4.0
-# A robot that drives on as far as this, m, before the wall at the end of a hallway has to turn; and nodes that are
-# nearer to it than this, m, are as good as it.
-_BEFORE, _ON = 1.0, 1.0
+# The next node is so far beyond what was driven along, m, at most.
+_ON = 1.0
+# An end that is nearer than this to the last node, m, is none of its own.
+_APART = 1.5
 # Deviation of a node's place in its area, m, and of the direction of a hallway, rad.
 _PLACED, _STRAIGHT = 0.02, 0.01
 
@@ -198,8 +202,8 @@ class _Charting:
         place = self._places[k]
         far, last = self._driven(k, direction)
         wall = math.nan if last is None else float(self._floors[place.area].clear[last, direction])
-        distance = far + wall - _BEFORE
-        if wall <= _END and distance > _ON:
+        distance = far + wall - BEFORE
+        if wall <= _END and distance > _APART:
             at = place.at + distance * DIRECTIONS[direction]
             self._places.append(_Place(place.area, at, END, 1.0, (), frozenset()))
             yield _Way(k, direction, len(self._places) - 1, distance, 2.0 * _PLACED**2)
@@ -257,18 +261,21 @@ class _Charting:
             begin = 0.0 if (k, opposite(direction)) in left else -np.inf
             end = 0.0 if (k, direction) in left else np.inf
             stretch = Stretch(place.at, direction, begin, end)
-            around = self._around(place.area)
-            lists.append(of_stretch(around, self._floors[place.area], stretch, members, place.members))
+            around, floor = self._around(place.area), self._floors[place.area]
+            found = of_stretch(around, floor, stretch, members, place.members)
+            led = not math.isinf(begin) or not math.isinf(end)
+            sides = [d for d in (direction - 1, direction + 1) if led and (k, d % QUARTERS) in left]
+            lists.append(with_hallways(found, floor, place.at, direction, sides))
         return Node(place.existence, *lists)
 
 
 def _place_of(group: Sequence[LeadingOff], feet: Float64) -> _Place:
-    """The node of some openings, in the frame of the one that was looked at most often.
+    """The node of some openings, in the frame of the area in which one of them is believed in most.
 
     :param feet: shape (n, 2), their places in the hallway's middle, in that frame.
     """
     best: dict[int, LeadingOff] = {}
-    for one in sorted(group, key=lambda one: -looks(one.landmark)):
+    for one in sorted(group, key=lambda one: -one.landmark.existence.probability):
         best.setdefault(one.direction, one)
     openings = tuple(best[direction] for direction in sorted(best))
     hallway = any(one.hallway for one in openings)
@@ -278,8 +285,8 @@ def _place_of(group: Sequence[LeadingOff], feet: Float64) -> _Place:
 
 
 def _home(group: Sequence[LeadingOff]) -> int:
-    """The area in which one of some openings was looked at most often."""
-    return max(group, key=lambda one: looks(one.landmark)).area
+    """The area in which one of some openings is believed in most."""
+    return max(group, key=lambda one: one.landmark.existence.probability).area
 
 
 def _ahead_of(places: Float64, at: Float64, direction: int) -> tuple[Float64, Float64]:

@@ -5,7 +5,8 @@ finite set of landmarks, and OS its density under this model, track by track (ob
 
 - The robot is ``delta`` beyond where it is taken to be along the axis, delta ~ N(0, tau^2).
 - Landmark i of the map, at x_i - delta, is extracted within reach with probability q_i = p_lmap p_det P(within reach).
-  It is then measured at N(x_i - delta, .), with a form (heading or width) of N(f_i, .): together g_ij.
+  Within reach of a convex corner is the robot only on the side of it to which that looks, where both of its walls are
+  in sight. It is then measured at N(x_i - delta, .), with a form (heading or width) of N(f_i, .): together g_ij.
 - What is not in the map is a Poisson process over the reach: landmarks of density lambda_new, and such that are none,
   of density lambda_false. Forms are uniform there, of density u.
 - Confidences p_l are calibrated: among all extracted landmarks they have some density h of mean pi, and are the
@@ -39,7 +40,7 @@ from numba import njit
 from hmt_slam_ros.arrays import Float64, Int64
 from hmt_slam_ros.configuration.features import Features
 from hmt_slam_ros.configuration.places import Places
-from hmt_slam_ros.places.observation_graph import OPENINGS, TRACKS, Landmarks
+from hmt_slam_ros.places.observation_graph import CONVEX, OPENINGS, TRACKS, Landmarks, chosen
 
 # Beyond so many deviations nothing is matched, and a landmark is not within reach.
 _FAR = 9.0
@@ -107,6 +108,25 @@ def log_observation(
     shifts, weights = _places_along(variance, model)
     tracks = np.searchsorted(observed.tracks, np.arange(TRACKS + 1))
     return _log_ratios(observed, tracks, _matched(observed, model), expected, away + shifts, weights, model)
+
+
+def place_along(
+    observed: Landmarks, expected: Expected, state: int, away: float, variance: float, model: ObservationModel
+) -> tuple[float, float]:
+    """How far the robot is beyond a state's node after what it observed, m, and the variance of that, m^2."""
+    shifts, weights = _places_along(variance, model)
+    tracks = np.searchsorted(observed.tracks, np.arange(TRACKS + 1))
+    own = chosen(expected.landmarks, slice(*expected.starts[state : state + 2].tolist()))
+    alone = Expected(np.array([0, len(own.tracks)]), own)
+    matched = _matched(observed, model)
+    logs = np.array([
+        _log_ratios(observed, tracks, matched, alone, np.array([away + shift]), np.array([weight]), model)[0]
+        for shift, weight in zip(shifts.tolist(), weights.tolist(), strict=True)
+    ])  # fmt: skip
+    shares = np.exp(logs - logs.max())
+    shares /= shares.sum()
+    mean = float(shares @ shifts)
+    return away + mean, float(shares @ (shifts - mean) ** 2)
 
 
 def log_unknown_ground(observed: Landmarks, model: ObservationModel) -> float:
@@ -184,12 +204,14 @@ def _forward(
     place, variance = landmarks.along[own] - away, landmarks.variances[own, 0] + model.along
     form_variance = landmarks.variances[own, 1] + (model.heading if landmarks.tracks[own] < OPENINGS else model.width)
     seen = landmarks.probabilities[own] * model.detection
-    missed = 1.0 - seen * _within(place, math.sqrt(variance), model.reach)
+    low, high = reach_of(landmarks.tracks[own], landmarks.forms[own], model.reach)
+    missed = 1.0 - seen * _within(place, math.sqrt(variance), low, high)
     before, paired = row[0], 0.0
     row[0] *= missed
     for j in range(count):
         k = first + j
         here = _fit(observed.along[k] - place, variance + observed.variances[k, 0])
+        here = here if low <= observed.along[k] <= high else 0.0
         if here > 0.0:
             off = observed.forms[k] - landmarks.forms[own]
             if landmarks.tracks[own] < OPENINGS:
@@ -214,11 +236,22 @@ def _fit(off: float, variance: float) -> float:
 
 
 @njit(cache=True)
-def _within(place: float, deviation: float, reach: float) -> float:
-    """Probability that a landmark is measured within reach."""
-    if abs(place) < reach - _FAR * deviation:
+def reach_of(track: int, form: float, reach: float) -> tuple[float, float]:
+    """From where to where ahead of the robot a landmark is in sight, m.
+
+    :param form: as of `Landmarks`.
+    """
+    if track not in {CONVEX, CONVEX + 1}:
+        return -reach, reach
+    return (-reach, 0.0) if math.cos(form) > 0.0 else (0.0, reach)
+
+
+@njit(cache=True)
+def _within(place: float, deviation: float, low: float, high: float) -> float:
+    """Probability that a landmark is measured between two places."""
+    if low + _FAR * deviation < place < high - _FAR * deviation:
         return 1.0
-    if abs(place) > reach + _FAR * deviation:
+    if not low - _FAR * deviation <= place <= high + _FAR * deviation:
         return 0.0
     scale = 1.0 / (math.sqrt(2.0) * deviation)
-    return 0.5 * (math.erf((reach - place) * scale) - math.erf((-reach - place) * scale))
+    return 0.5 * (math.erf((high - place) * scale) - math.erf((low - place) * scale))

@@ -30,6 +30,9 @@ TRACK_NAMES = (
 )  # fmt: skip
 """What the tracks are called."""
 
+CONVEX = 2
+"""The first track of convex corners."""
+
 OPENINGS = 4
 """The first track of openings."""
 
@@ -124,6 +127,18 @@ def joined(lists: Sequence[Landmarks]) -> Landmarks:
     """Several lists as one, in its order."""
     every = one_after_the_other(lists)
     return chosen(every, np.lexsort((every.along, every.tracks)))
+
+
+def of_walls(landmarks: Landmarks) -> Landmarks:
+    """Those of a hallway's walls to both sides: corners that look at its middle, and openings that lead to a side.
+
+    Corners of rooms are seen through doors alone, and openings along the hallway, as one sees them at a crossing, come
+    and go.
+    """
+    left = np.where(landmarks.tracks % 2 == 0, 1.0, -1.0)
+    looks_in = left * np.sin(landmarks.forms) < 0.0
+    sideways = (landmarks.tracks == OPENINGS + 1) | (landmarks.tracks == OPENINGS + 3)
+    return chosen(landmarks, np.where(landmarks.tracks < OPENINGS, looks_in, sideways))
 
 
 def moved(landmarks: Landmarks, distance: float) -> Landmarks:

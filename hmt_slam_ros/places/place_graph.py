@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hmt_slam_ros.arrays import Float64, Int64
+from hmt_slam_ros.arrays import Bool, Float64, Int64
 from hmt_slam_ros.configuration.places import Places
 from hmt_slam_ros.places.observation import Expected
 from hmt_slam_ros.places.observation_graph import (
@@ -105,6 +105,7 @@ class PlaceGraph:
     :ivar states: how many there are, four of every node.
     :ivar following: shape (states,), the state at the end of each state's edge, -1 where the map has none.
     :ivar lengths: shape (states,), mean length of that edge, m, nan where there is none.
+    :ivar travelled: shape (states,), whether the map has a hallway in the direction of a state, ahead or back.
     :ivar arcs: from state to state.
     :ivar expected: what is to be seen from every state, over its edge and the reach.
     """
@@ -112,6 +113,7 @@ class PlaceGraph:
     states: int
     following: Int64
     lengths: Float64
+    travelled: Bool
     arcs: Arcs
     expected: Expected
 
@@ -156,7 +158,9 @@ def place_graph(nodes: Sequence[Node], edges: Sequence[Edge], places: Places) ->
     lists = [_seen_from(state, nodes, leaving, places.reach) for state in range(states)]
     starts = np.concatenate(([0], np.cumsum([len(each.tracks) for each in lists])))
     expected = Expected(starts, one_after_the_other(lists))
-    return PlaceGraph(states, following, lengths, _arcs(nodes, leaving, places), expected)
+    onwards = (following >= 0).reshape(-1, QUARTERS)
+    travelled = (onwards | np.roll(onwards, 2, axis=1)).ravel()
+    return PlaceGraph(states, following, lengths, travelled, _arcs(nodes, leaving, places), expected)
 
 
 def _arcs(nodes: Sequence[Node], leaving: Mapping[int, Edge], places: Places) -> Arcs:
@@ -181,14 +185,20 @@ def _ways_on(
             return
         distance, turn = distance + edge.distance, turn + edge.turn
         state = state_of(edge.end, edge.arriving)
-        noticed = nodes[edge.end].existence * places.detection if state in leaving else 1.0
+        noticed = nodes[edge.end].existence * places.noticed if state in leaving else 1.0
         yield (source, state, passed * noticed, distance[0], turn[0], distance[1], turn[1])
         passed *= 1.0 - noticed
 
 
 def _seen_from(state: int, nodes: Sequence[Node], leaving: Mapping[int, Edge], reach: float) -> Landmarks:
-    """The landmarks of a straight hallway from so far behind a state's node to so far behind the end of its edge."""
-    ahead = leaving[state].distance[0] if state in leaving else 0.0
+    """The landmarks of a straight hallway from so far behind a state's node to so far behind the end of its edge.
+
+    Of the edges behind that, too, which end where the robot is when it passed openings without notice.
+    """
+    ahead, at = 0.0, state
+    for _ in range(1 + _PASSED):
+        if (edge := leaving.get(at)) is not None:
+            ahead, at = ahead + edge.distance[0], state_of(edge.end, edge.arriving)
     there = _along(state, nodes, leaving, ahead + reach)
     behind = _along(turned(state, 2), nodes, leaving, reach)
     return joined((_of_node(state, nodes), there, turned_back(behind)))

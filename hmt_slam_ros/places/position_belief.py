@@ -70,35 +70,58 @@ class PositionBelief:
         return self.entropy < self.places.max_entropy
 
     @property
+    def in_room(self) -> float:
+        """Probability that the robot's direction is one in which the map has no hallway, but, for example, a room."""
+        return float(self.probabilities[:-1][~self.graph.travelled].sum())
+
+    @property
     def most_likely(self) -> int | None:
         """The most likely state; None for unknown ground."""
         best = int(np.argmax(self.logs))
         return best if best < self.graph.states else None
 
-    def gone_on(self) -> PositionBelief:
-        """After a stretch on which no opening was noticed: T(s, a, s) = 1 - slip."""
-        return self._predicted(self.logs)
+    def gone_on(self, distance: float) -> PositionBelief:
+        """After a stretch on which no opening was noticed, m.
+
+        T(s, a, s) = 1 - slip over a way as long as that between two places, however often one looks meanwhile.
+        """
+        return self._predicted(self.logs, 1.0 - (1.0 - self.places.slip) ** (distance / self.places.spacing))
+
+    def is_listed(self, travel: Travel) -> bool:
+        """Whether an opening that was noticed is more probably one of the map, or of unknown ground, than one that the
+        map lacks in known ground. One that it lacks is a landmark, and no arrival.
+        """
+        logs = _densities(self.graph.arcs, np.array((travel.distance, travel.turn)), np.array(travel.variances))
+        arcs, shares = self.graph.arcs, self.probabilities
+        listed = float((shares[arcs.sources] * arcs.probabilities) @ np.exp(logs))
+        listed += shares[-1] * math.exp(self._usual(travel))
+        off = travel.turn**2 / travel.variances[1]
+        turn = math.exp(-0.5 * off) / math.sqrt(2.0 * math.pi * travel.variances[1])
+        return listed >= self.places.unlisted * turn * float(shares[:-1].sum())
 
     def turned(self, quarters: int) -> PositionBelief:
         """After so many quarters of a turn to the right at a node."""
         by_node = self.logs[:-1].reshape(-1, QUARTERS)
-        return self._predicted(np.append(np.roll(by_node, quarters, axis=1).ravel(), self.logs[-1]))
+        turned_logs = np.append(np.roll(by_node, quarters, axis=1).ravel(), self.logs[-1])
+        return self._predicted(turned_logs, self.places.slip)
 
-    def _predicted(self, logs: Float64) -> PositionBelief:
+    def _predicted(self, logs: Float64, slip: float) -> PositionBelief:
         """Each state keeps all but ``slip``, of which every other one gets its share."""
-        slip, others = self.places.slip, len(logs) - 1
+        others = len(logs) - 1
         probabilities = np.exp(logs)
         predicted = (1.0 - slip) * probabilities + slip / others * (probabilities.sum() - probabilities)
         return replace(self, logs=_normalised(_log(predicted)))
 
     def arrived(self, travel: Travel) -> PositionBelief:
         """After the next opening was noticed, Eq. (1) with d as a part of o."""
-        usual = -math.log(2.0 * math.pi * self.places.spacing) - travel.distance / self.places.spacing
-        predicted = _arrived(
-            np.exp(self.logs), self.graph.arcs, np.array((travel.distance, travel.turn)), np.array(travel.variances),
-            usual, self.places.slip, self.places.discovery,
-        )  # fmt: skip
+        way, noise = np.array((travel.distance, travel.turn)), np.array(travel.variances)
+        densities = np.exp(_densities(self.graph.arcs, way, noise) - self._usual(travel))
+        predicted = _arrived(self.probabilities, self.graph.arcs, densities, self.places.slip, self.places.discovery)
         return replace(self, logs=_normalised(_log(predicted)))
+
+    def _usual(self, travel: Travel) -> float:
+        """Log-density of a way that the map does not tell."""
+        return -math.log(2.0 * math.pi * self.places.spacing) - travel.distance / self.places.spacing
 
     def observed(
         self, graph: Landmarks, model: ObservationModel, away: float = 0.0, variance: float = 0.0
@@ -113,8 +136,14 @@ class PositionBelief:
 
 
 def flat_belief(graph: PlaceGraph, places: Places) -> PositionBelief:
-    """Nothing is known of where the robot is."""
-    logs = np.full(graph.states + 1, math.log1p(-places.unmapped) - math.log(graph.states))
+    """Nothing is known of where the robot is, but that it is in a hallway that it can go along.
+
+    :raises ValueError: where the map has none.
+    """
+    if not graph.travelled.any():
+        raise ValueError("a map without a stretch of hallway holds no place to be at")
+    logs = np.full(graph.states + 1, -np.inf)
+    logs[:-1][graph.travelled] = math.log1p(-places.unmapped) - math.log(graph.travelled.sum())
     logs[-1] = math.log(places.unmapped)
     return PositionBelief(graph, places, logs)
 
@@ -140,10 +169,24 @@ def _normalised(logs: Float64) -> Float64:
 
 
 @njit(cache=True)
-def _arrived(
-    belief: Float64, arcs: Arcs, way: Float64, noise: Float64, usual: float, slip: float, discovery: float
-) -> Float64:
-    """sum_s T(s, a, s') p(d | s, s') SE_s up to a factor: densities are relative to what is usual, given as a log.
+def _densities(arcs: Arcs, way: Float64, noise: Float64) -> Float64:
+    """Log-densities of a distance, m, and a turn, rad, of all arcs, shape (k,)."""
+    found = np.zeros(len(arcs.sources))
+    for k in range(len(arcs.sources)):
+        for axis in range(2):
+            variance = arcs.variances[k, axis] + noise[axis]
+            off = way[axis] - arcs.means[k, axis]
+            if axis == 1:
+                off = (off + math.pi) % (2.0 * math.pi) - math.pi
+            found[k] -= 0.5 * (off * off / variance + math.log(2.0 * math.pi * variance))
+    return found
+
+
+@njit(cache=True)
+def _arrived(belief: Float64, arcs: Arcs, densities: Float64, slip: float, discovery: float) -> Float64:
+    """sum_s T(s, a, s') p(d | s, s') SE_s up to a factor.
+
+    :param densities: shape (k,), p(d | s, s') of the arcs against that of what is usual.
 
     What no arc of a state accounts for leads to unknown ground.
     """
@@ -153,14 +196,7 @@ def _arrived(
     predicted[states] = slip / states * mapped + (1.0 - discovery) * unmapped + (1.0 - slip) * mapped
     for k in range(len(arcs.sources)):
         share = (1.0 - slip) * arcs.probabilities[k] * belief[arcs.sources[k]]
-        log_density = -usual
-        for axis in range(2):
-            variance = arcs.variances[k, axis] + noise[axis]
-            off = way[axis] - arcs.means[k, axis]
-            if axis == 1:
-                off = (off + math.pi) % (2.0 * math.pi) - math.pi
-            log_density -= 0.5 * (off * off / variance + math.log(2.0 * math.pi * variance))
         predicted[states] -= share
-        predicted[arcs.targets[k]] += share * math.exp(log_density)
+        predicted[arcs.targets[k]] += share * densities[k]
     predicted[states] = max(predicted[states], slip / states * mapped + (1.0 - discovery) * unmapped)
     return predicted

@@ -1,13 +1,13 @@
 """The landmarks of a hallway's walls, along a stretch of it, as a robot sees them that travels there.
 
-What is behind the walls, in rooms and in other hallways, is seen through openings alone, and is left out; so is the
-face of an opening's wall that looks into the room.
+What is behind the walls, in rooms and in other hallways, is seen through openings alone, and is left out; so is what
+looks into a room, as an opening and the corners of a room's wall do.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -21,15 +21,27 @@ from hmt_slam_ros.features.landmarks import OPENING, OUTER
 from hmt_slam_ros.features.openings import Openings
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.places.floor import DIRECTIONS, AreaView, Floor
-from hmt_slam_ros.places.observation_graph import QUARTERS, Landmarks, observation_graph
+from hmt_slam_ros.places.observation_graph import (
+    OPENINGS,
+    QUARTERS,
+    Landmarks,
+    chosen,
+    joined,
+    observation_graph,
+    of_walls,
+)
 
 # Landmarks of one kind that are so near to each other, m and rad, are one that several areas know.
 _TWICE, _TURN = 0.4, 0.5
 # A landmark so far behind a hallway's wall, m, is of the wall; the hallway is as wide as seen from keyframes so near to
 # its middle and to the stretch, m, or, where there are none, half as wide as this, m.
-_WALL, _MIDDLE, _BESIDE, _HALF = 0.4, 0.9, 2.0, 1.2
+_WALL, _MIDDLE, _BESIDE, _HALF, _NARROW = 0.4, 0.9, 2.0, 1.2, 0.25
 # A stretch without an end is this long, m.
 _FAR = 10.0
+
+# The opening of a hallway is so near to its node along another one, m, and believed in so much at least; of one that
+# is no landmark place and width are known so well, m, the width from so far into it, m.
+_SAME, _SURE, _UNSEEN, _INTO = 0.6, 0.9, (0.1, 0.2), (1.5, 6.0)
 
 # All that is on the stretch counts, however far away.
 _EVERYTHING = replace(Places(), reach=100.0, aside=100.0)
@@ -53,7 +65,7 @@ class Stretch(NamedTuple):
 class Known(NamedTuple):
     """The landmarks of a floor, each once.
 
-    :ivar landmarks: as the area knows them in which they were looked at most often.
+    :ivar landmarks: as the area knows them in which they are believed in most.
     :ivar poses: shape (n, 3), in the frame of the floor.
     :ivar members: which landmarks (area, number) each is.
     """
@@ -71,7 +83,7 @@ def known_around(floor: Floor, views: Mapping[int, AreaView]) -> Known:
         for number, landmark in enumerate(views[area].landmarks)
     ]
     known = Known([], np.empty((len(every), 3)), [])
-    for landmark, pose, member in sorted(every, key=lambda each: (-looks(each[0]), each[2])):
+    for landmark, pose, member in sorted(every, key=lambda each: (-each[0].existence.probability, each[2])):
         same = [k for k in range(len(known.landmarks)) if _one(known, k, landmark, pose)]
         if same:
             known.members[same[0]].add(member)
@@ -80,11 +92,6 @@ def known_around(floor: Floor, views: Mapping[int, AreaView]) -> Known:
             known.landmarks.append(landmark)
             known.members.append({member})
     return known._replace(poses=known.poses[: len(known.landmarks)])
-
-
-def looks(landmark: Landmark) -> int:
-    """How often one looked at a landmark, or for it."""
-    return landmark.existence.seen + landmark.existence.missed
 
 
 def of_stretch(
@@ -104,10 +111,39 @@ def of_stretch(
     local = se2.between(frame, known.poses)
     begin, end = max(stretch.begin, -_FAR), min(stretch.end, _FAR) if math.isinf(stretch.end) else stretch.end
     walls = np.abs(local[:, 1]) <= _half(floor, stretch, begin, end) + _WALL
-    on = (begin <= local[:, 0]) & (local[:, 0] < end) & walls & _faced(known, local)
+    on = (begin <= local[:, 0]) & (local[:, 0] < end) & walls
     on &= np.array([not own.intersection(without) for own in known.members], dtype=np.bool_)
     on |= np.array([bool(own.intersection(always)) for own in known.members], dtype=np.bool_)
+    on &= _faced(known, local, stretch)
     return _as_seen([known.landmarks[k] for k in np.flatnonzero(on).tolist()], local[on])
+
+
+def with_hallways(landmarks: Landmarks, floor: Floor, at: Float64, direction: int, sides: Sequence[int]) -> Landmarks:
+    """The landmarks of a node with the hallways that lead on from it to the sides as openings.
+
+    Those are there, whether or not many scans showed both of their jambs.
+
+    :param landmarks: as seen from the node.
+    :param at: shape (2,), the node.
+    :param direction: of travel.
+    :param sides: directions to the left and the right in which hallways lead on.
+    """
+    lists = [landmarks]
+    for side in sides:
+        track = OPENINGS + (direction - side) % QUARTERS
+        own = (lists[0].tracks == track) & (np.abs(lists[0].along) < _SAME)
+        best = chosen(lists[0], np.flatnonzero(own)[np.argsort(-lists[0].probabilities[own], kind="stable")[:1]])
+        if not len(best.tracks):
+            hallway = Stretch(at, side % QUARTERS, *_INTO)
+            best = _opening(track, 2.0 * _half(floor, hallway, *_INTO))
+        lists = [chosen(lists[0], ~own), *lists[1:], best._replace(probabilities=np.maximum(best.probabilities, _SURE))]
+    return joined(lists)
+
+
+def _opening(track: int, width: float) -> Landmarks:
+    """An opening at a node that no scan showed as one."""
+    variances = np.array([_UNSEEN]) ** 2
+    return Landmarks(np.array([track]), np.zeros(1), np.array([width]), variances, np.zeros(1))
 
 
 def _one(known: Known, k: int, landmark: Landmark, pose: Float64) -> bool:
@@ -117,21 +153,24 @@ def _one(known: Known, k: int, landmark: Landmark, pose: Float64) -> bool:
 
 
 def _half(floor: Floor, stretch: Stretch, begin: float, end: float) -> float:
-    """Half the width of the hallway, m."""
+    """Half the width of the hallway, m: that at its narrower places, where no other one leads off."""
     away = floor.places - stretch.at
     side = (stretch.direction + 1) % QUARTERS
     ahead, beside = away @ DIRECTIONS[stretch.direction], away @ DIRECTIONS[side]
     own = floor.along[:, stretch.direction % 2] & (np.abs(beside) <= _MIDDLE)
     own &= (begin - _BESIDE <= ahead) & (ahead <= end + _BESIDE)
     widths = floor.clear[own, side] + floor.clear[own, (side + 2) % QUARTERS]
-    return 0.5 * float(np.nanmedian(widths)) if np.isfinite(widths).any() else _HALF
+    return 0.5 * float(np.nanquantile(widths, _NARROW)) if np.isfinite(widths).any() else _HALF
 
 
-def _faced(known: Known, local: Float64) -> Bool:
-    """Which landmarks look as they do from the hallway's middle: an opening to a side leads away from it."""
+def _faced(known: Known, local: Float64, stretch: Stretch) -> Bool:
+    """Which landmarks are not those of other walls: openings lead away from the hallway, and beyond where it ends
+    corners look back at it.
+    """
     opening = np.array([landmark.kind == OPENING for landmark in known.landmarks], dtype=np.bool_)
-    aside = np.sin(local[:, 2])
-    return ~opening | (np.abs(aside) < math.sqrt(0.5)) | (aside * local[:, 1] > 0.0)
+    ahead, aside = np.cos(local[:, 2]), np.sin(local[:, 2])
+    beyond = np.where(local[:, 0] < 0.0, math.isinf(stretch.begin), math.isinf(stretch.end))
+    return np.where(opening, aside * local[:, 1] > 0.0, ~(beyond & (ahead * local[:, 0] > 0.0)))
 
 
 def _as_seen(landmarks: list[Landmark], poses: Float64) -> Landmarks:
@@ -143,4 +182,4 @@ def _as_seen(landmarks: list[Landmark], poses: Float64) -> Landmarks:
     widths = np.array([(landmark.width, landmark.width_deviation) for landmark in landmarks]).reshape(-1, 2)[opening]
     corners = Corners(poses[~opening], covariances[~opening], convex[~opening], existence[~opening])
     openings = Openings(poses[opening], covariances[opening], widths[:, 0], widths[:, 1], existence[opening])
-    return observation_graph(corners, openings, 0.0, _EVERYTHING)
+    return of_walls(observation_graph(corners, openings, 0.0, _EVERYTHING))

@@ -1,0 +1,60 @@
+"""A small floor: a hallway with two doors, one opposite the other, a third one, and a crossing; and its chart."""
+
+import math
+
+import numpy as np
+from worlds import scan_at
+
+from hmt_slam_ros.configuration import Configuration
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.local_map.area_landmarks import AreaLandmarks
+from hmt_slam_ros.local_map.local_mapping import LocalMapping
+from hmt_slam_ros.places.chart import chart_of
+from hmt_slam_ros.places.floor import views_of
+from hmt_slam_ros.simulation.building import FloorPlan
+from hmt_slam_ros.topology.hybrid_map import HybridMap
+
+CONFIGURATION = Configuration()
+# The world's pose of the second area, which begins behind the first door, and where the building stands.
+AREAS = {0: np.zeros(3), 1: np.array([9.0, 0.3, 2.0])}
+BUILDING = np.array([3.0, -2.0, 0.4])
+
+
+def walls():
+    """A hallway along x from 0 to 22 m, doors to the north at 5 m, on both sides at 10 m, another hallway at 16 m."""
+    plan = FloorPlan()
+    plan.free(0.0, -1.0, 22.0, 1.0)
+    plan.free(15.0, 1.0, 17.0, 12.0)
+    for x, side in ((5.0, 1.0), (10.1, 1.0), (9.9, -1.0)):
+        plan.free(x - 0.5, min(side, 1.3 * side), x + 0.5, max(side, 1.3 * side))
+        plan.free(x - 2.0, min(1.2 * side, 5.0 * side), x + 2.0, max(1.2 * side, 5.0 * side))
+    found = plan.walls()
+    return np.concatenate([se2.transform(BUILDING, found[:, k : k + 2]) for k in (0, 2)], axis=1)
+
+
+def keyframes(crossing_driven=True):
+    """Along the hallway, into the first room and up the other hallway."""
+    places = [(x, 0.1, 0.0) for x in np.arange(1.0, 21.2, 0.5)]
+    places += [(5.0, y, 0.5 * math.pi) for y in np.arange(0.5, 3.2, 0.5)]
+    if crossing_driven:
+        places += [(16.0, y, 0.5 * math.pi) for y in np.arange(0.5, 11.2, 0.5)]
+    return np.array(places)
+
+
+def seen_at(pose, rng):
+    """The scan at a pose (3,) of the floor."""
+    return scan_at(walls(), se2.compose(BUILDING, pose), 0.01, rng, 720)
+
+
+def charted(crossing_driven=True):
+    """The chart, the map that it is of, and what its areas show."""
+    hybrid_map, scans, rng = HybridMap(), {}, np.random.default_rng(1)
+    for k, pose in enumerate(keyframes(crossing_driven)):
+        area = int(pose[0] > 8.0)
+        hybrid_map.place(k, area, se2.between(AREAS[area], pose))
+        scans[k] = seen_at(pose, rng)
+    arc = se2.between(AREAS[0], AREAS[1])
+    hybrid_map.set_arc(0, 1, PoseGaussian(arc, np.diag([0.03, 0.03, 0.003]) ** 2), closure=False)
+    views = views_of(hybrid_map, scans, AreaLandmarks(LocalMapping(CONFIGURATION)))
+    return chart_of(hybrid_map, views, CONFIGURATION.features), hybrid_map, views

@@ -1,0 +1,121 @@
+"""The belief over places of a robot that drives through a small floor, and what the metric filter starts with."""
+
+import math
+
+import numpy as np
+import pytest
+from small_floor import AREAS, CONFIGURATION, charted, seen_at
+
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.places.chart import DOOR
+from hmt_slam_ros.places.estimator import PlaceEstimator
+from hmt_slam_ros.places.place_graph import heading_of, node_of, opposite, state_of
+from hmt_slam_ros.places.position_belief import certain_belief
+from hmt_slam_ros.places.switching import metric_start
+from hmt_slam_ros.sensing.motion import Step, increment_covariance
+
+
+@pytest.fixture(scope="module")
+def chart():
+    return charted()[0]
+
+
+@pytest.fixture(scope="module")
+def graph(chart):
+    return chart.graph(CONFIGURATION.places)
+
+
+def node_at(chart, x, y=0.0):
+    places = np.array([se2.compose(AREAS[node.area], node.pose) for node in chart.nodes])
+    return int(np.hypot(*(places[:, :2] - (x, y)).T).argmin())
+
+
+def eastwards(chart):
+    """The direction of the chart in which x grows."""
+    first, second = node_at(chart, 5.0), node_at(chart, 10.0)
+    return next(edge.leaving for edge in chart.edges if (edge.start, edge.end) == (first, second))
+
+
+def line(start, end, heading=None):
+    """Poses from place to place, 0.12 m apart; on the spot a turn of 0.2 rad each."""
+    (x0, y0), (x1, y1) = start, end
+    heading = math.atan2(y1 - y0, x1 - x0) if heading is None else heading
+    count = max(2, int(math.dist(start, end) / 0.12))
+    return [(x, y, heading) for x, y in zip(np.linspace(x0, x1, count), np.linspace(y0, y1, count), strict=True)]
+
+
+def turn(place, before, after):
+    return [(*place, heading) for heading in np.linspace(before, after, 9)]
+
+
+def drive(estimator, poses, seed=0):
+    """What an estimator says after every scan of a way; odometry with 1 % of noise."""
+    rng = np.random.default_rng(seed)
+    for before, after in zip([poses[0], *poses[:-1]], poses, strict=True):
+        increment = se2.between(np.array(before), np.array(after))
+        noisy = increment * (1.0 + rng.normal(0.0, 0.01, 3))
+        estimator.moved(Step(noisy, increment_covariance(noisy, CONFIGURATION.motion)))
+        yield estimator.observe(seen_at(np.array(after), rng))
+
+
+def test_a_lost_robot_knows_its_place_after_some_nodes_and_how_far_it_is_beyond_the_last_one(chart, graph):
+    estimator = PlaceEstimator(graph, CONFIGURATION)
+    poses = line((2.0, 0.1), (19.0, 0.1))
+    beliefs = list(drive(estimator, poses))
+    assert beliefs[0] is None
+    assert estimator.arrivals == 3
+    assert estimator.belief.confident
+    state = estimator.belief.most_likely
+    assert (node_of(state), heading_of(state)) == (node_at(chart, 16.0), eastwards(chart))
+    assert estimator.away == pytest.approx(3.0, abs=0.1)
+    assert estimator.in_hallway
+
+
+def test_the_wall_at_the_end_is_a_node_and_after_the_turn_the_way_leads_back(chart, graph):
+    start = state_of(node_at(chart, 16.0), eastwards(chart))
+    estimator = PlaceEstimator(graph, CONFIGURATION, certain_belief(graph, CONFIGURATION.places, start))
+    poses = line((16.0, 0.0), (21.0, 0.0)) + turn((21.0, 0.0), 0.0, math.pi) + line((21.0, 0.0), (12.0, 0.0))
+    seen = [belief.most_likely for belief in drive(estimator, poses)]
+    end, back = node_at(chart, 21.0), opposite(eastwards(chart))
+    ways = [start, state_of(end, eastwards(chart)), state_of(end, back), state_of(node_at(chart, 16.0), back)]
+    assert [state for k, state in enumerate(seen) if not k or state != seen[k - 1]] == ways
+
+
+def test_in_a_room_the_belief_pauses_and_goes_on_at_the_door(chart, graph):
+    door = node_at(chart, 5.0)
+    assert chart.nodes[door].kind == DOOR
+    start = state_of(node_at(chart, 1.0), eastwards(chart))
+    estimator = PlaceEstimator(graph, CONFIGURATION, certain_belief(graph, CONFIGURATION.places, start))
+    up = 0.5 * math.pi
+    into = line((1.0, 0.0), (5.1, 0.0)) + turn((5.1, 0.0), 0.0, up) + line((5.1, 0.0), (5.1, 3.0))
+    inside = list(drive(estimator, into))[-1]
+    assert not estimator.in_hallway
+    about = [(5.1, 3.0, up + 0.2 * k) for k in range(16)]
+    assert list(drive(estimator, about))[-1] is inside
+    out = line((5.1, 3.0), (5.1, 0.0)) + turn((5.1, 0.0), 1.5 * math.pi, 2.0 * math.pi) + line((5.1, 0.0), (12.0, 0.0))
+    list(drive(estimator, [about[-1], *out]))
+    assert estimator.belief.confident
+    state = estimator.belief.most_likely
+    assert (node_of(state), heading_of(state)) == (node_at(chart, 10.0), eastwards(chart))
+
+
+def test_before_a_door_a_confident_robot_knows_its_pose_in_the_area_of_the_door(chart, graph):
+    start = state_of(node_at(chart, 1.0), eastwards(chart))
+    places = CONFIGURATION.places
+    estimator = PlaceEstimator(graph, CONFIGURATION, certain_belief(graph, places, start))
+    up = 0.5 * math.pi
+    poses = line((1.0, 0.0), (4.9, 0.0)) + turn((4.9, 0.0), 0.0, up) + line((4.9, 0.0), (4.9, 0.5))
+    list(drive(estimator, poses))
+    found = metric_start(estimator, chart)
+    assert found.node == node_at(chart, 5.0)
+    true = se2.between(AREAS[found.area], np.array(poses[-1]))
+    off = se2.log(se2.between(found.pose.mean, true))
+    assert np.hypot(*off[:2]) < 0.1
+    assert float(off @ np.linalg.solve(found.pose.covariance, off)) < 16.3
+    # One that is not confident does not switch, and neither does one that looks along the hallway.
+    lost = PlaceEstimator(graph, CONFIGURATION)
+    list(drive(lost, poses))
+    assert lost.belief is None or not lost.belief.confident
+    assert metric_start(lost, chart) is None
+    list(drive(estimator, line((4.9, 0.5), (4.9, 0.0), up) + turn((4.9, 0.0), up, 0.0)))
+    assert metric_start(estimator, chart) is None
