@@ -5,12 +5,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_places_chart import AREAS, CONFIGURATION, charted
+from small_floor import AREAS, charted
 
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.local_map.area_landmarks import AreaLandmarks
-from hmt_slam_ros.local_map.local_mapping import LocalMapping
 from hmt_slam_ros.offline.places_file import write_places
 
 BACK = {"north": "south", "south": "north", "east": "west", "west": "east"}
@@ -18,7 +16,7 @@ BACK = {"north": "south", "south": "north", "east": "west", "west": "east"}
 
 @pytest.fixture(scope="module")
 def document(tmp_path_factory: pytest.TempPathFactory) -> dict:
-    chart, _, _ = charted(AreaLandmarks(LocalMapping(CONFIGURATION)))
+    chart, _, _ = charted()
     poses = {area: PoseGaussian.exactly(pose) for area, pose in AREAS.items()}
     path: Path = write_places(tmp_path_factory.mktemp("places"), poses, chart)
     assert path.name == "places.json"
@@ -48,7 +46,7 @@ def test_ways_lead_from_place_to_place_and_back(document: dict) -> None:
 
 def test_landmarks_stand_in_the_order_in_which_they_are_met(document: dict) -> None:
     every = [landmark for way in document["ways"] for landmark in way["landmarks"]]
-    assert {landmark["track"] for landmark in every} >= {"left corner", "right corner"}
+    assert {landmark["track"] for landmark in every} >= {"left convex corner", "right convex corner"}
     for way in document["ways"]:
         along = [landmark["along"] for landmark in way["landmarks"]]
         assert along == sorted(along)
