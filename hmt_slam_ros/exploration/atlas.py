@@ -28,6 +28,8 @@ class Atlas:
         self.replica = replica or Replica()
         self._pose: RealTimePose | None = None
         self._frames: Frames | None = None
+        # Of each room that was entered the keyframes around the place where it was, the nearest first.
+        self._rooms: list[tuple[int, ...]] = []
 
     def hear(self, message: Message) -> None:
         """Take in a message of the chain, or a pose."""
@@ -86,9 +88,22 @@ class Atlas:
         area, pose = self.frames.placed(route.keyframes[-1])
         return area, se2.compose(pose, np.array([*last[-1], np.arctan2(towards[1], towards[0])]))
 
+    def enter(self) -> None:
+        """Give the room a name in which the robot is, if it is in one that has none."""
+        here = self.look()
+        room = self.survey.room_of(here.keyframe) if here is not None else ()
+        if room and not any(self.survey.same_room(room[0], known) for known in self._named().values()):
+            self._rooms.append(room)
+
+    def _named(self) -> dict[str, int]:
+        """{name: keyframe} of the rooms; keyframes of crowded ground are forgotten, and others stand for them."""
+        known = self.survey.roadmap
+        left = [next((keyframe for keyframe in room if keyframe in known), None) for room in self._rooms]
+        return {f"room {number}": keyframe for number, keyframe in enumerate(left, 1) if keyframe is not None}
+
     def places(self) -> dict[str, int]:
-        """{name: keyframe that is taken for its middle} of all places that have a name: rooms, and areas."""
-        named = {f"room {number}": keyframe for number, keyframe in enumerate(self.survey.rooms(), 1)}
+        """{name: keyframe that stands for it} of all places that have a name: rooms that were entered, and areas."""
+        named = self._named()
         hybrid_map = self.hybrid_map
         for area in hybrid_map.area_ids():
             own = {k: pose for k, pose in hybrid_map.keyframes(area).items() if k in self.survey.roadmap}

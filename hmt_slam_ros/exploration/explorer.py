@@ -25,6 +25,8 @@ from hmt_slam_ros.sensing import Scan
 
 # So near a frontier and a place are reached, m.
 _AT_FRONTIER, _AT_PLACE = 0.5, 0.15
+# So near a frontier nothing more is seen from it where the robot does not get nearer, m.
+_BESIDE_FRONTIER = 1.0
 # So near to a frontier in a hallway it is chosen anew, since it moves on, m.
 _MOVES_ON = 3.0
 # Frontiers nearer to each other than this, m, are one.
@@ -101,7 +103,9 @@ class Explorer:
         assert self._route is not None
         command = self._pilot.steer(scan, self.atlas.way(self._route), self._velocity)
         if self._pilot.arrived or self._pilot.stuck(scan.stamp, self._patience):
-            said += self._end(reached=self._pilot.arrived)
+            # What is to be seen at a frontier is seen from beside it.
+            near = self._exploring and self._pilot.left <= _BESIDE_FRONTIER
+            said += self._end(reached=self._pilot.arrived or near)
         return command.speed, command.turn_rate
 
     def _end(self, *, reached: bool) -> list[Message]:
@@ -110,6 +114,8 @@ class Explorer:
         if self._exploring:
             assert self._target is not None
             (self._reached if reached else self._given_up).append((self._target.keyframe, self._target.way[-1]))
+            if reached and not self._target.hallway:
+                self.atlas.enter()
             return []
         self._tries += 1
         if reached:

@@ -11,8 +11,8 @@ from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.motion import Command, Limits, command_towards
 from hmt_slam_ros.sensing import Scan
 
-# How far ahead on the way the robot looks, m.
-_AHEAD = 2.0
+# How far ahead on the way the robot looks, and how far at least where something stands there, m.
+_AHEAD, _LEAST = 2.0, 0.5
 # Within so much of the way ahead it takes the nearest place for its own, in steps of so much, m.
 _PASSED, _STEP = 3.0, 0.1
 # Progress is this much less that is left, m.
@@ -47,8 +47,14 @@ class Pilot:
         self.left = float(away.min()) + end - self._passed
         if self.left < self._least - _PROGRESS:
             self._least, self._since = self.left, scan.stamp
-        goal = _at(way, along, np.array([min(self._passed + _AHEAD, end)]))[0]
-        return command_towards(scan, goal, velocity, self._limits)
+        return command_towards(scan, self._goal(scan, way, along), velocity, self._limits)
+
+    def _goal(self, scan: Scan, way: Float64, along: Float64) -> Float64:
+        """The farthest place on the way, up to some distance ahead, beside which nothing stands; else the farthest."""
+        ahead = np.minimum(self._passed + np.arange(_AHEAD, _LEAST, -_STEP), along[-1])
+        places = _at(way, along, ahead)
+        away = np.hypot(*(places[:, None] - scan.points[None]).transpose(2, 0, 1)).min(axis=1, initial=np.inf)
+        return places[int(np.argmax(away > self._limits.radius + self._limits.margin + _STEP))]
 
     @property
     def arrived(self) -> bool:

@@ -30,8 +30,8 @@ _UP_TO_DATE = 8.0
 _SEEN = _UP_TO_DATE + REACH
 # Keyframes of the roadmap are joined up to this distance, m; from one to the next the robot drove up to this one.
 _JOINED, _DROVE = 8.0, 1.5
-# A room has so many keyframes at least.
-_ROOM = 3
+# Whether a keyframe is in a room those tell, too, that are so near; and so far it is at most across a room, m.
+_BESIDE, _ACROSS = 1.5, 8.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,27 +185,23 @@ class Survey:
             way += self.path(way[-1], keyframe)[1:]
         return way
 
-    def rooms(self) -> list[int]:
-        """A keyframe in the middle of every room, the room that was entered first before the others.
+    def room_of(self, keyframe: int) -> tuple[int, ...]:
+        """The keyframes around one, the nearest first, if half of them are in a room; else none."""
+        beside = {
+            other: edge["length"]
+            for other, edge in self.roadmap[keyframe].items()
+            if edge["length"] <= _BESIDE and not edge["door"]
+        }
+        around = (keyframe, *sorted(beside, key=lambda other: (beside[other], other)))
+        hallways = sum(self._outlooks[other].hallway for other in around)
+        return around if hallways <= 0.5 * len(around) else ()
 
-        A room is what is left of the roadmap without hallways and doors, if most ways out of it pass a door.
-        """
-        inside = [keyframe for keyframe in self.roadmap if not self._outlooks[keyframe].hallway]
-        within = nx.subgraph_view(
-            self.roadmap.subgraph(inside), filter_edge=lambda a, b: not self.roadmap.edges[a, b]["door"]
-        )
-        rooms = sorted((sorted(room) for room in nx.connected_components(within)), key=min)
-        return [self._middle(within, room) for room in rooms if len(room) >= _ROOM and self._behind_door(room)]
-
-    def _behind_door(self, room: list[int]) -> bool:
-        out = [edge["door"] for _, _, edge in nx.edge_boundary(self.roadmap, room, data=True)]
-        return sum(out) > 0.5 * len(out)
-
-    @staticmethod
-    def _middle(within: nx.Graph, room: list[int]) -> int:
-        """The keyframe from which the others are nearest."""
-        spans = {one: nx.single_source_dijkstra_path_length(within, one, weight="length") for one in room}
-        return min(room, key=lambda one: (max(spans[one].values()), one))
+    def same_room(self, one: int, other: int) -> bool:
+        """Whether a short way that passes no door leads from one keyframe to another."""
+        within = nx.subgraph_view(self.roadmap, filter_edge=lambda a, b: not self.roadmap.edges[a, b]["door"])
+        if one not in within or other not in within:
+            return False
+        return other in nx.single_source_dijkstra_path_length(within, one, cutoff=_ACROSS, weight="length")
 
 
 def _is_near(place: Float64, pose: Float64) -> bool:
