@@ -10,7 +10,7 @@ from pathlib import Path
 from setuptools import find_packages, setup
 
 NAME = "hmt_slam_ros"
-NODES = ("slam", "aam", "tsbi", "tlca", "rtl", "robot", "view")
+NODES = ("slam", "aam", "tsbi", "tlca", "rtl", "robot", "view", "explorer")
 SHARED = ("launch", "config", "data/malaga_one_loop")
 
 

@@ -10,12 +10,13 @@ import pytest
 from benchmark.driven_run import DrivenRun
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration import Configuration
+from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.exploration.outlook import crosses, outlook_of
 from hmt_slam_ros.exploration.pilot import Pilot
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.logs.stamps import NANOSECONDS
 from hmt_slam_ros.motion import Limits
-from hmt_slam_ros.processes.errands import Errand, Outcome
+from hmt_slam_ros.processes.errands import Errand, Outcome, errand_of
 from hmt_slam_ros.sensing import Scan
 from hmt_slam_ros.simulation.building import Building, FloorPlan
 from hmt_slam_ros.simulation.driven_robot import DrivenRobot
@@ -147,3 +148,11 @@ def test_no_progress_for_long_is_noticed(seconds: float, stuck: bool) -> None:
     assert pilot.steer(begin, way, (0.0, 0.0)).speed > 0.0
     assert not pilot.arrived
     assert pilot.stuck(1 + round(seconds * NANOSECONDS), 15 * NANOSECONDS) == stuck
+
+
+def test_errands_as_they_are_written() -> None:
+    assert errand_of("explore") == Errand("explore")
+    assert errand_of(" go room 3") == Errand("go", "room 3")
+    for text in ("go", "dance", "explore room 3", ""):
+        with pytest.raises(HmtSlamError, match=f"'{text}' is no errand: give one of explore, backtrack, stop, or go"):
+            errand_of(text)

@@ -11,6 +11,13 @@ from hmt_slam_ros.configuration.parameter import parameter
 class Exploration:
     """The explorer: the robot that it drives, and when it gives something up."""
 
+    drive: str = parameter(
+        "velocities",
+        "How the robot is driven: by velocities on cmd_vel, or by goals on goal_pose to which another program drives, "
+        "such as nav2.",
+        choices=("velocities", "goals"),
+    )
+    explores: bool = parameter(True, "Explore from the start on; otherwise wait for an errand.")
     speed: float = parameter(0.6, "Speed at most.", unit="m/s", low=0.05, high=5.0)
     turn_rate: float = parameter(45.0, "Turn rate at most.", unit="deg/s", low=1.0, high=360.0)
     acceleration: float = parameter(0.5, "Acceleration at most, to brake as well.", unit="m/s^2", low=0.05, high=10.0)

@@ -8,6 +8,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from hmt_slam_ros.errors import HmtSlamError
+
+_WITHOUT_PLACE = ("explore", "backtrack", "stop")
+
 
 @dataclass(frozen=True, slots=True)
 class Errand:
@@ -20,6 +24,19 @@ class Errand:
 
     kind: Literal["explore", "go", "backtrack", "stop"]
     place: str = ""
+
+
+def errand_of(text: str) -> Errand:
+    """The errand that is written as its kind and, where it has one, the name of the place.
+
+    :raises HmtSlamError: for anything else.
+    """
+    kind, _, place = text.strip().partition(" ")
+    if kind == "go" and place:
+        return Errand("go", place)
+    if kind in _WITHOUT_PLACE and not place:
+        return Errand(kind)  # type: ignore[arg-type]
+    raise HmtSlamError(f"'{text}' is no errand: give one of {', '.join(_WITHOUT_PLACE)}, or go and the name of a place")
 
 
 @dataclass(frozen=True, slots=True)
