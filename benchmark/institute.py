@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -76,19 +78,25 @@ def measure_institute(settings: Settings) -> Report:
     """Drive missions and relocate lost robots."""
     seeds = chosen_seeds(settings, SEEDS)
     configuration = load_configuration(PARAMETERS, list(settings.changes))
-    missions: dict[str, list[Mission]] = {name: [] for name in _CHANGED}
-    lost: dict[str, list[list[Estimate]]] = {name: [] for name in _CHANGED}
-    for seed in seeds:
-        institute = mapped(seed, configuration)
-        for name, changed in _CHANGED.items():
-            scenario = scenario_of(seed, visit=1, changed=changed)
-            missions[name] += missions_of(institute, scenario, configuration)
-            lost[name] += relocations_of(institute, scenario, configuration)
+    with ProcessPoolExecutor(settings.records.jobs) as pool:
+        buildings = list(pool.map(partial(_of_building, configuration=configuration), seeds))
+    missions = {name: [one for building in buildings for one in building[name][0]] for name in _CHANGED}
+    lost = {name: [one for building in buildings for one in building[name][1]] for name in _CHANGED}
     report = Report("institute", "Missions and relocations in an institute", seeds=seeds)
     known = next(iter(_CHANGED))
     report.requirements = [*_mission_requirements(missions[known]), *_relocation_requirements(lost[known])]
     report.body += [_mission_table(missions), _relocation_table(lost), POLICY]
     return report
+
+
+def _of_building(seed: int, configuration: Configuration) -> dict[str, tuple[list[Mission], list[list[Estimate]]]]:
+    """Missions and relocations in one building, with the doors as mapped and changed."""
+    institute = mapped(seed, configuration)
+    scenarios = {name: scenario_of(seed, visit=1, changed=changed) for name, changed in _CHANGED.items()}
+    return {
+        name: (missions_of(institute, own, configuration), relocations_of(institute, own, configuration))
+        for name, own in scenarios.items()
+    }
 
 
 def missions_of(institute: InstituteMap, scenario: Scenario, configuration: Configuration) -> list[Mission]:

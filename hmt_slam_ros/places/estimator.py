@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -42,7 +43,7 @@ from hmt_slam_ros.places.position_belief import PositionBelief, Travel, flat_bel
 from hmt_slam_ros.sensing import Scan
 from hmt_slam_ros.sensing.motion import Step
 
-# Openings are noticed from this probability and so many sightings on, when the robot is so far beyond them, m; a robot
+# Openings are noticed from this confidence and so many sightings on, more than they were missed, when the robot is so far beyond them, m; a robot
 # that begins to turn is at one that is so far ahead, m, as well. They are so far beside it at most, m.
 _LEAST, _SIGHTINGS, _BEHIND, _AHEAD, _ASIDE = 0.5, 2, 1.0, 1.0, 2.5
 # Openings so near to each other along a hallway are one node, m; what is so far away is forgotten, m.
@@ -51,8 +52,11 @@ _SAME, _FORGET = 0.6, 8.0
 _ALONG, _ASKEW = math.radians(25.0), math.radians(20.0)
 # The wall at the end of a hallway is so near before the robot turns, m, and so much of it is seen, m.
 _WALL, _SEEN = 1.35, 0.8
-# A robot turns at its last node up to so far from it, m; where it turns elsewhere it is somewhere else, so exactly, m.
+# A robot turns at its last node up to so far from it, m; where it turns elsewhere it is at one that it did not notice,
+# of which it knows the place so well, m.
 _THERE, _SOMEWHERE = 1.5, 0.4
+# A robot that was in a hallway so far ago, m, turns off it.
+_DOORWAY = 1.0
 # A chord along a hallway is this share of the longest one; walls are so near to both sides of its middle, m.
 _LONG, _WALLS = 0.5, 2.5
 # Deviations of a node's place in the map, m, and of a hallway's direction, rad; of what is seen of the robot's place
@@ -85,14 +89,15 @@ class PlaceEstimator:
         self._features, self._places = configuration.features, configuration.places
         self._model = observation_model(configuration.places, configuration.features)
         self._heading = BuildingHeading(configuration.features)
-        self._around = LandmarkMap(configuration.features)
+        # Who walks by hides what is there.
+        self._around = LandmarkMap(replace(configuration.features, landmark_least=0.0))
         self._first, self._begins_there = belief or flat_belief(graph, configuration.places), belief is not None
         self._pose = np.zeros(3)
         self._quarter, self._middle = 0, 0.0
         self._last: Noticed | None = None
         self._passed: list[Float64] = []
         self._turned_at: Float64 | None = None
-        self._unseen, self._gone = math.inf, 0.0
+        self._unseen, self._gone, self._outside = math.inf, 0.0, math.inf
         self._seen = NO_OPENINGS
         self.belief: PositionBelief | None = None
         self.arrivals = 0
@@ -108,6 +113,11 @@ class PlaceEstimator:
     def turning(self) -> bool:
         """Whether the robot is on a turn that is not over yet."""
         return self._turned_at is not None
+
+    @property
+    def at_node(self) -> bool:
+        """Whether the robot is beside its last node."""
+        return self._last is not None and math.dist(self._pose[:2], self._last.place) <= _THERE
 
     @property
     def facing(self) -> tuple[int, int] | None:
@@ -136,7 +146,7 @@ class PlaceEstimator:
         forward = se2.transform(np.array((0.0, 0.0, self._pose[2])), step.increment[None, :2])[0]
         self._pose = np.array((*(self._pose[:2] + forward), self._heading.angle))
         way = float(np.hypot(*step.increment[:2]))
-        self._unseen, self._gone = self._unseen + way, self._gone + way
+        self._unseen, self._gone, self._outside = self._unseen + way, self._gone + way, self._outside + way
         if self._last is not None:
             self._last = self._last._replace(variance=self._last.variance + float(step.covariance[:2, :2].max()))
 
@@ -194,6 +204,7 @@ class PlaceEstimator:
         ahead, left, back, right = away[sector_of(np.arange(QUARTERS, dtype=np.float64) * QUARTER - off)].tolist()
         if space is None or log_odds(space, self._features) <= 0.0 or not ahead + back >= _LONG * space.length:
             return False
+        self._outside = 0.0
         if max(left, right) <= _WALLS:
             self._middle = 0.5 * (left - right)
         return True
@@ -205,19 +216,20 @@ class PlaceEstimator:
         """
         if self._turned_at is None:
             self._turned_at = self._pose[:2].copy()
-            if self.in_hallway:
+            if self._outside <= _DOORWAY:
                 self._notice(_AHEAD)
         if rays is None or nearest == self._quarter:
             return
         quarters = (self._quarter - nearest) % QUARTERS
         off = self._pose[2] - QUARTER * nearest
+        if quarters % 2 and self._outside <= _DOORWAY and self._last is not None:
+            away = (math.dist(place, self._last.place) for place in (self._pose[:2], self._turned_at))
+            if min(away) > _THERE:
+                self._reach(Noticed(self._turned_at, _SOMEWHERE**2))
         if not self._is_hallway(rays, off):
             self.in_hallway = False
             return
-        if self.belief is not None and self._last is not None:
-            away = (math.dist(place, self._last.place) for place in (self._pose[:2], self._turned_at))
-            if quarters % 2 and min(away) > _THERE:
-                self._arrive(Noticed(self._turned_at, _SOMEWHERE**2))
+        if self.belief is not None:
             self.belief = self.belief.turned(quarters)
         self._unseen = math.inf if quarters % 2 else self._unseen
         self._quarter, self._turned_at, self.in_hallway = nearest, None, True
@@ -246,7 +258,7 @@ class PlaceEstimator:
             beside = float((one.pose.mean[:2] - self._pose[:2]) @ self._left)
             side = math.copysign(1.0, beside) * math.sin(heading)
             existence = one.existence
-            believed = existence.probability >= _LEAST and existence.seen >= _SIGHTINGS
+            believed = existence.confidence >= _LEAST and existence.seen >= max(_SIGHTINGS, existence.missed)
             if one.kind == OPENING and believed and abs(beside) <= _ASIDE and side > math.cos(_ASKEW):
                 yield one
 
