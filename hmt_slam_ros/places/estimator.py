@@ -43,8 +43,9 @@ from hmt_slam_ros.places.position_belief import PositionBelief, Travel, flat_bel
 from hmt_slam_ros.sensing import Scan
 from hmt_slam_ros.sensing.motion import Step
 
-# Openings are noticed from this confidence and so many sightings on, more than they were missed, when the robot is so far beyond them, m; a robot
-# that begins to turn is at one that is so far ahead, m, as well. They are so far beside it at most, m.
+# Openings are noticed from this confidence and so many sightings on, more than they were missed, when the robot is so
+# far beyond them, m; a robot that begins to turn is at one that is so far ahead, m, as well. They are so far beside it
+# at most, m.
 _LEAST, _SIGHTINGS, _BEHIND, _AHEAD, _ASIDE = 0.5, 2, 1.0, 1.0, 2.5
 # Openings so near to each other along a hallway are one node, m; what is so far away is forgotten, m.
 _SAME, _FORGET = 0.6, 8.0
