@@ -7,6 +7,7 @@ import multiprocessing
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
@@ -16,8 +17,9 @@ from numpy.typing import NDArray
 
 from benchmark.logs import opened
 from benchmark.report import Report, Requirement, table
+from benchmark.runs import PARAMETERS
 from benchmark.settings import Settings
-from hmt_slam_ros.configuration import Configuration
+from hmt_slam_ros.configuration import load_configuration
 from hmt_slam_ros.evaluation import StampedPoses, evaluate_relations, true_relations
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.logs import open_log
@@ -120,8 +122,9 @@ class Watched:
     :ivar carried: the first keyframe event after the robot was carried, -1 before.
     """
 
-    def __init__(self) -> None:
-        self.run = Run(Configuration())
+    def __init__(self, changes: Sequence[str] = ()) -> None:
+        """:param changes: parameters that differ from the file, as ``name=value``."""
+        self.run = Run(load_configuration(PARAMETERS, list(changes)))
         self.true: dict[int, NDArray[np.float64]] = {}
         self.carried = -1
 
@@ -181,9 +184,9 @@ class Watched:
         return Heard(travelled, self.lost() <= DOUBT, self.sure(), self.right(true))
 
 
-def kidnapped(name: str) -> Kidnapping:
+def kidnapped(name: str, changes: Sequence[str] = ()) -> Kidnapping:
     """Drive through a simulated world in which the robot is carried."""
-    watched, travelled = Watched(), 0.0
+    watched, travelled = Watched(changes), 0.0
     heard: list[Heard] = []
     stamps, truth, parts = list[int](), list[NDArray[np.float64]](), list[bool]()
     for record in open_log(name).records():
@@ -248,9 +251,9 @@ class Alarm:
     doubted: float
 
 
-def ordinary(path: Path | str) -> Alarm:
+def ordinary(path: Path | str, changes: Sequence[str] = ()) -> Alarm:
     """Drive where nobody carries the robot."""
-    watched, driven, doubted = Watched(), 0.0, 0.0
+    watched, driven, doubted = Watched(changes), 0.0, 0.0
     for record in open_log(path).records():
         before = watched.events
         watched.run.read(record)
@@ -272,8 +275,9 @@ def measure_kidnapping(settings: Settings) -> Report:
         drives: list[tuple[str, Path | str]] = [(log.name, log.path) for log in logs]
         drives += [(world, f"{SIMULATED}{world},seed={seed},laps=2") for world in worlds for seed in seeds]
         with ProcessPoolExecutor(settings.runner.jobs, multiprocessing.get_context("spawn")) as pool:
-            found = list(pool.map(kidnapped, [drawn(*case) for case in cases]))
-            alarms = list(pool.map(ordinary, [path for _, path in drives]))
+            changes = settings.changes
+            found = list(pool.map(partial(kidnapped, changes=changes), [drawn(*case) for case in cases]))
+            alarms = list(pool.map(partial(ordinary, changes=changes), [path for _, path in drives]))
     rows = []
     for world in worlds:
         for kind in KINDS:

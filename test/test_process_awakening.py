@@ -7,7 +7,7 @@ import pytest
 
 from benchmark.awakening import FAR, awakened, mapped
 from benchmark.kidnapping import SOON, kidnapped
-from hmt_slam_ros.configuration import Configuration
+from hmt_slam_ros.configuration import Configuration, with_changes
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.logs import open_log
@@ -72,6 +72,16 @@ def test_it_begins_a_new_area_to_which_an_arc_leads_that_tells_nothing(office, b
 def test_it_is_recognized_where_it_is(maps, kind, share):
     log = maps[kind]
     found = awakened(log, log.starts[int(share * len(log.starts))])
+    assert found.right
+    assert not found.wrong
+    assert found.found <= FAR
+
+
+@pytest.mark.parametrize("share", [0.3, 0.8])
+def test_with_landmarks_as_prior_it_is_recognized_too(maps, share):
+    log = maps["first half"]
+    asked = replace(log, configuration=with_changes(Configuration(), {"places.prior": True}))
+    found = awakened(asked, log.starts[int(share * len(log.starts))])
     assert found.right
     assert not found.wrong
     assert found.found <= FAR

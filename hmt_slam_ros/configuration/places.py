@@ -61,6 +61,17 @@ class Places:
         0.05, "Probability that the robot is in unknown ground when nothing is known of where it is.",
         low=1e-9, high=0.999,
     )
+    prior: bool = parameter(
+        False, "Whether landmarks weigh the places where a robot may be that woke up somewhere or was carried."
+    )
+    prior_temper: float = parameter(
+        0.3, "Exponent on their likelihood there, as they are made of the same scans as the surfaces.",
+        low=0.0, high=1.0,
+    )
+    prior_alike: float = parameter(
+        5.0, "What they say, so tempered, of places of a building that only look alike, against new ground.",
+        unit="nat", low=-100.0, high=100.0,
+    )
     max_entropy: float = parameter(
         0.4, "The belief is confident below this entropy U_max.", unit="nat", low=1e-6, high=20.0
     )

@@ -243,7 +243,8 @@ class _Charting:
 
     def _around(self, area: int) -> Known:
         if area not in self._known:
-            self._known[area] = known_around(self._floors[area], self._views)
+            landmarks = {other: view.landmarks for other, view in self._views.items()}
+            self._known[area] = known_around(self._floors[area].areas, landmarks)
         return self._known[area]
 
     def _edge(self, way: _Way, members: frozenset[tuple[int, int]]) -> Edge:

@@ -9,7 +9,7 @@ asked of how areas lie that are far from each other.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -127,14 +127,21 @@ def _norths(around: Mapping[int, Mapping[int, PoseGaussian]], views: Mapping[int
 
 def _axis(areas: Mapping[int, PoseGaussian], views: Mapping[int, AreaView]) -> float | None:
     """The direction of the walls around an area, in its frame, up to quarters of a turn; None where none is known."""
+    return axis_of((one, pose.mean[2]) for area, pose in areas.items() for one in views[area].landmarks)
+
+
+def axis_of(landmarks: Iterable[tuple[Landmark, float]]) -> float | None:
+    """The direction of walls, rad, up to quarters of a turn; None where none is known.
+
+    :param landmarks: of the walls, each with the heading of the frame that it is in, rad.
+    """
     total = 0.0j
-    for area, pose in areas.items():
-        for landmark in views[area].landmarks:
-            # A corner looks between its two walls.
-            off = 0.0 if landmark.kind == OPENING else 0.5 * _QUARTER
-            heading = float(pose.mean[2] + landmark.pose.mean[2]) + off
-            weight = landmark.existence.probability / float(landmark.pose.covariance[2, 2])
-            total += weight * complex(math.cos(QUARTERS * heading), math.sin(QUARTERS * heading))
+    for landmark, frame in landmarks:
+        # A corner looks between its two walls.
+        off = 0.0 if landmark.kind == OPENING else 0.5 * _QUARTER
+        heading = float(frame + landmark.pose.mean[2]) + off
+        weight = landmark.existence.probability / float(landmark.pose.covariance[2, 2])
+        total += weight * complex(math.cos(QUARTERS * heading), math.sin(QUARTERS * heading))
     return math.atan2(total.imag, total.real) / QUARTERS if total else None
 
 

@@ -20,7 +20,8 @@ from hmt_slam_ros.features.landmark_map import Landmark
 from hmt_slam_ros.features.landmarks import OPENING, OUTER
 from hmt_slam_ros.features.openings import Openings
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.places.floor import DIRECTIONS, AreaView, Floor
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.places.floor import DIRECTIONS, Floor
 from hmt_slam_ros.places.observation_graph import (
     OPENINGS,
     QUARTERS,
@@ -75,12 +76,16 @@ class Known(NamedTuple):
     members: list[set[tuple[int, int]]]
 
 
-def known_around(floor: Floor, views: Mapping[int, AreaView]) -> Known:
-    """The landmarks of all areas of a floor."""
+def known_around(areas: Mapping[int, PoseGaussian], views: Mapping[int, Sequence[Landmark]]) -> Known:
+    """The landmarks of some areas in one frame, such as that of a floor.
+
+    :param areas: {area: the belief over its pose in the frame}.
+    :param views: {area: its landmarks}.
+    """
     every = [
         (landmark, se2.compose(pose.mean, landmark.pose.mean), (area, number))
-        for area, pose in floor.areas.items()
-        for number, landmark in enumerate(views[area].landmarks)
+        for area, pose in areas.items()
+        for number, landmark in enumerate(views[area])
     ]
     known = Known([], np.empty((len(every), 3)), [])
     for landmark, pose, member in sorted(every, key=lambda each: (-each[0].existence.probability, each[2])):
@@ -115,7 +120,7 @@ def of_stretch(
     on &= np.array([not own.intersection(without) for own in known.members], dtype=np.bool_)
     on |= np.array([bool(own.intersection(always)) for own in known.members], dtype=np.bool_)
     on &= _faced(known, local, stretch)
-    return _as_seen([known.landmarks[k] for k in np.flatnonzero(on).tolist()], local[on])
+    return as_seen([known.landmarks[k] for k in np.flatnonzero(on).tolist()], local[on])
 
 
 def with_hallways(landmarks: Landmarks, floor: Floor, at: Float64, direction: int, sides: Sequence[int]) -> Landmarks:
@@ -173,7 +178,7 @@ def _faced(known: Known, local: Float64, stretch: Stretch) -> Bool:
     return np.where(opening, aside * local[:, 1] > 0.0, ~(beyond & (ahead * local[:, 0] > 0.0)))
 
 
-def _as_seen(landmarks: list[Landmark], poses: Float64) -> Landmarks:
+def as_seen(landmarks: Sequence[Landmark], poses: Float64) -> Landmarks:
     """Landmarks at poses in the frame of a robot that looks along the hallway."""
     opening = np.array([landmark.kind == OPENING for landmark in landmarks], dtype=np.bool_)
     convex = np.array([landmark.kind == OUTER for landmark in landmarks], dtype=np.bool_)

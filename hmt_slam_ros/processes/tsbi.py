@@ -172,7 +172,7 @@ class Tsbi:
         outdated = () if self._reopened or arrived_now else keyframe.outdated
         self._replica.apply(Hypotheses(events.sequence, tuple(changed), settled.unexamined, forgotten, outdated))
         if outdated:
-            self._branching.search.forget_scans()
+            self._branching.forget_scans()
         loaded = [self._loaded(changed[n], child) for n, child in enumerate(chosen)]
         self._unexamined, self._reopened = settled.unexamined, self._reopened if keyframe.carried else ()
         leaves = tuple(sorted(loaded, key=lambda leaf: leaf.hypothesis))
@@ -273,7 +273,7 @@ class Tsbi:
         ]
         self._notes = {leaf.hypothesis: child.notes for leaf, child in zip(leaves, chosen, strict=True)}
         if all(notes.lost is None for notes in self._notes.values()):
-            self._branching.search.found()
+            self._branching.found()
         return leaves
 
     def _leaf(self, child: Child, branched: bool, probability: float) -> Leaf:

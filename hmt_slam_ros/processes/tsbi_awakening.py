@@ -116,7 +116,7 @@ def looked_for(branching: Branching, parent: Parent) -> Branches:
     reference = next(iter(keyframes.values()))
     poses = {k: se2.between(reference, pose) for k, pose in keyframes.items()}
     told = _told_of(parent, keyframes)
-    where = branching.search.everywhere(parent.hybrid_map, poses, parent.notes.lost, parent.clutter, told)
+    where = branching.everywhere(parent, poses, parent.notes.lost, told)
     if parent.notes.claim is not None:
         where = where.with_unmapped(UNKNOWN)
     noted = _credited(replace(parent, notes=parent.notes.checked((), tuple(poses))), where, poses)

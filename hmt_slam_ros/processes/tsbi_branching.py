@@ -20,6 +20,7 @@ from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.processes.map_parts import Arc, ArcEnds, Merged, Relabelled
+from hmt_slam_ros.processes.place_prior import PlacePrior
 from hmt_slam_ros.processes.replica import FIRST_AREA, Replica
 from hmt_slam_ros.sensing import Scan
 from hmt_slam_ros.topology.admission import Query
@@ -29,7 +30,7 @@ from hmt_slam_ros.topology.hypothesis_tree import LeafNotes, relative_covariance
 from hmt_slam_ros.topology.shortest_path import reachable
 from hmt_slam_ros.topology.surroundings import gap, positions
 from hmt_slam_ros.topology.unknown import beside, telling_arc
-from hmt_slam_ros.topology.whereabouts import Whereabouts
+from hmt_slam_ros.topology.whereabouts import Told, Whereabouts
 
 FEWEST = 4
 """Known areas that every hypothesis may examine at a cut, however improbable it is."""
@@ -119,6 +120,7 @@ class Branching:
 
     def __init__(self, configuration: Configuration, replica: Replica) -> None:
         self.search = ClosureSearch(configuration, replica.scans)
+        self._prior = PlacePrior(configuration, replica.scans) if configuration.places.prior else None
         self._options = configuration.tsbi
         self._replica = replica
         sigma, angle = configuration.tlca.arc_sigma_floor, math.radians(configuration.tlca.arc_angle_floor)
@@ -135,6 +137,30 @@ class Branching:
         """Take over what was known before the first event."""
         self._areas = state.areas
         self.search.go_on_from(state.search)
+
+    def everywhere(
+        self, parent: Parent, poses: Mapping[int, NDArray[np.float64]], before: int, told: Told | None = None
+    ) -> Whereabouts:
+        """Where in the map keyframes lie of which the arcs tell nothing.
+
+        :param poses: {keyframe: ``reference_T_base``}.
+        :param before: the map is that of the keyframes before this one.
+        :param told: where the reference is, if somebody says so.
+        """
+        where = self.search.everywhere(parent.hybrid_map, poses, before, parent.clutter, told)
+        return where if self._prior is None else self._prior.weighed(where, parent.hybrid_map, poses, before)
+
+    def found(self) -> None:
+        """It is known where the robot is."""
+        self.search.found()
+        if self._prior is not None:
+            self._prior.forget()
+
+    def forget_scans(self) -> None:
+        """Work out anew what is made of scans, of which some have changed."""
+        self.search.forget_scans()
+        if self._prior is not None:
+            self._prior.forget()
 
     def begin_event(self) -> None:
         """Forget which new areas were named; within one event hypotheses share the ids of the same new area."""

@@ -57,7 +57,7 @@ def _since(parent: Parent, event: int) -> list[int]:
 def _displaced(branching: Branching, parent: Parent, keyframes: Sequence[int], log_odds: float) -> Child:
     """The robot was displaced before the first of some keyframes of its area, which are a new one."""
     query = branching.query(parent, keyframes)
-    where = branching.search.everywhere(parent.hybrid_map, query.poses, keyframes[0], parent.clutter)
+    where = branching.everywhere(parent, query.poses, keyframes[0])
     where = where.with_unmapped(UNKNOWN)
     claim = Spot(parent.area, keyframes[0], query.belief.mean)
     credit = credit_of(parent.hybrid_map, where, claim, query.poses)

@@ -73,6 +73,14 @@ class Whereabouts(NamedTuple):
         n = int(self.probabilities.argmax())
         return self.found[n], float(self.probabilities[n])
 
+    def weighed(self, log_weights: Sequence[float] | NDArray[np.float64]) -> Whereabouts:
+        """The same after something more was learnt of every place, relative to where the map does not reach, nats."""
+        rest = max(1.0 - float(self.probabilities.sum()), 1e-300)
+        logs = np.log(np.maximum(self.probabilities, 1e-300)) + log_weights
+        shift = max(0.0, float(logs.max(initial=0.0)))
+        weights = np.exp(logs - shift)
+        return Whereabouts(self.found, weights / (weights.sum() + rest * math.exp(-shift)))
+
     def with_unmapped(self, prior: float) -> Whereabouts:
         """The same, where the map does not reach where the robot is with another probability than ``UNMAPPED``."""
         weights = (1.0 - prior) / prior * UNMAPPED / (1.0 - UNMAPPED) * self.probabilities

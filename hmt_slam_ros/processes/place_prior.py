@@ -1,0 +1,158 @@
+"""What landmarks say of the places in a map where a robot may be that woke up somewhere, or was carried.
+
+Tomatis, Nourbakhsh and Siegwart (2003), section 3.3: the observation graph of what the robot saw since, against that of
+the map around a place, by the observation function OS of the belief over places. It is the prior of the places that
+surfaces find, relative to new ground.
+
+Landmarks are made of the same scans as surfaces are, so OS counts with an exponent. And a building's places look more
+like each other than like ground of which nothing is known, whose landmarks are strewn; so OS has to say more of a place
+than it says of one that only looks alike. Both numbers are fitted by log score on training worlds, in which half of the
+robots are where the map does not reach.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from hmt_slam_ros.arrays import Bool, Float64
+from hmt_slam_ros.configuration import Configuration
+from hmt_slam_ros.features.landmark_map import Landmark
+from hmt_slam_ros.features.landmarks import due
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.local_map.area_landmarks import AreaLandmarks, Sighting
+from hmt_slam_ros.local_map.local_mapping import LocalMapping
+from hmt_slam_ros.places.floor import axis_of
+from hmt_slam_ros.places.observation import Expected, log_observation, log_unknown_ground, observation_model
+from hmt_slam_ros.places.observation_graph import Landmarks, chosen, one_after_the_other
+from hmt_slam_ros.places.wall_landmarks import as_seen, known_around
+from hmt_slam_ros.sensing import Scan
+from hmt_slam_ros.topology.hybrid_map import HybridMap
+from hmt_slam_ros.topology.located import Located
+from hmt_slam_ros.topology.surroundings import Nearness, areas_around, stacked
+from hmt_slam_ros.topology.whereabouts import Whereabouts
+
+Pose = Float64
+
+# Areas whose place is known this well, m, and whose keyframes are this near, m, are what is around one.
+_NEARNESS = Nearness(1.0, 16.0)
+# Places that are less probable by their surfaces stay as they are: their landmarks would have to be gathered.
+_PROBABLE = 1e-3
+# Landmarks of one kind that are so near to each other may be one, m.
+_BESIDE = 0.4
+
+
+class PlacePrior:
+    """Compares what a robot saw with what the map has at places where it may be."""
+
+    def __init__(self, configuration: Configuration, scans: Mapping[int, Scan]) -> None:
+        """:param scans: {keyframe: scan}, which may grow."""
+        self._scans, self._features, self._places = scans, configuration.features, configuration.places
+        self._model = observation_model(configuration.places, configuration.features)
+        self._known = AreaLandmarks(LocalMapping(configuration))
+        self._areas: dict[int, tuple[dict[int, Pose], tuple[Landmark, ...]]] = {}
+
+    def forget(self) -> None:
+        """Forget the landmarks of areas, which are gathered again where they are asked for."""
+        self._areas.clear()
+
+    def weighed(
+        self, where: Whereabouts, hybrid_map: HybridMap, poses: Mapping[int, Pose], before: int
+    ) -> Whereabouts:
+        """Places with what landmarks say of them.
+
+        :param poses: {keyframe: ``reference_T_base``} of what the robot saw.
+        :param before: the map is that of the keyframes before this one.
+        """
+        probable = np.flatnonzero(where.probabilities >= _PROBABLE)
+        ratios = self.log_ratios(hybrid_map, poses, before, [where.found[n] for n in probable])
+        log_weights = np.zeros(len(where.found))
+        if ratios is not None:
+            log_weights[probable] = self._places.prior_temper * ratios - self._places.prior_alike
+        return where.weighed(log_weights)
+
+    def log_ratios(
+        self, hybrid_map: HybridMap, poses: Mapping[int, Pose], before: int, found: Sequence[Located]
+    ) -> Float64 | None:
+        """log OS(o, s) of places against new ground, shape (len(found),), nats; None where no landmark tells anything.
+
+        :param poses: {keyframe: ``reference_T_base``} of what the robot saw.
+        :param before: the map is that of the keyframes before this one.
+        """
+        sightings = list(self._known.sightings([self._scans[k] for k in poses], stacked(poses)))
+        seen = self._known.gathered(sightings)
+        axis = axis_of((landmark, 0.0) for landmark in seen)
+        if axis is None or not found:
+            return None
+        frame = np.array([*poses[max(poses)][:2], axis])
+        observed = self._around(seen, np.array([one.pose.mean for one in seen]), frame)
+        lists = [
+            self._around(*self._expected(hybrid_map, before, place, sightings, seen), frame) for place in found
+        ]  # fmt: skip
+        starts = np.cumsum([0, *(len(each.tracks) for each in lists)])
+        expected = Expected(starts, one_after_the_other(lists))
+        return log_observation(observed, expected, 0.0, 0.0, self._model) - log_unknown_ground(observed, self._model)
+
+    def _expected(
+        self,
+        hybrid_map: HybridMap,
+        before: int,
+        located: Located,
+        sightings: Sequence[Sighting],
+        seen: Sequence[Landmark],
+    ) -> tuple[list[Landmark], Float64]:
+        """The landmarks of the map that keyframes should see if they lie in a place; and their poses (n, 3) there.
+
+        What is where one was seen is in sight, too, although a place that is some centimetres off, or a wall, may hide
+        it.
+
+        :returns: poses in the frame of the keyframes' reference.
+        """
+        into = PoseGaussian.exactly(se2.inverse(located.mode.pose.mean))
+        around = areas_around(hybrid_map, located.area, _NEARNESS)
+        areas = {area: into.compose(pose) for area, pose in around.items()}
+        known = known_around(areas, {area: self._of_area(hybrid_map, area, before) for area in areas})
+        shown = self._due(known.landmarks, known.poses, sightings) | _beside(known.landmarks, known.poses, seen)
+        return [known.landmarks[k] for k in np.flatnonzero(shown)], known.poses[shown]
+
+    def _due(self, landmarks: Sequence[Landmark], poses: Float64, sightings: Sequence[Sighting]) -> Bool:
+        """Which landmarks (n,) at poses (n, 3) any of the keyframes should see."""
+        kinds = np.array([one.kind for one in landmarks], dtype=np.int64)
+        widths = np.array([one.width for one in landmarks])
+        shown = np.zeros(len(landmarks), np.bool_)
+        for sighting in sightings:
+            local = se2.between(sighting.pose.mean, poses)
+            shown |= due(kinds, local, widths, sighting.rays, self._features)
+        return shown
+
+    def _of_area(self, hybrid_map: HybridMap, area: int, before: int) -> tuple[Landmark, ...]:
+        """The landmarks of an area's keyframes before one of them, gathered once."""
+        keyframes = {k: pose for k, pose in hybrid_map.keyframes(area).items() if k < before}
+        held = self._areas.get(area)
+        if held is None or not _same(held[0], keyframes):
+            held = keyframes, self._known.of([self._scans[k] for k in keyframes], stacked(keyframes))
+            self._areas[area] = held
+        return held[1]
+
+    def _around(self, landmarks: Sequence[Landmark], poses: Float64, frame: Pose) -> Landmarks:
+        """The observation graph of landmarks within reach along an axis.
+
+        :param frame: shape (3,), the robot's place, with the heading of the axis.
+        """
+        graph = as_seen(landmarks, se2.between(frame, poses.reshape(-1, 3)))
+        return chosen(graph, np.abs(graph.along) <= self._places.reach)
+
+
+def _beside(landmarks: Sequence[Landmark], poses: Float64, seen: Sequence[Landmark]) -> Bool:
+    """Which landmarks (n,) at poses (n, 3) are where one of their kind was seen."""
+    kinds, others = (np.array([one.kind for one in each]) for each in (landmarks, seen))
+    places = np.array([one.pose.mean[:2] for one in seen])
+    away = np.hypot(*(poses[:, None, :2] - places).transpose(2, 0, 1))
+    return np.asarray(((away <= _BESIDE) & (kinds[:, None] == others)).any(axis=1))
+
+
+def _same(one: Mapping[int, Pose], other: Mapping[int, Pose]) -> bool:
+    """Whether two areas have the same keyframes in the same places."""
+    return one.keys() == other.keys() and all(np.array_equal(pose, other[k]) for k, pose in one.items())

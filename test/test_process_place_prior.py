@@ -1,0 +1,103 @@
+"""What landmarks say of places where a robot may be that woke up in a map."""
+
+import math
+
+import numpy as np
+import pytest
+
+from benchmark.landmark_scans import keyframes_of
+from hmt_slam_ros.agreement import Agreement
+from hmt_slam_ros.configuration import Configuration, with_changes
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.processes.place_prior import PlacePrior
+from hmt_slam_ros.simulation import open_simulated
+from hmt_slam_ros.topology.area_matching import Mode
+from hmt_slam_ros.topology.hybrid_map import HybridMap
+from hmt_slam_ros.topology.located import Located
+from hmt_slam_ros.topology.whereabouts import UNMAPPED, Whereabouts
+
+CONFIGURATION = with_changes(Configuration(), {"places.prior_temper": 0.5, "places.prior_alike": 1.0})
+
+
+def located(pose, area=0):
+    belief = PoseGaussian(np.asarray(pose, dtype=float), np.eye(3) * 1e-4)
+    return Located(area, Mode(belief, belief, 0.0), Agreement(0, 0, 0))
+
+
+@pytest.fixture(scope="module")
+def drive():
+    """A map of the first round through a building; and of the second one some keyframes beside a door."""
+    scenario = open_simulated("sim:office,seed=3,size=0.7,laps=2").scenario
+    poses = scenario.true_poses(scenario.scan_stamps)
+    numbers = keyframes_of(poses, Configuration())
+    first = [n for n in numbers if n < len(poses) // 2]
+    second = [n for n in numbers if n > len(poses) // 2][10:20]
+    scans, hybrid_map = {}, HybridMap()
+    for k, n in enumerate(first):
+        scans[k] = scenario.scan(n)
+        hybrid_map.place(k, 0, se2.between(poses[first[0]], poses[n]))
+    before = len(first)
+    for k, n in enumerate(second, start=before):
+        scans[k] = scenario.scan(n)
+    seen = {before + i: se2.between(poses[second[0]], poses[n]) for i, n in enumerate(second)}
+    return hybrid_map, scans, seen, before, se2.between(poses[first[0]], poses[second[0]])
+
+
+def test_landmarks_speak_for_the_right_place_and_against_others(drive):
+    hybrid_map, scans, seen, before, true = drive
+    along = [se2.compose(true, np.array([shift, 0.0, 0.0])) for shift in (-2.0, 2.0, 5.0)]
+    turned = se2.compose(true, np.array([0.0, 0.0, math.pi]))
+    right, *others = PlacePrior(CONFIGURATION, scans).log_ratios(
+        hybrid_map, seen, before, [located(pose) for pose in (true, *along, turned)]
+    )
+    assert right > 5.0
+    assert max(others) < right - 5.0
+    # A place a few centimetres off is the same one.
+    (near,) = PlacePrior(CONFIGURATION, scans).log_ratios(
+        hybrid_map, seen, before, [located(se2.compose(true, np.array([0.05, 0.05, 0.01])))]
+    )
+    assert abs(near - right) < 3.0
+
+
+def test_places_are_weighed_by_them_with_an_exponent_and_against_ground_that_looks_alike(drive):
+    hybrid_map, scans, seen, before, true = drive
+    prior = PlacePrior(CONFIGURATION, scans)
+    found = (located(true), located(se2.compose(true, np.array([2.0, 0.0, 0.0]))), located(true))
+    where = Whereabouts(found, np.array([0.4, 0.4, 5e-4]))
+    ratios = prior.log_ratios(hybrid_map, seen, before, found)
+    expected = np.array([0.4, 0.4, 5e-4]) * np.exp([*(0.5 * ratios[:2] - 1.0), 0.0])
+    weighed = prior.weighed(where, hybrid_map, seen, before)
+    np.testing.assert_allclose(weighed.probabilities, expected / (expected.sum() + 1.0 - 0.8005), rtol=1e-9)
+    assert weighed.found is found
+
+
+def test_where_keyframes_of_the_map_moved_it_is_looked_at_anew(drive):
+    hybrid_map, scans, seen, before, true = drive
+    prior = PlacePrior(CONFIGURATION, scans)
+    place = [located(true)]
+    (asked,) = prior.log_ratios(hybrid_map, seen, before, place)
+    moved, shift = hybrid_map.branch(), np.array([3.0, -2.0, 0.0])
+    for k, pose in hybrid_map.keyframes(0).items():
+        moved.place(k, 0, se2.compose(shift, pose))
+    (off,) = prior.log_ratios(moved, seen, before, place)
+    (there,) = prior.log_ratios(moved, seen, before, [located(se2.compose(shift, true))])
+    assert there == pytest.approx(asked, abs=1.0)
+    assert off < asked - 3.0
+
+
+def test_without_a_landmark_or_a_place_nothing_changes(drive):
+    hybrid_map, scans, seen, before, _ = drive
+    prior = PlacePrior(CONFIGURATION, scans)
+    assert prior.log_ratios(hybrid_map, seen, before, []) is None
+    nowhere = Whereabouts((), np.zeros(0))
+    assert prior.weighed(nowhere, hybrid_map, seen, before).probabilities.size == 0
+
+
+def test_weights_follow_bayes_and_stay_finite():
+    where = Whereabouts((located(np.zeros(3)), located(np.ones(3))), np.array([0.3, 1.0 - UNMAPPED - 0.3]))
+    np.testing.assert_allclose(where.weighed([0.0, 0.0]).probabilities, where.probabilities)
+    weighed = where.weighed([math.log(4.0), 0.0]).probabilities
+    np.testing.assert_allclose(weighed, np.array([1.2, 0.5]) / 1.9)
+    np.testing.assert_allclose(where.weighed([5000.0, 0.0]).probabilities, [1.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(where.weighed([-5000.0, -5000.0]).probabilities, [0.0, 0.0], atol=1e-12)
