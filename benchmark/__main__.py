@@ -61,6 +61,7 @@ MEASUREMENTS = {
     "oracle": "TSBI's PMF against an exact enumeration of all topologies",
     "awakening": "whether a robot that wakes up in a saved map finds out where, and after how many metres",
     "kidnapping": "whether a robot that is carried while it drives notices, and is right in the end",
+    "prior": "what landmarks say of where a lost robot is, on looks at a map",
     "laps": "whether memory, cost and errors grow where a robot drives over known ground again and again",
     "changes": "whether a map follows furniture and doors in mode lifelong, and holds nobody who walked by",
     "scale": "time and memory in maps of up to 100,000 areas",
@@ -72,8 +73,7 @@ _GROUPS = {
     "validation": (
         "calibration", "loops", "topology", "consistency", "evidence", "appearance", "lines", "linemap", "heading",
         "landmarks", "landmarkmaps", "hallways", "places", "institute", "belief", "driving", "explore", "localmaps",
-        "policies", "ambiguity",
-        "table", "oracle", "awakening", "kidnapping", "laps", "changes", "scale",
+        "policies", "ambiguity", "table", "oracle", "awakening", "kidnapping", "prior", "laps", "changes", "scale",
     ),
 }  # fmt: skip
 

@@ -65,11 +65,11 @@ class Places:
         False, "Whether landmarks weigh the places where a robot may be that woke up somewhere or was carried."
     )
     prior_temper: float = parameter(
-        0.3, "Exponent on their likelihood there, as they are made of the same scans as the surfaces.",
+        0.1, "Exponent on their likelihood there, as they are made of the same scans as the surfaces.",
         low=0.0, high=1.0,
     )
     prior_alike: float = parameter(
-        5.0, "What they say, so tempered, of places of a building that only look alike, against new ground.",
+        1.5, "What they say, so tempered, of places of a building that only look alike, against new ground.",
         unit="nat", low=-100.0, high=100.0,
     )
     max_entropy: float = parameter(
