@@ -6,8 +6,8 @@ surfaces find, relative to new ground.
 
 Landmarks are made of the same scans as surfaces are, so OS counts with an exponent. And a building's places look more
 like each other than like ground of which nothing is known, whose landmarks are strewn; so OS has to say more of a place
-than it says of one that only looks alike. Both numbers are fitted by log score on training worlds, in which half of the
-robots are where the map does not reach.
+than it says of one that only looks alike. Both numbers are fitted by log score on training worlds, where looks from
+where the map does not reach weigh a fifth (`python -m benchmark prior --training`).
 """
 
 from __future__ import annotations
