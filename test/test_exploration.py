@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -11,12 +12,14 @@ from benchmark.driven_run import DrivenRun
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.errors import HmtSlamError
+from hmt_slam_ros.exploration.explorer import Explorer
 from hmt_slam_ros.exploration.outlook import crosses, outlook_of
 from hmt_slam_ros.exploration.pilot import Pilot
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.logs.stamps import NANOSECONDS
 from hmt_slam_ros.motion import Limits
-from hmt_slam_ros.processes.errands import Errand, Outcome, errand_of
+from hmt_slam_ros.processes.errands import Errand, Outcome, Steering, errand_of
+from hmt_slam_ros.processes.replica import Replica
 from hmt_slam_ros.sensing import Scan
 from hmt_slam_ros.simulation.building import Building, FloorPlan
 from hmt_slam_ros.simulation.driven_robot import DrivenRobot
@@ -51,11 +54,11 @@ def scan_at(pose: tuple[float, float, float]) -> Scan:
 class _Explored:
     """The floor after a robot explored it."""
 
-    def __init__(self) -> None:
+    def __init__(self, *, explore: bool = True) -> None:
         scenario = Scenario(small_floor(), Settings(seed=5, laps=1, field_of_view=360.0, beams=720))
         self.robot = DrivenRobot(scenario)
         self.run = DrivenRun(self.robot, Configuration())
-        self.outcome = self.run.do(Errand("explore"), 400.0)
+        self.outcome = self.run.do(Errand("explore"), 400.0) if explore else None
         self.length = len(path_of(self))
 
 
@@ -115,6 +118,27 @@ def test_unknown_places_are_told() -> None:
     outcome = done(explored().run.do(Errand("go", "cellar"), 5.0))
     assert not outcome.reached
     assert "choose from room 1, room 2, area 0" in outcome.text
+
+
+def test_a_known_map_is_known_from_the_start() -> None:
+    known = explored(1).run.explorer.atlas
+    atlas = Explorer(Configuration(), Replica.of(known.replica.state)).atlas
+    areas = {name for name in known.places() if name.startswith("area")}
+    assert set(atlas.places()) >= areas
+    first = min(atlas.survey.roadmap)
+    assert set(atlas.survey.distances(first)) >= set(known.survey.distances(first))
+
+
+def test_it_stands_where_nothing_tells_the_pose_any_more() -> None:
+    own = _Explored(explore=False)
+    own.run.do(Errand("explore"), 5.0)
+    scan = own.robot.measure()[1] or scan_at((1.0, 0.0, 0.0))
+    moving, lost = (
+        own.run.explorer.handle(replace(scan, stamp=own.robot.stamp + after))[-1] for after in (0, 2 * NANOSECONDS)
+    )
+    assert isinstance(moving, Steering)
+    assert moving.speed > 0.0
+    assert lost == Steering(own.robot.stamp + 2 * NANOSECONDS, 0.0, 0.0)
 
 
 def test_same_seed_same_path_bit_for_bit() -> None:

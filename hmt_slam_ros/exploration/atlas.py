@@ -9,9 +9,13 @@ from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.exploration.route import Frames, Route
 from hmt_slam_ros.exploration.survey import Here, Survey
 from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.logs.stamps import NANOSECONDS
 from hmt_slam_ros.processes.messages import Accepted, Hypotheses, Keyframe, Message, RealTimePose
 from hmt_slam_ros.processes.replica import Replica
 from hmt_slam_ros.topology.hybrid_map import HybridMap
+
+# A pose is good for so long, ns; real-time localization falls silent where the robot may be anywhere.
+_FRESH = NANOSECONDS
 
 
 class Atlas:
@@ -30,6 +34,7 @@ class Atlas:
         self._frames: Frames | None = None
         # Of each room that was entered the keyframes around the place where it was, the nearest first.
         self._rooms: list[tuple[int, ...]] = []
+        self.survey.look_everywhere(self.hybrid_map, self.replica.scans)
 
     def hear(self, message: Message) -> None:
         """Take in a message of the chain, or a pose."""
@@ -49,10 +54,10 @@ class Atlas:
         """The map of the most probable hypothesis."""
         return self.replica.maps[self.replica.best]
 
-    @property
-    def ready(self) -> bool:
-        """Whether it is known where in the map the robot is."""
-        return self._pose is not None and self.hybrid_map.has_area(self._pose.area)
+    def ready(self, stamp: int) -> bool:
+        """Whether it is known where in the map the robot is at a time, ns."""
+        pose = self._pose
+        return pose is not None and abs(stamp - pose.stamp) <= _FRESH and self.hybrid_map.has_area(pose.area)
 
     @property
     def changed(self) -> bool:

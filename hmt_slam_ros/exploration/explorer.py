@@ -62,11 +62,6 @@ class Explorer:
         self._given_up: list[tuple[int, Float64]] = []
         self._again = False
 
-    @property
-    def errand(self) -> Errand | None:
-        """What it does now."""
-        return self._errand
-
     def handle(self, message: Message) -> list[Message]:
         """Take in one message; a scan is answered with velocities."""
         if isinstance(message, Errand):
@@ -80,12 +75,13 @@ class Explorer:
 
     def _drive(self, scan: Scan) -> list[Message]:
         said: list[Message] = []
-        if self.atlas.ready and self._errand is not None:
+        ready = self.atlas.ready(scan.stamp)
+        if ready and self._errand is not None:
             if self.atlas.changed and not self._holds():
                 self._route = None
             if self._route is None:
                 said += self._decide(self._errand, scan.stamp)
-        self._velocity = self._steered(scan, said) if self._route is not None and self.atlas.ready else _STAND
+        self._velocity = self._steered(scan, said) if ready and self._route is not None else _STAND
         return [*said, Steering(scan.stamp, *self._velocity)]
 
     def _holds(self) -> bool:

@@ -105,6 +105,15 @@ class Survey:
         self._find(names, placed, ground, pose, doors)
         return self._here(names, placed, ground, pose)
 
+    def look_everywhere(self, hybrid_map: HybridMap, scans: Mapping[int, Scan]) -> None:
+        """Bring all of a map up to date."""
+        for area in hybrid_map.area_ids():
+            looked: list[Float64] = []
+            for pose in hybrid_map.keyframes(area).values():
+                if all(math.dist(pose[:2], other[:2]) > 0.5 * _UP_TO_DATE for other in looked):
+                    looked.append(pose)
+                    self.look(hybrid_map, scans, area, pose)
+
     def _here(self, names: list[int], placed: Float64, ground: Ground, pose: Float64) -> Here:
         """How the robot gets to the roadmap; straight to the nearest keyframe where no other way is seen."""
         way = ground.way_to(pose[:2])
