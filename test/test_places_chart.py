@@ -83,6 +83,18 @@ def test_a_node_shows_its_openings_to_the_side_on_which_they_are(charts):
     np.testing.assert_allclose(axis.along[openings], 0.0, atol=0.05)
 
 
+def test_a_hallway_that_leads_on_is_an_opening_of_its_crossing_to_both_sides(charts):
+    chart = charts[0]
+    number = at(chart, 16.0)
+    (mouth,) = {edge.leaving for edge in chart.edges if (edge.start, edge.end) == (number, at(chart, 16.0, 11.0))}
+    seen = chart.seen[number].east if mouth in {EAST, WEST} else chart.seen[number].north
+    for track in (OPENINGS + 1, OPENINGS + 3):
+        own = (seen.tracks == track) & (np.abs(seen.along) < 0.1)
+        assert own.sum() == 1
+        assert seen.probabilities[own][0] >= 0.9
+        assert seen.forms[own][0] == pytest.approx(2.0, abs=0.15)
+
+
 def test_landmarks_of_rooms_are_not_those_of_the_hallway(charts):
     chart, _, views = charts
     listed = sum(len(edge.landmarks.tracks) for edge in chart.edges[::2])

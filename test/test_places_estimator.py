@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from small_floor import AREAS, CONFIGURATION, charted, seen_at
 
+from hmt_slam_ros.features.openings import Openings, openings_of
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.places.chart import DOOR
 from hmt_slam_ros.places.estimator import PlaceEstimator
@@ -119,3 +120,20 @@ def test_before_a_door_a_confident_robot_knows_its_pose_in_the_area_of_the_door(
     assert metric_start(lost, chart) is None
     list(drive(estimator, line((4.9, 0.5), (4.9, 0.0), up) + turn((4.9, 0.0), up, 0.0)))
     assert metric_start(estimator, chart) is None
+
+
+def test_a_door_that_someone_hid_is_noticed_by_the_turn_into_it(chart, graph, monkeypatch):
+    start = state_of(node_at(chart, 1.0), eastwards(chart))
+    estimator = PlaceEstimator(graph, CONFIGURATION, certain_belief(graph, CONFIGURATION.places, start))
+    up = 0.5 * math.pi
+    poses = line((1.0, 0.0), (5.0, 0.0)) + turn((5.0, 0.0), 0.0, up)
+    hidden = openings_of
+    monkeypatch.setattr("hmt_slam_ros.places.estimator.openings_of", lambda *args: without_sides(hidden(*args)))
+    list(drive(estimator, poses))
+    assert estimator.arrivals == 1
+    assert estimator.facing == (node_at(chart, 5.0), chart.nodes[node_at(chart, 5.0)].openings[0].direction)
+
+
+def without_sides(openings):
+    """Those that lead ahead alone, as if somebody stood before the others."""
+    return Openings(*(field[np.abs(openings.poses[:, 2]) < 0.5] for field in openings))

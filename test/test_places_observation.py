@@ -15,7 +15,13 @@ from hmt_slam_ros.features.corners import Corners, corners_of
 from hmt_slam_ros.features.extraction import extract_lines
 from hmt_slam_ros.features.openings import Openings, openings_of
 from hmt_slam_ros.features.rays import rays_of
-from hmt_slam_ros.places.observation import Expected, log_observation, log_unknown_ground, observation_model
+from hmt_slam_ros.places.observation import (
+    Expected,
+    log_observation,
+    log_unknown_ground,
+    observation_model,
+    place_along,
+)
 from hmt_slam_ros.places.observation_graph import (
     OPENINGS,
     TRACKS,
@@ -100,6 +106,17 @@ def test_to_turn_back_is_to_see_the_hallway_from_its_other_end():
     assert is_in(back, mirrored) or is_in(mirrored, back)
     for one, other in zip(turned_back(mirrored), there, strict=True):
         np.testing.assert_allclose(one, other, atol=1e-12)
+
+
+def test_what_is_seen_tells_how_far_the_robot_is_beyond_the_node():
+    expected = Expected(np.array([0, 0, 2]), landmarks((0, 1.0, 0.5, 0.0, 0.0, 0.9), (5, 2.0, 1.0, 0.0, 0.0, 0.9)))
+    seen = landmarks((0, 0.8, 0.5, 0.0, 0.0, 0.9), (5, 1.8, 1.0, 0.0, 0.0, 0.9))
+    mean, variance = place_along(seen, expected, 1, 0.0, 0.25, MODEL)
+    assert mean == pytest.approx(0.2, abs=0.02)
+    assert variance == pytest.approx(1.0 / (2.0 / MODEL.along + 4.0), rel=0.1)
+    # Where nothing is seen that is known, nothing is learnt.
+    mean, variance = place_along(no_landmarks(), expected, 0, 0.1, 0.25, MODEL)
+    assert (mean, variance) == pytest.approx((0.1, 0.25), rel=0.01)
 
 
 def brute_force(observed, expected, away, model):
