@@ -17,7 +17,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import networkx
 import numpy as np
 
 from hmt_slam_ros.arrays import Float64
@@ -153,6 +152,8 @@ class _Charting:
     def _groups(self) -> list[list[LeadingOff]]:
         """The openings of each node."""
         every = [one for area, floor in self._floors.items() for one in leading_off(floor, self._views[area].landmarks)]
+        import networkx  # noqa: PLC0415  mapping does without it, and it takes a fifth of a second
+
         same = networkx.Graph()
         same.add_nodes_from(range(len(every)))
         for i, one in enumerate(every):
