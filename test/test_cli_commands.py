@@ -178,7 +178,7 @@ def test_map_makes_the_folder_and_replaces_it_and_plot_draws_from_it(tmp_path: P
     assert drawn.returncode == 0, drawn.stderr
     assert [Path(line).name for line in drawn.stdout.split()] == ["map.png", "pmf.png", "cost.png"]
     exported = hmt_slam("export", out)
-    files = "".join(f"{out / name}\n" for name in ("topology.graphml", "landmarks.json"))
+    files = "".join(f"{out / name}\n" for name in ("topology.graphml", "landmarks.json", "places.json"))
     assert (exported.returncode, exported.stdout) == (0, files), exported.stderr
 
 

@@ -2,6 +2,7 @@
 
 import shutil
 import signal
+import time
 
 import numpy as np
 import pytest
@@ -27,6 +28,9 @@ SHUTDOWN = {
     "inactive": Transition.TRANSITION_INACTIVE_SHUTDOWN,
     "active": Transition.TRANSITION_ACTIVE_SHUTDOWN,
 }
+LOST = 20.0
+"""After so long no answer comes any more, s."""
+
 UP, DOWN = ("rtl", "tsbi", "slam", "aam", "tlca"), ("tlca", "slam", "rtl", "aam", "tsbi")
 
 
@@ -38,24 +42,28 @@ class Manager:
         self.clients = {}
 
     def call(self, kind, name, request):
+        """The answer; None where DDS lost it, as it may where the node does not know of the client yet."""
         if name not in self.clients:
             self.clients[name] = self.listener.node.create_client(kind, name)
         self.listener.until(self.clients[name].service_is_ready)
-        future = self.clients[name].call_async(request)
-        self.listener.until(future.done)
-        return future.result()
+        future, deadline = self.clients[name].call_async(request), time.monotonic() + LOST
+        self.listener.until(lambda: future.done() or time.monotonic() > deadline)
+        return future.result() if future.done() else None
 
     def state(self, node):
-        return self.call(GetState, f"{node}/get_state", GetState.Request()).current_state.label
+        while (answer := self.call(GetState, f"{node}/get_state", GetState.Request())) is None:
+            pass
+        return answer.current_state.label
 
     def change(self, node, transition):
         """Whether the node did it; a transition is given by its name or its number."""
-        request = ChangeState.Request()
+        request, before = ChangeState.Request(), self.state(node)
         if isinstance(transition, str):
             request.transition.label = transition
         else:
             request.transition.id = transition
-        return self.call(ChangeState, f"{node}/change_state", request).success
+        answer = self.call(ChangeState, f"{node}/change_state", request)
+        return self.state(node) != before if answer is None else answer.success
 
     def lead(self, names, transition, state):
         for name in names:
