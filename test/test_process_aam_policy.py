@@ -1,0 +1,110 @@
+"""Where areas end: at the openings that the robot passes, at cuts of which openings are a part, or at cuts."""
+
+import numpy as np
+import pytest
+import worlds
+from test_process_aam import OPTIONS, WORLD, drive_until_cut, estimate, exact, keyframe, stay
+
+from hmt_slam_ros.configuration import Configuration, with_changes
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.persistence.folder import FolderReader, FolderWriter
+from hmt_slam_ros.processes.aam import Aam
+from hmt_slam_ros.processes.aam_watch import AamState
+from hmt_slam_ros.processes.map_parts import Arc, Relabelled
+from hmt_slam_ros.processes.messages import Accepted, Hypotheses, Keyframe, Leaf
+
+# Straight on through the door, in the first room and behind it.
+THROUGH = worlds.drive((1.2, 3.0), (10.5, 3.0))
+DOOR = 6.0
+
+
+def by_policy(policy, **changes):
+    return Aam(configured(policy, **changes))
+
+
+def configured(policy, **changes):
+    own = {"area_policy": policy, "ncut_threshold": 0.0, "min_cluster": 3, "persistence": 2} | changes
+    return with_changes(Configuration(), OPTIONS | {f"aam.{name}": value for name, value in own.items()})
+
+
+def looking_ahead(process, poses=THROUGH, first=0):
+    """The event of the first cut, where the laser sees half a circle; and its keyframe."""
+    for k, pose in enumerate(poses[first:], start=first):
+        leaf = estimate(0, 0, se2.between(poses[0], pose))
+        (answer,) = process.handle(Keyframe(k, worlds.scan_in(WORLD, pose, beams=361), 0.5 * k, (leaf,)))
+        if answer.events:
+            return answer.events[0], k
+        process.handle(stay(k, 0))
+    return None
+
+
+def all_around(process, poses=THROUGH):
+    try:
+        return drive_until_cut(process, poses)
+    except pytest.fail.Exception:
+        return None
+
+
+@pytest.mark.parametrize("driven", [looking_ahead, all_around])
+def test_by_portal_an_area_ends_in_the_door_whatever_overlaps(driven):
+    event, k = driven(by_policy("portal"))
+    assert event.kind == "cut"
+    assert [THROUGH[i, 0] > DOOR for i in range(k + 1)] == [i in event.keyframes for i in range(k + 1)]
+    # Three keyframes behind the door, and once more.
+    assert len(event.keyframes) == 4
+    assert driven(by_policy("ncut")) is None
+
+
+def test_by_both_the_door_makes_a_cut_of_what_is_none():
+    assert drive_until_cut(by_policy("both", ncut_threshold=0.5), THROUGH)[0].keyframes[0] == 10
+    assert all_around(by_policy("ncut", ncut_threshold=0.5)) is None
+    assert all_around(by_policy("both", ncut_threshold=0.5, portal_factor=1.0)) is None
+
+
+def test_by_portal_an_area_without_doors_is_no_larger_than_its_limit():
+    there = worlds.drive((1.0, 1.0), (5.0, 1.0), (5.0, 5.0), (2.0, 5.0))
+    assert all_around(by_policy("portal"), there) is None
+    event, k = drive_until_cut(by_policy("portal", area_limit=4.0), there)
+    points = there[: k + 1, :2]
+    # Found once before.
+    assert np.hypot(*(points[k - 1] - points[: k - 1]).T).max() > 4.0
+    assert event.keyframes == tuple(range(event.keyframes[0], k + 1))
+
+
+@pytest.mark.parametrize("policy", ["portal", "both"])
+@pytest.mark.parametrize("stop", [3, 9, 12])
+def test_what_openings_were_seen_and_passed_is_part_of_the_state(policy, stop, tmp_path):
+    options = {"ncut_threshold": 0.5} if policy == "both" else {}
+    (event, k), process = looking_ahead(by_policy(policy, **options)), by_policy(policy, **options)
+    assert looking_ahead(process, THROUGH[:stop]) is None
+    writer = FolderWriter(tmp_path)
+    writer.write("aam", process.state)
+    writer.finish("state", 1)
+    state = FolderReader(tmp_path, "state", 1).read("aam", AamState)
+    again = Aam(configured(policy, **options), state)
+    found, at = looking_ahead(again, THROUGH, stop)
+    assert (found.keyframes, found.score, at) == (event.keyframes, event.score, k)
+
+
+def test_a_state_of_another_policy_goes_on_by_the_own_one():
+    process = by_policy("ncut")
+    assert looking_ahead(process, THROUGH[:8]) is None
+    event, _ = looking_ahead(Aam(configured("portal"), process.state), THROUGH, 8)
+    assert event.keyframes[0] == 10
+
+
+@pytest.mark.parametrize(("policy", "merged"), [("ncut", True), ("both", False), ("portal", False)])
+def test_areas_with_an_opening_between_them_are_not_one(policy, merged):
+    """Played: a closure joins the two rooms, and by a radius of overlap of metres nothing separates them."""
+    process = by_policy("portal", overlap_radius=2.0)
+    event, k = drive_until_cut(process, THROUGH)
+    poses = {i: se2.between(THROUGH[0], THROUGH[i]) for i in event.keyframes}
+    begun = tuple(Relabelled(i, 0, 1, pose) for i, pose in poses.items())
+    arc = Arc(0, 1, exact(np.zeros(3)), closure=True)
+    process.handle(Hypotheses(k, (Leaf(0, 0, 1.0, 1, exact(np.zeros(3)), begun, (arc,)),)))
+    process.handle(Accepted(k, 0, (arc,)))
+    changed = {"ncut_threshold": 0.3, "overlap_radius": 2.0, "min_cluster": 5, "portal_factor": 0.01}
+    process = Aam(configured(policy, **changed), process.state)
+    leaf = estimate(0, 1, poses[k], stored=False)
+    (answer,) = process.handle(keyframe(k + 1, THROUGH[k], leaf))
+    assert [event.kind for event in answer.events] == ["merged"] * merged
