@@ -6,17 +6,17 @@ import math
 
 import numpy as np
 import pytest
-from rough_places import ROUGH
 
 from benchmark.belief_corridors import random_corridors
 from benchmark.belief_world import drawn_anywhere, drawn_observation
 from hmt_slam_ros.configuration.features import Features
+from hmt_slam_ros.configuration.places import Places
 from hmt_slam_ros.places.observation import log_observation, log_unknown_ground, observation_model
 from hmt_slam_ros.places.observation_graph import Landmarks, joined, no_landmarks
 from hmt_slam_ros.places.place_graph import EAST, NORTH, SOUTH, WEST, Edge, Node, place_graph, state_of
 from hmt_slam_ros.places.position_belief import Travel, certain_belief, flat_belief
 
-PLACES = ROUGH
+PLACES = Places()
 MODEL = observation_model(PLACES, Features())
 EMPTY = no_landmarks()
 QUARTER = 0.5 * math.pi
@@ -32,11 +32,11 @@ def straight(start, end, length, landmarks=EMPTY, heading=EAST):
     return Edge(start, heading, end, heading, (length, 0.04), (0.0, 0.01), landmarks)
 
 
-def chain(lengths, existence=0.5):
+def chain(lengths, existence=0.5, places=PLACES):
     """A hallway from west to east."""
     ways = [straight(k, k + 1, length, corner(1.0 + 0.1 * k)) for k, length in enumerate(lengths)]
     edges = [edge for way in ways for edge in (way, way.back)]
-    return place_graph([Node(existence, EMPTY, EMPTY)] * (len(lengths) + 1), edges, PLACES)
+    return place_graph([Node(existence, EMPTY, EMPTY)] * (len(lengths) + 1), edges, places)
 
 
 def random_graph(seed, rows=1, columns=1, density=0.1):
@@ -57,7 +57,7 @@ def test_the_next_opening_is_at_the_end_of_the_edge_or_behind_those_that_are_mis
 
 
 def test_a_state_sees_ahead_and_back_what_the_map_has_there():
-    graph = chain([3.0, 4.0, 5.0])
+    graph = chain([3.0, 4.0, 5.0], places=dataclasses.replace(PLACES, reach=6.0))
 
     def seen(state):
         own = slice(*graph.expected.starts[state : state + 2])

@@ -6,11 +6,11 @@ import math
 
 import numpy as np
 import pytest
-from rough_places import ROUGH
 from worlds import scan_at
 
 from benchmark.belief_world import drawn_anywhere, drawn_observation
 from hmt_slam_ros.configuration.features import Features
+from hmt_slam_ros.configuration.places import Places
 from hmt_slam_ros.features.corners import Corners, corners_of
 from hmt_slam_ros.features.extraction import extract_lines
 from hmt_slam_ros.features.openings import Openings, openings_of
@@ -34,8 +34,9 @@ from hmt_slam_ros.places.observation_graph import (
 )
 
 FEATURES = Features(range_deviation=0.01)
-PLACES = ROUGH
+PLACES = Places()
 MODEL = observation_model(PLACES, FEATURES)
+WHOLE = dataclasses.replace(PLACES, reach=6.0, aside=4.0)
 # A hallway of 2 m with a door of 1 m to a room on the left, and at its end another hallway to the right.
 HALLWAY = np.array([
     [-6, -1, 4, -1], [4, -1, 4, -6], [6, -6, 6, 1], [6, 1, 2.5, 1], [2.5, 1, 2.5, 1.2], [2.5, 1.2, 4, 1.2],
@@ -48,7 +49,7 @@ def graph_at(pose, axis):
     scan = scan_at(HALLWAY, pose, 0.01, np.random.default_rng(0), 720)
     lines = extract_lines(scan, FEATURES)
     openings = openings_of(lines, rays_of(scan, FEATURES), FEATURES)
-    return observation_graph(corners_of(lines, FEATURES), openings, axis, PLACES)
+    return observation_graph(corners_of(lines, FEATURES), openings, axis, WHOLE)
 
 
 def is_in(few, more):

@@ -76,6 +76,6 @@ class Places:
         0.4, "The belief is confident below this entropy U_max.", unit="nat", low=1e-6, high=20.0
     )
     twin_share: float = parameter(
-        0.9, "Two peaks that hold this share of the belief are all that counts in the search for a loop.",
+        0.9, "The second peak in the search for a loop holds this share of all that is left without the first one.",
         low=0.5, high=0.999999,
     )

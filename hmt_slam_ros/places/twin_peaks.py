@@ -1,26 +1,33 @@
 """The loop detector of Tomatis, Nourbakhsh and Siegwart (2003), section 3.5: two peaks that move in the same way.
 
-A map that holds a place twice makes the belief unconfident, and from then on it has two peaks of which neither loses
-the other. Where both moved in the same way for three state transitions in a row, a loop is proposed: where the one is
-and where the other is, is one place. Peaks of a belief that is still spread over more than two tell nothing, nor do
-two of which one follows the other along the same hallway: there it is not certain how far the robot is.
+A map that holds a place twice gives the belief two peaks of which neither loses the other. Where both moved in the same
+way for three state transitions in a row, a loop is proposed: where the one is and where the other is, is one place. Nor
+do two peaks tell anything of which one follows the other along the same hallway: there it is not certain how far the
+robot is.
 
-Two entries of one place stay equally probable only as long as they hold the same landmarks. Where one lap showed a
-fifth less than the other, the belief soon decides for one of them, before three transitions, and no loop is proposed.
+The two entries of one place never hold quite the same landmarks, and a belief that trusts its landmarks soon decides
+for one of them. That the robot is at the one is no evidence against the other being the same place. So the second peak
+is not weighed against the first one, but against all that is left without that: the other places of the map, and ground
+that the map does not hold. That is most probable at first, since a place is seldom in the map twice; and nothing slips
+from peak to peak, which would have every place begin anew at each transition.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
+from hmt_slam_ros.configuration.places import Places
 from hmt_slam_ros.places.observation_graph import QUARTERS
 from hmt_slam_ros.places.place_graph import PlaceGraph, heading_of, node_of
-from hmt_slam_ros.places.position_belief import PositionBelief
+from hmt_slam_ros.places.position_belief import PositionBelief, flat_belief
 
 TRANSITIONS = 3
 """In a row in which both peaks have to move in the same way."""
+
+_SLIP = 1e-9
 
 
 class Loop(NamedTuple):
@@ -34,6 +41,14 @@ class Loop(NamedTuple):
     node: int
     other: int
     quarters: int
+
+
+def belief_of_twins(graph: PlaceGraph, places: Places) -> PositionBelief:
+    """The belief whose peaks are followed, before anything was seen.
+
+    A place is in the map a second time with the probability of coming from unknown ground to known one.
+    """
+    return flat_belief(graph, replace(places, slip=_SLIP, unmapped=1.0 - places.discovery))
 
 
 class TwinPeaks:
@@ -67,12 +82,11 @@ class TwinPeaks:
 
 
 def _peaks(belief: PositionBelief) -> tuple[int, int] | None:
-    """The two highest peaks of an unconfident belief that has only two, both of them in the map."""
+    """The highest peak of a belief, and the one that is all that is left without it; both of them in the map."""
     first, second = np.argsort(-belief.logs, kind="stable")[:2].tolist()
-    together = float(belief.probabilities[[first, second]].sum())
-    if belief.confident or together < belief.places.twin_share or belief.graph.states in {first, second}:
-        return None
-    return first, second
+    left = float(np.delete(belief.probabilities, first).sum())
+    twin = left > 0.0 and belief.probabilities[second] >= belief.places.twin_share * left
+    return (first, second) if twin and belief.graph.states not in {first, second} else None
 
 
 def _moves(graph: PlaceGraph, source: int, target: int) -> bool:
