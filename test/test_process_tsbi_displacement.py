@@ -5,11 +5,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from ring_for_tsbi import RING, Run, ring_drive
 from test_process_tsbi_branching import OTHER, PATH, ROOM, rooms_apart
 from worlds import box, scan_in
 
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.processes import tsbi_awakening
+from hmt_slam_ros.processes.messages import AreaEvents, Forgotten
 from hmt_slam_ros.processes.tsbi_awakening import UNKNOWN
 from hmt_slam_ros.processes.tsbi_displacement import displaced_or_not, with_displaced
 from hmt_slam_ros.topology.hypothesis_tree import LeafNotes, Spot
@@ -129,3 +131,17 @@ def test_a_doubt_passes_with_scans_that_fit():
 
 def test_what_contradicted_a_little_before_is_another_matter():
     assert LeafNotes().heard(5, 2.0).heard(6, 9.0).heard(7, 6.0).displaced[1] == 6
+
+
+def test_what_a_displaced_robot_saw_is_not_forgotten_at_the_same_event():
+    run = Run(RING)
+    poses = ring_drive(16)
+    for pose in poses[:12]:
+        run.keyframe(pose)
+    run.evidence[0] = -6.0
+    for pose in poses[12:14]:
+        assert len(run.keyframe(pose).leaves) == 1
+    run._answer = lambda sequence, _events: run.tsbi.handle(AreaEvents(sequence, (), (Forgotten(sequence, 0),)))
+    (answer,) = run.keyframe(poses[14])
+    assert [leaf.lost for leaf in answer.leaves] == [False, True]
+    assert not answer.forgotten

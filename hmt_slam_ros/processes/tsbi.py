@@ -168,7 +168,9 @@ class Tsbi:
         changed = self._leaves(children, chosen, settled.probabilities)
         # What a question that is open again moves has to be there.
         arrived_now = keyframe.carried or keyframe.place is not None
-        forgotten = () if self._reopened or arrived_now else events.forgotten
+        # Area abstraction, which does not know that the robot was displaced, forgets where it moves nothing itself.
+        displaced = any(leaf.relabelled for leaf in changed)
+        forgotten = () if self._reopened or arrived_now or displaced else events.forgotten
         outdated = () if self._reopened or arrived_now else keyframe.outdated
         self._replica.apply(Hypotheses(events.sequence, tuple(changed), settled.unexamined, forgotten, outdated))
         if outdated:
