@@ -52,6 +52,7 @@ MEASUREMENTS = {
     "places": "whether the doors and crossings of an institute are in the charts of its maps",
     "institute": "whether robots in an institute know at which place they are, on missions and when they are lost",
     "belief": "how soon a lost robot knows at which place it is, in corridors of the belief's own model",
+    "threeloops": "whether loops close that only the belief over places can propose",
     "driving": "whether a robot that avoids obstacles reaches its goals, and touches nothing",
     "policies": "what areas that end at doors cost and gain, and portals against true doors",
     "explore": "whether a robot explores an institute by itself, and goes on missions to rooms on its own map",
@@ -72,8 +73,9 @@ _GROUPS = {
     "all": ("accuracy", "steps", "robustness", "choices", "sessions", "speed", "live"),
     "validation": (
         "calibration", "loops", "topology", "consistency", "evidence", "appearance", "lines", "linemap", "heading",
-        "landmarks", "landmarkmaps", "hallways", "places", "institute", "belief", "driving", "explore", "localmaps",
-        "policies", "ambiguity", "table", "oracle", "awakening", "kidnapping", "prior", "laps", "changes", "scale",
+        "landmarks", "landmarkmaps", "hallways", "places", "institute", "belief", "threeloops", "driving", "explore",
+        "localmaps", "policies", "ambiguity", "table", "oracle", "awakening", "kidnapping", "prior", "laps", "changes",
+        "scale",
     ),
 }  # fmt: skip
 

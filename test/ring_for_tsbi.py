@@ -49,7 +49,7 @@ class Run:
         self.poses = {0: np.zeros(3)}
         self.covariances = {0: np.diag([1e-8, 1e-8, 1e-8])}
         self.true_pose = None
-        self.answers = []
+        self.answers, self.notices = [], []
         self.evidence = {}
         self.stored = True
 
@@ -88,7 +88,8 @@ class Run:
         return tuple(AreaEvent(h, "cut", newest, self.replica.areas[h], 0.2) for h in sorted(self.poses) if cut)
 
     def _answer(self, sequence, events):
-        (answer,) = self.tsbi.handle(AreaEvents(sequence, events))
+        *notices, answer = self.tsbi.handle(AreaEvents(sequence, events))
+        self.notices += [notice.text for notice in notices]
         assert isinstance(answer, Hypotheses)
         assert answer.sequence == sequence
         assert sum(leaf.probability for leaf in answer.leaves) + answer.unexamined == pytest.approx(1.0)

@@ -25,6 +25,7 @@ from hmt_slam_ros.processes.rtl import Rtl
 from hmt_slam_ros.processes.slam import MetricSlam
 from hmt_slam_ros.processes.tlca import Tlca
 from hmt_slam_ros.processes.tsbi import Tsbi
+from hmt_slam_ros.processes.tsbi_branching import Branching
 from hmt_slam_ros.sensing import Scan
 from hmt_slam_ros.simulation import SimulatedLog
 from hmt_slam_ros.topology.hybrid_map import HybridMap
@@ -88,7 +89,7 @@ class Watch:
         processes: dict[str, Process] = {
             "slam": MetricSlam(configuration),
             "aam": Aam(configuration),
-            "tsbi": Tsbi(configuration, lambda c, r: WatchedBranching(c, r, self._examined)),
+            "tsbi": Tsbi(configuration, self.branching),
             "tlca": Tlca(configuration),
             "rtl": Rtl(configuration),
         }
@@ -97,6 +98,10 @@ class Watch:
             lock_step.feed(record.measurement)
         lock_step.feed(EndOfLog())
         self.loops.finish()
+
+    def branching(self, configuration: Configuration, replica: Replica) -> Branching:
+        """What makes the children of hypotheses, watched."""
+        return WatchedBranching(configuration, replica, self._examined)
 
     def _hear(self, message: Message) -> None:
         match message:

@@ -72,6 +72,10 @@ class Places:
         1.5, "What they say, so tempered, of places of a building that only look alike, against new ground.",
         unit="nat", low=-100.0, high=100.0,
     )
+    loops: bool = parameter(
+        False, "Whether landmarks propose loops: known areas where a map's last places are a second time, wherever the "
+        "arcs have these.",
+    )
     max_entropy: float = parameter(
         0.4, "The belief is confident below this entropy U_max.", unit="nat", low=1e-6, high=20.0
     )

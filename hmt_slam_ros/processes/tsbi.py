@@ -70,7 +70,7 @@ class TsbiState:
 class Tsbi:
     """Answers the area events of every keyframe with the live hypotheses.
 
-    Consumes Arriving, Keyframe, AreaEvents, Accepted; produces Hypotheses.
+    Consumes Arriving, Keyframe, AreaEvents, Accepted; produces Hypotheses, and Notices of loops that are looked for.
     """
 
     def __init__(
@@ -129,7 +129,8 @@ class Tsbi:
         if isinstance(message, Keyframe):
             self._note(message)
         elif isinstance(message, AreaEvents):
-            return [self._infer(message)]
+            answer = self._infer(message)
+            return [*(self._branching.loops.notices() if self._branching.loops else ()), answer]
         elif isinstance(message, Accepted):
             self._accept(message)
         elif isinstance(message, Arriving):

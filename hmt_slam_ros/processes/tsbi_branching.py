@@ -19,6 +19,7 @@ from hmt_slam_ros.agreement import NO_CLUTTER, Clutter
 from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.processes.loop_proposals import PROBABLE, LoopProposals
 from hmt_slam_ros.processes.map_parts import Arc, ArcEnds, Merged, Relabelled
 from hmt_slam_ros.processes.place_prior import PlacePrior
 from hmt_slam_ros.processes.replica import FIRST_AREA, Replica
@@ -116,11 +117,13 @@ class Branching:
     """Makes the children of hypotheses; numbers new areas.
 
     :ivar search: finds and compares known areas.
+    :ivar loops: proposes some, where landmarks are asked.
     """
 
     def __init__(self, configuration: Configuration, replica: Replica) -> None:
         self.search = ClosureSearch(configuration, replica.scans)
         self._prior = PlacePrior(configuration, replica.scans) if configuration.places.prior else None
+        self.loops = LoopProposals(configuration, replica.scans) if configuration.places.loops else None
         self._options = configuration.tsbi
         self._replica = replica
         sigma, angle = configuration.tlca.arc_sigma_floor, math.radians(configuration.tlca.arc_angle_floor)
@@ -161,6 +164,8 @@ class Branching:
         self.search.forget_scans()
         if self._prior is not None:
             self._prior.forget()
+        if self.loops is not None:
+            self.loops.forget_scans()
 
     def begin_event(self) -> None:
         """Forget which new areas were named; within one event hypotheses share the ids of the same new area."""
@@ -190,7 +195,10 @@ class Branching:
         if tracked is not None:
             return Branches([self._enter_tracked(parent, query, tracked)])
         excluded = {parent.area, *parent.around()}
-        found = self._compared(parent, query, excluded)
+        supposed = parent.hybrid_map
+        if self.loops is not None and parent.share >= PROBABLE:
+            supposed = self.loops.supposed(parent.hybrid_map)
+        found = self._compared(replace(parent, hybrid_map=supposed), query, excluded)
         noted = replace(parent, notes=parent.notes.checked(found.examined, keyframes, found.beside))
         children = [self._enter_new(noted, query, math.log(found.transition.new))]
         children += [self._enter_known(noted, query, fit) for fit in found.fits]

@@ -5,7 +5,7 @@ What all hypotheses agree on stands once, in a shared common map; a hypothesis h
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -38,6 +38,13 @@ class HybridMap:
     def branch(self) -> HybridMap:
         """A child that may change without its parent noticing."""
         return HybridMap(self.common, {a: dict(k) for a, k in self.areas.items()}, dict(self.arcs))
+
+    def part(self, areas: Collection[int]) -> HybridMap:
+        """A map of its own of some areas, and of the arcs between them."""
+        part = HybridMap(areas={area: dict(self.keyframes(area)) for area in areas})
+        part.arcs |= {(a, b): arc for a, b, arc in self.all_arcs() if a in areas and b in areas}
+        part.absorb()
+        return part
 
     def absorb(self) -> None:
         """Make this hypothesis's changes common; valid only when it is the one live hypothesis of ``common``."""

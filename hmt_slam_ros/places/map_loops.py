@@ -1,0 +1,124 @@
+"""Loops of an HMT map that its landmarks propose, whatever the arcs say of where its areas lie.
+
+Tomatis, Nourbakhsh and Siegwart (2003), section 3.5. The areas that the robot went through last make a chart of their
+own, those of before another one; what is around an area is asked within its own chart only, so that no prior by the
+arcs tells which of their nodes are one. The belief goes the robot's way again over both. Where its two peaks move in
+the same way, an area of the one is joined to an area of the other, as the poses of the two nodes say.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from hmt_slam_ros.arrays import Float64
+from hmt_slam_ros.configuration import Configuration
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.local_map.area_landmarks import AreaLandmarks
+from hmt_slam_ros.local_map.local_mapping import LocalMapping
+from hmt_slam_ros.places.chart import Chart, chart_of
+from hmt_slam_ros.places.floor import AreaView, view_of
+from hmt_slam_ros.places.observation import observation_model
+from hmt_slam_ros.places.place_graph import Edge, PlaceGraph
+from hmt_slam_ros.places.twin_peaks import TRANSITIONS, Loop
+from hmt_slam_ros.places.way_back import loops_along, ways
+from hmt_slam_ros.sensing import Scan
+from hmt_slam_ros.topology.hybrid_map import HybridMap
+
+# Of the robot's way so many transitions are enough.
+_ENOUGH = 3 * TRANSITIONS
+# Deviations of a node's place against its twin's, m, and of its axes, rad.
+_PLACED, _TURNED = 0.15, math.radians(1.5)
+
+
+class MapLoop(NamedTuple):
+    """Two areas that a loop joins.
+
+    :ivar area: one that the robot went through last.
+    :ivar other: one of before.
+    :ivar pose: the belief over ``area_T_other``.
+    """
+
+    area: int
+    other: int
+    pose: PoseGaussian
+
+
+class MapLoops:
+    """Looks for loops in maps; keeps what areas show."""
+
+    def __init__(self, configuration: Configuration, scans: Mapping[int, Scan]) -> None:
+        """:param scans: {keyframe: scan}, which may grow."""
+        self._features, self._places, self._scans = configuration.features, configuration.places, scans
+        self._model = observation_model(configuration.places, configuration.features)
+        self._known = AreaLandmarks(LocalMapping(configuration))
+        self._views: dict[int, tuple[dict[int, Float64], AreaView]] = {}
+
+    def forget(self) -> None:
+        """Forget what areas show, which is looked up again where it is asked for."""
+        self._views.clear()
+
+    def newest(self, hybrid_map: HybridMap) -> MapLoop | None:
+        """The newest place of the robot's way that the map holds another time, as the belief says; None for none."""
+        for last, before in _divisions(hybrid_map):
+            own = self._chart(last)
+            found = ways(last, own)
+            if max(map(len, found), default=0) >= TRANSITIONS:
+                both = _beside(own, self._chart(before))
+                graph = both.graph(self._places)
+                loops = [loop for way in found for loop in self._proposed(way, graph, len(own.nodes))]
+                if loops:
+                    return _joining(both, loops[-1], len(own.nodes))
+            if sum(map(len, found)) >= _ENOUGH:
+                break
+        return None
+
+    def _proposed(self, way: list[Edge], graph: PlaceGraph, own: int) -> Iterator[Loop]:
+        """The loops between one of the first nodes, and one of the others."""
+        for loop in loops_along(way, graph, self._model, self._places):
+            if loop is not None and (loop.node < own) != (loop.other < own):
+                yield loop
+
+    def _chart(self, hybrid_map: HybridMap) -> Chart:
+        views = {area: self._view(hybrid_map, area) for area in hybrid_map.area_ids()}
+        return chart_of(hybrid_map, views, self._features)
+
+    def _view(self, hybrid_map: HybridMap, area: int) -> AreaView:
+        keyframes = dict(hybrid_map.keyframes(area))
+        held = self._views.get(area)
+        if held is None or not _same(held[0], keyframes):
+            held = self._views[area] = keyframes, view_of(keyframes, self._scans, self._known)
+        return held[1]
+
+
+def _divisions(hybrid_map: HybridMap) -> Iterator[tuple[HybridMap, HybridMap]]:
+    """The map of the areas in which the robot was last, from the fewest on, and that of all in which it was before."""
+    keyframes = {area: hybrid_map.keyframes(area) for area in hybrid_map.area_ids()}
+    areas = sorted((area for area, own in keyframes.items() if own), key=lambda area: max(keyframes[area]))
+    for k in range(len(areas) - 1, 0, -1):
+        if max(keyframes[areas[k - 1]]) < min(min(keyframes[area]) for area in areas[k:]):
+            yield hybrid_map.part(areas[k:]), hybrid_map.part(areas[:k])
+
+
+def _beside(one: Chart, other: Chart) -> Chart:
+    """Two charts as one, in which no edge leads from the one to the other."""
+    count = len(one.nodes)
+    edges = (edge._replace(start=edge.start + count, end=edge.end + count) for edge in other.edges)
+    return Chart(one.nodes + other.nodes, one.seen + other.seen, (*one.edges, *edges))
+
+
+def _joining(chart: Chart, loop: Loop, own: int) -> MapLoop:
+    """A loop between a node of the first ones and another one, as it joins their areas."""
+    quarters = loop.quarters if loop.node < own else -loop.quarters
+    node, other = (chart.nodes[k] for k in sorted((loop.node, loop.other)))
+    turned = PoseGaussian(np.array((0.0, 0.0, 0.5 * math.pi * quarters)), np.diag([_PLACED, _PLACED, _TURNED]) ** 2)
+    back = PoseGaussian.exactly(other.pose).inverse()
+    return MapLoop(node.area, other.area, PoseGaussian.exactly(node.pose).compose(turned).compose(back))
+
+
+def _same(one: Mapping[int, Float64], other: Mapping[int, Float64]) -> bool:
+    """Whether two areas have the same keyframes in the same places."""
+    return one.keys() == other.keys() and all(np.array_equal(pose, other[k]) for k, pose in one.items())

@@ -1,0 +1,59 @@
+"""Loops that landmarks propose to TSBI: known areas are looked for as if an arc closed the loop.
+
+Tomatis, Nourbakhsh and Siegwart (2003), section 3.5, as a generator of candidates: the belief over places tells which
+areas may be one, and how they lie to each other, without any prior by the arcs (places/map_loops.py). What is proposed
+is no evidence and stays no arc. It is where keyframes are laid into known areas, and whether they fit there decides
+(topology/closure_search.py).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from hmt_slam_ros.configuration import Configuration
+from hmt_slam_ros.places.map_loops import MapLoop, MapLoops
+from hmt_slam_ros.processes.messages import Notice
+from hmt_slam_ros.sensing import Scan
+from hmt_slam_ros.topology.hybrid_map import HybridMap
+from hmt_slam_ros.topology.unknown import telling_arc
+
+PROBABLE = 0.5
+"""Hypotheses of this probability are asked for loops."""
+
+_TEXT = "landmarks on the way through area {} are those of area {}: a loop is looked for there, and nothing is to do"
+
+
+class LoopProposals:
+    """Supposes arcs."""
+
+    def __init__(self, configuration: Configuration, scans: Mapping[int, Scan]) -> None:
+        """:param scans: {keyframe: scan}, which may grow."""
+        self._loops = MapLoops(configuration, scans)
+        self._untold: list[tuple[int, int]] = []
+        self._told: set[tuple[int, int]] = set()
+
+    def forget_scans(self) -> None:
+        """Look up anew what scans show, of which some have changed."""
+        self._loops.forget()
+
+    def proposed(self, hybrid_map: HybridMap) -> MapLoop | None:
+        """The newest loop that landmarks propose and no arc closes; None for none."""
+        loop = self._loops.newest(hybrid_map)
+        return None if loop is None or telling_arc(hybrid_map, loop.area, loop.other) is not None else loop
+
+    def supposed(self, hybrid_map: HybridMap) -> HybridMap:
+        """The map with an arc where one is proposed; the map itself where none is."""
+        loop = self.proposed(hybrid_map)
+        if loop is None:
+            return hybrid_map
+        self._untold.append((loop.area, loop.other))
+        supposed = hybrid_map.branch()
+        supposed.set_arc(loop.area, loop.other, loop.pose, closure=False)
+        return supposed
+
+    def notices(self) -> list[Notice]:
+        """What was proposed since this was asked last, each pair of areas once."""
+        new = [pair for pair in dict.fromkeys(self._untold) if pair not in self._told]
+        self._untold.clear()
+        self._told.update(new)
+        return [Notice("tsbi", _TEXT.format(area, other)) for area, other in new]

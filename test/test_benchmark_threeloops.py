@@ -1,0 +1,39 @@
+"""The measurement of loops that only the belief proposes."""
+
+import pytest
+
+from benchmark.documents import VALIDATION, marks
+from benchmark.threeloops import Closed, Drive, Proposal, requirements
+
+RIGHT, WRONG = Proposal(220.0, (0.1, 1.0)), Proposal(50.0, (6.0, 1.0))
+
+
+def test_a_proposal_is_right_where_the_areas_lie_so():
+    assert RIGHT.right
+    assert not WRONG.right
+    assert not Proposal(220.0, (0.1, 90.0)).right
+    assert not Proposal(220.0, None).right
+
+
+def test_a_loop_is_closed_at_the_first_right_closure_behind_its_begin():
+    closures = [Closed(100.0, right=True), Closed(210.0, right=False), Closed(240.0, right=True)]
+    assert Drive(400.0, [200.0], [], closures).ways == [40.0]
+    assert Drive(400.0, [200.0], [], closures[:2]).ways == []
+
+
+def test_what_is_required():
+    nothing = [Proposal(float(at), None) for at in (30, 60, 250)]
+    good = Drive(400.0, [200.0], [*nothing, RIGHT], [Closed(240.0, right=True)])
+    control = Drive(400.0, [200.0], [], [])
+    assert all(one.met for one in requirements([good], [control]))
+    false = {one.name: one.met for one in requirements([good._replace(proposals=[WRONG])], [control])}
+    assert [name for name, met in false.items() if not met] == ["proposals that are false"]
+    assert not all(one.met for one in requirements([control], [control]))
+    assert not all(one.met for one in requirements([good], [good]))
+    values = {one.name: one.value for one in requirements([good, control], [control, control])}
+    assert values["loops closed, share"] == pytest.approx(0.5)
+
+
+def test_the_document_has_a_place_for_it():
+    text = VALIDATION.read_text()
+    assert all(text.count(mark) == 1 for mark in marks("threeloops"))

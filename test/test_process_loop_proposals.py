@@ -1,0 +1,73 @@
+"""Closures that are proposed without a prior by the arcs: the surfaces decide about them as about any other."""
+
+import math
+
+import numpy as np
+import pytest
+from ring_for_tsbi import RING, Run, ring_drive
+
+from hmt_slam_ros.configuration import Configuration
+from hmt_slam_ros.configuration.flat import with_changes
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.places.map_loops import MapLoop
+from hmt_slam_ros.processes.loop_proposals import LoopProposals
+
+SPREAD = np.diag([0.15, 0.15, math.radians(1.5)]) ** 2
+# Areas whose position is less certain than this are not looked at, m: none behind the ring.
+GATED = with_changes(Configuration(), {"tsbi.prior_limit": 0.5})
+LAP, LAST = 96, 120  # keyframes
+
+
+class Told(LoopProposals):
+    """Proposes what it is told."""
+
+    def __init__(self, loop):
+        super().__init__(GATED, {})
+        self.loop = loop
+
+    def proposed(self, _hybrid_map):
+        return self.loop
+
+
+def frame(run, poses, area):
+    """The true pose of an area."""
+    keyframe, pose = next(iter(run.replica.maps[run.replica.best].keyframes(area).items()))
+    return se2.compose(poses[keyframe], se2.inverse(pose))
+
+
+def twice_into_the_first_corridor(shift):
+    """Once around and on; from where the ring closes on, a loop with the first area is proposed.
+
+    :param shift: of what is proposed from what is true, m; None for no proposal.
+    """
+    run, poses = Run(RING, configuration=GATED, field_of_view=2 * np.pi, beams=241), ring_drive(LAST)
+    for k, pose in enumerate(poses):
+        if k == LAP + 4 and shift is not None:
+            own = run.replica.areas[run.replica.best]
+            true = se2.between(frame(run, poses, own), frame(run, poses, 0))
+            loop = MapLoop(own, 0, PoseGaussian(se2.compose(np.array((*shift, 0.0)), true), SPREAD))
+            run.tsbi._branching.loops = Told(loop)
+        run.keyframe(pose, cut=7 if k and k % 14 == 0 else 0)
+        if len(run.answers[-1].leaves) > 1:
+            run.accept(run.replica.best)
+    best = run.replica.maps[run.replica.best]
+    return run, poses, [(a, b, arc) for a, b, arc in best.all_arcs() if arc.closure]
+
+
+def test_nobody_proposes_where_nobody_asks_for_it():
+    assert Run(RING).tsbi._branching.loops is None
+
+
+def test_what_is_out_of_reach_by_the_arcs_is_closed_where_it_is_proposed():
+    assert not twice_into_the_first_corridor(None)[2]
+    run, poses, ((a, b, arc), *_) = twice_into_the_first_corridor((0.0, 0.0))
+    off = se2.log(se2.between(arc.pose.mean, se2.between(frame(run, poses, a), frame(run, poses, b))))
+    assert math.hypot(off[0], off[1]) < 0.1
+    (notice,) = run.notices
+    assert "area 7 are those of area 0" in notice
+
+
+@pytest.mark.parametrize("shift", [(3.0, 0.0), (0.0, 6.0)])
+def test_a_proposal_that_is_false_closes_nothing(shift):
+    assert not twice_into_the_first_corridor(shift)[2]
