@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache
 
@@ -11,6 +12,7 @@ import pytest
 from benchmark.driven_run import DrivenRun
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration import Configuration
+from hmt_slam_ros.configuration.flat import with_changes
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.exploration.explorer import Explorer
 from hmt_slam_ros.exploration.outlook import crosses, outlook_of
@@ -18,7 +20,8 @@ from hmt_slam_ros.exploration.pilot import Pilot
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.logs.stamps import NANOSECONDS
 from hmt_slam_ros.motion import Limits
-from hmt_slam_ros.processes.errands import Errand, Outcome, Steering, errand_of
+from hmt_slam_ros.processes.errands import Errand, Heading, Outcome, Steering, errand_of
+from hmt_slam_ros.processes.messages import Accepted, Hypotheses, Leaf
 from hmt_slam_ros.processes.replica import Replica
 from hmt_slam_ros.sensing import Scan
 from hmt_slam_ros.simulation.building import Building, FloorPlan
@@ -54,10 +57,10 @@ def scan_at(pose: tuple[float, float, float]) -> Scan:
 class _Explored:
     """The floor after a robot explored it."""
 
-    def __init__(self, *, explore: bool = True) -> None:
+    def __init__(self, *, explore: bool = True, changes: Mapping[str, bool] | None = None) -> None:
         scenario = Scenario(small_floor(), Settings(seed=5, laps=1, field_of_view=360.0, beams=720))
         self.robot = DrivenRobot(scenario)
-        self.run = DrivenRun(self.robot, Configuration())
+        self.run = DrivenRun(self.robot, with_changes(Configuration(), changes or {}))
         self.outcome = self.run.do(Errand("explore"), 400.0) if explore else None
         self.length = len(path_of(self))
 
@@ -112,6 +115,43 @@ def test_backtracking_goes_along_its_own_path_until_told_to_stop() -> None:
     assert max(np.hypot(*(before - place).T).min() for place in back) < 0.6
     assert own.run.do(Errand("stop"), 3.0) is None
     assert own.robot.velocity == (0.0, 0.0)
+
+
+def goes(own: _Explored, *probabilities: float) -> Heading | None:
+    """Where the explorer goes from now on, where so many topological paths are as probable as this; None for as before.
+
+    They are all the same map.
+    """
+    explorer, atlas = own.run.explorer, own.run.explorer.atlas
+    best, area, sequence = atlas.replica.best, atlas.pose.area, max(atlas.replica.scans)
+    leaves = tuple(Leaf(best + k, best, share, area) for k, share in enumerate(probabilities))
+    explorer.handle(Hypotheses(sequence, leaves, 0.0))
+    explorer.handle(Accepted(sequence, None, (), ()))
+    said = explorer.handle(replace(scan_at((1.0, 0.0, 0.0)), stamp=atlas.pose.stamp))
+    return next((word for word in said if isinstance(word, Heading)), None)
+
+
+def test_it_turns_back_while_several_topological_paths_are_probable() -> None:
+    own = _Explored(explore=False, changes={"explorer.backtracks": True})
+    assert own.run.do(Errand("explore"), 25.0) is None
+    back = goes(own, 0.6, 0.4)
+    assert back is not None
+    # It began there, in the frame of the first area.
+    assert back.area == 0
+    np.testing.assert_allclose(back.goal[:2], (0.0, 0.0), atol=0.01)
+    assert goes(own, 0.7, 0.3) is None
+    on = goes(own, 0.99, 0.01)
+    assert on is not None
+    assert np.hypot(*on.goal[:2]) > 1.0
+
+
+def test_it_explores_on_where_nobody_asks_it_to_turn_back() -> None:
+    own = _Explored(explore=False)
+    assert own.run.do(Errand("explore"), 25.0) is None
+    assert own.run.explorer.atlas.entropy == 0.0
+    on = goes(own, 0.6, 0.4)
+    assert own.run.explorer.atlas.entropy == pytest.approx(0.673, abs=0.001)
+    assert on is None or np.hypot(*on.goal[:2]) > 1.0
 
 
 def test_unknown_places_are_told() -> None:

@@ -18,6 +18,10 @@ class Exploration:
         choices=("velocities", "goals"),
     )
     explores: bool = parameter(True, "Explore from the start on; otherwise wait for an errand.")
+    backtracks: bool = parameter(
+        False, "Go back along the robot's own path where the probability of topological paths has several peaks, until "
+        "its entropy is below `places.max_entropy`, before it explores on.",
+    )
     speed: float = parameter(0.6, "Speed at most.", unit="m/s", low=0.05, high=5.0)
     turn_rate: float = parameter(45.0, "Turn rate at most.", unit="deg/s", low=1.0, high=360.0)
     acceleration: float = parameter(0.5, "Acceleration at most, to brake as well.", unit="m/s^2", low=0.05, high=10.0)

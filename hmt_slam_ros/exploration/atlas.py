@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from hmt_slam_ros.arrays import Float64
@@ -53,6 +55,11 @@ class Atlas:
     def hybrid_map(self) -> HybridMap:
         """The map of the most probable hypothesis."""
         return self.replica.maps[self.replica.best]
+
+    @property
+    def entropy(self) -> float:
+        """Of the probabilities of topological paths, nats."""
+        return -sum(each * math.log(each) for each in self.replica.probabilities.values() if each > 0.0)
 
     def ready(self, stamp: int) -> bool:
         """Whether it is known where in the map the robot is at a time, ns."""

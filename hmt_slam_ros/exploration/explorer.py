@@ -61,6 +61,8 @@ class Explorer:
         self._reached: list[tuple[int, Float64]] = []
         self._given_up: list[tuple[int, Float64]] = []
         self._again = False
+        self._single = configuration.places.max_entropy if own.backtracks else math.inf
+        self._backs = False
 
     def handle(self, message: Message) -> list[Message]:
         """Take in one message; a scan is answered with velocities."""
@@ -88,11 +90,18 @@ class Explorer:
         """Whether it goes on to where it went."""
         if self._route is None or not self.atlas.frames.knows(self._route):
             return False
+        if self._backs or self._unclear:
+            return self._backs and self._unclear
         return not (self._exploring and self._target and self._target.hallway and self._pilot.left < _MOVES_ON)
 
     @property
     def _exploring(self) -> bool:
         return self._errand is not None and self._errand.kind == "explore"
+
+    @property
+    def _unclear(self) -> bool:
+        """Whether it turns back until one topological path has nearly all of the probability, as the paper's robot."""
+        return self._exploring and self.atlas.entropy >= self._single
 
     def _steered(self, scan: Scan, said: list[Message]) -> tuple[float, float]:
         """The velocities along the route; where that ends, what there is to say is added."""
@@ -107,6 +116,8 @@ class Explorer:
     def _end(self, *, reached: bool) -> list[Message]:
         """The route is at its end."""
         self._route = None
+        if self._backs:
+            return []
         if self._exploring:
             assert self._target is not None
             (self._reached if reached else self._given_up).append((self._target.keyframe, self._target.way[-1]))
@@ -131,8 +142,9 @@ class Explorer:
         here = self.atlas.look()
         if here is None:
             return []
+        self._backs = self._unclear
         choose = {"explore": self._to_frontier, "go": self._to_place, "backtrack": self._back}[errand.kind]
-        said = choose(here)
+        said = self._back(here) if self._backs else choose(here)
         if self._route is not None:
             area, goal = self.atlas.goal(self._route)
             said.append(Heading(stamp, area, goal))
