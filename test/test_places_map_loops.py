@@ -72,7 +72,7 @@ def test_a_hallway_that_the_map_holds_twice_is_a_loop_as_it_truly_lies(twice):
     hybrid_map, scans = twice
     loop = MapLoops(CONFIGURATION, scans).newest(hybrid_map)
     assert loop is not None
-    assert (loop.area, loop.other in (0, 1)) == (3, True)
+    assert (loop.area, loop.begin, loop.other in (0, 1)) == (3, 3, True)
     off = se2.log(se2.between(loop.pose.mean, se2.between(THIRD, AREAS[loop.other])))
     assert math.hypot(off[0], off[1]) < 0.2
     assert abs(off[2]) < math.radians(2.0)
@@ -112,7 +112,7 @@ def test_what_is_proposed_is_supposed_and_told_once_and_stays_no_arc(twice):
     supposed = proposals.supposed(hybrid_map)
     (notice,) = proposals.notices()
     (other,) = set(supposed.neighbours(3)) - {2}
-    assert f"area 3 are those of area {other}" in notice.text
+    assert f"from area 3 to area 3 are those up to area {other}" in notice.text
     assert hybrid_map.neighbours(3) == [2]
     proposals.supposed(hybrid_map)
     assert not proposals.notices()

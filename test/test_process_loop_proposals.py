@@ -46,7 +46,7 @@ def twice_into_the_first_corridor(shift):
         if k == LAP + 4 and shift is not None:
             own = run.replica.areas[run.replica.best]
             true = se2.between(frame(run, poses, own), frame(run, poses, 0))
-            loop = MapLoop(own, 0, PoseGaussian(se2.compose(np.array((*shift, 0.0)), true), SPREAD))
+            loop = MapLoop(own, 0, PoseGaussian(se2.compose(np.array((*shift, 0.0)), true), SPREAD), own)
             run.tsbi._branching.loops = Told(loop)
         run.keyframe(pose, cut=7 if k and k % 14 == 0 else 0)
         if len(run.answers[-1].leaves) > 1:
@@ -65,7 +65,7 @@ def test_what_is_out_of_reach_by_the_arcs_is_closed_where_it_is_proposed():
     off = se2.log(se2.between(arc.pose.mean, se2.between(frame(run, poses, a), frame(run, poses, b))))
     assert math.hypot(off[0], off[1]) < 0.1
     (notice,) = run.notices
-    assert "area 7 are those of area 0" in notice
+    assert "from area 7 to area 7 are those up to area 0" in notice
 
 
 @pytest.mark.parametrize("shift", [(3.0, 0.0), (0.0, 6.0)])

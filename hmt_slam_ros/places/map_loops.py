@@ -4,12 +4,15 @@ Tomatis, Nourbakhsh and Siegwart (2003), section 3.5. The areas that the robot w
 own, those of before another one; what is around an area is asked within its own chart only, so that no prior by the
 arcs tells which of their nodes are one. The belief goes the robot's way again over both. Where its two peaks move in
 the same way, an area of the one is joined to an area of the other, as the poses of the two nodes say.
+
+The paper's robot then turns back, and where the belief falls to a single peak the loop begins. Over stored areas that
+is the belief of who goes the way backwards; a loop that shows in one direction alone is none.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -40,11 +43,13 @@ class MapLoop(NamedTuple):
     :ivar area: one that the robot went through last.
     :ivar other: one of before.
     :ivar pose: the belief over ``area_T_other``.
+    :ivar begin: the area, of those that the robot went through last, in which the loop begins.
     """
 
     area: int
     other: int
     pose: PoseGaussian
+    begin: int
 
 
 class MapLoops:
@@ -69,18 +74,27 @@ class MapLoops:
             if max(map(len, found), default=0) >= TRANSITIONS:
                 both = _beside(own, self._chart(before))
                 graph = both.graph(self._places)
-                loops = [loop for way in found for loop in self._proposed(way, graph, len(own.nodes))]
+                loops = [pair for way in found if (pair := self._smoothed(way, graph, len(own.nodes))) is not None]
                 if loops:
-                    return _joining(both, loops[-1], len(own.nodes))
+                    return _joining(both, *loops[-1], len(own.nodes))
             if sum(map(len, found)) >= _ENOUGH:
                 break
         return None
 
-    def _proposed(self, way: list[Edge], graph: PlaceGraph, own: int) -> Iterator[Loop]:
-        """The loops between one of the first nodes, and one of the others."""
-        for loop in loops_along(way, graph, self._model, self._places):
+    def _smoothed(self, way: Sequence[Edge], graph: PlaceGraph, own: int) -> tuple[Loop, Loop] | None:
+        """The newest loop on a way between one of the first nodes and one of the others, and where that begins."""
+        there = list(self._between(way, graph, own))
+        if not there:
+            return None
+        steps, newest = there[-1]
+        back = list(self._between([edge.back for edge in reversed(way[:steps])], graph, own))
+        return (newest, back[-1][1]) if back else None
+
+    def _between(self, way: Sequence[Edge], graph: PlaceGraph, own: int) -> Iterator[tuple[int, Loop]]:
+        """Loops between one of the first nodes and one of the others, each with the steps of the way up to there."""
+        for steps, loop in enumerate(loops_along(way, graph, self._model, self._places), 1):
             if loop is not None and (loop.node < own) != (loop.other < own):
-                yield loop
+                yield steps, loop
 
     def _chart(self, hybrid_map: HybridMap) -> Chart:
         views = {area: self._view(hybrid_map, area) for area in hybrid_map.area_ids()}
@@ -110,13 +124,17 @@ def _beside(one: Chart, other: Chart) -> Chart:
     return Chart(one.nodes + other.nodes, one.seen + other.seen, (*one.edges, *edges))
 
 
-def _joining(chart: Chart, loop: Loop, own: int) -> MapLoop:
-    """A loop between a node of the first ones and another one, as it joins their areas."""
+def _joining(chart: Chart, loop: Loop, begin: Loop, own: int) -> MapLoop:
+    """A loop between a node of the first ones and another one, as it joins their areas.
+
+    :param begin: the same loop where it begins.
+    """
     quarters = loop.quarters if loop.node < own else -loop.quarters
     node, other = (chart.nodes[k] for k in sorted((loop.node, loop.other)))
     turned = PoseGaussian(np.array((0.0, 0.0, 0.5 * math.pi * quarters)), np.diag([_PLACED, _PLACED, _TURNED]) ** 2)
     back = PoseGaussian.exactly(other.pose).inverse()
-    return MapLoop(node.area, other.area, PoseGaussian.exactly(node.pose).compose(turned).compose(back))
+    pose = PoseGaussian.exactly(node.pose).compose(turned).compose(back)
+    return MapLoop(node.area, other.area, pose, chart.nodes[min(begin.node, begin.other)].area)
 
 
 def _same(one: Mapping[int, Float64], other: Mapping[int, Float64]) -> bool:

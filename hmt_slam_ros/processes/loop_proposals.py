@@ -20,7 +20,10 @@ from hmt_slam_ros.topology.unknown import telling_arc
 PROBABLE = 0.5
 """Hypotheses of this probability are asked for loops."""
 
-_TEXT = "landmarks on the way through area {} are those of area {}: a loop is looked for there, and nothing is to do"
+_TEXT = (
+    "landmarks on the way from area {} to area {} are those up to area {}: a loop is looked for there, and nothing is "
+    "to do"
+)
 
 
 class LoopProposals:
@@ -29,7 +32,7 @@ class LoopProposals:
     def __init__(self, configuration: Configuration, scans: Mapping[int, Scan]) -> None:
         """:param scans: {keyframe: scan}, which may grow."""
         self._loops = MapLoops(configuration, scans)
-        self._untold: list[tuple[int, int]] = []
+        self._untold: list[MapLoop] = []
         self._told: set[tuple[int, int]] = set()
 
     def forget_scans(self) -> None:
@@ -46,14 +49,14 @@ class LoopProposals:
         loop = self.proposed(hybrid_map)
         if loop is None:
             return hybrid_map
-        self._untold.append((loop.area, loop.other))
+        self._untold.append(loop)
         supposed = hybrid_map.branch()
         supposed.set_arc(loop.area, loop.other, loop.pose, closure=False)
         return supposed
 
     def notices(self) -> list[Notice]:
         """What was proposed since this was asked last, each pair of areas once."""
-        new = [pair for pair in dict.fromkeys(self._untold) if pair not in self._told]
+        new = {(loop.area, loop.other): loop for loop in self._untold if (loop.area, loop.other) not in self._told}
         self._untold.clear()
         self._told.update(new)
-        return [Notice("tsbi", _TEXT.format(area, other)) for area, other in new]
+        return [Notice("tsbi", _TEXT.format(loop.begin, loop.area, loop.other)) for loop in new.values()]
