@@ -33,6 +33,7 @@ class InstituteMap(NamedTuple):
 
     :ivar scenario: the drive.
     :ivar hybrid_map: the map at its end.
+    :ivar scans: {keyframe: scan}.
     :ivar views: {area: what its keyframes show}.
     :ivar chart: of the map.
     :ivar frames: {area: ``world_T_area`` (3,)}, that in which the area's keyframes are nearest to where they were.
@@ -40,6 +41,7 @@ class InstituteMap(NamedTuple):
 
     scenario: Scenario
     hybrid_map: HybridMap
+    scans: Mapping[int, Scan]
     views: Mapping[int, AreaView]
     chart: Chart
     frames: dict[int, Float64]
@@ -84,4 +86,4 @@ def charted(
         own_poses = hybrid_map.keyframes(area)
         true = true_poses(np.array([scans[keyframe].stamp for keyframe in own_poses]))
         frames[area] = se2.best_fit(stacked(own_poses), true)
-    return InstituteMap(scenario, hybrid_map, views, chart_of(hybrid_map, views, configuration.features), frames)
+    return InstituteMap(scenario, hybrid_map, scans, views, chart_of(hybrid_map, views, configuration.features), frames)

@@ -49,6 +49,13 @@ def seen_at(pose, rng):
 
 def charted(crossing_driven=True):
     """The chart, the map that it is of, and what its areas show."""
+    hybrid_map, scans = mapped(crossing_driven)
+    views = views_of(hybrid_map, scans, AreaLandmarks(LocalMapping(CONFIGURATION)))
+    return chart_of(hybrid_map, views, CONFIGURATION.features), hybrid_map, views
+
+
+def mapped(crossing_driven=True):
+    """The map and its scans."""
     hybrid_map, scans, rng = HybridMap(), {}, np.random.default_rng(1)
     for k, pose in enumerate(keyframes(crossing_driven)):
         area = int(pose[0] > 8.0)
@@ -56,5 +63,4 @@ def charted(crossing_driven=True):
         scans[k] = seen_at(pose, rng)
     arc = se2.between(AREAS[0], AREAS[1])
     hybrid_map.set_arc(0, 1, PoseGaussian(arc, np.diag([0.03, 0.03, 0.003]) ** 2), closure=False)
-    views = views_of(hybrid_map, scans, AreaLandmarks(LocalMapping(CONFIGURATION)))
-    return chart_of(hybrid_map, views, CONFIGURATION.features), hybrid_map, views
+    return hybrid_map, scans

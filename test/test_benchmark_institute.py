@@ -5,9 +5,9 @@ import pytest
 
 from benchmark.belief import Estimate
 from benchmark.documents import VALIDATION, marks
-from benchmark.institute import Mission, _mission_requirements, _transitions, open_doors
-from benchmark.institute_drives import Guided
+from benchmark.institute import _mission_requirements, _transitions
 from benchmark.institute_maps import InstituteMap, scenario_of
+from benchmark.institute_missions import Mission, open_doors, way_length
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.places.chart import CROSSING, DOOR, Chart, ChartNode
 from hmt_slam_ros.places.observation_graph import no_landmarks
@@ -18,7 +18,7 @@ EMPTY = no_landmarks()
 
 def mission(rights, confident=True):
     estimates = [Estimate(k, float(k), 0.9, confident, right) for k, right in enumerate(rights)]
-    return Mission(all(rights), 30.0, 60.0, estimates, (0.01, 0.0, 3.0))
+    return Mission(all(rights), all(rights), 30.0, 60.0, 0, estimates, (0.01, 0.0, 3.0))
 
 
 def test_what_is_required_of_missions():
@@ -41,7 +41,7 @@ def institute():
     nodes = tuple(ChartNode(0, pose, kind, 1.0, ()) for pose, kind in zip(states.poses, kinds, strict=True))
     ways = [Edge(k, d, k + 1, d, (5.0, 0.01), (0.0, 0.01), EMPTY) for k, d in enumerate((NORTH, NORTH, EAST))]
     edges = tuple(edge for way in ways for edge in (way, way.back))
-    return InstituteMap(scenario, None, {}, Chart(nodes, (), edges), {0: np.zeros(3)})
+    return InstituteMap(scenario, None, {}, {}, Chart(nodes, (), edges), {0: np.zeros(3)})
 
 
 def test_missions_are_from_open_door_to_open_door():
@@ -54,8 +54,8 @@ def test_missions_are_from_open_door_to_open_door():
 
 def test_the_shortest_way_between_two_nodes():
     charted = institute()
-    assert Guided.way(charted, 3, 0) == [3, 2, 1, 0]
-    assert Guided.length(charted, 0, 2) == pytest.approx(10.0)
+    assert way_length(charted, 0, 2) == pytest.approx(10.0)
+    assert way_length(charted, 3, 0) == pytest.approx(15.0)
     assert float(se2.wrap(charted.nodes[0, 2] - charted.scenario.building.states.poses[0, 2])) == 0.0
 
 

@@ -23,7 +23,7 @@ def charted(changed=()):
         kind, away = dict(changed).get(k, (CROSSING if states.crossings[k] else DOOR, 0.1))
         place = se2.compose(pose, np.array((away, 0.0, 0.0)))
         nodes.append(ChartNode(0, se2.between(FRAME, place), kind, 1.0, ()))
-    return InstituteMap(scenario, None, {}, Chart(tuple(nodes), (), ()), {0: FRAME})
+    return InstituteMap(scenario, None, {}, {}, Chart(tuple(nodes), (), ()), {0: FRAME})
 
 
 def test_a_chart_of_the_states_has_all_and_confuses_none():

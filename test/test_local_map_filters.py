@@ -7,6 +7,7 @@ from worlds import box, drive, scan_in
 from hmt_slam_ros.agreement import Agreement
 from hmt_slam_ros.configuration import Configuration, with_changes
 from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.local_map.area_filter import AreaFilter
 from hmt_slam_ros.local_map.filters import Kinds, new_filter
 from hmt_slam_ros.local_map.judgement import Compared
@@ -41,7 +42,7 @@ def test_the_parameter_chooses_the_kind(kind, expected):
 def test_by_class_hallways_get_grids_and_rooms_lines_and_the_robot_goes_on_where_it_was(before, after):
     mapping, new_T_old = mapping_of("by_class"), np.array([-1.0, 0.5, 0.2])
     kinds, own, here = Kinds(mapping), before(mapping, 3, 0), np.array([0.4, 0.1, 0.1])
-    own.stand(se2.compose(se2.inverse(new_T_old), here))
+    own.stand(PoseGaussian.exactly(se2.compose(se2.inverse(new_T_old), here)))
     own.experience = own.experience.after(Compared(Agreement(9, 3, 1), Agreement(4, 2, 1)))
     experience, loaded = own.experience, content(WALLS[after], 7)
     elsewhere = content(WALLS[before], 0)

@@ -7,6 +7,7 @@ from worlds import blank_scan, box, scan_in
 from hmt_slam_ros.agreement import SIGHT
 from hmt_slam_ros.configuration import Configuration, with_changes
 from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.local_map.filters import filter_of, new_filter
 from hmt_slam_ros.local_map.local_filter import PlacedKeyframe
 from hmt_slam_ros.local_map.local_mapping import LocalMapping
@@ -145,7 +146,7 @@ def test_keyframes_are_dropped_and_what_was_known_is_forgotten(mapping):
     own.drop({1, 3})
     assert own.keyframes == [0, 2, 4]
     np.testing.assert_array_equal(own.leading_keyframe_poses(), kept)
-    own.stand(own.pose)
+    own.stand(PoseGaussian.exactly(own.pose))
     np.testing.assert_array_equal(own.room.pose.covariance, 0.0)
     np.testing.assert_array_equal(own.tracking_covariance, 0.0)
     own.track(Sighting(mapping, blank_scan()), predicted(STEP))

@@ -202,12 +202,13 @@ class AreaFilter:
         self._since_update = NO_STEP
         self.left_open = NO_STEP.covariance
 
-    def stand(self, pose: Float64) -> None:
-        """All particles stand at ``map_T_base``, shape (3,), as if that were known, and predict from there."""
-        self.poses = np.repeat(pose[None], len(self.poses), axis=0)
+    def stand(self, pose: PoseGaussian) -> None:
+        """All particles stand at the mean of ``map_T_base``, and predict from there; its covariance is left open."""
+        self.poses = np.repeat(pose.mean[None], len(self.poses), axis=0)
         self.log_weights = np.zeros(len(self.poses))
         self.tracking_covariance = np.zeros((3, 3))
         self._restart()
+        self.left_open = pose.covariance
 
     def _resample(self, step: int) -> None:
         """Systematic resampling; the leader is kept, and stands first afterwards."""

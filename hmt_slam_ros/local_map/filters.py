@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.local_map.area_filter import AreaFilter
 from hmt_slam_ros.local_map.area_kind import AreaKinds
 from hmt_slam_ros.local_map.filter_state import FilterState, LineFilterState
@@ -48,7 +49,7 @@ class Kinds:
         if kind is None or isinstance(own, kind):
             return own
         other = kind(self._mapping, own.hypothesis, own.area)
-        other.stand(own.pose)
+        other.stand(PoseGaussian.exactly(own.pose))
         other.tracking_covariance, other.experience = own.tracking_covariance, own.experience
         own.release()
         return other

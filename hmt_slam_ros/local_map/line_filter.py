@@ -112,9 +112,9 @@ class LineFilter:
     def release(self) -> None:
         """There is nothing to give back."""
 
-    def stand(self, pose: Float64) -> None:
-        """The robot stands at ``map_T_base``, shape (3,), as if that were known, and is predicted from there."""
-        self.room.put(PoseGaussian.exactly(pose))
+    def stand(self, pose: PoseGaussian) -> None:
+        """The robot stands at ``map_T_base``, known so well, and is predicted from there."""
+        self.room.put(pose)
         self.tracking_covariance = np.zeros((3, 3))
         self._restart()
 

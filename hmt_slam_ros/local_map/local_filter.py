@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 from hmt_slam_ros.arrays import Float64
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.local_map.filter_state import FilterState, LineFilterState
 from hmt_slam_ros.local_map.judgement import Compared, Experience
 from hmt_slam_ros.local_map.match_error import MatchError
@@ -101,8 +102,8 @@ class LocalFilter(Protocol):
         """Give up the map; the filter is not used any more."""
         ...
 
-    def stand(self, pose: Float64) -> None:
-        """The robot stands at ``map_T_base``, shape (3,), as if that were known, and is predicted from there."""
+    def stand(self, pose: PoseGaussian) -> None:
+        """The robot stands at ``map_T_base``, known so well, and is predicted from there."""
         ...
 
     def track(self, sighting: Sighting, prediction: Prediction) -> Tracked:

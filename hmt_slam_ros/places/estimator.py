@@ -51,7 +51,8 @@ _LEAST, _SIGHTINGS, _BEHIND, _AHEAD, _ASIDE = 0.5, 2, 1.0, 1.0, 2.5
 _SAME, _FORGET = 0.6, 8.0
 # A robot is along an axis within this angle of it, rad; an opening, or a wall across, within this one.
 _ALONG, _ASKEW = math.radians(25.0), math.radians(20.0)
-# The wall at the end of a hallway is so near before the robot turns, m, and so much of it is seen, m.
+# The wall at the end of a hallway is so near before the robot turns, m; so much of it is seen, m, and so
+# far to both sides.
 _WALL, _SEEN = 1.35, 0.8
 # A robot turns at its last node up to so far from it, m; where it turns elsewhere it is at one that it did not notice,
 # of which it knows the place so well, m.
@@ -60,9 +61,11 @@ _THERE, _SOMEWHERE = 1.5, 0.4
 _DOORWAY = 1.0
 # A chord along a hallway is this share of the longest one; walls are so near to both sides of its middle, m.
 _LONG, _WALLS = 0.5, 2.5
-# Deviations of a node's place in the map, m, and of a hallway's direction, rad; of what is seen of the robot's place
-# in the frame along the walls, m.
-_PLACED, _STRAIGHT, _HERE = 0.03, 0.01, 0.02
+# Deviations of a node's place in the map, m; of what is seen of the robot's place in the frame along the walls, m.
+_PLACED, _HERE = 0.03, 0.02
+# The robot follows one axis to the next node, in known ground and in unknown, so the turn tells nothing: with this
+# variance, rad^2, none at all is as probable as any is where the map does not tell it, 1 / (2 pi).
+_UNTOLD = 2.0 * math.pi
 # Where a robot stands that begins at a node, so exactly, m.
 _BEGIN = 0.1
 
@@ -83,6 +86,8 @@ class PlaceEstimator:
 
     :ivar belief: None before the first node is noticed.
     :ivar arrivals: how many nodes were noticed.
+    :ivar in_hallway: whether the robot is in one, along it.
+    :ivar at_wall: whether it is at the wall at the end of one.
     """
 
     def __init__(self, graph: PlaceGraph, configuration: Configuration, belief: PositionBelief | None = None) -> None:
@@ -94,7 +99,7 @@ class PlaceEstimator:
         self._around = LandmarkMap(replace(configuration.features, landmark_least=0.0))
         self._first, self._begins_there = belief or flat_belief(graph, configuration.places), belief is not None
         self._pose = np.zeros(3)
-        self._quarter, self._middle = 0, 0.0
+        self._quarter, self._middle = 0, np.zeros(2)
         self._last: Noticed | None = None
         self._passed: list[Float64] = []
         self._turned_at: Float64 | None = None
@@ -102,7 +107,7 @@ class PlaceEstimator:
         self._seen = NO_OPENINGS
         self.belief: PositionBelief | None = None
         self.arrivals = 0
-        self.in_hallway = False
+        self.in_hallway, self.at_wall = False, False
 
     @property
     def away(self) -> float:
@@ -119,6 +124,33 @@ class PlaceEstimator:
     def at_node(self) -> bool:
         """Whether the robot is beside its last node."""
         return self._last is not None and math.dist(self._pose[:2], self._last.place) <= _THERE
+
+    @property
+    def axis(self) -> int:
+        """Quarters of a turn to the left from the walls' frame to the direction in which the robot travels."""
+        return self._quarter
+
+    def ahead(self, distance: float) -> Float64:
+        """The place in the hallway's middle so far ahead of the robot, m, shape (2,), in the frame of the base."""
+        return self._seen_from_base(self._beyond(distance))
+
+    def on_line(self, axis: int, distance: float) -> Float64:
+        """The place so far ahead of the robot, m, on the line along an axis through its last node; likewise."""
+        last = self._node
+        along = _unit(axis)
+        return self._seen_from_base(last + (float((self._pose[:2] - last) @ along) + distance) * along)
+
+    def beside_node(self, axis: int, distance: float) -> Float64:
+        """The place so far from the last node along an axis, m; likewise."""
+        return self._seen_from_base(self._node + distance * _unit(axis))
+
+    @property
+    def _node(self) -> Float64:
+        """Its last node, or where it is, in the walls' frame."""
+        return self._pose[:2] if self._last is None else self._last.place
+
+    def _seen_from_base(self, place: Float64) -> Float64:
+        return np.asarray(se2.transform(se2.inverse(self._pose), place[None])[0])
 
     @property
     def facing(self) -> tuple[int, int] | None:
@@ -170,7 +202,7 @@ class PlaceEstimator:
             self._turn(nearest, rays if aligned else None)
         else:
             self._turned_at = None
-            self.in_hallway = self._is_hallway(rays, off)
+            self.in_hallway = self._is_hallway(rays, off, nearest)
         if self.in_hallway and nearest == self._quarter and aligned:
             self._notice(0.0)
             self._notice_wall(lines, off)
@@ -180,13 +212,12 @@ class PlaceEstimator:
     @property
     def _direction(self) -> Float64:
         """Unit vector along the hallway, as the robot travels."""
-        return np.array((math.cos(QUARTER * self._quarter), math.sin(QUARTER * self._quarter)))
+        return _unit(self._quarter)
 
     @property
     def _left(self) -> Float64:
         """Unit vector across it."""
-        ahead = self._direction
-        return np.array((-ahead[1], ahead[0]))
+        return _unit(self._quarter + 1)
 
     def _follow(self, seen: Landmarks, rays: Rays) -> None:
         """Follow the landmarks around."""
@@ -195,8 +226,8 @@ class PlaceEstimator:
         near = (one for one in self._around.landmarks if math.dist(one.pose.mean[:2], self._pose[:2]) < _FORGET)
         self._around.landmarks = list(near)
 
-    def _is_hallway(self, rays: Rays, off: float) -> bool:
-        """Whether the robot is in a hallway along the axis that its heading is so far off, rad.
+    def _is_hallway(self, rays: Rays, off: float, axis: int) -> bool:
+        """Whether the robot is in a hallway along an axis that its heading is so far off, rad.
 
         Where both walls are in sight its middle is known, too.
         """
@@ -207,7 +238,7 @@ class PlaceEstimator:
             return False
         self._outside = 0.0
         if max(left, right) <= _WALLS:
-            self._middle = 0.5 * (left - right)
+            self._middle = self._pose[:2] + 0.5 * (left - right) * _unit(axis + 1)
         return True
 
     def _turn(self, nearest: int, rays: Rays | None) -> None:
@@ -227,7 +258,10 @@ class PlaceEstimator:
             away = (math.dist(place, self._last.place) for place in (self._pose[:2], self._turned_at))
             if min(away) > _THERE:
                 self._reach(Noticed(self._turned_at, _SOMEWHERE**2))
-        if not self._is_hallway(rays, off):
+        if quarters % 2:
+            # A node is in the middle of the hallways that meet there.
+            self._middle = self._node
+        if not self._is_hallway(rays, off, nearest):
             self.in_hallway = False
             return
         if self.belief is not None:
@@ -250,7 +284,8 @@ class PlaceEstimator:
 
     def _beyond(self, away: float) -> Float64:
         """The place in the hallway's middle so far ahead, m."""
-        return np.asarray(self._pose[:2] + away * self._direction + self._middle * self._left)
+        aside = float((self._middle - self._pose[:2]) @ self._left)
+        return np.asarray(self._pose[:2] + away * self._direction + aside * self._left)
 
     def _openings(self) -> Iterator[Landmark]:
         """The openings to the sides that the robot believes in."""
@@ -267,9 +302,11 @@ class PlaceEstimator:
         """Arrive at the end of a hallway."""
         across = np.abs(se2.wrap(lines.parameters[:, 0] + off)) <= _ASKEW
         seen = np.zeros(len(lines))
-        np.add.at(seen, lines.owners, lines.pieces[:, 1] - lines.pieces[:, 0])
+        ahead = np.clip(lines.pieces, -_SEEN, _SEEN)
+        np.add.at(seen, lines.owners, ahead[:, 1] - ahead[:, 0])
         walls = lines.parameters[across & (seen >= _SEEN), 1]
-        if walls.size and walls.min() <= _WALL:
+        self.at_wall = bool(walls.size and walls.min() <= _WALL)
+        if self.at_wall:
             self._reach(Noticed(self._beyond(float(walls.min()) - BEFORE), _PLACED**2), end=True)
 
     def _reach(self, noticed: Noticed, *, end: bool = False) -> None:
@@ -297,7 +334,7 @@ class PlaceEstimator:
         assert self._last is not None
         distance = float((noticed.place - self._last.place) @ self._direction)
         variance = self._last.variance + noticed.variance
-        return Travel(max(0.0, distance), 0.0, (variance, _STRAIGHT**2))
+        return Travel(max(0.0, distance), 0.0, (variance, _UNTOLD))
 
     def _look(self, seen: Seen) -> None:
         """Ask the observation function, where as much of the hallway is new as the robot sees of it."""
@@ -312,3 +349,8 @@ class PlaceEstimator:
         if self.belief.confident and state is not None:
             ahead, variance = place_along(seen, self.belief.graph.expected, state, self.away, variance, self._model)
             self._last = Noticed(self._last.place + (self.away - ahead) * self._direction, variance)
+
+
+def _unit(axis: int) -> Float64:
+    """Unit vector so many quarters to the left of the x axis."""
+    return np.array((math.cos(QUARTER * axis), math.sin(QUARTER * axis)))

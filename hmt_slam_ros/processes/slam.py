@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.local_map.filters import Kinds, new_filter
 from hmt_slam_ros.local_map.local_filter import PlacedKeyframe
 from hmt_slam_ros.local_map.local_mapping import LocalMapping
@@ -230,7 +231,7 @@ class MetricSlam:
         """The next scan may be from anywhere."""
         self._arriving = True
         for live in self._live.values():
-            live.filter.stand(live.filter.pose)
+            live.filter.stand(PoseGaussian.exactly(live.filter.pose))
 
     def _process(self, scan: Scan) -> list[Message]:
         prediction = self._motion.predict(scan.stamp)

@@ -1,0 +1,82 @@
+"""Places in rooms to which a robot may be sent, each behind a door of the chart."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from hmt_slam_ros.arrays import Float64
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.places.chart import DOOR, Chart
+from hmt_slam_ros.places.leading_off import LeadingOff
+from hmt_slam_ros.places.place_graph import PlaceGraph
+from hmt_slam_ros.sensing import Scan
+from hmt_slam_ros.topology.hybrid_map import HybridMap
+from hmt_slam_ros.topology.surroundings import Nearness, areas_around, stacked
+
+# Areas whose place is known this well, m, and whose keyframes are this near, m, are the surroundings of an area.
+_NEARNESS = Nearness(0.3, 3.0)
+# A keyframe so far behind a door, m, and beside its middle up to this share of that, was taken in the door's room.
+_BEHIND, _ASIDE = (0.8, 4.0), 0.6
+
+
+@dataclass(frozen=True, eq=False)
+class KnownBuilding:
+    """A map with its places.
+
+    :ivar chart: of the map.
+    :ivar graph: of the chart.
+    :ivar hybrid_map: the map.
+    :ivar scans: {keyframe: scan}.
+    """
+
+    chart: Chart
+    graph: PlaceGraph
+    hybrid_map: HybridMap
+    scans: Mapping[int, Scan]
+
+    def surroundings(self, area: int) -> dict[int, Float64]:
+        """{keyframe: ``area_T_base`` (3,)} of an area and those around it."""
+        around = areas_around(self.hybrid_map, area, _NEARNESS)
+        return {
+            keyframe: se2.compose(frame.mean, pose)
+            for other, frame in around.items()
+            for keyframe, pose in self.hybrid_map.keyframes(other).items()
+        }
+
+
+class Destination(NamedTuple):
+    """A place in a room.
+
+    :ivar node: before the room's door.
+    :ivar opening: the door.
+    :ivar place: shape (2,), in the frame of the opening's area, m.
+    """
+
+    node: int
+    opening: LeadingOff
+    place: Float64
+
+
+def destinations(known: KnownBuilding) -> dict[int, Destination]:
+    """{node: the place behind its door}, where the robot was farthest in the room; of doors that it passed."""
+    found = {}
+    for number, node in enumerate(known.chart.nodes):
+        for opening in node.openings if node.kind == DOOR else ():
+            place = _behind(known, opening)
+            if place is not None:
+                found[number] = Destination(number, opening, place)
+    return found
+
+
+def _behind(known: KnownBuilding, opening: LeadingOff) -> Float64 | None:
+    poses = stacked(known.surroundings(opening.area))
+    there = se2.transform(se2.inverse(opening.landmark.pose.mean), poses[:, :2])
+    within = (_BEHIND[0] <= there[:, 0]) & (there[:, 0] <= _BEHIND[1])
+    within &= np.abs(there[:, 1]) <= _ASIDE * there[:, 0]
+    if not within.any():
+        return None
+    return np.asarray(poses[int(np.argmax(np.where(within, there[:, 0], -np.inf))), :2])

@@ -1,0 +1,247 @@
+"""A robot that gets to named places by the belief over places and, behind a door, by the metric filter.
+
+Tomatis, Nourbakhsh and Siegwart (2003), sections 3.3 and 3.4: along hallways the robot keeps to the middle between the
+walls that it sees; at a node it turns as the most likely state has it, or, where it is not confident, as most
+information is to be expected. Before the goal's door it goes over to the metric filter, but only if it is confident;
+one that finds no door there goes on along the hallway. Out of a room it drives to where the door's node is, and from
+there on the belief tells again where it is.
+"""
+
+from __future__ import annotations
+
+import math
+from enum import Enum
+
+import numpy as np
+
+from hmt_slam_ros.arrays import Float64
+from hmt_slam_ros.configuration.tree import Configuration
+from hmt_slam_ros.exploration.destinations import Destination, KnownBuilding
+from hmt_slam_ros.exploration.pilot import Pilot
+from hmt_slam_ros.exploration.room import RoomFilter
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.local_map.local_mapping import LocalMapping
+from hmt_slam_ros.logs.stamps import NANOSECONDS
+from hmt_slam_ros.motion import Command, Limits, command_towards
+from hmt_slam_ros.places.estimator import PlaceEstimator
+from hmt_slam_ros.places.observation import observation_model
+from hmt_slam_ros.places.observation_graph import QUARTERS
+from hmt_slam_ros.places.place_graph import opposite, state_of
+from hmt_slam_ros.places.policy import most_informative_turn, next_turn, turn_towards
+from hmt_slam_ros.places.position_belief import PositionBelief, certain_belief
+from hmt_slam_ros.places.switching import MetricStart, metric_start
+from hmt_slam_ros.sensing import Scan
+from hmt_slam_ros.sensing.motion import Step
+
+# How far ahead the robot looks along a hallway, m.
+_AHEAD = 2.0
+# Behind a door the way into a room begins so far from it, m; a place is reached so near to it, m.
+_BEHIND, _AT_PLACE = 0.6, 0.15
+# So long a robot before a door looks for it, and waits where something is in its way, ns. It gets on by so much, m.
+_LOOKS, _PATIENCE, _PROGRESS = 15 * NANOSECONDS, 10 * NANOSECONDS, 0.3
+# It stands before a door so near to the middle of the hallway, m, and looks along an axis within this angle, rad.
+_MIDDLE, _STRAIGHT = 0.2, math.radians(10.0)
+_STAND = Command(0.0, 0.0, arrived=False)
+
+
+class Phase(Enum):
+    """What the robot does."""
+
+    HALLWAY = "goes along a hallway"
+    TURN = "turns at a node"
+    DOOR = "looks for the door of its goal"
+    ROOM = "is on its way in a room"
+    LEAVING = "leaves a room"
+    THERE = "is at its goal"
+    LOST = "knows no way"
+
+
+class MissionPilot:
+    """Drives a robot.
+
+    :ivar estimator: of its place.
+    :ivar phase: what it does.
+    :ivar room: the metric filter, where it is in a room.
+    :ivar started: what that filter started with last.
+    """
+
+    def __init__(
+        self, known: KnownBuilding, configuration: Configuration, limits: Limits, belief: PositionBelief | None = None
+    ) -> None:
+        """:param belief: of a robot that begins at a node."""
+        self._known, self._configuration, self._limits = known, configuration, limits
+        self._model = observation_model(configuration.places, configuration.features)
+        self._mapping = LocalMapping(configuration)
+        self.estimator = PlaceEstimator(known.graph, configuration, belief)
+        self.phase, self._before_door = Phase.THERE, False
+        self.room: RoomFilter | None = None
+        self.started: MetricStart | None = None
+        self._goal: Destination | None = None
+        self._room_of: Destination | None = None
+        self._axis, self._here = 0, (-1, False)
+        self._since, self._gone = 0, math.inf
+        self._way = Pilot(limits, _AT_PLACE)
+        self._velocity = (0.0, 0.0)
+        self._drives = {
+            Phase.HALLWAY: self._along, Phase.TURN: self._around, Phase.DOOR: self._to_door, Phase.ROOM: self._inside,
+            Phase.LEAVING: self._outside,
+        }  # fmt: skip
+
+    def go(self, goal: Destination | None) -> None:
+        """Take on a mission.
+
+        :param goal: None to go on along hallways, to find out where the robot is.
+        """
+        self._goal = goal
+        self._way = Pilot(self._limits, _AT_PLACE)
+        self.phase = Phase.HALLWAY if self.room is None else Phase.LEAVING
+
+    def moved(self, step: Step) -> None:
+        """The robot moved."""
+        self.estimator.moved(step)
+        self._gone += float(np.hypot(*step.increment[:2]))
+        if self.room is not None:
+            self.room.moved(step)
+
+    def steer(self, scan: Scan) -> Command:
+        """The velocities until the next scan."""
+        if self.room is None:
+            self.estimator.observe(scan)
+        else:
+            self.room.observe(scan)
+        drive = self._drives.get(self.phase)
+        command = _STAND if drive is None else drive(scan)
+        self._velocity = command.speed, command.turn_rate
+        return command
+
+    def _towards(self, scan: Scan, place: Float64) -> Command:
+        return command_towards(scan, place, self._velocity, self._limits)
+
+    def _along(self, scan: Scan) -> Command:
+        """Keep to the middle of the hallway; at a node do what is best there.
+
+        A robot that was turned off its way by what stood in it turns back.
+        """
+        if (self.estimator.axis - self._axis) % QUARTERS:
+            self.phase = Phase.TURN
+            return self._around(scan)
+        here = self.estimator.arrivals, self.estimator.at_wall
+        if here[0] != self._here[0] or here[1] > self._here[1]:
+            self._decide(scan)
+        self._here = here
+        if self.phase is not Phase.HALLWAY:
+            return self._drives[self.phase](scan)
+        if self._held_up(scan):
+            self._turn(2)
+            self.phase = Phase.TURN
+        return self._towards(scan, self.estimator.ahead(_AHEAD))
+
+    def _held_up(self, scan: Scan) -> bool:
+        """Whether the robot has not got anywhere for long."""
+        if self._gone >= _PROGRESS:
+            self._gone, self._since = 0.0, scan.stamp
+        return scan.stamp - self._since > _PATIENCE
+
+    def _decide(self, scan: Scan) -> None:
+        """What the most likely state policy says; on straight where it says nothing, and back at a wall."""
+        belief, facing, goal = self.estimator.belief, self.estimator.facing, self._goal
+        if goal is not None and belief is not None and belief.confident and facing is not None:
+            if facing[0] == goal.node:
+                self._turn((goal.opening.direction - facing[1]) % QUARTERS)
+                self.phase, self._since, self._before_door = Phase.DOOR, scan.stamp, False
+                return
+            quarters = next_turn(belief, goal.node, self._model)
+        else:
+            quarters = self._informative(belief)
+        if self.estimator.at_wall:
+            quarters = quarters or 2
+        if quarters:
+            self._turn(quarters)
+            self.phase = Phase.TURN
+
+    def _informative(self, belief: PositionBelief | None) -> int | None:
+        """Where a robot that is not confident turns at an end; before that it goes on, as in section 4.2."""
+        if belief is None or not self.estimator.at_wall:
+            return None
+        return most_informative_turn(belief, self._model)
+
+    def _turn(self, quarters: int) -> None:
+        """Turn so many quarters to the right."""
+        self._axis = self.estimator.axis - quarters
+
+    def _around(self, scan: Scan) -> Command:
+        """Turn at the last node into a hallway."""
+        if self.estimator.axis % QUARTERS == self._axis % QUARTERS and not self.estimator.turning:
+            self.phase, self._gone = Phase.HALLWAY, math.inf
+        return self._towards(scan, self.estimator.on_line(self._axis, _AHEAD))
+
+    def _to_door(self, scan: Scan) -> Command:
+        """Turn to the goal's door, and begin with the metric filter there."""
+        assert self._goal is not None
+        front, beyond = (self.estimator.beside_node(self._axis, far) for far in (0.0, _BEHIND))
+        off = math.atan2(*(beyond - front)[::-1])
+        self._before_door |= math.hypot(*front) <= _MIDDLE
+        start = metric_start(self.estimator, self._known.chart) if self._before_door and abs(off) <= _STRAIGHT else None
+        if start is not None and start.node == self._goal.node:
+            return self._enter(start, scan)
+        if scan.stamp - self._since > _LOOKS:
+            self._axis, self.phase = self.estimator.axis, Phase.TURN
+            return self._around(scan)
+        if not self._before_door:
+            return self._towards(scan, front)
+        return self._turned(off) if abs(off) > _STRAIGHT else self._towards(scan, beyond)
+
+    def _enter(self, start: MetricStart, scan: Scan) -> Command:
+        """Go over to the metric filter."""
+        self.room = RoomFilter(self._mapping, self._known, start)
+        self._room_of, self.started, self.phase = self._goal, start, Phase.ROOM
+        self._way = Pilot(self._limits, _AT_PLACE)
+        return self._inside(scan)
+
+    def _turned(self, angle: float) -> Command:
+        """Turn on the spot."""
+        limits = self._limits
+        rate = min(limits.turn_rate, math.sqrt(2.0 * limits.turn_acceleration * abs(angle)), abs(angle) / limits.period)
+        return Command(0.0, math.copysign(rate, angle), arrived=False)
+
+    def _inside(self, scan: Scan) -> Command:
+        """Drive to the place in the room."""
+        goal = self._room_of
+        assert goal is not None
+        door = goal.opening.landmark.pose.mean
+        through = se2.transform(door, np.array([[-_BEHIND, 0.0], [_BEHIND, 0.0]]))
+        command = self._keep_to(scan, np.concatenate((through, goal.place[None])))
+        if self._way.arrived:
+            self.phase = Phase.THERE
+        return command
+
+    def _outside(self, scan: Scan) -> Command:
+        """Drive back to the node before the door, and let the belief go on from there."""
+        assert self._room_of is not None
+        assert self.room is not None
+        door = self._room_of.opening.landmark.pose.mean
+        through = se2.transform(door, np.array([[_BEHIND, 0.0], [-_BEHIND, 0.0]]))
+        command = self._keep_to(scan, np.concatenate((self._room_of.place[None], through)))
+        if self._way.arrived:
+            self._resume()
+        return command
+
+    def _keep_to(self, scan: Scan, way: Float64) -> Command:
+        assert self.room is not None
+        return self._way.steer(scan, se2.transform(se2.inverse(self.room.pose), way), self._velocity)
+
+    def _resume(self) -> None:
+        """Out of a room the robot is at the node before its door, and looks away from that."""
+        assert self.room is not None
+        assert self._room_of is not None
+        assert self._goal is not None
+        state = state_of(self._room_of.node, opposite(self._room_of.opening.direction))
+        graph, places = self._known.graph, self._configuration.places
+        self.room.release()
+        self.room, self._room_of = None, None
+        self.estimator = PlaceEstimator(graph, self._configuration, certain_belief(graph, places, state))
+        self._here = 0, False
+        quarters = turn_towards(graph, state, self._goal.node)
+        self._turn(quarters or 0)
+        self.phase = Phase.LOST if quarters is None else Phase.TURN
+

@@ -1,0 +1,105 @@
+"""Missions on a small floor by a robot that knows of its place only what the belief and the metric filter tell it."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from small_floor import AREAS, CONFIGURATION, charted, mapped, seen_at
+
+from hmt_slam_ros.exploration.destinations import Destination, KnownBuilding, destinations
+from hmt_slam_ros.exploration.mission import MissionPilot, Phase
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.motion import Limits
+from hmt_slam_ros.places.place_graph import opposite, state_of
+from hmt_slam_ros.places.position_belief import certain_belief
+from hmt_slam_ros.sensing.motion import Step, increment_covariance
+
+LIMITS = Limits(0.6, math.radians(45.0), 0.5, math.radians(90.0), 0.25)
+STEPS = 900
+
+
+@pytest.fixture(scope="module")
+def known():
+    chart = charted()[0]
+    return KnownBuilding(chart, chart.graph(CONFIGURATION.places), *mapped())
+
+
+def node_at(known, x):
+    places = np.array([se2.compose(AREAS[node.area], node.pose) for node in known.chart.nodes])
+    return int(np.hypot(places[:, 0] - x, places[:, 1]).argmin())
+
+
+def eastwards(known):
+    ends = node_at(known, 5.0), node_at(known, 10.0)
+    return next(edge.leaving for edge in known.chart.edges if (edge.start, edge.end) == ends)
+
+
+class Robot:
+    """It does what the pilot says; its odometry has 1 % of noise."""
+
+    def __init__(self, pilot, pose):
+        self.pilot, self.pose = pilot, np.array(pose)
+        self.rng, self.stamp = np.random.default_rng(0), 0
+
+    def go(self, goal):
+        """The phases on the way."""
+        self.pilot.go(goal)
+        for _ in range(STEPS):
+            scan = seen_at(self.pose, self.rng)
+            self.stamp += 200_000_000
+            command = self.pilot.steer(replace(scan, stamp=self.stamp))
+            yield self.pilot.phase
+            if self.pilot.phase in {Phase.THERE, Phase.LOST}:
+                return
+            increment = se2.exp(0.2 * np.array([command.speed, 0.0, command.turn_rate]))
+            self.pose = se2.compose(self.pose, increment)
+            noisy = increment * (1.0 + self.rng.normal(0.0, 0.01, 3))
+            self.pilot.moved(Step(noisy, increment_covariance(noisy, CONFIGURATION.motion)))
+
+
+def test_the_only_place_is_where_the_robot_was_in_the_room(known):
+    (place,) = destinations(known).values()
+    assert place.node == node_at(known, 5.0)
+    np.testing.assert_allclose(se2.transform(AREAS[place.opening.area], place.place[None])[0], (5.0, 3.0), atol=0.1)
+
+
+def test_a_robot_drives_into_a_room_and_from_there_to_another_door(known):
+    goal = destinations(known)[node_at(known, 5.0)]
+    west = opposite(eastwards(known))
+    belief = certain_belief(known.graph, CONFIGURATION.places, state_of(node_at(known, 16.0), west))
+    robot = Robot(MissionPilot(known, CONFIGURATION, LIMITS, belief), (16.0, 0.0, math.pi))
+    phases = list(dict.fromkeys(robot.go(goal)))
+    assert phases == [Phase.HALLWAY, Phase.DOOR, Phase.ROOM, Phase.THERE]
+    assert robot.pilot.started.node == goal.node
+    assert math.dist(robot.pose[:2], (5.0, 3.0)) < 0.3
+    node = node_at(known, 10.0)
+    opening = next(one for one in known.chart.nodes[node].openings if one.direction == goal.opening.direction)
+    behind = se2.transform(opening.landmark.pose.mean, np.array([[1.2, 0.0]]))[0]
+    phases = list(dict.fromkeys(robot.go(Destination(node, opening, behind))))
+    assert phases == [Phase.LEAVING, Phase.TURN, Phase.HALLWAY, Phase.DOOR, Phase.ROOM, Phase.THERE]
+    assert math.dist(robot.pose[:2], (10.1, 2.2)) < 0.3
+
+
+def test_a_lost_robot_turns_at_the_end_of_the_hallway_and_is_confident_before_it_enters(known):
+    goal = destinations(known)[node_at(known, 5.0)]
+    robot = Robot(MissionPilot(known, CONFIGURATION, LIMITS), (12.0, 0.1, 0.0))
+    phases = []
+    for phase in robot.go(goal):
+        phases.append(phase)
+        belief = robot.pilot.estimator.belief
+        assert phase is not Phase.ROOM or belief.confident
+    assert phases[0] is Phase.HALLWAY
+    assert phases[-1] is Phase.THERE
+    assert math.dist(robot.pose[:2], (5.0, 3.0)) < 0.3
+
+
+def test_where_the_belief_is_wrong_there_is_no_door_and_the_robot_goes_on(known):
+    goal = destinations(known)[node_at(known, 5.0)]
+    # It believes to be before the door, and is 2 m off.
+    belief = certain_belief(known.graph, CONFIGURATION.places, state_of(goal.node, eastwards(known)))
+    robot = Robot(MissionPilot(known, CONFIGURATION, LIMITS, belief), (7.0, 0.0, 0.0))
+    phases = list(robot.go(goal))
+    order = list(dict.fromkeys(phases))
+    assert order[:3] == [Phase.DOOR, Phase.TURN, Phase.HALLWAY]
+    assert Phase.ROOM not in phases or math.dist(robot.pose[:2], (5.0, 3.0)) < 0.3
