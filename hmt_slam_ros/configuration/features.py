@@ -110,13 +110,13 @@ class Features:
         0.3, "Deviation of walls from being parallel or square to each other.", unit="deg", low=0.0, high=10.0
     )
     hallway_bias: float = parameter(
-        -5.8, "Log-odds of a hallway as wide and as long as one metre.", unit="nat", low=-100.0, high=100.0
+        -25.3, "Log-odds of a hallway as wide and as long as one metre.", unit="nat", low=-100.0, high=100.0
     )
     hallway_width: float = parameter(
-        -2.5, "How they change with the logarithm of the width.", unit="nat", low=-100.0, high=100.0
+        7.8, "How they change with the logarithm of the width.", unit="nat", low=-100.0, high=100.0
     )
     hallway_ratio: float = parameter(
-        5.6, "How they change with the logarithm of length by width.", unit="nat", low=-100.0, high=100.0
+        14.1, "How they change with the logarithm of length by width.", unit="nat", low=-100.0, high=100.0
     )
     hallway_sure: float = parameter(
         0.7, "An area that was taken for a room is taken for a hallway from this probability on, and the other way.",

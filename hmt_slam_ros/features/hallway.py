@@ -1,7 +1,8 @@
 """Hallway or room: how long and how wide the free space around the robot is.
 
 Tomatis, Nourbakhsh and Siegwart (2003), section 3.1: thin and long open spaces are hallways, others are rooms. A chord
-is how far one sees ahead and back along an axis; a space is as wide as its shortest chord, as long as its longest. The
+is how far one sees ahead and back along an axis; a space is as wide as its shortest chord, and as long as all chords
+but the longest few: through a door one sees far out of a room, too, but only along the axes that pass the door. The
 log-odds of a hallway are linear in the logarithms of both. An area is what its keyframes say on average, one after the
 other, and what it is taken for changes only where that is clear (hysteresis).
 """
@@ -23,13 +24,15 @@ from hmt_slam_ros.features.rays import Rays
 _SECTORS, _KNOWN = 72, 18
 # Nobody sees farther along a hallway than this, m; so a length does not depend on the laser's reach.
 _FAR = 10.0
+# Share of the axes along which a space is no longer than its length.
+_LENGTH = 0.925
 
 
 class FreeSpace(NamedTuple):
     """The open space around a place.
 
     :ivar width: shortest chord, m.
-    :ivar length: longest chord, m.
+    :ivar length: no more than a few of the chords are longer, m.
     """
 
     width: float
@@ -77,7 +80,7 @@ def space_within(away: Float64) -> FreeSpace | None:
     chords = chords[np.isfinite(chords)]
     if chords.size < _KNOWN:
         return None
-    return FreeSpace(float(chords.min()), float(chords.max()))
+    return FreeSpace(float(chords.min()), float(np.quantile(chords, _LENGTH)))
 
 
 def log_odds(space: FreeSpace, features: Features) -> float:
