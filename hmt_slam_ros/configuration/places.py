@@ -65,12 +65,8 @@ class Places:
         False, "Whether landmarks weigh the places where a robot may be that woke up somewhere or was carried."
     )
     prior_temper: float = parameter(
-        0.1, "Exponent on their likelihood there, as they are made of the same scans as the surfaces.",
+        0.05, "Exponent on their likelihood there, as they are made of the same scans as the surfaces.",
         low=0.0, high=1.0,
-    )
-    prior_alike: float = parameter(
-        1.5, "What they say, so tempered, of places of a building that only look alike, against new ground.",
-        unit="nat", low=-100.0, high=100.0,
     )
     loops: bool = parameter(
         False, "Whether landmarks propose loops: known areas where a map's last places are a second time, wherever the "

@@ -4,15 +4,17 @@ Tomatis, Nourbakhsh and Siegwart (2003), section 3.3: the observation graph of w
 the map around a place, by the observation function OS of the belief over places. It is the prior of the places that
 surfaces find, relative to new ground.
 
-Landmarks are made of the same scans as surfaces are, so OS counts with an exponent. And a building's places look more
-like each other than like ground of which nothing is known, whose landmarks are strewn; so OS has to say more of a place
-than it says of one that only looks alike. Both numbers are fitted by log score on training worlds, where looks from
-where the map does not reach weigh a fifth (`python -m benchmark prior --training`).
+Landmarks are made of the same scans as surfaces are, so OS counts with an exponent, which is fitted by log score on
+training worlds, where looks from where the map does not reach weigh a fifth (`python -m benchmark prior --training`).
+And a building's places look more like each other than like ground of which nothing is known, whose landmarks are
+strewn: new ground is mostly like some place of the map, and that is measured at places where the robot has been.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -42,6 +44,19 @@ _NEARNESS = Nearness(1.0, 16.0)
 _PROBABLE = 1e-3
 # Landmarks of one kind that are so near to each other may be one, m.
 _BESIDE = 0.4
+# At so many places of the map it is asked how new ground may look; with this probability it looks like one of them.
+_OTHERS, _FAMILIAR = 24, 0.9
+
+
+class Place(NamedTuple):
+    """Where what the robot saw may lie.
+
+    :ivar area: of the map.
+    :ivar pose: ``area_T_reference``, shape (3,).
+    """
+
+    area: int
+    pose: Pose
 
 
 class PlacePrior:
@@ -70,7 +85,7 @@ class PlacePrior:
         ratios = self.log_ratios(hybrid_map, poses, before, [where.found[n] for n in probable])
         log_weights = np.zeros(len(where.found))
         if ratios is not None:
-            log_weights[probable] = self._places.prior_temper * ratios - self._places.prior_alike
+            log_weights[probable] = self._places.prior_temper * ratios
         return where.weighed(log_weights)
 
     def log_ratios(
@@ -86,20 +101,24 @@ class PlacePrior:
         axis = axis_of((landmark, 0.0) for landmark in seen)
         if axis is None or not found:
             return None
-        frame = np.array([*poses[max(poses)][:2], axis])
+        newest = poses[max(poses)]
+        frame = np.array([*newest[:2], axis])
         observed = self._around(seen, np.array([one.pose.mean for one in seen]), frame)
+        places = [*(Place(one.area, one.mode.pose.mean) for one in found), *_others(hybrid_map, newest, before)]
         lists = [
-            self._around(*self._expected(hybrid_map, before, place, sightings, seen), frame) for place in found
+            self._around(*self._expected(hybrid_map, before, place, sightings, seen), frame) for place in places
         ]  # fmt: skip
         starts = np.cumsum([0, *(len(each.tracks) for each in lists)])
         expected = Expected(starts, one_after_the_other(lists))
-        return log_observation(observed, expected, 0.0, 0.0, self._model) - log_unknown_ground(observed, self._model)
+        strewn = log_unknown_ground(observed, self._model)
+        ratios = log_observation(observed, expected, 0.0, 0.0, self._model) - strewn
+        return ratios[: len(found)] - _log_new_ground(ratios[len(found) :])
 
     def _expected(
         self,
         hybrid_map: HybridMap,
         before: int,
-        located: Located,
+        place: Place,
         sightings: Sequence[Sighting],
         seen: Sequence[Landmark],
     ) -> tuple[list[Landmark], Float64]:
@@ -110,8 +129,8 @@ class PlacePrior:
 
         :returns: poses in the frame of the keyframes' reference.
         """
-        into = PoseGaussian.exactly(se2.inverse(located.mode.pose.mean))
-        around = areas_around(hybrid_map, located.area, _NEARNESS)
+        into = PoseGaussian.exactly(se2.inverse(place.pose))
+        around = areas_around(hybrid_map, place.area, _NEARNESS)
         areas = {area: into.compose(pose) for area, pose in around.items()}
         known = known_around(areas, {area: self._of_area(hybrid_map, area, before) for area in areas})
         shown = self._due(known.landmarks, known.poses, sightings) | _beside(known.landmarks, known.poses, seen)
@@ -143,6 +162,29 @@ class PlacePrior:
         """
         graph = as_seen(landmarks, se2.between(frame, poses.reshape(-1, 3)))
         return chosen(graph, np.abs(graph.along) <= self._places.reach)
+
+
+def _others(hybrid_map: HybridMap, newest: Pose, before: int) -> Iterator[Place]:
+    """Places where the robot has been, as many keyframes apart.
+
+    :param newest: ``reference_T_base`` of the newest keyframe, with which it would stand there, shape (3,).
+    """
+    known = [
+        (area, pose)
+        for area in hybrid_map.area_ids()
+        for k, pose in sorted(hybrid_map.keyframes(area).items())
+        if k < before
+    ]
+    back = se2.inverse(newest)
+    for n in np.unique(np.linspace(0, len(known) - 1, _OTHERS).round().astype(np.int64)).tolist():
+        area, pose = known[n]
+        yield Place(area, se2.compose(pose, back))
+
+
+def _log_new_ground(ratios: Float64) -> float:
+    """log OS(o, new ground) against unknown ground, nats, by that of places of the map, shape (n,)."""
+    alike = float(np.logaddexp.reduce(ratios)) - math.log(len(ratios))
+    return float(np.logaddexp(math.log(1.0 - _FAMILIAR), math.log(_FAMILIAR) + alike))
 
 
 def _beside(landmarks: Sequence[Landmark], poses: Float64, seen: Sequence[Landmark]) -> Bool:
