@@ -62,6 +62,7 @@ MEASUREMENTS = {
     "oracle": "TSBI's PMF against an exact enumeration of all topologies",
     "awakening": "whether a robot that wakes up in a saved map finds out where, and after how many metres",
     "kidnapping": "whether a robot that is carried while it drives notices, and is right in the end",
+    "recorded": "what landmarks and kinds of areas add to recognizing places on recorded logs",
     "prior": "what landmarks say of where a lost robot is, on looks at a map",
     "laps": "whether memory, cost and errors grow where a robot drives over known ground again and again",
     "changes": "whether a map follows furniture and doors in mode lifelong, and holds nobody who walked by",
@@ -70,7 +71,7 @@ MEASUREMENTS = {
     "short": "for CI, whether accuracy became worse than benchmark/expected.toml beyond noise",
 }
 _GROUPS = {
-    "all": ("accuracy", "steps", "robustness", "choices", "sessions", "speed", "live"),
+    "all": ("accuracy", "steps", "robustness", "choices", "sessions", "speed", "live", "recorded"),
     "validation": (
         "calibration", "loops", "topology", "consistency", "evidence", "appearance", "lines", "linemap", "heading",
         "landmarks", "landmarkmaps", "hallways", "places", "institute", "belief", "threeloops", "driving", "explore",

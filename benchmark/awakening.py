@@ -19,7 +19,7 @@ from benchmark.logs import opened
 from benchmark.report import Report, Requirement, table
 from benchmark.runs import PARAMETERS
 from benchmark.settings import Settings
-from benchmark.simulated.records import code
+from benchmark.simulated.records import Records, code
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration import Configuration, load_configuration
 from hmt_slam_ros.geometry import se2
@@ -126,9 +126,7 @@ def measure_awakening(settings: Settings) -> Report:
         paths |= {log.name: log.path for log in logs}
         count, records = len(settings.seeds_or(STARTS)), settings.records
         for name in names:
-            kept = Kept(records.folder / f"awakening-{name}-{_known_by(settings.changes)}.json")
-            kept.complete(paths[name], configuration, count, records.jobs)
-            for kind, found in kept.starts(count).items():
+            for kind, found in made_starts(name, paths[name], configuration, settings.changes, count, records).items():
                 rows.append(_row(name, kind, found))
                 report.data[f"{name}, {kind}"] = [asdict(one) for one in found]
                 if found:
@@ -136,6 +134,18 @@ def measure_awakening(settings: Settings) -> Report:
     columns = ["log", "map of the", "starts", f"right within {FAR:g} m", "m until known, mean", "median", "most"]
     report.body += [table([*columns, "wrong", "not known"], rows), POLICY]
     return report
+
+
+def made_starts(
+    name: str, path: Path | str, configuration: Configuration, changes: Sequence[str], count: int, records: Records
+) -> dict[str, list[Awakening]]:
+    """The first starts in each map of a log, of which those are made that are not there.
+
+    :param changes: by which the configuration differs from the file.
+    """
+    kept = Kept(records.folder / f"awakening-{name}-{_known_by(changes)}.json")
+    kept.complete(path, configuration, count, records.jobs)
+    return kept.starts(count)
 
 
 def requirements(name: str, found: Sequence[Awakening], *, asked: bool) -> list[Requirement]:
