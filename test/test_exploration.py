@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from benchmark.driven_run import DrivenRun
+from hmt_slam_ros.agreement import Clutter
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.configuration.flat import with_changes
@@ -21,7 +22,7 @@ from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.logs.stamps import NANOSECONDS
 from hmt_slam_ros.motion import Limits
 from hmt_slam_ros.processes.errands import Errand, Heading, Outcome, Steering, errand_of
-from hmt_slam_ros.processes.messages import Accepted, Hypotheses, Leaf
+from hmt_slam_ros.processes.messages import Accepted, Hypotheses, Keyframe, Leaf, LeafEstimate
 from hmt_slam_ros.processes.replica import Replica
 from hmt_slam_ros.sensing import Scan
 from hmt_slam_ros.simulation.building import Building, FloorPlan
@@ -152,6 +153,22 @@ def test_it_explores_on_where_nobody_asks_it_to_turn_back() -> None:
     on = goes(own, 0.6, 0.4)
     assert own.run.explorer.atlas.entropy == pytest.approx(0.673, abs=0.001)
     assert on is None or np.hypot(*on.goal[:2]) > 1.0
+
+
+def test_scans_may_come_after_any_message_of_the_chain() -> None:
+    own = _Explored(explore=False)
+    assert own.run.do(Errand("explore"), 25.0) is None
+    explorer, atlas = own.run.explorer, own.run.explorer.atlas
+    replica, pose = atlas.replica, atlas.pose
+    new = max(replica.scans) + 1
+    scan = replace(scan_at((1.0, 0.0, 0.0)), stamp=pose.stamp)
+    leaf = LeafEstimate(replica.best, pose.area, pose.local, True, 0.0, 0.0, Clutter(), 12.0)
+    explorer.handle(scan)
+    explorer.handle(Keyframe(new, scan, 0.0, (leaf,)))
+    explorer.handle(Errand("explore"))
+    assert explorer.handle(scan)
+    assert new in atlas.survey.roadmap
+    assert new in atlas.frames
 
 
 def test_unknown_places_are_told() -> None:

@@ -39,7 +39,7 @@ class Atlas:
         self.survey.look_everywhere(self.hybrid_map, self.replica.scans)
 
     def hear(self, message: Message) -> None:
-        """Take in a message of the chain, or a pose."""
+        """Take in a message of the chain, or a pose; between nodes scans may come after any of them."""
         match message:
             case Keyframe():
                 self.replica.add(message)
@@ -47,9 +47,10 @@ class Atlas:
                 self.replica.apply(message)
             case Accepted():
                 self.replica.accept(message)
-                self._frames = None
             case RealTimePose():
                 self._pose = message
+        if isinstance(message, Keyframe | Hypotheses | Accepted):
+            self._frames = None
 
     @property
     def hybrid_map(self) -> HybridMap:
