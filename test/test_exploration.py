@@ -16,11 +16,14 @@ from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.configuration.flat import with_changes
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.exploration.explorer import Explorer
+from hmt_slam_ros.exploration.ground import Ground
 from hmt_slam_ros.exploration.outlook import crosses, outlook_of
 from hmt_slam_ros.exploration.pilot import Pilot
+from hmt_slam_ros.exploration.survey import Opened, Survey
+from hmt_slam_ros.features.doors import jambs_of, up_to_doors
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.logs.stamps import NANOSECONDS
-from hmt_slam_ros.motion import Limits
+from hmt_slam_ros.motion import Command, Limits, command_towards
 from hmt_slam_ros.processes.errands import Errand, Heading, Outcome, Steering, errand_of
 from hmt_slam_ros.processes.messages import Accepted, Hypotheses, Keyframe, Leaf, LeafEstimate
 from hmt_slam_ros.processes.replica import Replica
@@ -31,6 +34,7 @@ from hmt_slam_ros.simulation.laser import Laser
 from hmt_slam_ros.simulation.raycast import wall_index
 from hmt_slam_ros.simulation.scenario import START, Scenario
 from hmt_slam_ros.simulation.settings import Settings
+from hmt_slam_ros.topology.hybrid_map import HybridMap
 
 ROOMS = np.array([[3.0, -3.2], [9.0, -3.2]])
 """Middles of the rooms, m."""
@@ -42,7 +46,7 @@ def small_floor() -> Building:
     """A hallway along x with an arm to the north, and two rooms to the south; the robot begins at its western end."""
     plan = FloorPlan()
     plan.free(0.0, -1.0, 12.0, 1.0)
-    plan.free(5.0, 1.0, 7.0, 6.0)
+    plan.free(5.0, 1.0, 7.0, 9.0)
     for x, y in ROOMS:
         plan.free(x - 1.5, y - 2.0, x + 1.5, y + 2.0)
         plan.free(x - 0.5, y + 1.9, x + 0.5, -0.9)
@@ -53,6 +57,14 @@ def scan_at(pose: tuple[float, float, float]) -> Scan:
     """What a laser all around sees of that floor."""
     laser = Laser(LASER)
     return laser.scan(0, 0, laser.distances(np.array([pose]), wall_index(small_floor().walls), np.empty((0, 3))))
+
+
+def with_keyframes(poses: dict[int, tuple[float, float, float]]) -> HybridMap:
+    """A map of one area that has these keyframes."""
+    hybrid_map = HybridMap()
+    for keyframe, pose in poses.items():
+        hybrid_map.place(keyframe, 0, np.array(pose))
+    return hybrid_map
 
 
 class _Explored:
@@ -90,7 +102,7 @@ def test_explores_all_of_a_floor_hallways_first() -> None:
     assert done(own.outcome).reached
     assert own.robot.contacts == 0
     entered = [int(np.argmax(np.hypot(*(path - room).T) < 1.9)) for room in ROOMS]
-    arm, end = (int(np.argmax(np.hypot(*(path - place).T) < 3.5)) for place in ((6.0, 5.0), (11.0, 0.0)))
+    arm, end = (int(np.argmax(np.hypot(*(path - place).T) < 3.5)) for place in ((6.0, 8.0), (11.0, 0.0)))
     assert min(entered) > max(arm, end) > 0
 
 
@@ -180,8 +192,9 @@ def test_unknown_places_are_told() -> None:
 def test_a_known_map_is_known_from_the_start() -> None:
     known = explored(1).run.explorer.atlas
     atlas = Explorer(Configuration(), Replica.of(known.replica.state)).atlas
-    areas = {name for name in known.places() if name.startswith("area")}
-    assert set(atlas.places()) >= areas
+    assert set(atlas.places()) >= set(known.places())
+    for name in ("room 1", "room 2"):
+        assert atlas.survey.same_room(atlas.places()[name], known.places()[name])
     first = min(atlas.survey.roadmap)
     assert set(atlas.survey.distances(first)) >= set(known.survey.distances(first))
 
@@ -219,6 +232,79 @@ def test_hallways_and_doors_of_a_scan() -> None:
 def test_an_arm_as_wide_as_a_hallway_is_no_door() -> None:
     doors = outlook_of(scan_at((6.0, 0.0, 0.0)), Configuration().features, 1.75).doors
     assert not crosses(np.array([[0.0, 0.0, 0.0, 2.5]]), doors).any()
+
+
+def test_a_room_is_as_long_as_to_its_door() -> None:
+    # Through the door of the southern room one sees the hallway behind it from wall to wall.
+    origins, directions = np.zeros((3, 2)), np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0]])
+    doors = jambs_of(np.array([[2.0, 0.2, 0.0], [3.0, 0.0, 0.0], [0.0, 2.0, 0.0]]), np.array([1.0, 1.0, 0.9]))
+    assert np.allclose(doors[0], (2.0, 0.7, 2.0, -0.3))
+    assert np.allclose(up_to_doors(origins, directions, doors), (2.0, np.inf, np.inf))
+
+
+def test_a_room_that_is_seen_from_outside_as_a_whole_is_to_be_entered() -> None:
+    door = np.array([[2.5, -1.0, 3.5, -1.0]])
+    outside = np.array([(3.0, 0.0, 0.0), (3.0, -0.7, 0.0), (2.0, 0.0, 0.0), (4.0, 0.0, 0.0)])
+    inside = np.array([(3.0, -3.0, 0.0)])
+    for poses, count in ((outside, 1), (np.concatenate((outside, inside)), 0)):
+        ground = Ground([scan_at(tuple(pose)) for pose in poses.tolist()], poses, 0.3)
+        ways = ground.beyond(door)
+        assert len(ways) == count
+        assert all(np.abs(way.points[-1] - ROOMS[0]).max() < 1.5 for way in ways)
+        assert not ground.beyond(np.empty((0, 4)))
+
+
+def test_what_is_open_is_not_forgotten_with_the_keyframe_beside_it() -> None:
+    survey, scans = Survey(Configuration().features, 0.3, 1.75), {k: scan_at((1.0 + k, 0.0, 0.0)) for k in range(3)}
+    survey.look(with_keyframes({0: (1.0, 0.0, 0.0), 1: (2.0, 0.0, 0.5)}), scans, 0, np.array([1.0, 0.0, 0.0]))
+    way = np.array([[0.0, 0.0], [20.0, 0.0]])
+    survey.frontiers = [Opened(1, way, hallway=True)]
+    left = with_keyframes({0: (1.0, 0.0, 0.0), 2: (3.0, 0.0, 0.0)})
+    survey.look(left, scans, 0, np.array([1.0, 0.0, 0.0]))
+    (kept,) = (one for one in survey.frontiers if one.length > 19.0)
+    assert kept.keyframe == 0
+    there = se2.transform(np.array([2.0, 0.0, 0.5]), way[-1])
+    assert np.allclose(se2.transform(np.array([1.0, 0.0, 0.0]), kept.way[-1]), there)
+
+
+def test_places_beside_each_other_are_joined_whatever_stands_about() -> None:
+    survey = Survey(Configuration().features, 0.3, 1.75)
+    # So near to a wall no cell of the ground is free.
+    hybrid_map = with_keyframes({0: (2.0, 0.85, 0.0), 4: (2.2, 0.85, 0.0), 9: (2.9, 0.85, 0.0)})
+    survey.look(hybrid_map, dict.fromkeys((0, 4, 9), scan_at((2.0, 0.85, 0.0))), 0, np.array([2.0, 0.0, 0.0]))
+    assert set(survey.distances(0)) == {0, 4}
+
+
+def test_it_does_not_aim_behind_a_wall(monkeypatch: pytest.MonkeyPatch) -> None:
+    aims: list[Float64] = []
+
+    def towards(scan: Scan, goal: Float64, velocity: tuple[float, float], limits: Limits) -> Command:
+        aims.append(goal)
+        return command_towards(scan, goal, velocity, limits)
+
+    monkeypatch.setattr("hmt_slam_ros.exploration.pilot.command_towards", towards)
+    # From the northern arm around the eastern corner; the wall of the arm is at x = 7 up to y = 1.
+    at = np.array([6.6, 1.6, 0.0])
+    way = se2.transform(se2.inverse(at), np.array([(6.6, 1.6), (6.6, 0.5), (8.5, 0.5)]))
+    Pilot(Limits(0.6, 0.8, 0.5, 1.5, 0.25), 0.15).steer(scan_at((6.6, 1.6, 0.0)), way, (0.0, 0.0))
+    aim = se2.transform(at, aims[0])
+    assert aim[0] < 7.4
+    assert np.interp(7.0, (6.6, aim[0]), (1.6, aim[1])) < 1.0 or aim[0] < 7.0
+
+
+def test_it_waits_for_who_stands_in_its_way_and_then_goes_around() -> None:
+    pilot, way = Pilot(Limits(0.6, 0.8, 0.5, 1.5, 0.25), 0.15), np.array([[0.0, 0.0], [4.0, 0.0]])
+    laser, walls = Laser(LASER), wall_index(small_floor().walls)
+    person = np.array([[2.7, 0.0, 0.25]])
+
+    def speed(seconds: float, people: Float64) -> float:
+        scan = laser.scan(0, 0, laser.distances(np.array([(2.0, 0.0, 0.0)]), walls, people))
+        command = pilot.steer(replace(scan, stamp=1 + round(seconds * NANOSECONDS)), way, (0.0, 0.0))
+        return abs(command.speed) + abs(command.turn_rate)
+
+    assert [speed(seconds, person) == 0.0 for seconds in (0.0, 2.0, 3.9)] == [True] * 3
+    assert speed(5.0, person) > 0.0
+    assert speed(6.0, np.empty((0, 3))) > 0.0
 
 
 @pytest.mark.parametrize(("seconds", "stuck"), [(4.0, False), (20.0, True)])

@@ -11,6 +11,7 @@ from hmt_slam_ros.random_streams import Purpose, stream
 from hmt_slam_ros.simulation import open_simulated
 from hmt_slam_ros.simulation.building import Building, boxes
 from hmt_slam_ros.simulation.driven_robot import DrivenLog, DrivenRobot
+from hmt_slam_ros.simulation.people import People, Walkers
 from hmt_slam_ros.simulation.raycast import clearance
 from hmt_slam_ros.simulation.scenario import START, Scenario
 from hmt_slam_ros.simulation.settings import Settings
@@ -125,6 +126,19 @@ def test_people_walk_wait_before_the_robot_and_turn_back_and_are_not_passed_thro
     # The discs of a person and the robot never overlap more than where the person stood when the drive began.
     start = np.hypot(*(robot_in(people=8, seed=2).people[:, :2] - ROUTE[0]).T).min()
     assert nearest >= min(start, 0.2 + 0.25)
+
+
+def test_who_cannot_turn_back_for_long_squeezes_past_a_robot_that_stands():
+    # A walk of 2 m to and fro, and in its middle 0.8 m from the end a robot that wants nothing but to stand there.
+    drive_ = robot_in(people=1, seed=2).scenario.people.drive
+    people = People(drive_, *np.array([[0.0], [2.0], [1.0], [0.0], [0.0]]))
+    robot = np.append(people.places(np.array([1.2]))[0], 0.0)
+    walkers, passed = Walkers(people), []
+    for _ in range(1000):
+        walkers.walk(0.05, robot)
+        passed.append(np.hypot(*(walkers.discs[0, :2] - people.places(np.array([2.0]))[0])))
+    assert min(passed) < 0.3
+    assert max(passed) > 1.7
 
 
 def test_the_laser_sees_people_where_they_are():

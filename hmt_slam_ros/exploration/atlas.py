@@ -37,6 +37,8 @@ class Atlas:
         # Of each room that was entered the keyframes around the place where it was, the nearest first.
         self._rooms: list[tuple[int, ...]] = []
         self.survey.look_everywhere(self.hybrid_map, self.replica.scans)
+        for room in self.survey.rooms():
+            self._name(room)
 
     def hear(self, message: Message) -> None:
         """Take in a message of the chain, or a pose; between nodes scans may come after any of them."""
@@ -104,7 +106,10 @@ class Atlas:
     def enter(self) -> None:
         """Give the room a name in which the robot is, if it is in one that has none."""
         here = self.look()
-        room = self.survey.room_of(here.keyframe) if here is not None else ()
+        if here is not None:
+            self._name(self.survey.room_of(here.keyframe))
+
+    def _name(self, room: tuple[int, ...]) -> None:
         if room and not any(self.survey.same_room(room[0], known) for known in self._named().values()):
             self._rooms.append(room)
 

@@ -60,7 +60,7 @@ class Explorer:
         # Frontiers where it was, and others that it did not reach: each a place in the frame of a keyframe.
         self._reached: list[tuple[int, Float64]] = []
         self._given_up: list[tuple[int, Float64]] = []
-        self._again = False
+        self._again = True
         self._single = configuration.places.max_entropy if own.backtracks else math.inf
         self._backs = False
 
@@ -68,7 +68,7 @@ class Explorer:
         """Take in one message; a scan is answered with velocities."""
         if isinstance(message, Errand):
             self._errand = None if message.kind == "stop" else message
-            self._route, self._tries, self._again = None, 0, False
+            self._route, self._tries, self._again = None, 0, True
         elif isinstance(message, Scan):
             return self._drive(message)
         else:
@@ -121,6 +121,7 @@ class Explorer:
         if self._exploring:
             assert self._target is not None
             (self._reached if reached else self._given_up).append((self._target.keyframe, self._target.way[-1]))
+            self._again |= reached
             if reached and not self._target.hallway:
                 self.atlas.enter()
             return []
@@ -170,9 +171,9 @@ class Explorer:
         return []
 
     def _all_tried(self) -> list[Message]:
-        """There is nothing left; what was given up, maybe because of people, is tried once more."""
-        if self._given_up and not self._again:
-            self._again, self._given_up = True, []
+        """Nothing is left; what was given up, maybe because of people, is tried anew until none of it is reached."""
+        if self._given_up and self._again:
+            self._again, self._given_up = False, []
             return []
         left = len(self._given_up)
         return self._done(f"all is known that can be reached; {left} places were given up", reached=True)

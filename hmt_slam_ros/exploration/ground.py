@@ -15,12 +15,14 @@ from hmt_slam_ros.offline.map_image import OCCUPIED, UNKNOWN, occupancy_image
 from hmt_slam_ros.sensing import Scan
 
 _CELL = 0.1  # m
-# A beam tells of ground up to here, m: beyond, there are gaps between beams.
-REACH = 6.0
+# A beam tells of ground up to here, m: beyond, doors are seen too much askew, and there are gaps between beams.
+REACH = 4.0
 """So far a keyframe shows ground, m."""
 
 # Cells of a frontier at least, and how much farther from surfaces than the robot has to keep they are, m.
 _LEAST, _ROOM = 3, 0.1
+# A part of the ground is a room of its own from this size on, m^2.
+_PART = 0.5
 # A place that is too near to a surface is got to by way of the next one that is not, up to so far away, m.
 _ASIDE = 0.5
 # A cell costs up to so many times more the nearer it is to a surface, up to so many m beyond the radius.
@@ -67,6 +69,7 @@ class Ground:
         passable = self.free.copy()
         passable[rows, columns] = True
         self._numbers = np.full(passable.shape, -1)
+        self._taken = rows, columns
         self._numbers[passable] = np.arange(passable.sum())
         self._at = np.argwhere(passable)
         starts, owners = np.unique(self._numbers[rows, columns], return_index=True)
@@ -97,10 +100,38 @@ class Ground:
             own = self._numbers[groups == group]
             own = own[np.isfinite(self._cost[own])]
             if own.size >= _LEAST:
-                # Its middle, as far as that is from surfaces; of equals the first.
-                away = self.clearance[self._at[own, 0], self._at[own, 1]]
-                found.append(self._way(int(own[np.argmax(away)])))
+                found.append(self._way(self._widest(own)))
         return found
+
+    def beyond(self, doors: Float64) -> list[Way]:
+        """The ways to the parts of the ground behind doors in which no keyframe was taken: to the middle of each.
+
+        :param doors: shape (n, 4), x and y of both jambs of each, m.
+        """
+        parts, _ = ndimage.label(self.free & ~self._on(doors))
+        parts[np.isin(parts, parts[self._taken])] = 0
+        numbers, sizes = np.unique(parts[parts > 0], return_counts=True)
+        found = []
+        for part in numbers[sizes * _CELL**2 >= _PART]:
+            own = self._numbers[parts == part]
+            own = own[np.isfinite(self._cost[own])]
+            if own.size:
+                found.append(self._way(self._widest(own)))
+        return found
+
+    def _on(self, lines: Float64) -> Bool:
+        """The cells that straight lines (n, 4), m, pass."""
+        passed = np.zeros_like(self.free)
+        longest = float(np.hypot(*(lines[:, 2:] - lines[:, :2]).T).max(initial=0.0))
+        shares = np.linspace(0.0, 1.0, 2 + int(2.0 * longest / _CELL))[:, None, None]
+        rows, columns = np.moveaxis(self.cells(lines[:, :2] + shares * (lines[:, 2:] - lines[:, :2])), -1, 0)
+        passed[rows, columns] = True
+        return passed
+
+    def _widest(self, cells: Int64) -> int:
+        """Of some cells by their numbers the one that is the farthest from surfaces; of equals the first."""
+        away = self.clearance[self._at[cells, 0], self._at[cells, 1]]
+        return int(cells[np.argmax(away)])
 
     def way_to(self, place: Float64) -> Way | None:
         """The way to a place (2,), m, or to the nearest beside it; None where none leads there."""

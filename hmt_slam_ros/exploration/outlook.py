@@ -11,11 +11,11 @@ import numpy as np
 
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration.features import Features
+from hmt_slam_ros.features.doors import jambs_of, up_to_doors
 from hmt_slam_ros.features.extraction import extract_lines
 from hmt_slam_ros.features.hallway import free_space, log_odds
 from hmt_slam_ros.features.openings import openings_of
 from hmt_slam_ros.features.rays import rays_of
-from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.sensing import Scan
 
 
@@ -36,13 +36,12 @@ def outlook_of(scan: Scan, features: Features, door: float) -> Outlook:
     :param door: an opening up to so wide is a door, a wider one a hallway, m.
     """
     rays = rays_of(scan, features)
-    space = free_space(rays)
     openings = openings_of(extract_lines(scan, features), rays, features)
     narrow = openings.widths <= door
-    poses, half = openings.poses[narrow], 0.5 * openings.widths[narrow]
-    across = np.stack((np.zeros_like(half), half, np.zeros_like(half)), axis=1)
-    jambs = [se2.compose(poses, sign * across)[:, :2] for sign in (1.0, -1.0)]
-    return Outlook(space is not None and log_odds(space, features) > 0.0, np.concatenate(jambs, axis=1))
+    doors = jambs_of(openings.poses[narrow], openings.widths[narrow])
+    within = np.minimum(rays.free, up_to_doors(rays.origins, rays.directions, doors))
+    space = free_space(rays._replace(free=within))
+    return Outlook(space is not None and log_odds(space, features) > 0.0, doors)
 
 
 def crosses(ways: Float64, doors: Float64) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:

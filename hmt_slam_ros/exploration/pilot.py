@@ -7,7 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from hmt_slam_ros.arrays import Float64
+from hmt_slam_ros.arrays import Bool, Float64
+from hmt_slam_ros.logs.stamps import NANOSECONDS
 from hmt_slam_ros.motion import Command, Limits, command_towards
 from hmt_slam_ros.sensing import Scan
 
@@ -15,6 +16,8 @@ from hmt_slam_ros.sensing import Scan
 _AHEAD, _LEAST = 2.0, 0.5
 # Within so much of the way ahead it takes the nearest place for its own, in steps of so much, m.
 _PASSED, _STEP = 3.0, 0.1
+# Where something stands in the way, the robot waits for so long, ns, that it goes away, once in so much of the way, m.
+_WAIT, _ONCE = 4 * NANOSECONDS, 1.0
 # Progress is this much less that is left, m.
 _PROGRESS = 0.3
 
@@ -29,6 +32,7 @@ class Pilot:
         """:param tolerance: distance from the end of the way at which the robot has arrived, m."""
         self._limits, self._tolerance = replace(limits, tolerance=tolerance), tolerance
         self._passed, self._least, self._since = 0.0, math.inf, 0
+        self._waited, self._until = -math.inf, 0
         self.left = math.inf
 
     def steer(self, scan: Scan, way: Float64, velocity: tuple[float, float]) -> Command:
@@ -42,19 +46,33 @@ class Pilot:
         end = float(along[-1])
         ahead = np.append(np.arange(min(self._passed, end), min(self._passed + _PASSED, end), _STEP), end)
         ahead = ahead[ahead <= self._passed + _PASSED]
-        away = np.hypot(*_at(way, along, ahead).T)
-        self._passed = float(ahead[np.argmin(away)])
-        self.left = float(away.min()) + end - self._passed
+        places = _at(way, along, ahead)
+        away = np.hypot(*places.T)
+        # The way may lead by on the other side of a wall.
+        nearest = int(np.argmin(np.where(_in_sight(scan, places), away, away + _PASSED)))
+        self._passed = float(ahead[nearest])
+        self.left = float(away[nearest]) + end - self._passed
         if self.left < self._least - _PROGRESS:
             self._least, self._since = self.left, scan.stamp
-        return command_towards(scan, self._goal(scan, way, along), velocity, self._limits)
+        goal = self._goal(scan, way, along)
+        if goal is None and self._waits(scan.stamp):
+            return Command(0.0, 0.0, arrived=False)
+        beyond = _at(way, along, np.minimum(self._passed + np.array([_AHEAD]), end))[0]
+        return command_towards(scan, beyond if goal is None else goal, velocity, self._limits)
 
-    def _goal(self, scan: Scan, way: Float64, along: Float64) -> Float64:
-        """The farthest place on the way, up to some distance ahead, beside which nothing stands; else the farthest."""
+    def _waits(self, stamp: int) -> bool:
+        """Whether to stand now that something is in the way: who walks about stops, too, before what moves."""
+        if self._passed > self._waited + _ONCE:
+            self._waited, self._until = self._passed, stamp + _WAIT
+        return stamp < self._until
+
+    def _goal(self, scan: Scan, way: Float64, along: Float64) -> Float64 | None:
+        """The farthest place on the way, up to some distance ahead, in sight and beside which nothing stands."""
         ahead = np.minimum(self._passed + np.arange(_AHEAD, _LEAST, -_STEP), along[-1])
         places = _at(way, along, ahead)
         away = np.hypot(*(places[:, None] - scan.points[None]).transpose(2, 0, 1)).min(axis=1, initial=np.inf)
-        return places[int(np.argmax(away > self._limits.radius + self._limits.margin + _STEP))]
+        good = _in_sight(scan, places) & (away > self._limits.radius + self._limits.margin + _STEP)
+        return places[int(np.argmax(good))] if good.any() else None
 
     @property
     def arrived(self) -> bool:
@@ -73,3 +91,13 @@ class Pilot:
 def _at(way: Float64, along: Float64, places: Float64) -> Float64:
     """The points (k, 2) on a way (n, 2) that are so far along it, (k,), m."""
     return np.stack([np.interp(places, along, way[:, axis]) for axis in (0, 1)], axis=1)
+
+
+def _in_sight(scan: Scan, places: Float64) -> Bool:
+    """Which of some places (k, 2) no surface hides from the robot, shape (k,)."""
+    away = np.maximum(np.hypot(*places.T), 1e-9)
+    towards = places / away[:, None]
+    along = towards @ scan.points.T
+    beside = towards @ np.stack((-scan.points[:, 1], scan.points[:, 0]))
+    hiding = (along > 0.0) & (along < away[:, None]) & (np.abs(beside) <= 0.5 * _STEP)
+    return np.asarray(~hiding.any(axis=1))

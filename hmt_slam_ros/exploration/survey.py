@@ -1,4 +1,4 @@
-"""What of a building is known, on top of its HMT map: a roadmap of keyframes, and the frontiers beside them.
+"""What of a building is known, on top of its HMT map: a roadmap of keyframes, and what is open beside them.
 
 Where a keyframe was taken the robot has been, so it can get there again. The roadmap joins keyframes between which it
 can go straight. Both are kept up to date around the robot's area alone; what is farther away stays as it was seen.
@@ -32,14 +32,17 @@ _SEEN = _UP_TO_DATE + REACH
 _JOINED, _DROVE = 8.0, 1.5
 # Whether a keyframe is in a room those tell, too, that are so near; and so far it is at most across a room, m.
 _BESIDE, _ACROSS = 1.5, 8.0
+# Where fewer keyframes look like in a room, there is none.
+_FEW = 3
 
 
 @dataclass(frozen=True, eq=False)
 class Opened:
-    """Where known ground ends.
+    """Where known ground ends, or a room that nobody entered.
 
     :ivar keyframe: from which the way there is shortest.
-    :ivar way: shape (n, 2), from there to a place at the frontier, m, in the frame of the keyframe's base.
+    :ivar way: shape (n, 2), from there to a place at the frontier or in the room's middle, m, in the frame of the
+        keyframe's base.
     :ivar hallway: whether it is expected to be in a hallway; else it is in a room.
     """
 
@@ -80,6 +83,8 @@ class Survey:
         self._outlooks: dict[int, Outlook] = {}
         self.roadmap = nx.Graph()
         self.frontiers: list[Opened] = []
+        # {keyframe: its area and its pose in that} as of the last look.
+        self._placed: dict[int, tuple[int, Float64]] = {}
 
     def look(self, hybrid_map: HybridMap, scans: Mapping[int, Scan], area: int, pose: Float64) -> Here | None:
         """Bring all around the robot up to date.
@@ -129,16 +134,31 @@ class Survey:
 
         :param poses: {keyframe: pose (3,)} around the robot.
         """
-        known = {keyframe for area in hybrid_map.area_ids() for keyframe in hybrid_map.keyframes(area)}
+        known = {k: (area, own) for area in hybrid_map.area_ids() for k, own in hybrid_map.keyframes(area).items()}
         self.roadmap.remove_nodes_from([keyframe for keyframe in self.roadmap if keyframe not in known])
         near = {keyframe for keyframe, placed in poses.items() if _is_near(placed, pose)}
         self.roadmap.remove_edges_from([edge for edge in self.roadmap.edges if edge[0] in near and edge[1] in near])
         self.frontiers = [
             one
-            for one in self.frontiers
-            if one.keyframe in known
+            for one in (self._kept(one, known) for one in self.frontiers)
+            if one is not None
             and not (one.keyframe in poses and _is_near(se2.transform(poses[one.keyframe], one.way[-1]), pose))
         ]
+        self._placed = known
+
+    def _kept(self, one: Opened, known: Mapping[int, tuple[int, Float64]]) -> Opened | None:
+        """What is open, as seen from another keyframe of the same area where its own is no more.
+
+        :param known: {keyframe: its area and its pose in that}.
+        """
+        if one.keyframe in known:
+            return one
+        area, pose = self._placed[one.keyframe]
+        left = {k: own for k, (other, own) in self._placed.items() if other == area and k in known}
+        if not left:
+            return None
+        nearest = min(left, key=lambda keyframe: math.dist(left[keyframe][:2], pose[:2]))
+        return Opened(nearest, se2.transform(se2.between(left[nearest], pose), one.way), one.hallway)
 
     def _doors(self, names: list[int], placed: Float64, scans: Mapping[int, Scan]) -> Float64:
         """All doors that keyframes show, (n, 4), in the frame of their poses."""
@@ -159,22 +179,31 @@ class Survey:
         starts, ends = placed[firsts, :2], placed[seconds, :2]
         numbers = np.array(names)
         driven = (numbers[seconds] == numbers[firsts] + 1) & (apart[firsts, seconds] <= _DROVE)
-        joined = (near[firsts] & near[seconds]) & (driven | ground.clear(starts, ends))
+        # Nothing stands between places where the robot was that are nearer to each other than it is wide.
+        beside = apart[firsts, seconds] <= self._keep
+        joined = (near[firsts] & near[seconds]) & (driven | beside | ground.clear(starts, ends))
         passed = crosses(np.concatenate((starts, ends), axis=1), doors)
         for i, k, door in zip(firsts[joined].tolist(), seconds[joined].tolist(), passed[joined].tolist(), strict=True):
             self.roadmap.add_edge(names[i], names[k], length=float(apart[i, k]), door=door)
 
     def _find(self, names: list[int], placed: Float64, ground: Ground, pose: Float64, doors: Float64) -> None:
-        """Find the frontiers."""
+        """Find the frontiers, and the rooms that nobody entered: these may be seen from outside as a whole."""
         for frontier in ground.frontiers():
-            if not _is_near(frontier.points[-1], pose):
-                continue
             keyframe = names[frontier.keyframe]
             ways = np.concatenate((frontier.points[:-1], frontier.points[1:]), axis=1)
             # Who looks from one through a door looks into the other.
             hallway = self._outlooks[keyframe].hallway != bool(crosses(ways, doors).any())
-            way = se2.transform(se2.inverse(placed[frontier.keyframe]), frontier.points)
-            self.frontiers.append(Opened(keyframe, way, hallway))
+            self._open(keyframe, placed[frontier.keyframe], frontier.points, pose, hallway=hallway)
+        for room in ground.beyond(doors):
+            self._open(names[room.keyframe], placed[room.keyframe], room.points, pose, hallway=False)
+
+    def _open(self, keyframe: int, at: Float64, points: Float64, pose: Float64, *, hallway: bool) -> None:
+        """Add what is open near the robot.
+
+        :param at: pose of the keyframe from which the way (n, 2) leads there.
+        """
+        if _is_near(points[-1], pose):
+            self.frontiers.append(Opened(keyframe, se2.transform(se2.inverse(at), points), hallway))
 
     def distances(self, start: int) -> dict[int, float]:
         """{keyframe: how far it is to there from ``start``, m}, of those that can be reached."""
@@ -196,18 +225,33 @@ class Survey:
 
     def room_of(self, keyframe: int) -> tuple[int, ...]:
         """The keyframes around one, the nearest first, if half of them are in a room; else none."""
+        around = self._around(keyframe)
+        hallways = sum(self._outlooks[other].hallway for other in around)
+        return around if hallways <= 0.5 * len(around) else ()
+
+    def rooms(self) -> list[tuple[int, ...]]:
+        """Of every room that was entered, the first one first, the keyframes around its middle as in `room_of`."""
+        rooms = nx.Graph(self._within_doors())
+        rooms.remove_nodes_from([keyframe for keyframe in rooms if self._outlooks[keyframe].hallway])
+        parts = sorted((part for part in nx.connected_components(rooms) if len(part) >= _FEW), key=min)
+        middles = (nx.barycenter(rooms.subgraph(part), weight="length")[0] for part in parts)
+        return [room for middle in middles if (room := self.room_of(middle))]
+
+    def _around(self, keyframe: int) -> tuple[int, ...]:
         beside = {
             other: edge["length"]
             for other, edge in self.roadmap[keyframe].items()
             if edge["length"] <= _BESIDE and not edge["door"]
         }
-        around = (keyframe, *sorted(beside, key=lambda other: (beside[other], other)))
-        hallways = sum(self._outlooks[other].hallway for other in around)
-        return around if hallways <= 0.5 * len(around) else ()
+        return (keyframe, *sorted(beside, key=lambda other: (beside[other], other)))
+
+    def _within_doors(self) -> nx.Graph:
+        """The roadmap without ways through doors."""
+        return nx.subgraph_view(self.roadmap, filter_edge=lambda a, b: not self.roadmap.edges[a, b]["door"])
 
     def same_room(self, one: int, other: int) -> bool:
         """Whether a short way that passes no door leads from one keyframe to another."""
-        within = nx.subgraph_view(self.roadmap, filter_edge=lambda a, b: not self.roadmap.edges[a, b]["door"])
+        within = self._within_doors()
         if one not in within or other not in within:
             return False
         return other in nx.single_source_dijkstra_path_length(within, one, cutoff=_ACROSS, weight="length")

@@ -25,8 +25,9 @@ _LEAST = 0.5
 # An opening is beside a hallway that was driven along so near to it, m, at so many keyframes, which are so far from its
 # wall, m, and see that wall where the opening is to this, m. An opening askew from here on, rad, is in none.
 _NEAR, _FEW, _ASIDE, _OFF, _ASKEW = 3.0, 2, (0.2, 2.5), 0.5, math.radians(20.0)
-# Keyframes behind an opening are so far behind it, m, and so far beside its middle at most, m.
-_BEHIND, _WITHIN = (0.4, 5.0), 1.0
+# Keyframes behind an opening are so far behind it, m, and so far beside its middle at most, m; nearer to it one looks
+# back into the hallway.
+_BEHIND, _WITHIN = (1.5, 5.0), 1.0
 # A hallway that nobody drove along is so wide, m, and one sees so far along it from its mouth, m, at least.
 _WIDE, _FAR = 1.7, 7.0
 
@@ -73,9 +74,10 @@ def _foot(floor: Floor, place: Float64, direction: int) -> Float64 | None:
     """The place before an opening in the middle of the hallway that it leads off; None where it leads off none."""
     ahead, beside = _seen_from(floor, place, direction)
     wall, other = floor.clear[:, direction], floor.clear[:, opposite(direction)]
-    driven = floor.along[:, (direction + 1) % 2] & (np.abs(beside) <= _NEAR)
-    own = driven & (_ASIDE[0] <= ahead) & (ahead <= _ASIDE[1]) & (np.abs(wall - ahead) <= _OFF)
-    if own.sum() < _FEW:
+    before = (np.abs(beside) <= _NEAR) & (_ASIDE[0] <= ahead) & (ahead <= _ASIDE[1]) & (np.abs(wall - ahead) <= _OFF)
+    own = before & floor.along[:, (direction + 1) % 2]
+    # In a room, too, one may see into a hallway from some places.
+    if own.sum() < max(_FEW, 0.5 * before.sum()):
         return None
     between = own & (other <= _ASIDE[1])
     middle = np.where(between, 0.5 * (wall - other), np.nan) if between.any() else np.zeros(len(wall))

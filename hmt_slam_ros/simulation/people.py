@@ -16,6 +16,7 @@ _SLOW, _FAST = 0.7, 1.4  # m/s
 _SPAN = 20.0  # m, that a person walks at most before turning back
 _STOP = 1.0  # m, likewise where they cannot step aside
 _PATIENCE = 2.0  # s, that a person waits for the robot to go away
+_REMEMBERED = 10.0  # s, that a person knows of having turned back for it, be it that the way back was a short one
 _ASIDE = 0.25  # m, of the robot's way at most
 
 
@@ -68,7 +69,8 @@ class Walkers:
         self._people = people
         self._walked = people.phases.copy()
         self._waited = np.zeros_like(self._walked)
-        self._turned = self._squeezing = np.zeros(len(self._walked), dtype=np.bool_)
+        self._squeezing = np.zeros(len(self._walked), dtype=np.bool_)
+        self._remembers = np.zeros_like(self._walked)
         self.discs = _discs(people.places(self._walked))
 
     def walk(self, seconds: float, robot: NDArray[np.float64]) -> None:
@@ -84,10 +86,11 @@ class Walkers:
         self._walked = np.where(stop, self._walked, ahead)
         self._waited = np.where(stop, self._waited + seconds, 0.0)
         tired = self._waited > _PATIENCE
-        back = tired & ~self._turned
+        turned = self._remembers > 0.0
+        back = tired & ~turned
         self._walked, self._waited = np.where(back, -self._walked, self._walked), np.where(tired, 0.0, self._waited)
-        self._squeezing = near & (self._squeezing | (tired & self._turned))
-        self._turned = near & (self._turned | back)
+        self._squeezing = near & (self._squeezing | (tired & turned))
+        self._remembers = np.where(back, _REMEMBERED, np.maximum(self._remembers - seconds, 0.0))
         places = people.places(self._walked)
         self.discs = _discs(np.where(self._squeezing[:, None], _beside(places, robot), places))
 
