@@ -193,6 +193,9 @@ def test_an_opening_far_from_where_the_map_has_one_is_none_of_it():
     graph, noise = chain([3.0, 4.0]), (0.01, 0.01)
     sure = certain_belief(graph, PLACES, state_of(0, EAST))
     assert [sure.is_listed(Travel(d, 0.0, noise)) for d in (1.5, 2.9, 4.5, 7.1)] == [False, True, False, True]
+    # One that passed two closed doors knows the next one, and what is in between is none of the map.
+    beyond = certain_belief(chain([3.0, 4.0, 5.0, 6.0], existence=1.0), PLACES, state_of(0, EAST))
+    assert [beyond.is_listed(Travel(d, 0.0, noise)) for d in (9.5, 12.1)] == [False, True]
     # A robot that may be anywhere takes it for one of the map.
     assert flat_belief(graph, PLACES).is_listed(Travel(3.5, 0.0, noise))
     assert certain_belief(graph, PLACES, graph.states).is_listed(Travel(1.5, 0.0, noise))

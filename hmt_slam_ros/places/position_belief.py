@@ -90,14 +90,19 @@ class PositionBelief:
     def is_listed(self, travel: Travel) -> bool:
         """Whether an opening that was noticed is more probably one of the map, or of unknown ground, than one that the
         map lacks in known ground. One that it lacks is a landmark, and no arrival.
+
+        Such a one is noticed only as long as none of the map is, so it is the less probable the farther the way is.
         """
         logs = _densities(self.graph.arcs, np.array((travel.distance, travel.turn)), np.array(travel.variances))
         arcs, shares = self.graph.arcs, self.probabilities
-        listed = float((shares[arcs.sources] * arcs.probabilities) @ np.exp(logs))
-        listed += shares[-1] * math.exp(self._usual(travel))
+        ways = shares[arcs.sources] * arcs.probabilities
+        listed = float(ways @ np.exp(logs)) + shares[-1] * math.exp(self._usual(travel))
+        ahead = arcs.means[:, 0] - travel.distance
+        still = ahead / np.sqrt(2.0 * (arcs.variances[:, 0] + travel.variances[0]))
+        passed = float(ways @ [0.5 * math.erfc(each) for each in still.tolist()])
         off = travel.turn**2 / travel.variances[1]
         turn = math.exp(-0.5 * off) / math.sqrt(2.0 * math.pi * travel.variances[1])
-        return listed >= self.places.unlisted * turn * float(shares[:-1].sum())
+        return listed >= self.places.unlisted * turn * max(0.0, float(shares[:-1].sum()) - passed)
 
     def turned(self, quarters: int) -> PositionBelief:
         """After so many quarters of a turn to the right at a node."""
