@@ -42,14 +42,24 @@ def keyframes(crossing_driven=True):
     return np.array(places)
 
 
-def seen_at(pose, rng):
-    """The scan at a pose (3,) of the floor."""
-    return scan_at(walls(), se2.compose(BUILDING, pose), 0.01, rng, 720)
+def seen_at(pose, rng, barred=None):
+    """The scan at a pose (3,) of the floor, the hallway being barred there, m along it, where it is."""
+    bar = np.array([[barred, -1.0, barred, 1.0]] if barred else []).reshape(-1, 2)
+    surfaces = np.concatenate((walls(), se2.transform(BUILDING, bar).reshape(-1, 4)))
+    return scan_at(surfaces, se2.compose(BUILDING, pose), 0.01, rng, 720)
 
 
-def charted(crossing_driven=True):
-    """The chart, the map that it is of, and what its areas show."""
+def charted(crossing_driven=True, again=()):
+    """The chart, the map that it is of, and what its areas show.
+
+    :param again: places, m along the hallway, where the robot looks once more afterwards, and where it is barred then.
+    """
     hybrid_map, scans = mapped(crossing_driven)
+    rng = np.random.default_rng(2)
+    for x, barred in again:
+        keyframe, area, pose = len(scans), int(x > 8.0), np.array([x, 0.1, 0.0])
+        hybrid_map.place(keyframe, area, se2.between(AREAS[area], pose))
+        scans[keyframe] = seen_at(pose, rng, barred)
     views = views_of(hybrid_map, scans, AreaLandmarks(LocalMapping(CONFIGURATION)))
     return chart_of(hybrid_map, views, CONFIGURATION.features), hybrid_map, views
 

@@ -160,3 +160,22 @@ def test_north_is_one_direction_in_all_areas(charts):
         # From a pose that looks north, east is to the right.
         off = math.atan2(away[1], away[0]) + 0.5 * math.pi * edge.leaving
         assert abs(float(se2.wrap(off))) < 0.05
+
+
+BARRED = [(x, 7.5) for x in (4.0, 4.5, 5.0, 5.5, 6.0)]
+FREE = [(x, None) for x in (6.0, 6.5, 7.0, 7.5)]
+
+
+@pytest.mark.parametrize(
+    ("again", "there"),
+    [(BARRED, False), (BARRED[:2], True), (BARRED + FREE, True), (BARRED + BARRED[::-1] + [(2.0, 7.5)], False)],
+    ids=["closed", "for a moment", "opened again", "seen free before it"],
+)
+def test_a_way_that_was_closed_is_none_until_it_is_seen_free_again(charts, again, there):
+    chart, *_ = charted(again=again)
+    ways = {(edge.start, edge.end) for edge in chart.edges}
+    closed = at(chart, 5.0), at(chart, 10.0)
+    assert {closed, closed[::-1]} <= ways if there else not {closed, closed[::-1]} & ways
+    # All others stay, and so do the nodes.
+    assert len(ways) == len(charts[0].edges) - (0 if there else 2)
+    assert len(chart.nodes) == len(charts[0].nodes)

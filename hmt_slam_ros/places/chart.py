@@ -6,8 +6,8 @@ node. So a door is one node that several areas know; so are two openings opposit
 hallway with what it leads to on both sides. A node with an opening to another hallway is a crossing, others are doors.
 The end of a hallway is a node, too, where the robot has to turn; it is none of the paper's states.
 
-An edge is a stretch of hallway between two nodes all of which was driven along; the landmarks on it are those of the
-hallway's walls. Places are compared only within what is around one area, see floor.py.
+An edge is a stretch of hallway between two nodes all of which was driven along and that nothing closed since; the
+landmarks on it are those of the hallway's walls. Places are compared only within what is around one area, see floor.py.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ from hmt_slam_ros.places.leading_off import LeadingOff, leading_off
 from hmt_slam_ros.places.observation_graph import QUARTERS
 from hmt_slam_ros.places.place_graph import EAST, NORTH, Edge, Node, PlaceGraph, opposite, place_graph
 from hmt_slam_ros.places.wall_landmarks import Known, Stretch, known_around, of_stretch, with_hallways
+from hmt_slam_ros.places.way_existence import existence_of
 from hmt_slam_ros.topology.hybrid_map import HybridMap
 
 DOOR, CROSSING, END = range(3)
@@ -42,11 +43,9 @@ BEFORE = 1.0
 
 # Places nearer to each other than this, m, are one node.
 _SAME = 0.6
-# A hallway was driven along without a gap longer than this, m, within so much of its middle, m; and its end is so far
-# behind the last keyframe at most, m.
-_GAP, _MIDDLE, _END = 3.0, 0.9, 4.0
-# The next node is so far beyond what was driven along, m, at most.
-_ON = 1.0
+# A hallway was driven along without a gap longer than this, m, within so much of its middle, m; its end is so far
+# behind the last keyframe, and the next node beyond what was driven along, m, at most.
+_GAP, _MIDDLE, _END, _ON = 3.0, 0.9, 4.0, 1.0
 # An end that is nearer than this to the last node, m, is none of its own.
 _APART = 1.5
 # Deviation of a node's place in its area, m, and of the direction of a hallway, rad.
@@ -125,14 +124,14 @@ def chart_of(hybrid_map: HybridMap, views: Mapping[int, AreaView], features: Fea
 
     :param views: {area: what it shows}, of all areas.
     """
-    return _Charting(floors(hybrid_map, views, features), views).chart()
+    return _Charting(floors(hybrid_map, views, features), views, features).chart()
 
 
 class _Charting:
     """Makes a chart of floors."""
 
-    def __init__(self, own: Mapping[int, Floor], views: Mapping[int, AreaView]) -> None:
-        self._floors, self._views = own, views
+    def __init__(self, own: Mapping[int, Floor], views: Mapping[int, AreaView], features: Features) -> None:
+        self._floors, self._views, self._features = own, views, features
         self._known: dict[int, Known] = {}
         self._places = [_place_of(group, self._feet(group)) for group in self._groups()]
 
@@ -188,7 +187,12 @@ class _Charting:
                 taken |= both
                 ways.append(way)
         ways += [way for port in ports if port not in taken for way in self._to_end(*port)]
-        return [way if way.direction in {NORTH, EAST} else way.back for way in ways]
+        return [way if way.direction in {NORTH, EAST} else way.back for way in ways if self._is_there(way)]
+
+    def _is_there(self, way: _Way) -> bool:
+        place = self._places[way.start]
+        existence = existence_of(self._floors[place.area], _stretch(place, way), self._features)
+        return existence >= self._features.landmark_least
 
     def _to_next(self, k: int, direction: int) -> Iterator[_Way]:
         """The way from a node in a direction to the next node; none or one."""
@@ -250,8 +254,7 @@ class _Charting:
 
     def _edge(self, way: _Way, members: frozenset[tuple[int, int]]) -> Edge:
         place = self._places[way.start]
-        stretch = Stretch(place.at, way.direction, 0.0, way.distance)
-        landmarks = of_stretch(self._around(place.area), self._floors[place.area], stretch, members)
+        landmarks = of_stretch(self._around(place.area), self._floors[place.area], _stretch(place, way), members)
         distance = (way.distance, way.variance)
         return Edge(way.start, way.direction, way.end, way.direction, distance, (0.0, _STRAIGHT**2), landmarks)
 
@@ -289,6 +292,10 @@ def _place_of(group: Sequence[LeadingOff], feet: Float64) -> _Place:
 def _home(group: Sequence[LeadingOff]) -> int:
     """The area in which one of some openings is believed in most."""
     return max(group, key=lambda one: one.landmark.existence.probability).area
+
+
+def _stretch(place: _Place, way: _Way) -> Stretch:
+    return Stretch(place.at, way.direction, 0.0, way.distance)
 
 
 def _ahead_of(places: Float64, at: Float64, direction: int) -> tuple[Float64, Float64]:

@@ -42,11 +42,13 @@ class AreaView(NamedTuple):
     """What an area's keyframes show, in its frame.
 
     :ivar landmarks: of the area.
-    :ivar poses: shape (n, 3), ``area_T_base`` of its keyframes.
+    :ivar keyframes: shape (n,), numbers of its keyframes.
+    :ivar poses: shape (n, 3), their ``area_T_base``.
     :ivar around: shape (n, 72), how far one sees around each, m, in the frame of the base.
     """
 
     landmarks: tuple[Landmark, ...]
+    keyframes: Int64
     poses: Float64
     around: Float64
 
@@ -58,6 +60,7 @@ class Floor(NamedTuple):
     :ivar origin: shape (3,), pose of that frame in the area's.
     :ivar areas: {other area: the belief over its pose in the frame}.
     :ivar owners: shape (n,), the area of every keyframe.
+    :ivar keyframes: shape (n,), its number, which grows with time.
     :ivar places: shape (n, 2), where they were taken, m.
     :ivar clear: shape (n, 4), how far one sees from there to the north, east, south and west, m.
     :ivar along: shape (n, 2), whether they were taken in a hallway from south to north, and from west to east.
@@ -67,6 +70,7 @@ class Floor(NamedTuple):
     origin: Float64
     areas: dict[int, PoseGaussian]
     owners: Int64
+    keyframes: Int64
     places: Float64
     clear: Float64
     along: Bool
@@ -89,7 +93,7 @@ def view_of(keyframes: Mapping[int, Float64], scans: Mapping[int, Scan], known: 
     poses = stacked(keyframes)
     sightings = list(known.sightings([scans[keyframe] for keyframe in keyframes], poses))
     around = np.array([distances_around(sighting.rays) for sighting in sightings])
-    return AreaView(known.gathered(sightings), poses, around)
+    return AreaView(known.gathered(sightings), np.array(list(keyframes), dtype=np.int64), poses, around)
 
 
 def floors(hybrid_map: HybridMap, views: Mapping[int, AreaView], features: Features) -> dict[int, Floor]:
@@ -153,10 +157,12 @@ def _floor(
     areas = {other: into.compose(pose) for other, pose in around.items()}
     poses = np.concatenate([se2.compose(pose.mean, views[other].poses) for other, pose in areas.items()])
     owners = np.concatenate([np.full(len(views[other].poses), other) for other in areas])
+    numbers = np.concatenate([views[other].keyframes for other in areas])
     around_each = np.concatenate([views[other].around for other in areas])
     bearings = np.arctan2(DIRECTIONS[:, 1], DIRECTIONS[:, 0]) - poses[:, 2:]
     clear = np.take_along_axis(around_each, sector_of(bearings), axis=1)
-    return Floor(area, origin, areas, owners, poses[:, :2], clear, _along(around_each, clear, features))
+    along = _along(around_each, clear, features)
+    return Floor(area, origin, areas, owners, numbers, poses[:, :2], clear, along)
 
 
 def _along(around: Float64, clear: Float64, features: Features) -> Bool:
