@@ -41,8 +41,8 @@ def test_the_way_to_the_goal_is_the_shortest_one(square):
 
 
 def test_a_robot_that_is_sure_heads_for_its_goal_and_one_in_unknown_ground_for_none(square):
-    assert next_turn(certain_belief(square, PLACES, state_of(0, WEST)), 1, MODEL) == 2
-    assert next_turn(certain_belief(square, PLACES, square.states), 1, MODEL) is None
+    assert next_turn(certain_belief(square, PLACES, state_of(0, WEST)), 1, MODEL, ahead=True) == 2
+    assert next_turn(certain_belief(square, PLACES, square.states), 1, MODEL, ahead=True) is None
 
 
 def corners(along):
@@ -63,7 +63,10 @@ def test_a_robot_that_is_not_sure_goes_where_places_differ():
         belief = PositionBelief(graph, PLACES, logs)
         assert not belief.confident
         assert most_informative_turn(belief, MODEL) == expected
-        assert next_turn(belief, 0, MODEL) == expected
+        assert next_turn(belief, 0, MODEL, ahead=False) == expected
+        # It follows a hallway that leads on.
+        assert next_turn(belief, 0, MODEL, ahead=True) == 0
+        assert next_turn(belief, None, MODEL, ahead=False) == expected
 
 
 def test_without_a_way_there_is_no_turn():

@@ -1,10 +1,9 @@
 """A robot that gets to named places by the belief over places and, behind a door, by the metric filter.
 
 Tomatis, Nourbakhsh and Siegwart (2003), sections 3.3 and 3.4: along hallways the robot keeps to the middle between the
-walls that it sees; at a node it turns as the most likely state has it, or, where it is not confident, as most
-information is to be expected. Before the goal's door it goes over to the metric filter, but only if it is confident;
-one that finds no door there goes on along the hallway. Out of a room it drives to where the door's node is, and from
-there on the belief tells again where it is.
+walls that it sees, and at a node turns as the most likely state policy has it (policy.py). Before the goal's door it
+goes over to the metric filter, but only if it is confident; one that finds no door there goes on along the hallway. Out
+of a room it drives to where the door's node is, and from there on the belief tells again where it is.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ from hmt_slam_ros.places.estimator import PlaceEstimator
 from hmt_slam_ros.places.observation import observation_model
 from hmt_slam_ros.places.observation_graph import QUARTERS
 from hmt_slam_ros.places.place_graph import opposite, state_of
-from hmt_slam_ros.places.policy import most_informative_turn, next_turn, turn_towards
+from hmt_slam_ros.places.policy import next_turn, turn_towards
 from hmt_slam_ros.places.position_belief import PositionBelief, certain_belief
 from hmt_slam_ros.places.switching import MetricStart, metric_start
 from hmt_slam_ros.sensing import Scan
@@ -143,27 +142,19 @@ class MissionPilot:
         return scan.stamp - self._since > _PATIENCE
 
     def _decide(self, scan: Scan) -> None:
-        """What the most likely state policy says; on straight where it says nothing, and back at a wall."""
+        """What the most likely state policy says; straight on where it says nothing, and back at a wall."""
         belief, facing, goal = self.estimator.belief, self.estimator.facing, self._goal
-        if goal is not None and belief is not None and belief.confident and facing is not None:
-            if facing[0] == goal.node:
-                self._turn((goal.opening.direction - facing[1]) % QUARTERS)
-                self.phase, self._since, self._before_door = Phase.DOOR, scan.stamp, False
-                return
-            quarters = next_turn(belief, goal.node, self._model)
-        else:
-            quarters = self._informative(belief)
-        if self.estimator.at_wall:
-            quarters = quarters or 2
+        node = None if goal is None else goal.node
+        if goal is not None and belief is not None and belief.confident and facing is not None and facing[0] == node:
+            self._turn((goal.opening.direction - facing[1]) % QUARTERS)
+            self.phase, self._since, self._before_door = Phase.DOOR, scan.stamp, False
+            return
+        at_wall = self.estimator.at_wall
+        quarters = None if belief is None else next_turn(belief, node, self._model, ahead=not at_wall)
+        quarters = 2 if at_wall and not quarters else quarters
         if quarters:
             self._turn(quarters)
             self.phase = Phase.TURN
-
-    def _informative(self, belief: PositionBelief | None) -> int | None:
-        """Where a robot that is not confident turns at an end; before that it goes on, as in section 4.2."""
-        if belief is None or not self.estimator.at_wall:
-            return None
-        return most_informative_turn(belief, self._model)
 
     def _turn(self, quarters: int) -> None:
         """Turn so many quarters to the right."""

@@ -1,8 +1,8 @@
 """What the robot does next: the most likely state policy of Tomatis, Nourbakhsh and Siegwart (2003), section 3.3.
 
 A confident robot does what is best in the most likely state: it follows the shortest way to its goal. One that is not
-goes where it expects to find more information: where less entropy would be left after the next opening, if it saw
-there what each of its likely states has it expect.
+follows the hallway and, where that ends, goes where it expects to find more information: where less entropy would be
+left after the next opening, if it saw there what each of its likely states has it expect.
 """
 
 from __future__ import annotations
@@ -26,15 +26,16 @@ _LIKELY = 8
 _NEVER = 1e-300
 
 
-def next_turn(belief: PositionBelief, goal: int, model: ObservationModel) -> int | None:
+def next_turn(belief: PositionBelief, goal: int | None, model: ObservationModel, *, ahead: bool) -> int | None:
     """Quarters to the right that the robot has to turn before it goes on.
 
     :param belief: at a node.
-    :param goal: node.
+    :param goal: node; None where the robot only wants to know where it is.
+    :param ahead: whether the hallway leads on, as the robot sees it.
     :returns: None at the goal, where no way is known to lead there, and in unknown ground.
     """
-    if not belief.confident:
-        return most_informative_turn(belief, model)
+    if goal is None or not belief.confident:
+        return 0 if ahead else most_informative_turn(belief, model)
     state = belief.most_likely
     return None if state is None else turn_towards(belief.graph, state, goal)
 
