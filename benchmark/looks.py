@@ -136,22 +136,22 @@ class Looks:
         numbers = {stamp: n for n, stamp in enumerate(drive.scans.tolist())}
         self._true = {k: drive.poses[numbers[scan.stamp]] for k, scan in part.scans.items()}
 
-    def taken(self, again: int) -> Iterator[Look]:
+    def taken(self, again: int, most: int = LOOKS) -> Iterator[Look]:
         """Looks from inside and from outside.
 
         :param again: number of the scan from which on those from inside are taken.
+        :param most: of either.
         """
         draw = np.random.default_rng([_DRAWS, self._configuration.seed])
         for inside, first in ((True, again), (False, self._part.last)):
-            for numbers in self._starts(inside, first, draw):
+            for numbers in self._starts(inside, first, draw, most):
                 drift = np.cumsum(_DRIFT * draw.standard_normal((len(numbers), 3)), axis=0)
                 yield self._looked(numbers, drift, inside)
 
-    def _starts(self, inside: bool, first: int, draw: np.random.Generator) -> Iterator[list[int]]:
+    def _starts(self, inside: bool, first: int, draw: np.random.Generator, wanted: int) -> Iterator[list[int]]:
         """The scans that a robot sees, one after the other, in the map or outside."""
         poses, known = self._drive.poses, np.array(list(self._true.values()))
         away = cKDTree(known[:, :2]).query(poses[:, :2])[0]
-        wanted = LOOKS
         for start in draw.permutation(np.arange(first, len(poses))).tolist():
             numbers = [start + k for k in keyframes_of(poses[start:][:_MOST], self._configuration)[:KEYFRAMES]]
             apart = away[numbers]

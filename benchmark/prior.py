@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from benchmark.looks import INSIDE, KEYFRAMES, OUTSIDE, RIGHT, RIGHT_ANGLE, Look, Looks, map_of, simulated_drive
+from benchmark.looks import INSIDE, KEYFRAMES, LOOKS, OUTSIDE, RIGHT, RIGHT_ANGLE, Look, Looks, map_of, simulated_drive
 from benchmark.report import Report, Requirement, table
 from benchmark.runs import PARAMETERS
 from benchmark.settings import Settings
@@ -97,12 +97,12 @@ def _priors(looks: Sequence[Look], temper: float) -> list[tuple[str, float, floa
     return [("none", 0.0, 0.0), (f"a constant, {-constant:g}", 0.0, constant), ("landmarks", temper, 0.0)]
 
 
-def looks_of(world: str, seed: int, configuration: Configuration) -> Iterator[Look]:
-    """Looks at the map of a part of a building."""
+def looks_of(world: str, seed: int, configuration: Configuration, most: int = LOOKS) -> Iterator[Look]:
+    """Looks at the map of a part of a building, from inside and from outside."""
     drive = simulated_drive(f"sim:{world},seed={seed},laps=2")
     seeded = replace(configuration, seed=seed)
     part = map_of(drive, int(0.5 * _MAPPED * len(drive.poses)), seeded)
-    return Looks(drive, part, seeded).taken(len(drive.poses) // 2)
+    return Looks(drive, part, seeded).taken(len(drive.poses) // 2, most)
 
 
 def scored_with(looks: Sequence[Look], temper: float, constant: float = 0.0) -> Scored:
