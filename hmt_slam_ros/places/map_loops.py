@@ -30,6 +30,7 @@ from hmt_slam_ros.places.twin_peaks import TRANSITIONS, Loop
 from hmt_slam_ros.places.way_back import loops_along, ways
 from hmt_slam_ros.sensing import Scan
 from hmt_slam_ros.topology.hybrid_map import HybridMap
+from hmt_slam_ros.topology.surroundings import same_poses
 
 # Of the robot's way so many transitions are enough.
 _ENOUGH = 3 * TRANSITIONS
@@ -104,7 +105,7 @@ class MapLoops:
     def _view(self, hybrid_map: HybridMap, area: int) -> AreaView:
         keyframes = dict(hybrid_map.keyframes(area))
         held = self._views.get(area)
-        if held is None or not _same(held[0], keyframes):
+        if held is None or not same_poses(held[0], keyframes):
             held = self._views[area] = keyframes, view_of(keyframes, self._scans, self._known)
         return held[1]
 
@@ -136,8 +137,3 @@ def _joining(chart: Chart, loop: Loop, begin: Loop, own: int) -> MapLoop:
     back = PoseGaussian.exactly(other.pose).inverse()
     pose = PoseGaussian.exactly(node.pose).compose(turned).compose(back)
     return MapLoop(node.area, other.area, pose, chart.nodes[min(begin.node, begin.other)].area)
-
-
-def _same(one: Mapping[int, Float64], other: Mapping[int, Float64]) -> bool:
-    """Whether two areas have the same keyframes in the same places."""
-    return one.keys() == other.keys() and all(np.array_equal(pose, other[k]) for k, pose in one.items())

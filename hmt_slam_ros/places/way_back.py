@@ -13,7 +13,6 @@ import numpy as np
 
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration.places import Places
-from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.places.chart import Chart, ChartNode
 from hmt_slam_ros.places.observation import ObservationModel, reach_of
 from hmt_slam_ros.places.observation_graph import QUARTERS, Landmarks, chosen
@@ -22,7 +21,7 @@ from hmt_slam_ros.places.position_belief import PositionBelief, Travel
 from hmt_slam_ros.places.twin_peaks import Loop, TwinPeaks, belief_of_twins
 from hmt_slam_ros.topology.hybrid_map import HybridMap
 from hmt_slam_ros.topology.shortest_path import reachable
-from hmt_slam_ros.topology.surroundings import stacked
+from hmt_slam_ros.topology.surroundings import positions
 
 # Keyframes that are so near to a node are at it, m.
 _AT = 1.0
@@ -64,7 +63,7 @@ def _around(hybrid_map: HybridMap, area: int) -> tuple[Float64, Float64]:
     """All keyframes (n,) and their places (n, 2) in the frame of an area."""
     known = reachable(hybrid_map, area)
     keyframes = [np.array(list(hybrid_map.keyframes(other))) for other in known]
-    places = [se2.compose(pose.mean, stacked(hybrid_map.keyframes(other)))[:, :2] for other, pose in known.items()]
+    places = [positions(hybrid_map, other, pose.mean) for other, pose in known.items()]
     return np.concatenate(keyframes), np.concatenate(places)
 
 

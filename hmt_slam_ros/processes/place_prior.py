@@ -33,7 +33,7 @@ from hmt_slam_ros.places.wall_landmarks import as_seen, known_around
 from hmt_slam_ros.sensing import Scan
 from hmt_slam_ros.topology.hybrid_map import HybridMap
 from hmt_slam_ros.topology.located import Located
-from hmt_slam_ros.topology.surroundings import Nearness, areas_around, stacked
+from hmt_slam_ros.topology.surroundings import Nearness, areas_around, same_poses, stacked
 from hmt_slam_ros.topology.whereabouts import Whereabouts
 
 Pose = Float64
@@ -150,7 +150,7 @@ class PlacePrior:
         """The landmarks of an area's keyframes before one of them, gathered once."""
         keyframes = {k: pose for k, pose in hybrid_map.keyframes(area).items() if k < before}
         held = self._areas.get(area)
-        if held is None or not _same(held[0], keyframes):
+        if held is None or not same_poses(held[0], keyframes):
             held = keyframes, self._known.of([self._scans[k] for k in keyframes], stacked(keyframes))
             self._areas[area] = held
         return held[1]
@@ -193,8 +193,3 @@ def _beside(landmarks: Sequence[Landmark], poses: Float64, seen: Sequence[Landma
     places = np.array([one.pose.mean[:2] for one in seen])
     away = np.hypot(*(poses[:, None, :2] - places).transpose(2, 0, 1))
     return np.asarray(((away <= _BESIDE) & (kinds[:, None] == others)).any(axis=1))
-
-
-def _same(one: Mapping[int, Pose], other: Mapping[int, Pose]) -> bool:
-    """Whether two areas have the same keyframes in the same places."""
-    return one.keys() == other.keys() and all(np.array_equal(pose, other[k]) for k, pose in one.items())

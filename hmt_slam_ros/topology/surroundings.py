@@ -67,6 +67,11 @@ def stacked(poses: Mapping[int, Pose]) -> NDArray[np.float64]:
     return np.array(list(poses.values())).reshape(-1, 3)
 
 
+def same_poses(one: Mapping[int, Pose], other: Mapping[int, Pose]) -> bool:
+    """Whether the same keyframes are in the same places."""
+    return one.keys() == other.keys() and all(np.array_equal(pose, other[k]) for k, pose in one.items())
+
+
 def positions(hybrid_map: HybridMap, area: int, pose: Pose) -> NDArray[np.float64]:
     """Positions of an area's keyframes, shape (n, 2), where the area's frame stands at ``pose``."""
     return se2.transform(pose, stacked(hybrid_map.keyframes(area))[:, :2])
