@@ -184,9 +184,11 @@ class Looks:
 
     def _by_kind(self, seen: Sequence[int], placed: Array, found: Sequence[Located]) -> Array:
         """What it says of places that a robot is in a hallway or in a room, shape (len(found),), nats."""
-        areas = {area: self._hallway(self._part.hybrid_map.keyframes(area)) for area in {one.area for one in found}}
         here = self._hallway(dict(zip(seen, placed, strict=True)))
-        return np.array([same_kind(here, areas[one.area], self._share) for one in found])
+        known = [probability for probability in self._hallways.values() if probability is not None]
+        # One more area of either kind is taken for granted.
+        share = (1.0 + sum(known)) / (2.0 + len(known))
+        return np.array([same_kind(here, self._hallways[one.area], share) for one in found])
 
     def _hallway(self, keyframes: Mapping[int, Array]) -> float | None:
         """The probability of keyframes to be in a hallway; None where they do not tell."""
@@ -194,11 +196,10 @@ class Looks:
         return None if kind is None else kind.probability
 
     @cached_property
-    def _share(self) -> float:
-        """The share of hallways among the areas of the map, of which one more of either kind is taken for granted."""
-        areas = [self._hallway(self._part.hybrid_map.keyframes(area)) for area in self._part.hybrid_map.area_ids()]
-        known = [probability for probability in areas if probability is not None]
-        return (1.0 + sum(known)) / (2.0 + len(known))
+    def _hallways(self) -> dict[int, float | None]:
+        """{area of the map: its probability to be a hallway}."""
+        hybrid_map = self._part.hybrid_map
+        return {area: self._hallway(hybrid_map.keyframes(area)) for area in hybrid_map.area_ids()}
 
     def _is_right(self, located: Located, newest: Array, at: Array) -> bool:
         """Whether a place is where the robot is, by the keyframe of the area that is nearest to it.

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,7 +61,7 @@ def measure_recorded(settings: Settings) -> Report:
     report = Report("recorded", "What landmarks and kinds of areas add on recorded logs", seeds=(configuration.seed,))
     with opened(settings.logs_or(LOGS)) as logs:
         looks = {log.name: list(looks_of(log, configuration)) for log in logs}
-        woken = [row for log in logs if log.name in AWAKENING for row in _awakenings(log, configuration, settings)]
+        woken = [row for log in logs if log.name in AWAKENING for row in _awakenings(log, settings)]
     every = [look for own in looks.values() for look in own]
     scores = {name: scored(own, configuration) for name, own in {**looks, "**all**": every}.items()}
     without, landmarks = (scores["**all**"][name].score for name in (NONE, LANDMARKS))
@@ -148,12 +147,12 @@ def roc_area(evidence: Array, right: NDArray[np.bool_]) -> float:
     return ranks / (count * (len(right) - count))
 
 
-def _awakenings(log: MeasuredLog, configuration: Configuration, settings: Settings) -> Iterator[list[str]]:
+def _awakenings(log: MeasuredLog, settings: Settings) -> Iterator[list[str]]:
     """Rows of what came of waking up, without landmarks and with them."""
     count = len(settings.seeds_or(STARTS))
-    for name, prior in (("without", False), ("with", True)):
-        changes = (*settings.changes, f"places.prior={str(prior).lower()}")
-        asked = replace(configuration, places=replace(configuration.places, prior=prior))
+    for name, prior in (("without", "false"), ("with", "true")):
+        changes = (*settings.changes, f"places.prior={prior}")
+        asked = load_configuration(PARAMETERS, list(changes))
         for kind, starts in made_starts(log.name, log.path, asked, changes, count, settings.records).items():
             if starts:
                 yield [log.name, kind, name, *_figures(starts)]
