@@ -28,8 +28,8 @@ SHUTDOWN = {
     "inactive": Transition.TRANSITION_INACTIVE_SHUTDOWN,
     "active": Transition.TRANSITION_ACTIVE_SHUTDOWN,
 }
-LOST = 20.0
-"""After so long no answer comes any more, s."""
+LOST, ASKED = 20.0, 3
+"""After so long no answer comes any more, s; and how often a node is asked for its state."""
 
 UP, DOWN = ("rtl", "tsbi", "slam", "aam", "tlca"), ("tlca", "slam", "rtl", "aam", "tsbi")
 
@@ -51,8 +51,9 @@ class Manager:
         return future.result() if future.done() else None
 
     def state(self, node):
-        while (answer := self.call(GetState, f"{node}/get_state", GetState.Request())) is None:
-            pass
+        answers = (self.call(GetState, f"{node}/get_state", GetState.Request()) for _ in range(ASKED))
+        answer = next((one for one in answers if one is not None), None)
+        assert answer is not None, f"{node} does not say its state"
         return answer.current_state.label
 
     def change(self, node, transition):
