@@ -13,7 +13,8 @@ strewn: new ground is mostly like some place of the map, and that is measured at
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
@@ -23,13 +24,12 @@ from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.features.landmark_map import Landmark
 from hmt_slam_ros.features.landmarks import due
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.local_map.area_landmarks import AreaLandmarks, Sighting
 from hmt_slam_ros.local_map.local_mapping import LocalMapping
 from hmt_slam_ros.places.floor import axis_of
 from hmt_slam_ros.places.observation import Expected, log_observation, log_unknown_ground, observation_model
 from hmt_slam_ros.places.observation_graph import Landmarks, chosen, one_after_the_other
-from hmt_slam_ros.places.wall_landmarks import as_seen, known_around
+from hmt_slam_ros.places.wall_landmarks import Known, as_seen, known_around
 from hmt_slam_ros.sensing import Scan
 from hmt_slam_ros.topology.hybrid_map import HybridMap
 from hmt_slam_ros.topology.located import Located
@@ -96,45 +96,64 @@ class PlacePrior:
         :param poses: {keyframe: ``reference_T_base``} of what the robot saw.
         :param before: the map is that of the keyframes before this one.
         """
+        if not found:
+            return None
         sightings = list(self._known.sightings([self._scans[k] for k in poses], stacked(poses)))
         seen = self._known.gathered(sightings)
         axis = axis_of((landmark, 0.0) for landmark in seen)
-        if axis is None or not found:
+        if axis is None:
             return None
         newest = poses[max(poses)]
         frame = np.array([*newest[:2], axis])
         observed = self._around(seen, np.array([one.pose.mean for one in seen]), frame)
         places = [*(Place(one.area, one.mode.pose.mean) for one in found), *_others(hybrid_map, newest, before)]
-        lists = [
-            self._around(*self._expected(hybrid_map, before, place, sightings, seen), frame) for place in places
-        ]  # fmt: skip
+        lists = self._expected(self._known_at(hybrid_map, before, places, frame), sightings, seen, frame)
         starts = np.cumsum([0, *(len(each.tracks) for each in lists)])
         expected = Expected(starts, one_after_the_other(lists))
         strewn = log_unknown_ground(observed, self._model)
         ratios = log_observation(observed, expected, 0.0, 0.0, self._model) - strewn
         return ratios[: len(found)] - _log_new_ground(ratios[len(found) :])
 
+    def _known_at(
+        self, hybrid_map: HybridMap, before: int, places: Sequence[Place], frame: Pose
+    ) -> Iterator[tuple[list[Landmark], Float64]]:
+        """The landmarks of the map around a robot that is at each of some places, and their poses (n, 3).
+
+        :param frame: shape (3,), the robot's place, with the heading of the axis.
+        :returns: poses in the frame of the keyframes' reference.
+        """
+        known = {area: self._known_around(hybrid_map, area, before) for area in {place.area for place in places}}
+        for area, pose in places:
+            poses = se2.compose(se2.inverse(pose), known[area].poses)
+            near = np.abs(se2.between(frame, poses)[:, 0]) <= self._places.reach
+            yield [known[area].landmarks[k] for k in np.flatnonzero(near).tolist()], poses[near]
+
+    def _known_around(self, hybrid_map: HybridMap, area: int, before: int) -> Known:
+        """The landmarks of the map around an area, in its frame."""
+        around = areas_around(hybrid_map, area, _NEARNESS)
+        return known_around(around, {other: self._of_area(hybrid_map, other, before) for other in around})
+
     def _expected(
         self,
-        hybrid_map: HybridMap,
-        before: int,
-        place: Place,
+        known: Iterable[tuple[list[Landmark], Float64]],
         sightings: Sequence[Sighting],
         seen: Sequence[Landmark],
-    ) -> tuple[list[Landmark], Float64]:
-        """The landmarks of the map that keyframes should see if they lie in a place; and their poses (n, 3) there.
+        frame: Pose,
+    ) -> list[Landmarks]:
+        """Of the landmarks of the map in each of some places those that keyframes should see there.
 
         What is where one was seen is in sight, too, although a place that is some centimetres off, or a wall, may hide
         it.
-
-        :returns: poses in the frame of the keyframes' reference.
         """
-        into = PoseGaussian.exactly(se2.inverse(place.pose))
-        around = areas_around(hybrid_map, place.area, _NEARNESS)
-        areas = {area: into.compose(pose) for area, pose in around.items()}
-        known = known_around(areas, {area: self._of_area(hybrid_map, area, before) for area in areas})
-        shown = self._due(known.landmarks, known.poses, sightings) | _beside(known.landmarks, known.poses, seen)
-        return [known.landmarks[k] for k in np.flatnonzero(shown)], known.poses[shown]
+        lists, poses = zip(*known, strict=True)
+        every = list(chain(*lists))
+        # All places at once: a call costs more than a landmark.
+        shown = self._due(every, np.concatenate(poses), sightings) | _beside(every, np.concatenate(poses), seen)
+        ends = np.cumsum([len(own) for own in lists])[:-1]
+        return [
+            self._around([own[k] for k in np.flatnonzero(due_there).tolist()], at[due_there], frame)
+            for own, at, due_there in zip(lists, poses, np.split(shown, ends), strict=True)
+        ]
 
     def _due(self, landmarks: Sequence[Landmark], poses: Float64, sightings: Sequence[Sighting]) -> Bool:
         """Which landmarks (n,) at poses (n, 3) any of the keyframes should see."""
@@ -142,8 +161,9 @@ class PlacePrior:
         widths = np.array([one.width for one in landmarks])
         shown = np.zeros(len(landmarks), np.bool_)
         for sighting in sightings:
-            local = se2.between(sighting.pose.mean, poses)
-            shown |= due(kinds, local, widths, sighting.rays, self._features)
+            left = np.flatnonzero(~shown)
+            local = se2.between(sighting.pose.mean, poses[left])
+            shown[left] = due(kinds[left], local, widths[left], sighting.rays, self._features)
         return shown
 
     def _of_area(self, hybrid_map: HybridMap, area: int, before: int) -> tuple[Landmark, ...]:
