@@ -10,11 +10,10 @@ import numpy as np
 from hmt_slam_ros.arrays import Float64, Int64
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.local_map.area_landmarks import AreaLandmarks
 from hmt_slam_ros.local_map.local_mapping import LocalMapping
 from hmt_slam_ros.offline.runtime import run_log
+from hmt_slam_ros.places.area_views import AreaView, AreaViews
 from hmt_slam_ros.places.chart import Chart, chart_of
-from hmt_slam_ros.places.floor import AreaView, views_of
 from hmt_slam_ros.sensing import Scan
 from hmt_slam_ros.simulation import open_simulated
 from hmt_slam_ros.simulation.scenario import Scenario
@@ -80,7 +79,7 @@ def charted(
     :param scans: {keyframe: scan}.
     :param true_poses: gives ``world_T_base`` (n, 3) at stamps (n,), ns.
     """
-    views = views_of(hybrid_map, scans, AreaLandmarks(LocalMapping(configuration)))
+    views = AreaViews(LocalMapping(configuration), scans).of_map(hybrid_map)
     frames = {}
     for area in hybrid_map.area_ids():
         own_poses = hybrid_map.keyframes(area)

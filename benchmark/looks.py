@@ -20,6 +20,7 @@ from hmt_slam_ros.local_map.area_kind import AreaKinds
 from hmt_slam_ros.local_map.local_mapping import LocalMapping
 from hmt_slam_ros.logs import LogRecord
 from hmt_slam_ros.offline.runtime import Run
+from hmt_slam_ros.places.area_views import AreaViews
 from hmt_slam_ros.processes.place_prior import PlacePrior
 from hmt_slam_ros.processes.replica import Replica
 from hmt_slam_ros.sensing import Scan
@@ -131,8 +132,10 @@ class Looks:
     def __init__(self, drive: Drive, part: Part, configuration: Configuration) -> None:
         self._drive, self._part, self._configuration = drive, part, configuration
         self._scans, self._before = dict(part.scans), max(part.scans) + 1
-        self._search, self._prior = ClosureSearch(configuration, self._scans), PlacePrior(configuration, self._scans)
-        self._kinds = AreaKinds(LocalMapping(configuration))
+        mapping = LocalMapping(configuration)
+        self._search = ClosureSearch(configuration, self._scans)
+        self._prior = PlacePrior(configuration, AreaViews(mapping, self._scans))
+        self._kinds = AreaKinds(mapping)
         numbers = {stamp: n for n, stamp in enumerate(drive.scans.tolist())}
         self._true = {k: drive.poses[numbers[scan.stamp]] for k, scan in part.scans.items()}
 

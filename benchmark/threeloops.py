@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from typing import NamedTuple
@@ -18,11 +18,11 @@ from benchmark.simulated.truth import NEAR, TURN
 from benchmark.simulated.watch import Watch
 from hmt_slam_ros.configuration import Configuration, load_configuration
 from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.places.area_views import AreaViews
 from hmt_slam_ros.places.map_loops import MapLoop
 from hmt_slam_ros.processes.loop_proposals import LoopProposals
 from hmt_slam_ros.processes.replica import Replica
 from hmt_slam_ros.processes.tsbi_branching import Branching
-from hmt_slam_ros.sensing import Scan
 from hmt_slam_ros.simulation import open_simulated
 from hmt_slam_ros.topology.hybrid_map import HybridMap
 
@@ -107,8 +107,8 @@ class Drive(NamedTuple):
 class _Listening(LoopProposals):
     """Proposes loops, and tells which."""
 
-    def __init__(self, configuration: Configuration, scans: Mapping[int, Scan], heard: Heard) -> None:
-        super().__init__(configuration, scans)
+    def __init__(self, configuration: Configuration, views: AreaViews, heard: Heard) -> None:
+        super().__init__(configuration, views)
         self._heard = heard
 
     def proposed(self, hybrid_map: HybridMap) -> MapLoop | None:
@@ -129,7 +129,7 @@ class _Watch(Watch):
         """As always, but for who proposes loops."""
         branching = super().branching(configuration, replica)
         if branching.loops is not None:
-            branching.loops = _Listening(configuration, replica.scans, self._proposed)
+            branching.loops = _Listening(configuration, branching.views, self._proposed)
         return branching
 
     def _proposed(self, hybrid_map: HybridMap, loop: MapLoop | None) -> None:

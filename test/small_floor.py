@@ -8,10 +8,9 @@ from worlds import scan_at
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.local_map.area_landmarks import AreaLandmarks
 from hmt_slam_ros.local_map.local_mapping import LocalMapping
+from hmt_slam_ros.places.area_views import AreaViews
 from hmt_slam_ros.places.chart import chart_of
-from hmt_slam_ros.places.floor import views_of
 from hmt_slam_ros.simulation.building import FloorPlan
 from hmt_slam_ros.topology.hybrid_map import HybridMap
 
@@ -60,7 +59,7 @@ def charted(crossing_driven=True, again=()):
         keyframe, area, pose = len(scans), int(x > 8.0), np.array([x, 0.1, 0.0])
         hybrid_map.place(keyframe, area, se2.between(AREAS[area], pose))
         scans[keyframe] = seen_at(pose, rng, barred)
-    views = views_of(hybrid_map, scans, AreaLandmarks(LocalMapping(CONFIGURATION)))
+    views = AreaViews(LocalMapping(CONFIGURATION), scans).of_map(hybrid_map)
     return chart_of(hybrid_map, views, CONFIGURATION.features), hybrid_map, views
 
 

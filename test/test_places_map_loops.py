@@ -9,10 +9,9 @@ from worlds import scan_at
 
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.local_map.area_landmarks import AreaLandmarks
 from hmt_slam_ros.local_map.local_mapping import LocalMapping
+from hmt_slam_ros.places.area_views import AreaViews
 from hmt_slam_ros.places.chart import chart_of
-from hmt_slam_ros.places.floor import views_of
 from hmt_slam_ros.places.map_loops import MapLoops
 from hmt_slam_ros.places.way_back import ways
 from hmt_slam_ros.processes.loop_proposals import LoopProposals
@@ -63,6 +62,10 @@ def along(turned):
     return ahead if not turned else np.stack((ahead[::-1, 0], ahead[:, 1], np.full(len(ahead), math.pi)), axis=1)
 
 
+def map_loops(scans):
+    return MapLoops(CONFIGURATION, AreaViews(LocalMapping(CONFIGURATION), scans))
+
+
 @pytest.fixture(scope="module", params=[False, True])
 def twice(request):
     return driven_twice(along(request.param))
@@ -70,7 +73,7 @@ def twice(request):
 
 def test_a_hallway_that_the_map_holds_twice_is_a_loop_as_it_truly_lies(twice):
     hybrid_map, scans = twice
-    loop = MapLoops(CONFIGURATION, scans).newest(hybrid_map)
+    loop = map_loops(scans).newest(hybrid_map)
     assert loop is not None
     assert (loop.area, loop.begin, loop.other in (0, 1)) == (3, 3, True)
     off = se2.log(se2.between(loop.pose.mean, se2.between(THIRD, AREAS[loop.other])))
@@ -81,7 +84,7 @@ def test_a_hallway_that_the_map_holds_twice_is_a_loop_as_it_truly_lies(twice):
 
 def test_another_hallway_is_none():
     hybrid_map, scans = driven_twice(along(turned=False), other_hallway())
-    assert MapLoops(CONFIGURATION, scans).newest(hybrid_map) is None
+    assert map_loops(scans).newest(hybrid_map) is None
 
 
 def test_a_robot_that_was_in_all_areas_of_late_has_no_map_of_before():
@@ -89,13 +92,13 @@ def test_a_robot_that_was_in_all_areas_of_late_has_no_map_of_before():
     newest = max(scans)
     hybrid_map.place(newest, 0, hybrid_map.keyframes(0)[0])
     hybrid_map.place(newest, 2, hybrid_map.keyframes(2)[min(hybrid_map.keyframes(2))])
-    assert MapLoops(CONFIGURATION, scans).newest(hybrid_map) is None
+    assert map_loops(scans).newest(hybrid_map) is None
 
 
 def test_the_way_leads_from_node_to_node_as_the_robot_went(twice):
     hybrid_map, scans = twice
     part = hybrid_map.part([3])
-    chart = chart_of(part, views_of(part, scans, AreaLandmarks(LocalMapping(CONFIGURATION))), CONFIGURATION.features)
+    chart = chart_of(part, AreaViews(LocalMapping(CONFIGURATION), scans).of_map(part), CONFIGURATION.features)
     (way,) = ways(part, chart)
     assert len(way) == 4
     places = np.array([chart.nodes[k].pose for k in (way[0].start, *(edge.end for edge in way))])
@@ -108,7 +111,7 @@ def test_the_way_leads_from_node_to_node_as_the_robot_went(twice):
 
 def test_what_is_proposed_is_supposed_and_told_once_and_stays_no_arc(twice):
     hybrid_map, scans = twice
-    proposals = LoopProposals(CONFIGURATION, scans)
+    proposals = LoopProposals(CONFIGURATION, AreaViews(LocalMapping(CONFIGURATION), scans))
     supposed = proposals.supposed(hybrid_map)
     (notice,) = proposals.notices()
     (other,) = set(supposed.neighbours(3)) - {2}
@@ -123,6 +126,6 @@ def test_where_an_arc_joins_the_two_nothing_is_proposed(twice):
     closed = hybrid_map.branch()
     for known in (0, 1):
         closed.set_arc(3, known, PoseGaussian(se2.between(THIRD, AREAS[known]), 0.01 * np.eye(3)), closure=True)
-    proposals = LoopProposals(CONFIGURATION, scans)
+    proposals = LoopProposals(CONFIGURATION, AreaViews(LocalMapping(CONFIGURATION), scans))
     assert proposals.supposed(closed) is closed
     assert not proposals.notices()

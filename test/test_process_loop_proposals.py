@@ -10,6 +10,8 @@ from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.configuration.flat import with_changes
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.local_map.local_mapping import LocalMapping
+from hmt_slam_ros.places.area_views import AreaViews
 from hmt_slam_ros.places.map_loops import MapLoop
 from hmt_slam_ros.processes.loop_proposals import LoopProposals
 
@@ -23,7 +25,7 @@ class Told(LoopProposals):
     """Proposes what it is told."""
 
     def __init__(self, loop):
-        super().__init__(GATED, {})
+        super().__init__(GATED, AreaViews(LocalMapping(GATED), {}))
         self.loop = loop
 
     def proposed(self, _hybrid_map):

@@ -10,6 +10,8 @@ from hmt_slam_ros.agreement import Agreement
 from hmt_slam_ros.configuration import Configuration, with_changes
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.local_map.local_mapping import LocalMapping
+from hmt_slam_ros.places.area_views import AreaViews
 from hmt_slam_ros.processes.place_prior import PlacePrior
 from hmt_slam_ros.simulation import open_simulated
 from hmt_slam_ros.topology.area_matching import Mode
@@ -18,6 +20,10 @@ from hmt_slam_ros.topology.located import Located
 from hmt_slam_ros.topology.whereabouts import UNMAPPED, Whereabouts
 
 CONFIGURATION = with_changes(Configuration(), {"places.prior_temper": 0.5})
+
+
+def place_prior(scans):
+    return PlacePrior(CONFIGURATION, AreaViews(LocalMapping(CONFIGURATION), scans))
 
 
 def located(pose, area=0):
@@ -48,13 +54,13 @@ def test_landmarks_speak_for_the_right_place_and_against_others(drive):
     hybrid_map, scans, seen, before, true = drive
     along = [se2.compose(true, np.array([shift, 0.0, 0.0])) for shift in (-2.0, 2.0, 5.0)]
     turned = se2.compose(true, np.array([0.0, 0.0, math.pi]))
-    right, *others = PlacePrior(CONFIGURATION, scans).log_ratios(
+    right, *others = place_prior(scans).log_ratios(
         hybrid_map, seen, before, [located(pose) for pose in (true, *along, turned)]
     )
     assert right > 1.0
     assert max(others) < right - 5.0
     # A place a few centimetres off is the same one.
-    (near,) = PlacePrior(CONFIGURATION, scans).log_ratios(
+    (near,) = place_prior(scans).log_ratios(
         hybrid_map, seen, before, [located(se2.compose(true, np.array([0.05, 0.05, 0.01])))]
     )
     assert abs(near - right) < 3.0
@@ -62,7 +68,7 @@ def test_landmarks_speak_for_the_right_place_and_against_others(drive):
 
 def test_places_are_weighed_by_them_with_an_exponent(drive):
     hybrid_map, scans, seen, before, true = drive
-    prior = PlacePrior(CONFIGURATION, scans)
+    prior = place_prior(scans)
     found = (located(true), located(se2.compose(true, np.array([2.0, 0.0, 0.0]))), located(true))
     where = Whereabouts(found, np.array([0.4, 0.4, 5e-4]))
     ratios = prior.log_ratios(hybrid_map, seen, before, found)
@@ -74,7 +80,7 @@ def test_places_are_weighed_by_them_with_an_exponent(drive):
 
 def test_where_keyframes_of_the_map_moved_it_is_looked_at_anew(drive):
     hybrid_map, scans, seen, before, true = drive
-    prior = PlacePrior(CONFIGURATION, scans)
+    prior = place_prior(scans)
     place = [located(true)]
     (asked,) = prior.log_ratios(hybrid_map, seen, before, place)
     moved, shift = hybrid_map.branch(), np.array([3.0, -2.0, 0.0])
@@ -93,14 +99,14 @@ def test_new_ground_looks_like_the_places_of_the_map(drive):
         only.place(k, 0, hybrid_map.keyframes(0)[k])
     newest = seen[max(seen)]
     same = [located(se2.compose(pose, se2.inverse(newest))) for pose in only.keyframes(0).values()]
-    ratios = PlacePrior(CONFIGURATION, scans).log_ratios(only, seen, before, same)
+    ratios = place_prior(scans).log_ratios(only, seen, before, same)
     # All that is known of it are these two, of which it is one or the other with a probability of 0.9.
     assert np.exp(ratios).mean() < 1.0 / 0.9
 
 
 def test_without_a_landmark_or_a_place_nothing_changes(drive):
     hybrid_map, scans, seen, before, _ = drive
-    prior = PlacePrior(CONFIGURATION, scans)
+    prior = place_prior(scans)
     assert prior.log_ratios(hybrid_map, seen, before, []) is None
     nowhere = Whereabouts((), np.zeros(0))
     assert prior.weighed(nowhere, hybrid_map, seen, before).probabilities.size == 0

@@ -24,7 +24,8 @@ from hmt_slam_ros.configuration.features import Features
 from hmt_slam_ros.configuration.places import Places
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.places.floor import DIRECTIONS, AreaView, Floor, floors
+from hmt_slam_ros.places.area_views import AreaView
+from hmt_slam_ros.places.floor import DIRECTIONS, Floor, floors
 from hmt_slam_ros.places.leading_off import LeadingOff, leading_off
 from hmt_slam_ros.places.observation_graph import QUARTERS
 from hmt_slam_ros.places.place_graph import EAST, NORTH, Edge, Node, PlaceGraph, opposite, place_graph
@@ -124,7 +125,7 @@ def chart_of(hybrid_map: HybridMap, views: Mapping[int, AreaView], features: Fea
 
     :param views: {area: what it shows}, of all areas.
     """
-    return _Charting(floors(hybrid_map, views, features), views, features).chart()
+    return _Charting(floors(hybrid_map, views), views, features).chart()
 
 
 class _Charting:

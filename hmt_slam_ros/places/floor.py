@@ -15,17 +15,15 @@ from typing import NamedTuple
 import numpy as np
 
 from hmt_slam_ros.arrays import Bool, Float64, Int64
-from hmt_slam_ros.configuration.features import Features
-from hmt_slam_ros.features.hallway import distances_around, log_odds, sector_of, space_within
+from hmt_slam_ros.features.hallway import sector_of
 from hmt_slam_ros.features.landmark_map import Landmark
 from hmt_slam_ros.features.landmarks import OPENING
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.local_map.area_landmarks import AreaLandmarks
+from hmt_slam_ros.places.area_views import AreaView
 from hmt_slam_ros.places.observation_graph import QUARTERS
-from hmt_slam_ros.sensing import Scan
 from hmt_slam_ros.topology.hybrid_map import HybridMap
-from hmt_slam_ros.topology.surroundings import Nearness, areas_around, stacked
+from hmt_slam_ros.topology.surroundings import Nearness, areas_around
 
 # Areas whose place is known this well, m, and whose keyframes are this near, m, are put into one frame.
 _NEARNESS = Nearness(1.0, 25.0)
@@ -36,21 +34,6 @@ _QUARTER = 0.5 * math.pi
 
 DIRECTIONS: Float64 = np.array([[0.0, 1.0], [1.0, 0.0], [0.0, -1.0], [-1.0, 0.0]])
 """Unit vectors of the directions of travel, north, east, south and west, in a frame whose x is east."""
-
-
-class AreaView(NamedTuple):
-    """What an area's keyframes show, in its frame.
-
-    :ivar landmarks: of the area.
-    :ivar keyframes: shape (n,), numbers of its keyframes.
-    :ivar poses: shape (n, 3), their ``area_T_base``.
-    :ivar around: shape (n, 72), how far one sees around each, m, in the frame of the base.
-    """
-
-    landmarks: tuple[Landmark, ...]
-    keyframes: Int64
-    poses: Float64
-    around: Float64
 
 
 class Floor(NamedTuple):
@@ -76,31 +59,11 @@ class Floor(NamedTuple):
     along: Bool
 
 
-def views_of(hybrid_map: HybridMap, scans: Mapping[int, Scan], known: AreaLandmarks) -> dict[int, AreaView]:
-    """{area: what it shows}, of all areas of a map.
-
-    :param scans: {keyframe: scan}.
-    """
-    return {area: view_of(hybrid_map.keyframes(area), scans, known) for area in hybrid_map.area_ids()}
-
-
-def view_of(keyframes: Mapping[int, Float64], scans: Mapping[int, Scan], known: AreaLandmarks) -> AreaView:
-    """What an area shows.
-
-    :param keyframes: {keyframe: ``area_T_base`` (3,)}.
-    :param scans: {keyframe: scan}.
-    """
-    poses = stacked(keyframes)
-    sightings = list(known.sightings([scans[keyframe] for keyframe in keyframes], poses))
-    around = np.array([distances_around(sighting.rays) for sighting in sightings])
-    return AreaView(known.gathered(sightings), np.array(list(keyframes), dtype=np.int64), poses, around)
-
-
-def floors(hybrid_map: HybridMap, views: Mapping[int, AreaView], features: Features) -> dict[int, Floor]:
+def floors(hybrid_map: HybridMap, views: Mapping[int, AreaView]) -> dict[int, Floor]:
     """{area: what is around it}, of all areas around which landmarks tell the building's axes."""
     around = {area: areas_around(hybrid_map, area, _NEARNESS) for area in hybrid_map.area_ids()}
     norths = _norths(around, views)
-    return {area: _floor(area, north, around[area], views, features) for area, north in norths.items()}
+    return {area: _floor(area, north, around[area], views) for area, north in norths.items()}
 
 
 def quarter_of(headings: Float64) -> Int64:
@@ -149,9 +112,7 @@ def axis_of(landmarks: Iterable[tuple[Landmark, float]]) -> float | None:
     return math.atan2(total.imag, total.real) / QUARTERS if total else None
 
 
-def _floor(
-    area: int, north: float, around: Mapping[int, PoseGaussian], views: Mapping[int, AreaView], features: Features
-) -> Floor:
+def _floor(area: int, north: float, around: Mapping[int, PoseGaussian], views: Mapping[int, AreaView]) -> Floor:
     origin = np.array([0.0, 0.0, north - _QUARTER])
     into = PoseGaussian.exactly(se2.inverse(origin))
     areas = {other: into.compose(pose) for other, pose in around.items()}
@@ -161,15 +122,6 @@ def _floor(
     around_each = np.concatenate([views[other].around for other in areas])
     bearings = np.arctan2(DIRECTIONS[:, 1], DIRECTIONS[:, 0]) - poses[:, 2:]
     clear = np.take_along_axis(around_each, sector_of(bearings), axis=1)
-    along = _along(around_each, clear, features)
+    hallways = np.concatenate([views[other].hallways for other in areas])
+    along = clear[:, :2] + clear[:, 2:] >= _LONG * hallways[:, None]
     return Floor(area, origin, areas, owners, numbers, poses[:, :2], clear, along)
-
-
-def _along(around: Float64, clear: Float64, features: Features) -> Bool:
-    """Along which axes places lie in a hallway, shape (n, 2)."""
-    found = np.zeros((len(around), 2), np.bool_)
-    for k, away in enumerate(around):
-        space = space_within(away)
-        if space is not None and log_odds(space, features) > 0.0:
-            found[k] = clear[k, :2] + clear[k, 2:] >= _LONG * space.length
-    return found

@@ -12,25 +12,20 @@ is the belief of who goes the way backwards; a loop that shows in one direction 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.local_map.area_landmarks import AreaLandmarks
-from hmt_slam_ros.local_map.local_mapping import LocalMapping
+from hmt_slam_ros.places.area_views import AreaViews
 from hmt_slam_ros.places.chart import Chart, chart_of
-from hmt_slam_ros.places.floor import AreaView, view_of
 from hmt_slam_ros.places.observation import observation_model
 from hmt_slam_ros.places.place_graph import Edge, PlaceGraph
 from hmt_slam_ros.places.twin_peaks import TRANSITIONS, Loop
 from hmt_slam_ros.places.way_back import loops_along, ways
-from hmt_slam_ros.sensing import Scan
 from hmt_slam_ros.topology.hybrid_map import HybridMap
-from hmt_slam_ros.topology.surroundings import same_poses
 
 # Of the robot's way so many transitions are enough.
 _ENOUGH = 3 * TRANSITIONS
@@ -55,18 +50,12 @@ class MapLoop(NamedTuple):
 
 
 class MapLoops:
-    """Looks for loops in maps; keeps what areas show."""
+    """Looks for loops in maps."""
 
-    def __init__(self, configuration: Configuration, scans: Mapping[int, Scan]) -> None:
-        """:param scans: {keyframe: scan}, which may grow."""
-        self._features, self._places, self._scans = configuration.features, configuration.places, scans
+    def __init__(self, configuration: Configuration, views: AreaViews) -> None:
+        """:param views: what areas show."""
+        self._features, self._places, self._views = configuration.features, configuration.places, views
         self._model = observation_model(configuration.places, configuration.features)
-        self._known = AreaLandmarks(LocalMapping(configuration))
-        self._views: dict[int, tuple[dict[int, Float64], AreaView]] = {}
-
-    def forget(self) -> None:
-        """Forget what areas show, which is looked up again where it is asked for."""
-        self._views.clear()
 
     def newest(self, hybrid_map: HybridMap) -> MapLoop | None:
         """The newest place of the robot's way that the map holds another time, as the belief says; None for none."""
@@ -99,15 +88,7 @@ class MapLoops:
                 yield steps, loop
 
     def _chart(self, hybrid_map: HybridMap) -> Chart:
-        views = {area: self._view(hybrid_map, area) for area in hybrid_map.area_ids()}
-        return chart_of(hybrid_map, views, self._features)
-
-    def _view(self, hybrid_map: HybridMap, area: int) -> AreaView:
-        keyframes = dict(hybrid_map.keyframes(area))
-        held = self._views.get(area)
-        if held is None or not same_poses(held[0], keyframes):
-            held = self._views[area] = keyframes, view_of(keyframes, self._scans, self._known)
-        return held[1]
+        return chart_of(hybrid_map, self._views.of_map(hybrid_map), self._features)
 
 
 def _divisions(hybrid_map: HybridMap) -> Iterator[tuple[HybridMap, HybridMap]]:

@@ -8,12 +8,10 @@ is no evidence and stays no arc. It is where keyframes are laid into known areas
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 from hmt_slam_ros.configuration import Configuration
+from hmt_slam_ros.places.area_views import AreaViews
 from hmt_slam_ros.places.map_loops import MapLoop, MapLoops
 from hmt_slam_ros.processes.messages import Notice
-from hmt_slam_ros.sensing import Scan
 from hmt_slam_ros.topology.hybrid_map import HybridMap
 from hmt_slam_ros.topology.unknown import telling_arc
 
@@ -29,15 +27,11 @@ _TEXT = (
 class LoopProposals:
     """Supposes arcs."""
 
-    def __init__(self, configuration: Configuration, scans: Mapping[int, Scan]) -> None:
-        """:param scans: {keyframe: scan}, which may grow."""
-        self._loops = MapLoops(configuration, scans)
+    def __init__(self, configuration: Configuration, views: AreaViews) -> None:
+        """:param views: what areas show."""
+        self._loops = MapLoops(configuration, views)
         self._untold: list[MapLoop] = []
         self._told: set[tuple[int, int]] = set()
-
-    def forget_scans(self) -> None:
-        """Look up anew what scans show, of which some have changed."""
-        self._loops.forget()
 
     def proposed(self, hybrid_map: HybridMap) -> MapLoop | None:
         """The newest loop that landmarks propose and no arc closes; None for none."""

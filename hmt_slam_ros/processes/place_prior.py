@@ -24,16 +24,15 @@ from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.features.landmark_map import Landmark
 from hmt_slam_ros.features.landmarks import due
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.local_map.area_landmarks import AreaLandmarks, Sighting
-from hmt_slam_ros.local_map.local_mapping import LocalMapping
+from hmt_slam_ros.local_map.area_landmarks import Sighting
+from hmt_slam_ros.places.area_views import AreaViews
 from hmt_slam_ros.places.floor import axis_of
 from hmt_slam_ros.places.observation import Expected, log_observation, log_unknown_ground, observation_model
 from hmt_slam_ros.places.observation_graph import Landmarks, chosen, one_after_the_other
 from hmt_slam_ros.places.wall_landmarks import Known, as_seen, known_around
-from hmt_slam_ros.sensing import Scan
 from hmt_slam_ros.topology.hybrid_map import HybridMap
 from hmt_slam_ros.topology.located import Located
-from hmt_slam_ros.topology.surroundings import Nearness, areas_around, same_poses, stacked
+from hmt_slam_ros.topology.surroundings import Nearness, areas_around, stacked
 from hmt_slam_ros.topology.whereabouts import Whereabouts
 
 Pose = Float64
@@ -62,16 +61,11 @@ class Place(NamedTuple):
 class PlacePrior:
     """Compares what a robot saw with what the map has at places where it may be."""
 
-    def __init__(self, configuration: Configuration, scans: Mapping[int, Scan]) -> None:
-        """:param scans: {keyframe: scan}, which may grow."""
-        self._scans, self._features, self._places = scans, configuration.features, configuration.places
+    def __init__(self, configuration: Configuration, views: AreaViews) -> None:
+        """:param views: what areas show."""
+        self._features, self._places = configuration.features, configuration.places
         self._model = observation_model(configuration.places, configuration.features)
-        self._known = AreaLandmarks(LocalMapping(configuration))
-        self._areas: dict[int, tuple[dict[int, Pose], tuple[Landmark, ...]]] = {}
-
-    def forget(self) -> None:
-        """Forget the landmarks of areas, which are gathered again where they are asked for."""
-        self._areas.clear()
+        self._views = views
 
     def weighed(
         self, where: Whereabouts, hybrid_map: HybridMap, poses: Mapping[int, Pose], before: int
@@ -98,8 +92,8 @@ class PlacePrior:
         """
         if not found:
             return None
-        sightings = list(self._known.sightings([self._scans[k] for k in poses], stacked(poses)))
-        seen = self._known.gathered(sightings)
+        sightings = list(self._views.known.sightings([self._views.scans[k] for k in poses], stacked(poses)))
+        seen = self._views.known.gathered(sightings)
         axis = axis_of((landmark, 0.0) for landmark in seen)
         if axis is None:
             return None
@@ -167,13 +161,9 @@ class PlacePrior:
         return shown
 
     def _of_area(self, hybrid_map: HybridMap, area: int, before: int) -> tuple[Landmark, ...]:
-        """The landmarks of an area's keyframes before one of them, gathered once."""
+        """The landmarks of an area's keyframes before one of them."""
         keyframes = {k: pose for k, pose in hybrid_map.keyframes(area).items() if k < before}
-        held = self._areas.get(area)
-        if held is None or not same_poses(held[0], keyframes):
-            held = keyframes, self._known.of([self._scans[k] for k in keyframes], stacked(keyframes))
-            self._areas[area] = held
-        return held[1]
+        return self._views.of(area, keyframes).landmarks
 
     def _around(self, landmarks: Sequence[Landmark], poses: Float64, frame: Pose) -> Landmarks:
         """The observation graph of landmarks within reach along an axis.

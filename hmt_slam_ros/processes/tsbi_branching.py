@@ -19,6 +19,8 @@ from hmt_slam_ros.agreement import NO_CLUTTER, Clutter
 from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.local_map.local_mapping import LocalMapping
+from hmt_slam_ros.places.area_views import AreaViews
 from hmt_slam_ros.processes.loop_proposals import PROBABLE, LoopProposals
 from hmt_slam_ros.processes.map_parts import Arc, ArcEnds, Merged, Relabelled
 from hmt_slam_ros.processes.place_prior import PlacePrior
@@ -117,13 +119,15 @@ class Branching:
     """Makes the children of hypotheses; numbers new areas.
 
     :ivar search: finds and compares known areas.
+    :ivar views: what areas show.
     :ivar loops: proposes some, where landmarks are asked.
     """
 
     def __init__(self, configuration: Configuration, replica: Replica) -> None:
         self.search = ClosureSearch(configuration, replica.scans)
-        self._prior = PlacePrior(configuration, replica.scans) if configuration.places.prior else None
-        self.loops = LoopProposals(configuration, replica.scans) if configuration.places.loops else None
+        self.views = AreaViews(LocalMapping(configuration), replica.scans)
+        self._prior = PlacePrior(configuration, self.views) if configuration.places.prior else None
+        self.loops = LoopProposals(configuration, self.views) if configuration.places.loops else None
         self._options = configuration.tsbi
         self._replica = replica
         sigma, angle = configuration.tlca.arc_sigma_floor, math.radians(configuration.tlca.arc_angle_floor)
@@ -156,16 +160,13 @@ class Branching:
     def found(self) -> None:
         """It is known where the robot is."""
         self.search.found()
-        if self._prior is not None:
-            self._prior.forget()
+        if self.loops is None:
+            self.views.forget()
 
     def forget_scans(self) -> None:
         """Work out anew what is made of scans, of which some have changed."""
         self.search.forget_scans()
-        if self._prior is not None:
-            self._prior.forget()
-        if self.loops is not None:
-            self.loops.forget_scans()
+        self.views.forget()
 
     def begin_event(self) -> None:
         """Forget which new areas were named; within one event hypotheses share the ids of the same new area."""

@@ -1,0 +1,81 @@
+"""What the keyframes of a map's areas show, each area looked up once as long as its keyframes stay where they are."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from hmt_slam_ros.arrays import Float64, Int64
+from hmt_slam_ros.configuration.features import Features
+from hmt_slam_ros.features.hallway import distances_around, log_odds, space_within
+from hmt_slam_ros.features.landmark_map import Landmark
+from hmt_slam_ros.local_map.area_landmarks import AreaLandmarks
+from hmt_slam_ros.local_map.local_mapping import LocalMapping
+from hmt_slam_ros.sensing import Scan
+from hmt_slam_ros.topology.hybrid_map import HybridMap
+from hmt_slam_ros.topology.surroundings import same_poses, stacked
+
+
+class AreaView(NamedTuple):
+    """What an area's keyframes show, in its frame.
+
+    :ivar landmarks: of the area.
+    :ivar keyframes: shape (n,), numbers of its keyframes.
+    :ivar poses: shape (n, 3), their ``area_T_base``.
+    :ivar around: shape (n, 72), how far one sees around each, m, in the frame of the base.
+    :ivar hallways: shape (n,), how long the hallway is that each was taken in, m; nan in none.
+    """
+
+    landmarks: tuple[Landmark, ...]
+    keyframes: Int64
+    poses: Float64
+    around: Float64
+    hallways: Float64
+
+
+class AreaViews:
+    """Looks up what areas show, and keeps it.
+
+    :ivar scans: {keyframe: scan}, which may grow.
+    :ivar known: gathers landmarks.
+    """
+
+    def __init__(self, mapping: LocalMapping, scans: Mapping[int, Scan]) -> None:
+        self.scans, self._features = scans, mapping.configuration.features
+        self.known = AreaLandmarks(mapping)
+        self._views: dict[int, tuple[dict[int, Float64], AreaView]] = {}
+
+    def forget(self) -> None:
+        """Forget what areas show, which is looked up again where it is asked for."""
+        self._views.clear()
+
+    def of_map(self, hybrid_map: HybridMap) -> dict[int, AreaView]:
+        """{area: what it shows}, of all areas of a map."""
+        return {area: self.of(area, hybrid_map.keyframes(area)) for area in hybrid_map.area_ids()}
+
+    def of(self, area: int, keyframes: Mapping[int, Float64]) -> AreaView:
+        """What an area shows.
+
+        :param keyframes: {keyframe: ``area_T_base`` (3,)}.
+        """
+        held = self._views.get(area)
+        if held is None or not same_poses(held[0], keyframes):
+            held = self._views[area] = dict(keyframes), self._view(keyframes)
+        return held[1]
+
+    def _view(self, keyframes: Mapping[int, Float64]) -> AreaView:
+        poses = stacked(keyframes)
+        sightings = list(self.known.sightings([self.scans[keyframe] for keyframe in keyframes], poses))
+        around = np.array([distances_around(sighting.rays) for sighting in sightings])
+        hallways = np.array([_hallway(away, self._features) for away in around])
+        numbers = np.array(list(keyframes), dtype=np.int64)
+        return AreaView(self.known.gathered(sightings), numbers, poses, around, hallways)
+
+
+def _hallway(away: Float64, features: Features) -> float:
+    """The length of the hallway in which one sees so far around, m; nan in none."""
+    space = space_within(away)
+    return math.nan if space is None or log_odds(space, features) <= 0.0 else space.length
