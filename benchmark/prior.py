@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -14,7 +14,9 @@ from benchmark.report import Report, Requirement, table
 from benchmark.runs import PARAMETERS
 from benchmark.settings import Settings
 from benchmark.simulated.measured import chosen_families, chosen_seeds
+from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration import Configuration, load_configuration
+from hmt_slam_ros.processes.place_prior import counted
 from hmt_slam_ros.topology.whereabouts import UNMAPPED
 
 SEEDS = 2
@@ -25,11 +27,13 @@ WORLDS = ("office", "busy", "institute", "nested")
 SURE = 0.8
 """Probability from which on a look takes a place for the right one, as TSBI's second one in a row does."""
 
-EXPONENTS = (0.0, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5)
+EXPONENTS = (0.0, 0.05, 0.1, 0.2, 0.3, 0.5, 0.7, 1.0)
 """What is tried for ``places.prior_temper``."""
 
 CONSTANTS: tuple[float, ...] = tuple(np.arange(-2.0, 10.5, 0.5).tolist())
 """What is tried in the stead of landmarks, nats."""
+
+Weights = Callable[[Look], Float64]
 
 # The map is of this share of the first of two rounds.
 _MAPPED = 0.6
@@ -69,12 +73,12 @@ def measure_prior(settings: Settings) -> Report:
     head = ["world", "looks from inside", "outside", "prior", "log score", "found", "wrong", "found from outside"]
     rows, every = [], [look for own in looks.values() for look in own]
     for world, own in {**looks, "**all**": every}.items():
-        for name, temper, constant in _priors(own, places.prior_temper):
-            scored = scored_with(own, temper, constant)
+        for name, weights in _priors(own, places.prior_temper):
+            scored = scored_with(own, weights)
             inside = sum(look.inside for look in own)
             shares = [f"{100.0 * share:.0f} %" for share in scored[1:]]
             rows.append([world, str(inside), str(len(own) - inside), name, f"{scored.score:.3f}", *shares])
-    without, asked = (scored_with(every, *of) for of in ((0.0,), (places.prior_temper,)))
+    without, asked = scored_with(every), scored_with(every, by_landmarks(places.prior_temper))
     report.requirements += [
         Requirement("log score with landmarks / without", asked.score / without.score, 1.0),
         Requirement("found from inside with landmarks / without", asked.found / without.found, math.inf, least=0.95),
@@ -91,10 +95,26 @@ def measure_prior(settings: Settings) -> Report:
     return report
 
 
-def _priors(looks: Sequence[Look], temper: float) -> list[tuple[str, float, float]]:
-    """Names, exponents and constants of what is compared."""
+def _priors(looks: Sequence[Look], temper: float) -> list[tuple[str, Weights]]:
+    """What is compared, and its name."""
     constant = best_constant(looks)
-    return [("none", 0.0, 0.0), (f"a constant, {-constant:g}", 0.0, constant), ("landmarks", temper, 0.0)]
+    by_constant = by_a_constant(constant)
+    return [("none", by_nothing), (f"a constant, {-constant:g}", by_constant), ("landmarks", by_landmarks(temper))]
+
+
+def by_nothing(look: Look) -> Float64:
+    """Places count by their surfaces alone."""
+    return np.zeros(len(look.right))
+
+
+def by_a_constant(constant: float) -> Weights:
+    """The map counts so much less, nats, than it does."""
+    return lambda look: np.full(len(look.right), -constant)
+
+
+def by_landmarks(temper: float) -> Weights:
+    """Landmarks count with an exponent."""
+    return lambda look: counted(look.ratios, temper)
 
 
 def looks_of(world: str, seed: int, configuration: Configuration, most: int = LOOKS) -> Iterator[Look]:
@@ -105,12 +125,12 @@ def looks_of(world: str, seed: int, configuration: Configuration, most: int = LO
     return Looks(drive, part, seeded).taken(len(drive.poses) // 2, most)
 
 
-def scored_with(looks: Sequence[Look], temper: float, constant: float = 0.0) -> Scored:
-    """What comes of looks where landmarks count with an exponent, and the map so much less than it does, nats."""
+def scored_with(looks: Sequence[Look], weights: Weights = by_nothing) -> Scored:
+    """What comes of looks whose places count so much more, nats."""
     scores: dict[bool, list[float]] = {True: [], False: []}
     found, wrong, outside = [], [], []
     for look in looks:
-        probabilities = look.where.weighed(temper * look.ratios - constant).probabilities
+        probabilities = look.where.weighed(weights(look)).probabilities
         right = float(probabilities[look.right].sum()) if look.inside else 1.0 - float(probabilities.sum())
         if not look.inside or look.right.any():
             scores[look.inside].append(-math.log(max(right, 1e-12)))
@@ -126,12 +146,12 @@ def scored_with(looks: Sequence[Look], temper: float, constant: float = 0.0) -> 
 
 def fitted(looks: Sequence[Look]) -> float:
     """The exponent of the least log score."""
-    return min(EXPONENTS, key=lambda exponent: scored_with(looks, exponent).score)
+    return min(EXPONENTS, key=lambda exponent: scored_with(looks, by_landmarks(exponent)).score)
 
 
 def best_constant(looks: Sequence[Look]) -> float:
     """What the map counts less, nats, for the least log score without landmarks."""
-    return min(CONSTANTS, key=lambda constant: scored_with(looks, 0.0, constant).score)
+    return min(CONSTANTS, key=lambda constant: scored_with(looks, by_a_constant(constant)).score)
 
 
 def _mean(values: Sequence[float]) -> float:

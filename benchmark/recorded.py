@@ -13,7 +13,7 @@ from benchmark.awakening import FAR, Awakening, made_starts
 from benchmark.evidence import fitted as regression
 from benchmark.logs import MeasuredLog, opened
 from benchmark.looks import INSIDE, KEYFRAMES, OUTSIDE, RIGHT, RIGHT_ANGLE, Drive, Look, Looks, Part, mapped_part
-from benchmark.prior import SURE, Scored, best_constant, scored_with
+from benchmark.prior import SURE, Scored, best_constant, by_a_constant, by_landmarks, scored_with
 from benchmark.report import Report, Requirement, table
 from benchmark.runs import PARAMETERS
 from benchmark.settings import Settings
@@ -103,15 +103,13 @@ def _mapped(
 
 def scored(looks: Sequence[Look], configuration: Configuration) -> dict[str, Scored]:
     """What comes of looks by each way to weigh their places."""
-    temper = configuration.places.prior_temper
-    kinds = [look._replace(ratios=look.kinds) for look in looks]
-    both = [look._replace(ratios=look.kinds + temper * look.ratios) for look in looks]
+    landmarks = by_landmarks(configuration.places.prior_temper)
     return {
-        NONE: scored_with(looks, 0.0),
-        CONSTANT: scored_with(looks, 0.0, best_constant(looks)),
-        LANDMARKS: scored_with(looks, temper),
-        KINDS: scored_with(kinds, 1.0),
-        BOTH: scored_with(both, 1.0),
+        NONE: scored_with(looks),
+        CONSTANT: scored_with(looks, by_a_constant(best_constant(looks))),
+        LANDMARKS: scored_with(looks, landmarks),
+        KINDS: scored_with(looks, lambda look: look.kinds),
+        BOTH: scored_with(looks, lambda look: look.kinds + landmarks(look)),
     }
 
 

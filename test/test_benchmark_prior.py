@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from benchmark.looks import Look
-from benchmark.prior import EXPONENTS, best_constant, fitted, looks_of, scored_with
+from benchmark.prior import EXPONENTS, best_constant, by_a_constant, by_landmarks, fitted, looks_of, scored_with
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.topology.whereabouts import Whereabouts
 
@@ -20,21 +20,24 @@ def look(probabilities, right=(), ratios=None, inside=True):
 
 def test_the_score_is_of_where_the_robot_is_and_those_outside_weigh_a_fifth():
     own = [look([0.5, 0.3], right=(0,)), look([0.2], inside=False)]
-    scored = scored_with(own, 0.0)
+    scored = scored_with(own)
     assert scored.score == pytest.approx(-0.8 * math.log(0.5) - 0.2 * math.log(0.8))
     assert (scored.found, scored.wrong, scored.outside) == (0.0, 0.0, 0.0)
     # The right place is none of those that were found.
-    assert scored_with([*own, look([0.01])], 0.0).score == scored.score
+    assert scored_with([*own, look([0.01])]).score == scored.score
     sure = [look([0.9], right=(0,)), look([0.85]), look([0.95], inside=False), look([0.1], inside=False)]
-    assert scored_with(sure, 0.0)[1:] == (0.5, 0.5, 0.5)
+    assert scored_with(sure)[1:] == (0.5, 0.5, 0.5)
 
 
-def test_landmarks_count_with_their_exponent_and_the_map_less_by_a_constant():
-    scored = scored_with([look([0.4, 0.4], right=(0,), ratios=[6.0, 2.0]), look([0.1], inside=False)], 0.5, 1.0)
-    right = 0.4 * math.exp(2.0)
-    inside = -math.log(right / (right + 0.4 + 0.2))
-    outside = -math.log(0.9 / (0.9 + 0.1 * math.exp(-1.0)))
-    assert scored.score == pytest.approx(0.8 * inside + 0.2 * outside)
+def test_landmarks_count_against_places_with_their_exponent_and_the_map_less_by_a_constant():
+    own = [look([0.4, 0.4], right=(0,), ratios=[6.0, -2.0]), look([0.1], inside=False, ratios=[1.0])]
+    inside = -math.log(0.4 / (0.4 + 0.4 * math.exp(-1.0) + 0.2))
+    outside = -math.log(0.9)
+    assert scored_with(own, by_landmarks(0.5)).score == pytest.approx(0.8 * inside + 0.2 * outside)
+    less = math.exp(-1.0)
+    inside = -math.log(0.4 * less / (0.8 * less + 0.2))
+    outside = -math.log(0.9 / (0.9 + 0.1 * less))
+    assert scored_with(own, by_a_constant(1.0)).score == pytest.approx(0.8 * inside + 0.2 * outside)
 
 
 def test_what_fits_best_follows_what_landmarks_are_worth():

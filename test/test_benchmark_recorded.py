@@ -26,11 +26,11 @@ def test_places_of_one_kind_are_likelier_the_rarer_it_is():
 
 
 def test_looks_are_scored_by_every_way_to_weigh_them():
-    places = Whereabouts((None, None), np.array([0.3, 0.3]))
-    look = Look(True, places, np.array([True, False]), np.array([4.0, 0.0]), np.array([1.0, 0.0]), (0.1, 0.01))
+    places = Whereabouts((None, None), np.array([0.45, 0.45]))
+    look = Look(True, places, np.array([True, False]), np.array([1.0, -4.0]), np.array([1.0, 0.0]), (0.1, 0.01))
     of = scored([look], with_changes(Configuration(), {"places.prior_temper": 0.5}))
-    for name, nats in ((NONE, 0.0), (LANDMARKS, 2.0), (KINDS, 1.0), (BOTH, 3.0)):
-        right = 0.3 * math.exp(nats)
+    for name, nats in ((NONE, (0.0, 0.0)), (LANDMARKS, (0.0, -2.0)), (KINDS, (1.0, 0.0)), (BOTH, (1.0, -2.0))):
+        right, wrong = (0.45 * math.exp(each) for each in nats)
         # None from outside, so that there is no mean of these.
         assert math.isnan(of[name].score)
-        assert (of[name].found == 1.0) == (right / (right + 0.3 + 0.4) >= 0.8)
+        assert (of[name].found == 1.0) == (right / (right + wrong + 0.1) >= 0.8), name

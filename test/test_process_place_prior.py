@@ -66,13 +66,15 @@ def test_landmarks_speak_for_the_right_place_and_against_others(drive):
     assert abs(near - right) < 3.0
 
 
-def test_places_are_weighed_by_them_with_an_exponent(drive):
+def test_what_speaks_against_places_weighs_them_with_an_exponent(drive):
     hybrid_map, scans, seen, before, true = drive
     prior = place_prior(scans)
     found = (located(true), located(se2.compose(true, np.array([2.0, 0.0, 0.0]))), located(true))
     where = Whereabouts(found, np.array([0.4, 0.4, 5e-4]))
     ratios = prior.log_ratios(hybrid_map, seen, before, found)
-    expected = np.array([0.4, 0.4, 5e-4]) * np.exp([*(0.5 * ratios[:2]), 0.0])
+    expected = np.array([0.4, 0.4, 5e-4]) * np.exp([0.0, 0.5 * ratios[1], 0.0])
+    # That landmarks agree in a place says no more than its surfaces.
+    assert ratios[0] > 0.0 > ratios[1]
     weighed = prior.weighed(where, hybrid_map, seen, before)
     np.testing.assert_allclose(weighed.probabilities, expected / (expected.sum() + 1.0 - 0.8005), rtol=1e-9)
     assert weighed.found is found

@@ -65,7 +65,7 @@ class Places:
         False, "Whether landmarks weigh the places where a robot may be that woke up somewhere or was carried."
     )
     prior_temper: float = parameter(
-        0.05, "Exponent on their likelihood there, as they are made of the same scans as the surfaces.",
+        0.5, "Exponent on their likelihood where it speaks against a place, being made of the same scans as surfaces.",
         low=0.0, high=1.0,
     )
     loops: bool = parameter(

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hmt_slam_ros.arrays import Float64, Int32
+from hmt_slam_ros.configuration.features import Features
 from hmt_slam_ros.features.extraction import extract_lines
 from hmt_slam_ros.features.landmark_map import Landmark, LandmarkMap
 from hmt_slam_ros.features.landmarks import Landmarks, landmarks_of
@@ -78,15 +79,10 @@ class AreaLandmarks:
         A keyframe whose laser sees all around shows that itself; else a virtual scan from its place does, in the map of
         the keyframes of the same visit up to there: what earlier visits saw may be gone.
         """
-        table, before = self._mapping.pool.empty_table(), None
-        for scan, pose in zip(scans, np.ascontiguousarray(poses), strict=True):
-            if before is not None and not 0 <= scan.stamp - before <= _VISIT:
-                self._mapping.pool.release(table)
-                table = self._mapping.pool.empty_table()
-            before = scan.stamp
-            self._mapping.insert(table[None], pose[None], scan)
-            yield self._sighting(table, scan, pose)
-        self._mapping.pool.release(table)
+        area = Growing(self._mapping)
+        for scan, pose in zip(scans, poses, strict=True):
+            yield area.sighting(scan, pose)
+        area.release()
 
     def sighting(self, scan: Scan, pose: Float64, around: Iterable[Scan], poses: Float64) -> Sighting:
         """What one keyframe shows, in the map of it and of others around it where its laser does not see all around.
@@ -99,21 +95,47 @@ class AreaLandmarks:
         if not sees_around(scan):
             for other, at in zip((*around, scan), np.concatenate((poses, pose[None])), strict=True):
                 self._mapping.insert(table[None], at[None], other)
-        found = self._sighting(table, scan, pose)
+        found = _sighting(self._mapping, table, scan, pose)
         self._mapping.pool.release(table)
         return found
 
-    def _sighting(self, table: Int32, scan: Scan, pose: Float64) -> Sighting:
-        """What is around a keyframe, in its own scan or else in the map of a table."""
-        in_map = not sees_around(scan)
-        if not in_map:
-            lines, rays = extract_lines(scan, self._features), rays_of(scan, self._features)
-        else:
-            virtual = virtual_scan(self._mapping.pool.view(table), pose, _BEAMS, _REACH)
-            lines, rays = lines_of_map(virtual, self._features), rays_of_map(virtual, self._features)
-        return Sighting(self._place(pose), landmarks_of(lines, rays, self._features), rays, in_map)
 
-    def _place(self, pose: Float64) -> PoseGaussian:
-        """Where a keyframe was taken; the map there, which is made of such keyframes, is as far off."""
-        off = self._features.map_deviation
-        return PoseGaussian(pose, np.diag([off, off, math.radians(self._features.square_deviation)]) ** 2)
+class Growing:
+    """An area to which keyframes are added."""
+
+    def __init__(self, mapping: LocalMapping) -> None:
+        self._mapping, self._table = mapping, mapping.pool.empty_table()
+        self._before: int | None = None
+
+    def release(self) -> None:
+        """Nothing will be added any more."""
+        self._mapping.pool.release(self._table)
+
+    def sighting(self, scan: Scan, pose: Float64) -> Sighting:
+        """What one more keyframe shows, as of `AreaLandmarks.sightings`.
+
+        :param pose: its ``area_T_base``, shape (3,), m and rad.
+        """
+        if self._before is not None and not 0 <= scan.stamp - self._before <= _VISIT:
+            self._mapping.pool.release(self._table)
+            self._table = self._mapping.pool.empty_table()
+        self._before, pose = scan.stamp, np.ascontiguousarray(pose)
+        self._mapping.insert(self._table[None], pose[None], scan)
+        return _sighting(self._mapping, self._table, scan, pose)
+
+
+def _sighting(mapping: LocalMapping, table: Int32, scan: Scan, pose: Float64) -> Sighting:
+    """What is around a keyframe, in its own scan or else in the map of a table."""
+    features, in_map = mapping.configuration.features, not sees_around(scan)
+    if not in_map:
+        lines, rays = extract_lines(scan, features), rays_of(scan, features)
+    else:
+        virtual = virtual_scan(mapping.pool.view(table), pose, _BEAMS, _REACH)
+        lines, rays = lines_of_map(virtual, features), rays_of_map(virtual, features)
+    return Sighting(_place(pose, features), landmarks_of(lines, rays, features), rays, in_map)
+
+
+def _place(pose: Float64, features: Features) -> PoseGaussian:
+    """Where a keyframe was taken; the map there, which is made of such keyframes, is as far off."""
+    off = features.map_deviation
+    return PoseGaussian(pose, np.diag([off, off, math.radians(features.square_deviation)]) ** 2)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from itertools import islice
 from typing import NamedTuple
 
 import numpy as np
@@ -11,8 +12,8 @@ import numpy as np
 from hmt_slam_ros.arrays import Float64, Int64
 from hmt_slam_ros.configuration.features import Features
 from hmt_slam_ros.features.hallway import distances_around, log_odds, space_within
-from hmt_slam_ros.features.landmark_map import Landmark
-from hmt_slam_ros.local_map.area_landmarks import AreaLandmarks
+from hmt_slam_ros.features.landmark_map import Landmark, LandmarkMap
+from hmt_slam_ros.local_map.area_landmarks import AreaLandmarks, Growing
 from hmt_slam_ros.local_map.local_mapping import LocalMapping
 from hmt_slam_ros.sensing import Scan
 from hmt_slam_ros.topology.hybrid_map import HybridMap
@@ -36,21 +37,55 @@ class AreaView(NamedTuple):
     hallways: Float64
 
 
+class _GrowingView:
+    """What an area shows to which keyframes are added."""
+
+    def __init__(self, mapping: LocalMapping) -> None:
+        self._features, self._area = mapping.configuration.features, Growing(mapping)
+        self._found, self._around = LandmarkMap(self._features), list[Float64]()
+        self._keyframes: dict[int, Float64] = {}
+
+    def release(self) -> None:
+        """The area does not grow any more."""
+        self._area.release()
+
+    def is_begin_of(self, keyframes: Mapping[int, Float64]) -> bool:
+        """Whether an area of keyframes was this one before some were added."""
+        first = dict(islice(keyframes.items(), len(self._keyframes)))
+        return list(first) == list(self._keyframes) and same_poses(first, self._keyframes)
+
+    def grown(self, keyframes: Mapping[int, Float64], scans: Mapping[int, Scan]) -> AreaView:
+        """What the area shows after what it lacks of keyframes was added."""
+        for keyframe, pose in islice(keyframes.items(), len(self._keyframes), None):
+            sighting = self._area.sighting(scans[keyframe], pose)
+            sighting.add_to(self._found)
+            self._around.append(distances_around(sighting.rays))
+            self._keyframes[keyframe] = pose
+        around, numbers = np.array(self._around), np.array(list(keyframes), dtype=np.int64)
+        hallways = np.array([_hallway(away, self._features) for away in around])
+        return AreaView(tuple(self._found.landmarks), numbers, stacked(keyframes), around, hallways)
+
+
 class AreaViews:
-    """Looks up what areas show, and keeps it.
+    """Looks up what areas show, and keeps it; of the area that was looked up last also what that takes to grow.
 
     :ivar scans: {keyframe: scan}, which may grow.
     :ivar known: gathers landmarks.
     """
 
     def __init__(self, mapping: LocalMapping, scans: Mapping[int, Scan]) -> None:
-        self.scans, self._features = scans, mapping.configuration.features
-        self.known = AreaLandmarks(mapping)
+        self.scans, self.known, self._mapping = scans, AreaLandmarks(mapping), mapping
         self._views: dict[int, tuple[dict[int, Float64], AreaView]] = {}
+        self._newest = _GrowingView(mapping)
 
     def forget(self) -> None:
         """Forget what areas show, which is looked up again where it is asked for."""
         self._views.clear()
+        self._begin()
+
+    def _begin(self) -> None:
+        self._newest.release()
+        self._newest = _GrowingView(self._mapping)
 
     def of_map(self, hybrid_map: HybridMap) -> dict[int, AreaView]:
         """{area: what it shows}, of all areas of a map."""
@@ -63,16 +98,10 @@ class AreaViews:
         """
         held = self._views.get(area)
         if held is None or not same_poses(held[0], keyframes):
-            held = self._views[area] = dict(keyframes), self._view(keyframes)
+            if not self._newest.is_begin_of(keyframes):
+                self._begin()
+            held = self._views[area] = dict(keyframes), self._newest.grown(keyframes, self.scans)
         return held[1]
-
-    def _view(self, keyframes: Mapping[int, Float64]) -> AreaView:
-        poses = stacked(keyframes)
-        sightings = list(self.known.sightings([self.scans[keyframe] for keyframe in keyframes], poses))
-        around = np.array([distances_around(sighting.rays) for sighting in sightings])
-        hallways = np.array([_hallway(away, self._features) for away in around])
-        numbers = np.array(list(keyframes), dtype=np.int64)
-        return AreaView(self.known.gathered(sightings), numbers, poses, around, hallways)
 
 
 def _hallway(away: Float64, features: Features) -> float:

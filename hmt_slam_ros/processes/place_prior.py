@@ -4,10 +4,12 @@ Tomatis, Nourbakhsh and Siegwart (2003), section 3.3: the observation graph of w
 the map around a place, by the observation function OS of the belief over places. It is the prior of the places that
 surfaces find, relative to new ground.
 
-Landmarks are made of the same scans as surfaces are, so OS counts with an exponent, which is fitted by log score on
-training worlds, where looks from where the map does not reach weigh a fifth (`python -m benchmark prior --training`).
-And a building's places look more like each other than like ground of which nothing is known, whose landmarks are
-strewn: new ground is mostly like some place of the map, and that is measured at places where the robot has been.
+Landmarks are made of the same scans as surfaces are. That they agree in a place that surfaces have found says no more
+than that; only what speaks against a place counts, as with walls that beams pass, and with an exponent. Both were
+chosen by log score on training worlds, where looks from where the map does not reach weigh a fifth (`python -m
+benchmark prior --training`). And a building's places look more like each other than like ground of which nothing is
+known, whose landmarks are strewn: new ground is mostly like some place of the map, and that is measured at places where
+the robot has been.
 """
 
 from __future__ import annotations
@@ -79,7 +81,7 @@ class PlacePrior:
         ratios = self.log_ratios(hybrid_map, poses, before, [where.found[n] for n in probable])
         log_weights = np.zeros(len(where.found))
         if ratios is not None:
-            log_weights[probable] = self._places.prior_temper * ratios
+            log_weights[probable] = counted(ratios, self._places.prior_temper)
         return where.weighed(log_weights)
 
     def log_ratios(
@@ -172,6 +174,14 @@ class PlacePrior:
         """
         graph = as_seen(landmarks, se2.between(frame, poses.reshape(-1, 3)))
         return chosen(graph, np.abs(graph.along) <= self._places.reach)
+
+
+def counted(ratios: Float64, temper: float) -> Float64:
+    """What places weigh more by their landmarks, nats, shape as ``ratios``.
+
+    :param ratios: log OS(o, s) of places against new ground.
+    """
+    return temper * np.minimum(ratios, 0.0)
 
 
 def _others(hybrid_map: HybridMap, newest: Pose, before: int) -> Iterator[Place]:

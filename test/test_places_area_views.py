@@ -1,0 +1,78 @@
+"""What areas show, kept while their keyframes are where they were."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from small_floor import CONFIGURATION, mapped
+
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.local_map.area_landmarks import Growing
+from hmt_slam_ros.local_map.local_mapping import LocalMapping
+from hmt_slam_ros.places.area_views import AreaViews
+
+
+def ahead(scan):
+    first = scan.angle_min + 180 * scan.angle_increment
+    return replace(scan, ranges=scan.ranges[180:540], angle_min=first)
+
+
+@pytest.fixture(scope="module")
+def area():
+    """An area's keyframes, and their scans, every other one of which sees only what is ahead."""
+    hybrid_map, scans = mapped(crossing_driven=False)
+    keyframes = dict(list(hybrid_map.keyframes(0).items())[:8])
+    return keyframes, {k: ahead(scans[k]) if k % 2 else scans[k] for k in keyframes}
+
+
+@pytest.fixture
+def looked_up(monkeypatch):
+    """The scans that were looked up."""
+    scans, sighting = [], Growing.sighting
+
+    def noted(own, scan, pose):
+        scans.append(scan)
+        return sighting(own, scan, pose)
+
+    monkeypatch.setattr(Growing, "sighting", noted)
+    return scans
+
+
+def views(scans):
+    return AreaViews(LocalMapping(CONFIGURATION), scans)
+
+
+def assert_same(one, other):
+    for name in ("keyframes", "poses", "around", "hallways"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+    assert [landmark.kind for landmark in one.landmarks] == [landmark.kind for landmark in other.landmarks]
+    for mine, its in zip(one.landmarks, other.landmarks, strict=True):
+        np.testing.assert_array_equal(mine.pose.mean, its.pose.mean)
+        np.testing.assert_array_equal(mine.pose.covariance, its.pose.covariance)
+        assert mine.existence == its.existence
+
+
+def test_an_area_that_grew_shows_what_it_would_if_it_were_looked_up_at_once(area, looked_up):
+    keyframes, scans = area
+    grown = views(scans)
+    grown.of(0, dict(list(keyframes.items())[:5]))
+    before = len(looked_up)
+    found = grown.of(0, keyframes)
+    assert (before, len(looked_up)) == (5, 8)
+    assert grown.of(0, keyframes) is found
+    assert_same(found, views(scans).of(0, keyframes))
+
+
+def test_where_keyframes_moved_or_were_taken_out_it_is_looked_up_anew(area, looked_up):
+    keyframes, scans = area
+    own = views(scans)
+    own.of(0, keyframes)
+    moved = {k: se2.compose(np.array([1.0, 2.0, math.pi]), pose) for k, pose in keyframes.items()}
+    assert_same(own.of(0, moved), views(scans).of(0, moved))
+    without = dict(list(moved.items())[2:])
+    assert_same(own.of(0, without), views(scans).of(0, without))
+    own.forget()
+    before = len(looked_up)
+    own.of(0, without)
+    assert len(looked_up) - before == len(without)
