@@ -21,7 +21,7 @@ from benchmark.settings import Settings
 from benchmark.simulated.measured import chosen_seeds
 from hmt_slam_ros.configuration import Configuration, load_configuration
 from hmt_slam_ros.errors import HmtSlamError
-from hmt_slam_ros.features.extraction import extract_lines
+from hmt_slam_ros.features.extraction import extract_for_map
 from hmt_slam_ros.features.stochastic_map import LineMap
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.sensing.motion import Step, increment_covariance
@@ -110,7 +110,7 @@ def mapped(kind: str, seed: int, laser: str, configuration: Configuration) -> Ma
         if number:
             room.predict(_step(scenario, number, configuration))
         seen = seen_in(scenario, number)
-        lines = extract_lines(seen.scan, features)
+        lines = extract_for_map(seen.scan, features)
         walls, observed = walls_of(lines, seen), room.observe(lines)
         for k, line in (*observed.known, *observed.new):
             votes.setdefault(line, Counter())[int(walls[k])] += 1

@@ -10,8 +10,9 @@ from benchmark import lines as measured
 from benchmark.line_truth import difference, lines_of, seen_in
 from benchmark.simulated.worlds import World
 from hmt_slam_ros.configuration.features import Features
-from hmt_slam_ros.features.extraction import distance2, extract_lines
+from hmt_slam_ros.features.extraction import extract_for_map, extract_lines
 from hmt_slam_ros.features.line_fit import Beams, fit
+from hmt_slam_ros.features.merging import distance2
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.simulation import open_simulated
 
@@ -138,3 +139,14 @@ def test_lines_of_a_simulated_drive_are_measured_against_its_walls(monkeypatch):
     seen = seen_in(scenario, 40)
     assert np.hypot(*(seen.scan.points - seen.ends).T).max() < 0.1
     assert set(np.unique(seen.met)) <= set(range(-1, len(seen.lines)))
+
+
+def test_a_map_is_given_apart_what_a_scan_joins_on_little_evidence():
+    # The first and the last beams of the circle are on one wall; those of the shorter piece are few.
+    scan = scan_at(ROOM, (0.5, 0.3, 0.4), beams=720)
+    ranges = scan.ranges.copy()
+    ranges[::3], ranges[1::9] = np.nan, np.inf
+    holed = replace(scan, ranges=ranges)
+    assert len(extract_lines(holed, FEATURES)) == 4
+    lines = extract_for_map(holed, FEATURES)
+    assert sorted(np.round(lines.parameters[:, 1], 1)) == [2.3, 3.5, 3.5, 3.7, 4.5]

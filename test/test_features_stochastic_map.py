@@ -188,3 +188,41 @@ def test_a_simulated_room_is_mapped_to_the_centimetre(kind):
     assert np.abs(drive.pose_errors[:, :2]).max() < 0.03
     assert drive.strays <= 1
     assert drive.bytes[0] < 10.0 * drive.floor
+
+
+def test_where_the_robot_was_is_corrected_by_what_is_seen_later():
+    # Along a hallway whose end is hidden nothing tells how far the robot goes; it goes farther than odometry says.
+    room, true, hidden = LineMap(FEATURES), np.zeros(3), WALLS[[1, 3]]
+    long = ((-6.0, 6.0),)
+    room.observe(observed(true, extents=long), surely=True)
+    noise, along = np.diag([0.05, 0.02, 0.01]) ** 2, []
+    for _ in range(12):
+        true = se2.compose(true, np.array([0.15, 0.0, 0.0]))
+        room.predict(Step(np.array([0.12, 0.0, 0.0]), noise))
+        room.observe(observed(true, hidden, extents=long))
+        room.mark()
+        along.append(true[0])
+    off = np.array(along) - room.marks.poses[:, 0]
+    assert off[-1] > 0.3
+    room.observe(observed(true, extents=long))
+    assert np.abs(np.array(along) - room.marks.poses[:, 0]).max() < 0.02
+    # A pose that is known is not corrected.
+    before = room.marks.poses.copy()
+    room.put(PoseGaussian.exactly(room.pose.mean + np.array([0.1, 0.0, 0.0])))
+    room.observe(observed(true, extents=long))
+    np.testing.assert_allclose(room.marks.poses, before, atol=0.02)
+
+
+def test_marks_are_as_far_off_as_the_state_says():
+    # What a mark has in common with the robot is what the robot's covariance was, as long as nothing is observed.
+    room, step = LineMap(FEATURES), Step(np.array([0.2, 0.0, 0.1]), np.diag([0.05, 0.02, 0.01]) ** 2)
+    room.predict(step)
+    room.mark()
+    np.testing.assert_array_equal(room.marks.common[0], room.covariance[:3])
+    before = room.covariance.copy()
+    room.predict(step)
+    np.testing.assert_allclose(room.marks.common[0][2, 2], before[2, 2])
+    # Its errors turn about where it was: theta moves the robot's x and y.
+    lever = room.mean[:2] - room.marks.poses[0, :2]
+    turned = before[2, 2] * np.array([-lever[1], lever[0]])
+    np.testing.assert_allclose(room.marks.common[0][2, :2] - before[2, :2], turned)

@@ -151,3 +151,22 @@ def test_keyframes_are_dropped_and_what_was_known_is_forgotten(mapping):
     np.testing.assert_array_equal(own.tracking_covariance, 0.0)
     own.track(Sighting(mapping, blank_scan()), predicted(STEP))
     np.testing.assert_allclose(own.room.pose.covariance, SURE, atol=1e-12)
+
+
+def test_keyframes_of_a_drift_are_corrected_and_told(mapping):
+    # A hallway whose end comes into sight only near it, as it does behind people.
+    hallway = box(-2.0, -1.0, 12.0, 1.0)
+    own, truth, ahead = new_filter(mapping, 0, 0), np.zeros(3), np.array([0.1, 0.0, 0.0])
+    own.add_keyframe(0, scan_in(hallway, truth, noise=0.01))
+    for k in range(1, 81):
+        truth = se2.compose(truth, ahead)
+        sides = hallway[np.abs(hallway[:, 0] - hallway[:, 2]) > 1.0] if 3 < k < 80 else hallway
+        sighting = Sighting(mapping, scan_in(sides, truth, noise=0.01, seed=k))
+        own.track(sighting, predicted(ahead - np.array([0.005, 0.0, 0.0])))
+        if k % 5 == 0:
+            step = own.update(sighting, k)
+            own.add_keyframe(k, sighting.scan)
+            assert step.history_changed == (k == 80)
+    assert own.pose[0] == pytest.approx(8.0, abs=0.03)
+    np.testing.assert_allclose(own.leading_keyframe_poses()[:, 0], 0.5 * np.arange(17), atol=0.05)
+    assert step.moved[0] == pytest.approx(0.5, abs=0.05)

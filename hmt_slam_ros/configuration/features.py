@@ -32,9 +32,11 @@ class Features:
         low=0.5, high=0.999999,
     )
     merge_deviation: float = parameter(
-        0.01, "Segments, and lines of a map, are joined only where the distance of the one from the other's line is "
-        "known this well.",
+        0.01, "Segments are joined only where the distance of the one from the other's line is known this well.",
         unit="m", low=0.001, high=1.0,
+    )
+    map_merge_deviation: float = parameter(
+        0.005, "The same of the lines of a map, and of what it observes.", unit="m", low=0.001, high=1.0
     )
     pair_probability: float = parameter(
         0.99999, "Share of true pairings of a scan's lines with the map's that chi-square admits, each and together.",

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numba import njit
 
 from hmt_slam_ros.arrays import Bool, Float64, Int32, Int64
 from hmt_slam_ros.configuration.features import Features
-from hmt_slam_ros.features.line_fit import Beams, fit, variance_at, wrapped
+from hmt_slam_ros.features.line_fit import Beams, fit
+from hmt_slam_ros.features.merging import Gate, merge, relabel
 from hmt_slam_ros.features.segmentation import segments
 from hmt_slam_ros.geometry.chi_square import gate as bound
 from hmt_slam_ros.sensing import Scan
@@ -23,17 +23,6 @@ _STRAY = 3.5
 # What a line bends over its uncertainty, in deviations across it.
 _BEND = 1.0
 _NONE = -1
-
-
-class Gate(NamedTuple):
-    """When two segments are one line.
-
-    :ivar distance2: squared Mahalanobis distance at most.
-    :ivar deviation: of the distance of one's middle from the other at most, m.
-    """
-
-    distance2: float
-    deviation: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,6 +69,11 @@ def extract_lines(scan: Scan, features: Features, deviations: Float64 | None = N
     seen = np.zeros(len(found))
     np.add.at(seen, owners, pieces[:, 1] - pieces[:, 0])
     return _long_enough(found, pieces, owners, labels, (seen >= features.min_length) & _straight(found))
+
+
+def extract_for_map(scan: Scan, features: Features) -> Lines:
+    """The lines of a scan that a stochastic map observes: it joins them itself when it knows more."""
+    return extract_lines(scan, replace(features, merge_deviation=features.map_merge_deviation))
 
 
 def _straight(lines: Float64) -> Bool:
@@ -130,11 +124,11 @@ def _extract(beams: Beams, labels: Int32, count: int, min_beams: int, gate: Gate
     """
     lines = np.empty((count, 5))
     count = _fit_all(beams, labels, lines, count, min_beams)
-    count = _merge(beams, labels, lines, count, gate)
+    count = merge(beams, labels, lines, count, gate)
     _leave_out_doubtful(beams, labels, lines)
     _leave_out_ends(labels)
     count = _fit_all(beams, labels, lines, count, min_beams)
-    count = _merge(beams, labels, lines, count, gate)
+    count = merge(beams, labels, lines, count, gate)
     _leave_out_strays(beams, labels, lines)
     lines = lines[: _fit_all(beams, labels, lines, count, min_beams)]
     for step in (1, -1):
@@ -148,83 +142,9 @@ def _fit_all(beams: Beams, labels: Int32, lines: Float64, count: int, min_beams:
     kept = 0
     for line in range(count):
         enough = fit(beams, labels, line, lines[kept]) >= min_beams
-        _relabel(labels, line, kept if enough else _NONE)
+        relabel(labels, line, kept if enough else _NONE)
         kept += enough
     return kept
-
-
-@njit(cache=True)
-def _relabel(labels: Int32, old: int, new: int) -> None:
-    for k in range(len(labels)):
-        if labels[k] == old:
-            labels[k] = new
-
-
-@njit(cache=True)
-def _merge(beams: Beams, labels: Int32, lines: Float64, count: int, gate: Gate) -> int:
-    """Join those two lines that differ least, as long as the gate allows; return how many are left."""
-    middles = np.empty((count, 2))
-    for line in range(count):
-        _middle(beams.points, labels, line, middles[line])
-    while True:
-        least, one, other = gate.distance2, 0, 0
-        for i in range(count):
-            for k in range(i):
-                away = distance2(lines[i], lines[k])
-                if away < least and _tell(lines[i], middles[i], lines[k], middles[k]) <= gate.deviation**2:
-                    least, one, other = away, k, i
-        if one == other:
-            return count
-        _relabel(labels, other, one)
-        fit(beams, labels, one, lines[one])
-        _middle(beams.points, labels, one, middles[one])
-        count -= 1
-        if other != count:
-            lines[other], middles[other] = lines[count], middles[count]
-            _relabel(labels, count, other)
-
-
-@njit(cache=True)
-def _middle(points: Float64, labels: Int32, line: int, middle: Float64) -> None:
-    """Write the mean of the points of a line, (2,)."""
-    count, x, y = 0, 0.0, 0.0
-    for k in range(len(labels)):
-        if labels[k] == line:
-            count, x, y = count + 1, x + points[k, 0], y + points[k, 1]
-    middle[0], middle[1] = x / count, y / count
-
-
-@njit(cache=True)
-def _tell(a: Float64, middle_a: Float64, b: Float64, middle_b: Float64) -> float:
-    """How well two lines tell that they are one: variance, m^2, of the distance of the one's middle from the other.
-
-    Of two short pieces far from each other that lie side by side, either could point at the other; that the one is
-    where the other points to says something only where it would not be so by chance.
-    """
-    return min(
-        _variance_at(a, middle_b) + _variance_at(b, middle_b), _variance_at(a, middle_a) + _variance_at(b, middle_a)
-    )
-
-
-@njit(cache=True)
-def _variance_at(line: Float64, point: Float64) -> float:
-    """Variance, m^2, of the distance of a point (2,) near a line (5,) from it."""
-    along = math.cos(line[0]) * point[1] - math.sin(line[0]) * point[0]
-    return variance_at(line[2], line[3], line[4], along)
-
-
-@njit(cache=True)
-def distance2(a: Float64, b: Float64) -> float:
-    """Squared Mahalanobis distance of two independent lines (5,); chi-square with 2 degrees of freedom.
-
-    The second is taken in that of its two representations, (alpha, r) and (alpha + pi, -r), whose angle is nearer.
-    """
-    turn = wrapped(b[0] - a[0])
-    away, sign = b[1] - a[1], 1.0
-    if abs(turn) > 0.5 * math.pi:
-        turn, away, sign = wrapped(turn - math.pi), -b[1] - a[1], -1.0
-    aa, ar, rr = a[2] + b[2], a[3] + sign * b[3], a[4] + b[4]
-    return (rr * turn * turn - 2.0 * ar * turn * away + aa * away * away) / (aa * rr - ar * ar)
 
 
 @njit(cache=True)

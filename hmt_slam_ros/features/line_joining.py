@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from hmt_slam_ros.arrays import Float64
-from hmt_slam_ros.features.extraction import Gate
+from hmt_slam_ros.features.merging import Gate
 from hmt_slam_ros.geometry import se2
 
 

@@ -26,9 +26,12 @@ import numpy as np
 
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration.features import Features
-from hmt_slam_ros.features.extraction import Gate, Lines
+from hmt_slam_ros.features.extraction import Lines
 from hmt_slam_ros.features.joint_compatibility import Pairing, compatible
 from hmt_slam_ros.features.line_joining import most_alike
+from hmt_slam_ros.features.line_map_state import LineMapState, Wall
+from hmt_slam_ros.features.marks import NO_MARKS, Marks
+from hmt_slam_ros.features.merging import Gate
 from hmt_slam_ros.features.pieces import joined, middle, overlap
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.chi_square import gate
@@ -53,20 +56,6 @@ class Observed(NamedTuple):
     joined: tuple[tuple[int, int], ...] = ()
 
 
-class Wall(NamedTuple):
-    """What the map knows of a line beside its place in the state.
-
-    :ivar name: a number that no other line of the map ever has.
-    :ivar sightings: scans that showed it.
-    :ivar pieces: where the stretches that were seen begin and end, (m, 2), m along its direction
-        (-sin(alpha), cos(alpha)) from the foot of the perpendicular.
-    """
-
-    name: int
-    sightings: int
-    pieces: Float64
-
-
 class _Placed(NamedTuple):
     """An observed line, on that of its sides that the map has.
 
@@ -82,39 +71,26 @@ class _Placed(NamedTuple):
     pieces: Float64
 
 
-class LineMapState(NamedTuple):
-    """A stochastic map as a value.
-
-    :ivar mean: shape (3 + 2 n,), x and y in m, theta in rad, then alpha in rad and r in m of each line.
-    :ivar covariance: shape (3 + 2 n, 3 + 2 n).
-    :ivar walls: the n lines, in the order of the state.
-    :ivar names: how many lines were given one.
-    """
-
-    mean: Float64
-    covariance: Float64
-    walls: tuple[Wall, ...]
-    names: int
-
-
 class LineMap:
     """An extended Kalman filter over the robot's pose and the lines of a room.
 
     :ivar mean: shape (3 + 2 n,), x and y in m, theta in rad, then alpha in rad and r in m of each line.
     :ivar covariance: shape (3 + 2 n, 3 + 2 n).
     :ivar walls: the n lines, in the order of the state.
+    :ivar marks: poses where the robot was, corrected by what it learns later.
     """
 
     def __init__(self, features: Features, start: PoseGaussian | None = None) -> None:
         """:param start: ``map_T_base``; the origin, for certain, unless it is given."""
         self._features = features
         self._gate = gate(features.pair_probability, 2)
-        self._alike = Gate(gate(features.merge_probability, 2), features.merge_deviation)
+        self._alike = Gate(gate(features.merge_probability, 2), features.map_merge_deviation)
         start = start or PoseGaussian.exactly(np.zeros(3))
         self.mean: Float64 = start.mean.copy()
         turn = _turn(start.mean[2])
         self.covariance: Float64 = turn @ start.covariance @ turn.T
         self.walls: list[Wall] = []
+        self.marks: Marks = NO_MARKS
         self._names = 0
 
     @classmethod
@@ -122,13 +98,13 @@ class LineMap:
         """The map of a state."""
         found = cls(features)
         found.mean, found.covariance = state.mean, state.covariance
-        found.walls, found._names = list(state.walls), state.names
+        found.walls, found._names, found.marks = list(state.walls), state.names, state.marks
         return found
 
     @property
     def state(self) -> LineMapState:
         """All that is known; none of its arrays is written to later."""
-        return LineMapState(self.mean.copy(), self.covariance.copy(), tuple(self.walls), self._names)
+        return LineMapState(self.mean.copy(), self.covariance.copy(), tuple(self.walls), self._names, self.marks)
 
     def __len__(self) -> int:
         return len(self.walls)
@@ -157,6 +133,7 @@ class LineMap:
         by_robot[:2, 2] = y - self.mean[1], self.mean[0] - x
         self.covariance[:3] = by_robot @ self.covariance[:3]
         self.covariance[:, :3] = self.covariance[:, :3] @ by_robot.T
+        self.marks = self.marks.after_motion(by_robot)
         turn = _turn(self.mean[2])
         self.covariance[:3, :3] += turn @ step.covariance @ turn.T
 
@@ -166,6 +143,11 @@ class LineMap:
         self.mean[:3] = pose.mean
         self.covariance[:3], self.covariance[:, :3] = 0.0, 0.0
         self.covariance[:3, :3] = turn @ pose.covariance @ turn.T
+        self.marks = self.marks.without_robot()
+
+    def mark(self) -> None:
+        """Note where the robot is."""
+        self.marks = self.marks.and_robot(self.mean, self.covariance)
 
     def observe(self, lines: Lines, *, surely: bool = False) -> Observed:
         """Correct robot and lines by those that are known, take in those that are new, and join what is one.
@@ -246,6 +228,7 @@ class LineMap:
         self.mean = self.mean + gain @ difference
         self.mean[2] = se2.wrap(self.mean[2])
         kept = np.eye(self.mean.size) - gain @ jacobian
+        self.marks = self.marks.corrected(jacobian.T @ np.linalg.solve(spread, difference), kept)
         self.covariance = kept @ self.covariance @ kept.T + gain @ noise @ gain.T
 
     def _add(self, placed: _Placed, sightings: int) -> int:
@@ -261,6 +244,7 @@ class LineMap:
         own = by_line @ placed.covariance @ by_line.T
         covariance[size:, size:] = by_robot @ self.covariance[:3, :3] @ by_robot.T + own
         self.mean, self.covariance = np.concatenate((self.mean, placed.line)), covariance
+        self.marks = self.marks.with_line(by_robot)
         self.walls.append(Wall(self._names, sightings, joined(placed.pieces, self._features.max_gap)))
         self._names += 1
         return self.walls[-1].name
@@ -301,6 +285,7 @@ class LineMap:
         """Take a line out of the state; what it told of the others stays."""
         left = np.delete(np.arange(self.mean.size), _place(line))
         self.mean, self.covariance = self.mean[left], self.covariance[np.ix_(left, left)]
+        self.marks = self.marks.left(left)
         del self.walls[line]
 
 

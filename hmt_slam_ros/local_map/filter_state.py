@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from hmt_slam_ros.arrays import Float64, Int32
-from hmt_slam_ros.features.stochastic_map import LineMapState
-from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.features.line_map_state import LineMapState
 from hmt_slam_ros.local_map.judgement import Experience
 from hmt_slam_ros.sensing.motion import Step
 
@@ -56,11 +55,11 @@ class LineFilterState:
 
     :ivar hypothesis: id of the hypothesis.
     :ivar area: the current area.
-    :ivar room: over the robot's pose and the lines.
+    :ivar room: over the robot's pose and the lines; its marks are the pose at the last filter step, and the keyframes'.
     :ivar keyframes: the local map's keyframes, ids.
     :ivar keyframe_areas: their areas.
-    :ivar keyframe_poses: shape (K, 3), ``map_T_base`` of each, m and rad.
-    :ivar last: belief over the robot's pose at the last filter step.
+    :ivar told: shape (K, 3), ``map_T_base`` of each as it was told, m and rad.
+    :ivar last_covariance: of the robot's pose at the last filter step, shape (3, 3), right tangent frame.
     :ivar since_update: the predicted motion since then.
     :ivar information: of the newest scan's known lines alone, in the frame of the pose, shape (3, 3).
     :ivar tracking_covariance: of the motion since the last filter step, shape (3, 3), right tangent frame.
@@ -72,8 +71,8 @@ class LineFilterState:
     room: LineMapState
     keyframes: tuple[int, ...]
     keyframe_areas: tuple[int, ...]
-    keyframe_poses: Float64
-    last: PoseGaussian
+    told: Float64
+    last_covariance: Float64
     since_update: Step
     information: Float64
     tracking_covariance: Float64

@@ -1,8 +1,9 @@
 """The extended Kalman filter of one hypothesis in its current area, whose local map is one of lines.
 
 The stochastic map of Tomatis, Nourbakhsh and Siegwart (2003), section 3.6, in the place of the particles and grids of
-Blanco et al. (2008). Every scan corrects robot and lines; a keyframe only notes where it was taken. The lines of an
-area that is entered come from the scans of its keyframes.
+Blanco et al. (2008). Every scan corrects robot and lines; of a keyframe is noted where it was taken, and corrected
+too: along a hallway whose end people hide the robot drifts, and so do its keyframes, until the end is seen again. The
+lines of an area that is entered come from the scans of its keyframes.
 """
 
 from __future__ import annotations
@@ -15,7 +16,8 @@ import numpy as np
 
 from hmt_slam_ros.agreement import Agreement
 from hmt_slam_ros.arrays import Float64
-from hmt_slam_ros.features.extraction import Lines, extract_lines
+from hmt_slam_ros.features.extraction import Lines, extract_for_map
+from hmt_slam_ros.features.marks import Marks
 from hmt_slam_ros.features.stochastic_map import LineMap, Observed
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.covariance import carried, inverse
@@ -32,6 +34,8 @@ from hmt_slam_ros.sensing.motion import NO_STEP, Prediction, Step
 
 # How well keyframes lie in the frame of an area that is loaded: they err independently, m and rad.
 _KEYFRAME = np.diag([0.01, 0.01, math.radians(0.3)]) ** 2
+# Keyframes that were corrected by more than this, m, are told anew.
+_CORRECTED = 0.01
 # Odometry of which more than this share of a scan's lines knows nothing in the map may be wrong.
 _UNKNOWN = 0.5
 
@@ -63,11 +67,12 @@ class LineFilter:
         self.room = LineMap(mapping.configuration.features)
         self.keyframes: list[int] = []
         self.keyframe_areas: list[int] = []
-        self._keyframe_poses = np.zeros((0, 3))
+        self.room.mark()
+        self._told = np.zeros((0, 3))
         self.tracking_covariance = np.zeros((3, 3))
         self.experience = Experience()
         self._information = np.zeros((3, 3))
-        self._last, self._since_update = self.room.pose, NO_STEP
+        self._last_covariance, self._since_update = np.zeros((3, 3)), NO_STEP
 
     @classmethod
     def of(cls, mapping: LocalMapping, state: LineFilterState) -> LineFilter:
@@ -75,9 +80,9 @@ class LineFilter:
         found = cls(mapping, state.hypothesis, state.area)
         found.room = LineMap.of(mapping.configuration.features, state.room)
         found.keyframes, found.keyframe_areas = list(state.keyframes), list(state.keyframe_areas)
-        found._keyframe_poses, found.tracking_covariance = state.keyframe_poses, state.tracking_covariance
+        found._told, found.tracking_covariance = state.told, state.tracking_covariance
         found._information, found.experience = state.information, state.experience
-        found._last, found._since_update = state.last, state.since_update
+        found._last_covariance, found._since_update = state.last_covariance, state.since_update
         return found
 
     @property
@@ -85,7 +90,7 @@ class LineFilter:
         """All that is remembered."""
         return LineFilterState(
             self.hypothesis, self.area, self.room.state, tuple(self.keyframes), tuple(self.keyframe_areas),
-            self._keyframe_poses, self._last, self._since_update, self._information, self.tracking_covariance,
+            self._told, self._last_covariance, self._since_update, self._information, self.tracking_covariance,
             self.experience,
         )  # fmt: skip
 
@@ -101,7 +106,7 @@ class LineFilter:
 
     def leading_keyframe_poses(self) -> Float64:
         """``map_T_base`` of the local map's keyframes, shape (K, 3)."""
-        return self._keyframe_poses
+        return self.room.marks.poses[1:]
 
     def branch(self, hypothesis: int) -> LineFilter:
         """A filter of the same state for a child hypothesis."""
@@ -148,16 +153,22 @@ class LineFilter:
     def update(self, sighting: Sighting, step: int) -> FilterStep:  # noqa: ARG002  it was tracked; nothing is drawn
         """What the scans since the last keyframe came to."""
         here = self.room.pose
-        moved = se2.between(self._last.mean, here.mean)
+        moved = se2.between(self.room.marks.poses[0], here.mean)
         matched = inverse(inverse(self._since_update.covariance) + self._information)
         # What the pose in the area's frame became less certain by.
-        lasting = _positive(here.covariance - carried(self._last.covariance, moved))
+        lasting = _positive(here.covariance - carried(self._last_covariance, moved))
         error = MatchError(matched, lasting, matched @ self._information)
         self._restart()
-        return FilterStep(moved, error, self._information, 1.0, False)
+        corrected = bool(np.any(np.hypot(*(self.leading_keyframe_poses() - self._told)[:, :2].T) > _CORRECTED))
+        if corrected:
+            self._told = self.leading_keyframe_poses()
+        return FilterStep(moved, error, self._information, 1.0, corrected)
 
     def _restart(self) -> None:
-        self._last, self._since_update = self.room.pose, NO_STEP
+        self._last_covariance, self._since_update = self.room.pose.covariance, NO_STEP
+        self.room.mark()
+        count = len(self.room.marks.poses)
+        self.room.marks = self.room.marks.only([count - 1, *range(1, count - 1)])
 
     def compared(self, sighting: Sighting) -> Compared:
         """A scan in the map: what passes walls contradicts it."""
@@ -170,17 +181,19 @@ class LineFilter:
     def add_keyframe(self, keyframe: int, scan: Scan) -> None:
         """Note where a scan was taken; with the first one the map begins."""
         if not self.keyframes:
-            self.room.observe(extract_lines(scan, self.mapping.configuration.features), surely=True)
+            self.room.observe(extract_for_map(scan, self.mapping.configuration.features), surely=True)
         self.keyframes.append(keyframe)
         self.keyframe_areas.append(self.area)
-        self._keyframe_poses = np.concatenate((self._keyframe_poses, self.poses))
+        self.room.mark()
+        self._told = np.concatenate((self._told, self.poses))
 
     def drop(self, keyframes: Collection[int]) -> None:
         """Forget keyframes, but not what the map holds of them."""
         kept = [k for k, keyframe in enumerate(self.keyframes) if keyframe not in keyframes]
         self.keyframes = [self.keyframes[k] for k in kept]
         self.keyframe_areas = [self.keyframe_areas[k] for k in kept]
-        self._keyframe_poses = self._keyframe_poses[kept]
+        self.room.marks = self.room.marks.only([0, *(1 + k for k in kept)])
+        self._told = self._told[kept]
 
     def change_area(self, area: int, area_T_previous: Float64, content: Sequence[PlacedKeyframe]) -> None:
         """Go over to the frame of another area and load its local map.
@@ -198,7 +211,7 @@ class LineFilter:
         :param content: all keyframes of the local map.
         :param anchor: the keyframe by which the robot's place is known.
         """
-        before = self._keyframe_poses[self.keyframes.index(anchor)]
+        before = self.leading_keyframe_poses()[self.keyframes.index(anchor)]
         after = next(placed.pose for placed in content if placed.keyframe == anchor)
         self._load(content, se2.compose(after, se2.inverse(before)))
 
@@ -207,17 +220,18 @@ class LineFilter:
 
         :param moved: ``new_T_old`` of the map frame, shape (3,).
         """
-        here, last = (se2.compose(moved, pose) for pose in (self.pose, self._last.mean))
+        here, last = (se2.compose(moved, pose) for pose in (self.pose, self.room.marks.poses[0]))
         features = self.mapping.configuration.features
         self.room = LineMap(features)
         for placed in content:
             self.room.put(PoseGaussian(placed.pose, _KEYFRAME))
-            self.room.observe(extract_lines(placed.scan, features), surely=True)
+            self.room.observe(extract_for_map(placed.scan, features), surely=True)
         self.room.put(PoseGaussian(here, _KEYFRAME))
-        self._last = PoseGaussian(last, _KEYFRAME)
+        self._last_covariance = _KEYFRAME
         self.keyframes = [placed.keyframe for placed in content]
         self.keyframe_areas = [placed.area for placed in content]
-        self._keyframe_poses = np.array([placed.pose for placed in content]).reshape(-1, 3)
+        self._told = np.array([placed.pose for placed in content]).reshape(-1, 3)
+        self.room.marks = Marks.fixed(np.concatenate((last[None], self._told)), self.room.mean.size)
 
 
 def _told(lines: Lines, observed: Observed) -> Float64:

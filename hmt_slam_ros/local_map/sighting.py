@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import cached_property
 
 from hmt_slam_ros.arrays import Float64
-from hmt_slam_ros.features.extraction import Lines, extract_lines
+from hmt_slam_ros.features.extraction import Lines, extract_for_map
 from hmt_slam_ros.local_map.local_mapping import LocalMapping
 from hmt_slam_ros.sensing import Scan
 
@@ -28,7 +28,7 @@ class Sighting:
     @cached_property
     def lines(self) -> Lines:
         """What is compared with a map of lines."""
-        return extract_lines(self.scan, self._mapping.configuration.features)
+        return extract_for_map(self.scan, self._mapping.configuration.features)
 
     @property
     def laser(self) -> Float64:
