@@ -53,17 +53,22 @@ class Visit:
         return World(self.scenario, int(self.scenario.scan_stamps[self.numbers[k]]), self.poses[k])
 
 
-def truth_of(visit: Visit, keyframes: Sequence[int], frame: Array, features: Features) -> TrueLandmarks:
-    """All that is true around keyframes, each once."""
+def truth_of(
+    visit: Visit, keyframes: Sequence[int], every: int, frame: Array, features: Features
+) -> TrueLandmarks:
+    """All that is true around keyframes, each once.
+
+    :param every: one keyframe of so many is asked what had to be found from there.
+    """
     kinds: list[int] = []
     due: list[int] = []
     poses = np.zeros((0, 3))
-    for k in keyframes:
-        world = visit.world(k)
+    for number, k in enumerate(keyframes):
+        world, asked = visit.world(k), number % every == 0
         corners, openings = world.corners(features), world.openings(features)
         own = np.where(corners.kinds > 0.0, OUTER, INNER).tolist() + [OPENING] * len(openings.poses)
         local = np.concatenate((corners.poses, openings.poses))
-        shown = np.concatenate((corners.due, openings.due)).tolist()
+        shown = (asked & np.concatenate((corners.due, openings.due))).tolist()
         for kind, pose, is_due in zip(own, se2.compose(se2.between(frame, visit.poses[k]), local), shown, strict=True):
             known = np.flatnonzero(alike(poses, pose, 0.05, 0.1) & (np.array(kinds, dtype=np.int64) == kind))
             if known.size:

@@ -35,7 +35,7 @@ SEEDS = 3
 FAMILIES = ("office",)
 
 _AREA = 30  # keyframes of an area
-_TRUTH = 3  # every so many of them the truth is asked for
+_TRUTH = 3  # one of so many is asked what has to be found from there
 _SURE = 0.5
 
 # What is asked of either laser.
@@ -45,10 +45,11 @@ POLICY = (
     f"The first round of a drive in an office, {_AREA} keyframes after each other being an area, at true poses with "
     "deviations of 1 cm and 0.2 degrees; then the first round of the next visit, before which all furniture was moved "
     "and all doors off the way were closed, its keyframes being of the area that is nearest. Landmarks are judged "
-    "after the first visit, as those of single scans (`landmarks`). Had to be found: what had to be in two of every "
-    "third keyframe's scans of a laser that sees all around. There and gone: landmarks that were true and believed in "
-    f"after the first visit, the place of which is in sight within {REACH:g} m from two of every third keyframe of the "
-    f"second one; kept is one where a landmark is believed in after that, from {_SURE:g} on."
+    "after the first visit, as those of single scans (`landmarks`), by what is true around any of its keyframes. Had "
+    "to be found: what had to be in two of every third keyframe's scans of a laser that sees all around. There and "
+    "gone: landmarks that were true and believed in after the first visit, the place of which is in sight within "
+    f"{REACH:g} m from two of every third keyframe of the second one; kept is one where a landmark is believed in "
+    f"after that, from {_SURE:g} on."
 )
 
 
@@ -147,7 +148,7 @@ def _area(
     features, draw = configuration.features, np.random.default_rng(seed)
     frame = visits[0].poses[keyframes[0][0]]
     poses = [se2.between(frame, visit.poses[own]) for visit, own in zip(visits, keyframes, strict=True)]
-    truths = [truth_of(visit, own[::_TRUTH], frame, features) for visit, own in zip(visits, keyframes, strict=True)]
+    truths = [truth_of(visit, own, _TRUTH, frame, features) for visit, own in zip(visits, keyframes, strict=True)]
     placed = np.concatenate(poses)
     placed = se2.compose(placed, POSES * draw.standard_normal(placed.shape))
     numbers = [visit.numbers[k] for visit, own in zip(visits, keyframes, strict=True) for k in own]

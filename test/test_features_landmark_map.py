@@ -62,6 +62,12 @@ def test_the_corner_of_a_pillar_should_be_seen_from_before_it_alone():
     assert is_due(ROOM, (0.0, -0.5, 0.3), OUTER, corner)
 
 
+def test_a_corner_is_gone_where_beams_pass_one_of_its_walls():
+    corner, walls, beside = (2.0, 1.0, -0.75 * np.pi), np.concatenate((ROOM, PILLAR)), (0.0, 2.0, 0.3)
+    assert not is_due(walls, beside, OUTER, corner)
+    assert is_due(ROOM, beside, OUTER, corner)
+
+
 def test_an_opening_should_be_seen_from_before_it_open_or_closed():
     opening = (1.0, -2.0, -0.5 * np.pi)
     closed = np.concatenate((DOOR, [[0.5, -2.0, 1.5, -2.0]]))

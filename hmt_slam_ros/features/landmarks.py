@@ -2,7 +2,8 @@
 
 Corners and openings are landmarks (Tomatis, Nourbakhsh and Siegwart, 2003, section 2.1). One that is known has to be
 seen where beams reach what it is made of: both walls of a corner; the gap of an opening and a jamb. A beam that ends
-before that tells nothing, one that goes on behind it is in sight of what is not there any more.
+before that tells nothing, one that goes on behind it is in sight of what is not there any more: where beams pass one
+wall of a corner, the other one does not have to be in sight.
 """
 
 from __future__ import annotations
@@ -26,8 +27,8 @@ INNER, OUTER, OPENING = range(3)
 KINDS = ("corner", "convex corner", "opening")
 """Their names."""
 
-# What is asked whether it is in sight lies so far before its wall, m.
-_BEFORE = 0.1
+# What is asked whether it is in sight lies so far before its wall, m; and whether it is passed, so far behind it.
+_BEFORE, _BEHIND = 0.1, 0.15
 # Places along each wall of a corner, and over the width of an opening; and how far beside it its jambs are, m.
 _PLACES, _BESIDE = 4, 0.15
 # A landmark has to be shown under so wide an angle, and be faced so much (sine); of an opening this share.
@@ -87,19 +88,28 @@ def due(kinds: Int64, poses: Float64, widths: Float64, rays: Rays, features: Fea
 
 
 def _corners_due(poses: Float64, convex: Bool, rays: Rays, length: float) -> Bool:
-    """Which corners have both walls in sight for ``length``, m, under a wide enough angle."""
+    """Which corners have both walls in sight for ``length``, m, under a wide enough angle, or one that beams pass."""
     sign = np.where(convex, -1.0, 1.0)
-    found = np.ones(len(poses), np.bool_)
+    shown, passed = np.ones(len(poses), np.bool_), np.zeros(len(poses), np.bool_)
     for side in (1.0, -1.0):
         # In the frame of the corner: along one of its walls, and before that, on the free side.
         along = math.sqrt(0.5) * np.stack((sign, side * np.ones(len(poses))), axis=1)
         before = math.sqrt(0.5) * np.stack((np.ones(len(poses)), -side * sign), axis=1)
-        places = np.linspace(_BEFORE, length, _PLACES)[:, None, None] * along + _BEFORE * before
-        points = se2.transform(poses, places)
+        places = np.linspace(_BEFORE, length, _PLACES)[:, None, None] * along
+        points = se2.transform(poses, places + _BEFORE * before)
         bearings = np.arctan2(points[..., 1], points[..., 0])
         wide = np.abs(se2.wrap(bearings[-1] - bearings[0])) >= _WIDE
-        found &= in_sight(points, rays).all(axis=0) & wide
-    return found
+        shown &= in_sight(points, rays).all(axis=0) & wide
+        faced = _faced(poses, before)
+        passed |= faced & in_sight(se2.transform(poses, places - _BEHIND * before), rays).all(axis=0)
+    return shown | passed
+
+
+def _faced(poses: Float64, before: Float64) -> Bool:
+    """Which corners (n, 3) have a wall, with a normal (n, 2) in their frame, that the origin is well before."""
+    origin = se2.inverse(poses)[:, :2]
+    away = np.maximum(np.hypot(*origin.T), 1e-9)
+    return np.asarray((origin * before).sum(axis=1) >= _FACED * away)
 
 
 def _openings_due(poses: Float64, widths: Float64, rays: Rays) -> Bool:
