@@ -1,5 +1,6 @@
 """Missions on a small floor by a robot that knows of its place only what the belief and the metric filter tell it."""
 
+import itertools
 import math
 from dataclasses import replace
 
@@ -103,3 +104,15 @@ def test_where_the_belief_is_wrong_there_is_no_door_and_the_robot_goes_on(known)
     order = list(dict.fromkeys(phases))
     assert order[:3] == [Phase.DOOR, Phase.TURN, Phase.HALLWAY]
     assert Phase.ROOM not in phases or math.dist(robot.pose[:2], (5.0, 3.0)) < 0.3
+
+
+def test_a_robot_that_gets_nowhere_turns_back_and_where_it_cannot_goes_on_however_its_wheels_tremble(known):
+    pilot = MissionPilot(known, CONFIGURATION, LIMITS)
+    pilot.go(None)
+    rng, scan = np.random.default_rng(0), seen_at(np.array((3.0, 0.0, 0.0)), np.random.default_rng(1))
+    phases = []
+    for k in range(115):
+        pilot.steer(replace(scan, stamp=200_000_000 * (k + 1)))
+        phases.append(pilot.phase)
+        pilot.moved(Step(np.array((rng.normal(0.0, 0.02), 0.0, 0.0)), np.diag((1e-4, 1e-4, 1e-6))))
+    assert [phase for phase, _ in itertools.groupby(phases)] == [Phase.HALLWAY, Phase.TURN, Phase.HALLWAY]

@@ -4,14 +4,16 @@ import math
 
 import numpy as np
 import pytest
-from small_floor import AREAS, CONFIGURATION, charted, seen_at
+from small_floor import AREAS, BUILDING, CONFIGURATION, charted, seen_at, walls
+from worlds import scan_at
 
 from hmt_slam_ros.features.openings import Openings, openings_of
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.places.chart import DOOR
 from hmt_slam_ros.places.estimator import PlaceEstimator
+from hmt_slam_ros.places.observation_graph import QUARTERS, chosen, turned_back
 from hmt_slam_ros.places.place_graph import heading_of, node_of, opposite, state_of
-from hmt_slam_ros.places.position_belief import certain_belief
+from hmt_slam_ros.places.position_belief import PositionBelief, certain_belief
 from hmt_slam_ros.places.switching import metric_start
 from hmt_slam_ros.sensing.motion import Step, increment_covariance
 
@@ -137,3 +139,65 @@ def test_a_door_that_someone_hid_is_noticed_by_the_turn_into_it(chart, graph, mo
 def without_sides(openings):
     """Those that lead ahead alone, as if somebody stood before the others."""
     return Openings(*(field[np.abs(openings.poses[:, 2]) < 0.5] for field in openings))
+
+
+def test_where_the_robot_turns_into_another_hallway_there_is_a_node_though_its_opening_looked_like_none(
+    chart, graph, monkeypatch
+):
+    start = state_of(node_at(chart, 10.0), eastwards(chart))
+    estimator = PlaceEstimator(graph, CONFIGURATION, certain_belief(graph, CONFIGURATION.places, start))
+    monkeypatch.setattr(PositionBelief, "is_listed", lambda *_: False)
+    up = 0.5 * math.pi
+    list(drive(estimator, line((10.0, 0.0), (16.0, 0.0)) + turn((16.0, 0.0), 0.0, up) + line((16.0, 0.0), (16.0, 4.0))))
+    north = (eastwards(chart) - 1) % QUARTERS
+    assert estimator.facing == (node_at(chart, 16.0), north)
+    assert estimator.belief.confident
+
+
+def test_an_opening_that_is_none_of_the_map_hides_no_end_of_a_hallway(chart, graph, monkeypatch):
+    start = state_of(node_at(chart, 16.0), eastwards(chart))
+    estimator = PlaceEstimator(graph, CONFIGURATION, certain_belief(graph, CONFIGURATION.places, start))
+    seen, ahead = openings_of, iter(np.linspace(4.6, -0.3, 41).tolist())
+
+    def and_a_new_one(*args):
+        """Beside where the robot turns at the end."""
+        found, away = seen(*args), next(ahead)
+        new = Openings(
+            np.array([(away, -1.0, -0.5 * math.pi)]), np.diag((1e-4, 1e-4, 1e-6))[None], np.ones(1),
+            np.full(1, 0.02), np.full(1, 0.99),
+        )  # fmt: skip
+        return Openings(*(np.concatenate(fields) for fields in zip(found, new, strict=True)))
+
+    monkeypatch.setattr("hmt_slam_ros.places.estimator.openings_of", and_a_new_one)
+    list(drive(estimator, line((16.0, 0.0), (20.9, 0.0))))
+    assert estimator.facing == (node_at(chart, 21.0), eastwards(chart))
+
+
+def test_who_stands_beside_the_robot_does_not_move_the_middle_of_the_hallway(graph):
+    estimator = PlaceEstimator(graph, CONFIGURATION)
+    rng, pose = np.random.default_rng(0), np.array((2.5, 0.1, 0.0))
+    beside = np.array([(2.3, 0.5, 2.7, 0.5), (2.3, 0.5, 2.3, 0.9), (2.7, 0.5, 2.7, 0.9)])
+    person = np.concatenate([se2.transform(BUILDING, beside[:, k : k + 2]) for k in (0, 2)], axis=1)
+    for _ in range(2):
+        estimator.observe(scan_at(np.concatenate((walls(), person)), se2.compose(BUILDING, pose), 0.01, rng, 720))
+    np.testing.assert_allclose(estimator.ahead(2.0), (2.0, -0.1), atol=0.05)
+
+
+def test_a_robot_that_stands_learns_nothing_however_its_wheels_tremble(chart, graph):
+    start = state_of(node_at(chart, 10.0), eastwards(chart))
+    estimator = PlaceEstimator(graph, CONFIGURATION, certain_belief(graph, CONFIGURATION.places, start))
+    rng = np.random.default_rng(0)
+    (first,) = drive(estimator, [(10.0, 0.0, 0.0)])
+    for _ in range(300):
+        estimator.moved(Step(np.array((rng.normal(0.0, 0.03), 0.0, 0.0)), np.diag((1e-4, 1e-4, 1e-6))))
+    assert estimator.observe(seen_at(np.array((10.0, 0.0, 0.0)), rng)) is first
+
+
+def test_a_robot_that_turned_back_on_its_way_sees_what_it_saw_before(chart, graph):
+    ways = (state_of(node_at(chart, 10.0), heading) for heading in (eastwards(chart), opposite(eastwards(chart))))
+    there, back = (
+        chosen(graph.expected.landmarks, slice(*graph.expected.starts[state : state + 2].tolist())) for state in ways
+    )
+    assert np.abs(there.along).max() > 5.0
+    for one, other in zip(there, turned_back(back), strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-9)

@@ -32,14 +32,16 @@ from hmt_slam_ros.places.switching import MetricStart, metric_start
 from hmt_slam_ros.sensing import Scan
 from hmt_slam_ros.sensing.motion import Step
 
-# How far ahead the robot looks along a hallway, m.
-_AHEAD = 2.0
+# How far ahead the robot looks along a hallway, m; where it sees so far, m, a hallway leads on.
+_AHEAD, _OPEN = 2.0, 3.0
 # Behind a door the way into a room begins so far from it, m; a place is reached so near to it, m.
 _BEHIND, _AT_PLACE = 0.6, 0.15
 # So long a robot before a door looks for it, and waits where something is in its way, ns. It gets on by so much, m.
 _LOOKS, _PATIENCE, _PROGRESS = 15 * NANOSECONDS, 10 * NANOSECONDS, 0.3
 # It stands before a door so near to the middle of the hallway, m, and looks along an axis within this angle, rad.
 _MIDDLE, _STRAIGHT = 0.2, math.radians(10.0)
+# Displacement of a robot that got on.
+_ELSEWHERE = np.array((_PROGRESS, 0.0, 0.0))
 _STAND = Command(0.0, 0.0, arrived=False)
 
 
@@ -77,8 +79,8 @@ class MissionPilot:
         self.started: MetricStart | None = None
         self._goal: Destination | None = None
         self._room_of: Destination | None = None
-        self._axis, self._here = 0, (-1, False)
-        self._since, self._gone = 0, math.inf
+        self._axis, self._along_hallway, self._here = 0, 0, (-1, False)
+        self._since, self._gone = 0, _ELSEWHERE
         self._way = Pilot(limits, _AT_PLACE)
         self._velocity = (0.0, 0.0)
         self._drives = {
@@ -98,7 +100,7 @@ class MissionPilot:
     def moved(self, step: Step) -> None:
         """The robot moved."""
         self.estimator.moved(step)
-        self._gone += float(np.hypot(*step.increment[:2]))
+        self._gone = se2.compose(self._gone, step.increment)
         if self.room is not None:
             self.room.moved(step)
 
@@ -119,13 +121,15 @@ class MissionPilot:
     def _along(self, scan: Scan) -> Command:
         """Keep to the middle of the hallway; at a node do what is best there.
 
-        A robot that was turned off its way by what stood in it turns back.
+        A robot that was turned off its way by what stood in it turns back, unless it came to a node thereby.
         """
-        if (self.estimator.axis - self._axis) % QUARTERS:
+        here = self.estimator.arrivals, self.estimator.at_wall
+        arrived = here[0] != self._here[0]
+        if (self.estimator.axis - self._axis) % QUARTERS and not arrived:
             self.phase = Phase.TURN
             return self._around(scan)
-        here = self.estimator.arrivals, self.estimator.at_wall
-        if here[0] != self._here[0] or here[1] > self._here[1]:
+        self._axis = self.estimator.axis
+        if arrived or here[1] > self._here[1]:
             self._decide(scan)
         self._here = here
         if self.phase is not Phase.HALLWAY:
@@ -136,34 +140,50 @@ class MissionPilot:
         return self._towards(scan, self.estimator.ahead(_AHEAD))
 
     def _held_up(self, scan: Scan) -> bool:
-        """Whether the robot has not got anywhere for long."""
-        if self._gone >= _PROGRESS:
-            self._gone, self._since = 0.0, scan.stamp
-        return scan.stamp - self._since > _PATIENCE
+        """Whether the robot has not got anywhere for long, nor tried another way."""
+        gone = math.hypot(*self._gone[:2]) >= _PROGRESS
+        held_up = not gone and scan.stamp - self._since > _PATIENCE
+        if gone or held_up:
+            self._gone, self._since = np.zeros(3), scan.stamp
+        return held_up
 
     def _decide(self, scan: Scan) -> None:
         """What the most likely state policy says; straight on where it says nothing, and back at a wall."""
         belief, facing, goal = self.estimator.belief, self.estimator.facing, self._goal
         node = None if goal is None else goal.node
         if goal is not None and belief is not None and belief.confident and facing is not None and facing[0] == node:
+            self._along_hallway = self.estimator.axis
             self._turn((goal.opening.direction - facing[1]) % QUARTERS)
             self.phase, self._since, self._before_door = Phase.DOOR, scan.stamp, False
             return
         at_wall = self.estimator.at_wall
         quarters = None if belief is None else next_turn(belief, node, self._model, ahead=not at_wall)
         quarters = 2 if at_wall and not quarters else quarters
+        if quarters and not (belief is not None and belief.confident) and not self._leads_on(quarters):
+            quarters = self._freest(quarters)
         if quarters:
             self._turn(quarters)
             self.phase = Phase.TURN
+
+    def _leads_on(self, quarters: int) -> bool:
+        """Whether the robot sees that it goes on so many quarters to the right."""
+        return not self.estimator.free(self.estimator.axis - quarters) < _OPEN
+
+    def _freest(self, without: int) -> int:
+        """In how many quarters to the right one sees farthest, but for some."""
+        others = [k for k in range(QUARTERS) if (k - without) % QUARTERS]
+        return max(others, key=lambda k: np.nan_to_num(self.estimator.free(self.estimator.axis - k)))
 
     def _turn(self, quarters: int) -> None:
         """Turn so many quarters to the right."""
         self._axis = self.estimator.axis - quarters
 
     def _around(self, scan: Scan) -> Command:
-        """Turn at the last node into a hallway."""
+        """Turn at the last node into a hallway; where that does not get anywhere, into another one."""
         if self.estimator.axis % QUARTERS == self._axis % QUARTERS and not self.estimator.turning:
-            self.phase, self._gone = Phase.HALLWAY, math.inf
+            self.phase, self._gone = Phase.HALLWAY, _ELSEWHERE
+        elif self._held_up(scan):
+            self._turn(self._freest(self.estimator.axis - self._axis))
         return self._towards(scan, self.estimator.on_line(self._axis, _AHEAD))
 
     def _to_door(self, scan: Scan) -> Command:
@@ -176,7 +196,7 @@ class MissionPilot:
         if start is not None and start.node == self._goal.node:
             return self._enter(start, scan)
         if scan.stamp - self._since > _LOOKS:
-            self._axis, self.phase = self.estimator.axis, Phase.TURN
+            self._axis, self.phase, self._gone = self._along_hallway, Phase.TURN, _ELSEWHERE
             return self._around(scan)
         if not self._before_door:
             return self._towards(scan, front)

@@ -40,6 +40,7 @@ from hmt_slam_ros.places.observation_graph import QUARTERS, observation_graph, o
 from hmt_slam_ros.places.observation_graph import Landmarks as Seen
 from hmt_slam_ros.places.place_graph import PlaceGraph, heading_of, node_of
 from hmt_slam_ros.places.position_belief import PositionBelief, Travel, flat_belief
+from hmt_slam_ros.places.walls_around import wall_ahead, wall_beside
 from hmt_slam_ros.sensing import Scan
 from hmt_slam_ros.sensing.motion import Step
 
@@ -49,18 +50,17 @@ from hmt_slam_ros.sensing.motion import Step
 _LEAST, _SIGHTINGS, _BEHIND, _AHEAD, _ASIDE = 0.5, 2, 1.0, 1.0, 2.5
 # Openings so near to each other along a hallway are one node, m; what is so far away is forgotten, m.
 _SAME, _FORGET = 0.6, 8.0
-# A robot is along an axis within this angle of it, rad; an opening, or a wall across, within this one.
+# A robot is along an axis within this angle of it, rad; an opening within this one.
 _ALONG, _ASKEW = math.radians(25.0), math.radians(20.0)
-# The wall at the end of a hallway is so near before the robot turns, m; so much of it is seen, m, and so
-# far to both sides.
-_WALL, _SEEN = 1.35, 0.8
+# The wall at the end of a hallway is so near before the robot turns, m.
+_WALL = 1.35
 # A robot turns at its last node up to so far from it, m; where it turns elsewhere it is at one that it did not notice,
 # of which it knows the place so well, m.
 _THERE, _SOMEWHERE = 1.5, 0.4
 # A robot that was in a hallway so far ago, m, turns off it.
 _DOORWAY = 1.0
-# A chord along a hallway is this share of the longest one; walls are so near to both sides of its middle, m.
-_LONG, _WALLS = 0.5, 2.5
+# A chord along a hallway is this share of the longest one.
+_LONG = 0.5
 # Deviations of a node's place in the map, m; of what is seen of the robot's place in the frame along the walls, m.
 _PLACED, _HERE = 0.03, 0.02
 # The robot follows one axis to the next node, in known ground and in unknown, so the turn tells nothing: with this
@@ -102,9 +102,14 @@ class PlaceEstimator:
         self._quarter, self._middle = 0, np.zeros(2)
         self._last: Noticed | None = None
         self._passed: list[Float64] = []
+        self._unlisted: list[Float64] = []
         self._turned_at: Float64 | None = None
-        self._unseen, self._gone, self._outside = math.inf, 0.0, math.inf
+        # Where it looked last, where it looked or arrived last, and where it was in a hallway last.
+        self._looked: Float64 | None = None
+        self._told = np.zeros(2)
+        self._in_hallway_at: Float64 | None = None
         self._seen = NO_OPENINGS
+        self._distances = np.full(1, np.nan)
         self.belief: PositionBelief | None = None
         self.arrivals = 0
         self.in_hallway, self.at_wall = False, False
@@ -129,6 +134,10 @@ class PlaceEstimator:
     def axis(self) -> int:
         """Quarters of a turn to the left from the walls' frame to the direction in which the robot travels."""
         return self._quarter
+
+    def free(self, axis: int) -> float:
+        """How far one sees along an axis, m; nan where no beam tells."""
+        return float(self._distances[sector_of(np.array(QUARTER * axis - self._pose[2]))])
 
     def ahead(self, distance: float) -> Float64:
         """The place in the hallway's middle so far ahead of the robot, m, shape (2,), in the frame of the base."""
@@ -178,8 +187,6 @@ class PlaceEstimator:
             return
         forward = se2.transform(np.array((0.0, 0.0, self._pose[2])), step.increment[None, :2])[0]
         self._pose = np.array((*(self._pose[:2] + forward), self._heading.angle))
-        way = float(np.hypot(*step.increment[:2]))
-        self._unseen, self._gone, self._outside = self._unseen + way, self._gone + way, self._outside + way
         if self._last is not None:
             self._last = self._last._replace(variance=self._last.variance + float(step.covariance[:2, :2].max()))
 
@@ -193,16 +200,16 @@ class PlaceEstimator:
         if self._begins_there and self.belief is None:
             self._last, self.belief = Noticed(self._pose[:2].copy(), _BEGIN**2), self._first
         corners, openings = corners_of(lines, self._features), openings_of(lines, rays, self._features)
-        self._seen = openings
+        self._seen, self._distances = openings, distances_around(rays)
         self._follow(both(corners, openings), rays)
         nearest = round(self._pose[2] / QUARTER)
         off = self._pose[2] - QUARTER * nearest
         aligned = abs(off) <= _ALONG
         if nearest != self._quarter or not aligned:
-            self._turn(nearest, rays if aligned else None)
+            self._turn(nearest, lines if aligned else None)
         else:
             self._turned_at = None
-            self.in_hallway = self._is_hallway(rays, off, nearest)
+            self.in_hallway = self._is_hallway(lines, nearest)
         if self.in_hallway and nearest == self._quarter and aligned:
             self._notice(0.0)
             self._notice_wall(lines, off)
@@ -226,50 +233,61 @@ class PlaceEstimator:
         near = (one for one in self._around.landmarks if math.dist(one.pose.mean[:2], self._pose[:2]) < _FORGET)
         self._around.landmarks = list(near)
 
-    def _is_hallway(self, rays: Rays, off: float, axis: int) -> bool:
-        """Whether the robot is in a hallway along an axis that its heading is so far off, rad.
-
-        Where both walls are in sight its middle is known, too.
-        """
-        away = distances_around(rays)
-        space = space_within(away)
-        ahead, left, back, right = away[sector_of(np.arange(QUARTERS, dtype=np.float64) * QUARTER - off)].tolist()
-        if space is None or log_odds(space, self._features) <= 0.0 or not ahead + back >= _LONG * space.length:
+    def _is_hallway(self, lines: Lines, axis: int) -> bool:
+        """Whether the robot is in a hallway along an axis. Where both walls are in sight its middle is known, too."""
+        space = space_within(self._distances)
+        chord = self.free(axis) + self.free(axis + 2)
+        if space is None or log_odds(space, self._features) <= 0.0 or not chord >= _LONG * space.length:
             return False
-        self._outside = 0.0
-        if max(left, right) <= _WALLS:
+        self._in_hallway_at = self._pose[:2].copy()
+        left, right = (wall_beside(lines, QUARTER * side - self._pose[2]) for side in (axis + 1, axis - 1))
+        if left is not None and right is not None:
             self._middle = self._pose[:2] + 0.5 * (left - right) * _unit(axis + 1)
         return True
 
-    def _turn(self, nearest: int, rays: Rays | None) -> None:
+    def _turn(self, nearest: int, lines: Lines | None) -> None:
         """The robot turns, and at last is along another axis.
 
-        :param rays: of the scan, where it is along one.
+        :param lines: of the scan, where it is along one.
         """
         if self._turned_at is None:
             self._turned_at = self._pose[:2].copy()
-            if self._outside <= _DOORWAY:
+            if self._is_near(self._in_hallway_at, _DOORWAY):
                 self._notice(_AHEAD)
-        if rays is None or nearest == self._quarter:
+        if lines is None or nearest == self._quarter:
             return
         quarters = (self._quarter - nearest) % QUARTERS
-        off = self._pose[2] - QUARTER * nearest
-        if quarters % 2 and self._outside <= _DOORWAY and self._last is not None:
-            away = (math.dist(place, self._last.place) for place in (self._pose[:2], self._turned_at))
-            if min(away) > _THERE:
-                self._reach(Noticed(self._turned_at, _SOMEWHERE**2))
+        elsewhere = quarters % 2 and self._last is not None and self._turned_off(self._last)
+        if elsewhere and self._is_near(self._in_hallway_at, _DOORWAY):
+            self._reach(Noticed(self._turned_at, _SOMEWHERE**2))
         if quarters % 2:
             # A node is in the middle of the hallways that meet there.
             self._middle = self._node
-        if not self._is_hallway(rays, off, nearest):
+        if not self._is_hallway(lines, nearest):
             self.in_hallway = False
             return
+        if quarters % 2 and self._last is not None and self._turned_off(self._last):
+            # Where another hallway leads off there is a node, whatever was seen of it.
+            self._arrive(Noticed(self._turned_at, _SOMEWHERE**2))
+            self._middle = self._node
         if self.belief is not None:
             self.belief = self.belief.turned(quarters)
-        self._unseen = math.inf if quarters % 2 else self._unseen
+        self._looked = None if quarters % 2 else self._looked
         self._quarter, self._turned_at, self.in_hallway = nearest, None, True
         # What was passed is passed again.
-        self._passed = [place for place in self._passed if math.dist(place, self._pose[:2]) <= _THERE]
+        self._passed, self._unlisted = (
+            [place for place in places if math.dist(place, self._pose[:2]) <= _THERE]
+            for places in (self._passed, self._unlisted)
+        )
+
+    def _is_near(self, place: Float64 | None, distance: float) -> bool:
+        """Whether the robot is so near to a place that it was at, m; wheels that stand and roll tell of ways, too."""
+        return place is not None and math.dist(self._pose[:2], place) <= distance
+
+    def _turned_off(self, last: Noticed) -> bool:
+        """Whether the robot turns elsewhere than at its last node."""
+        assert self._turned_at is not None
+        return min(math.dist(place, last.place) for place in (self._pose[:2], self._turned_at)) > _THERE
 
     def _notice(self, ahead: float) -> None:
         """Arrive at the openings that are passed.
@@ -300,33 +318,33 @@ class PlaceEstimator:
 
     def _notice_wall(self, lines: Lines, off: float) -> None:
         """Arrive at the end of a hallway."""
-        across = np.abs(se2.wrap(lines.parameters[:, 0] + off)) <= _ASKEW
-        seen = np.zeros(len(lines))
-        ahead = np.clip(lines.pieces, -_SEEN, _SEEN)
-        np.add.at(seen, lines.owners, ahead[:, 1] - ahead[:, 0])
-        walls = lines.parameters[across & (seen >= _SEEN), 1]
-        self.at_wall = bool(walls.size and walls.min() <= _WALL)
-        if self.at_wall:
-            self._reach(Noticed(self._beyond(float(walls.min()) - BEFORE), _PLACED**2), end=True)
+        away = wall_ahead(lines, -off)
+        self.at_wall = away is not None and away <= _WALL
+        if away is not None and self.at_wall:
+            self._reach(Noticed(self._beyond(away - BEFORE), _PLACED**2), end=True)
 
     def _reach(self, noticed: Noticed, *, end: bool = False) -> None:
         """Arrive at what was noticed, unless it was noticed before, or is none of the map.
 
-        An opening at which the robot is again corrects its place. An end that is so near to an opening is no node.
+        An opening at which the robot is again corrects its place. An end that is so near to an opening is no node. One
+        that is none of the map may be another one that somebody half hides, and no end is taken for it.
         """
-        away = [np.abs((place - noticed.place) @ self._direction) for place in self._passed]
+        known = self._passed if end else self._passed + self._unlisted
+        away = [np.abs((place - noticed.place) @ self._direction) for place in known]
         if away and min(away) < _SAME:
             return
-        self._passed = [*self._passed[-2:], noticed.place]
         if self._last is not None and abs((noticed.place - self._last.place) @ self._direction) <= _THERE:
             self._last = self._last if end else noticed
-            return
-        if self.belief is None or self.belief.is_listed(self._way(noticed)):
+            self._passed = [*self._passed[-2:], noticed.place]
+        elif self.belief is None or self.belief.is_listed(self._way(noticed)):
             self._arrive(noticed)
+        else:
+            self._unlisted = [*self._unlisted[-2:], noticed.place]
 
     def _arrive(self, noticed: Noticed) -> None:
+        self._passed = [*self._passed[-2:], noticed.place]
         self.belief = self._first if self.belief is None else self.belief.arrived(self._way(noticed))
-        self._last, self._unseen, self._gone = noticed, math.inf, 0.0
+        self._last, self._looked, self._told = noticed, None, self._pose[:2].copy()
         self.arrivals += 1
 
     def _way(self, noticed: Noticed) -> Travel:
@@ -338,13 +356,14 @@ class PlaceEstimator:
 
     def _look(self, seen: Seen) -> None:
         """Ask the observation function, where as much of the hallway is new as the robot sees of it."""
-        if self.belief is None or self._last is None or self._unseen < 2.0 * self._places.reach:
+        if self.belief is None or self._last is None or self._is_near(self._looked, 2.0 * self._places.reach):
             return
         if self.belief.in_room >= 0.5:
             return
         variance = self._last.variance + _PLACED**2
-        self.belief = self.belief.gone_on(self._gone).observed(seen, self._model, self.away, variance)
-        self._unseen, self._gone = 0.0, 0.0
+        gone = math.dist(self._pose[:2], self._told)
+        self.belief = self.belief.gone_on(gone).observed(seen, self._model, self.away, variance)
+        self._looked = self._told = self._pose[:2].copy()
         state = self.belief.most_likely
         if self.belief.confident and state is not None:
             ahead, variance = place_along(seen, self.belief.graph.expected, state, self.away, variance, self._model)

@@ -191,17 +191,24 @@ def _ways_on(
 
 
 def _seen_from(state: int, nodes: Sequence[Node], leaving: Mapping[int, Edge], reach: float) -> Landmarks:
-    """The landmarks of a straight hallway from so far behind a state's node to so far behind the end of its edge.
+    """The landmarks of a straight hallway from so far behind the end of a state's edge to so far behind that of the
+    edge at its back, where a robot is that turned back on its way.
 
-    Of the edges behind that, too, which end where the robot is when it passed openings without notice.
+    Of the edges behind those, too, which end where the robot is when it passed openings without notice.
     """
-    ahead, at = 0.0, state
+    ahead, behind = (_ways_end(start, leaving) + reach for start in (state, turned(state, 2)))
+    there = _along(state, nodes, leaving, ahead)
+    back = _along(turned(state, 2), nodes, leaving, behind)
+    return joined((_of_node(state, nodes), there, turned_back(back)))
+
+
+def _ways_end(state: int, leaving: Mapping[int, Edge]) -> float:
+    """How far it is to where a robot is that passed openings without notice, m."""
+    far = 0.0
     for _ in range(1 + _PASSED):
-        if (edge := leaving.get(at)) is not None:
-            ahead, at = ahead + edge.distance[0], state_of(edge.end, edge.arriving)
-    there = _along(state, nodes, leaving, ahead + reach)
-    behind = _along(turned(state, 2), nodes, leaving, reach)
-    return joined((_of_node(state, nodes), there, turned_back(behind)))
+        if (edge := leaving.get(state)) is not None:
+            far, state = far + edge.distance[0], state_of(edge.end, edge.arriving)
+    return far
 
 
 def _along(state: int, nodes: Sequence[Node], leaving: Mapping[int, Edge], far: float) -> Landmarks:
