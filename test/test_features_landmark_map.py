@@ -78,6 +78,14 @@ def test_an_opening_should_be_seen_from_before_it_open_or_closed():
     assert not is_due(cupboard, (0.5, 0.5, 0.0), OPENING, opening, 1.0)
 
 
+def test_who_stands_before_an_opening_closes_none():
+    opening = (1.0, -2.0, -0.5 * np.pi)
+    person = np.concatenate((DOOR, box(1.3, -1.6, 1.8, -1.3)))
+    # The gap is in sight, and so is one jamb.
+    assert not is_due(person, (0.8, 0.5, 0.0), OPENING, opening, 1.0)
+    assert is_due(np.concatenate((person, [[0.5, -2.0, 1.5, -2.0]])), (0.8, 0.5, 0.0), OPENING, opening, 1.0)
+
+
 def test_what_many_scans_show_is_one_landmark_each():
     inner = of_kind(gathered(LandmarkMap(FEATURES), ROOM, PLACES), INNER)
     assert len(inner) == 4

@@ -1,9 +1,10 @@
 """The landmarks that a scan all around shows, and which of those that are known it should show.
 
 Corners and openings are landmarks (Tomatis, Nourbakhsh and Siegwart, 2003, section 2.1). One that is known has to be
-seen where beams reach what it is made of: both walls of a corner; the gap of an opening and a jamb. A beam that ends
-before that tells nothing, one that goes on behind it is in sight of what is not there any more: where beams pass one
-wall of a corner, the other one does not have to be in sight.
+seen where beams reach what it is made of: both walls of a corner; the gap of an opening and both jambs, one of which
+may be hidden where no beam passes the gap, as at a door that was closed. A beam that ends before that tells nothing: a
+person who stands before an opening closes none. One that goes on behind it is in sight of what is not there any more:
+where beams pass one wall of a corner, the other one does not have to be in sight.
 """
 
 from __future__ import annotations
@@ -83,7 +84,7 @@ def due(kinds: Int64, poses: Float64, widths: Float64, rays: Rays, features: Fea
     shown = np.hypot(*poses[:, :2].T) <= features.landmark_reach
     corner = kinds != OPENING
     shown[corner] &= _corners_due(poses[corner], kinds[corner] == OUTER, rays, features.min_length)
-    shown[~corner] &= _openings_due(poses[~corner], widths[~corner], rays)
+    shown[~corner] &= _openings_due(poses[~corner], widths[~corner], rays, features.opening_depth)
     return shown
 
 
@@ -112,15 +113,21 @@ def _faced(poses: Float64, before: Float64) -> Bool:
     return np.asarray((origin * before).sum(axis=1) >= _FACED * away)
 
 
-def _openings_due(poses: Float64, widths: Float64, rays: Rays) -> Bool:
-    """Which openings have their gap in sight, and the wall at one of their jambs."""
+def _openings_due(poses: Float64, widths: Float64, rays: Rays, depth: float) -> Bool:
+    """Which openings have their gap and both jambs in sight, or are closed in half of the gap and show a jamb.
+
+    :param depth: so far behind its wall an opening is free, m.
+    """
     away = np.hypot(*poses[:, :2].T)
     faced = np.cos(np.arctan2(poses[:, 1], poses[:, 0]) - poses[:, 2]) >= _FACED
     over = (np.arange(_PLACES) + 0.5)[:, None] / _PLACES - 0.5
     gap = np.stack(np.broadcast_arrays(-_BEFORE, over * widths), axis=-1)
     jambs = np.stack(np.broadcast_arrays(-_BEFORE, np.array([[-1.0], [1.0]]) * (0.5 * widths + _BESIDE)), axis=-1)
-    through = in_sight(se2.transform(poses, gap), rays).mean(axis=0) >= _SHARE
-    return faced & through & in_sight(se2.transform(poses, jambs), rays).any(axis=0) & (away > _BEFORE)
+    seen, sides = (in_sight(se2.transform(poses, points), rays) for points in (gap, jambs))
+    behind = in_sight(se2.transform(poses, gap + np.array([_BEFORE + depth, 0.0])), rays)
+    whole = seen.all(axis=0) & sides.all(axis=0)
+    closed = (seen.mean(axis=0) >= _SHARE) & sides.any(axis=0) & ~behind.any(axis=0)
+    return np.asarray(faced & (whole | closed) & (away > _BEFORE))
 
 
 def in_sight(points: Float64, rays: Rays) -> Bool:
