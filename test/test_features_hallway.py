@@ -7,7 +7,7 @@ from worlds import box, drive, scan_at, scan_in
 from benchmark.hallways import depth_in_rooms
 from hmt_slam_ros.configuration.features import Features
 from hmt_slam_ros.configuration.tree import Configuration
-from hmt_slam_ros.features.hallway import FreeSpace, after, area_class, free_space, log_odds
+from hmt_slam_ros.features.hallway import FreeSpace, after, area_class, free_space, log_odds, shortest_hallway
 from hmt_slam_ros.features.rays import rays_of
 from hmt_slam_ros.local_map.area_kind import AreaKinds
 from hmt_slam_ros.local_map.local_mapping import LocalMapping
@@ -51,6 +51,13 @@ def test_thin_and_long_is_a_hallway():
     assert log_odds(WIDE, FEATURES) < -3.0
     longer, wider = THIN._replace(length=20.0), FreeSpace(2.5, 15.0)
     assert log_odds(wider, FEATURES) < log_odds(THIN, FEATURES) < log_odds(longer, FEATURES)
+
+
+@pytest.mark.parametrize("width", [1.2, 2.0, 4.5])
+def test_from_the_shortest_length_on_a_space_is_a_hallway(width):
+    shortest = shortest_hallway(width, FEATURES)
+    assert log_odds(FreeSpace(width, shortest), FEATURES) == pytest.approx(0.0, abs=1e-9)
+    assert shortest_hallway(2.5, FEATURES) > shortest_hallway(2.0, FEATURES)
 
 
 def test_one_keyframe_of_another_kind_does_not_change_an_area():

@@ -7,11 +7,17 @@ import math
 import numpy as np
 import pytest
 from small_floor import AREAS, CONFIGURATION, charted
+from worlds import box, scan_at
 
 from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.local_map.local_mapping import LocalMapping
+from hmt_slam_ros.places.area_views import AreaViews
 from hmt_slam_ros.places.chart import CROSSING, DOOR, END, chart_of
+from hmt_slam_ros.places.floor import floors
 from hmt_slam_ros.places.observation_graph import OPENINGS
 from hmt_slam_ros.places.place_graph import EAST, WEST
+from hmt_slam_ros.simulation.building import FloorPlan
+from hmt_slam_ros.topology.hybrid_map import HybridMap
 
 
 @pytest.fixture(scope="module")
@@ -160,6 +166,31 @@ def test_north_is_one_direction_in_all_areas(charts):
         # From a pose that looks north, east is to the right.
         off = math.atan2(away[1], away[0]) + 0.5 * math.pi * edge.leaving
         assert abs(float(se2.wrap(off))) < 0.05
+
+
+def turning(walls, places):
+    """The floor of an area with keyframes at these poses."""
+    hybrid_map, rng = HybridMap(), np.random.default_rng(3)
+    for k, pose in enumerate(places):
+        hybrid_map.place(k, 0, np.array(pose))
+    scans = {k: scan_at(walls, np.array(pose), 0.01, rng, 720) for k, pose in enumerate(places)}
+    return floors(hybrid_map, AreaViews(LocalMapping(CONFIGURATION), scans).of_map(hybrid_map))[0]
+
+
+def test_the_end_of_a_hallway_is_in_the_hallway_where_a_room_behind_a_door_is_not():
+    plan = FloorPlan()
+    plan.free(0.0, -1.0, 12.0, 1.0)
+    plan.free(9.5, 0.9, 10.5, 1.3)
+    plan.free(8.0, 1.2, 12.0, 5.0)
+    person = box(8.8, -0.2, 9.2, 0.2)
+    along = [(x, 0.0, 0.0) for x in np.arange(5.0, 8.1, 0.5)]
+    end = [(11.0, 0.0, heading) for heading in np.arange(0.0, 6.0, 0.5)]
+    room = [(x, y, 0.5 * math.pi) for x in (9.0, 10.0, 11.0) for y in (2.0, 3.0, 4.0)]
+    floor = turning(np.concatenate((plan.walls(), person)), along + end + room)
+    lies = {bool(floor.along[k].any()) for k in range(len(along))}
+    ends = {bool(floor.along[k].any()) for k in range(len(along), len(along + end))}
+    rooms = {bool(floor.along[k].any()) for k in range(len(along + end), len(along + end + room))}
+    assert (lies, ends, rooms) == ({True}, {True}, {False})
 
 
 BARRED = [(x, 7.5) for x in (4.0, 4.5, 5.0, 5.5, 6.0)]

@@ -94,6 +94,14 @@ def log_odds(space: FreeSpace, features: Features) -> float:
     return features.hallway_bias + features.hallway_width * width + features.hallway_ratio * ratio
 
 
+def shortest_hallway(width: float, features: Features) -> float:
+    """From which length on a space of a width is a hallway rather than a room, m; inf where length tells of none."""
+    if features.hallway_ratio <= 0.0:
+        return math.inf
+    logarithm = math.log(max(width, 1e-3))
+    return math.exp(logarithm - (features.hallway_bias + features.hallway_width * logarithm) / features.hallway_ratio)
+
+
 def area_class(spaces: Iterable[FreeSpace], features: Features) -> AreaClass:
     """What an area is by the spaces around its keyframes, in the order in which they were taken.
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from hmt_slam_ros.arrays import Float64, Int64
 from hmt_slam_ros.configuration.features import Features
-from hmt_slam_ros.features.hallway import distances_around, log_odds, space_within
+from hmt_slam_ros.features.hallway import distances_around, shortest_hallway, space_within
 from hmt_slam_ros.features.landmark_map import Landmark, LandmarkMap
 from hmt_slam_ros.local_map.area_landmarks import AreaLandmarks, Growing
 from hmt_slam_ros.local_map.local_mapping import LocalMapping
@@ -28,6 +28,7 @@ class AreaView(NamedTuple):
     :ivar poses: shape (n, 3), their ``area_T_base``.
     :ivar around: shape (n, 72), how far one sees around each, m, in the frame of the base.
     :ivar hallways: shape (n,), how long the hallway is that each was taken in, m; nan in none.
+    :ivar shortest: shape (n,), how long a hallway as wide as there would be at least, m; nan where that is not known.
     """
 
     landmarks: tuple[Landmark, ...]
@@ -35,6 +36,7 @@ class AreaView(NamedTuple):
     poses: Float64
     around: Float64
     hallways: Float64
+    shortest: Float64
 
 
 class _GrowingView:
@@ -62,8 +64,8 @@ class _GrowingView:
             self._around.append(distances_around(sighting.rays))
             self._keyframes[keyframe] = pose
         around, numbers = np.array(self._around), np.array(list(keyframes), dtype=np.int64)
-        hallways = np.array([_hallway(away, self._features) for away in around])
-        return AreaView(tuple(self._found.landmarks), numbers, stacked(keyframes), around, hallways)
+        lengths = np.array([_hallway(away, self._features) for away in around]).reshape(-1, 2)
+        return AreaView(tuple(self._found.landmarks), numbers, stacked(keyframes), around, *lengths.T)
 
 
 class AreaViews:
@@ -104,7 +106,10 @@ class AreaViews:
         return held[1]
 
 
-def _hallway(away: Float64, features: Features) -> float:
-    """The length of the hallway in which one sees so far around, m; nan in none."""
+def _hallway(away: Float64, features: Features) -> tuple[float, float]:
+    """The length of the hallway in which one sees so far around, nan in none, and the least of one as wide, m."""
     space = space_within(away)
-    return math.nan if space is None or log_odds(space, features) <= 0.0 else space.length
+    if space is None:
+        return math.nan, math.nan
+    shortest = shortest_hallway(space.width, features)
+    return space.length if space.length > shortest else math.nan, shortest

@@ -29,6 +29,8 @@ from hmt_slam_ros.topology.surroundings import Nearness, areas_around
 _NEARNESS = Nearness(1.0, 25.0)
 # A chord along an axis that is this share of the longest one is as long as the hallway.
 _LONG = 0.5
+# A place lies between the walls of a hallway, m, where so many places of that at least are so near, m.
+_SAME_WALL, _BESIDE, _FEW = 0.2, 4.0, 2
 
 _QUARTER = 0.5 * math.pi
 
@@ -123,5 +125,35 @@ def _floor(area: int, north: float, around: Mapping[int, PoseGaussian], views: M
     bearings = np.arctan2(DIRECTIONS[:, 1], DIRECTIONS[:, 0]) - poses[:, 2:]
     clear = np.take_along_axis(around_each, sector_of(bearings), axis=1)
     hallways = np.concatenate([views[other].hallways for other in areas])
-    along = clear[:, :2] + clear[:, 2:] >= _LONG * hallways[:, None]
+    shortest = np.concatenate([views[other].shortest for other in areas])
+    along = _along(poses[:, :2], clear, hallways, shortest)
     return Floor(area, origin, areas, owners, numbers, poses[:, :2], clear, along)
+
+
+def _along(places: Float64, clear: Float64, hallways: Float64, shortest: Float64) -> Bool:
+    """Along which axes places lie in a hallway, shape (n, 2).
+
+    At the end of a hallway, and where people stand about, one sees no farther than in a room. So a place between the
+    walls of a hallway counts as long as that is where others are, on the median.
+
+    :param hallways: shape (n,), as of `AreaView`; ``shortest`` likewise.
+    """
+    found = clear[:, :2] + clear[:, 2:] >= _LONG * hallways[:, None]
+    within = found.copy()
+    for axis in (0, 1):
+        there, here = np.flatnonzero(found[:, axis]), np.flatnonzero(~found[:, axis])
+        same = _between_same_walls(places, clear, axis, here, there)
+        enough = same.sum(axis=1) >= _FEW
+        here, same = here[enough], same[enough]
+        if len(here):
+            within[here, axis] = np.nanmedian(np.where(same, hallways[there], np.nan), axis=1) > shortest[here]
+    return within
+
+
+def _between_same_walls(places: Float64, clear: Float64, axis: int, here: Int64, there: Int64) -> Bool:
+    """Which pairs of places, one of each group, are near along an axis and see the same walls beside it, (n, m)."""
+    side = axis + 1
+    ahead, beside = places @ DIRECTIONS[axis], places @ DIRECTIONS[side]
+    told = (beside - clear[:, (side + 2) % QUARTERS], beside + clear[:, side], ahead)
+    apart = [np.abs(one[here][:, None] - one[there][None]) for one in told]
+    return np.asarray((apart[0] <= _SAME_WALL) & (apart[1] <= _SAME_WALL) & (apart[2] <= _BESIDE))
