@@ -194,7 +194,7 @@ def test_a_known_map_is_known_from_the_start() -> None:
     atlas = Explorer(Configuration(), Replica.of(known.replica.state)).atlas
     assert set(atlas.places()) >= set(known.places())
     for name in ("room 1", "room 2"):
-        assert atlas.survey.same_room(atlas.places()[name], known.places()[name])
+        assert any({atlas.places()[name], known.places()[name]} <= own for own in atlas.survey.chambers())
     first = min(atlas.survey.roadmap)
     assert set(atlas.survey.distances(first)) >= set(known.survey.distances(first))
 
@@ -273,6 +273,49 @@ def test_places_beside_each_other_are_joined_whatever_stands_about() -> None:
     hybrid_map = with_keyframes({0: (2.0, 0.85, 0.0), 4: (2.2, 0.85, 0.0), 9: (2.9, 0.85, 0.0)})
     survey.look(hybrid_map, dict.fromkeys((0, 4, 9), scan_at((2.0, 0.85, 0.0))), 0, np.array([2.0, 0.0, 0.0]))
     assert set(survey.distances(0)) == {0, 4}
+
+
+def surveyed(poses: list[tuple[float, float, float]], walls: Float64, person: Float64, until: int = 0) -> Survey:
+    """A survey of a floor with keyframes at these poses, one after the other, somebody (1, 3) being there at first.
+
+    :param until: this keyframe.
+    """
+    survey, laser = Survey(Configuration().features, 0.3, 1.75), Laser(LASER)
+    index, people = wall_index(walls), [person] * until + [np.empty((0, 3))] * (len(poses) - until)
+    seen = [laser.distances(np.array([pose]), index, own) for pose, own in zip(poses, people, strict=True)]
+    scans = {k: laser.scan(0, 0, distances) for k, distances in enumerate(seen)}
+    survey.look_everywhere(with_keyframes(dict(enumerate(poses))), scans)
+    return survey
+
+
+def test_the_end_of_a_hallway_is_no_room() -> None:
+    hallway = [(x, 0.0, 0.0) for x in np.arange(1.0, 11.1, 0.5)]
+    person = np.array([[4.2, 0.0, 0.5]])
+    survey = surveyed(hallway, small_floor().walls, person, until=4)
+    # From there it looked like one.
+    laser = Laser(LASER)
+    seen = laser.distances(np.array([hallway[0]]), wall_index(small_floor().walls), person)
+    assert not outlook_of(laser.scan(0, 0, seen), Configuration().features, 1.75).hallway
+    assert survey.room_of(0) == ()
+    assert survey.rooms() == []
+
+
+def test_a_room_behind_a_gap_in_a_room_is_part_of_it() -> None:
+    plan = FloorPlan()
+    plan.free(0.0, -1.0, 12.0, 1.0)
+    plan.free(4.5, -1.3, 5.5, -0.9)
+    # Two cupboards leave a gap of a metre in the middle of the room.
+    plan.free(3.0, -4.0, 7.0, -1.2)
+    plan.free(4.5, -4.4, 5.5, -3.9)
+    plan.free(3.0, -8.0, 7.0, -4.3)
+    poses = [(x, 0.0, 0.0) for x in np.arange(1.0, 10.0, 0.5)]
+    poses += [(5.0, y, -0.5 * np.pi) for y in np.arange(-0.4, -7.0, -0.5)]
+    poses += [(x, y, 0.0) for x in (4.0, 6.0) for y in (-2.5, -6.0, -6.8)]
+    survey = surveyed(poses, plan.walls(), np.empty((0, 3)))
+    doors = [survey.roadmap.edges[edge]["door"] for edge in ((24, 27), (18, 21))]
+    assert doors == [True, True]
+    assert len(survey.rooms()) == 1
+    assert {bool(survey.room_of(k)) for k in (24, 29, 30)} == {True}
 
 
 def test_it_does_not_aim_behind_a_wall(monkeypatch: pytest.MonkeyPatch) -> None:

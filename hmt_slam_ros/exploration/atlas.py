@@ -37,8 +37,7 @@ class Atlas:
         # Of each room that was entered the keyframes around the place where it was, the nearest first.
         self._rooms: list[tuple[int, ...]] = []
         self.survey.look_everywhere(self.hybrid_map, self.replica.scans)
-        for room in self.survey.rooms():
-            self._name(room)
+        self.name_rooms()
 
     def hear(self, message: Message) -> None:
         """Take in a message of the chain, or a pose; between nodes scans may come after any of them."""
@@ -109,19 +108,33 @@ class Atlas:
         if here is not None:
             self._name(self.survey.room_of(here.keyframe))
 
+    def name_rooms(self) -> None:
+        """Give every room a name that was entered and has none."""
+        for room in self.survey.rooms():
+            self._name(room)
+
     def _name(self, room: tuple[int, ...]) -> None:
-        if room and not any(self.survey.same_room(room[0], known) for known in self._named().values()):
+        if room and len(self._named([*self._rooms, room])) > len(self._named(self._rooms)):
             self._rooms.append(room)
 
-    def _named(self) -> dict[str, int]:
-        """{name: keyframe} of the rooms; keyframes of crowded ground are forgotten, and others stand for them."""
-        known = self.survey.roadmap
-        left = [next((keyframe for keyframe in room if keyframe in known), None) for room in self._rooms]
-        return {f"room {number}": keyframe for number, keyframe in enumerate(left, 1) if keyframe is not None}
+    def _named(self, rooms: list[tuple[int, ...]]) -> dict[str, int]:
+        """{name: keyframe} of rooms; keyframes of crowded ground are forgotten, and others stand for them.
+
+        A room that was found twice, before the map told that it is one, has its first name; what turned out to be part
+        of a hallway has none.
+        """
+        rooms_now = filter(self.survey.is_room, self.survey.chambers())
+        chamber = {keyframe: number for number, own in enumerate(rooms_now) for keyframe in own}
+        found: dict[int, tuple[str, int]] = {}
+        for number, room in enumerate(rooms, 1):
+            keyframe = next((keyframe for keyframe in room if keyframe in chamber), None)
+            if keyframe is not None:
+                found.setdefault(chamber[keyframe], (f"room {number}", keyframe))
+        return dict(found.values())
 
     def places(self) -> dict[str, int]:
         """{name: keyframe that stands for it} of all places that have a name: rooms that were entered, and areas."""
-        named = self._named()
+        named = self._named(self._rooms)
         hybrid_map = self.hybrid_map
         for area in hybrid_map.area_ids():
             own = {k: pose for k, pose in hybrid_map.keyframes(area).items() if k in self.survey.roadmap}

@@ -7,7 +7,8 @@ can go straight. Both are kept up to date around the robot's area alone; what is
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -30,9 +31,9 @@ _UP_TO_DATE = 8.0
 _SEEN = _UP_TO_DATE + REACH
 # Keyframes of the roadmap are joined up to this distance, m; from one to the next the robot drove up to this one.
 _JOINED, _DROVE = 8.0, 1.5
-# Whether a keyframe is in a room those tell, too, that are so near; and so far it is at most across a room, m.
-_BESIDE, _ACROSS = 1.5, 8.0
-# Where fewer keyframes look like in a room, there is none.
+# Keyframes that are so near to one, m, may stand for it.
+_BESIDE = 1.5
+# Where fewer keyframes are in a chamber, there is no room.
 _FEW = 3
 
 
@@ -223,19 +224,40 @@ class Survey:
             way += self.path(way[-1], keyframe)[1:]
         return way
 
+    def chambers(self) -> list[set[int]]:
+        """The keyframes of hallways and of rooms, each one chamber.
+
+        Doors end a chamber, but for those behind which there is no hallway: what one gets to from a room alone, such as
+        by a gap between furniture, is part of that room.
+        """
+        parts = sorted(nx.connected_components(self._within_doors()), key=min)
+        number = {keyframe: k for k, part in enumerate(parts) for keyframe in part}
+        near = ((a, b) for a, b, length in self.roadmap.edges(data="length") if length <= _BESIDE)
+        beside: list[Counter[int]] = [Counter() for _ in parts]
+        for a, b in near:
+            if number[a] != number[b]:
+                beside[number[a]][number[b]] += 1
+                beside[number[b]][number[a]] += 1
+        rooms = {k for k, part in enumerate(parts) if self.is_room(part)}
+        whole = nx.empty_graph(len(parts))
+        within = (k for k in sorted(rooms) if beside[k] and rooms >= set(beside[k]))
+        whole.add_edges_from((k, beside[k].most_common(1)[0][0]) for k in within)
+        return [set().union(*(parts[k] for k in group)) for group in nx.connected_components(whole)]
+
     def room_of(self, keyframe: int) -> tuple[int, ...]:
-        """The keyframes around one, the nearest first, if half of them are in a room; else none."""
-        around = self._around(keyframe)
-        hallways = sum(self._outlooks[other].hallway for other in around)
-        return around if hallways <= 0.5 * len(around) else ()
+        """The keyframes around one, the nearest first, if its chamber is a room; none where that is a hallway."""
+        chamber = next((own for own in self.chambers() if keyframe in own), set())
+        return self._around(keyframe) if self.is_room(chamber) else ()
 
     def rooms(self) -> list[tuple[int, ...]]:
         """Of every room that was entered, the first one first, the keyframes around its middle as in `room_of`."""
-        rooms = nx.Graph(self._within_doors())
-        rooms.remove_nodes_from([keyframe for keyframe in rooms if self._outlooks[keyframe].hallway])
-        parts = sorted((part for part in nx.connected_components(rooms) if len(part) >= _FEW), key=min)
-        middles = (nx.barycenter(rooms.subgraph(part), weight="length")[0] for part in parts)
-        return [room for middle in middles if (room := self.room_of(middle))]
+        rooms = sorted((own for own in self.chambers() if len(own) >= _FEW and self.is_room(own)), key=min)
+        return [self._around(nx.barycenter(self.roadmap.subgraph(room), weight="length")[0]) for room in rooms]
+
+    def is_room(self, chamber: Collection[int]) -> bool:
+        """Whether half of a chamber looks like a room: the end of a hallway does, but not all of the hallway."""
+        hallways = sum(self._outlooks[keyframe].hallway for keyframe in chamber)
+        return len(chamber) > 0 and hallways <= 0.5 * len(chamber)
 
     def _around(self, keyframe: int) -> tuple[int, ...]:
         beside = {
@@ -247,14 +269,11 @@ class Survey:
 
     def _within_doors(self) -> nx.Graph:
         """The roadmap without ways through doors."""
-        return nx.subgraph_view(self.roadmap, filter_edge=lambda a, b: not self.roadmap.edges[a, b]["door"])
-
-    def same_room(self, one: int, other: int) -> bool:
-        """Whether a short way that passes no door leads from one keyframe to another."""
-        within = self._within_doors()
-        if one not in within or other not in within:
-            return False
-        return other in nx.single_source_dijkstra_path_length(within, one, cutoff=_ACROSS, weight="length")
+        ways = ((a, b, length) for a, b, length in self.roadmap.edges(data="length") if not self.roadmap[a][b]["door"])
+        within = nx.Graph()
+        within.add_nodes_from(self.roadmap)
+        within.add_weighted_edges_from(ways, weight="length")
+        return within
 
 
 def _is_near(place: Float64, pose: Float64) -> bool:
