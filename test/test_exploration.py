@@ -24,7 +24,7 @@ from hmt_slam_ros.features.doors import jambs_of, up_to_doors
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.logs.stamps import NANOSECONDS
 from hmt_slam_ros.motion import Command, Limits, command_towards
-from hmt_slam_ros.processes.errands import Errand, Heading, Outcome, Steering, errand_of
+from hmt_slam_ros.processes.errands import OF_EXPLORER, Errand, Heading, Outcome, Steering, errand_of
 from hmt_slam_ros.processes.messages import Accepted, Hypotheses, Keyframe, Leaf, LeafEstimate
 from hmt_slam_ros.processes.replica import Replica
 from hmt_slam_ros.sensing import Scan
@@ -361,8 +361,8 @@ def test_no_progress_for_long_is_noticed(seconds: float, stuck: bool) -> None:
 
 
 def test_errands_as_they_are_written() -> None:
-    assert errand_of("explore") == Errand("explore")
-    assert errand_of(" go room 3") == Errand("go", "room 3")
+    assert errand_of("explore", OF_EXPLORER) == Errand("explore")
+    assert errand_of(" go room 3", OF_EXPLORER) == Errand("go", "room 3")
     for text in ("go", "dance", "explore room 3", ""):
         with pytest.raises(HmtSlamError, match=f"'{text}' is no errand: give one of explore, backtrack, stop, or go"):
-            errand_of(text)
+            errand_of(text, OF_EXPLORER)

@@ -31,7 +31,7 @@ MESSAGES = Path(__file__).parent.parent / "docs" / "messages.md"
 SAID = {f"/{topic.lstrip('/')}" for topic in {*NAMED, *topics.DOCUMENTS.values(), *TRANSFORMS}} - {
     *("/initialpose", "/cmd_vel"),  # which are only heard
     "/ground_truth",  # of a robot that is driven
-    *("/explorer/errand", "/explorer/outcome", "/goal_pose"),  # of the explorer
+    *("/goal_pose", "/pilot/place"),  # of explorer and pilot
     "/hmt/notices",  # as there is nothing to complain of
 }
 

@@ -41,17 +41,11 @@ class Atlas:
 
     def hear(self, message: Message) -> None:
         """Take in a message of the chain, or a pose; between nodes scans may come after any of them."""
-        match message:
-            case Keyframe():
-                self.replica.add(message)
-            case Hypotheses():
-                self.replica.apply(message)
-            case Accepted():
-                self.replica.accept(message)
-            case RealTimePose():
-                self._pose = message
         if isinstance(message, Keyframe | Hypotheses | Accepted):
+            self.replica.hear(message)
             self._frames = None
+        elif isinstance(message, RealTimePose):
+            self._pose = message
 
     @property
     def hybrid_map(self) -> HybridMap:

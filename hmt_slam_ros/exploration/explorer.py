@@ -12,12 +12,11 @@ import math
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.exploration.atlas import Atlas
-from hmt_slam_ros.exploration.pilot import Pilot
+from hmt_slam_ros.exploration.pilot import Pilot, limits_of
 from hmt_slam_ros.exploration.route import Route
 from hmt_slam_ros.exploration.survey import Here, Opened
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.logs.stamps import NANOSECONDS
-from hmt_slam_ros.motion import Limits
 from hmt_slam_ros.processes.errands import Errand, Heading, Outcome, Steering
 from hmt_slam_ros.processes.messages import Message
 from hmt_slam_ros.processes.replica import Replica
@@ -45,10 +44,7 @@ class Explorer:
     def __init__(self, configuration: Configuration, known: Replica | None = None) -> None:
         """:param known: the map at first, None for none."""
         own = configuration.explorer
-        self._limits = Limits(
-            own.speed, math.radians(own.turn_rate), own.acceleration, math.radians(own.turn_acceleration), own.radius,
-            own.margin,
-        )  # fmt: skip
+        self._limits = limits_of(own)
         self._patience = round(NANOSECONDS * own.patience)
         self.atlas = Atlas(configuration, known)
         self._errand: Errand | None = None
@@ -134,7 +130,7 @@ class Explorer:
 
     def _done(self, text: str, *, reached: bool) -> list[Message]:
         assert self._errand is not None
-        outcome = Outcome(self._errand, reached, f"{self._errand.kind} {self._errand.place}".strip() + f": {text}")
+        outcome = Outcome(self._errand, reached, text)
         self._errand = self._route = None
         return [outcome]
 

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from hmt_slam_ros.arrays import Bool, Float64
+from hmt_slam_ros.configuration.explorer import Exploration
 from hmt_slam_ros.logs.stamps import NANOSECONDS
 from hmt_slam_ros.motion import Command, Limits, command_towards
 from hmt_slam_ros.sensing import Scan
@@ -20,6 +21,14 @@ _PASSED, _STEP = 3.0, 0.1
 _WAIT, _ONCE = 4 * NANOSECONDS, 1.0
 # Progress is this much less that is left, m.
 _PROGRESS = 0.3
+
+
+def limits_of(robot: Exploration) -> Limits:
+    """Those of the robot that the parameters describe."""
+    return Limits(
+        robot.speed, math.radians(robot.turn_rate), robot.acceleration, math.radians(robot.turn_acceleration),
+        robot.radius, robot.margin,
+    )  # fmt: skip
 
 
 class Pilot:

@@ -102,7 +102,11 @@ class Beginning:
         return self.part("map", MapDocument)
 
 
+def declare_map(node: ConfiguredNode) -> str:
+    """Path of the map, empty for none."""
+    return str(node.declare_parameter("start_from", "", _FROM).value)
+
+
 def declare_beginning(node: ConfiguredNode) -> tuple[str, bool]:
     """Path of the map, empty for none, and whether the robot may be anywhere in it."""
-    path = str(node.declare_parameter("start_from", "", _FROM).value)
-    return path, bool(node.declare_parameter("start_carried", True, _CARRIED).value)
+    return declare_map(node), bool(node.declare_parameter("start_carried", True, _CARRIED).value)

@@ -42,6 +42,7 @@ _PLANAR = np.ix_((0, 1, 5), (0, 1, 5))
 # Units in the last place by which a quaternion may be off, the smallest first.
 _NUDGES = ((0, 0), (1, 0), (-1, 0), (0, 1), (0, -1), (2, 0), (-2, 0), (0, 2), (0, -2))
 _TRAIL_FRAME = re.compile(r"hypothesis_(\d+)/scan_(\d+)")
+_AREA_FRAME = re.compile(r"area_(\d+)")
 _KEYFRAME_FRAME = re.compile(r"keyframe_(\d+)(?:/begun_(\d+))?")
 
 
@@ -167,6 +168,19 @@ def belief_from(message: PoseWithCovariance) -> PoseGaussian:
     sin, cos = math.sin(mean[2]), math.cos(mean[2])
     axes = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
     return PoseGaussian(mean, axes.T @ np.reshape(message.covariance, (6, 6))[_PLANAR] @ axes)
+
+
+def area_frame(area: int) -> str:
+    """Name of an area's frame."""
+    return f"area_{area}"
+
+
+def area_of(frame: str) -> int:
+    """The area that a frame is named after.
+
+    :raises HmtSlamError: where it is named after something else.
+    """
+    return int(_matched(_AREA_FRAME, frame)[1])
 
 
 def keyframe_frame(keyframe: int, begun: int = 0) -> str:

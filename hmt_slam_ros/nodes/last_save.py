@@ -10,13 +10,11 @@ import signal
 import time
 
 import rclpy
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.signals import uninstall_signal_handlers
 
 from hmt_slam_ros.nodes.departure import end_within
 from hmt_slam_ros.nodes.process_node import SAVING_PATIENCE, ProcessNode
-
-_POLL = 0.05  # s
+from hmt_slam_ros.nodes.running import spin_until
 
 
 def spin(node: ProcessNode) -> None:
@@ -35,17 +33,11 @@ def spin(node: ProcessNode) -> None:
 
 
 def _spin(node: ProcessNode) -> None:
-    """By an executor of its own: ``rclpy.spin`` shares one, and fails where the signal comes before it has it."""
-    if not rclpy.ok():
+    if not node.saves_at_end or not rclpy.ok():
+        spin_until(node)
         return
-    executor = SingleThreadedExecutor()
-    told = _Told() if node.saves_at_end else None
-    try:
-        executor.add_node(node)
-        while rclpy.ok() and not (told and (told.over or (told.at and node.saved_last()))):
-            executor.spin_once(timeout_sec=_POLL if told else None)
-    finally:
-        executor.shutdown()
+    told = _Told()
+    spin_until(node, lambda: told.over or (told.at is not None and node.saved_last()))
 
 
 class _Told:

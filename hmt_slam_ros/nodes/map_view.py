@@ -77,13 +77,11 @@ class MapView:
 
     def hear(self, message: Message) -> None:
         """Take in a message of the chain."""
+        if isinstance(message, Keyframe | Hypotheses | Accepted):
+            self._replica.hear(message)
         if isinstance(message, Keyframe):
-            self._replica.add(message)
             self.stamp = message.scan.stamp
-        elif isinstance(message, Hypotheses):
-            self._replica.apply(message)
         elif isinstance(message, Accepted):
-            self._replica.accept(message)
             if message.global_poses:
                 self._poses = {area.area: area.pose for area in message.global_poses}
             self.version += 1

@@ -48,7 +48,8 @@ class RtlNode(ProcessNode):
             self.figures.state["real-time scheduling"] = "yes" if take_precedence() else "not permitted"
 
     def _publish(self, pose: RealTimePose) -> None:
-        self._hmt_poses.publish(conversions.pose_with_covariance(pose.stamp, f"area_{pose.area}", pose.local))
+        area = conversions.area_frame(pose.area)
+        self._hmt_poses.publish(conversions.pose_with_covariance(pose.stamp, area, pose.local))
         self._poses.publish(conversions.pose_with_covariance(pose.stamp, self._map, pose.map_pose))
         settings = self.configuration.rtl
         if settings.publish_tf:

@@ -12,7 +12,7 @@ from typing import TypeVar
 
 import rclpy
 from rclpy.exceptions import NotInitializedException
-from rclpy.executors import ExternalShutdownException
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 
@@ -28,6 +28,8 @@ _PR_SET_PDEATHSIG = 1
 _GRACE = 8.0  # s
 # How long taking leave of the other nodes may take.
 _DEPARTURE = 2.0  # s
+# Between two looks whether a node is at its end for another reason than a signal.
+_POLL = 0.05  # s
 # What calls of rclpy raise whose context is gone; the last two where they find None in its place.
 _CONTEXT_LOST = (
     NotInitializedException,
@@ -58,6 +60,24 @@ def run(make: Callable[[], NodeType], spin: Callable[[NodeType], None]) -> int:
             node.destroy_node()
         rclpy.try_shutdown()
     return status
+
+
+def spin_until(node: Node, over: Callable[[], bool] | None = None) -> None:
+    """Spin a node until SIGINT or SIGTERM, or until it is at its end.
+
+    By an executor of its own: ``rclpy.spin`` shares one, and fails where the signal comes before it has it.
+
+    :param over: whether it is at its end, asked 20 times a second.
+    """
+    if not rclpy.ok():
+        return
+    executor = SingleThreadedExecutor()
+    try:
+        executor.add_node(node)
+        while rclpy.ok() and not (over and over()):
+            executor.spin_once(timeout_sec=_POLL if over else None)
+    finally:
+        executor.shutdown()
 
 
 def _live(

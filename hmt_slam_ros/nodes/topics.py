@@ -4,7 +4,9 @@ from hmt_slam_ros.processes.messages import Accepted, AreaEvents, Arriving, Hypo
 
 SCAN, ODOM, CLOCK = "scan", "odom", "/clock"
 COMMANDS, GROUND_TRUTH = "cmd_vel", "ground_truth"
-ERRANDS, OUTCOMES, GOALS = "explorer/errand", "explorer/outcome", "goal_pose"
+ERRANDS = {"explorer": "explorer/errand", "pilot": "pilot/errand"}
+OUTCOMES = {"explorer": "explorer/outcome", "pilot": "pilot/outcome"}
+GOALS, PLACE = "goal_pose", "pilot/place"
 KEYFRAMES, KEYFRAME_SCANS = "hmt/keyframes", "hmt/keyframe_scans"
 TRAIL = "hmt/trail"
 FINISHED = "hmt/finished"

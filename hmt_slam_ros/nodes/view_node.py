@@ -24,7 +24,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry.gaussian import ELLIPSE_95
 from hmt_slam_ros.nodes import qos
-from hmt_slam_ros.nodes.conversions import belief_from, planar_pose, stamp_of
+from hmt_slam_ros.nodes.conversions import area_of, belief_from, planar_pose, stamp_of
 from hmt_slam_ros.nodes.figures import Figures
 from hmt_slam_ros.nodes.running import run
 from hmt_slam_ros.nodes.topics import (
@@ -54,7 +54,6 @@ _LONGEST_STEP = 1.0  # s
 _MOST_AT_ONCE = 2000  # messages
 # What is ready may also be a timer or a service; after so many turns without a message there is none.
 _IDLE_TURNS = 3
-_AREA_FRAME = "area_"
 _SECOND = 1e9
 _ADDRESS = ParameterDescriptor(
     description="IP address that the page listens on; 127.0.0.1 for this computer alone, 0.0.0.0 for all.",
@@ -184,7 +183,7 @@ class ViewNode(Node):
         self.board.put("robot", pose)
 
     def _hear_hmt_pose(self, message: PoseWithCovarianceStamped) -> None:
-        self.board.put("area", message.header.frame_id.removeprefix(_AREA_FRAME))
+        self.board.put("area", str(area_of(message.header.frame_id)))
 
     def _hear_graph(self, message: MarkerArray) -> None:
         groups: dict[str, dict[int, Marker]] = {}

@@ -1,7 +1,8 @@
-"""What is said to the explorer, and what it says."""
+"""What is said to explorer and pilot, who drive the robot, and what they say."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -10,47 +11,59 @@ from numpy.typing import NDArray
 
 from hmt_slam_ros.errors import HmtSlamError
 
-_WITHOUT_PLACE = ("explore", "backtrack", "stop")
+Kind = Literal["explore", "go", "backtrack", "find", "stop"]
+
+OF_EXPLORER: tuple[Kind, ...] = ("explore", "backtrack", "stop", "go")
+"""Errands of the explorer."""
+
+OF_PILOT: tuple[Kind, ...] = ("find", "stop", "go")
+"""Errands of the pilot."""
 
 
 @dataclass(frozen=True, slots=True)
 class Errand:
-    """to explorer: what to do from now on.
+    """to explorer or pilot: what to do from now on.
 
     :ivar kind: "explore" until the building is known, "go" to a place, "backtrack" along the robot's own path until
-        told otherwise, "stop".
+        told otherwise, "find" out where the robot is, "stop".
     :ivar place: name of the place to go to, such as "room 3" or "area 12".
     """
 
-    kind: Literal["explore", "go", "backtrack", "stop"]
+    kind: Kind
     place: str = ""
 
 
-def errand_of(text: str) -> Errand:
+def errand_of(text: str, kinds: Sequence[Kind]) -> Errand:
     """The errand that is written as its kind and, where it has one, the name of the place.
 
+    :param kinds: those that there are.
     :raises HmtSlamError: for anything else.
     """
-    kind, _, place = text.strip().partition(" ")
-    if kind == "go" and place:
-        return Errand("go", place)
-    if kind in _WITHOUT_PLACE and not place:
-        return Errand(kind)  # type: ignore[arg-type]
-    raise HmtSlamError(f"'{text}' is no errand: give one of {', '.join(_WITHOUT_PLACE)}, or go and the name of a place")
+    word, _, place = text.strip().partition(" ")
+    for kind in kinds:
+        if kind == word and bool(place) == (kind == "go"):
+            return Errand(kind, place)
+    alone = ", ".join(kind for kind in kinds if kind != "go")
+    raise HmtSlamError(f"'{text}' is no errand: give one of {alone}, or go and the name of a place")
 
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """explorer -> who gave the errand: how it ended.
+    """explorer or pilot -> who gave the errand: how it ended.
 
     :ivar errand: which.
     :ivar reached: whether all was done that was to be done.
-    :ivar text: one sentence.
+    :ivar why: in a few words.
     """
 
     errand: Errand
     reached: bool
-    text: str
+    why: str
+
+    @property
+    def text(self) -> str:
+        """One sentence."""
+        return f"{self.errand.kind} {self.errand.place}".strip() + f": {self.why}"
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -69,7 +82,7 @@ class Heading:
 
 @dataclass(frozen=True, slots=True)
 class Steering:
-    """explorer -> robot: the velocities until the next scan; one for every scan.
+    """explorer or pilot -> robot: the velocities until the next scan; one for every scan, of the pilot amid an errand.
 
     :ivar stamp: of the scan, ns.
     :ivar speed: m/s.
@@ -79,3 +92,27 @@ class Steering:
     stamp: int
     speed: float
     turn_rate: float
+
+
+@dataclass(frozen=True, slots=True)
+class PlaceEstimate:
+    """pilot -> people and other programs: the belief over places, Eq. (1) of Tomatis et al. (2003); one for every scan.
+
+    :ivar stamp: of the scan, ns.
+    :ivar place: name of the most probable place, at which the robot was last, None for unknown ground.
+    :ivar heading: the direction in which it looks, "north", "east", "south" or "west", None likewise.
+    :ivar away: how far it is beyond the place, m.
+    :ivar probability: of the place with the direction of travel, or of unknown ground.
+    :ivar entropy: of the belief, Eq. (3), nats.
+    :ivar confident: whether that is below `places.max_entropy`.
+    :ivar room: name of the room behind the place in which the metric filter has it, None where that is not asked.
+    """
+
+    stamp: int
+    place: str | None
+    heading: str | None
+    away: float
+    probability: float
+    entropy: float
+    confident: bool
+    room: str | None

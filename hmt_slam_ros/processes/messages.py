@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from hmt_slam_ros.agreement import Clutter
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.processes.errands import Errand, Heading, Outcome, Steering
+from hmt_slam_ros.processes.errands import Errand, Heading, Outcome, PlaceEstimate, Steering
 from hmt_slam_ros.processes.map_parts import (
     Arc,
     ArcEnds,
@@ -355,4 +355,5 @@ Message = (
     | Heading
     | Outcome
     | Steering
+    | PlaceEstimate
 )

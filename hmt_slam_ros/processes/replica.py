@@ -87,6 +87,16 @@ class Replica:
         """The most probable hypothesis; of equals the oldest."""
         return min(self.probabilities, key=lambda h: (-self.probabilities[h], h))
 
+    def hear(self, message: Keyframe | Hypotheses | Accepted) -> None:
+        """Take in a message of the chain, for one who has no decision in it."""
+        match message:
+            case Keyframe():
+                self.add(message)
+            case Hypotheses():
+                self.apply(message)
+            case Accepted():
+                self.accept(message)
+
     def add(self, keyframe: Keyframe) -> None:
         """Store a keyframe in the maps of the hypotheses that want it."""
         for leaf in keyframe.leaves:

@@ -1,0 +1,138 @@
+"""What explorer and pilot share: they hear scans, poses and errands, drive the robot and say how errands end."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from geometry_msgs.msg import PoseWithCovarianceStamped, Twist
+from sensor_msgs.msg import LaserScan
+from std_msgs.msg import String
+
+from hmt_slam_ros.compilation import tell_of_compilation
+from hmt_slam_ros.errors import HmtSlamError
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.nodes import conversions, qos
+from hmt_slam_ros.nodes.beginning import Beginning, declare_map
+from hmt_slam_ros.nodes.managed_node import ManagedNode
+from hmt_slam_ros.nodes.parameters import declare_frame, declare_laser_pose
+from hmt_slam_ros.nodes.running import run, spin_until
+from hmt_slam_ros.nodes.topics import COMMANDS, ERRANDS, HMT_POSE, OUTCOMES, SCAN
+from hmt_slam_ros.nodes.transforms import LaserMounting
+from hmt_slam_ros.processes.errands import Kind, Outcome, Steering, errand_of
+from hmt_slam_ros.processes.messages import Message, RealTimePose
+from hmt_slam_ros.processes.routing import Process
+
+_NOTHING = PoseGaussian.exactly(np.zeros(3))
+# Of so many scans a transform is missing before that is told.
+_UNMOUNTED = 20
+
+
+class ErrandNode(ManagedNode):
+    """A node whose process drives the robot on errands.
+
+    :ivar map_frame: name of the frame.
+    """
+
+    def __init__(self, name: str, kinds: Sequence[Kind]) -> None:
+        """Declare the parameters.
+
+        :param name: of the node.
+        :param kinds: of errands.
+        """
+        self._name, self._kinds = name, kinds
+        super().__init__(name)
+
+    def declare(self) -> None:
+        """Declare frames, the laser's pose and the map to begin with."""
+        self.map_frame, self._base = declare_frame(self, "map", "map"), declare_frame(self, "base", "base_link")
+        self._laser_pose = declare_laser_pose(self)
+        self._start_from = declare_map(self)
+
+    def beginning(self) -> Beginning:
+        """What the node begins with.
+
+        :raises HmtSlamError: for a map that cannot be.
+        """
+        return Beginning(self, self._start_from, carried=True)
+
+    def listen(self, process: Process, *, drives: bool = True) -> None:
+        """Begin to hear all that the process hears of the robot and of people.
+
+        :param drives: whether it gives commands.
+        """
+        self._process, self._unmounted = process, 0
+        tell_of_compilation(self.get_logger().info)
+        self._commands = self.create_publisher(Twist, COMMANDS, qos.STREAM) if drives else None
+        self._outcomes = self.create_publisher(String, OUTCOMES[self._name], qos.LATCHED)
+        self._mounting = LaserMounting(self, self._base, self._laser_pose, _nothing, _nothing)
+        self.create_subscription(PoseWithCovarianceStamped, HMT_POSE, self._hear_pose, qos.NEWEST)
+        self.create_subscription(LaserScan, SCAN, self._hear_scan, qos.NEWEST)
+        self.create_subscription(String, ERRANDS[self._name], self._hear_errand, qos.STREAM)
+
+    def stand_still(self) -> None:
+        """Let the robot stand."""
+        if self._commands is not None:
+            self._commands.publish(Twist())
+
+    def hear(self, message: Message) -> None:
+        """Let the process hear a message, and say what it answers."""
+        said: list[Message] = []
+        with self.figures.timed(message, said):
+            said += self._process.handle(message)
+        for answer in said:
+            self.say(answer)
+
+    def say(self, message: Message) -> None:
+        """Publish what the process says."""
+        if isinstance(message, Outcome):
+            self._outcomes.publish(String(data=message.text))
+            self.get_logger().info(message.text)
+        elif isinstance(message, Steering) and self._commands is not None:
+            command = Twist()
+            command.linear.x, command.angular.z = message.speed, message.turn_rate
+            self._commands.publish(command)
+
+    def _hear_pose(self, message: PoseWithCovarianceStamped) -> None:
+        try:
+            area = conversions.area_of(message.header.frame_id)
+        except HmtSlamError as fault:
+            self.figures.warn(f"{HMT_POSE}: {fault}")
+            return
+        belief, stamp = conversions.belief_from(message.pose), conversions.stamp_of(message.header.stamp)
+        self.hear(RealTimePose(stamp, area, _NOTHING, belief, _NOTHING, np.zeros(3), np.zeros((3, 3))))
+
+    def _hear_scan(self, message: LaserScan) -> None:
+        if not self.active:
+            return
+        self.figures.received["Scan"] += 1
+        mounted = self._mounting.of(message.header.frame_id)
+        if mounted is None:
+            self._unmounted += 1
+            if self._unmounted == _UNMOUNTED:
+                self.figures.warn(self._mounting.complaint(message, self._unmounted))
+            return
+        self.hear(conversions.scan_from(message, mounted.laser_pose, mounted.side))
+
+    def _hear_errand(self, message: String) -> None:
+        try:
+            errand = errand_of(message.data, self._kinds)
+        except HmtSlamError as fault:
+            self.figures.warn(str(fault))
+        else:
+            self.hear(errand)
+
+
+def _nothing(*_told: object) -> None:
+    """What the mounting tells is looked up when it is needed."""
+
+
+def _spin(node: ErrandNode) -> None:
+    node.begin()
+    spin_until(node)
+
+
+def run_errands(make: Callable[[], ErrandNode]) -> None:
+    """Run such a node, and exit."""
+    sys.exit(run(make, _spin))
