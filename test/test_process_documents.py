@@ -27,6 +27,7 @@ from hmt_slam_ros.processes.documents import (
     decode,
     encode,
 )
+from hmt_slam_ros.processes.errands import PlaceEstimate
 from hmt_slam_ros.processes.messages import (
     Accepted,
     AreaEvents,
@@ -53,6 +54,7 @@ KINDS = (
     SavedPart,
     BeginRequest,
     BegunPart,
+    PlaceEstimate,
 )
 NUMBERS = st.floats(allow_nan=False, allow_infinity=False)
 

@@ -1,4 +1,4 @@
-"""Parameters of the explorer."""
+"""Parameters of those who drive the robot: the explorer and the pilot."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from hmt_slam_ros.configuration.parameter import parameter
 
 @dataclass(frozen=True)
 class Exploration:
-    """The explorer: the robot that it drives, and when it gives something up."""
+    """The explorer: the robot, which the pilot drives as well, and when it gives something up."""
 
     drive: str = parameter(
         "velocities",
@@ -33,4 +33,14 @@ class Exploration:
     )
     patience: float = parameter(
         15.0, "A goal is given up to which the robot has not come nearer for so long.", unit="s", low=1.0, high=600.0
+    )
+
+
+@dataclass(frozen=True)
+class Piloting:
+    """The pilot, who goes by the belief over places: whether it drives the robot, and when it gives up."""
+
+    drives: bool = parameter(True, "Take errands and drive; otherwise only say where the robot is that others drive.")
+    patience: float = parameter(
+        300.0, "An errand is given up that takes longer.", unit="s", low=1.0, high=1e5
     )

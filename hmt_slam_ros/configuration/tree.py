@@ -13,7 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-from hmt_slam_ros.configuration.explorer import Exploration
+from hmt_slam_ros.configuration.explorer import Exploration, Piloting
 from hmt_slam_ros.configuration.features import Features
 from hmt_slam_ros.configuration.live import RealTimeLocalization, Robot
 from hmt_slam_ros.configuration.metric import Filter, LocalMap, Matching, Motion
@@ -55,6 +55,7 @@ class Configuration:
     rtl: RealTimeLocalization = field(default_factory=RealTimeLocalization)
     robot: Robot = field(default_factory=Robot)
     explorer: Exploration = field(default_factory=Exploration)
+    pilot: Piloting = field(default_factory=Piloting)
 
 
 class Rule(NamedTuple):

@@ -2,23 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from hmt_slam_ros.arrays import Float64
+from hmt_slam_ros.configuration.tree import Configuration
+from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.places.chart import DOOR, Chart
+from hmt_slam_ros.local_map.local_mapping import LocalMapping
+from hmt_slam_ros.places.area_views import AreaViews
+from hmt_slam_ros.places.chart import DOOR, Chart, chart_of
 from hmt_slam_ros.places.leading_off import LeadingOff
-from hmt_slam_ros.places.place_graph import PlaceGraph
+from hmt_slam_ros.places.place_graph import DIRECTION_NAMES, PlaceGraph
 from hmt_slam_ros.sensing import Scan
 from hmt_slam_ros.topology.hybrid_map import HybridMap
 from hmt_slam_ros.topology.surroundings import Nearness, areas_around, stacked
 
-# Areas whose place is known this well, m, and whose keyframes are this near, m, are the surroundings of an area.
-_NEARNESS = Nearness(0.3, 3.0)
+NEARNESS = Nearness(0.3, 3.0)
+"""Areas whose place is known this well, m, and whose keyframes are this near, m, are the surroundings of an area."""
+
 # A keyframe so far behind a door, m, and beside its middle up to this share of that, was taken in the door's room.
 _BEHIND, _ASIDE = (0.8, 4.0), 0.6
 
@@ -38,9 +43,24 @@ class KnownBuilding:
     hybrid_map: HybridMap
     scans: Mapping[int, Scan]
 
+    @classmethod
+    def of(cls, hybrid_map: HybridMap, scans: Mapping[int, Scan], configuration: Configuration) -> KnownBuilding:
+        """Make the chart of a map.
+
+        :raises HmtSlamError: where no place is in it.
+        """
+        views = AreaViews(LocalMapping(configuration), scans).of_map(hybrid_map)
+        chart = chart_of(hybrid_map, views, configuration.features)
+        if not chart.edges:
+            raise HmtSlamError(
+                "the map has no door or crossing along a hallway, so that there is no place to be at: map a building "
+                "along its hallways, and see places.json of hmt_slam export"
+            )
+        return cls(chart, chart.graph(configuration.places), hybrid_map, scans)
+
     def surroundings(self, area: int) -> dict[int, Float64]:
         """{keyframe: ``area_T_base`` (3,)} of an area and those around it."""
-        around = areas_around(self.hybrid_map, area, _NEARNESS)
+        around = areas_around(self.hybrid_map, area, NEARNESS)
         return {
             keyframe: se2.compose(frame.mean, pose)
             for other, frame in around.items()
@@ -63,13 +83,25 @@ class Destination(NamedTuple):
 
 def destinations(known: KnownBuilding) -> dict[int, Destination]:
     """{node: the place behind its door}, where the robot was farthest in the room; of doors that it passed."""
-    found = {}
+    return {destination.node: destination for destination in _every(known)}
+
+
+def rooms(known: KnownBuilding) -> dict[str, Destination]:
+    """{name: the place in it}; "room 3" is behind "door 3", with a direction where there is one on either side."""
+    found = list(_every(known))
+    nodes = [destination.node for destination in found]
+    return {
+        f"room {one.node}" + f" {DIRECTION_NAMES[one.opening.direction]}" * (nodes.count(one.node) > 1): one
+        for one in found
+    }
+
+
+def _every(known: KnownBuilding) -> Iterator[Destination]:
     for number, node in enumerate(known.chart.nodes):
         for opening in node.openings if node.kind == DOOR else ():
             place = _behind(known, opening)
             if place is not None:
-                found[number] = Destination(number, opening, place)
-    return found
+                yield Destination(number, opening, place)
 
 
 def _behind(known: KnownBuilding, opening: LeadingOff) -> Float64 | None:

@@ -10,8 +10,8 @@ from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.offline.reading import LogState
 from hmt_slam_ros.persistence.hmt_map import HMT_MAP
 
-# Which part of a log is used, how it is played, and what is done with known ground.
-_FREE = ("robot.", "mode")
+# Which part of a log is used, how it is played, what is done with known ground, and who drives.
+_FREE = ("robot.", "mode", "explorer.", "pilot.")
 # Where a log begins that goes on.
 _START = "robot.start"
 # What the numbers in the state mean depends on these.

@@ -83,6 +83,10 @@ class Chart:
     seen: tuple[Node, ...]
     edges: tuple[Edge, ...]
 
+    def name(self, node: int) -> str:
+        """Such as "door 3"; the numbers are those of the nodes, of whatever kind."""
+        return f"{NAMES[self.nodes[node].kind]} {node}"
+
     def graph(self, places: Places) -> PlaceGraph:
         """The graph of places."""
         return place_graph(self.seen, self.edges, places)

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.persistence.folder import File
 from hmt_slam_ros.plain_data import Reader, Values, plain
+from hmt_slam_ros.processes.errands import PlaceEstimate
 from hmt_slam_ros.processes.map_parts import Outdated, Place
 from hmt_slam_ros.processes.messages import (
     Accepted,
@@ -195,6 +196,7 @@ _DOCUMENTS: dict[type, tuple[str, int]] = {
     SavedPart: ("saved_part", 1),
     BeginRequest: ("begin_request", 1),
     BegunPart: ("begun_part", 1),
+    PlaceEstimate: ("place_estimate", 1),
 }
 
 

@@ -45,6 +45,7 @@ HEARD_BY: dict[str, tuple[type, ...]] = {
     "tlca": (Keyframe, Hypotheses),
     "rtl": (Odometry, Arriving, LocalEstimate, Hypotheses, Accepted),
     "explorer": (Errand, Scan, RealTimePose, Keyframe, Hypotheses, Accepted),
+    "pilot": (Errand, Odometry, Scan, RealTimePose, Keyframe, Hypotheses, Accepted),
     "robot": (Steering, Outcome),
     "recorder": (Keyframe, Hypotheses, Accepted, Trail, LocalEstimate, Finished, Notice),
 }

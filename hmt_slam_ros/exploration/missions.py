@@ -1,0 +1,263 @@
+"""The pilot: says where the robot is by the belief over places, and gets it to rooms by that.
+
+Tomatis, Nourbakhsh and Siegwart (2003), sections 3.3 and 3.4. The belief is followed at every scan, whoever drives. At
+an opening, where it is confident, it tells metric SLAM where the robot is, if that does not have it there; behind the
+door of a mission the robot is steered by what RTL says.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+
+import numpy as np
+
+from hmt_slam_ros.arrays import Float64
+from hmt_slam_ros.configuration import Configuration
+from hmt_slam_ros.exploration.destinations import KnownBuilding, rooms
+from hmt_slam_ros.exploration.mission import MissionPilot, Phase
+from hmt_slam_ros.exploration.pilot import limits_of
+from hmt_slam_ros.exploration.told_pose import MetricProcesses, ToldPose
+from hmt_slam_ros.features.heading import QUARTER
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.logs.stamps import NANOSECONDS
+from hmt_slam_ros.places.observation_graph import QUARTERS
+from hmt_slam_ros.places.place_graph import DIRECTION_NAMES, state_of
+from hmt_slam_ros.places.position_belief import PositionBelief, certain_belief, flat_belief
+from hmt_slam_ros.places.switching import MetricStart, metric_start
+from hmt_slam_ros.processes.errands import Errand, Outcome, PlaceEstimate, Steering
+from hmt_slam_ros.processes.map_parts import Place
+from hmt_slam_ros.processes.messages import Carried, Message
+from hmt_slam_ros.processes.replica import Replica, ReplicaState
+from hmt_slam_ros.sensing import Odometry, Scan
+from hmt_slam_ros.sensing.motion import NO_STEP, Step, increment_covariance
+from hmt_slam_ros.sensing.odometry import OdometryBuffer
+
+# Scans that wait for odometry, at most.
+_WAITING = 50
+# Behind a door the robot goes on so far without the metric processes, m.
+_UNSEEN = 4.0
+# So far before the door, m, it is out of a room.
+_OUT = 0.6
+# A robot stands that went and turned no more than this since the last scan, m and rad, and waits for so long, ns.
+_GOES, _TURNS, _WAITS = 0.01, math.radians(1.0), 3 * NANOSECONDS
+# A scan that is stamped so much before the one before, ns, says that time went back.
+_BACK = NANOSECONDS
+
+
+class Missions:
+    """The pilot as a process. Consumes Errand, Odometry, Scan, RealTimePose and the chain; says Carried, and what
+    errands.py has.
+
+    :ivar rooms: {name: the place in it} to which it can be sent.
+    :ivar pilot: that drives.
+    """
+
+    def __init__(self, configuration: Configuration, saved: ReplicaState) -> None:
+        """:param saved: the map, with which the metric processes begin, too.
+
+        :raises HmtSlamError: where no place is in it.
+        """
+        replica = Replica.of(saved)
+        self._configuration = configuration
+        self._known = KnownBuilding.of(replica.maps[replica.best], replica.scans, configuration)
+        self._metric = MetricProcesses(Replica.of(saved))
+        self._limits = limits_of(configuration.explorer)
+        self._patience = round(NANOSECONDS * configuration.pilot.patience)
+        self._nothing = flat_belief(self._known.graph, configuration.places)
+        self.rooms = rooms(self._known)
+        self._begin()
+
+    def _begin(self) -> None:
+        """The robot may be anywhere, at any time."""
+        self._drive_anew(None)
+        self._readings = OdometryBuffer()
+        self._waiting: deque[Scan] = deque(maxlen=_WAITING)
+        self._stamp, self._odometry = 0, np.zeros(3)
+        self._errand: Errand | None = None
+        self._since: int | None = None
+        self._entered: ToldPose | None = None
+        self._told_at: int | None = None
+        self._seen_through: tuple[int, object] | None = None
+        self._room, self._step = "", NO_STEP
+
+    def _drive_anew(self, belief: PositionBelief | None) -> None:
+        self.pilot = MissionPilot(self._known, self._configuration, self._limits, belief, self._switch)
+
+    def handle(self, message: Message) -> list[Message]:
+        """Take in one message; a scan is answered as soon as odometry of its time is there."""
+        if isinstance(message, Errand):
+            return self._take(message)
+        said: list[Message] = []
+        self._metric.hear(message)
+        if isinstance(message, Odometry):
+            self._readings.add(message)
+        elif isinstance(message, Scan):
+            said += self._back_in_time(message.stamp)
+            self._waiting.append(message)
+        while self._waiting and self._readings.covers(self._waiting[0].stamp):
+            said += self._see(self._waiting.popleft())
+        return said
+
+    def _take(self, errand: Errand) -> list[Message]:
+        """Begin an errand in place of the one before."""
+        if not self._configuration.pilot.drives:
+            return [Outcome(errand, False, "pilot.drives is false, so others drive the robot: set it to true")]
+        if errand.kind == "go" and errand.place not in self.rooms:
+            choice = ", ".join(self.rooms) or "none, as the robot was in no room behind a door"
+            return [Outcome(errand, False, f"there is no such room: choose from {choice}")]
+        if errand.kind == "stop":
+            return self._stop()
+        self._errand, self._since = errand, None
+        if self.pilot.room is None or errand.kind == "go":
+            self.pilot.go(self.rooms.get(errand.place))
+        return []
+
+    def _stop(self) -> list[Message]:
+        """Let the robot stand, if it is on an errand."""
+        if self._errand is None:
+            return []
+        self.pilot.stop()
+        self._errand = None
+        return [Steering(self._stamp, 0.0, 0.0)]
+
+    def _back_in_time(self, stamp: int) -> list[Message]:
+        """Begin anew where time went back."""
+        if stamp > self._stamp - _BACK:
+            return []
+        errand, stopped = self._errand, self._stop()
+        self._begin()
+        ended = [] if errand is None else [Outcome(errand, False, "given up: time went back")]
+        return [*ended, *stopped]
+
+    def _see(self, scan: Scan) -> list[Message]:
+        """Follow the robot, and drive."""
+        odometry = self._readings.at(scan.stamp)
+        if odometry is None or scan.stamp <= self._stamp:
+            return []
+        self._move(odometry[0])
+        self._stamp = scan.stamp
+        self._metric.carry(scan.stamp)
+        command = self.pilot.steer(scan)
+        self._follow_out()
+        said = [self._estimate(), *self._at_opening(), *self._at_goal()]
+        if self._errand is None:
+            return said
+        ended = self._ended(self._errand)
+        if ended is not None:
+            return [*said, ended, *self._stop()]
+        stands = self._entered is not None
+        return [*said, Steering(scan.stamp, 0.0, 0.0) if stands else Steering(scan.stamp, *command[:2])]
+
+    def _move(self, odometry: Float64) -> None:
+        """The robot moved to where odometry has it now, ``odom_T_base`` (3,)."""
+        if self._stamp:
+            increment = se2.between(self._odometry, odometry)
+            self._step = Step(increment, increment_covariance(increment, self._configuration.motion))
+            self.pilot.moved(self._step)
+        self._odometry = odometry
+
+    def _switch(self, start: MetricStart) -> ToldPose:
+        """Go over to what the metric processes tell."""
+        assert self._errand is not None
+        self._room, self._told_at = self._errand.place, None
+        self._entered = ToldPose(self._metric, start)
+        return self._entered
+
+    def _at_goal(self) -> list[Message]:
+        """The robot stands before the door until the metric processes have it there, or do not find it.
+
+        They take what they are told for the place of the next scan.
+        """
+        entered = self._entered
+        if entered is None:
+            return []
+        out = self.pilot.room is not entered
+        late = self._told_at is not None and self._stamp - self._told_at > _WAITS
+        if entered.found or late or out:
+            self._entered = None
+        elif self._told_at is None and self._stands:
+            self._told_at = self._stamp
+            return [Carried(Place(entered.area, entered.belief))]
+        return []
+
+    def _at_opening(self) -> list[Message]:
+        """What an opening tells through which a robot looks that others drive, once, unless it is known."""
+        estimator = self.pilot.estimator
+        this = estimator.arrivals, estimator.facing
+        if self._errand is not None or self.pilot.room is not None or this == self._seen_through or self._turns:
+            return []
+        start = metric_start(estimator, self._known.chart)
+        if start is None:
+            return []
+        self._seen_through = this
+        known = self._metric.agreed(start.area, start.pose) is not None
+        return [] if known else [Carried(Place(start.area, start.pose))]
+
+    @property
+    def _turns(self) -> bool:
+        return abs(float(self._step.increment[2])) > _TURNS
+
+    @property
+    def _stands(self) -> bool:
+        return not self._turns and float(np.hypot(*self._step.increment[:2])) <= _GOES
+
+    def _estimate(self) -> PlaceEstimate:
+        estimator, chart = self.pilot.estimator, self._known.chart
+        belief = estimator.belief or self._nothing
+        facing = estimator.facing
+        share = float(belief.probabilities.max() if facing else belief.probabilities[-1])
+        return PlaceEstimate(
+            self._stamp, chart.name(facing[0]) if facing else None, DIRECTION_NAMES[facing[1]] if facing else None,
+            estimator.away if facing else 0.0, share, max(0.0, belief.entropy), belief.confident,
+            None if self.pilot.room is None else self._room,
+        )  # fmt: skip
+
+    def _follow_out(self) -> None:
+        """Where somebody drove the robot out of a room it is at the node before the door."""
+        room = self.pilot.room
+        if room is None or self._errand is not None:
+            return
+        node, opening, _ = self.rooms[self._room]
+        off = se2.between(opening.landmark.pose.mean, room.pose)
+        if off[0] > -_OUT:
+            return
+        state = state_of(node, (opening.direction - round(off[2] / QUARTER)) % QUARTERS)
+        room.release()
+        self._drive_anew(certain_belief(self._known.graph, self._configuration.places, state))
+
+    def _found(self, errand: Errand) -> bool:
+        """Whether it is known where the robot is, and that was asked."""
+        estimator = self.pilot.estimator
+        known = estimator.belief is not None and estimator.belief.confident and estimator.facing is not None
+        return errand.kind == "find" and (known or self.pilot.room is not None)
+
+    @property
+    def _somewhere(self) -> str:
+        """Where it is most probably."""
+        if self.pilot.room is not None:
+            return f"in {self._room}"
+        facing = self.pilot.estimator.facing
+        assert facing is not None
+        return f"at {self._known.chart.name(facing[0])}, looking {DIRECTION_NAMES[facing[1]]}"
+
+    def _ended(self, errand: Errand) -> Outcome | None:
+        """How an errand ended, if it did."""
+        if self._since is None:
+            self._since = self._stamp
+        room = self.pilot.room
+        if self._found(errand):
+            return Outcome(errand, True, f"the robot is {self._somewhere}")
+        if errand.kind == "go" and self.pilot.phase is Phase.THERE:
+            return Outcome(errand, True, "the robot is there")
+        if self.pilot.phase is Phase.LOST:
+            return Outcome(errand, False, "no way is known that leads there")
+        if isinstance(room, ToldPose) and (self._metric.silent or room.unseen > _UNSEEN):
+            how = "is silent" if self._metric.silent else "does not have the robot there"
+            return Outcome(
+                errand, False, f"given up at the door: rtl {how}; start the five processes from the same map, in mode "
+                "localization",
+            )  # fmt: skip
+        if self._stamp - self._since > self._patience:
+            return Outcome(errand, False, f"given up after {self._configuration.pilot.patience:g} s")
+        return None

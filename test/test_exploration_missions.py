@@ -1,0 +1,212 @@
+"""The pilot as a process on a small floor: what it says, and how it has metric SLAM begin at doors."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from small_floor import AREAS, CONFIGURATION, mapped, seen_at
+
+from hmt_slam_ros.configuration.flat import with_changes
+from hmt_slam_ros.errors import HmtSlamError
+from hmt_slam_ros.exploration.missions import Missions
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.processes.errands import OF_PILOT, Outcome, PlaceEstimate, Steering, errand_of
+from hmt_slam_ros.processes.messages import Carried, RealTimePose
+from hmt_slam_ros.processes.replica import Replica
+from hmt_slam_ros.sensing import Odometry
+from hmt_slam_ros.topology.hybrid_map import HybridMap
+
+PERIOD = 0.2
+BEGIN = 5_000_000_000
+KNOWN = np.diag([0.02, 0.02, 0.005]) ** 2
+NEW_AREA = 7
+"""Which the map has not: where metric SLAM maps that does not know where it is."""
+
+
+@pytest.fixture(scope="module")
+def saved():
+    hybrid_map, scans = mapped()
+    return Replica(scans, {0: hybrid_map}, {0: 1.0}, {0: 0}).state
+
+
+class Robot:
+    """It does what it is told, and RTL tells where it is: from the door on, always, never, or falsely."""
+
+    def __init__(self, missions, pose, rtl="always"):
+        self.missions, self.pose, self.odometry, self.rtl = missions, np.array(pose), np.zeros(3), rtl
+        self.rng, self.stamp = np.random.default_rng(0), BEGIN
+        self.velocity, self.said = np.zeros(3), []
+
+    def hear(self, message):
+        said = self.missions.handle(message)
+        self.said += said
+        for answer in said:
+            if isinstance(answer, Steering):
+                self.velocity = np.array([answer.speed, 0.0, answer.turn_rate])
+            if isinstance(answer, Carried) and self.rtl == "door":
+                self.rtl = "always"
+        return said
+
+    def told(self):
+        """What RTL says."""
+        area = int(self.pose[0] > 8.0)
+        pose = se2.between(AREAS[area], self.pose)
+        if self.rtl == "false":
+            pose = se2.compose(pose, np.array([-3.0, 0.0, 0.0]))
+        exactly = PoseGaussian.exactly(np.zeros(3))
+        return RealTimePose(
+            self.stamp, NEW_AREA if self.rtl == "door" else area, exactly, PoseGaussian(pose, KNOWN), exactly,
+            self.odometry, np.zeros((3, 3)),
+        )  # fmt: skip
+
+    def step(self, velocity=None):
+        """Odometry, pose and scan, and on; what the pilot says."""
+        said = self.hear(replace(seen_at(self.pose, self.rng), stamp=self.stamp))
+        said += self.hear(Odometry(self.stamp, self.odometry))
+        if self.rtl != "never":
+            said += self.hear(self.told())
+        increment = se2.exp(PERIOD * (self.velocity if velocity is None else np.array(velocity)))
+        self.pose, self.odometry = se2.compose(self.pose, increment), se2.compose(self.odometry, increment)
+        self.stamp += round(1e9 * PERIOD)
+        return said
+
+    def do(self, text, steps=600):
+        """How an errand ends."""
+        said = self.hear(errand_of(text, OF_PILOT))
+        for _ in range(steps):
+            for answer in said:
+                if isinstance(answer, Outcome):
+                    return answer
+            said = self.step()
+        return None
+
+    def starts(self):
+        return [message.place for message in self.said if isinstance(message, Carried)]
+
+    def estimate(self):
+        return next(message for message in reversed(self.said) if isinstance(message, PlaceEstimate))
+
+
+def off(place, pose):
+    return se2.between(place.pose.mean, se2.between(AREAS[place.area], pose))
+
+
+def the_room(missions):
+    (room,) = missions.rooms
+    return room
+
+
+def test_metric_slam_that_is_lost_begins_at_the_door_where_the_robot_stands_until_it_does(saved):
+    missions = Missions(CONFIGURATION, saved)
+    robot, room = Robot(missions, (12.0, 0.0, math.pi), rtl="door"), the_room(missions)
+    outcome = robot.do("go cellar")
+    assert (outcome.reached, outcome.text) == (False, f"go cellar: there is no such room: choose from {room}")
+    stood = []
+    robot.hear(errand_of(f"go {room}", OF_PILOT))
+    while not robot.starts():
+        stood.append(robot.pose)
+        robot.step()
+    (place,) = robot.starts()
+    assert np.abs(off(place, stood[-1])).max() < 0.05
+    np.testing.assert_allclose(stood[-1], stood[-2], atol=0.02)
+    outcome = robot.do(f"go {room}")
+    assert (outcome.reached, outcome.text) == (True, f"go {room}: the robot is there")
+    assert math.dist(robot.pose[:2], (5.0, 3.0)) < 0.3
+    assert len(robot.starts()) == 1
+    said = robot.estimate()
+    assert (said.place, said.room, said.confident) == (room.replace("room", "door"), room, True)
+    np.testing.assert_array_equal(robot.velocity, 0.0)
+    assert robot.do("find").text == f"find: the robot is in {room}"
+    assert robot.do(f"go {room}").reached
+
+
+def test_metric_slam_that_has_the_robot_at_the_door_is_told_nothing(saved):
+    missions = Missions(CONFIGURATION, saved)
+    robot = Robot(missions, (12.0, 0.0, math.pi))
+    assert robot.do(f"go {the_room(missions)}").reached
+    assert not robot.starts()
+
+
+@pytest.mark.parametrize(("rtl", "why"), [("never", "rtl is silent"), ("false", "rtl does not have the robot there")])
+def test_without_metric_slam_the_robot_does_not_go_far_behind_a_door(saved, rtl, why, monkeypatch):
+    monkeypatch.setattr("hmt_slam_ros.exploration.missions._UNSEEN", 1.0)
+    missions = Missions(CONFIGURATION, saved)
+    robot = Robot(missions, (12.0, 0.0, math.pi), rtl)
+    outcome = robot.do(f"go {the_room(missions)}")
+    assert not outcome.reached
+    assert why in outcome.text
+    assert "start the five processes from the same map" in outcome.text
+    assert robot.pose[1] < 2.0
+    np.testing.assert_array_equal(robot.velocity, 0.0)
+
+
+def test_where_others_drive_it_says_where_the_robot_is_and_what_a_door_tells_once(saved):
+    configuration = with_changes(CONFIGURATION, {"pilot.drives": False})
+    missions = Missions(configuration, saved)
+    robot, room = Robot(missions, (12.0, 0.0, math.pi), rtl="never"), the_room(missions)
+    assert "pilot.drives is false" in robot.do(f"go {room}").text
+    robot.said.clear()
+    robot.step()
+    assert robot.estimate().place is None
+    while robot.pose[0] > 5.0:
+        robot.step((0.6, 0.0, 0.0))
+    for _ in range(10):
+        robot.step((0.0, 0.0, -math.pi / 4.0))
+    assert (robot.estimate().place, robot.estimate().confident) == (room.replace("room", "door"), True)
+    at = []
+    while robot.pose[1] < 1.5:
+        at.append(robot.pose)
+        if any(isinstance(message, Carried) for message in robot.step((0.5, 0.0, 0.0))):
+            (place,) = robot.starts()
+            assert np.abs(off(place, at[-1])).max() < 0.1
+    assert len(robot.starts()) == 1
+    assert not any(isinstance(message, Steering) for message in robot.said)
+
+
+def test_it_finds_out_where_it_is_and_stops_when_told_or_when_it_takes_too_long(saved):
+    missions = Missions(with_changes(CONFIGURATION, {"pilot.patience": 2.0}), saved)
+    robot = Robot(missions, (14.0, 0.0, math.pi), rtl="never")
+    assert robot.do("find").text == "find: given up after 2 s"
+    np.testing.assert_array_equal(robot.velocity, 0.0)
+    robot.hear(errand_of("find", OF_PILOT))
+    robot.step()
+    robot.hear(errand_of("stop", OF_PILOT))
+    np.testing.assert_array_equal(robot.velocity, 0.0)
+    assert not any(isinstance(message, Steering) for message in robot.step())
+    robot = Robot(Missions(CONFIGURATION, saved), (14.0, 0.0, math.pi), rtl="never")
+    outcome = robot.do("find")
+    assert outcome.reached
+    assert outcome.text.startswith("find: the robot is at door ")
+
+
+def test_where_time_goes_back_the_robot_may_be_anywhere(saved):
+    missions = Missions(CONFIGURATION, saved)
+    robot = Robot(missions, (12.0, 0.0, math.pi), rtl="never")
+    assert robot.do("find").reached
+    robot.hear(errand_of("find", OF_PILOT))
+    robot.stamp -= 3_000_000_000
+    assert [answer.text for answer in robot.step() if isinstance(answer, Outcome)] == ["find: given up: time went back"]
+    robot.step()
+    assert robot.estimate().place is None
+
+
+def test_one_who_drives_the_robot_out_of_a_room_brings_it_before_the_door(saved):
+    missions = Missions(CONFIGURATION, saved)
+    robot, room = Robot(missions, (12.0, 0.0, math.pi)), the_room(missions)
+    assert robot.do(f"go {room}").reached
+    for _ in range(20):
+        robot.step((0.0, 0.0, math.pi / 4.0))
+    while robot.pose[1] > 0.2:
+        turn = se2.wrap(math.atan2(-robot.pose[1] - 1.0, 5.0 - robot.pose[0]) - robot.pose[2])
+        robot.step((0.5, 0.0, turn))
+    for _ in range(2):
+        robot.step((0.0, 0.0, 0.0))
+    said = robot.estimate()
+    assert (said.place, said.room, said.confident) == (room.replace("room", "door"), None, True)
+
+
+def test_a_map_without_places_is_refused():
+    with pytest.raises(HmtSlamError, match="no door or crossing along a hallway"):
+        Missions(CONFIGURATION, Replica({}, {0: HybridMap()}, {0: 1.0}, {0: 0}).state)
