@@ -10,7 +10,7 @@ from pathlib import Path
 from setuptools import find_packages, setup
 
 NAME = "hmt_slam_ros"
-NODES = ("slam", "aam", "tsbi", "tlca", "rtl", "robot", "view", "explorer")
+NODES = ("slam", "aam", "tsbi", "tlca", "rtl", "robot", "view", "explorer", "pilot")
 SHARED = ("launch", "config", "data/malaga_one_loop")
 
 

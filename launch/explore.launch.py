@@ -52,6 +52,9 @@ def generate_launch_description() -> LaunchDescription:
                 package="hmt_slam_ros",
                 executable="explorer",
                 parameters=[LaunchConfiguration("params_file"), {"use_sim_time": True}],
+                respawn=True,
+                respawn_delay=1.0,
+                respawn_max_retries=3,
                 **common,
             ),
         ]

@@ -1,7 +1,7 @@
 """Mapping with a live robot: the five processes, which want /scan, /odom and the transform from base to laser."""
 
-from launch import LaunchDescription
-from launch.actions import DeclareLaunchArgument
+from launch import LaunchContext, LaunchDescription
+from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.conditions import IfCondition
 from launch.substitutions import LaunchConfiguration, LaunchLogDir, PathJoinSubstitution
 from launch_ros.actions import Node
@@ -13,7 +13,7 @@ PROCESSES = ("slam", "aam", "tsbi", "tlca", "rtl")
 
 def generate_launch_description() -> LaunchDescription:
     """Describe the five process nodes, the live page and their arguments."""
-    return LaunchDescription([*_arguments(), *_processes(), _view()])
+    return LaunchDescription([*_arguments(), OpaqueFunction(function=_processes), _view()])
 
 
 def _arguments() -> list[DeclareLaunchArgument]:
@@ -24,6 +24,10 @@ def _arguments() -> list[DeclareLaunchArgument]:
         _switch("use_sim_time", "false", "Take the time from /clock, for a replay or a simulator."),
         DeclareLaunchArgument("namespace", default_value="", description="Namespace of the nodes and their topics."),
         DeclareLaunchArgument("start_from", default_value="", description="Saved map to go on from; empty for none."),
+        DeclareLaunchArgument(
+            "mode", default_value="", choices=["", "mapping", "localization", "lifelong"],
+            description="What is done with known ground; empty for what the YAML file says.",
+        ),
         _switch("start_carried", "true", "Whether the robot may be anywhere in that map; else it is where it was."),
         DeclareLaunchArgument("save_to", default_value="hmt_map", description="Folder for the service slam/save."),
         _switch("save_at_end", "false", "Whether the map is saved there before the nodes end."),
@@ -45,9 +49,11 @@ def _value(name: str, kind: type) -> ParameterValue:
     return ParameterValue(LaunchConfiguration(name), value_type=kind)
 
 
-def _processes() -> list[Node]:
+def _processes(context: LaunchContext) -> list[Node]:
     kinds = {"use_sim_time": bool, "start_from": str, "start_carried": bool}
     kinds |= {"save_to": str, "save_at_end": bool, "recovery": str, "autostart": bool}
+    chosen = LaunchConfiguration("mode").perform(context)
+    mode = {"mode": chosen} if chosen else {}
     return [
         Node(
             package="hmt_slam_ros",
@@ -55,7 +61,7 @@ def _processes() -> list[Node]:
             namespace=LaunchConfiguration("namespace"),
             parameters=[
                 LaunchConfiguration("params_file"),
-                {name: _value(name, kind) for name, kind in kinds.items()},
+                {name: _value(name, kind) for name, kind in kinds.items()} | mode,
             ],
             ros_arguments=["--log-level", LaunchConfiguration("log_level")],
             output="screen",

@@ -18,7 +18,7 @@ import yaml
 import hmt_slam_ros
 
 ROOT = Path(__file__).resolve().parent.parent
-NODES = ("slam", "aam", "tsbi", "tlca", "rtl", "robot", "view", "explorer")
+NODES = ("slam", "aam", "tsbi", "tlca", "rtl", "robot", "view", "explorer", "pilot")
 LAUNCH_FILES = sorted((ROOT / "launch").glob("*.launch.py"))
 
 

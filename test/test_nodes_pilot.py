@@ -1,0 +1,93 @@
+"""The pilot as an OS process over DDS, with the five processes and a simulated robot that it drives in a saved map."""
+
+import math
+import os
+import signal
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from door_floor import ROOM, in_hallway, scripted, write_world
+
+pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
+
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
+from std_msgs.msg import Bool, String
+
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.nodes import qos
+from hmt_slam_ros.nodes.conversions import planar_pose
+from hmt_slam_ros.nodes.topics import DIAGNOSTICS, INITIAL_POSE, IS_LOCALIZED, PLACE
+from hmt_slam_ros.processes.documents import decode
+from hmt_slam_ros.processes.errands import PlaceEstimate
+
+PROCESSES = ("slam", "aam", "tsbi", "tlca", "rtl")
+
+
+@pytest.fixture(scope="module")
+def mapped(tmp_path_factory):
+    """The world, and the folder of its map."""
+    folder = tmp_path_factory.mktemp("floor")
+    world, out = write_world(folder), folder / "out"
+    command = [sys.executable, "-m", "hmt_slam_ros.cli.main", "map", world, "--out", str(out)]
+    subprocess.run(command, check=True, timeout=120)
+    return world, out
+
+
+def test_it_goes_to_a_room_and_has_slam_begin_at_the_door(mapped, listener, start):
+    world, out = mapped
+    # Slam alone would not look for the robot before it is there.
+    shared = {"start_from": out, "mode": "localization", "tsbi__recheck_keyframes": 100}
+    outcomes = listener.hear(String, "pilot/outcome", qos.LATCHED)
+    places = listener.hear(String, PLACE, qos.LATCHED)
+    starts = listener.hear(PoseWithCovarianceStamped, INITIAL_POSE, qos.STREAM)
+    truths = listener.hear(PoseStamped, "ground_truth", qos.STREAM)
+    localized = listener.hear(Bool, IS_LOCALIZED, qos.LATCHED)
+    diagnostics = listener.hear(DiagnosticArray, DIAGNOSTICS, qos.STREAM)
+    pilot = start("pilot", **shared)
+    others = [start(name, **shared) for name in PROCESSES]
+    errands = listener.node.create_publisher(String, "pilot/errand", qos.STREAM)
+    listener.until(lambda: errands.get_subscription_count() == 1, alive=[pilot])
+    errands.publish(String(data="go cellar"))
+    errands.publish(String(data="dance"))
+    listener.until(lambda: outcomes, alive=[pilot])
+    sentence, _, room = outcomes[0].data.rpartition(" from ")
+    assert sentence == "go cellar: there is no such room: choose"
+    errands.publish(String(data=f"go {room}"))
+    robot = start(
+        "robot", log=world, robot__drive="commands", robot__rate=4.0, robot__start=in_hallway(world, 9.0),
+        robot__scan_listeners=2, robot__odometry_listeners=3, robot__patience=60.0,
+    )  # fmt: skip
+    listener.until(lambda: len(outcomes) == 2, alive=[pilot, robot, *others])
+    assert outcomes[1].data == f"go {room}: the robot is there"
+    assert math.dist(planar_pose(truths[-1].pose)[:2], ROOM) < 0.7
+    said = [value.value for m in diagnostics if m.status[0].name == "/pilot" for value in m.status[0].values]
+    assert "'dance' is no errand: give one of find, stop, or go and the name of a place" in said
+    last = decode(places[-1].data, PlaceEstimate)
+    assert (last.place, last.room, last.confident) == (room.replace("room", "door"), room, True)
+    # The map's frame is where the scripted drive began.
+    (begun,) = starts
+    assert begun.header.frame_id == "map"
+    true = next(planar_pose(m.pose) for m in truths if m.header.stamp == begun.header.stamp)
+    off = se2.between(se2.between(scripted(world)[1][0], true), planar_pose(begun.pose.pose))
+    assert np.abs(off).max() < 0.3, off
+    listener.until(lambda: localized[-1].data, alive=others)
+
+    # Killed, it begins anew: the robot may be anywhere, and stands.
+    os.kill(pilot.pid, signal.SIGKILL)
+    pilot.wait(10)
+    again = start("pilot", **shared)
+    listener.until(lambda: decode(places[-1].data, PlaceEstimate).place is None, alive=[again, robot, *others])
+    listener.spin(0.5)
+    anew = decode(places[-1].data, PlaceEstimate)
+    assert (anew.place, anew.room, anew.confident) == (None, None, False)
+    assert np.abs(planar_pose(truths[-1].pose) - planar_pose(truths[-20].pose)).max() < 1e-9
+
+
+def test_without_a_map_it_ends_with_a_sentence(start):
+    node = start("pilot")
+    sentence = "the pilot goes by the places of a map, and there is none: set start_from"
+    assert sentence in node.communicate(timeout=60)[1]
+    assert node.returncode == 2
