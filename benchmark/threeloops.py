@@ -41,9 +41,10 @@ POLICY = (
     f"certain to {LIMIT:g} m (`tsbi.prior_limit={LIMIT:g}`), which none is on the other side of such a loop: what "
     "closes has been proposed by landmarks, as the column without them shows. A proposal says how two areas lie to "
     f"each other; it is right where that is true to {NEAR:g} m and {TURN:g} degrees. It is asked for one at every "
-    "cut, so at many before there is a loop, where all proposals are false. A loop is closed at the first right "
-    "closure that is accepted; these are judged as in `loops`. In the paper a robot that was carried made the loops: "
-    "3 of 3 were detected, and nowhere else did two peaks move in the same way three times."
+    "cut at which an area is less certain than that, so at some before there is a loop, where all proposals are false. "
+    "A loop is closed at the first right closure that is accepted; these are judged as in `loops`. In the paper a "
+    "robot that was carried made the loops: 3 of 3 were detected, and nowhere else did two peaks move in the same way "
+    "three times."
 )
 
 
@@ -51,7 +52,7 @@ Heard = Callable[[HybridMap, MapLoop | None], None]
 
 
 class Proposal(NamedTuple):
-    """What landmarks said at a cut.
+    """What landmarks said at a cut at which they were asked.
 
     :ivar at: path length, m.
     :ivar error: of the proposed pose, m and degrees; None where nothing was proposed.
@@ -82,7 +83,7 @@ class Drive(NamedTuple):
 
     :ivar travelled: m.
     :ivar begins: path lengths at which the robot came back to known ground, m.
-    :ivar proposals: at every cut.
+    :ivar proposals: at every cut at which landmarks were asked.
     :ivar accepted: the closures.
     """
 

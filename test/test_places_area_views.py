@@ -64,6 +64,16 @@ def test_an_area_that_grew_shows_what_it_would_if_it_were_looked_up_at_once(area
     assert_same(found, views(scans).of(0, keyframes))
 
 
+def test_areas_are_looked_up_one_after_the_other(looked_up):
+    hybrid_map, scans = mapped(crossing_driven=False)
+    own, counts = views(scans), []
+    for _ in range(3):
+        own.look_up_one(hybrid_map)
+        counts.append(len(looked_up))
+    first, second = (len(hybrid_map.keyframes(area)) for area in (0, 1))
+    assert counts == [first, first + second, first + second]
+
+
 def test_where_keyframes_moved_or_were_taken_out_it_is_looked_up_anew(area, looked_up):
     keyframes, scans = area
     own = views(scans)

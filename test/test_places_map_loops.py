@@ -112,12 +112,12 @@ def test_the_way_leads_from_node_to_node_as_the_robot_went(twice):
 def test_what_is_proposed_is_supposed_and_told_once_and_stays_no_arc(twice):
     hybrid_map, scans = twice
     proposals = LoopProposals(CONFIGURATION, AreaViews(LocalMapping(CONFIGURATION), scans))
-    supposed = proposals.supposed(hybrid_map)
+    supposed = proposals.supposed(hybrid_map, 3)
     (notice,) = proposals.notices()
     (other,) = set(supposed.neighbours(3)) - {2}
     assert f"from area 3 to area 3 are those up to area {other}" in notice.text
     assert hybrid_map.neighbours(3) == [2]
-    proposals.supposed(hybrid_map)
+    proposals.supposed(hybrid_map, 3)
     assert not proposals.notices()
 
 
@@ -127,5 +127,5 @@ def test_where_an_arc_joins_the_two_nothing_is_proposed(twice):
     for known in (0, 1):
         closed.set_arc(3, known, PoseGaussian(se2.between(THIRD, AREAS[known]), 0.01 * np.eye(3)), closure=True)
     proposals = LoopProposals(CONFIGURATION, AreaViews(LocalMapping(CONFIGURATION), scans))
-    assert proposals.supposed(closed) is closed
+    assert proposals.supposed(closed, 3) is closed
     assert not proposals.notices()

@@ -10,8 +10,6 @@ from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.configuration.flat import with_changes
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.local_map.local_mapping import LocalMapping
-from hmt_slam_ros.places.area_views import AreaViews
 from hmt_slam_ros.places.map_loops import MapLoop
 from hmt_slam_ros.processes.loop_proposals import LoopProposals
 
@@ -24,11 +22,12 @@ LAP, LAST = 96, 120  # keyframes
 class Told(LoopProposals):
     """Proposes what it is told."""
 
-    def __init__(self, loop):
-        super().__init__(GATED, AreaViews(LocalMapping(GATED), {}))
-        self.loop = loop
+    def __init__(self, loop, configuration, views):
+        super().__init__(configuration, views)
+        self.loop, self.asked = loop, 0
 
     def proposed(self, _hybrid_map):
+        self.asked += 1
         return self.loop
 
 
@@ -38,10 +37,11 @@ def frame(run, poses, area):
     return se2.compose(poses[keyframe], se2.inverse(pose))
 
 
-def twice_into_the_first_corridor(shift):
+def twice_into_the_first_corridor(shift, proposing=GATED):
     """Once around and on; from where the ring closes on, a loop with the first area is proposed.
 
     :param shift: of what is proposed from what is true, m; None for no proposal.
+    :param proposing: configuration of who proposes.
     """
     run, poses = Run(RING, configuration=GATED, field_of_view=2 * np.pi, beams=241), ring_drive(LAST)
     for k, pose in enumerate(poses):
@@ -49,7 +49,7 @@ def twice_into_the_first_corridor(shift):
             own = run.replica.areas[run.replica.best]
             true = se2.between(frame(run, poses, own), frame(run, poses, 0))
             loop = MapLoop(own, 0, PoseGaussian(se2.compose(np.array((*shift, 0.0)), true), SPREAD), own)
-            run.tsbi._branching.loops = Told(loop)
+            run.tsbi._branching.loops = Told(loop, proposing, run.tsbi._branching.views)
         run.keyframe(pose, cut=7 if k and k % 14 == 0 else 0)
         if len(run.answers[-1].leaves) > 1:
             run.accept(run.replica.best)
@@ -68,6 +68,13 @@ def test_what_is_out_of_reach_by_the_arcs_is_closed_where_it_is_proposed():
     assert math.hypot(off[0], off[1]) < 0.1
     (notice,) = run.notices
     assert "from area 7 to area 7 are those up to area 0" in notice
+    assert run.tsbi._branching.loops.asked == 1
+
+
+def test_nothing_is_proposed_where_the_arcs_tell_where_all_areas_are():
+    run, _, closures = twice_into_the_first_corridor((0.0, 0.0), Configuration())
+    assert run.tsbi._branching.loops.asked == 0
+    assert not closures
 
 
 @pytest.mark.parametrize("shift", [(3.0, 0.0), (0.0, 6.0)])

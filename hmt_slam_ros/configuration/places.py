@@ -65,7 +65,7 @@ class Places:
         False, "Whether landmarks weigh the places where a robot may be that woke up somewhere or was carried."
     )
     prior_temper: float = parameter(
-        0.5, "Exponent on their likelihood where it speaks against a place, being made of the same scans as surfaces.",
+        0.2, "Exponent on their likelihood where it speaks against a place, being made of the same scans as surfaces.",
         low=0.0, high=1.0,
     )
     loops: bool = parameter(

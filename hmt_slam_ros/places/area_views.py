@@ -98,12 +98,26 @@ class AreaViews:
 
         :param keyframes: {keyframe: ``area_T_base`` (3,)}.
         """
-        held = self._views.get(area)
-        if held is None or not same_poses(held[0], keyframes):
+        held = self._held(area, keyframes)
+        if held is None:
             if not self._newest.is_begin_of(keyframes):
                 self._begin()
-            held = self._views[area] = dict(keyframes), self._newest.grown(keyframes, self.scans)
-        return held[1]
+            held = self._newest.grown(keyframes, self.scans)
+            self._views[area] = dict(keyframes), held
+        return held
+
+    def look_up_one(self, hybrid_map: HybridMap) -> None:
+        """Look up what one more area of a map shows, if there is one of which that is not kept."""
+        for area in hybrid_map.area_ids():
+            keyframes = hybrid_map.keyframes(area)
+            if self._held(area, keyframes) is None:
+                self.of(area, keyframes)
+                return
+
+    def _held(self, area: int, keyframes: Mapping[int, Float64]) -> AreaView | None:
+        """What an area shows, if it is kept and its keyframes are where they were."""
+        held = self._views.get(area)
+        return held[1] if held is not None and same_poses(held[0], keyframes) else None
 
 
 def _hallway(away: Float64, features: Features) -> tuple[float, float]:

@@ -12,14 +12,14 @@ is the belief of who goes the way backwards; a loop that shows in one direction 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.places.area_views import AreaViews
+from hmt_slam_ros.places.area_views import AreaView, AreaViews
 from hmt_slam_ros.places.chart import Chart, chart_of
 from hmt_slam_ros.places.observation import observation_model
 from hmt_slam_ros.places.place_graph import Edge, PlaceGraph
@@ -49,21 +49,35 @@ class MapLoop(NamedTuple):
     begin: int
 
 
+class _Charted(NamedTuple):
+    """A chart, and what it was made of."""
+
+    views: tuple[AreaView, ...]
+    arcs: tuple[tuple[int, int, bytes, bytes], ...]
+    chart: Chart
+
+    def is_of(self, views: Iterable[AreaView], arcs: tuple[tuple[int, int, bytes, bytes], ...]) -> bool:
+        """Whether it is made of these."""
+        return arcs == self.arcs and all(own is other for own, other in zip(self.views, views, strict=True))
+
+
 class MapLoops:
-    """Looks for loops in maps."""
+    """Looks for loops in maps; keeps the charts that were asked for last."""
 
     def __init__(self, configuration: Configuration, views: AreaViews) -> None:
         """:param views: what areas show."""
         self._features, self._places, self._views = configuration.features, configuration.places, views
         self._model = observation_model(configuration.places, configuration.features)
+        self._charts: dict[tuple[int, ...], _Charted] = {}
 
     def newest(self, hybrid_map: HybridMap) -> MapLoop | None:
         """The newest place of the robot's way that the map holds another time, as the belief says; None for none."""
+        kept, self._charts = self._charts, {}
         for last, before in _divisions(hybrid_map):
-            own = self._chart(last)
+            own = self._chart(last, kept)
             found = ways(last, own)
             if max(map(len, found), default=0) >= TRANSITIONS:
-                both = _beside(own, self._chart(before))
+                both = _beside(own, self._chart(before, kept))
                 graph = both.graph(self._places)
                 loops = [pair for way in found if (pair := self._smoothed(way, graph, len(own.nodes))) is not None]
                 if loops:
@@ -87,8 +101,16 @@ class MapLoops:
             if loop is not None and (loop.node < own) != (loop.other < own):
                 yield steps, loop
 
-    def _chart(self, hybrid_map: HybridMap) -> Chart:
-        return chart_of(hybrid_map, self._views.of_map(hybrid_map), self._features)
+    def _chart(self, hybrid_map: HybridMap, kept: Mapping[tuple[int, ...], _Charted]) -> Chart:
+        """The chart of a map, which may be one of those that were kept."""
+        views = self._views.of_map(hybrid_map)
+        every = ((a, b, arc.pose) for a, b, arc in hybrid_map.all_arcs())
+        arcs = tuple((a, b, pose.mean.tobytes(), pose.covariance.tobytes()) for a, b, pose in every)
+        found = kept.get(tuple(views))
+        if found is None or not found.is_of(views.values(), arcs):
+            found = _Charted(tuple(views.values()), arcs, chart_of(hybrid_map, views, self._features))
+        self._charts[tuple(views)] = found
+        return found.chart
 
 
 def _divisions(hybrid_map: HybridMap) -> Iterator[tuple[HybridMap, HybridMap]]:

@@ -13,6 +13,7 @@ from hmt_slam_ros.places.area_views import AreaViews
 from hmt_slam_ros.places.map_loops import MapLoop, MapLoops
 from hmt_slam_ros.processes.messages import Notice
 from hmt_slam_ros.topology.hybrid_map import HybridMap
+from hmt_slam_ros.topology.shortest_path import reached
 from hmt_slam_ros.topology.unknown import telling_arc
 
 PROBABLE = 0.5
@@ -29,7 +30,9 @@ class LoopProposals:
 
     def __init__(self, configuration: Configuration, views: AreaViews) -> None:
         """:param views: what areas show."""
-        self._loops = MapLoops(configuration, views)
+        self._loops, self._views = MapLoops(configuration, views), views
+        # Areas whose position is known this well, m, are told from others by the arcs, or looked for all the same.
+        self._told_by_arcs = min(configuration.places.spacing, configuration.tsbi.prior_limit)
         self._untold: list[MapLoop] = []
         self._told: set[tuple[int, int]] = set()
 
@@ -38,15 +41,30 @@ class LoopProposals:
         loop = self._loops.newest(hybrid_map)
         return None if loop is None or telling_arc(hybrid_map, loop.area, loop.other) is not None else loop
 
-    def supposed(self, hybrid_map: HybridMap) -> HybridMap:
-        """The map with an arc where one is proposed; the map itself where none is."""
-        loop = self.proposed(hybrid_map)
+    def supposed(self, hybrid_map: HybridMap, area: int) -> HybridMap:
+        """The map with an arc where one is proposed; the map itself where none is, and where the arcs know all.
+
+        :param area: the robot's.
+        """
+        loop = self.proposed(hybrid_map) if self._is_asked(hybrid_map, area) else None
         if loop is None:
             return hybrid_map
         self._untold.append(loop)
         supposed = hybrid_map.branch()
         supposed.set_arc(loop.area, loop.other, loop.pose, closure=False)
         return supposed
+
+    def look_ahead(self, hybrid_map: HybridMap, area: int) -> None:
+        """Between cuts, look up what one area shows, which the next cut would ask for.
+
+        :param area: the robot's.
+        """
+        if self._is_asked(hybrid_map, area):
+            self._views.look_up_one(hybrid_map)
+
+    def _is_asked(self, hybrid_map: HybridMap, area: int) -> bool:
+        """Whether the arcs leave open where an area is, seen from that of the robot."""
+        return len(reached(hybrid_map, area, self._told_by_arcs**2).areas) < len(hybrid_map.area_ids())
 
     def notices(self) -> list[Notice]:
         """What was proposed since this was asked last, each pair of areas once."""

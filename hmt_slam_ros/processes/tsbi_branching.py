@@ -196,10 +196,10 @@ class Branching:
         if tracked is not None:
             return Branches([self._enter_tracked(parent, query, tracked)])
         excluded = {parent.area, *parent.around()}
-        supposed = parent.hybrid_map
+        supposed = parent
         if self.loops is not None and parent.share >= PROBABLE:
-            supposed = self.loops.supposed(parent.hybrid_map)
-        found = self._compared(replace(parent, hybrid_map=supposed), query, excluded)
+            supposed = replace(parent, hybrid_map=self.loops.supposed(parent.hybrid_map, parent.area))
+        found = self._compared(supposed, query, excluded)
         noted = replace(parent, notes=parent.notes.checked(found.examined, keyframes, found.beside))
         children = [self._enter_new(noted, query, math.log(found.transition.new))]
         children += [self._enter_known(noted, query, fit) for fit in found.fits]
@@ -215,6 +215,8 @@ class Branching:
         keyframes = [k for k in (newest if only else parent.notes.unchecked) if k in placed]
         query = self.query(parent, keyframes)
         excluded = {parent.area, *parent.around(), *beside(parent.hybrid_map, parent.area)}
+        if self.loops is not None and parent.share >= PROBABLE:
+            self.loops.look_ahead(parent.hybrid_map, parent.area)
         found = self._compared(parent, query, excluded, only)
         notes = parent.notes.checked(found.examined, keyframes, found.beside, all_areas=not only)
         noted = replace(parent, notes=notes)
