@@ -66,19 +66,18 @@ class Features:
         0.8, "So far behind the wall an opening is free; niches are less deep.", unit="m", low=0.1, high=10.0
     )
     opening_bias: float = parameter(
-        3.7, "Log-odds of an opening as wide as what is seen of its wall, and up to either jamb, and all behind it.",
+        3.3, "Log-odds of an opening of which a metre of the wall, a metre at either jamb and all behind is seen.",
         unit="nat", low=-100.0, high=100.0,
     )
     opening_wall: float = parameter(
-        1.5, "How they change with the logarithm of what is seen of the wall, as a multiple of the width.", unit="nat",
-        low=-100.0, high=100.0,
+        0.8, "How they change with the logarithm of what is seen of the wall.", unit="nat", low=-100.0, high=100.0
     )
     opening_jambs: float = parameter(
-        1.0, "How they change with the logarithm of what is seen of the wall up to either jamb, likewise.", unit="nat",
+        1.3, "How they change with the logarithm of what is seen of the wall up to either jamb.", unit="nat",
         low=-100.0, high=100.0,
     )
     opening_share: float = parameter(
-        1.1, "How they change with the logarithm of the share of the width that is seen through.", unit="nat",
+        1.3, "How they change with the logarithm of the share of the width that is seen through.", unit="nat",
         low=-100.0, high=100.0,
     )
     landmark_reach: float = parameter(

@@ -6,8 +6,7 @@ opening where some of them go deep. A jamb is an end of the wall, or another wal
 of a hallway that another one leaves to the side; one of the two is an end of the wall.
 
 Furniture has ends, too, and so have people who stand in an opening. The log-odds of an opening are linear in the
-logarithms of what was seen of its wall, of its jambs, and of what is behind it, all relative to its width: between
-pieces shorter than the gap there is a gap by chance, and no wall that it is an opening of.
+logarithms of what was seen of its wall, of its jambs, and of what is behind it.
 """
 
 from __future__ import annotations
@@ -65,8 +64,8 @@ def openings_of(lines: Lines, rays: Rays, features: Features) -> Openings:
 def openings_and_evidence(lines: Lines, rays: Rays, features: Features) -> tuple[Openings, Float64]:
     """The openings, and what their confidences follow from.
 
-    :returns: the second of shape (n, 3), logarithms of what was seen of the wall, of both jambs together, by the width,
-        and of the share of the width that is seen through.
+    :returns: the second of shape (n, 3), logarithms of what was seen of the wall, m, of both jambs, m, together, and of
+        the share of the width that is seen through.
     """
     parameters = np.ascontiguousarray(lines.parameters)
     found = _openings(parameters, lines.covariances, rays, features.opening_depth, features.max_gap)
@@ -94,11 +93,10 @@ def openings_and_evidence(lines: Lines, rays: Rays, features: Features) -> tuple
 
 def _evidence(found: Float64, lines: Lines) -> Float64:
     """What speaks for gaps (n, 8) being openings, shape (n, 3)."""
-    seen, widths = np.zeros(len(lines)), found[:, _LAST] - found[:, _FIRST]
+    seen = np.zeros(len(lines))
     np.add.at(seen, lines.owners, lines.pieces[:, 1] - lines.pieces[:, 0])
-    walls = np.log(seen[found[:, _LINE].astype(np.int64)] / widths)
-    jambs = np.maximum(found[:, [_FIRST + SUPPORT, _LAST + SUPPORT]], _LEAST_JAMB)
-    jambs = np.log(jambs / widths[:, None]).sum(axis=1)
+    walls = np.log(seen[found[:, _LINE].astype(np.int64)])
+    jambs = np.log(np.maximum(found[:, [_FIRST + SUPPORT, _LAST + SUPPORT]], _LEAST_JAMB)).sum(axis=1)
     shares = np.log(np.maximum(found[:, _SHARE], _LEAST_SHARE))
     return np.stack((walls, jambs, shares), axis=1)
 
