@@ -37,7 +37,8 @@ class Atlas:
         # Of each room that was entered the keyframes around the place where it was, the nearest first.
         self._rooms: list[tuple[int, ...]] = []
         self.survey.look_everywhere(self.hybrid_map, self.replica.scans)
-        self.name_rooms()
+        for room in self.survey.rooms():
+            self._name(room)
 
     def hear(self, message: Message) -> None:
         """Take in a message of the chain, or a pose; between nodes scans may come after any of them."""
@@ -101,11 +102,6 @@ class Atlas:
         here = self.look()
         if here is not None:
             self._name(self.survey.room_of(here.keyframe))
-
-    def name_rooms(self) -> None:
-        """Give every room a name that was entered and has none."""
-        for room in self.survey.rooms():
-            self._name(room)
 
     def _name(self, room: tuple[int, ...]) -> None:
         if room and len(self._named([*self._rooms, room])) > len(self._named(self._rooms)):

@@ -171,7 +171,6 @@ class Explorer:
         if self._given_up and self._again:
             self._again, self._given_up = False, []
             return []
-        self.atlas.name_rooms()
         left = len(self._given_up)
         return self._done(f"all is known that can be reached; {left} places were given up", reached=True)
 
