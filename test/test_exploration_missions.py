@@ -32,7 +32,10 @@ def saved():
 
 
 class Robot:
-    """It does what it is told, and RTL tells where it is: from the door on, always, never, or falsely."""
+    """It does what it is told, and RTL tells where it is: always, from the door on, never, or elsewhere.
+
+    RTL that is lost has it in an area that the map has not.
+    """
 
     def __init__(self, missions, pose, rtl="always"):
         self.missions, self.pose, self.odometry, self.rtl = missions, np.array(pose), np.zeros(3), rtl
@@ -53,11 +56,11 @@ class Robot:
         """What RTL says."""
         area = int(self.pose[0] > 8.0)
         pose = se2.between(AREAS[area], self.pose)
-        if self.rtl == "false":
+        if self.rtl == "elsewhere":
             pose = se2.compose(pose, np.array([-3.0, 0.0, 0.0]))
         exactly = PoseGaussian.exactly(np.zeros(3))
         return RealTimePose(
-            self.stamp, NEW_AREA if self.rtl == "door" else area, exactly, PoseGaussian(pose, KNOWN), exactly,
+            self.stamp, NEW_AREA if self.rtl in {"door", "lost"} else area, exactly, PoseGaussian(pose, KNOWN), exactly,
             self.odometry, np.zeros((3, 3)),
         )  # fmt: skip
 
@@ -129,7 +132,7 @@ def test_metric_slam_that_has_the_robot_at_the_door_is_told_nothing(saved):
     assert not robot.starts()
 
 
-@pytest.mark.parametrize(("rtl", "why"), [("never", "rtl is silent"), ("false", "rtl does not have the robot there")])
+@pytest.mark.parametrize(("rtl", "why"), [("never", "rtl is silent"), ("lost", "rtl does not have the robot there")])
 def test_without_metric_slam_the_robot_does_not_go_far_behind_a_door(saved, rtl, why, monkeypatch):
     monkeypatch.setattr("hmt_slam_ros.exploration.missions._UNSEEN", 1.0)
     missions = Missions(CONFIGURATION, saved)
@@ -140,6 +143,23 @@ def test_without_metric_slam_the_robot_does_not_go_far_behind_a_door(saved, rtl,
     assert "start the five processes from the same map" in outcome.text
     assert robot.pose[1] < 2.0
     np.testing.assert_array_equal(robot.velocity, 0.0)
+
+
+def test_where_metric_slam_has_the_robot_elsewhere_the_belief_begins_anew_and_no_door_is_entered(saved):
+    missions = Missions(CONFIGURATION, saved)
+    robot, room = Robot(missions, (12.0, 0.0, math.pi), rtl="elsewhere"), the_room(missions)
+    robot.hear(errand_of(f"go {room}", OF_PILOT))
+    confident = []
+    for _ in range(250):
+        robot.step()
+        confident.append(robot.estimate().confident)
+        assert robot.pose[1] < 0.7
+    assert not robot.starts()
+    lost = confident.index(True)
+    assert not all(confident[lost:])
+    robot.rtl = "always"
+    assert robot.do(f"go {room}", 900).reached
+    assert math.dist(robot.pose[:2], (5.0, 3.0)) < 0.3
 
 
 def test_where_others_drive_it_says_where_the_robot_is_and_what_a_door_tells_once(saved):

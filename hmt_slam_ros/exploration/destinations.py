@@ -21,9 +21,8 @@ from hmt_slam_ros.sensing import Scan
 from hmt_slam_ros.topology.hybrid_map import HybridMap
 from hmt_slam_ros.topology.surroundings import Nearness, areas_around, stacked
 
-NEARNESS = Nearness(0.3, 3.0)
-"""Areas whose place is known this well, m, and whose keyframes are this near, m, are the surroundings of an area."""
-
+# Areas whose place is known this well, m, and whose keyframes are this near, m, are the surroundings of an area.
+_NEARNESS = Nearness(0.3, 3.0)
 # A keyframe so far behind a door, m, and beside its middle up to this share of that, was taken in the door's room.
 _BEHIND, _ASIDE = (0.8, 4.0), 0.6
 
@@ -60,7 +59,7 @@ class KnownBuilding:
 
     def surroundings(self, area: int) -> dict[int, Float64]:
         """{keyframe: ``area_T_base`` (3,)} of an area and those around it."""
-        around = areas_around(self.hybrid_map, area, NEARNESS)
+        around = areas_around(self.hybrid_map, area, _NEARNESS)
         return {
             keyframe: se2.compose(frame.mean, pose)
             for other, frame in around.items()

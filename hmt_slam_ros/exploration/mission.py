@@ -106,6 +106,14 @@ class MissionPilot:
         if self.room is not None:
             self.phase = Phase.ROOM if goal is self._room_of else Phase.LEAVING
 
+    def begin_anew(self, belief: PositionBelief) -> None:
+        """The robot is not before the door where its belief had it: it goes on along the hallway by another one."""
+        assert self.room is not None
+        self.room.release()
+        self.room = self._room_of = None
+        self.estimator.belief = belief
+        self._axis, self.phase = self.estimator.axis, Phase.TURN
+
     def stop(self) -> None:
         """Stand until the next mission."""
         self.phase = Phase.THERE

@@ -1,8 +1,8 @@
 """The pilot: says where the robot is by the belief over places, and gets it to rooms by that.
 
 Tomatis, Nourbakhsh and Siegwart (2003), sections 3.3 and 3.4. The belief is followed at every scan, whoever drives. At
-an opening, where it is confident, it tells metric SLAM where the robot is, if that does not have it there; behind the
-door of a mission the robot is steered by what RTL says.
+an opening, where it is confident, it tells metric SLAM where the robot is, if that does not know; behind the door of a
+mission the robot is steered by what RTL says.
 """
 
 from __future__ import annotations
@@ -167,7 +167,8 @@ class Missions:
     def _at_goal(self) -> list[Message]:
         """The robot stands before the door until the metric processes have it there, or do not find it.
 
-        They take what they are told for the place of the next scan.
+        They are told where it is if they do not know, and take that for the place of the next scan. Where they have it
+        elsewhere in the map the belief is taken for wrong, since surfaces say more than landmarks.
         """
         entered = self._entered
         if entered is None:
@@ -176,6 +177,9 @@ class Missions:
         late = self._told_at is not None and self._stamp - self._told_at > _WAITS
         if entered.found or late or out:
             self._entered = None
+        elif self._metric.told(entered.area) is not None and self._stands:
+            self._entered = None
+            self.pilot.begin_anew(self._nothing)
         elif self._told_at is None and self._stands:
             self._told_at = self._stamp
             return [Carried(Place(entered.area, entered.belief))]
@@ -191,7 +195,7 @@ class Missions:
         if start is None:
             return []
         self._seen_through = this
-        known = self._metric.agreed(start.area, start.pose) is not None
+        known = self._metric.told(start.area) is not None
         return [] if known else [Carried(Place(start.area, start.pose))]
 
     @property

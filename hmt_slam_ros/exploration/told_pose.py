@@ -12,7 +12,6 @@ import math
 import numpy as np
 
 from hmt_slam_ros.arrays import Float64
-from hmt_slam_ros.exploration.destinations import NEARNESS
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.chi_square import gate
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
@@ -23,7 +22,7 @@ from hmt_slam_ros.processes.replica import Replica
 from hmt_slam_ros.sensing import Odometry, Scan
 from hmt_slam_ros.sensing.motion import Step
 from hmt_slam_ros.sensing.odometry import OdometryBuffer
-from hmt_slam_ros.topology.surroundings import areas_around
+from hmt_slam_ros.topology.unknown import joined
 
 # Two beliefs over one pose agree with this probability, both known no better than this, m, m, rad.
 _AGREES = gate(0.999)
@@ -70,12 +69,16 @@ class MetricProcesses:
         return self._newest is None or self._stamp - self._newest.stamp > _SILENT
 
     def told(self, area: int) -> PoseGaussian | None:
-        """The belief over ``area_T_base``; None where they do not have the robot around that area of the map."""
+        """The belief over ``area_T_base``; None where they do not have the robot in the map.
+
+        Metric SLAM lays what is around the robot into the frame of the robot's area as the arcs have it, and matches
+        with that. So the pose relative to what is there is as good as the match, however long the way over the arcs is.
+        """
         hybrid_map = self._replica.maps[self._replica.best]
         if self._now is None or self._newest is None or not hybrid_map.has_area(area):
             return None
-        frame = areas_around(hybrid_map, area, NEARNESS).get(self._newest.area)
-        return None if frame is None else frame.compose(self._now)
+        frame = joined(hybrid_map, area).get(self._newest.area)
+        return None if frame is None else PoseGaussian.exactly(frame.mean).compose(self._now)
 
     def agreed(self, area: int, belief: PoseGaussian) -> PoseGaussian | None:
         """The same; None also where it contradicts another belief over ``area_T_base``."""
