@@ -112,7 +112,8 @@ class MissionPilot:
         self.room.release()
         self.room = self._room_of = None
         self.estimator.belief = belief
-        self._axis, self.phase = self.estimator.axis, Phase.TURN
+        # Its axis was the door's, along which one may see as far as along a hallway.
+        self._axis, self.phase = self._axis + 1, Phase.TURN
 
     def stop(self) -> None:
         """Stand until the next mission."""
