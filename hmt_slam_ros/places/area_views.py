@@ -82,8 +82,9 @@ class AreaViews:
 
     def forget(self) -> None:
         """Forget what areas show, which is looked up again where it is asked for."""
-        self._views.clear()
-        self._begin()
+        if self._views:
+            self._views.clear()
+            self._begin()
 
     def _begin(self) -> None:
         self._newest.release()
