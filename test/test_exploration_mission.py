@@ -116,3 +116,22 @@ def test_a_robot_that_gets_nowhere_turns_back_and_where_it_cannot_goes_on_howeve
         phases.append(pilot.phase)
         pilot.moved(Step(np.array((rng.normal(0.0, 0.02), 0.0, 0.0)), np.diag((1e-4, 1e-4, 1e-6))))
     assert [phase for phase, _ in itertools.groupby(phases)] == [Phase.HALLWAY, Phase.TURN, Phase.HALLWAY]
+
+
+def test_a_robot_that_left_a_room_looks_where_the_metric_filter_says(known):
+    goal = destinations(known)[node_at(known, 5.0)]
+    belief = certain_belief(known.graph, CONFIGURATION.places, state_of(goal.node, eastwards(known)))
+    robot = Robot(MissionPilot(known, CONFIGURATION, LIMITS, belief), (5.0, 0.0, 0.0))
+    assert list(robot.go(goal))[-1] is Phase.THERE
+    # Somebody made it turn at the end of its way out.
+    out = iter(robot.go(goal._replace(node=node_at(known, 10.0))))
+    while robot.pose[1] > 0.75:
+        assert next(out) is Phase.LEAVING
+    increment = np.array((0.0, 0.0, -robot.pose[2]))
+    robot.pose = robot.pose + increment
+    robot.pilot.moved(Step(increment, increment_covariance(increment, CONFIGURATION.motion)))
+    while robot.pilot.room is not None or robot.pilot.estimator.belief is None:
+        next(out)
+    looks = (eastwards(known) - round(float(robot.pose[2]) / (0.5 * math.pi))) % 4
+    assert looks != opposite(goal.opening.direction)
+    assert robot.pilot.estimator.facing == (goal.node, looks)

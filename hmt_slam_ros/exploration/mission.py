@@ -20,6 +20,7 @@ from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.exploration.destinations import Destination, KnownBuilding
 from hmt_slam_ros.exploration.pilot import Pilot
 from hmt_slam_ros.exploration.room import RoomFilter, RoomPose
+from hmt_slam_ros.features.heading import QUARTER
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.local_map.local_mapping import LocalMapping
 from hmt_slam_ros.logs.stamps import NANOSECONDS
@@ -27,7 +28,7 @@ from hmt_slam_ros.motion import Command, Limits, command_towards
 from hmt_slam_ros.places.estimator import PlaceEstimator
 from hmt_slam_ros.places.observation import observation_model
 from hmt_slam_ros.places.observation_graph import QUARTERS
-from hmt_slam_ros.places.place_graph import opposite, state_of
+from hmt_slam_ros.places.place_graph import state_of
 from hmt_slam_ros.places.policy import next_turn, turn_towards
 from hmt_slam_ros.places.position_belief import PositionBelief, certain_belief
 from hmt_slam_ros.places.switching import MetricStart, metric_start
@@ -264,11 +265,13 @@ class MissionPilot:
         return self._way.steer(scan, se2.transform(se2.inverse(self.room.pose), way), self._velocity)
 
     def _resume(self) -> None:
-        """Out of a room the robot is at the node before its door, and looks away from that."""
+        """Out of a room the robot is at the node before its door; where it looks, the metric filter knows."""
         assert self.room is not None
         assert self._room_of is not None
         assert self._goal is not None
-        state = state_of(self._room_of.node, opposite(self._room_of.opening.direction))
+        opening = self._room_of.opening
+        turned = round(float(se2.wrap(self.room.pose[2] - opening.landmark.pose.mean[2])) / QUARTER)
+        state = state_of(self._room_of.node, (opening.direction - turned) % QUARTERS)
         graph, places = self._known.graph, self._configuration.places
         self.room.release()
         self.room, self._room_of = None, None
