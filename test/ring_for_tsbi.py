@@ -53,7 +53,7 @@ class Run:
         self.evidence = {}
         self.stored = True
 
-    def keyframe(self, true_pose, cut=0, moved=None, merged=None):
+    def keyframe(self, true_pose, cut=0, moved=None, merged=None, mapping=True):
         """One keyframe event; ``cut`` is how many of the newest keyframes leave the area, in every hypothesis.
 
         :param merged: an area, and the one that it becomes part of.
@@ -74,7 +74,7 @@ class Run:
             )
             for h in sorted(self.poses)
         )  # fmt: skip
-        message = Keyframe(sequence, scan, 0.5 * sequence, leaves)
+        message = Keyframe(sequence, scan, 0.5 * sequence, leaves, mapping=mapping)
         assert self.tsbi.handle(message) == []
         self.replica.add(message)
         return self._answer(sequence, self._events(sequence, cut, moved, merged))

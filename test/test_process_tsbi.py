@@ -61,14 +61,15 @@ def test_the_local_map_holds_the_area_and_those_that_are_surely_near():
     assert np.allclose(leaf.local[1].pose, leaf.rebase.mean)
 
 
-def test_a_move_goes_to_the_known_area_and_no_keyframe_changes():
+@pytest.mark.parametrize("mapping", [True, False])
+def test_a_move_goes_to_the_known_area_and_no_keyframe_changes(mapping):
     run = Run(RING)
     poses = ring_drive(8)
     for pose in poses[:-1]:
         run.keyframe(pose)
     run.keyframe(poses[-1], cut=3)
     before = run.poses[0]
-    (leaf,) = run.keyframe(poses[-1], moved=0).leaves
+    (leaf,) = run.keyframe(poses[-1], moved=0, mapping=mapping).leaves
     assert (leaf.hypothesis, leaf.area, leaf.relabelled, leaf.arcs) == (0, 0, (), ())
     assert [local.area for local in leaf.local] == [0, 1]
     assert np.allclose(se2.compose(leaf.rebase.mean, before), se2.between(poses[0], poses[-1]))

@@ -219,7 +219,7 @@ class Tsbi:
         if self._reopened:
             return Branches([reopened(parent, leaf, keyframe.sequence) for leaf in self._reopened])
         if not keyframe.mapping and parent.notes.lost is None:
-            return Branches([displaced_or_not(parent, keyframe.sequence)])
+            return self._unmapped(parent, event, keyframe.sequence)
         if not any(notes.lost is not None for notes in self._notes.values()):
             displaced = with_displaced(self._branching, parent)
             if displaced is not None:
@@ -227,6 +227,13 @@ class Tsbi:
         if event is not None:
             return self._changed(parent, event)
         return self._go_on(parent, self._estimates[parent.hypothesis], keyframe.scan)
+
+    def _unmapped(self, parent: Parent, event: AreaEvent | None, sequence: int) -> Branches:
+        """The map stays as it is; the robot may go into another area of it, or be lost."""
+        child = displaced_or_not(parent, sequence)
+        if event is not None and event.kind == "moved" and child.notes.lost is None:
+            return self._branching.move(parent, event.area)
+        return Branches([child])
 
     def _changed(self, parent: Parent, event: AreaEvent) -> Branches:
         """Areas changed, or the robot its own."""
