@@ -68,8 +68,21 @@ def test_it_is_believed_to_be_where_two_looks_find_it():
     (still,) = tsbi_awakening.looked_for(branching, replace(parent, notes=notes)).children
     assert still.notes.sighted.area == 0
     _, found = tsbi_awakening.looked_for(branching, replace(parent, notes=still.notes)).children
-    assert (found.notes.lost, found.notes.claim) == (None, None)
+    assert (found.notes.lost, found.notes.claim, found.notes.found) == (None, None, 0)
     assert (found.arcs[0].source, found.arcs[0].target) == (2, 0)
+
+
+@pytest.mark.parametrize(("mapping", "area"), [(True, 1), (False, 0)])
+def test_where_nothing_is_stored_it_goes_over_into_the_area_where_it_was_recognized(mapping, area):
+    """Of what it mapped while it was lost one place alone is joined to the map."""
+    run, poses = Run(RING), ring_drive(8)
+    for pose in poses[:-1]:
+        run.keyframe(pose)
+    run.keyframe(poses[-1], cut=3)
+    run.tsbi._notes[0] = replace(run.tsbi._notes[0], found=0)
+    (leaf,) = run.keyframe(poses[-1], mapping=mapping).leaves
+    assert leaf.area == area
+    assert run.tsbi._notes[0].found is None
 
 
 def test_on_ground_that_nobody_knows_the_doubts_alone_speak_for_it():

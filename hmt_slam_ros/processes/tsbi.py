@@ -229,9 +229,17 @@ class Tsbi:
         return self._go_on(parent, self._estimates[parent.hypothesis], keyframe.scan)
 
     def _unmapped(self, parent: Parent, event: AreaEvent | None, sequence: int) -> Branches:
-        """The map stays as it is; the robot may go into another area of it, or be lost."""
-        child = displaced_or_not(parent, sequence)
-        if event is not None and event.kind == "moved" and child.notes.lost is None:
+        """The map stays as it is; the robot may go into another area of it, or be lost.
+
+        What it mapped while it was lost is joined to the map in one place alone and leads nowhere, so that it goes over
+        into the area where it was recognized as soon as that is sure.
+        """
+        child, found = displaced_or_not(parent, sequence), parent.notes.found
+        if child.notes.lost is not None:
+            return Branches([child])
+        if found is not None and len(self._notes) == 1 and parent.hybrid_map.has_area(found):
+            return self._branching.move(parent, found)
+        if event is not None and event.kind == "moved":
             return self._branching.move(parent, event.area)
         return Branches([child])
 
@@ -245,7 +253,7 @@ class Tsbi:
 
     def _go_on(self, parent: Parent, estimate: LeafEstimate, scan: Scan) -> Branches:
         """No area was left; but the robot may be in known ground that area abstraction does not know to be near."""
-        notes = parent.notes.seen_in(self._branching.astray(parent, estimate.pose.mean))
+        notes = replace(parent.notes.seen_in(self._branching.astray(parent, estimate.pose.mean)), found=None)
         parent = replace(parent, notes=notes)
         if notes.astray is not None and notes.astray[1] >= _ASTRAY:
             return self._branching.link(parent, notes.astray[0], scan, estimate.pose)

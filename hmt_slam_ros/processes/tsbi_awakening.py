@@ -133,7 +133,7 @@ def looked_for(branching: Branching, parent: Parent) -> Branches:
         return Branches([still], True, where=where)
     arc = Arc(parent.area, located.area, PoseGaussian.exactly(reference).compose(located.mode.measured.inverse()), True)
     log_weight = noted.log_weight + math.log(probability)
-    notes = replace(noted.notes, lost=None, told=None, sighted=None, claim=None, credit=0.0)
+    notes = replace(noted.notes, lost=None, told=None, sighted=None, found=located.area, claim=None, credit=0.0)
     found = Child(parent.hypothesis, log_weight, parent.area, notes, arcs=(arc,), reload=True)
     # What speaks for the place from here on is the other's.
     still_lost = replace(sighted, credit=None)

@@ -59,6 +59,7 @@ class LeafNotes:
     :ivar lost: the keyframe at which the robot arrived it is not known where, until that is recognized; else None.
     :ivar told: where one of the keyframes since then is, as somebody says; else None.
     :ivar sighted: where it was recognized at the last look, if it was.
+    :ivar found: the known area in which it was recognized, until it goes over into another one; else None.
     :ivar claim: where it was at ``lost`` if it was not displaced, as another hypothesis says; else None.
     :ivar credit: nats by which what it saw since then speaks for a place elsewhere, as far as that is in the
         hypothesis's weight; None where another one has it there since.
@@ -74,6 +75,7 @@ class LeafNotes:
     lost: int | None = None
     told: Told | None = None
     sighted: Spot | None = None
+    found: int | None = None
     claim: Spot | None = None
     credit: float | None = 0.0
 
