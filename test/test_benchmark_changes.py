@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from benchmark.changes import Visit, requirements, unchanged_by_localization, visited_twice
+from benchmark.changes import Localized, Visit, localized, requirements, visited_twice
 from benchmark.documents import VALIDATION, marks
 from benchmark.surfaces import Surfaces, judged, unexplained
 from hmt_slam_ros.offline.map_image import FREE, OCCUPIED, OccupancyImage
@@ -49,9 +49,9 @@ def test_cells_far_from_all_walls_are_unexplained():
 
 def test_what_falls_short_is_told():
     good = Visit(0.9, 0.05, 0.99, 0.0, 0.001, 0.02, 0.08, (100, 120), (5.0, 5.0))
-    assert all(asked.met for asked in requirements("quiet", [good], [100, 110, 112], same=True))
+    assert all(asked.met for asked in requirements("quiet", [good], [100, 110, 112], [Localized(True, 0.03, 0.09)]))
     bad = Visit(0.7, 0.2, 0.9, 0.003, 0.01, 0.05, 0.2, (100, 120), (5.0, 5.0))
-    assert not any(asked.met for asked in requirements("quiet", [bad], [100, 110, 120], same=False))
+    assert not any(asked.met for asked in requirements("quiet", [bad], [100, 110, 120], [Localized(False, 0.2, 0.3)]))
 
 
 def test_two_visits_are_measured():
@@ -63,8 +63,11 @@ def test_two_visits_are_measured():
     assert found.error < 0.1
 
 
-def test_localization_leaves_the_map_as_it_was():
-    assert unchanged_by_localization("busy", 1000, size=0.7, rate=1.0)
+def test_localization_leaves_the_map_as_it_was_and_follows_the_robot_through_all_of_it():
+    found = localized("busy", 0, size=0.7, rate=3.0)
+    assert found.same
+    assert found.error < 0.1
+    assert found.worst < 0.5
 
 
 def test_the_document_has_a_place_for_the_tables():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from worlds import box, scan_in
 
-from benchmark.changes import OneDrive
+from benchmark.one_drive import OneDrive
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.local_map.local_filter import PlacedKeyframe
 from hmt_slam_ros.offline.runtime import Run
