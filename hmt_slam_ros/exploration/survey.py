@@ -269,10 +269,9 @@ class Survey:
 
     def _within_doors(self) -> nx.Graph:
         """The roadmap without ways through doors."""
-        ways = ((a, b, length) for a, b, length in self.roadmap.edges(data="length") if not self.roadmap[a][b]["door"])
         within = nx.Graph()
         within.add_nodes_from(self.roadmap)
-        within.add_weighted_edges_from(ways, weight="length")
+        within.add_edges_from((a, b) for a, b, door in self.roadmap.edges(data="door") if not door)
         return within
 
 
