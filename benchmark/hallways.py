@@ -25,7 +25,7 @@ from hmt_slam_ros.simulation.scenario import Scenario
 
 Array = NDArray[np.float64]
 
-SEEDS = 4
+SEEDS = 20
 """Worlds of every family."""
 
 FAMILIES = ("office", "busy")
