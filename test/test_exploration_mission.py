@@ -43,11 +43,11 @@ class Robot:
         self.pilot, self.pose = pilot, np.array(pose)
         self.rng, self.stamp = np.random.default_rng(0), 0
 
-    def go(self, goal):
-        """The phases on the way."""
+    def go(self, goal, barred=None):
+        """The phases on the way, the hallway being barred there, m along it, where it is."""
         self.pilot.go(goal)
         for _ in range(STEPS):
-            scan = seen_at(self.pose, self.rng)
+            scan = seen_at(self.pose, self.rng, barred)
             self.stamp += 200_000_000
             command = self.pilot.steer(replace(scan, stamp=self.stamp))
             yield self.pilot.phase
@@ -104,6 +104,21 @@ def test_where_the_belief_is_wrong_there_is_no_door_and_the_robot_goes_on(known)
     order = list(dict.fromkeys(phases))
     assert order[:3] == [Phase.DOOR, Phase.TURN, Phase.HALLWAY]
     assert Phase.ROOM not in phases or math.dist(robot.pose[:2], (5.0, 3.0)) < 0.3
+
+
+def test_a_robot_turns_back_where_its_way_is_closed_and_goes_there_when_it_is_open_again(known):
+    goal = destinations(known)[node_at(known, 5.0)]
+    west = opposite(eastwards(known))
+    start = state_of(node_at(known, 16.0), west)
+    pilot = MissionPilot(known, CONFIGURATION, LIMITS, certain_belief(known.graph, CONFIGURATION.places, start))
+    robot = Robot(pilot, (16.0, 0.0, math.pi))
+    closed = {state_of(node_at(known, 10.0), west), state_of(node_at(known, 5.0), eastwards(known))}
+    barred = zip(range(300), robot.go(goal, barred=7.0), strict=False)
+    assert Phase.TURN in [phase for _, phase in barred]
+    assert robot.pilot.ways.closed == closed
+    assert robot.pose[0] > 7.3
+    assert list(robot.go(goal))[-1] is Phase.THERE
+    assert robot.pilot.ways.closed == frozenset()
 
 
 def test_a_robot_that_gets_nowhere_turns_back_and_where_it_cannot_goes_on_however_its_wheels_tremble(known):

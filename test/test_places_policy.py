@@ -40,6 +40,14 @@ def test_the_way_to_the_goal_is_the_shortest_one(square):
     assert turn_towards(square, state_of(3, EAST), 4) is None
 
 
+def test_a_way_that_is_closed_is_gone_only_where_no_other_leads_to_the_goal(square):
+    closed = {state_of(0, NORTH), state_of(2, SOUTH)}
+    assert turn_towards(square, state_of(0, EAST), 3, closed) == 0
+    belief = certain_belief(square, PLACES, state_of(0, EAST))
+    assert next_turn(belief, 3, MODEL, ahead=True, closed=closed) == 0
+    assert turn_towards(square, state_of(0, EAST), 3, closed | {state_of(0, EAST), state_of(1, WEST)}) == 3
+
+
 def test_a_robot_that_is_sure_heads_for_its_goal_and_one_in_unknown_ground_for_none(square):
     assert next_turn(certain_belief(square, PLACES, state_of(0, WEST)), 1, MODEL, ahead=True) == 2
     assert next_turn(certain_belief(square, PLACES, square.states), 1, MODEL, ahead=True) is None

@@ -32,6 +32,7 @@ from hmt_slam_ros.places.place_graph import state_of
 from hmt_slam_ros.places.policy import next_turn, turn_towards
 from hmt_slam_ros.places.position_belief import PositionBelief, certain_belief
 from hmt_slam_ros.places.switching import MetricStart, metric_start
+from hmt_slam_ros.places.watched_ways import WatchedWays
 from hmt_slam_ros.sensing import Scan
 from hmt_slam_ros.sensing.motion import Step
 
@@ -43,6 +44,9 @@ _BEHIND, _AT_PLACE = 0.6, 0.15
 _LOOKS, _PATIENCE, _PROGRESS = 15 * NANOSECONDS, 10 * NANOSECONDS, 0.3
 # It stands before a door so near to the middle of the hallway, m, and looks along an axis within this angle, rad.
 _MIDDLE, _STRAIGHT = 0.2, math.radians(10.0)
+# It looks along the ways around it where it is so far from where it did last, m, or stands for so long, ns; one that
+# turned back is at its last node again so far before that, m.
+_LOOK, _LOOK_AGAIN, _BACK = 0.5, 5 * NANOSECONDS, 0.2
 # Displacement of a robot that got on.
 _ELSEWHERE = np.array((_PROGRESS, 0.0, 0.0))
 _STAND = Command(0.0, 0.0, arrived=False)
@@ -65,22 +69,25 @@ class MissionPilot:
 
     :ivar estimator: of its place.
     :ivar phase: what it does.
+    :ivar ways: which of them are closed.
     :ivar room: the metric filter, where it is in a room.
     :ivar started: what that filter started with last.
     """
 
     def __init__(
         self, known: KnownBuilding, configuration: Configuration, limits: Limits, belief: PositionBelief | None = None,
-        begin: Callable[[MetricStart], RoomPose] | None = None,
+        begin: Callable[[MetricStart], RoomPose] | None = None, ways: WatchedWays | None = None,
     ) -> None:  # fmt: skip
         """:param belief: of a robot that begins at a node.
 
         :param begin: starts the metric filter; a filter of the room's own unless given.
+        :param ways: what is known of whether ways are open; nothing unless given.
         """
         self._known, self._configuration, self._limits = known, configuration, limits
         self._model = observation_model(configuration.places, configuration.features)
         self._begin = begin or partial(RoomFilter, LocalMapping(configuration), known)
         self.estimator = PlaceEstimator(known.graph, configuration, belief)
+        self.ways = ways or WatchedWays(known.graph, configuration.features)
         self.phase, self._before_door = Phase.THERE, False
         self.room: RoomPose | None = None
         self.started: MetricStart | None = None
@@ -88,6 +95,7 @@ class MissionPilot:
         self._room_of: Destination | None = None
         self._axis, self._along_hallway, self._here = 0, 0, (-1, False)
         self._since, self._gone = 0, _ELSEWHERE
+        self._looked, self._looked_from, self._turned_back = 0, _ELSEWHERE, False
         self._way = Pilot(limits, _AT_PLACE)
         self._velocity = (0.0, 0.0)
         self._drives = {
@@ -100,7 +108,7 @@ class MissionPilot:
 
         :param goal: None to go on along hallways, to find out where the robot is.
         """
-        self._goal = goal
+        self._goal, self._turned_back = goal, False
         self._way = Pilot(self._limits, _AT_PLACE)
         self._axis = self.estimator.axis
         self.phase = Phase.HALLWAY
@@ -123,7 +131,7 @@ class MissionPilot:
     def moved(self, step: Step) -> None:
         """The robot moved."""
         self.estimator.moved(step)
-        self._gone = se2.compose(self._gone, step.increment)
+        self._gone, self._looked_from = (se2.compose(each, step.increment) for each in (self._gone, self._looked_from))
         if self.room is not None:
             self.room.moved(step)
 
@@ -131,12 +139,25 @@ class MissionPilot:
         """The velocities until the next scan."""
         if self.room is None:
             self.estimator.observe(scan)
+            self._look(scan.stamp)
         else:
             self.room.observe(scan)
         drive = self._drives.get(self.phase)
         command = _STAND if drive is None else drive(scan)
         self._velocity = command.speed, command.turn_rate
         return command
+
+    def _look(self, stamp: int) -> None:
+        """See which ways are open around a robot that knows where it is."""
+        estimator = self.estimator
+        belief = estimator.belief
+        state = belief.most_likely if belief is not None and belief.confident else None
+        due = math.hypot(*self._looked_from[:2]) >= _LOOK or stamp - self._looked >= _LOOK_AGAIN
+        if state is None or not due or estimator.turning:
+            return
+        self._looked, self._looked_from = stamp, np.zeros(3)
+        clear = np.array([estimator.free(estimator.axis - quarter) for quarter in range(QUARTERS)])
+        self.ways.look(state, estimator.away, estimator.aside, clear)
 
     def _towards(self, scan: Scan, place: Float64) -> Command:
         return command_towards(scan, place, self._velocity, self._limits)
@@ -152,15 +173,27 @@ class MissionPilot:
             self.phase = Phase.TURN
             return self._around(scan)
         self._axis = self.estimator.axis
-        if arrived or here[1] > self._here[1]:
+        if arrived or here[1] > self._here[1] or (self._turned_back and self.estimator.away >= -_BACK):
             self._decide(scan)
         self._here = here
         if self.phase is not Phase.HALLWAY:
             return self._drives[self.phase](scan)
-        if self._held_up(scan):
-            self._turn(2)
-            self.phase = Phase.TURN
+        if self._held_up(scan) or self._goes_wrong():
+            self._turn_back()
         return self._towards(scan, self.estimator.ahead(_AHEAD))
+
+    def _goes_wrong(self) -> bool:
+        """Whether its way was seen to be closed, and there is another one."""
+        belief, goal, closed = self.estimator.belief, self._goal, self.ways.closed
+        state = belief.most_likely if belief is not None and belief.confident else None
+        if goal is None or state not in closed or self.estimator.away < 0.0:
+            return False
+        return bool(turn_towards(self._known.graph, state, goal.node, closed))
+
+    def _turn_back(self) -> None:
+        """Turn between two nodes; at the last one it is decided anew."""
+        self._turn(2)
+        self.phase, self._turned_back = Phase.TURN, self.estimator.belief is not None
 
     def _held_up(self, scan: Scan) -> bool:
         """Whether the robot has not got anywhere for long, nor tried another way."""
@@ -174,13 +207,17 @@ class MissionPilot:
         """What the most likely state policy says; straight on where it says nothing, and back at a wall."""
         belief, facing, goal = self.estimator.belief, self.estimator.facing, self._goal
         node = None if goal is None else goal.node
+        at_wall, self._turned_back = self.estimator.at_wall, False
+        if at_wall and belief is not None and belief.confident and not self.estimator.at_node:
+            self._turn_back()
+            return
         if goal is not None and belief is not None and belief.confident and facing is not None and facing[0] == node:
             self._along_hallway = self.estimator.axis
             self._turn((goal.opening.direction - facing[1]) % QUARTERS)
             self.phase, self._since, self._before_door = Phase.DOOR, scan.stamp, False
             return
-        at_wall = self.estimator.at_wall
-        quarters = None if belief is None else next_turn(belief, node, self._model, ahead=not at_wall)
+        closed = self.ways.closed
+        quarters = None if belief is None else next_turn(belief, node, self._model, ahead=not at_wall, closed=closed)
         quarters = 2 if at_wall and not quarters else quarters
         if quarters and not (belief is not None and belief.confident) and not self._leads_on(quarters):
             quarters = self._freest(quarters)
@@ -277,7 +314,7 @@ class MissionPilot:
         self.room, self._room_of = None, None
         self.estimator = PlaceEstimator(graph, self._configuration, certain_belief(graph, places, state))
         self._here = 0, False
-        quarters = turn_towards(graph, state, self._goal.node)
+        quarters = turn_towards(graph, state, self._goal.node, self.ways.closed)
         self._turn(quarters or 0)
         self.phase = Phase.LOST if quarters is None else Phase.TURN
 

@@ -25,6 +25,7 @@ from hmt_slam_ros.places.observation_graph import QUARTERS
 from hmt_slam_ros.places.place_graph import DIRECTION_NAMES, state_of
 from hmt_slam_ros.places.position_belief import PositionBelief, certain_belief, flat_belief
 from hmt_slam_ros.places.switching import MetricStart, metric_start
+from hmt_slam_ros.places.watched_ways import WatchedWays
 from hmt_slam_ros.processes.errands import Errand, Outcome, PlaceEstimate, Steering
 from hmt_slam_ros.processes.map_parts import Place
 from hmt_slam_ros.processes.messages import Carried, Message
@@ -64,6 +65,7 @@ class Missions:
         self._metric = MetricProcesses(Replica.of(saved))
         self._limits = limits_of(configuration.explorer)
         self._patience = round(NANOSECONDS * configuration.pilot.patience)
+        self._ways = WatchedWays(self._known.graph, configuration.features)
         self._nothing = flat_belief(self._known.graph, configuration.places)
         self.rooms = rooms(self._known)
         self._begin()
@@ -82,7 +84,8 @@ class Missions:
         self._room, self._step = "", NO_STEP
 
     def _drive_anew(self, belief: PositionBelief | None) -> None:
-        self.pilot = MissionPilot(self._known, self._configuration, self._limits, belief, self._switch)
+        known, configuration = self._known, self._configuration
+        self.pilot = MissionPilot(known, configuration, self._limits, belief, self._switch, self._ways)
 
     def handle(self, message: Message) -> list[Message]:
         """Take in one message; a scan is answered as soon as odometry of its time is there."""

@@ -121,6 +121,11 @@ class PlaceEstimator:
         return float((self._pose[:2] - self._last.place) @ self._direction)
 
     @property
+    def aside(self) -> float:
+        """How far the robot is to the right of the hallway's middle, m."""
+        return float((self._middle - self._pose[:2]) @ self._left)
+
+    @property
     def turning(self) -> bool:
         """Whether the robot is on a turn that is not over yet."""
         return self._turned_at is not None

@@ -7,6 +7,7 @@ left after the next opening, if it saw there what each of its likely states has 
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import replace
 from itertools import pairwise
 
@@ -18,34 +19,39 @@ from hmt_slam_ros.places.observation_graph import QUARTERS, Landmarks, chosen
 from hmt_slam_ros.places.place_graph import PlaceGraph, node_of, turned
 from hmt_slam_ros.places.position_belief import PositionBelief
 
-# A quarter of a turn costs as much as so many metres.
-_TURN = 1.0
+# A quarter of a turn costs as much as so many metres, and so does a way that is closed: where no other leads to the
+# goal, that one may be open again.
+_TURN, _CLOSED = 1.0, 1e6
 # States of which it is worked out what the robot would see.
 _LIKELY = 8
 # Instead of a probability of 0.
 _NEVER = 1e-300
 
 
-def next_turn(belief: PositionBelief, goal: int | None, model: ObservationModel, *, ahead: bool) -> int | None:
+def next_turn(
+    belief: PositionBelief, goal: int | None, model: ObservationModel, *, ahead: bool, closed: Collection[int] = ()
+) -> int | None:
     """Quarters to the right that the robot has to turn before it goes on.
 
     :param belief: at a node.
     :param goal: node; None where the robot only wants to know where it is.
     :param ahead: whether the hallway leads on, as the robot sees it.
+    :param closed: states whose edges are not to be gone where others lead to the goal.
     :returns: None at the goal, where no way is known to lead there, and in unknown ground.
     """
     if goal is None or not belief.confident:
         return 0 if ahead else most_informative_turn(belief, model)
     state = belief.most_likely
-    return None if state is None else turn_towards(belief.graph, state, goal)
+    return None if state is None else turn_towards(belief.graph, state, goal, closed)
 
 
-def turn_towards(graph: PlaceGraph, state: int, goal: int) -> int | None:
+def turn_towards(graph: PlaceGraph, state: int, goal: int, closed: Collection[int] = ()) -> int | None:
     """The same for a robot that is in a state for certain, on the shortest way."""
     ways = networkx.DiGraph()
     for source in range(graph.states):
         if graph.following[source] >= 0:
-            ways.add_edge(source, int(graph.following[source]), length=float(graph.lengths[source]))
+            length = float(graph.lengths[source]) + (_CLOSED if source in closed else 0.0)
+            ways.add_edge(source, int(graph.following[source]), length=length)
         for quarters in (1, QUARTERS - 1):
             ways.add_edge(source, turned(source, quarters), length=_TURN)
     lengths, paths = networkx.single_source_dijkstra(ways, state, weight="length")

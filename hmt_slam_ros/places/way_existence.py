@@ -19,9 +19,12 @@ from hmt_slam_ros.places.observation_graph import QUARTERS
 from hmt_slam_ros.places.place_graph import opposite
 from hmt_slam_ros.places.wall_landmarks import Stretch
 
-# Length of a piece, how far a keyframe tells of a way, and how far from its middle it is at most, m. Sectors are 5
-# degrees wide, so that farther on the beams along the middle of a narrow hallway may meet its walls.
-_PIECE, _REACH, _MIDDLE = 0.5, 5.0, 0.5
+MIDDLE = 0.5
+"""So far from the middle of a way it is looked along at most, m."""
+
+# Length of a piece, and how far a keyframe tells of a way, m. Sectors are 5 degrees wide, so that farther on the beams
+# along the middle of a narrow hallway may meet its walls.
+_PIECE, _REACH = 0.5, 5.0
 
 _UNSEEN, _FREE, _BLOCKED = range(3)
 
@@ -31,25 +34,43 @@ def existence_of(floor: Floor, way: Stretch, features: Features) -> float:
 
     :param floor: with the keyframes around, the way being in its frame.
     """
-    pieces = max(1, round((way.end - way.begin) / _PIECE))
+    length = way.end - way.begin
     order = np.argsort(floor.keyframes, kind="stable")
-    ahead = _seen(floor, way, pieces)[order]
-    start = way.at + (way.begin + way.end) * DIRECTIONS[way.direction]
-    back = _seen(floor, way._replace(at=start, direction=opposite(way.direction)), pieces)[order, ::-1]
-    doubted = np.any((ahead == _BLOCKED) | (back == _BLOCKED), axis=0)
-    return min((_of_piece(np.maximum(ahead, back)[:, k], features) for k in np.flatnonzero(doubted)), default=1.0)
-
-
-def _seen(floor: Floor, way: Stretch, pieces: int) -> Int8:
-    """What each keyframe sees of each piece of a way, looking along it in its direction, shape (n, pieces)."""
     away = floor.places - way.at
     along = away @ DIRECTIONS[way.direction] - way.begin
     beside = away @ DIRECTIONS[(way.direction + 1) % QUARTERS]
-    clear = floor.clear[:, way.direction]
+    within = order[np.abs(beside[order]) <= MIDDLE]
+    ahead, back = (floor.clear[within, direction] for direction in (way.direction, opposite(way.direction)))
+    seen = seen_of_pieces(along[within], ahead, back, length)
+    doubted = np.flatnonzero(np.any(seen == _BLOCKED, axis=0))
+    return min((_of_piece(seen[:, k], features) for k in doubted), default=1.0)
+
+
+def seen_of_pieces(along: Float64, ahead: Float64, back: Float64, length: float) -> Int8:
+    """What looks from the middle of a way tell of each of its pieces, shape (n, pieces).
+
+    :param along: shape (n,), where they were taken, m from the way's begin.
+    :param ahead: shape (n,), how far one saw along it, m; ``back`` likewise.
+    """
+    pieces = max(1, round(length / _PIECE))
+    return np.maximum(_seen(along, ahead, length, pieces), _seen(length - along, back, length, pieces)[:, ::-1])
+
+
+def after_look(existence: Existence, seen: int, features: Features) -> Existence:
+    """That of a piece after a look that tells this of it; one that was deleted and is seen free is there anew."""
+    if seen == _BLOCKED:
+        return existence.after_miss(features)
+    if seen == _UNSEEN:
+        return existence
+    return existence.after_sight(1.0, features) if existence.probability >= features.landmark_least else Existence(1.0)
+
+
+def _seen(along: Float64, clear: Float64, length: float, pieces: int) -> Int8:
+    """What is seen of each piece by those who look along a way in its direction, shape (n, pieces)."""
     ends = along + np.minimum(clear, _REACH)
-    edges: Float64 = np.linspace(0.0, way.end - way.begin, pieces + 1)
+    edges: Float64 = np.linspace(0.0, length, pieces + 1)
     first, last = edges[None, :-1], edges[None, 1:]
-    ahead = (np.abs(beside) <= _MIDDLE)[:, None] & (last > along[:, None])
+    ahead = last > along[:, None]
     free = ahead & (last <= ends[:, None])
     blocked = ahead & (clear < _REACH)[:, None] & (first <= ends[:, None]) & (ends[:, None] < last)
     return np.where(blocked, _BLOCKED, np.where(free, _FREE, _UNSEEN)).astype(np.int8)
@@ -58,6 +79,6 @@ def _seen(floor: Floor, way: Stretch, pieces: int) -> Int8:
 def _of_piece(seen: Int8, features: Features) -> float:
     """Probability that a piece is there by what keyframes saw of it, in their order, shape (n,)."""
     existence = Existence(1.0)
-    for one in seen[seen != _UNSEEN].tolist():
-        existence = existence.after_miss(features) if one == _BLOCKED else existence.after_sight(1.0, features)
+    for one in seen.tolist():
+        existence = after_look(existence, one, features)
     return existence.probability

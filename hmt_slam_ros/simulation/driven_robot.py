@@ -17,7 +17,7 @@ from hmt_slam_ros.random_streams import Purpose, stream
 from hmt_slam_ros.sensing import Odometry, Scan
 from hmt_slam_ros.simulation.driver import ACCELERATION, TURN_ACCELERATION
 from hmt_slam_ros.simulation.people import Walkers
-from hmt_slam_ros.simulation.raycast import clearance
+from hmt_slam_ros.simulation.raycast import clearance, wall_index
 from hmt_slam_ros.simulation.scenario import START, Scenario
 from hmt_slam_ros.simulation.wheels import noised
 
@@ -64,6 +64,7 @@ class DrivenRobot:
         self._per_reading = math.ceil(period / _STEP)
         self._seconds = period / self._per_reading
         self._walkers = Walkers(scenario.people)
+        self._surfaces = scenario.surfaces
         self._command, self._held = (0.0, 0.0), 0
         self._touching = False
         self._step, self._reading = 0, 0
@@ -102,6 +103,11 @@ class DrivenRobot:
         self._at_scan = se2.compose(pose, se2.between(self.pose, self._at_scan))
         self.pose, self.velocity, self._touching = np.array(pose, dtype=np.float64), (0.0, 0.0), False
 
+    def close(self, walls: NDArray[np.float64]) -> None:
+        """Put up walls (n, 4) in the building in place of those of the last time, as in `Building`, m; people pass."""
+        own = self.scenario.surfaces.walls
+        self._surfaces = wall_index(np.concatenate((own, walls))) if len(walls) else self.scenario.surfaces
+
     def drive(self) -> None:
         """Drive on to the next odometry reading."""
         for _ in range(self._per_reading):
@@ -117,7 +123,7 @@ class DrivenRobot:
         if between:
             return reading, None
         laser = self.scenario.laser
-        distances = laser.distances(self.pose[None], self.scenario.surfaces, self.people)
+        distances = laser.distances(self.pose[None], self._surfaces, self.people)
         return reading, laser.scan(number, stamp, distances)
 
     def true_poses(self, stamps: NDArray[np.int64]) -> NDArray[np.float64]:
@@ -158,7 +164,7 @@ class DrivenRobot:
     def _free(self, pose: NDArray[np.float64]) -> NDArray[np.float64]:
         """How far the nearest surface is from its middle there and here, shape (2,), m."""
         places = np.array([pose[:2], self.pose[:2]])
-        walls = clearance(self.scenario.surfaces.walls, places)
+        walls = clearance(self._surfaces.walls, places)
         people = np.hypot(*(self.people[None, :, :2] - places[:, None]).transpose(2, 0, 1)) - self.people[:, 2]
         return np.minimum(walls, people.min(axis=1, initial=math.inf))
 
