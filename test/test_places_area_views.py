@@ -64,14 +64,26 @@ def test_an_area_that_grew_shows_what_it_would_if_it_were_looked_up_at_once(area
     assert_same(found, views(scans).of(0, keyframes))
 
 
-def test_areas_are_looked_up_one_after_the_other(looked_up):
+def test_areas_are_looked_at_ahead_so_many_keyframes_at_a_time(looked_up):
     hybrid_map, scans = mapped(crossing_driven=False)
-    own, counts = views(scans), []
-    for _ in range(3):
-        own.look_up_one(hybrid_map)
+    areas = [(area, hybrid_map.keyframes(area)) for area in hybrid_map.area_ids()]
+    own, counts, every = views(scans), [], sum(len(keyframes) for _, keyframes in areas)
+    while len(counts) < 2 or counts[-1] > counts[-2]:
+        own.look_ahead(areas, 7)
         counts.append(len(looked_up))
-    first, second = (len(hybrid_map.keyframes(area)) for area in (0, 1))
-    assert counts == [first, first + second, first + second]
+    assert counts == [*range(7, every, 7), every, every]
+    found = own.of_map(hybrid_map)
+    assert len(looked_up) == every
+    for area, keyframes in areas:
+        assert_same(found[area], views(scans).of(area, keyframes))
+
+
+def test_what_an_area_shows_in_two_maps_is_kept_for_both(area, looked_up):
+    keyframes, scans = area
+    own, other = views(scans), {k: se2.compose(np.array([0.5, 0.0, 0.0]), pose) for k, pose in keyframes.items()}
+    first = [own.of(0, each) for each in (keyframes, other)]
+    assert [own.of(0, each) for each in (keyframes, other)] == first
+    assert len(looked_up) == 2 * len(keyframes)
 
 
 def test_where_keyframes_moved_or_were_taken_out_it_is_looked_up_anew(area, looked_up):

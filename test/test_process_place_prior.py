@@ -10,6 +10,7 @@ from hmt_slam_ros.agreement import Agreement
 from hmt_slam_ros.configuration import Configuration, with_changes
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.local_map.area_landmarks import Growing
 from hmt_slam_ros.local_map.local_mapping import LocalMapping
 from hmt_slam_ros.places.area_views import AreaViews
 from hmt_slam_ros.processes.place_prior import PlacePrior
@@ -78,6 +79,26 @@ def test_what_speaks_against_places_weighs_them_with_an_exponent(drive):
     weighed = prior.weighed(where, hybrid_map, seen, before)
     np.testing.assert_allclose(weighed.probabilities, expected / (expected.sum() + 1.0 - 0.8005), rtol=1e-9)
     assert weighed.found is found
+
+
+def test_a_first_look_goes_without_landmarks_and_the_second_one_finds_them_gathered(drive, monkeypatch):
+    hybrid_map, scans, seen, before, true = drive
+    prior, found = place_prior(scans), (located(se2.compose(true, np.array([2.0, 0.0, 0.0]))),)
+    where, sighting = Whereabouts(found, np.array([0.8])), Growing.sighting
+    looked_at = []
+    monkeypatch.setattr(Growing, "sighting", lambda *asked: looked_at.append(asked) or sighting(*asked))
+    first = dict(list(seen.items())[:CONFIGURATION.tsbi.recheck_keyframes])
+    assert prior.weighed(where, hybrid_map, first, before) is where
+    assert not looked_at
+    steps = 2 * (CONFIGURATION.tsbi.recheck_keyframes - 1)
+    for _ in range(steps):
+        known = len(looked_at)
+        # Two hypotheses, whose maps are the same up to there.
+        prior.look_ahead([(hybrid_map, before), (hybrid_map.branch(), before)])
+        assert len(looked_at) - known <= math.ceil(before / steps)
+    assert len(looked_at) == before
+    assert prior.weighed(where, hybrid_map, seen, before).probabilities[0] < 0.8
+    assert len(looked_at) == before + len(seen)
 
 
 def test_where_keyframes_of_the_map_moved_it_is_looked_at_anew(drive):

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections import OrderedDict
+from collections.abc import Iterable, Mapping
 from itertools import islice
 from typing import NamedTuple
 
@@ -18,6 +19,9 @@ from hmt_slam_ros.local_map.local_mapping import LocalMapping
 from hmt_slam_ros.sensing import Scan
 from hmt_slam_ros.topology.hybrid_map import HybridMap
 from hmt_slam_ros.topology.surroundings import same_poses, stacked
+
+# Of an area that differs from hypothesis to hypothesis so many are kept.
+_VERSIONS = 4
 
 
 class AreaView(NamedTuple):
@@ -40,12 +44,15 @@ class AreaView(NamedTuple):
 
 
 class _GrowingView:
-    """What an area shows to which keyframes are added."""
+    """What an area shows to which keyframes are added.
+
+    :ivar keyframes: {keyframe: ``area_T_base`` (3,)} of those that were.
+    """
 
     def __init__(self, mapping: LocalMapping) -> None:
         self._features, self._area = mapping.configuration.features, Growing(mapping)
         self._found, self._around = LandmarkMap(self._features), list[Float64]()
-        self._keyframes: dict[int, Float64] = {}
+        self.keyframes: dict[int, Float64] = {}
 
     def release(self) -> None:
         """The area does not grow any more."""
@@ -53,16 +60,23 @@ class _GrowingView:
 
     def is_begin_of(self, keyframes: Mapping[int, Float64]) -> bool:
         """Whether an area of keyframes was this one before some were added."""
-        first = dict(islice(keyframes.items(), len(self._keyframes)))
-        return list(first) == list(self._keyframes) and same_poses(first, self._keyframes)
+        first = dict(islice(keyframes.items(), len(self.keyframes)))
+        return list(first) == list(self.keyframes) and same_poses(first, self.keyframes)
 
-    def grown(self, keyframes: Mapping[int, Float64], scans: Mapping[int, Scan]) -> AreaView:
-        """What the area shows after what it lacks of keyframes was added."""
-        for keyframe, pose in islice(keyframes.items(), len(self._keyframes), None):
+    def add(self, keyframes: Mapping[int, Float64], scans: Mapping[int, Scan], most: int) -> int:
+        """Add so many at most of the keyframes that it lacks; how many these were."""
+        before = len(self.keyframes)
+        for keyframe, pose in islice(keyframes.items(), before, before + most):
             sighting = self._area.sighting(scans[keyframe], pose)
             sighting.add_to(self._found)
             self._around.append(distances_around(sighting.rays))
-            self._keyframes[keyframe] = pose
+            self.keyframes[keyframe] = pose
+        return len(self.keyframes) - before
+
+    @property
+    def view(self) -> AreaView:
+        """What the area shows."""
+        keyframes = self.keyframes
         around, numbers = np.array(self._around), np.array(list(keyframes), dtype=np.int64)
         lengths = np.array([_hallway(away, self._features) for away in around]).reshape(-1, 2)
         return AreaView(tuple(self._found.landmarks), numbers, stacked(keyframes), around, *lengths.T)
@@ -77,12 +91,12 @@ class AreaViews:
 
     def __init__(self, mapping: LocalMapping, scans: Mapping[int, Scan]) -> None:
         self.scans, self.known, self._mapping = scans, AreaLandmarks(mapping), mapping
-        self._views: dict[int, tuple[dict[int, Float64], AreaView]] = {}
+        self._views: dict[int, OrderedDict[bytes, AreaView]] = {}
         self._newest = _GrowingView(mapping)
 
     def forget(self) -> None:
         """Forget what areas show, which is looked up again where it is asked for."""
-        if self._views:
+        if self._views or self._newest.keyframes:
             self._views.clear()
             self._begin()
 
@@ -101,24 +115,45 @@ class AreaViews:
         """
         held = self._held(area, keyframes)
         if held is None:
-            if not self._newest.is_begin_of(keyframes):
-                self._begin()
-            held = self._newest.grown(keyframes, self.scans)
-            self._views[area] = dict(keyframes), held
+            self._look_at(area, keyframes, len(keyframes))
+            held = self._views[area][_key(keyframes)]
         return held
 
-    def look_up_one(self, hybrid_map: HybridMap) -> None:
-        """Look up what one more area of a map shows, if there is one of which that is not kept."""
-        for area in hybrid_map.area_ids():
-            keyframes = hybrid_map.keyframes(area)
-            if self._held(area, keyframes) is None:
-                self.of(area, keyframes)
+    def look_ahead(self, areas: Iterable[tuple[int, Mapping[int, Float64]]], most: int) -> None:
+        """Look at so many keyframes at most of areas of which it is not kept what they show.
+
+        :param areas: with their keyframes as in `of`, in the order in which they are looked up.
+        """
+        for area, keyframes in areas:
+            if most <= 0:
                 return
+            if keyframes and self._held(area, keyframes) is None:
+                most -= self._look_at(area, keyframes, most)
+
+    def _look_at(self, area: int, keyframes: Mapping[int, Float64], most: int) -> int:
+        """Look at so many keyframes at most of an area, and keep what it shows after the last; how many these were."""
+        if not self._newest.is_begin_of(keyframes):
+            self._begin()
+        count = self._newest.add(keyframes, self.scans, most)
+        if len(self._newest.keyframes) == len(keyframes):
+            kept = self._views.setdefault(area, OrderedDict())
+            kept[_key(keyframes)] = self._newest.view
+            if len(kept) > _VERSIONS:
+                kept.popitem(last=False)
+        return count
 
     def _held(self, area: int, keyframes: Mapping[int, Float64]) -> AreaView | None:
         """What an area shows, if it is kept and its keyframes are where they were."""
-        held = self._views.get(area)
-        return held[1] if held is not None and same_poses(held[0], keyframes) else None
+        kept, key = self._views.get(area), _key(keyframes)
+        if kept is None or key not in kept:
+            return None
+        kept.move_to_end(key)
+        return kept[key]
+
+
+def _key(keyframes: Mapping[int, Float64]) -> bytes:
+    """What differs where other keyframes are in an area, or elsewhere in it."""
+    return np.array(list(keyframes), dtype=np.int64).tobytes() + stacked(keyframes).tobytes()
 
 
 def _hallway(away: Float64, features: Features) -> tuple[float, float]:

@@ -19,6 +19,9 @@ from hmt_slam_ros.topology.unknown import telling_arc
 PROBABLE = 0.5
 """Hypotheses of this probability are asked for loops."""
 
+# Keyframes that are looked at ahead, at a time.
+_AHEAD = 32
+
 _TEXT = (
     "landmarks on the way from area {} to area {} are those up to area {}: a loop is looked for there, and nothing is "
     "to do"
@@ -55,12 +58,13 @@ class LoopProposals:
         return supposed
 
     def look_ahead(self, hybrid_map: HybridMap, area: int) -> None:
-        """Between cuts, look up what one area shows, which the next cut would ask for.
+        """Between cuts, look up a part of what areas show, which the next cut would ask for.
 
         :param area: the robot's.
         """
         if self._is_asked(hybrid_map, area):
-            self._views.look_up_one(hybrid_map)
+            areas = ((known, hybrid_map.keyframes(known)) for known in hybrid_map.area_ids())
+            self._views.look_ahead(areas, _AHEAD)
 
     def _is_asked(self, hybrid_map: HybridMap, area: int) -> bool:
         """Whether the arcs leave open where an area is, seen from that of the robot."""

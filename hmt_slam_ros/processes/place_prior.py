@@ -45,6 +45,9 @@ _NEARNESS = Nearness(1.0, 16.0)
 _PROBABLE = 1e-3
 # Landmarks of one kind that are so near to each other may be one, m.
 _BESIDE = 0.4
+# Landmarks are asked from this look on: few keyframes miss some that are there, one look alone finds no robot of which
+# nobody says where it is, and until the second one there is time to gather those of the map.
+_LOOKS = 2
 # At so many places of the map it is asked how new ground may look; with this probability it looks like one of them.
 _OTHERS, _FAMILIAR = 24, 0.9
 
@@ -68,6 +71,7 @@ class PlacePrior:
         self._features, self._places = configuration.features, configuration.places
         self._model = observation_model(configuration.places, configuration.features)
         self._views = views
+        self._enough = _LOOKS * configuration.tsbi.recheck_keyframes
 
     def weighed(
         self, where: Whereabouts, hybrid_map: HybridMap, poses: Mapping[int, Pose], before: int
@@ -77,12 +81,25 @@ class PlacePrior:
         :param poses: {keyframe: ``reference_T_base``} of what the robot saw.
         :param before: the map is that of the keyframes before this one.
         """
+        if len(poses) < self._enough:
+            return where
         probable = np.flatnonzero(where.probabilities >= _PROBABLE)
         ratios = self.log_ratios(hybrid_map, poses, before, [where.found[n] for n in probable])
         log_weights = np.zeros(len(where.found))
         if ratios is not None:
             log_weights[probable] = counted(ratios, self._places.prior_temper)
         return where.weighed(log_weights)
+
+    def look_ahead(self, maps: Iterable[tuple[HybridMap, int]]) -> None:
+        """At a keyframe event between looks, gather a share of maps' landmarks: at the second look they are there.
+
+        :param maps: each with the keyframe before which it is.
+        """
+        every = ((area, _before(one, area, before)) for one, before in maps for area in one.area_ids())
+        # What hypotheses have in common once.
+        areas = {(area, *keyframes): (area, keyframes) for area, keyframes in every}
+        count = sum(len(keyframes) for _, keyframes in areas.values())
+        self._views.look_ahead(areas.values(), math.ceil(count / (self._enough - _LOOKS)))
 
     def log_ratios(
         self, hybrid_map: HybridMap, poses: Mapping[int, Pose], before: int, found: Sequence[Located]
@@ -164,8 +181,7 @@ class PlacePrior:
 
     def _of_area(self, hybrid_map: HybridMap, area: int, before: int) -> tuple[Landmark, ...]:
         """The landmarks of an area's keyframes before one of them."""
-        keyframes = {k: pose for k, pose in hybrid_map.keyframes(area).items() if k < before}
-        return self._views.of(area, keyframes).landmarks
+        return self._views.of(area, _before(hybrid_map, area, before)).landmarks
 
     def _around(self, landmarks: Sequence[Landmark], poses: Float64, frame: Pose) -> Landmarks:
         """The observation graph of landmarks within reach along an axis.
@@ -184,6 +200,11 @@ def counted(ratios: Float64, temper: float) -> Float64:
     return temper * np.minimum(ratios, 0.0)
 
 
+def _before(hybrid_map: HybridMap, area: int, keyframe: int) -> dict[int, Pose]:
+    """{keyframe: ``area_T_base``} of an area's keyframes before one of them."""
+    return {k: pose for k, pose in hybrid_map.keyframes(area).items() if k < keyframe}
+
+
 def _others(hybrid_map: HybridMap, newest: Pose, before: int) -> Iterator[Place]:
     """Places where the robot has been, as many keyframes apart.
 
@@ -192,8 +213,7 @@ def _others(hybrid_map: HybridMap, newest: Pose, before: int) -> Iterator[Place]
     known = [
         (area, pose)
         for area in hybrid_map.area_ids()
-        for k, pose in sorted(hybrid_map.keyframes(area).items())
-        if k < before
+        for k, pose in sorted(_before(hybrid_map, area, before).items())
     ]
     back = se2.inverse(newest)
     for n in np.unique(np.linspace(0, len(known) - 1, _OTHERS).round().astype(np.int64)).tolist():

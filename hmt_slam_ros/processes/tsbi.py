@@ -163,7 +163,7 @@ class Tsbi:
         children = [child for branch in branches for child in branch.children]
         self._where = next((branch.where for branch in branches if branch.where is not None), self._where)
         if not any(branch.looked for branch in branches):
-            self._branching.search.look_ahead(max(parents, key=lambda parent: parent.log_weight).hybrid_map)
+            self._branching.look_ahead(parents)
         settled = self._settle(events.sequence, children, branches)
         chosen = [children[k] for k in settled.kept]
         changed = self._leaves(children, chosen, settled.probabilities)

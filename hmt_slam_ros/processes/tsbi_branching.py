@@ -157,6 +157,13 @@ class Branching:
         where = self.search.everywhere(parent.hybrid_map, poses, before, parent.clutter, told)
         return where if self._prior is None else self._prior.weighed(where, parent.hybrid_map, poses, before)
 
+    def look_ahead(self, parents: Sequence[Parent]) -> None:
+        """At an event at which nothing was looked for, prepare what the next look will ask for."""
+        self.search.look_ahead(max(parents, key=lambda parent: parent.log_weight).hybrid_map)
+        lost = [(one.hybrid_map, one.notes.lost) for one in parents if one.notes.lost is not None]
+        if lost and self._prior is not None:
+            self._prior.look_ahead(lost)
+
     def found(self) -> None:
         """It is known where the robot is."""
         self.search.found()
