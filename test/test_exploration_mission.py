@@ -82,6 +82,22 @@ def test_a_robot_drives_into_a_room_and_from_there_to_another_door(known):
     assert math.dist(robot.pose[:2], (10.1, 2.2)) < 0.3
 
 
+def test_a_robot_goes_from_a_room_to_the_one_behind_the_opposite_door(known):
+    node = node_at(known, 10.0)
+    doors = sorted(known.chart.nodes[node].openings, key=lambda one: (one.direction - eastwards(known)) % 4)
+    south, north = (
+        Destination(node, one, se2.transform(one.landmark.pose.mean, np.array([[1.2, 0.0]]))[0]) for one in doors
+    )
+    belief = certain_belief(known.graph, CONFIGURATION.places, state_of(node_at(known, 16.0), opposite(eastwards(known))))
+    robot = Robot(MissionPilot(known, CONFIGURATION, LIMITS, belief), (16.0, 0.0, math.pi))
+    assert list(robot.go(south))[-1] is Phase.THERE
+    for goal, place in ((north, (10.1, 2.2)), (south, (9.9, -2.2))):
+        phases = list(dict.fromkeys(robot.go(goal)))
+        assert phases == [Phase.LEAVING, Phase.DOOR, Phase.ROOM, Phase.THERE]
+        assert robot.pilot.started.node == node
+        assert math.dist(robot.pose[:2], place) < 0.3
+
+
 def test_a_lost_robot_turns_at_the_end_of_the_hallway_and_is_confident_before_it_enters(known):
     goal = destinations(known)[node_at(known, 5.0)]
     robot = Robot(MissionPilot(known, CONFIGURATION, LIMITS), (12.0, 0.1, 0.0))

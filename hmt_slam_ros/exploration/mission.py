@@ -213,8 +213,7 @@ class MissionPilot:
             return
         if goal is not None and belief is not None and belief.confident and facing is not None and facing[0] == node:
             self._along_hallway = self.estimator.axis
-            self._turn((goal.opening.direction - facing[1]) % QUARTERS)
-            self.phase, self._since, self._before_door = Phase.DOOR, scan.stamp, False
+            self._turn_to_door(goal.opening.direction - facing[1], scan)
             return
         closed = self.ways.closed
         quarters = None if belief is None else next_turn(belief, node, self._model, ahead=not at_wall, closed=closed)
@@ -237,6 +236,11 @@ class MissionPilot:
     def _turn(self, quarters: int) -> None:
         """Turn so many quarters to the right."""
         self._axis = self.estimator.axis - quarters
+
+    def _turn_to_door(self, quarters: int, scan: Scan) -> None:
+        """Turn so many quarters to the right, to where the goal's door is."""
+        self._turn(quarters % QUARTERS)
+        self.phase, self._since, self._before_door = Phase.DOOR, scan.stamp, False
 
     def _around(self, scan: Scan) -> Command:
         """Turn at the last node into a hallway; where that does not get anywhere, into another one."""
@@ -294,26 +298,34 @@ class MissionPilot:
         through = se2.transform(door, np.array([[_BEHIND, 0.0], [-_BEHIND, 0.0]]))
         command = self._keep_to(scan, np.concatenate((self._room_of.place[None], through)))
         if self._way.arrived:
-            self._resume()
+            self._resume(scan)
         return command
 
     def _keep_to(self, scan: Scan, way: Float64) -> Command:
         assert self.room is not None
         return self._way.steer(scan, se2.transform(se2.inverse(self.room.pose), way), self._velocity)
 
-    def _resume(self) -> None:
-        """Out of a room the robot is at the node before its door; where it looks, the metric filter knows."""
+    def _resume(self, scan: Scan) -> None:
+        """Out of a room the robot is at the node before its door; where it looks, the metric filter knows.
+
+        From there the goal is another node's, or it is the room behind another door of this one.
+        """
         assert self.room is not None
         assert self._room_of is not None
         assert self._goal is not None
         opening = self._room_of.opening
         turned = round(float(se2.wrap(self.room.pose[2] - opening.landmark.pose.mean[2])) / QUARTER)
-        state = state_of(self._room_of.node, (opening.direction - turned) % QUARTERS)
+        node, looks = self._room_of.node, (opening.direction - turned) % QUARTERS
+        state = state_of(node, looks)
         graph, places = self._known.graph, self._configuration.places
         self.room.release()
         self.room, self._room_of = None, None
         self.estimator = PlaceEstimator(graph, self._configuration, certain_belief(graph, places, state))
         self._here = 0, False
+        if self._goal.node == node:
+            self._along_hallway = self.estimator.axis - (opening.direction - looks) + 1
+            self._turn_to_door(self._goal.opening.direction - looks, scan)
+            return
         quarters = turn_towards(graph, state, self._goal.node, self.ways.closed)
         self._turn(quarters or 0)
         self.phase = Phase.LOST if quarters is None else Phase.TURN
