@@ -88,7 +88,8 @@ def test_a_robot_goes_from_a_room_to_the_one_behind_the_opposite_door(known):
     south, north = (
         Destination(node, one, se2.transform(one.landmark.pose.mean, np.array([[1.2, 0.0]]))[0]) for one in doors
     )
-    belief = certain_belief(known.graph, CONFIGURATION.places, state_of(node_at(known, 16.0), opposite(eastwards(known))))
+    west = opposite(eastwards(known))
+    belief = certain_belief(known.graph, CONFIGURATION.places, state_of(node_at(known, 16.0), west))
     robot = Robot(MissionPilot(known, CONFIGURATION, LIMITS, belief), (16.0, 0.0, math.pi))
     assert list(robot.go(south))[-1] is Phase.THERE
     for goal, place in ((north, (10.1, 2.2)), (south, (9.9, -2.2))):

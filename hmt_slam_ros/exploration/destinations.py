@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -78,6 +79,12 @@ class Destination(NamedTuple):
     node: int
     opening: LeadingOff
     place: Float64
+
+    @property
+    def pose(self) -> Float64:
+        """Of a robot that comes there straight from the door, in the same frame, shape (3,)."""
+        x, y = self.place - self.opening.landmark.pose.mean[:2]
+        return np.array((*self.place, math.atan2(y, x)))
 
 
 def destinations(known: KnownBuilding) -> dict[int, Destination]:

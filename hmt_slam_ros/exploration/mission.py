@@ -9,9 +9,7 @@ of a room it drives to where the door's node is, and from there on the belief te
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from enum import Enum
-from functools import partial
 
 import numpy as np
 
@@ -19,7 +17,7 @@ from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.exploration.destinations import Destination, KnownBuilding
 from hmt_slam_ros.exploration.pilot import Pilot
-from hmt_slam_ros.exploration.room import RoomFilter, RoomPose
+from hmt_slam_ros.exploration.room import RoomFilter
 from hmt_slam_ros.features.heading import QUARTER
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.local_map.local_mapping import LocalMapping
@@ -76,20 +74,19 @@ class MissionPilot:
 
     def __init__(
         self, known: KnownBuilding, configuration: Configuration, limits: Limits, belief: PositionBelief | None = None,
-        begin: Callable[[MetricStart], RoomPose] | None = None, ways: WatchedWays | None = None,
+        ways: WatchedWays | None = None,
     ) -> None:  # fmt: skip
         """:param belief: of a robot that begins at a node.
 
-        :param begin: starts the metric filter; a filter of the room's own unless given.
         :param ways: what is known of whether ways are open; nothing unless given.
         """
         self._known, self._configuration, self._limits = known, configuration, limits
         self._model = observation_model(configuration.places, configuration.features)
-        self._begin = begin or partial(RoomFilter, LocalMapping(configuration), known)
+        self._mapping = LocalMapping(configuration)
         self.estimator = PlaceEstimator(known.graph, configuration, belief)
         self.ways = ways or WatchedWays(known.graph, configuration.features)
         self.phase, self._before_door = Phase.THERE, False
-        self.room: RoomPose | None = None
+        self.room: RoomFilter | None = None
         self.started: MetricStart | None = None
         self._goal: Destination | None = None
         self._room_of: Destination | None = None
@@ -268,7 +265,7 @@ class MissionPilot:
 
     def _enter(self, start: MetricStart, scan: Scan) -> Command:
         """Go over to the metric filter."""
-        self.room = self._begin(start)
+        self.room = RoomFilter(self._mapping, self._known, start)
         self._room_of, self.started, self.phase = self._goal, start, Phase.ROOM
         self._way = Pilot(self._limits, _AT_PLACE)
         return self._inside(scan)

@@ -1,8 +1,8 @@
 """The pilot: says where the robot is by the belief over places, and gets it to rooms by that.
 
 Tomatis, Nourbakhsh and Siegwart (2003), sections 3.3 and 3.4. The belief is followed at every scan, whoever drives. At
-an opening, where it is confident, it tells metric SLAM where the robot is, if that does not know; behind the door of a
-mission the robot is steered by what RTL says.
+an opening, where it is confident, it tells metric SLAM where the robot is, if that does not know. Behind the door of a
+mission the robot is steered by the metric filter of the room, see room.py.
 """
 
 from __future__ import annotations
@@ -15,18 +15,19 @@ import numpy as np
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.exploration.destinations import KnownBuilding, rooms
+from hmt_slam_ros.exploration.metric_processes import MetricProcesses
 from hmt_slam_ros.exploration.mission import MissionPilot, Phase
 from hmt_slam_ros.exploration.pilot import limits_of
-from hmt_slam_ros.exploration.told_pose import MetricProcesses, ToldPose
 from hmt_slam_ros.features.heading import QUARTER
 from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.logs.stamps import NANOSECONDS
 from hmt_slam_ros.places.observation_graph import QUARTERS
 from hmt_slam_ros.places.place_graph import DIRECTION_NAMES, state_of
 from hmt_slam_ros.places.position_belief import PositionBelief, certain_belief, flat_belief
 from hmt_slam_ros.places.switching import MetricStart, metric_start
 from hmt_slam_ros.places.watched_ways import WatchedWays
-from hmt_slam_ros.processes.errands import Errand, Outcome, PlaceEstimate, Steering
+from hmt_slam_ros.processes.errands import Errand, Heading, Outcome, PlaceEstimate, Steering
 from hmt_slam_ros.processes.map_parts import Place
 from hmt_slam_ros.processes.messages import Carried, Message
 from hmt_slam_ros.processes.replica import Replica, ReplicaState
@@ -36,8 +37,6 @@ from hmt_slam_ros.sensing.odometry import OdometryBuffer
 
 # Scans that wait for odometry, at most.
 _WAITING = 50
-# Behind a door the robot goes on so far without the metric processes, m.
-_UNSEEN = 4.0
 # So far before the door, m, it is out of a room.
 _OUT = 0.6
 # A robot stands that went and turned no more than this since the last scan, m and rad, and waits for so long, ns.
@@ -78,14 +77,13 @@ class Missions:
         self._stamp, self._odometry = 0, np.zeros(3)
         self._errand: Errand | None = None
         self._since: int | None = None
-        self._entered: ToldPose | None = None
+        self._entered: MetricStart | None = None
         self._told_at: int | None = None
         self._seen_through: tuple[int, object] | None = None
         self._room, self._step = "", NO_STEP
 
     def _drive_anew(self, belief: PositionBelief | None) -> None:
-        known, configuration = self._known, self._configuration
-        self.pilot = MissionPilot(known, configuration, self._limits, belief, self._switch, self._ways)
+        self.pilot = MissionPilot(self._known, self._configuration, self._limits, belief, self._ways)
 
     def handle(self, message: Message) -> list[Message]:
         """Take in one message; a scan is answered as soon as odometry of its time is there."""
@@ -112,9 +110,10 @@ class Missions:
         if errand.kind == "stop":
             return self._stop()
         self._errand, self._since = errand, None
-        if self.pilot.room is None or errand.kind == "go":
-            self.pilot.go(self.rooms.get(errand.place))
-        return []
+        goal = self.rooms.get(errand.place)
+        if self.pilot.room is None or goal is not None:
+            self.pilot.go(goal)
+        return [] if goal is None else [Heading(self._stamp, goal.opening.area, goal.pose)]
 
     def _stop(self) -> list[Message]:
         """Let the robot stand, if it is on an errand."""
@@ -141,7 +140,10 @@ class Missions:
         self._move(odometry[0])
         self._stamp = scan.stamp
         self._metric.carry(scan.stamp)
+        before = self.pilot.started
         command = self.pilot.steer(scan)
+        if self.pilot.started is not before:
+            self._enter(self.pilot.started)
         self._follow_out()
         said = [self._estimate(), *self._at_opening(), *self._at_goal()]
         if self._errand is None:
@@ -160,12 +162,10 @@ class Missions:
             self.pilot.moved(self._step)
         self._odometry = odometry
 
-    def _switch(self, start: MetricStart) -> ToldPose:
-        """Go over to what the metric processes tell."""
+    def _enter(self, start: MetricStart | None) -> None:
+        """The metric filter of a room begins."""
         assert self._errand is not None
-        self._room, self._told_at = self._errand.place, None
-        self._entered = ToldPose(self._metric, start)
-        return self._entered
+        self._room, self._told_at, self._entered = self._errand.place, None, start
 
     def _at_goal(self) -> list[Message]:
         """The robot stands before the door until the metric processes have it there, or do not find it.
@@ -173,19 +173,20 @@ class Missions:
         They are told where it is if they do not know, and take that for the place of the next scan. Where they have it
         elsewhere in the map the belief is taken for wrong, since surfaces say more than landmarks.
         """
-        entered = self._entered
-        if entered is None:
+        entered, room = self._entered, self.pilot.room
+        if entered is None or room is None:
+            self._entered = None
             return []
-        out = self.pilot.room is not entered
+        belief = PoseGaussian(room.pose, entered.pose.covariance)
         late = self._told_at is not None and self._stamp - self._told_at > _WAITS
-        if entered.found or late or out:
+        if late or self._metric.agree(entered.area, belief):
             self._entered = None
         elif self._metric.told(entered.area) is not None and self._stands:
             self._entered = None
             self.pilot.begin_anew(self._nothing)
         elif self._told_at is None and self._stands:
             self._told_at = self._stamp
-            return [Carried(Place(entered.area, entered.belief))]
+            return [Carried(Place(entered.area, belief))]
         return []
 
     def _at_opening(self) -> list[Message]:
@@ -252,19 +253,12 @@ class Missions:
         """How an errand ended, if it did."""
         if self._since is None:
             self._since = self._stamp
-        room = self.pilot.room
         if self._found(errand):
             return Outcome(errand, True, f"the robot is {self._somewhere}")
         if errand.kind == "go" and self.pilot.phase is Phase.THERE:
             return Outcome(errand, True, "the robot is there")
         if self.pilot.phase is Phase.LOST:
             return Outcome(errand, False, "no way is known that leads there")
-        if isinstance(room, ToldPose) and (self._metric.silent or room.unseen > _UNSEEN):
-            how = "is silent" if self._metric.silent else "does not have the robot there"
-            return Outcome(
-                errand, False, f"given up at the door: rtl {how}; start the five processes from the same map, in mode "
-                "localization",
-            )  # fmt: skip
         if self._stamp - self._since > self._patience:
             return Outcome(errand, False, f"given up after {self._configuration.pilot.patience:g} s")
         return None

@@ -1,13 +1,10 @@
 """Where a robot is in a room that it entered by a door, by the map of the room's area.
 
 Tomatis, Nourbakhsh and Siegwart (2003), sections 3.4 and 3.6: the metric filter starts with the first two moments of
-what the door tells of the robot's pose. The map stays as it is. Where metric SLAM runs that is the filter, see
-told_pose.py; a robot that drives alone has one of its own.
+what the door tells of the robot's pose. The map stays as it is.
 """
 
 from __future__ import annotations
-
-from typing import Protocol
 
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.exploration.destinations import KnownBuilding
@@ -18,23 +15,6 @@ from hmt_slam_ros.local_map.sighting import Sighting
 from hmt_slam_ros.places.switching import MetricStart
 from hmt_slam_ros.sensing import Scan
 from hmt_slam_ros.sensing.motion import NO_STEP, Prediction, Step
-
-
-class RoomPose(Protocol):
-    """What tells where a robot is in a room, from the door on, in the frame of the area in which that is known."""
-
-    @property
-    def pose(self) -> Float64:
-        """``area_T_base``, shape (3,), now."""
-
-    def moved(self, step: Step) -> None:
-        """The robot moved."""
-
-    def observe(self, scan: Scan) -> None:
-        """A scan has come."""
-
-    def release(self) -> None:
-        """The robot is out of the room."""
 
 
 class RoomFilter:

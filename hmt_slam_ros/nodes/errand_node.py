@@ -6,21 +6,23 @@ import sys
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from geometry_msgs.msg import PoseWithCovarianceStamped, Twist
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Twist
 from sensor_msgs.msg import LaserScan
 from std_msgs.msg import String
 
 from hmt_slam_ros.compilation import tell_of_compilation
 from hmt_slam_ros.errors import HmtSlamError
+from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.nodes import conversions, qos
 from hmt_slam_ros.nodes.beginning import Beginning, declare_map
 from hmt_slam_ros.nodes.managed_node import ManagedNode
 from hmt_slam_ros.nodes.parameters import declare_frame, declare_laser_pose
 from hmt_slam_ros.nodes.running import run, spin_until
-from hmt_slam_ros.nodes.topics import COMMANDS, ERRANDS, HMT_POSE, OUTCOMES, SCAN
+from hmt_slam_ros.nodes.topics import COMMANDS, ERRANDS, GOALS, HMT_POSE, OUTCOMES, SCAN
 from hmt_slam_ros.nodes.transforms import LaserMounting
-from hmt_slam_ros.processes.errands import Kind, Outcome, Steering, errand_of
+from hmt_slam_ros.processes.errands import Heading, Kind, Outcome, Steering, errand_of
+from hmt_slam_ros.processes.global_poses import GlobalPoses
 from hmt_slam_ros.processes.messages import Message, RealTimePose
 from hmt_slam_ros.processes.routing import Process
 
@@ -33,7 +35,10 @@ class ErrandNode(ManagedNode):
     """A node whose process drives the robot on errands.
 
     :ivar map_frame: name of the frame.
+    :ivar areas: where in the map its areas are, from :meth:`listen` on.
     """
+
+    areas: GlobalPoses
 
     def __init__(self, name: str, kinds: Sequence[Kind]) -> None:
         """Declare the parameters.
@@ -66,6 +71,7 @@ class ErrandNode(ManagedNode):
         tell_of_compilation(self.get_logger().info)
         self._commands = self.create_publisher(Twist, COMMANDS, qos.STREAM) if drives else None
         self._outcomes = self.create_publisher(String, OUTCOMES[self._name], qos.LATCHED)
+        self._goals = self.create_publisher(PoseStamped, GOALS, qos.STREAM)
         self._mounting = LaserMounting(self, self._base, self._laser_pose, _nothing, _nothing)
         self.create_subscription(PoseWithCovarianceStamped, HMT_POSE, self._hear_pose, qos.NEWEST)
         self.create_subscription(LaserScan, SCAN, self._hear_scan, qos.NEWEST)
@@ -85,7 +91,7 @@ class ErrandNode(ManagedNode):
             self.say(answer)
 
     def say(self, message: Message) -> None:
-        """Publish what the process says."""
+        """Publish what the process says; a goal as soon as its area has a place in the map."""
         if isinstance(message, Outcome):
             self._outcomes.publish(String(data=message.text))
             self.get_logger().info(message.text)
@@ -93,6 +99,15 @@ class ErrandNode(ManagedNode):
             command = Twist()
             command.linear.x, command.angular.z = message.speed, message.turn_rate
             self._commands.publish(command)
+        elif isinstance(message, Heading):
+            self._tell_goal(message)
+
+    def _tell_goal(self, heading: Heading) -> None:
+        area = self.areas.get(heading.area)
+        if area is not None:
+            goal = conversions.pose_message(se2.compose(area.mean, heading.goal))
+            header = conversions.header(heading.stamp, self.map_frame)
+            self._goals.publish(PoseStamped(header=header, pose=goal))
 
     def _hear_pose(self, message: PoseWithCovarianceStamped) -> None:
         try:

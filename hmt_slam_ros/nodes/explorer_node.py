@@ -3,15 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from geometry_msgs.msg import PoseStamped
 
-from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.nodes import conversions, qos
 from hmt_slam_ros.nodes.errand_node import ErrandNode, run_errands
 from hmt_slam_ros.nodes.inbox import Inbox
-from hmt_slam_ros.nodes.topics import GOALS
-from hmt_slam_ros.processes.errands import OF_EXPLORER, Errand, Heading
+from hmt_slam_ros.processes.errands import OF_EXPLORER, Errand
 from hmt_slam_ros.processes.global_poses import GlobalPoses
 from hmt_slam_ros.processes.map_parts import AreaPose
 from hmt_slam_ros.processes.messages import Accepted, Hypotheses, Keyframe, Message
@@ -36,11 +32,10 @@ class ExplorerNode(ErrandNode):
 
         beginning, own = self.beginning(), self.configuration.explorer
         known = beginning.map
-        self._areas = GlobalPoses((_FIRST,) if known is None else known.area_poses)
+        self.areas = GlobalPoses((_FIRST,) if known is None else known.area_poses)
         explorer = Explorer(self.configuration, None if known is None else Replica.of(known.replica))
         if own.explores:
             explorer.handle(Errand("explore"))
-        self._goals = self.create_publisher(PoseStamped, GOALS, qos.STREAM)
         self.listen(explorer, drives=own.drive == "velocities")
         self._inbox = Inbox(
             self, (Keyframe, Hypotheses, Accepted), self._hear, self.figures, first=beginning.events, begun=None
@@ -48,17 +43,8 @@ class ExplorerNode(ErrandNode):
 
     def _hear(self, message: Message) -> None:
         if isinstance(message, Accepted) and message.global_poses:
-            self._areas = GlobalPoses(message.global_poses)
+            self.areas = GlobalPoses(message.global_poses)
         self.hear(message)
-
-    def say(self, message: Message) -> None:
-        """Publish what the explorer says; a goal as soon as its area has a place in the map."""
-        super().say(message)
-        area = self._areas.get(message.area) if isinstance(message, Heading) else None
-        if isinstance(message, Heading) and area is not None:
-            goal = se2.compose(area.mean, message.goal)
-            header = conversions.header(message.stamp, self.map_frame)
-            self._goals.publish(PoseStamped(header=header, pose=conversions.pose_message(goal)))
 
 
 def main() -> None:

@@ -37,7 +37,7 @@ class PilotNode(ErrandNode):
         known = beginning.map
         if known is None:
             raise HmtSlamError("the pilot goes by the places of a map, and there is none: set start_from")
-        self._areas = GlobalPoses(known.area_poses)
+        self.areas = GlobalPoses(known.area_poses)
         missions = Missions(self.configuration, known.replica)
         self.get_logger().info(f"rooms to go to: {', '.join(missions.rooms) or 'none'}")
         self._estimates = self.create_publisher(String, PLACE, qos.LATCHED)
@@ -64,7 +64,7 @@ class PilotNode(ErrandNode):
             self._begin_at(message.place)
 
     def _begin_at(self, place: Place) -> None:
-        pose = se2.compose(self._areas[place.area].mean, place.pose.mean)
+        pose = se2.compose(self.areas[place.area].mean, place.pose.mean)
         belief = PoseGaussian(pose, place.pose.covariance)
         self._starts.publish(conversions.pose_with_covariance(self._stamp, self.map_frame, belief))
 

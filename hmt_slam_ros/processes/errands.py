@@ -68,9 +68,9 @@ class Outcome:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Heading:
-    """explorer -> who drives in its stead: where the robot is to go now; one for every new goal.
+    """explorer or pilot -> who drives in its stead, or looks on: where the robot is to go now; one for every new goal.
 
-    :ivar stamp: of the scan with which it was chosen, ns.
+    :ivar stamp: of the newest scan when it was chosen, ns.
     :ivar area: area of the goal.
     :ivar goal: shape (3,), ``area_T_goal``, m and rad.
     """

@@ -1,8 +1,7 @@
-"""Where a robot is behind a door, as the metric processes tell it that run beside it.
+"""Where the metric processes have the robot, which run beside the pilot.
 
-Tomatis, Nourbakhsh and Siegwart (2003), section 3.4: the metric filter starts with what the door tells. Here that is
-metric SLAM, which looks for the robot there, and RTL tells the pose in which it was found. Until then, and wherever the
-two do not agree, odometry carries on what the door told.
+Tomatis, Nourbakhsh and Siegwart (2003), section 3.4: the metric filter starts with what the door tells. RTL tells the
+pose in which metric SLAM has the robot; whether that agrees with the door shows whether either is wrong.
 """
 
 from __future__ import annotations
@@ -11,24 +10,21 @@ import math
 
 import numpy as np
 
-from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.chi_square import gate
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.logs.stamps import NANOSECONDS
-from hmt_slam_ros.places.switching import MetricStart
 from hmt_slam_ros.processes.messages import Accepted, Hypotheses, Keyframe, Message, RealTimePose
 from hmt_slam_ros.processes.replica import Replica
-from hmt_slam_ros.sensing import Odometry, Scan
-from hmt_slam_ros.sensing.motion import Step
+from hmt_slam_ros.sensing import Odometry
 from hmt_slam_ros.sensing.odometry import OdometryBuffer
 from hmt_slam_ros.topology.unknown import joined
 
 # Two beliefs over one pose agree with this probability, both known no better than this, m, m, rad.
 _AGREES = gate(0.999)
 _LEAST = np.diag([0.1, 0.1, math.radians(3.0)]) ** 2
-# A pose is good for so long, ns; RTL that says nothing for so long does not run, or does not know anything.
-_FRESH, _SILENT = NANOSECONDS, 5 * NANOSECONDS
+# A pose is good for so long, ns.
+_FRESH = NANOSECONDS
 
 
 class MetricProcesses:
@@ -42,7 +38,6 @@ class MetricProcesses:
         self._replica = replica
         self._readings = OdometryBuffer()
         self._newest: RealTimePose | None = None
-        self._stamp = 0
         self._now: PoseGaussian | None = None
 
     def hear(self, message: Message) -> None:
@@ -56,17 +51,12 @@ class MetricProcesses:
 
     def carry(self, stamp: int) -> None:
         """Carry the pose on to a time, ns, or back to it."""
-        self._stamp, self._now = stamp, None
+        self._now = None
         self._readings.at(stamp - _FRESH)
         newest = self._newest
         if newest is not None and abs(stamp - newest.stamp) <= _FRESH:
             since = se2.exp(self._readings.motion(newest.stamp, stamp))
             self._now = newest.local.compose(PoseGaussian.exactly(since))
-
-    @property
-    def silent(self) -> bool:
-        """Whether nothing was said for long."""
-        return self._newest is None or self._stamp - self._newest.stamp > _SILENT
 
     def told(self, area: int) -> PoseGaussian | None:
         """The belief over ``area_T_base``; None where they do not have the robot in the map.
@@ -80,45 +70,11 @@ class MetricProcesses:
         frame = joined(hybrid_map, area).get(self._newest.area)
         return None if frame is None else PoseGaussian.exactly(frame.mean).compose(self._now)
 
-    def agreed(self, area: int, belief: PoseGaussian) -> PoseGaussian | None:
-        """The same; None also where it contradicts another belief over ``area_T_base``."""
+    def agree(self, area: int, belief: PoseGaussian) -> bool:
+        """Whether they have the robot where another belief over ``area_T_base`` has it."""
         told = self.told(area)
         if told is None:
-            return None
+            return False
         off = se2.log(se2.between(belief.mean, told.mean))
         spread = belief.covariance + told.covariance + _LEAST
-        return told if float(off @ np.linalg.solve(spread, off)) <= _AGREES else None
-
-
-class ToldPose:
-    """A :class:`~hmt_slam_ros.exploration.room.RoomPose` by what the metric processes tell.
-
-    :ivar area: in whose frame it is.
-    :ivar belief: over ``area_T_base``, now.
-    :ivar unseen: how far the robot went since they told a pose that can be, m.
-    :ivar found: whether they told one for the newest scan.
-    """
-
-    def __init__(self, metric: MetricProcesses, start: MetricStart) -> None:
-        self._metric, self.area, self.belief = metric, start.area, start.pose
-        self.unseen, self.found = 0.0, False
-
-    @property
-    def pose(self) -> Float64:
-        """``area_T_base``, shape (3,)."""
-        return self.belief.mean
-
-    def moved(self, step: Step) -> None:
-        """The robot moved."""
-        self.belief = self.belief.compose(PoseGaussian(step.increment, step.covariance))
-        self.unseen += float(np.hypot(*step.increment[:2]))
-
-    def observe(self, _scan: Scan) -> None:
-        """Take over what is told now, where that can be."""
-        told = self._metric.agreed(self.area, self.belief)
-        self.found = told is not None
-        if told is not None:
-            self.belief, self.unseen = told, 0.0
-
-    def release(self) -> None:
-        """They go on."""
+        return float(off @ np.linalg.solve(spread, off)) <= _AGREES
