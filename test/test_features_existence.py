@@ -52,3 +52,12 @@ def test_what_is_missed_once_in_ten_visits_stays():
 def test_visits_are_counted():
     existence = missed(visited(Existence(0.9), 3), 2)
     assert (existence.seen, existence.missed) == (4, 2)
+
+
+def test_one_look_suffices_for_what_is_gone_when_the_robot_comes_back():
+    existence = visited(Existence(1.0), 100, confidence=1.0)
+    assert missed(existence, 1).probability > 0.5
+    back = existence.after_absence().after_absence()
+    assert back.probability == existence.probability
+    assert missed(back, 1).probability < 0.5
+    assert visited(back, 1, confidence=1.0).probability > 0.95

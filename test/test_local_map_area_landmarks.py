@@ -48,3 +48,10 @@ def test_what_is_gone_at_a_later_visit_is_not_believed_in_because_the_map_held_i
     true = np.array([(-2.02, -1.51), (4.03, -1.51), (4.03, 2.02), (-2.02, 2.02)])
     assert believed.shape == (4, 2)
     assert np.hypot(*(believed[None] - true[:, None]).transpose(2, 0, 1)).min(axis=1).max() < 0.1
+
+
+@pytest.mark.parametrize("away", [10, 100])
+def test_only_a_robot_that_was_away_is_told_that_it_comes_back(away):
+    scans = [replace(whole(POSES[0], k), stamp=away * k * 1_000_000_000) for k in range(3)]
+    sightings = AreaLandmarks(LocalMapping(Configuration())).sightings(scans, POSES[[0, 0, 0]])
+    assert [sighting.back for sighting in sightings] == [False, away > 60, away > 60]

@@ -98,6 +98,9 @@ class Features:
     landmark_lasting: float = parameter(
         0.99, "Probability that a landmark is still there at the next scan that should show it.", low=0.5, high=1.0
     )
+    landmark_lasting_away: float = parameter(
+        0.8, "Times this, if the robot was away for a minute or more since the last one.", low=0.1, high=1.0
+    )
     landmark_least: float = parameter(
         0.1, "Landmarks that are less probable are deleted.", low=0.0, high=0.9
     )

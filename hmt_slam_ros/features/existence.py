@@ -14,7 +14,9 @@ it was still there after one more visit with probability p_S, is seen with p_D i
     r  = p_D r- / (p_D r- + p_F (1 - r-))                          where it is seen,
     r  = (1 - p_D) r- / ((1 - p_D) r- + (1 - p_F) (1 - r-))        where it is missed, instead of Eq. (5).
 
-As r- is p_S at most, a few misses suffice for what was seen a hundred times. p_lmap is the product of the two.
+As r- is p_S at most, a few misses suffice for what was seen a hundred times. Doors are closed and furniture is moved
+while nobody looks rather than between two scans: at the first look after an absence r- is p_A p_S r, so that one look
+may suffice. p_lmap is the product of the two.
 """
 
 from __future__ import annotations
@@ -32,12 +34,14 @@ class Existence:
     :ivar presence: r, the probability that it is still there, in [0, 1].
     :ivar seen: at how many visits it was seen, 1 or more.
     :ivar missed: at how many it should have been and was not.
+    :ivar away: whether the robot was away since.
     """
 
     confidence: float
     presence: float = 1.0
     seen: int = 1
     missed: int = 0
+    away: bool = False
 
     @property
     def probability(self) -> float:
@@ -49,14 +53,19 @@ class Existence:
         seen = self.seen + 1
         mean = self.confidence + (confidence - self.confidence) / seen  # Eq. (4)
         presence = self._present(features.landmark_detected, features.landmark_by_chance, features)
-        return replace(self, confidence=mean, presence=presence, seen=seen)
+        return replace(self, confidence=mean, presence=presence, seen=seen, away=False)
 
     def after_miss(self, features: Features) -> Existence:
         """It should have been seen and was not."""
         presence = self._present(1.0 - features.landmark_detected, 1.0 - features.landmark_by_chance, features)
-        return replace(self, presence=presence, missed=self.missed + 1)
+        return replace(self, presence=presence, missed=self.missed + 1, away=False)
+
+    def after_absence(self) -> Existence:
+        """Nobody looked for a while."""
+        return replace(self, away=True)
 
     def _present(self, likelihood: float, otherwise: float, features: Features) -> float:
         """Bayes' rule, for something that is there or not."""
-        prior = features.landmark_lasting * self.presence
+        lasting = features.landmark_lasting * (features.landmark_lasting_away if self.away else 1.0)
+        prior = lasting * self.presence
         return likelihood * prior / (likelihood * prior + otherwise * (1.0 - prior))

@@ -85,6 +85,10 @@ class LandmarkMap:
         least = self._features.landmark_least
         self.landmarks = [one for one in self.landmarks if one.existence.probability >= least]
 
+    def come_back(self) -> None:
+        """The robot comes back after a while."""
+        self.landmarks = [replace(one, existence=one.existence.after_absence()) for one in self.landmarks]
+
     def _due(self, pose: Float64, rays: Rays) -> Bool:
         """Which landmarks the scan from a pose should show."""
         kinds = np.array([landmark.kind for landmark in self.landmarks], dtype=np.int64)

@@ -40,15 +40,19 @@ class Sighting(NamedTuple):
     :ivar seen: its landmarks, in the frame of the base.
     :ivar rays: its beams, likewise.
     :ivar in_map: whether these are those of a virtual scan.
+    :ivar back: whether it is the first one of another visit.
     """
 
     pose: PoseGaussian
     seen: Landmarks
     rays: Rays
     in_map: bool
+    back: bool
 
     def add_to(self, found: LandmarkMap) -> None:
         """Have a map of landmarks learn it."""
+        if self.back:
+            found.come_back()
         found.observe(self.pose, self.seen, self.rays, in_map=self.in_map)
 
 
@@ -95,7 +99,7 @@ class AreaLandmarks:
         if not sees_around(scan):
             for other, at in zip((*around, scan), np.concatenate((poses, pose[None])), strict=True):
                 self._mapping.insert(table[None], at[None], other)
-        found = _sighting(self._mapping, table, scan, pose)
+        found = _sighting(self._mapping, table, scan, pose, back=False)
         self._mapping.pool.release(table)
         return found
 
@@ -116,15 +120,16 @@ class Growing:
 
         :param pose: its ``area_T_base``, shape (3,), m and rad.
         """
-        if self._before is not None and not 0 <= scan.stamp - self._before <= _VISIT:
+        back = self._before is not None and not 0 <= scan.stamp - self._before <= _VISIT
+        if back:
             self._mapping.pool.release(self._table)
             self._table = self._mapping.pool.empty_table()
         self._before, pose = scan.stamp, np.ascontiguousarray(pose)
         self._mapping.insert(self._table[None], pose[None], scan)
-        return _sighting(self._mapping, self._table, scan, pose)
+        return _sighting(self._mapping, self._table, scan, pose, back=back)
 
 
-def _sighting(mapping: LocalMapping, table: Int32, scan: Scan, pose: Float64) -> Sighting:
+def _sighting(mapping: LocalMapping, table: Int32, scan: Scan, pose: Float64, *, back: bool) -> Sighting:
     """What is around a keyframe, in its own scan or else in the map of a table."""
     features, in_map = mapping.configuration.features, not sees_around(scan)
     if not in_map:
@@ -132,7 +137,7 @@ def _sighting(mapping: LocalMapping, table: Int32, scan: Scan, pose: Float64) ->
     else:
         virtual = virtual_scan(mapping.pool.view(table), pose, _BEAMS, _REACH)
         lines, rays = lines_of_map(virtual, features), rays_of_map(virtual, features)
-    return Sighting(_place(pose, features), landmarks_of(lines, rays, features), rays, in_map)
+    return Sighting(_place(pose, features), landmarks_of(lines, rays, features), rays, in_map, back)
 
 
 def _place(pose: Float64, features: Features) -> PoseGaussian:
