@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from small_floor import AREAS, CONFIGURATION, charted, mapped, seen_at
 
+from hmt_slam_ros.exploration import mission
 from hmt_slam_ros.exploration.destinations import Destination, KnownBuilding, destinations
 from hmt_slam_ros.exploration.mission import MissionPilot, Phase
 from hmt_slam_ros.geometry import se2
@@ -167,3 +168,19 @@ def test_a_robot_that_left_a_room_looks_where_the_metric_filter_says(known):
     looks = (eastwards(known) - round(float(robot.pose[2]) / (0.5 * math.pi))) % 4
     assert looks != opposite(goal.opening.direction)
     assert robot.pilot.estimator.facing == (goal.node, looks)
+
+
+def test_a_robot_that_is_out_of_a_room_where_it_went_in_has_got_on_and_turns_as_it_should(known, monkeypatch):
+    # In the time and the way of a visit to the room it would not have got anywhere.
+    monkeypatch.setattr(mission, "_PROGRESS", 2.0)
+    monkeypatch.setattr(mission, "_ELSEWHERE", np.array((2.0, 0.0, 0.0)))
+    goal = destinations(known)[node_at(known, 5.0)]
+    west = state_of(node_at(known, 10.0), opposite(eastwards(known)))
+    belief = certain_belief(known.graph, CONFIGURATION.places, west)
+    robot = Robot(MissionPilot(known, CONFIGURATION, LIMITS, belief), (10.0, 0.0, math.pi))
+    assert list(robot.go(goal))[-1] is Phase.THERE
+    robot.stamp += 10_000_000_000
+    phases, places = robot.go(Destination(node_at(known, 10.0), goal.opening, goal.place)), []
+    while next(phases) is not Phase.DOOR:
+        places.append(robot.pose[0])
+    assert min(places) > 4.0

@@ -107,7 +107,7 @@ class MissionPilot:
         """
         self._goal, self._turned_back = goal, False
         self._way = Pilot(self._limits, _AT_PLACE)
-        self._axis = self.estimator.axis
+        self._axis, self._gone = self.estimator.axis, _ELSEWHERE
         self.phase = Phase.HALLWAY
         if self.room is not None:
             self.phase = Phase.ROOM if goal is self._room_of else Phase.LEAVING
@@ -119,7 +119,7 @@ class MissionPilot:
         self.room = self._room_of = None
         self.estimator.belief = belief
         # Its axis was the door's, along which one may see as far as along a hallway.
-        self._axis, self.phase = self._axis + 1, Phase.TURN
+        self._axis, self.phase, self._gone = self._axis + 1, Phase.TURN, _ELSEWHERE
 
     def stop(self) -> None:
         """Stand until the next mission."""
@@ -305,7 +305,8 @@ class MissionPilot:
     def _resume(self, scan: Scan) -> None:
         """Out of a room the robot is at the node before its door; where it looks, the metric filter knows.
 
-        From there the goal is another node's, or it is the room behind another door of this one.
+        From there the goal is another node's, or it is the room behind another door of this one. The robot has got on,
+        though it may be where it went in.
         """
         assert self.room is not None
         assert self._room_of is not None
@@ -318,7 +319,7 @@ class MissionPilot:
         self.room.release()
         self.room, self._room_of = None, None
         self.estimator = PlaceEstimator(graph, self._configuration, certain_belief(graph, places, state))
-        self._here = 0, False
+        self._here, self._gone = (0, False), _ELSEWHERE
         if self._goal.node == node:
             self._along_hallway = self.estimator.axis - (opening.direction - looks) + 1
             self._turn_to_door(self._goal.opening.direction - looks, scan)
