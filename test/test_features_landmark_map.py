@@ -6,7 +6,7 @@ from worlds import box, scan_at
 
 from hmt_slam_ros.configuration.features import Features
 from hmt_slam_ros.features.extraction import extract_lines
-from hmt_slam_ros.features.landmark_map import LandmarkMap
+from hmt_slam_ros.features.landmark_map import LandmarkMap, scatter_ratio
 from hmt_slam_ros.features.landmarks import INNER, OPENING, OUTER, due, landmarks_of
 from hmt_slam_ros.features.rays import rays_of
 from hmt_slam_ros.geometry import se2
@@ -123,3 +123,28 @@ def test_what_is_hidden_is_not_missed():
     gathered(found, np.concatenate((DOOR, box(-0.5, -1.8, 2.5, -0.8))), PLACES, first=20)
     (after,) = (one for one in of_kind(found, OPENING) if one.pose is before.pose)
     assert after.existence == before.existence
+
+
+@pytest.mark.parametrize(("off", "low", "high"), [(0.0, 0.0, 0.005), (0.04, 0.02, 0.08)])
+def test_where_a_door_is_follows_from_how_far_its_sightings_are_apart(off, low, high):
+    found, rng = LandmarkMap(FEATURES), np.random.default_rng(3)
+    stated = np.diag([0.02, 0.02, 0.005]) ** 2
+    for k in range(12):
+        believed = np.array([0.8, -0.5, 0.0]) + off * np.array([*rng.normal(size=2), 0.0])
+        found.observe(PoseGaussian(believed, stated), *shown(DOOR, np.array([0.8, -0.5, 0.0]), k))
+    (door,) = of_kind(found, OPENING)
+    assert door.existence.seen >= 10
+    across = np.sqrt(door.located(scatter_ratio(found.landmarks)).covariance[0, 0])
+    assert low < across < high
+    assert np.sqrt(door.pose.covariance[0, 0]) == pytest.approx(0.02, abs=0.002)
+
+
+def test_errors_of_scans_average_out_those_of_their_places_do_not():
+    found = LandmarkMap(FEATURES)
+    for k in range(8):
+        found.observe(PoseGaussian(np.zeros(3), np.diag([0.02, 0.02, 0.005]) ** 2), *shown(DOOR, PLACES[0], k))
+    (door,) = of_kind(found, OPENING)
+    stated = door.located(8.0 * np.eye(3) - door.scatter).covariance
+    across, along = np.sqrt(np.diag(stated)[:2] / np.diag(door.pose.covariance)[:2])
+    assert across == pytest.approx(1.0, abs=0.02)
+    assert along < 0.95

@@ -9,11 +9,16 @@ import pytest
 from small_floor import AREAS, CONFIGURATION, charted
 from worlds import box, scan_at
 
+from hmt_slam_ros.features.existence import Existence
+from hmt_slam_ros.features.landmark_map import Landmark
+from hmt_slam_ros.features.landmarks import OPENING
 from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.local_map.local_mapping import LocalMapping
 from hmt_slam_ros.places.area_views import AreaViews
-from hmt_slam_ros.places.chart import CROSSING, DOOR, END, chart_of
+from hmt_slam_ros.places.chart import CROSSING, DOOR, END, _place_of, chart_of
 from hmt_slam_ros.places.floor import floors
+from hmt_slam_ros.places.leading_off import LeadingOff
 from hmt_slam_ros.places.observation_graph import OPENINGS
 from hmt_slam_ros.places.place_graph import EAST, WEST
 from hmt_slam_ros.simulation.building import FloorPlan
@@ -210,3 +215,15 @@ def test_a_way_that_was_closed_is_none_until_it_is_seen_free_again(charts, again
     # All others stay, and so do the nodes.
     assert len(ways) == len(charts[0].edges) - (0 if there else 2)
     assert len(chart.nodes) == len(charts[0].nodes)
+
+
+def test_of_a_door_in_several_areas_that_counts_which_was_seen_most_often():
+    def known(area, y, confidence, seen):
+        pose = PoseGaussian(np.array([0.0, y, 0.0]), np.eye(3))
+        landmark = Landmark(OPENING, pose, 0.9, 0.05, Existence(confidence, seen=seen))
+        return LeadingOff(area, 0, landmark, pose, EAST, False, pose.mean[:2])
+
+    often, once = known(0, 0.0, 0.97, 20), known(1, 0.1, 0.99, 1)
+    place = _place_of([once, often], np.zeros((2, 2)))
+    assert place.openings == (often,)
+    assert place.area == 0

@@ -9,15 +9,15 @@ depend on each other, in a way that nobody knows. So they are fused by covarianc
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from hmt_slam_ros.arrays import Bool, Float64
 from hmt_slam_ros.configuration.features import Features
 from hmt_slam_ros.features.existence import Existence
-from hmt_slam_ros.features.landmarks import Landmarks, due
+from hmt_slam_ros.features.landmarks import OPENING, Landmarks, due
 from hmt_slam_ros.features.rays import Rays
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.chi_square import gate
@@ -37,6 +37,8 @@ class Landmark:
     :ivar width: of an opening, m; 0 of a corner.
     :ivar width_deviation: of this, m.
     :ivar existence: whether it is there.
+    :ivar scatter: shape (3, 3), sum of the squares of its sightings about their mean, each in its own deviations.
+    :ivar by_scans: shape (3, 3), what part of their covariances is the scans' own, in the same, on average.
     """
 
     kind: int
@@ -44,6 +46,29 @@ class Landmark:
     width: float
     width_deviation: float
     existence: Existence
+    scatter: Float64 = field(default_factory=lambda: np.zeros((3, 3)))
+    by_scans: Float64 = field(default_factory=lambda: np.zeros((3, 3)))
+
+    def located(self, ratio: Float64) -> PoseGaussian:
+        """The belief over its pose by how far its sightings are apart.
+
+        What is stated of a sighting is scaled by the scatter of all n, one more being as those of its area. Errors of
+        n scans average out; those of the places that they were taken from may be one and the same, and do not.
+
+        :param ratio: of its area, see `scatter_ratio`.
+        """
+        n = self.existence.seen
+        own = np.linalg.cholesky(self.pose.covariance) @ np.linalg.cholesky((ratio + self.scatter) / n)
+        return PoseGaussian(self.pose.mean, own @ (np.eye(3) - (1.0 - 1.0 / n) * self.by_scans) @ own.T)
+
+
+def scatter_ratio(landmarks: Iterable[Landmark]) -> Float64:
+    """Birge's ratio of an area's openings, for all axes together: by how much what is stated of a sighting is too large
+    or too small, as sightings of one opening are apart. Shape (3, 3), in deviations; one more sighting is as stated.
+    """
+    openings = [one for one in landmarks if one.kind == OPENING]
+    again = sum(one.existence.seen - 1 for one in openings)
+    return np.asarray((np.eye(3) + sum(one.scatter for one in openings)) / (1 + again))
 
 
 class LandmarkMap:
@@ -113,8 +138,11 @@ class LandmarkMap:
                 yield k, i
 
     def _new(self, pose: PoseGaussian, seen: Landmarks, i: int) -> Landmark:
-        existence = self._begin(float(seen.confidences[i]))
-        return Landmark(int(seen.kinds[i]), pose, float(seen.widths[i]), float(seen.width_deviations[i]), existence)
+        into = np.linalg.inv(np.linalg.cholesky(pose.covariance))
+        return Landmark(
+            int(seen.kinds[i]), pose, float(seen.widths[i]), float(seen.width_deviations[i]),
+            self._begin(float(seen.confidences[i])), by_scans=into @ seen.covariances[i] @ into.T,
+        )  # fmt: skip
 
     def _beside_known(self, pose: PoseGaussian, kind: int, known: int) -> bool:
         """Whether a landmark is so near to a known one of its kind that it is no other one."""
@@ -130,9 +158,14 @@ def _seen_again(landmark: Landmark, pose: PoseGaussian, seen: Landmarks, i: int,
     """A landmark after one more observation of it."""
     n = landmark.existence.seen + 1
     width, deviation = seen.widths[i], seen.width_deviations[i]
+    fused = _intersected(landmark.pose, pose, 1.0 / n)
+    into = np.linalg.inv(np.linalg.cholesky(pose.covariance))
+    before, after = (into @ se2.log(se2.between(pose.mean, known.mean)) for known in (landmark.pose, fused))
     return replace(
         landmark,
-        pose=_intersected(landmark.pose, pose, 1.0 / n),
+        pose=fused,
+        scatter=landmark.scatter + 0.5 * (np.outer(before, after) + np.outer(after, before)),
+        by_scans=landmark.by_scans + (into @ seen.covariances[i] @ into.T - landmark.by_scans) / n,
         width=landmark.width + float(width - landmark.width) / n,
         width_deviation=landmark.width_deviation + float(deviation - landmark.width_deviation) / n,
         existence=landmark.existence.after_sight(float(seen.confidences[i]), features),

@@ -280,12 +280,12 @@ class _Charting:
 
 
 def _place_of(group: Sequence[LeadingOff], feet: Float64) -> _Place:
-    """The node of some openings, in the frame of the area in which one of them is believed in most.
+    """The node of some openings, in the frame of the area in which one of them was seen most often.
 
     :param feet: shape (n, 2), their places in the hallway's middle, in that frame.
     """
     best: dict[int, LeadingOff] = {}
-    for one in sorted(group, key=lambda one: -one.landmark.existence.probability):
+    for one in sorted(group, key=_sightings, reverse=True):
         best.setdefault(one.direction, one)
     openings = tuple(best[direction] for direction in sorted(best))
     hallway = any(one.hallway for one in openings)
@@ -295,8 +295,13 @@ def _place_of(group: Sequence[LeadingOff], feet: Float64) -> _Place:
 
 
 def _home(group: Sequence[LeadingOff]) -> int:
-    """The area in which one of some openings is believed in most."""
-    return max(group, key=lambda one: one.landmark.existence.probability).area
+    """The area in which one of some openings was seen most often."""
+    return max(group, key=_sightings).area
+
+
+def _sightings(opening: LeadingOff) -> tuple[int, float]:
+    """What openings are ranked by: one that was seen once, from afar, is believed in, but its place is not known."""
+    return opening.landmark.existence.seen, opening.landmark.existence.probability
 
 
 def _stretch(place: _Place, way: _Way) -> Stretch:

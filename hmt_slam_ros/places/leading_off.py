@@ -13,9 +13,10 @@ from typing import NamedTuple
 import numpy as np
 
 from hmt_slam_ros.arrays import Float64
-from hmt_slam_ros.features.landmark_map import Landmark
+from hmt_slam_ros.features.landmark_map import Landmark, scatter_ratio
 from hmt_slam_ros.features.landmarks import OPENING
 from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.places.floor import DIRECTIONS, Floor, off_axes, quarter_of
 from hmt_slam_ros.places.observation_graph import QUARTERS
 from hmt_slam_ros.places.place_graph import opposite
@@ -38,6 +39,7 @@ class LeadingOff(NamedTuple):
     :ivar area: in which it is known.
     :ivar number: of the landmark in that area.
     :ivar landmark: as known there.
+    :ivar located: the belief over its pose there, by how far its sightings are apart.
     :ivar direction: in which it leads off.
     :ivar hallway: whether to another hallway; else to a room.
     :ivar foot: shape (2,), the place before it in the hallway's middle, in the frame of the area's floor, m.
@@ -46,6 +48,7 @@ class LeadingOff(NamedTuple):
     area: int
     number: int
     landmark: Landmark
+    located: PoseGaussian
     direction: int
     hallway: bool
     foot: Float64
@@ -57,6 +60,7 @@ def leading_off(floor: Floor, landmarks: tuple[Landmark, ...]) -> Iterator[Leadi
     :param floor: around the area.
     :param landmarks: of the area.
     """
+    ratio = scatter_ratio(landmarks)
     for number, landmark in enumerate(landmarks):
         if landmark.kind != OPENING or landmark.existence.probability < _LEAST:
             continue
@@ -67,7 +71,8 @@ def leading_off(floor: Floor, landmarks: tuple[Landmark, ...]) -> Iterator[Leadi
         foot = _foot(floor, pose[:2], direction)
         if foot is not None:
             hallway = _to_hallway(floor, pose[:2], direction, landmark.width)
-            yield LeadingOff(floor.area, number, landmark, direction, hallway, foot)
+            located = landmark.located(ratio)
+            yield LeadingOff(floor.area, number, landmark, located, direction, hallway, foot)
 
 
 def _foot(floor: Floor, place: Float64, direction: int) -> Float64 | None:

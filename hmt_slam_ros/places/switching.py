@@ -39,5 +39,5 @@ def metric_start(estimator: PlaceEstimator, chart: Chart) -> MetricStart | None:
     node, direction = facing
     for opening in chart.nodes[node].openings:
         if opening.direction == direction:
-            return MetricStart(node, opening.area, opening.landmark.pose.compose(seen.inverse()))
+            return MetricStart(node, opening.area, opening.located.compose(seen.inverse()))
     return None
