@@ -26,7 +26,7 @@ SEEDS = 5
 _CHANGED = {"as mapped": 0.0, "doors changed": 0.25}
 _SUCCESS, _UNCONFIDENT, _FALSE, _CONFIDENT_FALSE, _TRANSITIONS = 1.0, 0.12, 0.014, 0.005, 0.12  # paper, table 2
 _METRES, _STATES = 13.7, 2.11  # paper, table 3
-_NEES = 3.6
+_NEES = 2.1, 4.2  # 0.7 to 1.4 for each of 3 degrees of freedom
 
 POLICY = (
     f"In a map that SLAM made of another drive robots go by their belief, with {PEOPLE} people about, a laser that "
@@ -87,7 +87,7 @@ def _mission_requirements(missions: Sequence[Mission]) -> list[Requirement]:
         Requirement("unconfident estimates", _mean([not one.confident for one in estimates]), _UNCONFIDENT),
         Requirement("false estimates", _mean(false), _FALSE),
         Requirement("confident false estimates", _mean(confident), _CONFIDENT_FALSE),
-        Requirement("NEES of the metric start, mean", _mean(nees), _NEES),
+        Requirement("NEES of the metric start, mean", _mean(nees), _NEES[1], least=_NEES[0]),
     ]
 
 

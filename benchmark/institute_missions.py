@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import networkx
@@ -18,7 +18,6 @@ from hmt_slam_ros.exploration.mission import MissionPilot, Phase
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.logs.stamps import NANOSECONDS
 from hmt_slam_ros.motion import Limits
-from hmt_slam_ros.places.chart import DOOR
 from hmt_slam_ros.places.estimator import PlaceEstimator
 from hmt_slam_ros.places.place_graph import heading_of, node_of, state_of
 from hmt_slam_ros.places.position_belief import certain_belief
@@ -173,7 +172,7 @@ def missions_of(institute: InstituteMap, scenario: Scenario, configuration: Conf
     """From room to room; where one fails, somebody carries the robot before the door of its goal."""
     random = np.random.default_rng([scenario.settings.seed, 1])
     places = destinations(known_of(institute, configuration))
-    doors = [door for door in open_doors(institute, scenario) if door in places]
+    doors = open_doors(institute, scenario, places)
     start, steered, missions = int(random.choice(doors)), None, []
     for _ in range(MISSIONS):
         goal = _next_stop(random, institute, doors, start)
@@ -187,15 +186,22 @@ def missions_of(institute: InstituteMap, scenario: Scenario, configuration: Conf
     return missions
 
 
-def open_doors(institute: InstituteMap, scenario: Scenario) -> list[int]:
-    """The nodes of the chart that are doors and open at a visit."""
+def open_doors(institute: InstituteMap, scenario: Scenario, places: Mapping[int, Destination]) -> list[int]:
+    """The nodes of the chart with places behind doors that are open at a visit.
+
+    :param places: {node: the place behind its door}.
+    """
     states = scenario.building.states
-    places = states.poses[~states.crossings, :2]
-    return [
-        k
-        for k, node in enumerate(institute.chart.nodes)
-        if node.kind == DOOR and np.hypot(*(places - institute.nodes[k, :2]).T).min() <= _NEAR
-    ]
+    doors = states.poses[~states.crossings]
+    return [node for node, place in places.items() if _is_open(doors, institute, place)]
+
+
+def _is_open(doors: Float64, institute: InstituteMap, place: Destination) -> bool:
+    """Whether the door of a place is one of some open ones (n, 3); one opposite it is another one."""
+    opening = place.opening
+    heading = se2.compose(institute.frames[opening.area], opening.landmark.pose.mean)[2]
+    near = np.hypot(*(doors[:, :2] - institute.nodes[place.node, :2]).T) <= _NEAR
+    return bool((near & (np.abs(se2.wrap(doors[:, 2] - heading)) <= _TURN)).any())
 
 
 def _next_stop(random: np.random.Generator, institute: InstituteMap, doors: Sequence[int], stop: int) -> int:

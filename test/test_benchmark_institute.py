@@ -8,8 +8,14 @@ from benchmark.documents import VALIDATION, marks
 from benchmark.institute import _mission_requirements, _transitions
 from benchmark.institute_maps import InstituteMap, scenario_of
 from benchmark.institute_missions import Mission, open_doors, way_length
+from hmt_slam_ros.exploration.destinations import Destination
+from hmt_slam_ros.features.existence import Existence
+from hmt_slam_ros.features.landmark_map import Landmark
+from hmt_slam_ros.features.landmarks import OPENING
 from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.places.chart import CROSSING, DOOR, Chart, ChartNode
+from hmt_slam_ros.places.leading_off import LeadingOff
 from hmt_slam_ros.places.observation_graph import no_landmarks
 from hmt_slam_ros.places.place_graph import EAST, NORTH, Edge
 
@@ -47,9 +53,19 @@ def institute():
 def test_missions_are_from_open_door_to_open_door():
     charted = institute()
     doors = [k for k, node in enumerate(charted.chart.nodes) if node.kind == DOOR]
-    assert open_doors(charted, charted.scenario) == doors
+    places = {k: behind_door(k, charted.nodes[k]) for k in doors}
+    assert open_doors(charted, charted.scenario, places) == doors
     changed = scenario_of(0, visit=1, changed=0.5)
-    assert set(open_doors(charted, changed)) < set(doors)
+    assert set(open_doors(charted, changed, places)) < set(doors)
+    opposite = {k: behind_door(k, charted.nodes[k] + (0.0, 0.0, np.pi)) for k in doors}
+    assert open_doors(charted, charted.scenario, opposite) == []
+
+
+def behind_door(node, pose):
+    """A place behind a door that leads off where a node looks."""
+    door = PoseGaussian(pose, np.eye(3))
+    landmark = Landmark(OPENING, door, 0.9, 0.05, Existence(1.0))
+    return Destination(node, LeadingOff(0, 0, landmark, door, NORTH, False, pose[:2]), pose[:2])
 
 
 def test_the_shortest_way_between_two_nodes():
