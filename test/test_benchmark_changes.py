@@ -70,6 +70,13 @@ def test_localization_leaves_the_map_as_it_was_and_follows_the_robot_through_all
     assert found.worst < 0.5
 
 
+def test_a_robot_does_not_take_moved_furniture_for_another_place():
+    found = localized("office", 3, size=0.7, rate=1.5)
+    assert found.same
+    assert found.error < 0.08
+    assert found.worst < 0.3
+
+
 def test_the_document_has_a_place_for_the_tables():
     text = VALIDATION.read_text()
     assert all(text.count(mark) == 1 for mark in marks("changes"))

@@ -9,9 +9,11 @@ from ring_for_tsbi import RING, Run, ring_drive
 from test_process_tsbi_branching import OTHER, PATH, ROOM, rooms_apart
 from worlds import box, scan_in
 
+from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.processes import tsbi_awakening
 from hmt_slam_ros.processes.messages import AreaEvents, Forgotten
+from hmt_slam_ros.processes.tsbi import Tsbi
 from hmt_slam_ros.processes.tsbi_awakening import UNKNOWN
 from hmt_slam_ros.processes.tsbi_displacement import displaced_or_not, with_displaced
 from hmt_slam_ros.topology.hypothesis_tree import LeafNotes, Spot
@@ -21,6 +23,12 @@ FAR, HERE = (30.0, 20.0), (0.0, 0.0)
 PRIOR = math.log(1e-5)
 
 
+ANGLE = np.array(
+    [[0, 0, 6, 0], [6, 0, 6, 3], [6, 3, 4, 3], [4, 3, 4, 5], [4, 5, 0, 5], [0, 5, 0, 0]], dtype=np.float64
+)
+BEFORE = np.concatenate((ANGLE, box(1.0, 3.0, 2.0, 3.5)))
+MOVED = np.concatenate((ANGLE, box(2.6, 0.5, 3.4, 1.1)))
+NOWHERE = np.concatenate((box(-1.0, 1.0, 4.2, 6.5), box(2.6, 4.0, 3.6, 5.0)))
 HALL = np.concatenate((box(-3.0, 0.5, 9.0, 4.5), box(4.0, 3.0, 5.0, 4.0)))
 
 
@@ -67,7 +75,9 @@ def test_it_is_believed_to_be_where_two_looks_find_it():
     notes = replace(parent.notes, lost=newest[0], claim=Spot(2, newest[0], np.zeros(3)), credit=None)
     (still,) = tsbi_awakening.looked_for(branching, replace(parent, notes=notes)).children
     assert still.notes.sighted.area == 0
-    _, found = tsbi_awakening.looked_for(branching, replace(parent, notes=still.notes)).children
+    looked = tsbi_awakening.looked_for(branching, replace(parent, notes=still.notes))
+    _, found = looked.children
+    assert tsbi_awakening.surely_found(looked).children == [found]
     assert (found.notes.lost, found.notes.claim, found.notes.found) == (None, None, 0)
     assert (found.arcs[0].source, found.arcs[0].target) == (2, 0)
 
@@ -112,11 +122,47 @@ def test_an_area_is_not_left_without_keyframes():
 
 @pytest.mark.parametrize(("nats", "lost"), [(11.0, None), (12.0, 18)])
 def test_where_nothing_is_stored_it_is_lost_from_the_next_keyframe_on_if_that_is_more_probable(nats, lost):
-    parent, _, newest = rooms_apart((ROOM,), [], 0.1)
+    parent, branching, newest = rooms_apart((ROOM,), [], 0.1)
     doubtful = replace(parent, notes=replace(parent.notes, doubts={newest[4]: nats}))
-    child = displaced_or_not(doubtful, 17)
+    child = displaced_or_not(branching, doubtful, 17)
     assert child.notes.lost == lost
     assert bool(child.notes.doubts) == (lost is None)
+
+
+@pytest.mark.parametrize(
+    ("world", "off", "lost"),
+    [(MOVED, 0.0, None), (MOVED, 2.0, 16), (OTHER, 0.0, 16), (NOWHERE, 0.0, 16)],
+    ids=["furniture was moved", "farther on in the same room", "in another room", "on ground that nobody knows"],
+)
+def test_where_nothing_is_stored_it_is_lost_if_it_is_rather_in_another_place(world, off, lost):
+    parent, branching, _ = rooms_apart((OTHER, BEFORE), [FAR], 0.1)
+    notes = parent.notes
+    for event, pose in enumerate(PATH[:4], start=12):
+        scan = scan_in(world, pose, noise=0.01, seed=event, field_of_view=2 * np.pi, beams=361)
+        claimed = se2.between(PATH[0], pose) + np.array([off, 0.0, 0.0])
+        notes = notes.heard(event, 6.0, Spot(1, event, claimed))
+        branching.remember(event, scan, notes.spots)
+    child = displaced_or_not(branching, replace(parent, notes=notes), 15)
+    assert child.notes.lost == lost
+    assert not child.notes.doubts
+    assert not child.notes.spots
+
+
+def test_scans_that_the_map_does_not_hold_are_remembered_as_long_as_they_are_doubtful():
+    run, poses = Run(RING), ring_drive(8)
+    for pose in poses[:6]:
+        run.keyframe(pose)
+    run.evidence[0], run.stored = -3.0, False
+    for pose in poses[6:]:
+        run.keyframe(pose, mapping=False)
+    state = run.tsbi.state
+    assert [*state.notes[0].spots] == [*state.branching.recent] == [6, 7]
+    assert [*Tsbi(Configuration(), state=state).state.branching.recent] == [6, 7]
+    np.testing.assert_array_equal(state.notes[0].spots[7].pose, run.poses[0])
+    run.evidence[0] = 9.0
+    run.keyframe(poses[7], mapping=False)
+    assert not run.tsbi.state.notes[0].spots
+    assert not run.tsbi.state.branching.recent
 
 
 def test_scans_that_contradict_add_up_and_are_remembered_in_the_next_area():

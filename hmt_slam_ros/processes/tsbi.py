@@ -27,14 +27,13 @@ from hmt_slam_ros.processes.messages import (
     Message,
 )
 from hmt_slam_ros.processes.replica import FIRST_HYPOTHESIS, Replica, ReplicaState
-from hmt_slam_ros.processes.tsbi_awakening import arrived, looked_for
+from hmt_slam_ros.processes.tsbi_awakening import arrived, looked_for, surely_found
 from hmt_slam_ros.processes.tsbi_branching import Branches, Branching, BranchingState, Child, Parent
 from hmt_slam_ros.processes.tsbi_displacement import displaced_or_not, with_displaced
 from hmt_slam_ros.processes.tsbi_merging import merged as merged_into
 from hmt_slam_ros.processes.tsbi_reopening import reopened
 from hmt_slam_ros.random_streams import Purpose, stream
-from hmt_slam_ros.sensing import Scan
-from hmt_slam_ros.topology.hypothesis_tree import LeafNotes, Settled, settle
+from hmt_slam_ros.topology.hypothesis_tree import LeafNotes, Settled, Spot, settle
 from hmt_slam_ros.topology.same_claim import Claim, merged
 from hmt_slam_ros.topology.surroundings import agreeing, areas_around
 from hmt_slam_ros.topology.whereabouts import Whereabouts
@@ -144,9 +143,13 @@ class Tsbi:
         self._estimates = {leaf.hypothesis: leaf for leaf in keyframe.leaves}
         for leaf in keyframe.leaves:
             if leaf.hypothesis in self._notes:
-                notes = self._notes[leaf.hypothesis].heard(keyframe.sequence, leaf.doubt)
+                held = keyframe.mapping or leaf.stored
+                spot = None if held else Spot(leaf.area, keyframe.sequence, leaf.pose.mean)
+                notes = self._notes[leaf.hypothesis].heard(keyframe.sequence, leaf.doubt, spot)
                 stored = notes.stored(keyframe.sequence, leaf.pose.covariance) if leaf.stored else notes
                 self._notes[leaf.hypothesis] = stored
+        wanted = {event for notes in self._notes.values() for event in notes.spots}
+        self._branching.remember(keyframe.sequence, keyframe.scan, wanted)
 
     def _infer(self, events: AreaEvents) -> Hypotheses:
         """Weight, branch, normalise, reduce."""
@@ -215,7 +218,8 @@ class Tsbi:
     def _branch(self, parent: Parent, event: AreaEvent | None, keyframe: Keyframe) -> Branches:
         """The continuations of one hypothesis, each with its weight."""
         if keyframe.carried or keyframe.place is not None:
-            return arrived(self._branching, parent, keyframe, self._estimates[parent.hypothesis].pose.mean)
+            come = arrived(self._branching, parent, keyframe, self._estimates[parent.hypothesis].pose.mean)
+            return come if keyframe.mapping else surely_found(come)
         if self._reopened:
             return Branches([reopened(parent, leaf, keyframe.sequence) for leaf in self._reopened])
         if not keyframe.mapping and parent.notes.lost is None:
@@ -226,7 +230,7 @@ class Tsbi:
                 return displaced
         if event is not None:
             return self._changed(parent, event)
-        return self._go_on(parent, self._estimates[parent.hypothesis], keyframe.scan)
+        return self._go_on(parent, self._estimates[parent.hypothesis], keyframe)
 
     def _unmapped(self, parent: Parent, event: AreaEvent | None, sequence: int) -> Branches:
         """The map stays as it is; the robot may go into another area of it, or be lost.
@@ -234,7 +238,7 @@ class Tsbi:
         What it mapped while it was lost is joined to the map in one place alone and leads nowhere, so that it goes over
         into the area where it was recognized as soon as that is sure.
         """
-        child, found = displaced_or_not(parent, sequence), parent.notes.found
+        child, found = displaced_or_not(self._branching, parent, sequence), parent.notes.found
         if child.notes.lost is not None:
             return Branches([child])
         if found is not None and len(self._notes) == 1 and parent.hybrid_map.has_area(found):
@@ -251,15 +255,16 @@ class Tsbi:
             return Branches([merged_into(parent, event.area, event.into, self._branching.search)])
         return self._branching.move(parent, event.area)
 
-    def _go_on(self, parent: Parent, estimate: LeafEstimate, scan: Scan) -> Branches:
+    def _go_on(self, parent: Parent, estimate: LeafEstimate, keyframe: Keyframe) -> Branches:
         """No area was left; but the robot may be in known ground that area abstraction does not know to be near."""
         notes = replace(parent.notes.seen_in(self._branching.astray(parent, estimate.pose.mean)), found=None)
         parent = replace(parent, notes=notes)
         if notes.astray is not None and notes.astray[1] >= _ASTRAY:
-            return self._branching.link(parent, notes.astray[0], scan, estimate.pose)
+            return self._branching.link(parent, notes.astray[0], keyframe.scan, estimate.pose)
         enough = self._options.recheck_keyframes if notes.told is None else 1
         if len(notes.unchecked) >= enough and notes.lost is not None:
-            return looked_for(self._branching, parent)
+            looked = looked_for(self._branching, parent)
+            return looked if keyframe.mapping else surely_found(looked)
         if len(notes.unchecked) >= self._options.recheck_keyframes:
             return self._branching.recheck(parent)
         if notes.beside and len(notes.unchecked) == _SOON:

@@ -142,6 +142,16 @@ def looked_for(branching: Branching, parent: Parent) -> Branches:
     return Branches([still, found], True, where=where)
 
 
+def surely_found(looked: Branches) -> Branches:
+    """A look after which a robot that was recognized is lost no more.
+
+    Where nothing is mapped, what the robot saw since would go on to explain itself better than a map of before that the
+    world does not keep to; if it was taken for another place, the map contradicts it soon.
+    """
+    found = [child for child in looked.children if child.notes.lost is None]
+    return looked._replace(children=found or looked.children)
+
+
 def _credited(parent: Parent, where: Whereabouts, poses: Mapping[int, Pose]) -> Parent:
     """A hypothesis of a displaced robot, weighed by what it saw since, as far as that is not in its weight yet.
 
@@ -163,13 +173,30 @@ def credit_of(hybrid_map: HybridMap, where: Whereabouts, claim: Spot, poses: Map
     :param claim: where it is if it was not displaced: there it is not, if it was.
     :param poses: {keyframe: ``reference_T_base``} of those that were located.
     """
-    there = [_agree(hybrid_map, _spot(located, poses, claim.keyframe), claim) for located in where.found]
-    shares = where.probabilities
+    there, shares = _at(hybrid_map, where, claim, poses), where.probabilities
     unmapped = max(1.0 - float(shares.sum()), _LEAST)
-    elsewhere = unmapped + float(shares[[not one for one in there]].sum())
+    elsewhere = unmapped + float(shares[~there].sum())
     areas = len(hybrid_map.area_ids())
     stayed = float(shares[there].sum()) / unmapped * UNKNOWN / (1.0 - UNKNOWN) * areas
     return math.log(elsewhere / unmapped * UNKNOWN) - math.log(max(1.0, stayed))
+
+
+def is_rather(hybrid_map: HybridMap, where: Whereabouts, claim: Spot, poses: Mapping[int, Pose]) -> bool:
+    """Whether a robot is rather where a claim has it than in any other place of the map, and most of it is known there.
+
+    What contradicts there speaks for ground that the map does not hold, too; it is not asked again whether that is so.
+
+    :param poses: {keyframe: ``reference_T_base``} of those that were located.
+    """
+    there, shares = _at(hybrid_map, where, claim, poses), where.probabilities
+    known = max((located.found.share for located, one in zip(where.found, there, strict=True) if one), default=0.0)
+    return known >= _KNOWN and bool(shares[there].sum() > shares[~there].sum())
+
+
+def _at(hybrid_map: HybridMap, where: Whereabouts, claim: Spot, poses: Mapping[int, Pose]) -> NDArray[np.bool_]:
+    """Which of the places where a robot may be are that of a claim, shape (len(where.found),)."""
+    found = [_agree(hybrid_map, _spot(located, poses, claim.keyframe), claim) for located in where.found]
+    return np.array(found, dtype=np.bool_)
 
 
 def sighted_in(where: Whereabouts, poses: Mapping[int, Pose]) -> Spot | None:

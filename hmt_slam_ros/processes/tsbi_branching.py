@@ -8,6 +8,7 @@ candidates' grids, and no keyframe is compared with an area twice.
 from __future__ import annotations
 
 import math
+from collections import ChainMap
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
@@ -109,10 +110,12 @@ class BranchingState:
 
     :ivar areas: the largest number that an area was given.
     :ivar search: what was learnt by comparing areas.
+    :ivar recent: {keyframe event: scan} of those that no map holds and that may be looked for.
     """
 
     areas: int = FIRST_AREA
     search: SearchState = field(default_factory=SearchState)
+    recent: Mapping[int, Scan] = field(default_factory=dict)
 
 
 class Branching:
@@ -121,11 +124,14 @@ class Branching:
     :ivar search: finds and compares known areas.
     :ivar views: what areas show.
     :ivar loops: proposes some, where landmarks are asked.
+    :ivar recent: {keyframe event: scan} of those that no map holds and that may be looked for.
     """
 
     def __init__(self, configuration: Configuration, replica: Replica) -> None:
-        self.search = ClosureSearch(configuration, replica.scans)
-        self.views = AreaViews(LocalMapping(configuration), replica.scans)
+        self.recent: dict[int, Scan] = {}
+        scans = ChainMap(self.recent, replica.scans)
+        self.search = ClosureSearch(configuration, scans)
+        self.views = AreaViews(LocalMapping(configuration), scans)
         self._prior = PlacePrior(configuration, self.views) if configuration.places.prior else None
         self.loops = LoopProposals(configuration, self.views) if configuration.places.loops else None
         self._options = configuration.tsbi
@@ -138,12 +144,13 @@ class Branching:
     @property
     def state(self) -> BranchingState:
         """All that is known between two events."""
-        return BranchingState(self._areas, self.search.state)
+        return BranchingState(self._areas, self.search.state, dict(self.recent))
 
     def go_on_from(self, state: BranchingState) -> None:
         """Take over what was known before the first event."""
         self._areas = state.areas
         self.search.go_on_from(state.search)
+        self.recent.update(state.recent)
 
     def everywhere(
         self, parent: Parent, poses: Mapping[int, NDArray[np.float64]], before: int, told: Told | None = None
@@ -174,6 +181,13 @@ class Branching:
         """Work out anew what is made of scans, of which some have changed."""
         self.search.forget_scans()
         self.views.forget()
+
+    def remember(self, event: int, scan: Scan, wanted: Collection[int]) -> None:
+        """Keep the scan of a keyframe event, and of those that were kept the ones that are wanted."""
+        for late in self.recent.keys() - set(wanted):
+            del self.recent[late]
+        if event in wanted:
+            self.recent[event] = scan
 
     def begin_event(self) -> None:
         """Forget which new areas were named; within one event hypotheses share the ids of the same new area."""

@@ -15,10 +15,12 @@ from dataclasses import replace
 
 import numpy as np
 
+from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.processes.tsbi_awakening import UNKNOWN, credit_of, sighted_in
+from hmt_slam_ros.processes.tsbi_awakening import UNKNOWN, credit_of, is_rather, sighted_in
 from hmt_slam_ros.processes.tsbi_branching import Branches, Branching, Child, Parent
 from hmt_slam_ros.topology.hypothesis_tree import Spot
+from hmt_slam_ros.topology.shortest_path import reachable
 from hmt_slam_ros.topology.unknown import unknown
 
 # Log-odds of a displacement from which on it is a hypothesis, of hypotheses of at least such a probability, with at
@@ -37,14 +39,33 @@ def with_displaced(branching: Branching, parent: Parent) -> Branches | None:
     return Branches([Child(parent.hypothesis, parent.log_weight, parent.area, noted), child], True)
 
 
-def displaced_or_not(parent: Parent, event: int) -> Child:
+def displaced_or_not(branching: Branching, parent: Parent, event: int) -> Child:
     """To go on, or, where that is less probable, to be lost: no keyframe is stored that could tell which.
+
+    Furniture that was moved contradicts as a wrong place does; but then what is seen beside it is where the robot has
+    it, and in no other place of the map.
 
     :param event: the newest; metric SLAM arrives at the next one then.
     """
-    lost = event + 1 if parent.notes.displaced[0] > 0.0 else None
-    notes = parent.notes if lost is None else replace(parent.notes, doubts={}, lost=lost)
+    log_odds, since = parent.notes.displaced
+    notes = parent.notes
+    if log_odds > 0.0:
+        lost = None if _recognized(branching, parent, since) else event + 1
+        notes = replace(notes, doubts={}, spots={}, lost=lost)
     return Child(parent.hypothesis, parent.log_weight, parent.area, notes)
+
+
+def _recognized(branching: Branching, parent: Parent, since: int) -> bool:
+    """Whether the scans since an event, which the map does not hold, lie in it where the robot has them."""
+    spots = [spot for event, spot in sorted(parent.notes.spots.items()) if event >= since]
+    frames = reachable(parent.hybrid_map, parent.area, until={spot.area for spot in spots})
+    seen = {spot.keyframe: se2.compose(frames[spot.area].mean, spot.pose) for spot in spots if spot.area in frames}
+    if not seen:
+        return False
+    first = min(seen)
+    poses = {keyframe: se2.between(seen[first], pose) for keyframe, pose in seen.items()}
+    where = branching.everywhere(parent, poses, first)
+    return is_rather(parent.hybrid_map, where, Spot(parent.area, first, seen[first]), poses)
 
 
 def _since(parent: Parent, event: int) -> list[int]:

@@ -56,6 +56,7 @@ class LeafNotes:
         and for how many keyframe events in a row; or None.
     :ivar doubts: {keyframe event: nats by which its scan contradicted what the robot should have seen}, of the latest
         events since the robot may have been displaced.
+    :ivar spots: {event of these: where the robot was}, where the map stays as it is and does not hold them.
     :ivar lost: the keyframe at which the robot arrived it is not known where, until that is recognized; else None.
     :ivar told: where one of the keyframes since then is, as somebody says; else None.
     :ivar sighted: where it was recognized at the last look, if it was.
@@ -72,6 +73,7 @@ class LeafNotes:
     beside: tuple[int, ...] = ()
     astray: tuple[int, int] | None = None
     doubts: Mapping[int, float] = field(default_factory=dict)
+    spots: Mapping[int, Spot] = field(default_factory=dict)
     lost: int | None = None
     told: Told | None = None
     sighted: Spot | None = None
@@ -79,9 +81,10 @@ class LeafNotes:
     claim: Spot | None = None
     credit: float | None = 0.0
 
-    def heard(self, event: int, doubt: float) -> LeafNotes:
+    def heard(self, event: int, doubt: float, spot: Spot | None = None) -> LeafNotes:
         """After the scan of a keyframe event.
 
+        :param spot: where the robot was, if the map does not hold that.
         :param doubt: log p(scan | the robot was displaced before it) / p(scan | the robot is there), nats, by the map
             of what is around.
         """
@@ -91,7 +94,10 @@ class LeafNotes:
             doubts[event] = told
         if sum(doubts.values()) <= 0.0:
             doubts = {}
-        return self if not doubts and not self.doubts else replace(self, doubts=doubts)
+        if not doubts and not self.doubts:
+            return self
+        spots = self.spots if spot is None else {**self.spots, event: spot}
+        return replace(self, doubts=doubts, spots={k: at for k, at in spots.items() if k in doubts})
 
     @property
     def displaced(self) -> tuple[float, int]:
@@ -133,8 +139,8 @@ class LeafNotes:
         kept = {area: keyframes & covariances.keys() for area, keyframes in self.compared.items()}
         compared = {area: keyframes for area, keyframes in kept.items() if keyframes}
         return LeafNotes(
-            covariances, compared, doubts=self.doubts, lost=self.lost, told=self.told, sighted=self.sighted,
-            claim=self.claim, credit=self.credit,
+            covariances, compared, doubts=self.doubts, spots=self.spots, lost=self.lost, told=self.told,
+            sighted=self.sighted, claim=self.claim, credit=self.credit,
         )  # fmt: skip
 
 
