@@ -31,7 +31,7 @@ from benchmark.simulated.measured import chosen_families, chosen_seeds
 from benchmark.simulated.worlds import World
 from hmt_slam_ros.configuration import load_configuration
 
-SEEDS = 4
+SEEDS = 8
 """Worlds of every family."""
 
 FAMILIES = ("office", "busy", "nested")
