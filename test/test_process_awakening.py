@@ -78,9 +78,9 @@ def test_it_is_recognized_where_it_is(maps, kind, share):
 
 
 @pytest.mark.parametrize("share", [0.3, 0.8])
-def test_with_landmarks_as_prior_it_is_recognized_too(maps, share):
+def test_without_landmarks_as_prior_it_is_recognized_too(maps, share):
     log = maps["first half"]
-    asked = replace(log, configuration=with_changes(Configuration(), {"places.prior": True}))
+    asked = replace(log, configuration=with_changes(Configuration(), {"places.prior": False}))
     found = awakened(asked, log.starts[int(share * len(log.starts))])
     assert found.right
     assert not found.wrong

@@ -62,7 +62,7 @@ class Places:
         low=1e-9, high=0.999,
     )
     prior: bool = parameter(
-        False, "Whether landmarks weigh the places where a robot may be that woke up somewhere or was carried."
+        True, "Whether landmarks weigh the places where a robot may be that woke up somewhere or was carried."
     )
     prior_temper: float = parameter(
         0.2, "Exponent on their likelihood where it speaks against a place, being made of the same scans as surfaces.",

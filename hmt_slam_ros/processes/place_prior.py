@@ -45,9 +45,6 @@ _NEARNESS = Nearness(1.0, 16.0)
 _PROBABLE = 1e-3
 # Landmarks of one kind that are so near to each other may be one, m.
 _BESIDE = 0.4
-# Landmarks are asked from this look on: few keyframes miss some that are there, one look alone finds no robot of which
-# nobody says where it is, and until the second one there is time to gather those of the map.
-_LOOKS = 2
 # At so many places of the map it is asked how new ground may look; with this probability it looks like one of them.
 _OTHERS, _FAMILIAR = 24, 0.9
 
@@ -71,7 +68,7 @@ class PlacePrior:
         self._features, self._places = configuration.features, configuration.places
         self._model = observation_model(configuration.places, configuration.features)
         self._views = views
-        self._enough = _LOOKS * configuration.tsbi.recheck_keyframes
+        self._between_looks = max(1, configuration.tsbi.recheck_keyframes - 1)
 
     def weighed(
         self, where: Whereabouts, hybrid_map: HybridMap, poses: Mapping[int, Pose], before: int
@@ -81,8 +78,6 @@ class PlacePrior:
         :param poses: {keyframe: ``reference_T_base``} of what the robot saw.
         :param before: the map is that of the keyframes before this one.
         """
-        if len(poses) < self._enough:
-            return where
         probable = np.flatnonzero(where.probabilities >= _PROBABLE)
         ratios = self.log_ratios(hybrid_map, poses, before, [where.found[n] for n in probable])
         log_weights = np.zeros(len(where.found))
@@ -91,7 +86,7 @@ class PlacePrior:
         return where.weighed(log_weights)
 
     def look_ahead(self, maps: Iterable[tuple[HybridMap, int]]) -> None:
-        """At a keyframe event between looks, gather a share of maps' landmarks: at the second look they are there.
+        """At a keyframe event between looks, gather a share of the landmarks of maps, so that all are there soon.
 
         :param maps: each with the keyframe before which it is.
         """
@@ -99,7 +94,7 @@ class PlacePrior:
         # What hypotheses have in common once.
         areas = {(area, *keyframes): (area, keyframes) for area, keyframes in every}
         count = sum(len(keyframes) for _, keyframes in areas.values())
-        self._views.look_ahead(areas.values(), math.ceil(count / (self._enough - _LOOKS)))
+        self._views.look_ahead(areas.values(), math.ceil(count / self._between_looks))
 
     def log_ratios(
         self, hybrid_map: HybridMap, poses: Mapping[int, Pose], before: int, found: Sequence[Located]

@@ -157,12 +157,16 @@ class Branching:
     ) -> Whereabouts:
         """Where in the map keyframes lie of which the arcs tell nothing.
 
+        Landmarks are asked after a look that found a place: one look alone finds nobody, and by then they are gathered.
+
         :param poses: {keyframe: ``reference_T_base``}.
         :param before: the map is that of the keyframes before this one.
         :param told: where the reference is, if somebody says so.
         """
         where = self.search.everywhere(parent.hybrid_map, poses, before, parent.clutter, told)
-        return where if self._prior is None else self._prior.weighed(where, parent.hybrid_map, poses, before)
+        if self._prior is None or parent.notes.sighted is None:
+            return where
+        return self._prior.weighed(where, parent.hybrid_map, poses, before)
 
     def look_ahead(self, parents: Sequence[Parent]) -> None:
         """At an event at which nothing was looked for, prepare what the next look will ask for."""
