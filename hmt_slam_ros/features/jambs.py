@@ -37,8 +37,7 @@ def wall_end(
     # Where the end is between two beams, and how far the line's error moves it along the beam.
     facing = math.cos(line[0]) * rays.directions[beam, 0] + math.sin(line[0]) * rays.directions[beam, 1]
     slant = (1.0 - facing * facing) / (facing * facing)
-    slanted = math.sqrt(max(0.0, 1.0 - facing * facing))
-    uncertain = abs(spacing) + 2.0 * STRAY * rays.deviations[beam] * slanted
+    uncertain = abs(spacing) + 2.0 * STRAY * rays.deviations[beam]
     jamb[VARIANCE] = uncertain * uncertain / 12.0
     jamb[VARIANCE] += slant * variance_at(covariance[0, 0], covariance[0, 1], covariance[1, 1], told.along[k])
     last = k
