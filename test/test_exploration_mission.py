@@ -139,7 +139,8 @@ def test_a_robot_turns_back_where_its_way_is_closed_and_goes_there_when_it_is_op
     assert robot.pilot.ways.closed == frozenset()
 
 
-def test_a_robot_that_gets_nowhere_turns_back_and_where_it_cannot_goes_on_however_its_wheels_tremble(known):
+@pytest.mark.parametrize("sway", [0.0, 0.1])
+def test_a_robot_that_gets_nowhere_turns_back_and_where_it_cannot_goes_on_however_it_trembles_or_sways(known, sway):
     pilot = MissionPilot(known, CONFIGURATION, LIMITS)
     pilot.go(None)
     rng, scan = np.random.default_rng(0), seen_at(np.array((3.0, 0.0, 0.0)), np.random.default_rng(1))
@@ -147,7 +148,8 @@ def test_a_robot_that_gets_nowhere_turns_back_and_where_it_cannot_goes_on_howeve
     for k in range(115):
         pilot.steer(replace(scan, stamp=200_000_000 * (k + 1)))
         phases.append(pilot.phase)
-        pilot.moved(Step(np.array((rng.normal(0.0, 0.02), 0.0, 0.0)), np.diag((1e-4, 1e-4, 1e-6))))
+        aside = sway if k // 5 % 2 else -sway
+        pilot.moved(Step(np.array((rng.normal(0.0, 0.02), aside, 0.0)), np.diag((1e-4, 1e-4, 1e-6))))
     assert [phase for phase, _ in itertools.groupby(phases)] == [Phase.HALLWAY, Phase.TURN, Phase.HALLWAY]
 
 

@@ -91,7 +91,7 @@ class MissionPilot:
         self._goal: Destination | None = None
         self._room_of: Destination | None = None
         self._axis, self._along_hallway, self._here = 0, 0, (-1, False)
-        self._since, self._gone = 0, _ELSEWHERE
+        self._since, self._came = 0, -math.inf
         self._looked, self._looked_from, self._turned_back = 0, _ELSEWHERE, False
         self._way = Pilot(limits, _AT_PLACE)
         self._velocity = (0.0, 0.0)
@@ -107,7 +107,7 @@ class MissionPilot:
         """
         self._goal, self._turned_back = goal, False
         self._way = Pilot(self._limits, _AT_PLACE)
-        self._axis, self._gone = self.estimator.axis, _ELSEWHERE
+        self._turn(0)
         self.phase = Phase.HALLWAY
         if self.room is not None:
             self.phase = Phase.ROOM if goal is self._room_of else Phase.LEAVING
@@ -119,7 +119,7 @@ class MissionPilot:
         self.room = self._room_of = None
         self.estimator.belief = belief
         # Its axis was the door's, along which one may see as far as along a hallway.
-        self._axis, self.phase, self._gone = self._axis + 1, Phase.TURN, _ELSEWHERE
+        self._axis, self.phase, self._came = self._axis + 1, Phase.TURN, -math.inf
 
     def stop(self) -> None:
         """Stand until the next mission."""
@@ -128,7 +128,7 @@ class MissionPilot:
     def moved(self, step: Step) -> None:
         """The robot moved."""
         self.estimator.moved(step)
-        self._gone, self._looked_from = (se2.compose(each, step.increment) for each in (self._gone, self._looked_from))
+        self._looked_from = se2.compose(self._looked_from, step.increment)
         if self.room is not None:
             self.room.moved(step)
 
@@ -175,7 +175,9 @@ class MissionPilot:
         self._here = here
         if self.phase is not Phase.HALLWAY:
             return self._drives[self.phase](scan)
-        if self._held_up(scan) or self._goes_wrong():
+        if self._held_up(scan):
+            self._get_away()
+        elif self._goes_wrong():
             self._turn_back()
         return self._towards(scan, self.estimator.ahead(_AHEAD))
 
@@ -192,12 +194,24 @@ class MissionPilot:
         self._turn(2)
         self.phase, self._turned_back = Phase.TURN, self.estimator.belief is not None
 
+    def _get_away(self) -> None:
+        """Turn back where the way does not lead on; a robot that does not know its place turns to where it sees far.
+
+        Before the wall opposite a door the way back is the room, out of which it came.
+        """
+        belief = self.estimator.belief
+        if belief is not None and belief.confident:
+            self._turn_back()
+        else:
+            self._turn(self._freest(0))
+            self.phase = Phase.TURN
+
     def _held_up(self, scan: Scan) -> bool:
-        """Whether the robot has not got anywhere for long, nor tried another way."""
-        gone = math.hypot(*self._gone[:2]) >= _PROGRESS
-        held_up = not gone and scan.stamp - self._since > _PATIENCE
-        if gone or held_up:
-            self._gone, self._since = np.zeros(3), scan.stamp
+        """Whether the robot has not come farther along its axis for long, wherever it drove meanwhile."""
+        came = self.estimator.along(self._axis)
+        held_up = came < self._came + _PROGRESS and scan.stamp - self._since > _PATIENCE
+        if held_up or came >= self._came + _PROGRESS:
+            self._came, self._since = came, scan.stamp
         return held_up
 
     def _decide(self, scan: Scan) -> None:
@@ -232,7 +246,7 @@ class MissionPilot:
 
     def _turn(self, quarters: int) -> None:
         """Turn so many quarters to the right."""
-        self._axis = self.estimator.axis - quarters
+        self._axis, self._came = self.estimator.axis - quarters, -math.inf
 
     def _turn_to_door(self, quarters: int, scan: Scan) -> None:
         """Turn so many quarters to the right, to where the goal's door is."""
@@ -242,7 +256,7 @@ class MissionPilot:
     def _around(self, scan: Scan) -> Command:
         """Turn at the last node into a hallway; where that does not get anywhere, into another one."""
         if self.estimator.axis % QUARTERS == self._axis % QUARTERS and not self.estimator.turning:
-            self.phase, self._gone = Phase.HALLWAY, _ELSEWHERE
+            self.phase, self._came = Phase.HALLWAY, -math.inf
         elif self._held_up(scan):
             self._turn(self._freest(self.estimator.axis - self._axis))
         return self._towards(scan, self.estimator.on_line(self._axis, _AHEAD))
@@ -257,7 +271,7 @@ class MissionPilot:
         if start is not None and start.node == self._goal.node:
             return self._enter(start, scan)
         if scan.stamp - self._since > _LOOKS:
-            self._axis, self.phase, self._gone = self._along_hallway, Phase.TURN, _ELSEWHERE
+            self._axis, self.phase, self._came = self._along_hallway, Phase.TURN, -math.inf
             return self._around(scan)
         if not self._before_door:
             return self._towards(scan, front)
@@ -319,7 +333,7 @@ class MissionPilot:
         self.room.release()
         self.room, self._room_of = None, None
         self.estimator = PlaceEstimator(graph, self._configuration, certain_belief(graph, places, state))
-        self._here, self._gone = (0, False), _ELSEWHERE
+        self._here = 0, False
         if self._goal.node == node:
             self._along_hallway = self.estimator.axis - (opening.direction - looks) + 1
             self._turn_to_door(self._goal.opening.direction - looks, scan)

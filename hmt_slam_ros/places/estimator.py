@@ -140,6 +140,10 @@ class PlaceEstimator:
         """Quarters of a turn to the left from the walls' frame to the direction in which the robot travels."""
         return self._quarter
 
+    def along(self, axis: int) -> float:
+        """How far the robot came along an axis, from anywhere, m."""
+        return float(self._pose[:2] @ _unit(axis))
+
     def free(self, axis: int) -> float:
         """How far one sees along an axis, m; nan where no beam tells."""
         return float(self._distances[sector_of(np.array(QUARTER * axis - self._pose[2]))])
