@@ -66,6 +66,7 @@ MEASUREMENTS = {
     "prior": "what landmarks say of where a lost robot is, on looks at a map",
     "laps": "whether memory, cost and errors grow where a robot drives over known ground again and again",
     "changes": "whether a map follows furniture and doors in mode lifelong, and holds nobody who walked by",
+    "ways": "whether a robot notices that a hallway is closed, goes another way, and comes back to it",
     "scale": "time and memory in maps of up to 100,000 areas",
     "soak": "whether nodes that run for an hour keep their memory and leave nothing behind",
     "short": "for CI, whether accuracy became worse than benchmark/expected.toml beyond noise",
@@ -76,7 +77,7 @@ _GROUPS = {
         "calibration", "loops", "topology", "consistency", "evidence", "appearance", "lines", "linemap", "heading",
         "landmarks", "landmarkmaps", "hallways", "places", "institute", "belief", "threeloops", "driving", "explore",
         "localmaps", "policies", "ambiguity", "table", "oracle", "awakening", "kidnapping", "prior", "laps", "changes",
-        "scale",
+        "ways", "scale",
     ),
 }  # fmt: skip
 
