@@ -28,8 +28,8 @@ from hmt_slam_ros.places.policy import turn_towards
 from hmt_slam_ros.places.watched_ways import WatchedWays
 from hmt_slam_ros.simulation import SimulatedLog, open_simulated
 
-WORLDS = ("office", "institute")
-"""A ring of corridors, and hallways with two passages between them."""
+WORLDS = {"office": 0.7, "institute": 0.8}
+"""A ring of corridors, and hallways with two passages between them, and how large they are."""
 
 SEEDS, PEOPLE = 5, 2
 """Buildings of each, and who walks about at every visit."""
@@ -45,7 +45,7 @@ DRIVES = ("open", "closed", "still closed", "open again")
 _LEAST, _SEEN, _HALF = 3.0, 4.0, 1.5
 
 POLICY = (
-    f"Every building, of the smallest size, is mapped by a scripted drive; then robots go by their belief, as on the "
+    f"Every building, a small one, is mapped by a scripted drive; then robots go by their belief, as on the "
     f"missions in an institute, with {PEOPLE} people about, who also pass what is closed. Drawn by chance are a way of "
     f"the chart, {_LEAST:g} m long or more, round which another way leads, and a door; the shortest way from one of "
     "its ends to the door leads over it. Four drives are from there to that door, the robot knowing its place and "
@@ -107,7 +107,7 @@ def measure_ways(settings: Settings) -> Report:
     """Close ways and open them again."""
     seeds = chosen_seeds(settings, SEEDS)
     configuration = load_configuration(PARAMETERS, list(settings.changes))
-    cases = list(product(settings.logs_or(WORLDS), seeds))
+    cases = list(product(settings.logs_or(tuple(WORLDS)), seeds))
     with ProcessPoolExecutor(settings.records.jobs) as pool:
         found = list(pool.map(partial(driven, configuration=configuration), *zip(*cases, strict=True)))
     report = Report("ways", "Ways that are closed and opened again", seeds=seeds)
@@ -130,7 +130,7 @@ def driven(world: str, seed: int, configuration: Configuration) -> Building:
 
 
 def _log(world: str, seed: int, visit: int) -> SimulatedLog:
-    own = "changed=0,laps=1,size=0.7,rate=3,field_of_view=360,beams=360,moved=0"
+    own = f"changed=0,laps=1,size={WORLDS[world]:g},rate=3,field_of_view=360,beams=360,moved=0"
     return open_simulated(f"sim:{world},seed={seed},visit={visit},people={PEOPLE},{own}")
 
 
