@@ -124,6 +124,16 @@ def test_before_a_door_a_confident_robot_knows_its_pose_in_the_area_of_the_door(
     assert metric_start(estimator, chart) is None
 
 
+def test_a_door_of_whose_wall_too_little_is_seen_tells_no_pose(chart, graph, monkeypatch):
+    estimator = PlaceEstimator(graph, CONFIGURATION, certain_belief(graph, CONFIGURATION.places, 0))
+    list(drive(estimator, [(4.9, 0.3, 0.5 * math.pi)] * 2))
+    assert estimator.door_ahead() is not None
+    hidden = estimator._seen.covariances.copy()
+    hidden[:, 2, 2] = math.radians(0.4) ** 2
+    monkeypatch.setattr(estimator, "_seen", estimator._seen._replace(covariances=hidden))
+    assert estimator.door_ahead() is None
+
+
 def test_a_door_that_someone_hid_is_noticed_by_the_turn_into_it(chart, graph, monkeypatch):
     start = state_of(node_at(chart, 1.0), eastwards(chart))
     estimator = PlaceEstimator(graph, CONFIGURATION, certain_belief(graph, CONFIGURATION.places, start))

@@ -180,13 +180,19 @@ class PlaceEstimator:
         return node_of(state), (heading_of(state) + turned) % QUARTERS
 
     def door_ahead(self) -> PoseGaussian | None:
-        """The belief over ``base_T_opening`` of the nearest opening that the robot looks through; None for none."""
+        """The belief over ``base_T_opening`` of the nearest opening that the robot looks through; None for none.
+
+        None, too, for one that it sees less exactly along a wall than walls are square: who hides most of a wall may
+        be a part of its line.
+        """
         seen = self._seen
         ahead = (seen.confidences >= _LEAST) & (seen.poses[:, 0] > 0.0) & (np.abs(seen.poses[:, 2]) <= _ALONG)
         ahead &= np.abs(seen.poses[:, 1]) <= 0.5 * seen.widths
         if not ahead.any():
             return None
         k = int(np.argmin(np.where(ahead, seen.poses[:, 0], np.inf)))
+        if seen.covariances[k, 2, 2] > math.radians(self._features.square_deviation) ** 2:
+            return None
         return PoseGaussian(seen.poses[k], seen.covariances[k])
 
     def moved(self, step: Step) -> None:
