@@ -3,7 +3,7 @@
 import pytest
 
 from benchmark.documents import VALIDATION, marks
-from benchmark.threeloops import Closed, Drive, Proposal, requirements
+from benchmark.threeloops import Closed, Drive, Proposal, elsewhere_requirements, requirements
 
 RIGHT, WRONG = Proposal(220.0, (0.1, 1.0)), Proposal(50.0, (6.0, 1.0))
 
@@ -32,6 +32,15 @@ def test_what_is_required():
     assert not all(one.met for one in requirements([good], [good]))
     values = {one.name: one.value for one in requirements([good, control], [control, control])}
     assert values["loops closed, share"] == pytest.approx(0.5)
+
+
+def test_elsewhere_nothing_false_is_proposed_or_closed():
+    good = Drive(400.0, [], [RIGHT, Proposal(60.0, None)], [Closed(240.0, right=True)])
+    assert all(one.met for one in elsewhere_requirements([good, good]))
+    proposed, closed = elsewhere_requirements([good, good._replace(proposals=[WRONG])])
+    assert (proposed.met, closed.met) == (False, True)
+    proposed, closed = elsewhere_requirements([good._replace(accepted=[Closed(90.0, right=False)]), good])
+    assert (proposed.met, closed.met) == (True, False)
 
 
 def test_the_document_has_a_place_for_it():
