@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 from numpy.typing import NDArray
 
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.exploration.explorer import Explorer
 from hmt_slam_ros.logs.stamps import NANOSECONDS
+from hmt_slam_ros.offline.output_folder import map_writer
+from hmt_slam_ros.offline.recorder import Recording
 from hmt_slam_ros.offline.runtime import Run
 from hmt_slam_ros.processes.errands import Errand, Outcome, Steering
 from hmt_slam_ros.processes.messages import Message
@@ -59,6 +63,20 @@ class DrivenRun:
                 if self._ears.outcome is not None or self.robot.stamp >= end:
                     break
         return self._ears.outcome
+
+    def save(self, folder: Path, configuration: Configuration) -> Recording:
+        """End the drive, and write its map for nodes to begin with.
+
+        :param folder: to be made.
+        """
+        folder.mkdir(parents=True)
+        writer = map_writer(folder)
+        writer.write_state(self._run.state)
+        result = self._run.finish()
+        recording = result.recorder.finish(result.log.stamps, result.log.first_scans, result.log.earlier)
+        writer.write_map(recording.replica, recording.area_poses, recording.last, recording.scans)
+        writer.finish(configuration)
+        return recording
 
     def true_place(self, name: str) -> NDArray[np.float64]:
         """Where the robot truly was when it took the keyframe in the middle of a named place, ``world_T_base`` (3,)."""

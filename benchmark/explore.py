@@ -119,12 +119,12 @@ def _explored(run: DrivenRun, configuration: Configuration) -> Explored:
     institute = charted(scenario, atlas.hybrid_map, atlas.replica.scans, robot.true_poses, configuration)
     return Explored(
         outcome is not None, robot.travelled, (robot.stamp - START) / NANOSECONDS, robot.contacts,
-        sum(distance <= _PASSED for distance in away), sum(_within(room, path) for room in rooms), len(rooms),
+        sum(distance <= _PASSED for distance in away), sum(is_within(room, path) for room in rooms), len(rooms),
         sum(name.startswith("room ") for name in atlas.places()), judged(institute),
     )  # fmt: skip
 
 
-def _within(room: Float64, path: Float64) -> bool:
+def is_within(room: Float64, path: Float64) -> bool:
     """Whether any of some places (n, 2) is in a room (5,)."""
     local = se2.transform(se2.inverse(room[:3]), path)
     return bool(np.any((np.abs(local[:, 0]) < 0.5 * room[3]) & (np.abs(local[:, 1]) < 0.5 * room[4])))

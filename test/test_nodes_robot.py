@@ -12,6 +12,7 @@ from logs_for_nodes import LASER, START, Corridor, corridor_bag
 
 pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
 
+from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped, TransformStamped, Twist
 from nav_msgs.msg import Odometry as OdometryMessage
 from rosgraph_msgs.msg import Clock
@@ -23,7 +24,7 @@ from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.logs import open_log
 from hmt_slam_ros.nodes import conversions, qos
-from hmt_slam_ros.nodes.topics import DOCUMENTS, ROBOT_STATUS
+from hmt_slam_ros.nodes.topics import DIAGNOSTICS, DOCUMENTS, ROBOT_STATUS
 from hmt_slam_ros.nodes.transforms import TFMessage
 from hmt_slam_ros.processes.documents import encode
 from hmt_slam_ros.processes.messages import LocalEstimate
@@ -255,6 +256,8 @@ def test_commands_drive_the_robot_and_silence_stops_it(listener, start, heard, d
 
 def test_the_driven_robot_does_not_pass_a_wall(listener, start, driver):
     # It begins a metre before the end of a hallway, with its back to it.
+    reports = listener.hear(DiagnosticArray, DIAGNOSTICS, qos.STREAM)
+    contacts = lambda: [v.value for r in reports[-1:] for v in r.status[0].values if v.key == "contacts"]  # noqa: E731
     robot = start_driven(start)
     listener.until(driver.stands, alive=[robot])
     begin = driver.poses[-1]
@@ -263,6 +266,7 @@ def test_the_driven_robot_does_not_pass_a_wall(listener, start, driver):
     count = len(driver.truths)
     driver.until(lambda: len(driver.truths) > count + 20, -0.4, alive=[robot])
     assert back() <= 1.0 - 0.25
+    listener.until(lambda: contacts() == ["1"], alive=[robot])
 
 
 def test_a_command_that_is_no_number_stops_the_robot_and_is_told(listener, start, driver):

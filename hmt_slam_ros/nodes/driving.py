@@ -58,6 +58,11 @@ class Driving:
                 self._truths.append((record.measurement.stamp, self._robot.pose))
             yield record
 
+    @property
+    def contacts(self) -> int:
+        """How often the robot came upon something."""
+        return self._robot.contacts
+
     def tell_truth(self, stamp: int) -> None:
         """Publish where the robot truly was at the odometry readings that are sent.
 

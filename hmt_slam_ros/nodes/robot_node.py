@@ -169,6 +169,7 @@ class RobotNode(ConfiguredNode):
         self.figures.sent[type(measurement).__name__] += 1
         if self._driving is not None:
             self._driving.tell_truth(measurement.stamp)
+            self.figures.state["contacts"] = self._driving.contacts
         if self._player.ended:
             self._report()
             self.get_logger().info(f"end of the log after {self._player.scans} scans")

@@ -1,0 +1,192 @@
+"""Errands of the pilot through nodes: a robot that wakes up in an institute that was explored goes to its rooms."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import ExitStack
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from benchmark.driven_run import DrivenRun
+from benchmark.explore import is_within
+from benchmark.institute_maps import LASER, PEOPLE, charted, scenario_of
+from benchmark.institute_missions import AT_PLACE, known_of
+from benchmark.pilot_nodes import Errands, Ran, Start
+from benchmark.report import Report, Requirement, table
+from benchmark.running_nodes import Listener
+from benchmark.runs import PARAMETERS
+from benchmark.settings import Settings
+from benchmark.simulated.measured import chosen_seeds
+from hmt_slam_ros.arrays import Float64
+from hmt_slam_ros.configuration import Configuration, load_configuration
+from hmt_slam_ros.errors import HmtSlamError
+from hmt_slam_ros.exploration.destinations import rooms
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.logs.stamps import NANOSECONDS
+from hmt_slam_ros.processes.errands import Errand
+from hmt_slam_ros.simulation import open_simulated
+from hmt_slam_ros.simulation.driven_robot import DrivenRobot
+from hmt_slam_ros.simulation.scenario import START
+
+SEEDS = 2
+"""Buildings."""
+
+ERRANDS = 4
+"""In each of them."""
+
+_EXPLORATION = 2000.0  # s, of the simulation
+_SPEED = 0.31  # m/s, paper, table 2
+_FROM, _TO = 10.0, 200.0  # s of the scripted drive, where the robot may wake up
+_START = 0.1  # m, of initialpose
+
+POLICY = (
+    f"Nodes as processes over DDS, {PEOPLE} people, a laser that sees all around. The map is the explorer's. At "
+    f"another visit the robot wakes up at a random place of a hallway, and is sent to {ERRANDS} rooms, one after the "
+    "other, drawn by chance. Reached: the pilot says that the robot is there, and it is within "
+    f"{AT_PLACE:g} m of where it truly was when it took the keyframe that stands for the room. initialpose: what the "
+    "pilot tells slam before doors, against the true pose then. A contact is counted where a step would bring the "
+    "robot's disc into a surface or a person."
+)
+
+
+class Explored(NamedTuple):
+    """A building and its saved map.
+
+    :ivar seed: of the building.
+    :ivar folder: of the map.
+    :ivar frames: {area: (``map_T_area``, ``world_T_area``)}, each (3,).
+    :ivar rooms: {name: (its area, its place in the world (2,), m)}.
+    """
+
+    seed: int
+    folder: Path
+    frames: dict[int, tuple[Float64, Float64]]
+    rooms: dict[str, tuple[int, Float64]]
+
+
+class Scored(NamedTuple):
+    """An errand.
+
+    :ivar seed: of the building.
+    :ivar ran: what happened.
+    :ivar off: distance from the room's place at the end, m.
+    :ivar starts: errors of what slam was told, m and rad.
+    """
+
+    seed: int
+    ran: Ran
+    off: float
+    starts: list[tuple[float, float]]
+
+    @property
+    def reached(self) -> bool:
+        """Whether the robot is there, as the pilot says."""
+        return self.ran.text.endswith(": the robot is there") and self.off <= AT_PLACE
+
+
+def measure_pilot(settings: Settings) -> Report:
+    """Explore, save the maps, and send the pilot to rooms."""
+    seeds = chosen_seeds(settings, SEEDS)
+    configuration = load_configuration(PARAMETERS, list(settings.changes))
+    explore = partial(explored, configuration=configuration, out=settings.out)
+    with ProcessPoolExecutor(settings.records.jobs) as pool:
+        buildings = list(pool.map(explore, seeds))
+    errands = [one for building in buildings for one in errands_in(building)]
+    report = Report("pilot", "Errands of the pilot through nodes", seeds=seeds)
+    report.requirements = requirements(errands)
+    report.body += [_table(errands), POLICY]
+    return report
+
+
+def explored(seed: int, configuration: Configuration, out: Path) -> Explored:
+    """Let the explorer explore a building, and save its map.
+
+    :param out: where the folder of the map is made.
+    :raises HmtSlamError: where it comes to no end.
+    """
+    run = DrivenRun(DrivenRobot(scenario_of(seed)), configuration)
+    if run.do(Errand("explore"), _EXPLORATION) is None:
+        raise HmtSlamError(f"the explorer came to no end in {_EXPLORATION:g} s: see python -m benchmark explore")
+    folder = out / f"map{seed}"
+    recording = run.save(folder, configuration)
+    institute = charted(
+        run.robot.scenario, recording.hybrid_map, recording.replica.scans, run.robot.true_poses, configuration
+    )
+    frames = {area: (pose.mean, institute.frames[area]) for area, pose in recording.area_poses.items()}
+    places = {
+        name: (room.opening.area, se2.transform(frames[room.opening.area][1], room.place[None])[0])
+        for name, room in rooms(known_of(institute, configuration)).items()
+    }
+    return Explored(seed, folder, frames, places)
+
+
+def errands_in(building: Explored) -> list[Scored]:
+    """Send the robot to rooms drawn by chance, never twice in a row to the same."""
+    draw = np.random.default_rng([building.seed, 3])
+    world = f"sim:institute,seed={building.seed},visit=1,changed=0,laps=1,people={PEOPLE},{LASER}"
+    scored: list[Scored] = []
+    with ExitStack() as stack:
+        start = Start(world, _awakening(world, draw), building.folder)
+        errands = Errands(stack, stack.enter_context(Listener()), start)
+        last = ""
+        for _ in range(ERRANDS):
+            others = [name for name in building.rooms if name != last]
+            last = others[int(draw.integers(len(others)))]
+            scored.append(_scored(building, errands.run(last), last))
+    return scored
+
+
+def _awakening(world: str, draw: np.random.Generator) -> float:
+    """Seconds from the beginning of the scripted drive to a time at which the robot is in a hallway."""
+    simulated = open_simulated(world)
+    inside = True
+    while inside:
+        seconds = float(draw.uniform(_FROM, _TO))
+        path = simulated.true_poses(np.array([START + round(NANOSECONDS * seconds)]))[:, :2]
+        inside = any(is_within(room, path) for room in simulated.scenario.building.rooms)
+    return seconds
+
+
+def _scored(building: Explored, ran: Ran, room: str) -> Scored:
+    """An errand against what is true."""
+    area, place = building.rooms[room]
+    in_map, in_world = building.frames[area]
+    starts = []
+    for told, true in ran.starts:
+        off = se2.between(se2.compose(in_world, se2.between(in_map, told)), true)
+        starts.append((math.hypot(off[0], off[1]), abs(float(off[2]))))
+    return Scored(building.seed, ran, math.dist(place, ran.path[-1]), starts)
+
+
+def requirements(errands: Sequence[Scored]) -> list[Requirement]:
+    """What is asked of errands."""
+    starts = [off for one in errands for off, _ in one.starts]
+    metres, seconds = sum(one.ran.metres for one in errands), sum(one.ran.seconds for one in errands)
+    told = [Requirement("initialpose: largest error", max(starts), _START, "m")] if starts else []
+    return [
+        Requirement("errands that reach their place", float(np.mean([one.reached for one in errands])), 1.0, least=1.0),
+        Requirement("contacts", float(sum(one.ran.contacts for one in errands)), 0.0),
+        Requirement("mean speed", metres / max(1e-9, seconds), math.inf, "m/s", least=_SPEED),
+        *told,
+    ]
+
+
+def _table(errands: Sequence[Scored]) -> str:
+    head = ["building", "errand", "how it ended", "off [m]", "way [m]", "time [s]", "contacts"]
+    head += ["initialpose off [m]", "[deg]"]
+    return table(head, [_row(one) for one in errands])
+
+
+def _row(one: Scored) -> list[str]:
+    errand, _, end = one.ran.text.partition(": ")
+    far, turned = (max((start[k] for start in one.starts), default=math.nan) for k in (0, 1))
+    told = [f"{far:.2f}", f"{math.degrees(turned):.1f}"] if one.starts else ["-", "-"]
+    return [
+        str(one.seed), errand, end, f"{one.off:.2f}", f"{one.ran.metres:.0f}", f"{one.ran.seconds:.0f}",
+        str(one.ran.contacts), *told,
+    ]  # fmt: skip
