@@ -148,3 +148,16 @@ def test_errors_of_scans_average_out_those_of_their_places_do_not():
     across, along = np.sqrt(np.diag(stated)[:2] / np.diag(door.pose.covariance)[:2])
     assert across == pytest.approx(1.0, abs=0.02)
     assert along < 0.95
+
+
+def test_the_scatter_of_sightings_that_are_vague_in_different_ways_is_one_of_squares():
+    found = LandmarkMap(FEATURES)
+    for k, (x, y) in enumerate([(0.0, 0.0), (0.1, 0.0), (0.1, 0.1), (0.0, -0.1), (-0.1, 0.1)]):
+        aslant = np.array([1.0, 1.0 if k % 2 else -1.0, 0.0]) * 0.2
+        stated = np.outer(aslant, aslant) + np.diag([0.02, 0.02, 0.01]) ** 2
+        look = shown(DOOR, np.array([0.8, -0.5, 0.0]), k)
+        found.observe(PoseGaussian(np.array([0.8 + x, -0.5 + y, 0.0]), stated), *look)
+    for door in of_kind(found, OPENING):
+        assert np.linalg.eigvalsh(door.scatter).min() > -1e-9
+        assert np.linalg.eigvalsh(door.located(scatter_ratio(found.landmarks)).covariance).min() > 0.0
+    assert max(door.existence.seen for door in of_kind(found, OPENING)) > 2

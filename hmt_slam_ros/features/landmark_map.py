@@ -37,8 +37,8 @@ class Landmark:
     :ivar width: of an opening, m; 0 of a corner.
     :ivar width_deviation: of this, m.
     :ivar existence: whether it is there.
-    :ivar scatter: shape (3, 3), sum of the squares of its sightings about their mean, each in its own deviations.
-    :ivar by_scans: shape (3, 3), what part of their covariances is the scans' own, in the same, on average.
+    :ivar scatter: shape (3, 3), sum of the squares of its sightings about their mean, each in deviations.
+    :ivar by_scans: shape (3, 3), what part of their covariances is the scans' own, in deviations, on average.
     """
 
     kind: int
@@ -158,13 +158,14 @@ def _seen_again(landmark: Landmark, pose: PoseGaussian, seen: Landmarks, i: int,
     """A landmark after one more observation of it."""
     n = landmark.existence.seen + 1
     width, deviation = seen.widths[i], seen.width_deviations[i]
-    fused = _intersected(landmark.pose, pose, 1.0 / n)
     into = np.linalg.inv(np.linalg.cholesky(pose.covariance))
-    before, after = (into @ se2.log(se2.between(pose.mean, known.mean)) for known in (landmark.pose, fused))
+    # Welford's update: by what a sighting and the mean of those before it may be apart.
+    spread = np.linalg.cholesky(pose.covariance + landmark.pose.covariance / (n - 1))
+    off = np.linalg.solve(spread, se2.log(se2.between(pose.mean, landmark.pose.mean)))
     return replace(
         landmark,
-        pose=fused,
-        scatter=landmark.scatter + 0.5 * (np.outer(before, after) + np.outer(after, before)),
+        pose=_intersected(landmark.pose, pose, 1.0 / n),
+        scatter=landmark.scatter + np.outer(off, off),
         by_scans=landmark.by_scans + (into @ seen.covariances[i] @ into.T - landmark.by_scans) / n,
         width=landmark.width + float(width - landmark.width) / n,
         width_deviation=landmark.width_deviation + float(deviation - landmark.width_deviation) / n,
