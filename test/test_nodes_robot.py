@@ -91,11 +91,11 @@ def test_the_transforms_come_on_tf_and_tf_static(tmp_path, listener, start, hear
 
 
 def test_a_replay_in_real_time_takes_its_time(tmp_path, listener, start, heard):
-    start("robot", log=corridor_bag(tmp_path, 6), robot__rate=2.0, robot__paced=False)
+    start("robot", log=corridor_bag(tmp_path, 21), robot__rate=2.0, robot__paced=False)
     listener.until(lambda: heard["scan"])
     begin = time.monotonic()
     listener.until(ended(heard))
-    assert time.monotonic() - begin == pytest.approx(0.5, abs=0.25)
+    assert time.monotonic() - begin == pytest.approx(2.0, abs=0.5)
 
 
 def test_a_pause_stops_the_robot_and_its_end_lets_it_go_on(tmp_path, listener, start, heard):
