@@ -66,6 +66,14 @@ def test_the_only_place_is_where_the_robot_was_in_the_room(known):
     np.testing.assert_allclose(se2.transform(AREAS[place.opening.area], place.place[None])[0], (5.0, 3.0), atol=0.1)
 
 
+def test_a_door_to_which_no_way_leads_is_no_place_to_go_to(known):
+    (place,) = destinations(known).values()
+    chart = known.chart
+    edges = tuple(edge for edge in chart.edges if place.node not in {edge.start, edge.end})
+    assert edges
+    assert not destinations(replace(known, chart=replace(chart, edges=edges)))
+
+
 def test_a_robot_drives_into_a_room_and_from_there_to_another_door(known):
     goal = destinations(known)[node_at(known, 5.0)]
     west = opposite(eastwards(known))

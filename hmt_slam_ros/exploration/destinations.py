@@ -103,8 +103,10 @@ def rooms(known: KnownBuilding) -> dict[str, Destination]:
 
 
 def _every(known: KnownBuilding) -> Iterator[Destination]:
+    """Those to whose doors a way leads; a door seen from within its room is a node by itself."""
+    reached = {edge.end for edge in known.chart.edges}
     for number, node in enumerate(known.chart.nodes):
-        for opening in node.openings if node.kind == DOOR else ():
+        for opening in node.openings if node.kind == DOOR and number in reached else ():
             place = _behind(known, opening)
             if place is not None:
                 yield Destination(number, opening, place)
