@@ -19,7 +19,8 @@ from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry.chi_square import gate
 from hmt_slam_ros.processes.replica import FIRST_HYPOTHESIS, Replica
-from hmt_slam_ros.processes.tsbi_branching import Branching, Child, Parent
+from hmt_slam_ros.processes.tsbi_branches import Child, Parent
+from hmt_slam_ros.processes.tsbi_branching import Branching
 from hmt_slam_ros.sensing import Scan
 from hmt_slam_ros.topology.admission import Candidate, Query
 from hmt_slam_ros.topology.closure_search import ClosureSearch, Comparison

@@ -15,7 +15,8 @@ from hmt_slam_ros.processes.rtl import Rtl
 from hmt_slam_ros.processes.slam import MetricSlam
 from hmt_slam_ros.processes.tlca import Tlca
 from hmt_slam_ros.processes.tsbi import Tsbi
-from hmt_slam_ros.processes.tsbi_branching import Branches, Branching, Child
+from hmt_slam_ros.processes.tsbi_branches import Branches, Child
+from hmt_slam_ros.processes.tsbi_branching import Branching
 from hmt_slam_ros.sensing import Scan
 from hmt_slam_ros.topology.shortest_path import reachable
 

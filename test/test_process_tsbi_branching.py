@@ -10,7 +10,8 @@ from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.processes.replica import Replica
-from hmt_slam_ros.processes.tsbi_branching import Branching, Parent
+from hmt_slam_ros.processes.tsbi_branches import Parent
+from hmt_slam_ros.processes.tsbi_branching import Branching
 from hmt_slam_ros.topology.hypothesis_tree import LeafNotes
 
 PATH = np.array([[1.2 + 0.5 * k, 2.2, 0.1 * math.sin(k)] for k in range(6)])

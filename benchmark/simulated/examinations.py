@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.processes.replica import Replica
-from hmt_slam_ros.processes.tsbi_branching import Branches, Branching, Parent
+from hmt_slam_ros.processes.tsbi_branches import Branches, Parent
+from hmt_slam_ros.processes.tsbi_branching import Branching
 from hmt_slam_ros.sensing import Scan
 from hmt_slam_ros.topology.admission import Query
 from hmt_slam_ros.topology.appearance import Looks

@@ -28,7 +28,8 @@ from hmt_slam_ros.processes.messages import (
 )
 from hmt_slam_ros.processes.replica import FIRST_HYPOTHESIS, Replica, ReplicaState
 from hmt_slam_ros.processes.tsbi_awakening import arrived, looked_for, surely_found
-from hmt_slam_ros.processes.tsbi_branching import Branches, Branching, BranchingState, Child, Parent
+from hmt_slam_ros.processes.tsbi_branches import Branches, Child, Parent
+from hmt_slam_ros.processes.tsbi_branching import Branching, BranchingState
 from hmt_slam_ros.processes.tsbi_displacement import displaced_or_not, with_displaced
 from hmt_slam_ros.processes.tsbi_merging import merged as merged_into
 from hmt_slam_ros.processes.tsbi_reopening import reopened

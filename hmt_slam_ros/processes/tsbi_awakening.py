@@ -19,7 +19,8 @@ from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.processes.map_parts import Arc, Place
 from hmt_slam_ros.processes.messages import Keyframe
-from hmt_slam_ros.processes.tsbi_branching import Branches, Branching, Child, Parent
+from hmt_slam_ros.processes.tsbi_branches import Branches, Child, Parent
+from hmt_slam_ros.processes.tsbi_branching import Branching
 from hmt_slam_ros.topology.hybrid_map import HybridMap
 from hmt_slam_ros.topology.hypothesis_tree import Spot
 from hmt_slam_ros.topology.located import Located, is_certain

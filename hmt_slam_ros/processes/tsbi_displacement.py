@@ -18,7 +18,8 @@ import numpy as np
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.processes.tsbi_awakening import UNKNOWN, credit_of, is_rather, sighted_in
-from hmt_slam_ros.processes.tsbi_branching import Branches, Branching, Child, Parent
+from hmt_slam_ros.processes.tsbi_branches import Branches, Child, Parent
+from hmt_slam_ros.processes.tsbi_branching import Branching
 from hmt_slam_ros.topology.hypothesis_tree import Spot
 from hmt_slam_ros.topology.shortest_path import reachable
 from hmt_slam_ros.topology.unknown import unknown

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.processes.map_parts import Merged
-from hmt_slam_ros.processes.tsbi_branching import Child, Parent
+from hmt_slam_ros.processes.tsbi_branches import Child, Parent
 from hmt_slam_ros.topology.closure_search import ClosureSearch
 
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.processes.map_parts import Relabelled
 from hmt_slam_ros.processes.messages import Leaf
-from hmt_slam_ros.processes.tsbi_branching import Child, Parent
+from hmt_slam_ros.processes.tsbi_branches import Child, Parent
 from hmt_slam_ros.topology.hypothesis_tree import LeafNotes
 
 
