@@ -83,6 +83,18 @@ def test_a_room_in_which_the_map_has_traces_of_people_is_recognised(asked, laid)
     assert off(best) < 0.1
 
 
+def test_who_walks_through_what_the_robot_sees_speaks_against_no_place(asked, laid):
+    """Two people stand elsewhere at every keyframe, where the others see through."""
+    _, poses, scans = asked
+    for n, keyframe in enumerate(poses):
+        people = [box(x, y, x + 0.4, y + 0.4) for x, y in ((0.6 + 1.1 * n, 0.6), (4.6 - 1.0 * n, 1.2))]
+        scans[keyframe] = seen(np.concatenate((ROOM, *people)), ASKED[n], keyframe)
+    best = max(laid([0, 1]), key=lambda fit: fit.mode.log_mass)
+    assert best.area == 0
+    assert off(best) < 0.05
+    assert best.found.free <= 1
+
+
 def test_all_areas_are_looked_at_however_many_there_are(asked, laid):
     hybrid_map, _, scans = asked
     for area in range(2, 24):

@@ -16,7 +16,8 @@ from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.covariance import carried, of_inverse
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.sensing import Scan
-from hmt_slam_ros.topology.area_grid import AreaGrid, GridModel, build_area_grid
+from hmt_slam_ros.sensing.view import FREE, seen, view_of
+from hmt_slam_ros.topology.area_grid import AreaGrid, GridModel, Points, build_area_grid
 from hmt_slam_ros.topology.hybrid_map import HybridMap
 from hmt_slam_ros.topology.shortest_path import Reached, reachable
 from hmt_slam_ros.topology.transition import Place
@@ -176,6 +177,14 @@ class Views:
             self._drop_oldest()
         self._grids.move_to_end(key)
         return self._grids[key]
+
+    def lasting(self, keyframes: Mapping[int, Pose]) -> Points:
+        """Surface points of the keyframes, shape (n, 2), m, that none of them sees through: nobody who walked by."""
+        points = self.grid(keyframes).points
+        passed = np.zeros(len(points), dtype=np.bool_)
+        for keyframe, pose in keyframes.items():
+            passed |= seen(view_of(self._scans[keyframe]), se2.transform(se2.inverse(pose), points)) == FREE
+        return points[~passed]
 
     def _drop_oldest(self) -> None:
         """Forget the grids that were not used for longest, but not the newest."""

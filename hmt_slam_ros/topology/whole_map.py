@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from hmt_slam_ros.agreement import Agreement
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.topology.area_grid import AreaGrid
 from hmt_slam_ros.topology.area_ground import ground_around
 from hmt_slam_ros.topology.area_matching import MatchSettings, Mode, match
 from hmt_slam_ros.topology.hybrid_map import HybridMap
@@ -76,13 +77,14 @@ class WholeMap:
         :param shares: {area: probability by its look} of the areas; where it is most probable is looked first.
         """
         found: list[Located] = []
+        query = replace(self._views.grid(poses), points=self._views.lasting(poses))
         known = [area for area in hybrid_map.area_ids() if min(hybrid_map.keyframes(area), default=before) < before]
         parts = [part for part in regions(hybrid_map, known, self._reach) if part.own & shares.keys()]
         for part in sorted(parts, key=lambda part: (-sum(shares.get(a, 0.0) for a in part.own), part.reference)):
             best = max((fit.found.share for fit in found), default=0.0)
             place = self._views.place_of(hybrid_map, part.reference, part.poses, before)
             own = part.own & shares.keys()
-            here = self._fits(place, poses, own, max(_HALF, (best - _WORSE) * _SURE))
+            here = self._fits(place, query, poses, own, max(_HALF, (best - _WORSE) * _SURE))
             found += [fit._replace(mode=_seen_from(fit.mode, part.poses[fit.area])) for fit in here]
         return found
 
@@ -105,14 +107,14 @@ class WholeMap:
         self._views.forget()
 
     def _fits(
-        self, place: Place, poses: Mapping[int, Pose], own: Collection[int], least: float
+        self, place: Place, query: AreaGrid, poses: Mapping[int, Pose], own: Collection[int], least: float
     ) -> Iterator[Located]:
         """How the keyframes lie in areas of a region, in the frame of its reference.
 
+        :param query: what the keyframes saw.
         :param own: the areas.
         :param least: log-ratio of the samples on average, nats.
         """
-        query = self._views.grid(poses)
         some, known = (replace(grid, points=grid.points[::_EVERY]) for grid in (query, place.grid))
         temper = _EVERY * self._settings.temper
         margin = max(self._settings.margin, _WORSE * _SURE * temper * len(some.points))
