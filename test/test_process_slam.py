@@ -284,3 +284,22 @@ def test_two_hypotheses_are_tracked_side_by_side():
     for odometry, scan, _ in drive(10, start=40):
         dialogue.tell(odometry, scan)
     assert [leaf.hypothesis for leaf in dialogue.of(Keyframe)[-1].leaves] == [2]
+
+
+def test_a_robot_that_takes_itself_for_lost_goes_on_by_odometry():
+    """It may be wrong about that, so that it is drawn where it is if nobody carried it."""
+
+    def lost_at_the_third(keyframe):
+        lost = keyframe.sequence == 2
+        answer, accepted = agree(keyframe)
+        leaves = tuple(replace(leaf, lost=lost, arriving=lost) for leaf in answer.leaves)
+        return [replace(answer, leaves=leaves), accepted]
+
+    dialogue = Dialogue(answer=lost_at_the_third)
+    truths = []
+    for odometry, scan, pose in drive(40):
+        dialogue.tell(odometry, scan)
+        truths.append(pose)
+    assert [keyframe.carried for keyframe in dialogue.of(Keyframe)[:5]] == [False, False, False, True, False]
+    off = np.array([se2.between(t, e.pose.mean) for t, e in zip(truths, dialogue.of(LocalEstimate), strict=True)])
+    assert np.hypot(*off[:, :2].T).max() < 0.05

@@ -224,25 +224,29 @@ class MetricSlam:
         self._motion, self._watch = MotionModel(self._configuration.motion), OdometryWatch()
         self._dropped += len(self._queue)
         self._queue = self._queue.emptied(self._motion.odometry)
-        self._lose()
-        return [Arriving(self._events, self._scans)]
-
-    def _lose(self) -> None:
-        """The next scan may be from anywhere."""
         self._arriving = True
-        for live in self._live.values():
-            live.filter.stand(PoseGaussian.exactly(live.filter.pose))
+        return [Arriving(self._events, self._scans)]
 
     def _process(self, scan: Scan) -> list[Message]:
         prediction = self._motion.predict(scan.stamp)
         sighting = Sighting(self._mapping, deskewed(scan, self._motion.odometry, self._configuration.rtl))
-        said = [] if self._arriving else self._track(sighting, prediction)
+        said = self._put_down(prediction) if self._arriving else self._track(sighting, prediction)
         if self._arriving or self._place is not None or self._best.event_due(sighting):
             said += self._keyframe_event(sighting)
         for live in self._live.values():
             live.note_scan(scan.stamp)
         self._scans += 1
         return [*said, self._estimate(scan.stamp)]
+
+    def _put_down(self, prediction: Prediction) -> list[Message]:
+        """Draw every hypothesis where the prediction has the robot, of which nothing is known where nothing is sure.
+
+        A robot that was carried is drawn where it was last; one that takes itself for lost, and may be wrong, goes on.
+        """
+        for live in self._live.values():
+            at = se2.compose(live.filter.pose, prediction.together.increment)
+            live.filter.stand(PoseGaussian.exactly(at))
+        return []
 
     def _track(self, sighting: Sighting, prediction: Prediction) -> list[Message]:
         """Move every hypothesis on to the scan, and learn from what the best one found."""
@@ -319,8 +323,7 @@ class MetricSlam:
                 self._live[leaf.parent].merge(leaf.merged, keyframes)
         self._replica.apply(hypotheses)
         self._lost = all(leaf.lost for leaf in hypotheses.leaves)
-        if all(leaf.arriving for leaf in hypotheses.leaves):
-            self._lose()
+        self._arriving |= all(leaf.arriving for leaf in hypotheses.leaves)
         children = {}
         for leaf in hypotheses.leaves:
             parent = self._live[leaf.parent]
