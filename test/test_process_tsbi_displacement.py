@@ -12,12 +12,13 @@ from worlds import box, scan_in
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.processes import tsbi_awakening
-from hmt_slam_ros.processes.messages import AreaEvents, Forgotten
+from hmt_slam_ros.processes.messages import AreaEvents, Forgotten, Keyframe
 from hmt_slam_ros.processes.tsbi import Tsbi
 from hmt_slam_ros.processes.tsbi_awakening import UNKNOWN
 from hmt_slam_ros.processes.tsbi_displacement import displaced_or_not, with_displaced
-from hmt_slam_ros.topology.hypothesis_tree import LeafNotes, Spot
+from hmt_slam_ros.topology.hypothesis_tree import LeafNotes, Spot, Stay
 from hmt_slam_ros.topology.unknown import tells_nothing
+from hmt_slam_ros.topology.whereabouts import Whereabouts
 
 FAR, HERE = (30.0, 20.0), (0.0, 0.0)
 PRIOR = math.log(1e-5)
@@ -122,11 +123,16 @@ def test_an_area_is_not_left_without_keyframes():
 
 @pytest.mark.parametrize(("nats", "lost"), [(11.0, None), (12.0, 18)])
 def test_where_nothing_is_stored_it_is_lost_from_the_next_keyframe_on_if_that_is_more_probable(nats, lost):
-    parent, branching, newest = rooms_apart((ROOM,), [], 0.1)
-    doubtful = replace(parent, notes=replace(parent.notes, doubts={newest[4]: nats}))
+    parent, branching, _ = rooms_apart((ROOM,), [], 0.1)
+    spot = Spot(0, 17, PATH[3])
+    doubtful = replace(parent, notes=replace(parent.notes, doubts={17: nats}, spots={17: spot}))
+    branching.remember(17, scan_in(OTHER, PATH[3], field_of_view=2 * np.pi, beams=361), {17})
     child = displaced_or_not(branching, doubtful, 17)
     assert child.notes.lost == lost
     assert bool(child.notes.doubts) == (lost is None)
+    if lost is not None:
+        assert child.notes.stay.spot is spot
+        assert child.notes.stay.probability == pytest.approx(1.0 / (1.0 + math.exp(PRIOR + nats)))
 
 
 @pytest.mark.parametrize(
@@ -146,6 +152,43 @@ def test_where_nothing_is_stored_it_is_lost_if_it_is_rather_in_another_place(wor
     assert child.notes.lost == lost
     assert not child.notes.doubts
     assert not child.notes.spots
+
+
+@pytest.mark.parametrize(("lost", "stays"), [(11, True), (9, False)], ids=["takes itself for lost", "was carried"])
+def test_where_it_would_be_if_it_had_not_been_displaced_is_where_odometry_has_it_when_it_is_lost(lost, stays):
+    parent, branching, _ = rooms_apart((ROOM, OTHER), [FAR], 0.1)
+    notes = replace(parent.notes, lost=lost, stay=Stay(Spot(1, 10, PATH[2]), 0.4))
+    scan = scan_in(ROOM, PATH[3], field_of_view=2 * np.pi, beams=361)
+    keyframe = Keyframe(11, scan, 1.0, (), carried=True, mapping=False)
+    (child,) = tsbi_awakening.arrived(branching, replace(parent, notes=notes), keyframe, PATH[3]).children
+    assert child.notes.lost == 11
+    if not stays:
+        assert child.notes.stay is None
+        return
+    assert (child.notes.stay.spot.area, child.notes.stay.spot.keyframe, child.notes.stay.probability) == (1, 11, 0.4)
+    np.testing.assert_array_equal(child.notes.stay.spot.pose, PATH[3])
+
+
+@pytest.mark.parametrize(("at", "found"), [(0.0, True), (3.0, False)], ids=["there", "elsewhere"])
+def test_a_place_is_believed_sooner_where_it_would_be_if_it_had_not_been_displaced_and_later_elsewhere(at, found):
+    parent, branching, newest = rooms_apart((ROOM, OTHER, ROOM), [FAR, FAR], 0.1)
+    looked = {}
+    for probability in (0.0, 0.4):
+        stay = Stay(Spot(0, newest[0], np.array([at, 0.0, 0.0])), probability)
+        notes = replace(parent.notes, lost=newest[0], stay=stay)
+        where = tsbi_awakening.looked_for(branching, replace(parent, notes=notes)).where
+        looked[probability] = max(p for p, fit in zip(where.probabilities, where.found, strict=True) if fit.area == 0)
+    assert (looked[0.4] > looked[0.0]) == found
+
+
+def test_a_robot_that_may_have_stayed_where_much_was_moved_is_nowhere_rather_than_in_a_like_place():
+    where = Whereabouts((None, None), np.array([0.0, 0.9]))
+    stayed = where.or_stayed(np.array([True, False]), 0.5, 4)
+    # Of the displaced half, 0.2 on ground that nobody knows weighs 0.1 of it; the other half weighs as new ground.
+    np.testing.assert_allclose(stayed.probabilities, [0.0, 0.9 / (0.9 + 0.1 + 0.1 / 0.2)], atol=1e-12)
+    assert where.or_stayed(np.array([True, False]), 0.0, 4).probabilities == pytest.approx(where.probabilities)
+    known = Whereabouts((None, None), np.array([0.6, 0.3]))
+    assert known.or_stayed(np.array([True, False]), 0.5, 4).probabilities[0] > 0.8
 
 
 def test_scans_that_the_map_does_not_hold_are_remembered_as_long_as_they_are_doubtful():

@@ -1,6 +1,6 @@
 """The names of what makes a folder a saved map."""
 
-FORMAT, VERSION = "hmt_map", 16
+FORMAT, VERSION = "hmt_map", 17
 
 HMT_MAP = "hmt_map"
 """The folder in an output folder."""

@@ -54,10 +54,23 @@ def arrived(branching: Branching, parent: Parent, keyframe: Keyframe, pose: Pose
     :param pose: ``area_T_base`` of its scan.
     """
     if keyframe.carried:
-        return _awoken(branching, parent, keyframe.sequence, keyframe.place)
+        return _awoken(branching, _stayed_until(parent, keyframe, pose), keyframe.sequence, keyframe.place)
     if keyframe.place is not None and parent.notes.lost is not None:
         return _told_where(branching, parent, keyframe.place, pose)
     return Branches([Child(parent.hypothesis, parent.log_weight, parent.area, parent.notes)])
+
+
+def _stayed_until(parent: Parent, keyframe: Keyframe, pose: Pose) -> Parent:
+    """The hypothesis, which knows where a robot is that takes itself for lost and is not; of one carried, nobody does.
+
+    :param pose: ``area_T_base`` of the scan, as its odometry has it.
+    """
+    stay, notes = parent.notes.stay, parent.notes
+    if stay is not None and notes.lost == keyframe.sequence and keyframe.place is None:
+        stay = replace(stay, spot=Spot(parent.area, keyframe.sequence, pose))
+    else:
+        stay = None
+    return replace(parent, notes=replace(notes, stay=stay))
 
 
 def _awoken(branching: Branching, parent: Parent, keyframe: int, place: Place | None) -> Branches:
@@ -120,6 +133,7 @@ def looked_for(branching: Branching, parent: Parent) -> Branches:
     where = branching.everywhere(parent, poses, parent.notes.lost, told)
     if parent.notes.claim is not None:
         where = where.with_unmapped(UNKNOWN)
+    where = _or_stayed(parent, where, poses)
     noted = _credited(replace(parent, notes=parent.notes.checked((), tuple(poses))), where, poses)
     if len(keyframes) >= _REFUTED and float(where.probabilities.sum()) < 1.0 - _NOWHERE:
         noted = replace(noted, notes=replace(noted.notes, told=None))
@@ -134,13 +148,26 @@ def looked_for(branching: Branching, parent: Parent) -> Branches:
         return Branches([still], True, where=where)
     arc = Arc(parent.area, located.area, PoseGaussian.exactly(reference).compose(located.mode.measured.inverse()), True)
     log_weight = noted.log_weight + math.log(probability)
-    notes = replace(noted.notes, lost=None, told=None, sighted=None, found=located.area, claim=None, credit=0.0)
+    notes = replace(noted.notes, lost=None, stay=None, told=None, sighted=None, claim=None, credit=0.0)
+    notes = replace(notes, found=located.area)
     found = Child(parent.hypothesis, log_weight, parent.area, notes, arcs=(arc,), reload=True)
     # What speaks for the place from here on is the other's.
     still_lost = replace(sighted, credit=None)
     left = noted.log_weight + math.log(max(1.0 - probability, 1e-300))
     still = replace(still, log_weight=left, notes=still_lost)
     return Branches([still, found], True, where=where)
+
+
+def _or_stayed(parent: Parent, where: Whereabouts, poses: Mapping[int, Pose]) -> Whereabouts:
+    """Where a robot is that may have been right about its place before it took itself for lost.
+
+    :param poses: {keyframe: ``reference_T_base``} of those that were located.
+    """
+    stay = parent.notes.stay
+    if stay is None or stay.spot.keyframe not in poses:
+        return where
+    there = _at(parent.hybrid_map, where, stay.spot, poses)
+    return where.or_stayed(there, stay.probability, len(parent.hybrid_map.area_ids()))
 
 
 def surely_found(looked: Branches) -> Branches:

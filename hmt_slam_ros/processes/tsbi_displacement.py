@@ -20,7 +20,7 @@ from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.processes.tsbi_awakening import UNKNOWN, credit_of, is_rather, sighted_in
 from hmt_slam_ros.processes.tsbi_branches import Branches, Child, Parent
 from hmt_slam_ros.processes.tsbi_branching import Branching
-from hmt_slam_ros.topology.hypothesis_tree import Spot
+from hmt_slam_ros.topology.hypothesis_tree import Spot, Stay
 from hmt_slam_ros.topology.shortest_path import reachable
 from hmt_slam_ros.topology.unknown import unknown
 
@@ -51,8 +51,11 @@ def displaced_or_not(branching: Branching, parent: Parent, event: int) -> Child:
     log_odds, since = parent.notes.displaced
     notes = parent.notes
     if log_odds > 0.0:
-        lost = None if _recognized(branching, parent, since) else event + 1
-        notes = replace(notes, doubts={}, spots={}, lost=lost)
+        if _recognized(branching, parent, since):
+            notes = replace(notes, doubts={}, spots={})
+        else:
+            stay = Stay(notes.spots[event], 1.0 / (1.0 + math.exp(log_odds)))
+            notes = replace(notes, doubts={}, spots={}, lost=event + 1, stay=stay)
     return Child(parent.hypothesis, parent.log_weight, parent.area, notes)
 
 

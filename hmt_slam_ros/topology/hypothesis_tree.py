@@ -42,6 +42,18 @@ class Spot:
 
 
 @dataclass(frozen=True, eq=False)
+class Stay:
+    """That a robot that takes itself for lost was not displaced: furniture that was moved contradicts, too.
+
+    :ivar spot: where it is then.
+    :ivar probability: of that, by the scans for which it takes itself for lost.
+    """
+
+    spot: Spot
+    probability: float
+
+
+@dataclass(frozen=True, eq=False)
 class LeafNotes:
     """What TSBI remembers of a leaf beside its map; children inherit it.
 
@@ -58,6 +70,7 @@ class LeafNotes:
         events since the robot may have been displaced.
     :ivar spots: {event of these: where the robot was}, where the map stays as it is and does not hold them.
     :ivar lost: the keyframe at which the robot arrived it is not known where, until that is recognized; else None.
+    :ivar stay: where it was then if it was not displaced, where nothing is mapped and nobody carried it; else None.
     :ivar told: where one of the keyframes since then is, as somebody says; else None.
     :ivar sighted: where it was recognized at the last look, if it was.
     :ivar found: the known area in which it was recognized, until it goes over into another one; else None.
@@ -75,6 +88,7 @@ class LeafNotes:
     doubts: Mapping[int, float] = field(default_factory=dict)
     spots: Mapping[int, Spot] = field(default_factory=dict)
     lost: int | None = None
+    stay: Stay | None = None
     told: Told | None = None
     sighted: Spot | None = None
     found: int | None = None
@@ -139,8 +153,8 @@ class LeafNotes:
         kept = {area: keyframes & covariances.keys() for area, keyframes in self.compared.items()}
         compared = {area: keyframes for area, keyframes in kept.items() if keyframes}
         return LeafNotes(
-            covariances, compared, doubts=self.doubts, spots=self.spots, lost=self.lost, told=self.told,
-            sighted=self.sighted, claim=self.claim, credit=self.credit,
+            covariances, compared, doubts=self.doubts, spots=self.spots, lost=self.lost, stay=self.stay,
+            told=self.told, sighted=self.sighted, claim=self.claim, credit=self.credit,
         )  # fmt: skip
 
 

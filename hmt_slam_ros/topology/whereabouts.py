@@ -87,6 +87,22 @@ class Whereabouts(NamedTuple):
         rest = max(0.0, 1.0 - float(self.probabilities.sum()))
         return Whereabouts(self.found, weights / max(rest + float(weights.sum()), 1e-300))
 
+    def or_stayed(self, there: NDArray[np.bool_], probability: float, areas: int) -> Whereabouts:
+        """The same for a robot that may be where it would be if it had not been displaced.
+
+        What it sees there is as likely as in new ground at least, since things are moved.
+
+        :param there: which places are where it would be, shape (len(found),).
+        :param probability: that it was not displaced.
+        :param areas: known areas, over which the prior of one that was is flat.
+        """
+        rest = max(1.0 - float(self.probabilities.sum()), 1e-300)
+        displaced = UNMAPPED / rest * self.probabilities
+        stayed = np.where(there, areas / (1.0 - UNMAPPED) * displaced, 0.0)
+        weights = (1.0 - probability) * displaced + probability * stayed
+        nowhere = (1.0 - probability) * UNMAPPED + probability * max(0.0, 1.0 - float(stayed.sum()))
+        return Whereabouts(self.found, weights / (nowhere + weights.sum()))
+
 
 def whereabouts(
     whole_map: WholeMap,
