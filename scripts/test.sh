@@ -13,6 +13,13 @@ check() {
     "$venv/bin/python" -m "$@" || status=1
 }
 
+compile_kernels() {
+    local folder
+    folder=$(mktemp -d)
+    "$venv/bin/hmt_slam" map data/malaga_one_loop --out "$folder/map" >/dev/null 2>&1
+    rm -r "$folder"
+}
+
 if [ "${1:-}" = --floor ]; then
     shift
     make_environment --floor
@@ -20,8 +27,11 @@ if [ "${1:-}" = --floor ]; then
     export NUMBA_CACHE_DIR="$venv/numba_cache"
 else
     make_environment
+    # While mypy reads, as both workers of the tests would otherwise compile the same kernels at the same time.
+    [ "$#" != 0 ] || compile_kernels &
     check ruff check
     check mypy
+    wait
     [ "$status" = 0 ] || echo "ruff or mypy found faults, see above; the tests run all the same"
 fi
 
