@@ -158,7 +158,7 @@ def is_right(institute: InstituteMap, estimator: PlaceEstimator, pose: Float64) 
     if state is None:
         return False
     off = se2.between(axis_of(institute, state), pose)
-    near = math.hypot(off[0] - estimator.away, off[1]) <= _RIGHT
+    near = math.hypot(off[0] - estimator.frame.away, off[1]) <= _RIGHT
     return near and abs(float(off[2])) <= _TURN
 
 

@@ -70,7 +70,7 @@ def test_a_lost_robot_knows_its_place_after_some_nodes_and_how_far_it_is_beyond_
     assert estimator.belief.confident
     state = estimator.belief.most_likely
     assert (node_of(state), heading_of(state)) == (node_at(chart, 16.0), eastwards(chart))
-    assert estimator.away == pytest.approx(3.0, abs=0.1)
+    assert estimator.frame.away == pytest.approx(3.0, abs=0.1)
     assert estimator.in_hallway
 
 
@@ -127,11 +127,11 @@ def test_before_a_door_a_confident_robot_knows_its_pose_in_the_area_of_the_door(
 def test_a_door_of_whose_wall_too_little_is_seen_tells_no_pose(chart, graph, monkeypatch):
     estimator = PlaceEstimator(graph, CONFIGURATION, certain_belief(graph, CONFIGURATION.places, 0))
     list(drive(estimator, [(4.9, 0.3, 0.5 * math.pi)] * 2))
-    assert estimator.door_ahead() is not None
-    hidden = estimator._seen.covariances.copy()
+    assert estimator.openings.door_ahead() is not None
+    hidden = estimator.openings.seen.covariances.copy()
     hidden[:, 2, 2] = math.radians(0.4) ** 2
-    monkeypatch.setattr(estimator, "_seen", estimator._seen._replace(covariances=hidden))
-    assert estimator.door_ahead() is None
+    monkeypatch.setattr(estimator.openings, "seen", estimator.openings.seen._replace(covariances=hidden))
+    assert estimator.openings.door_ahead() is None
 
 
 def test_a_door_that_someone_hid_is_noticed_by_the_turn_into_it(chart, graph, monkeypatch):
@@ -190,7 +190,7 @@ def test_who_stands_beside_the_robot_does_not_move_the_middle_of_the_hallway(gra
     person = np.concatenate([se2.transform(BUILDING, beside[:, k : k + 2]) for k in (0, 2)], axis=1)
     for _ in range(2):
         estimator.observe(scan_at(np.concatenate((walls(), person)), se2.compose(BUILDING, pose), 0.01, rng, 720))
-    np.testing.assert_allclose(estimator.ahead(2.0), (2.0, -0.1), atol=0.05)
+    np.testing.assert_allclose(estimator.frame.ahead(2.0), (2.0, -0.1), atol=0.05)
 
 
 def test_a_robot_that_stands_learns_nothing_however_its_wheels_tremble(chart, graph):

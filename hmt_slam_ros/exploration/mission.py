@@ -153,8 +153,9 @@ class MissionPilot:
         if state is None or not due or estimator.turning:
             return
         self._looked, self._looked_from = stamp, np.zeros(3)
-        clear = np.array([estimator.free(estimator.axis - quarter) for quarter in range(QUARTERS)])
-        self.ways.look(state, estimator.away, estimator.aside, clear)
+        frame = estimator.frame
+        clear = np.array([frame.free(quarter) for quarter in range(QUARTERS)])
+        self.ways.look(state, frame.away, frame.aside, clear)
 
     def _towards(self, scan: Scan, place: Float64) -> Command:
         return command_towards(scan, place, self._velocity, self._limits)
@@ -166,11 +167,11 @@ class MissionPilot:
         """
         here = self.estimator.arrivals, self.estimator.at_wall
         arrived = here[0] != self._here[0]
-        if (self.estimator.axis - self._axis) % QUARTERS and not arrived:
+        if (self.estimator.frame.axis - self._axis) % QUARTERS and not arrived:
             self.phase = Phase.TURN
             return self._around(scan)
-        self._axis = self.estimator.axis
-        if arrived or here[1] > self._here[1] or (self._turned_back and self.estimator.away >= -_BACK):
+        self._axis = self.estimator.frame.axis
+        if arrived or here[1] > self._here[1] or (self._turned_back and self.estimator.frame.away >= -_BACK):
             self._decide(scan)
         self._here = here
         if self.phase is not Phase.HALLWAY:
@@ -179,13 +180,13 @@ class MissionPilot:
             self._get_away()
         elif self._goes_wrong():
             self._turn_back()
-        return self._towards(scan, self.estimator.ahead(_AHEAD))
+        return self._towards(scan, self.estimator.frame.ahead(_AHEAD))
 
     def _goes_wrong(self) -> bool:
         """Whether its way was seen to be closed, and there is another one."""
         belief, goal, closed = self.estimator.belief, self._goal, self.ways.closed
         state = belief.most_likely if belief is not None and belief.confident else None
-        if goal is None or state not in closed or self.estimator.away < 0.0:
+        if goal is None or state not in closed or self.estimator.frame.away < 0.0:
             return False
         return bool(turn_towards(self._known.graph, state, goal.node, closed))
 
@@ -208,7 +209,7 @@ class MissionPilot:
 
     def _held_up(self, scan: Scan) -> bool:
         """Whether the robot has not come farther along its axis for long, wherever it drove meanwhile."""
-        came = self.estimator.along(self._axis)
+        came = self.estimator.frame.along(self._axis)
         held_up = came < self._came + _PROGRESS and scan.stamp - self._since > _PATIENCE
         if held_up or came >= self._came + _PROGRESS:
             self._came, self._since = came, scan.stamp
@@ -223,7 +224,7 @@ class MissionPilot:
             self._turn_back()
             return
         if goal is not None and belief is not None and belief.confident and facing is not None and facing[0] == node:
-            self._along_hallway = self.estimator.axis
+            self._along_hallway = self.estimator.frame.axis
             self._turn_to_door(goal.opening.direction - facing[1], scan)
             return
         closed = self.ways.closed
@@ -237,16 +238,16 @@ class MissionPilot:
 
     def _leads_on(self, quarters: int) -> bool:
         """Whether the robot sees that it goes on so many quarters to the right."""
-        return not self.estimator.free(self.estimator.axis - quarters) < _OPEN
+        return not self.estimator.frame.free(quarters) < _OPEN
 
     def _freest(self, without: int) -> int:
         """In how many quarters to the right one sees farthest, but for some."""
         others = [k for k in range(QUARTERS) if (k - without) % QUARTERS]
-        return max(others, key=lambda k: np.nan_to_num(self.estimator.free(self.estimator.axis - k)))
+        return max(others, key=lambda k: np.nan_to_num(self.estimator.frame.free(k)))
 
     def _turn(self, quarters: int) -> None:
         """Turn so many quarters to the right."""
-        self._axis, self._came = self.estimator.axis - quarters, -math.inf
+        self._axis, self._came = self.estimator.frame.axis - quarters, -math.inf
 
     def _turn_to_door(self, quarters: int, scan: Scan) -> None:
         """Turn so many quarters to the right, to where the goal's door is."""
@@ -255,16 +256,16 @@ class MissionPilot:
 
     def _around(self, scan: Scan) -> Command:
         """Turn at the last node into a hallway; where that does not get anywhere, into another one."""
-        if self.estimator.axis % QUARTERS == self._axis % QUARTERS and not self.estimator.turning:
+        if self.estimator.frame.axis % QUARTERS == self._axis % QUARTERS and not self.estimator.turning:
             self.phase, self._came = Phase.HALLWAY, -math.inf
         elif self._held_up(scan):
-            self._turn(self._freest(self.estimator.axis - self._axis))
-        return self._towards(scan, self.estimator.on_line(self._axis, _AHEAD))
+            self._turn(self._freest(self.estimator.frame.axis - self._axis))
+        return self._towards(scan, self.estimator.frame.on_line(self._axis, _AHEAD))
 
     def _to_door(self, scan: Scan) -> Command:
         """Turn to the goal's door, and begin with the metric filter there."""
         assert self._goal is not None
-        front, beyond = (self.estimator.beside_node(self._axis, far) for far in (0.0, _BEHIND))
+        front, beyond = (self.estimator.frame.beside_node(self._axis, far) for far in (0.0, _BEHIND))
         off = math.atan2(*(beyond - front)[::-1])
         self._before_door |= math.hypot(*front) <= _MIDDLE
         start = metric_start(self.estimator, self._known.chart) if self._before_door and abs(off) <= _STRAIGHT else None
@@ -335,7 +336,7 @@ class MissionPilot:
         self.estimator = PlaceEstimator(graph, self._configuration, certain_belief(graph, places, state))
         self._here = 0, False
         if self._goal.node == node:
-            self._along_hallway = self.estimator.axis - (opening.direction - looks) + 1
+            self._along_hallway = self.estimator.frame.axis - (opening.direction - looks) + 1
             self._turn_to_door(self._goal.opening.direction - looks, scan)
             return
         quarters = turn_towards(graph, state, self._goal.node, self.ways.closed)

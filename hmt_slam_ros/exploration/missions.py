@@ -217,7 +217,7 @@ class Missions:
         share = float(belief.probabilities.max() if facing else belief.probabilities[-1])
         return PlaceEstimate(
             self._stamp, chart.name(facing[0]) if facing else None, DIRECTION_NAMES[facing[1]] if facing else None,
-            estimator.away if facing else 0.0, share, max(0.0, belief.entropy), belief.confident,
+            estimator.frame.away if facing else 0.0, share, max(0.0, belief.entropy), belief.confident,
             None if self.pilot.room is None else self._room,
         )  # fmt: skip
 

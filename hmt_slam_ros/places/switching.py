@@ -31,7 +31,7 @@ class MetricStart(NamedTuple):
 
 def metric_start(estimator: PlaceEstimator, chart: Chart) -> MetricStart | None:
     """What the opening before the robot tells of its pose; None where it is not confident, or before no opening."""
-    facing, seen = estimator.facing, estimator.door_ahead()
+    facing, seen = estimator.facing, estimator.openings.door_ahead()
     if facing is None or seen is None or not estimator.at_node:
         return None
     if estimator.belief is None or not estimator.belief.confident:
