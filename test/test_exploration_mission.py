@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from small_floor import AREAS, CONFIGURATION, charted, mapped, seen_at
+from worlds import blank_scan
 
 from hmt_slam_ros.exploration import mission
 from hmt_slam_ros.exploration.destinations import Destination, KnownBuilding, destinations
@@ -119,6 +120,16 @@ def test_a_lost_robot_turns_at_the_end_of_the_hallway_and_is_confident_before_it
     assert phases[0] is Phase.HALLWAY
     assert phases[-1] is Phase.THERE
     assert math.dist(robot.pose[:2], (5.0, 3.0)) < 0.3
+
+
+def test_a_robot_that_sees_nothing_goes_on_and_waits_for_walls(known):
+    pilot = MissionPilot(known, CONFIGURATION, LIMITS)
+    pilot.go(None)
+    for k in range(100):
+        command = pilot.steer(replace(blank_scan(), stamp=200_000_000 * k))
+        assert math.isfinite(command.speed)
+        assert math.isfinite(command.turn_rate)
+    assert pilot.estimator.belief is None
 
 
 def test_where_the_belief_is_wrong_there_is_no_door_and_the_robot_goes_on(known):

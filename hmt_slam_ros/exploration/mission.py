@@ -342,4 +342,3 @@ class MissionPilot:
         quarters = turn_towards(graph, state, self._goal.node, self.ways.closed)
         self._turn(quarters or 0)
         self.phase = Phase.LOST if quarters is None else Phase.TURN
-

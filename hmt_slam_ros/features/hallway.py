@@ -22,6 +22,9 @@ from hmt_slam_ros.features.rays import Rays
 # Sectors of the circle, an even number, in each of which the median beam counts, so that no single beam decides; and
 # how many axes have to be known.
 _SECTORS, _KNOWN = 72, 18
+NOTHING_AROUND = np.full(_SECTORS, np.nan)
+"""How far one sees in every sector before the first scan."""
+
 # Nobody sees farther along a hallway than this, m; so a length does not depend on the laser's reach.
 _FAR = 10.0
 # Share of the axes along which a space is no longer than its length.

@@ -15,7 +15,7 @@ import numpy as np
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration.features import Features
 from hmt_slam_ros.features.extraction import Lines
-from hmt_slam_ros.features.hallway import distances_around, log_odds, sector_of, space_within
+from hmt_slam_ros.features.hallway import NOTHING_AROUND, distances_around, log_odds, sector_of, space_within
 from hmt_slam_ros.features.heading import QUARTER, BuildingHeading
 from hmt_slam_ros.features.rays import Rays
 from hmt_slam_ros.geometry import se2
@@ -56,7 +56,7 @@ class WallFrame:
 
     def __init__(self, features: Features) -> None:
         self._features, self._heading = features, BuildingHeading(features)
-        self._distances = np.full(1, np.nan)
+        self._distances = NOTHING_AROUND
         self.pose, self.axis, self.middle = np.zeros(3), 0, np.zeros(2)
         self.node: Noticed | None = None
 
