@@ -35,6 +35,10 @@ class Corners(NamedTuple):
     confidences: Float64
 
 
+NO_CORNERS = Corners(np.empty((0, 3)), np.empty((0, 3, 3)), np.empty(0, np.bool_), np.empty(0))
+"""What is followed where openings alone are asked for."""
+
+
 def corners_of(lines: Lines, features: Features) -> Corners:
     """The corners that lines make."""
     tolerance = math.sin(math.radians(features.corner_angle))

@@ -117,7 +117,7 @@ class PlaceEstimator:
         if self._begins_there and self.belief is None:
             frame.node, self.belief = Noticed(frame.place, _BEGIN**2), self._first
         corners, openings = corners_of(lines, features), openings_of(lines, rays, features)
-        self.openings.observe(frame, corners, openings, rays)
+        self.openings.observe(frame, openings, rays)
         if frame.looks_ahead:
             self._turned_at = None
             self.in_hallway = self._is_in_hallway(lines)

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from hmt_slam_ros.configuration.features import Features
-from hmt_slam_ros.features.corners import Corners
+from hmt_slam_ros.features.corners import NO_CORNERS
 from hmt_slam_ros.features.heading import QUARTER
 from hmt_slam_ros.features.landmark_map import Landmark, LandmarkMap
 from hmt_slam_ros.features.landmarks import OPENING, both
@@ -37,14 +37,14 @@ class OpeningsAround:
         self._around = LandmarkMap(replace(features, landmark_least=0.0))
         self.seen = NO_OPENINGS
 
-    def observe(self, frame: WallFrame, corners: Corners, openings: Openings, rays: Rays) -> None:
+    def observe(self, frame: WallFrame, openings: Openings, rays: Rays) -> None:
         """Follow what a scan shows.
 
         :param frame: where it was taken.
         :param rays: its beams.
         """
         self.seen = openings
-        self._around.observe(frame.pose_belief, both(corners, openings), rays)
+        self._around.observe(frame.pose_belief, both(NO_CORNERS, openings), rays)
         near = (one for one in self._around.landmarks if math.dist(one.pose.mean[:2], frame.place) < _FORGET)
         self._around.landmarks = list(near)
 
