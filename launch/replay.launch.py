@@ -34,6 +34,14 @@ def generate_launch_description() -> LaunchDescription:
                 description="YAML file with the parameters.",
             ),
             DeclareLaunchArgument("namespace", default_value="", description="Namespace of nodes and topics."),
+            # Where rviz2 is not installed, launch gives up before the other nodes run.
+            Node(
+                package="rviz2",
+                executable="rviz2",
+                arguments=["-d", PathJoinSubstitution([share, "config", "hmt_slam.rviz"])],
+                parameters=[{"use_sim_time": True}],
+                condition=IfCondition(LaunchConfiguration("rviz")),
+            ),
             IncludeLaunchDescription(
                 PythonLaunchDescriptionSource(PathJoinSubstitution([share, "launch", "mapping.launch.py"])),
                 launch_arguments={
@@ -53,13 +61,6 @@ def generate_launch_description() -> LaunchDescription:
                     {"log": LaunchConfiguration("log"), "robot.rate": rate, "use_sim_time": False},
                 ],
                 output="screen",
-            ),
-            Node(
-                package="rviz2",
-                executable="rviz2",
-                arguments=["-d", PathJoinSubstitution([share, "config", "hmt_slam.rviz"])],
-                parameters=[{"use_sim_time": True}],
-                condition=IfCondition(LaunchConfiguration("rviz")),
             ),
         ]
     )

@@ -23,7 +23,7 @@ from hmt_slam_ros.processes.documents import BeginRequest, BegunPart, SavedPart,
 if TYPE_CHECKING:
     from hmt_slam_ros.nodes.slam_node import SlamNode
 
-_PATIENCE = 20.0  # s, for the end of a keyframe event and for the answers of the others
+_PATIENCE = 60.0  # s, for the end of a keyframe event and for the answers of the others, who may compile kernels
 _DISCOVERY = 5.0  # s, until DDS has made processes known to each other that just began
 
 
