@@ -1,15 +1,20 @@
 """The explorer as an OS process over DDS, with the five processes and a simulated robot that it drives."""
 
+import json
+
 import numpy as np
 import pytest
 
 pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
 
 from geometry_msgs.msg import PoseStamped
+from sensor_msgs.msg import LaserScan
 from std_msgs.msg import String
+from std_srvs.srv import Trigger
 
 from hmt_slam_ros.nodes import qos
-from hmt_slam_ros.nodes.conversions import planar_pose
+from hmt_slam_ros.nodes.conversions import keyframe_frame, planar_pose
+from hmt_slam_ros.nodes.topics import KEYFRAME_SCANS, KEYFRAMES
 
 WORLD = """
 walls: [[0, -1, 5, -1], [5, -1, 5, 1], [5, 1, 3, 1], [3, 1, 3, 4],
@@ -59,6 +64,48 @@ def test_it_explores_and_goes_where_it_is_sent(listener, system):
     errands.publish(String(data="go area 0"))
     listener.until(lambda: len(outcomes) > 2, alive=nodes)
     assert outcomes[2].data == "go area 0: the robot is there"
+
+
+def test_with_another_map_it_begins_anew_also_where_it_was_not_there_when_the_map_was_exchanged(
+    listener, system, start
+):
+    outcomes = listener.hear(String, "explorer/outcome", qos.LATCHED)
+    nodes = system()
+    *others, explorer, robot = nodes
+    listener.until(lambda: outcomes, alive=nodes)
+    assert listener.call(Trigger, "slam/reset", Trigger.Request()).success
+    listener.until(lambda: len(outcomes) > 1, alive=nodes)
+    explorer.kill()
+    explorer.communicate()
+    heard = len(outcomes)
+    again = start("explorer", laser_pose="[0.0,0.0,0.0]")
+    listener.until(lambda: len(outcomes) > heard, alive=[*others, robot, again])
+    explored = "explore: all is known that can be reached; 0 places were given up"
+    assert {outcome.data for outcome in outcomes} == {explored}
+
+
+def test_where_a_part_of_the_map_never_comes_it_ends_with_a_sentence(listener, system, start):
+    """Slam comes back without what it said before its last checkpoint, and the explorer has not heard that."""
+    keyframes = listener.hear(String, KEYFRAMES, qos.CHAIN)
+    nodes = system()
+    listener.until(lambda: len(keyframes) > 2, alive=nodes)
+    explorer, slam = nodes[-2], nodes[0]
+    for node in (explorer, slam):
+        node.kill()
+        node.communicate()
+    writer = listener.node.create_publisher(String, KEYFRAMES, qos.CHAIN)
+    scans = listener.node.create_publisher(LaserScan, KEYFRAME_SCANS, qos.CHAIN)
+    document = json.loads(keyframes[2].data)
+    assert document["sequence"] == 2
+    late = start("explorer", laser_pose="[0.0,0.0,0.0]")
+    scan = LaserScan(angle_min=-3.0, angle_max=3.0, angle_increment=0.1, range_max=10.0, ranges=[1.0] * 61)
+    scan.header.frame_id = keyframe_frame(2, 0)
+    listener.until(lambda: writer.get_subscription_count() > 0)
+    writer.publish(keyframes[2])
+    scans.publish(scan)
+    error = late.communicate(timeout=60.0)[1]
+    assert late.returncode == 2
+    assert "Keyframe 0 never came, 2 did" in error
 
 
 def test_others_drive_to_its_goals(listener, system):

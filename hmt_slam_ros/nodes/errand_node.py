@@ -16,12 +16,15 @@ from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.nodes import conversions, qos
 from hmt_slam_ros.nodes.beginning import Beginning, declare_map
+from hmt_slam_ros.nodes.figures import PERIOD
+from hmt_slam_ros.nodes.inbox import Inbox
 from hmt_slam_ros.nodes.managed_node import ManagedNode
 from hmt_slam_ros.nodes.parameters import declare_frame, declare_laser_pose
 from hmt_slam_ros.nodes.running import run, spin_until
-from hmt_slam_ros.nodes.topics import COMMANDS, ERRANDS, GOALS, HMT_POSE, OUTCOMES, SCAN
+from hmt_slam_ros.nodes.topics import BEGIN, COMMANDS, ERRANDS, GOALS, HMT_POSE, OUTCOMES, SCAN
 from hmt_slam_ros.nodes.transforms import LaserMounting
-from hmt_slam_ros.processes.errands import Heading, Kind, Outcome, Steering, errand_of
+from hmt_slam_ros.processes.documents import BeginRequest, decode
+from hmt_slam_ros.processes.errands import Errand, Heading, Kind, Outcome, Steering, errand_of
 from hmt_slam_ros.processes.global_poses import GlobalPoses
 from hmt_slam_ros.processes.messages import Message, RealTimePose
 from hmt_slam_ros.processes.routing import Process
@@ -35,18 +38,19 @@ class ErrandNode(ManagedNode):
     """A node whose process drives the robot on errands.
 
     :ivar map_frame: name of the frame.
-    :ivar areas: where in the map its areas are, from :meth:`listen` on.
+    :ivar areas: where in the map its areas are, from :meth:`set_up` on.
     """
 
     areas: GlobalPoses
 
-    def __init__(self, name: str, kinds: Sequence[Kind]) -> None:
+    def __init__(self, name: str, kinds: Sequence[Kind], heard: Sequence[type]) -> None:
         """Declare the parameters.
 
         :param name: of the node.
         :param kinds: of errands.
+        :param heard: of messages that it hears of the five processes and the robot, but for scans and poses.
         """
-        self._name, self._kinds = name, kinds
+        self._name, self._kinds, self._heard = name, kinds, heard
         super().__init__(name)
 
     def declare(self) -> None:
@@ -55,32 +59,46 @@ class ErrandNode(ManagedNode):
         self._laser_pose = declare_laser_pose(self)
         self._start_from = declare_map(self)
 
-    def beginning(self) -> Beginning:
-        """What the node begins with.
+    @property
+    def drives(self) -> bool:
+        """Whether it gives commands."""
+        raise NotImplementedError
+
+    def make(self, beginning: Beginning) -> Process:
+        """The process that begins with a map or with nothing; :attr:`areas` are as they are then.
+
+        :raises HmtSlamError: where it cannot.
+        """
+        raise NotImplementedError
+
+    def set_up(self) -> None:
+        """Make the process, and all that it hears and says.
 
         :raises HmtSlamError: for a map that cannot be.
         """
-        return Beginning(self, self._start_from, carried=True)
-
-    def listen(self, process: Process, *, drives: bool = True) -> None:
-        """Begin to hear all that the process hears of the robot and of people.
-
-        :param drives: whether it gives commands.
-        """
-        self._process, self._unmounted = process, 0
+        self._begun, self._unmounted = 0, 0
+        beginning = Beginning(self, self._start_from, carried=True)
+        self._process = self.make(beginning)
         tell_of_compilation(self.get_logger().info)
-        self._commands = self.create_publisher(Twist, COMMANDS, qos.STREAM) if drives else None
+        self._commands = self.create_publisher(Twist, COMMANDS, qos.STREAM) if self.drives else None
         self._outcomes = self.create_publisher(String, OUTCOMES[self._name], qos.LATCHED)
         self._goals = self.create_publisher(PoseStamped, GOALS, qos.STREAM)
         self._mounting = LaserMounting(self, self._base, self._laser_pose, _nothing, _nothing)
         self.create_subscription(PoseWithCovarianceStamped, HMT_POSE, self._hear_pose, qos.NEWEST)
         self.create_subscription(LaserScan, SCAN, self._hear_scan, qos.NEWEST)
         self.create_subscription(String, ERRANDS[self._name], self._hear_errand, qos.STREAM)
+        self._inbox = Inbox(self, self._heard, self.receive, self.figures, first=beginning.events, begun=0)
+        self.create_subscription(String, BEGIN, self._hear_begin, qos.CHAIN)
+        self.create_timer(PERIOD, self._check_chain, clock=self.figures.steady_clock)
 
     def stand_still(self) -> None:
         """Let the robot stand."""
         if self._commands is not None:
             self._commands.publish(Twist())
+
+    def receive(self, message: Message) -> None:
+        """Take in what the inbox delivers."""
+        self.hear(message)
 
     def hear(self, message: Message) -> None:
         """Let the process hear a message, and say what it answers."""
@@ -129,6 +147,34 @@ class ErrandNode(ManagedNode):
                 self.figures.warn(self._mounting.complaint(message, self._unmounted))
             return
         self.hear(conversions.scan_from(message, mounted.laser_pose, mounted.side))
+
+    def _hear_begin(self, message: String) -> None:
+        """Begin anew with the map with which all others do; an errand ends with the map that it was in.
+
+        :raises HmtSlamError: where the process cannot go on with that map.
+        """
+        request = decode(message.data, BeginRequest)
+        if request.number <= self._begun:
+            return
+        self.hear(Errand("stop"))
+        self.stand_still()
+        try:
+            beginning = Beginning(self, request.folder, carried=True)
+            self._process = self.make(beginning)
+        except HmtSlamError as fault:
+            raise HmtSlamError(f"the map was exchanged, and {self._name} cannot go on: {fault}") from fault
+        self._begun = request.number
+        self._inbox.begin_anew(beginning.events, request.number)
+        self._inbox.catch_up()
+
+    def _check_chain(self) -> None:
+        """Let the robot stand where the map lacks what others have said.
+
+        :raises HmtSlamError: then, as the node will never have it again.
+        """
+        if self._inbox.fault is not None:
+            self.stand_still()
+            raise HmtSlamError(self._inbox.fault)
 
     def _hear_errand(self, message: String) -> None:
         try:

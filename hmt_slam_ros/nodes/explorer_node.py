@@ -5,13 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.nodes.beginning import Beginning
 from hmt_slam_ros.nodes.errand_node import ErrandNode, run_errands
-from hmt_slam_ros.nodes.inbox import Inbox
 from hmt_slam_ros.processes.errands import OF_EXPLORER, Errand
 from hmt_slam_ros.processes.global_poses import GlobalPoses
 from hmt_slam_ros.processes.map_parts import AreaPose
 from hmt_slam_ros.processes.messages import Accepted, Hypotheses, Keyframe, Message
 from hmt_slam_ros.processes.replica import FIRST_AREA, Replica
+from hmt_slam_ros.processes.routing import Process
 
 # The map's frame is the first area's: known before TLCA has spoken.
 _FIRST = AreaPose(FIRST_AREA, PoseGaussian.exactly(np.zeros(3)))
@@ -21,27 +22,26 @@ class ExplorerNode(ErrandNode):
     """The node ``explorer``."""
 
     def __init__(self) -> None:
-        super().__init__("explorer", OF_EXPLORER)
+        super().__init__("explorer", OF_EXPLORER, (Keyframe, Hypotheses, Accepted))
 
-    def set_up(self) -> None:
-        """Make the explorer, and all that it hears and says.
+    @property
+    def drives(self) -> bool:
+        """Whether it gives commands."""
+        return self.configuration.explorer.drive == "velocities"
 
-        :raises HmtSlamError: for a map that cannot be.
-        """
+    def make(self, beginning: Beginning) -> Process:
+        """The explorer of a map."""
         from hmt_slam_ros.exploration.explorer import Explorer  # noqa: PLC0415  takes time
 
-        beginning, own = self.beginning(), self.configuration.explorer
         known = beginning.map
         self.areas = GlobalPoses((_FIRST,) if known is None else known.area_poses)
         explorer = Explorer(self.configuration, None if known is None else Replica.of(known.replica))
-        if own.explores:
+        if self.configuration.explorer.explores:
             explorer.handle(Errand("explore"))
-        self.listen(explorer, drives=own.drive == "velocities")
-        self._inbox = Inbox(
-            self, (Keyframe, Hypotheses, Accepted), self._hear, self.figures, first=beginning.events, begun=None
-        )
+        return explorer
 
-    def _hear(self, message: Message) -> None:
+    def receive(self, message: Message) -> None:
+        """Take in what the inbox delivers, and where in the map the areas are."""
         if isinstance(message, Accepted) and message.global_poses:
             self.areas = GlobalPoses(message.global_poses)
         self.hear(message)

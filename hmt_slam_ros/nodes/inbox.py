@@ -112,6 +112,11 @@ class Inbox:
             self._ahead.append((begun, hear))
 
     @property
+    def fault(self) -> str | None:
+        """One sentence about the first gap in the chain, None where nothing is missing."""
+        return self._order.fault
+
+    @property
     def events(self) -> int | None:
         """Keyframe events that were delivered to the end, None amid one."""
         return self._order.events

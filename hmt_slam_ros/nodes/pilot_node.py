@@ -9,14 +9,15 @@ from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.nodes import conversions, qos
+from hmt_slam_ros.nodes.beginning import Beginning
 from hmt_slam_ros.nodes.errand_node import ErrandNode, run_errands
-from hmt_slam_ros.nodes.inbox import Inbox
 from hmt_slam_ros.nodes.topics import INITIAL_POSE, PLACE
 from hmt_slam_ros.processes.documents import encode
 from hmt_slam_ros.processes.errands import OF_PILOT, PlaceEstimate
 from hmt_slam_ros.processes.global_poses import GlobalPoses
 from hmt_slam_ros.processes.map_parts import Place
 from hmt_slam_ros.processes.messages import Accepted, Carried, Hypotheses, Keyframe, Message
+from hmt_slam_ros.processes.routing import Process
 from hmt_slam_ros.sensing import Odometry
 
 
@@ -24,32 +25,40 @@ class PilotNode(ErrandNode):
     """The node ``pilot``."""
 
     def __init__(self) -> None:
-        super().__init__("pilot", OF_PILOT)
+        super().__init__("pilot", OF_PILOT, (Odometry, Keyframe, Hypotheses, Accepted))
+
+    @property
+    def drives(self) -> bool:
+        """Whether it gives commands."""
+        return self.configuration.pilot.drives
 
     def set_up(self) -> None:
         """Make the pilot, and all that it hears and says.
 
         :raises HmtSlamError: where there is no map, or one that cannot be or has no place.
         """
+        super().set_up()
+        self._estimates = self.create_publisher(String, PLACE, qos.LATCHED)
+        self._starts = self.create_publisher(PoseWithCovarianceStamped, INITIAL_POSE, qos.STREAM)
+        self._stamp = 0
+
+    def make(self, beginning: Beginning) -> Process:
+        """The pilot of a map.
+
+        :raises HmtSlamError: where there is none, or one that has no place.
+        """
         from hmt_slam_ros.exploration.missions import Missions  # noqa: PLC0415  takes time
 
-        beginning = self.beginning()
         known = beginning.map
         if known is None:
             raise HmtSlamError("the pilot goes by the places of a map, and there is none: set start_from")
         self.areas = GlobalPoses(known.area_poses)
         missions = Missions(self.configuration, known.replica)
         self.get_logger().info(f"rooms to go to: {', '.join(missions.rooms) or 'none'}")
-        self._estimates = self.create_publisher(String, PLACE, qos.LATCHED)
-        self._starts = self.create_publisher(PoseWithCovarianceStamped, INITIAL_POSE, qos.STREAM)
-        self.listen(missions, drives=self.configuration.pilot.drives)
-        self._inbox = Inbox(
-            self, (Odometry, Keyframe, Hypotheses, Accepted), self._hear, self.figures, first=beginning.events,
-            begun=None,
-        )  # fmt: skip
-        self._stamp = 0
+        return missions
 
-    def _hear(self, message: Message) -> None:
+    def receive(self, message: Message) -> None:
+        """Take in what the inbox delivers; who does not take part needs no odometry."""
         if self.active or not isinstance(message, Odometry):
             self.hear(message)
 
