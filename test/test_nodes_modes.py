@@ -53,7 +53,8 @@ def test_a_robot_is_recognized_and_tracked_in_a_map_that_is_saved_as_it_was_load
     nodes.drive(log, first=20, rate=8.0)
     nodes.until(nodes.is_localized)
     nodes.until(lambda: len(nodes.estimates) == SCANS - 20)
-    nodes.until(lambda: np.abs(planar_pose(nodes.poses[-1].pose.pose) - 4 * (SCANS - 1) * PACE).max() < 0.15)
+    end = 4 * (SCANS - 1) * PACE
+    nodes.until(lambda: nodes.poses and np.abs(planar_pose(nodes.poses[-1].pose.pose) - end).max() < 0.15)
     while_lost = stored(keyframes)
     # What it needs to be recognized, which is two looks at five keyframes each and what came meanwhile; nothing since.
     recognized = while_lost.index(False)

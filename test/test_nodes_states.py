@@ -114,7 +114,7 @@ def test_nodes_that_are_halted_and_taken_down_amid_a_drive_come_to_the_same_as_o
     nodes.park()
     assert np.diff([stamp_of(pose.header.stamp) for pose in nodes.poses]).max() > 2 * SECOND
     end = 4 * (SCANS - 1) * PACE
-    nodes.until(lambda: np.abs(planar_pose(nodes.poses[-1].pose.pose) - end).max() < 0.15)
+    nodes.until(lambda: nodes.poses and np.abs(planar_pose(nodes.poses[-1].pose.pose) - end).max() < 0.15)
 
     manager.lead(DOWN, "deactivate", "inactive")
     assert listener.call(Trigger, "slam/save", Trigger.Request()).success
