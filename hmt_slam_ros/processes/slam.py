@@ -230,7 +230,11 @@ class MetricSlam:
     def _process(self, scan: Scan) -> list[Message]:
         prediction = self._motion.predict(scan.stamp)
         sighting = Sighting(self._mapping, deskewed(scan, self._motion.odometry, self._configuration.rtl))
-        said = self._put_down(prediction) if self._arriving else self._track(sighting, prediction)
+        said: list[Message] = []
+        if self._arriving:
+            self._put_down(prediction)
+        else:
+            said += self._track(sighting, prediction)
         if self._arriving or self._place is not None or self._best.event_due(sighting):
             said += self._keyframe_event(sighting)
         for live in self._live.values():
@@ -238,15 +242,14 @@ class MetricSlam:
         self._scans += 1
         return [*said, self._estimate(scan.stamp)]
 
-    def _put_down(self, prediction: Prediction) -> list[Message]:
-        """Draw every hypothesis where the prediction has the robot, of which nothing is known where nothing is sure.
+    def _put_down(self, prediction: Prediction) -> None:
+        """Draw every hypothesis where the motion since the last scan leads.
 
-        A robot that was carried is drawn where it was last; one that takes itself for lost, and may be wrong, goes on.
+        Of a robot that was carried none is known; one that takes itself for lost may be wrong about that.
         """
         for live in self._live.values():
             at = se2.compose(live.filter.pose, prediction.together.increment)
             live.filter.stand(PoseGaussian.exactly(at))
-        return []
 
     def _track(self, sighting: Sighting, prediction: Prediction) -> list[Message]:
         """Move every hypothesis on to the scan, and learn from what the best one found."""
