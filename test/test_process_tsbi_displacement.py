@@ -11,7 +11,9 @@ from worlds import box, scan_in
 
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.processes import tsbi_awakening
+from hmt_slam_ros.processes.map_parts import Place
 from hmt_slam_ros.processes.messages import AreaEvents, Forgotten, Keyframe
 from hmt_slam_ros.processes.tsbi import Tsbi
 from hmt_slam_ros.processes.tsbi_awakening import UNKNOWN
@@ -179,6 +181,16 @@ def test_a_place_is_believed_sooner_where_it_would_be_if_it_had_not_been_displac
         where = tsbi_awakening.looked_for(branching, replace(parent, notes=notes)).where
         looked[probability] = max(p for p, fit in zip(where.probabilities, where.found, strict=True) if fit.area == 0)
     assert (looked[0.4] > looked[0.0]) == found
+
+
+def test_who_says_where_it_is_knows_better_than_where_it_would_be_if_it_had_not_been_displaced():
+    parent, branching, newest = rooms_apart((ROOM, OTHER, ROOM), [FAR, FAR], 0.1)
+    notes = replace(parent.notes, lost=newest[0], stay=Stay(Spot(1, newest[0], np.zeros(3)), 0.4))
+    told = Place(0, PoseGaussian(se2.between(PATH[0], PATH[5]), np.diag([0.3, 0.3, 0.2]) ** 2))
+    pose = parent.hybrid_map.keyframes(2)[newest[-1]]
+    keyframe = Keyframe(newest[-1], branching._replica.scans[newest[-1]], 1.0, (), place=told, mapping=False)
+    looked = tsbi_awakening.arrived(branching, replace(parent, notes=notes), keyframe, pose)
+    assert all(child.notes.stay is None for child in looked.children)
 
 
 def test_a_robot_that_may_have_stayed_where_much_was_moved_is_nowhere_rather_than_in_a_like_place():

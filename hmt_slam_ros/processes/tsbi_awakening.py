@@ -99,7 +99,7 @@ def _told_where(branching: Branching, parent: Parent, place: Place, pose: Pose) 
         return Branches([Child(parent.hypothesis, parent.log_weight, parent.area, parent.notes)])
     newest = max(seen)
     told = Told(newest, place.area, place.pose.compose(PoseGaussian.exactly(se2.between(pose, seen[newest]))))
-    looked = looked_for(branching, replace(parent, notes=replace(parent.notes, told=told)))
+    looked = looked_for(branching, replace(parent, notes=replace(parent.notes, told=told, stay=None)))
     arcs = _drawn_anew(parent, parent.notes.lost, told, seen[newest])
     return looked._replace(children=[replace(child, arcs=child.arcs or arcs) for child in looked.children])
 
@@ -148,8 +148,9 @@ def looked_for(branching: Branching, parent: Parent) -> Branches:
         return Branches([still], True, where=where)
     arc = Arc(parent.area, located.area, PoseGaussian.exactly(reference).compose(located.mode.measured.inverse()), True)
     log_weight = noted.log_weight + math.log(probability)
-    notes = replace(noted.notes, lost=None, stay=None, told=None, sighted=None, claim=None, credit=0.0)
-    notes = replace(notes, found=located.area)
+    notes = replace(
+        noted.notes, lost=None, stay=None, told=None, sighted=None, found=located.area, claim=None, credit=0.0
+    )  # fmt: skip
     found = Child(parent.hypothesis, log_weight, parent.area, notes, arcs=(arc,), reload=True)
     # What speaks for the place from here on is the other's.
     still_lost = replace(sighted, credit=None)
