@@ -70,6 +70,7 @@ MEASUREMENTS = {
     "ways": "whether a robot notices that a hallway is closed, goes another way, and comes back to it",
     "scale": "time and memory in maps of up to 100,000 areas",
     "soak": "whether nodes that run for an hour keep their memory and leave nothing behind",
+    "identity": "whether results are the same, byte for byte, as those on record",
     "short": "for CI, whether accuracy became worse than benchmark/expected.toml beyond noise",
 }
 _GROUPS = {

@@ -1,18 +1,21 @@
-"""A simulated robot that the explorer drives by what the package's own processes say, all in lock-step."""
+"""A simulated robot that the explorer or the pilot drives by what the package's own processes say, all in lock-step."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.exploration.explorer import Explorer
+from hmt_slam_ros.exploration.missions import Missions
 from hmt_slam_ros.logs.stamps import NANOSECONDS
 from hmt_slam_ros.offline.output_folder import map_writer
 from hmt_slam_ros.offline.recorder import Recording
 from hmt_slam_ros.offline.runtime import Run
+from hmt_slam_ros.offline.saved_map import RunState
 from hmt_slam_ros.processes.errands import Errand, Outcome, Steering
 from hmt_slam_ros.processes.messages import Message
 from hmt_slam_ros.sensing import Scan
@@ -35,18 +38,27 @@ class _Ears:
         return []
 
 
-class DrivenRun:
-    """Robot, SLAM and explorer.
+Driver = TypeVar("Driver", Explorer, Missions)
+
+
+class DrivenRun(Generic[Driver]):
+    """Robot, SLAM and who drives it.
 
     :ivar robot: in its world.
-    :ivar explorer: that drives it.
+    :ivar driver: the explorer, or the pilot.
     """
 
-    def __init__(self, robot: DrivenRobot, configuration: Configuration) -> None:
-        self.robot, self.explorer = robot, Explorer(configuration)
+    def __init__(
+        self, robot: DrivenRobot, configuration: Configuration, driver: Driver, state: RunState | None = None
+    ) -> None:
+        """:param state: that the run goes on from, with the robot anywhere in its map; None for none."""
+        self.robot = robot
+        self.driver: Driver = driver
         self._ears = _Ears(robot)
-        self._run = Run(configuration, others={"explorer": self.explorer, "robot": self._ears})
-        self._records = DrivenLog("driven", robot).records()
+        name = "explorer" if isinstance(driver, Explorer) else "pilot"
+        self._run = Run(configuration, state=state, others={name: driver, "robot": self._ears})
+        log = DrivenLog("driven", robot)
+        self._records = log.records() if state is None else self._run.unread(log)
 
     def do(self, errand: Errand, seconds: float) -> Outcome | None:
         """What comes of an errand, None where it takes longer.
@@ -78,9 +90,10 @@ class DrivenRun:
         writer.finish(configuration)
         return recording
 
-    def true_place(self, name: str) -> NDArray[np.float64]:
-        """Where the robot truly was when it took the keyframe in the middle of a named place, ``world_T_base`` (3,)."""
-        atlas = self.explorer.atlas
-        stamp = atlas.replica.scans[atlas.places()[name]].stamp
-        true: NDArray[np.float64] = self.robot.true_poses(np.array([stamp]))[0]
-        return true
+
+def true_place(run: DrivenRun[Explorer], name: str) -> NDArray[np.float64]:
+    """Where the robot truly was when it took the keyframe in the middle of a named place, ``world_T_base`` (3,)."""
+    atlas = run.driver.atlas
+    stamp = atlas.replica.scans[atlas.places()[name]].stamp
+    true: NDArray[np.float64] = run.robot.true_poses(np.array([stamp]))[0]
+    return true

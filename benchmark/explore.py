@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from benchmark.driven_run import DrivenRun
+from benchmark.driven_run import DrivenRun, true_place
 from benchmark.institute_maps import PEOPLE, charted, scenario_of
 from benchmark.places import Judged, judged
 from benchmark.report import Report, Requirement, table
@@ -17,6 +17,7 @@ from benchmark.settings import Settings
 from benchmark.simulated.measured import chosen_seeds
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration import Configuration, load_configuration
+from hmt_slam_ros.exploration.explorer import Explorer
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.logs.stamps import NANOSECONDS
 from hmt_slam_ros.processes.errands import Errand
@@ -99,7 +100,7 @@ def measure_explore(settings: Settings) -> Report:
     missions: list[list[Mission]] = []
     for seed in seeds:
         robot = DrivenRobot(scenario_of(seed))
-        run = DrivenRun(robot, configuration)
+        run = DrivenRun(robot, configuration, Explorer(configuration))
         explorations.append(_explored(run, configuration))
         missions.append(_missions(run, seed))
     report = Report("explore", "Exploration of an institute, and missions", seeds=seeds)
@@ -108,14 +109,14 @@ def measure_explore(settings: Settings) -> Report:
     return report
 
 
-def _explored(run: DrivenRun, configuration: Configuration) -> Explored:
+def _explored(run: DrivenRun[Explorer], configuration: Configuration) -> Explored:
     """Explore, and compare with the truth."""
     robot, scenario = run.robot, run.robot.scenario
     outcome = run.do(Errand("explore"), _TIME)
     path = robot.true_poses(np.arange(START, robot.stamp, NANOSECONDS // 5))[:, :2]
     states, rooms = scenario.building.states, scenario.building.rooms
     away = [float(np.hypot(*(path - state[:2]).T).min()) for state in states.poses]
-    atlas = run.explorer.atlas
+    atlas = run.driver.atlas
     institute = charted(scenario, atlas.hybrid_map, atlas.replica.scans, robot.true_poses, configuration)
     return Explored(
         outcome is not None, robot.travelled, (robot.stamp - START) / NANOSECONDS, robot.contacts,
@@ -130,13 +131,13 @@ def is_within(room: Float64, path: Float64) -> bool:
     return bool(np.any((np.abs(local[:, 0]) < 0.5 * room[3]) & (np.abs(local[:, 1]) < 0.5 * room[4])))
 
 
-def _missions(run: DrivenRun, seed: int) -> list[Mission]:
+def _missions(run: DrivenRun[Explorer], seed: int) -> list[Mission]:
     """Go to rooms drawn by chance, never twice in a row to the same."""
     draw, robot, begin = np.random.default_rng(seed), run.robot, run.robot.travelled
     found: list[Mission] = []
     last = ""
     while len(found) < MISSIONS or (robot.travelled - begin < METRES and len(found) < _MOST):
-        names = [name for name in run.explorer.atlas.places() if name.startswith("room ") and name != last]
+        names = [name for name in run.driver.atlas.places() if name.startswith("room ") and name != last]
         if not names:
             found.append(Mission(False, math.inf, 0.0, 0.0, 0))
             continue
@@ -145,9 +146,9 @@ def _missions(run: DrivenRun, seed: int) -> list[Mission]:
     return found
 
 
-def _mission(run: DrivenRun, name: str) -> Mission:
+def _mission(run: DrivenRun[Explorer], name: str) -> Mission:
     """Go to a place."""
-    robot, place = run.robot, run.true_place(name)
+    robot, place = run.robot, true_place(run, name)
     metres, begin, contacts = robot.travelled, robot.stamp, robot.contacts
     outcome = run.do(Errand("go", name), _MISSION)
     off = float(np.hypot(*(robot.pose - place)[:2]))

@@ -26,6 +26,7 @@ from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration import Configuration, load_configuration
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.exploration.destinations import rooms
+from hmt_slam_ros.exploration.explorer import Explorer
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.logs.stamps import NANOSECONDS
 from hmt_slam_ros.processes.errands import Errand
@@ -109,7 +110,7 @@ def explored(seed: int, configuration: Configuration, out: Path) -> Explored:
     :param out: where the folder of the map is made.
     :raises HmtSlamError: where it comes to no end.
     """
-    run = DrivenRun(DrivenRobot(scenario_of(seed)), configuration)
+    run = DrivenRun(DrivenRobot(scenario_of(seed)), configuration, Explorer(configuration))
     if run.do(Errand("explore"), _EXPLORATION) is None:
         raise HmtSlamError(f"the explorer came to no end in {_EXPLORATION:g} s: see python -m benchmark explore")
     folder = out / f"map{seed}"

@@ -9,7 +9,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from benchmark.driven_run import DrivenRun
+from benchmark.driven_run import DrivenRun, true_place
 from hmt_slam_ros.agreement import Clutter
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration import Configuration
@@ -73,7 +73,8 @@ class _Explored:
     def __init__(self, *, explore: bool = True, changes: Mapping[str, bool] | None = None) -> None:
         scenario = Scenario(small_floor(), Settings(seed=5, laps=1, field_of_view=360.0, beams=720))
         self.robot = DrivenRobot(scenario)
-        self.run = DrivenRun(self.robot, with_changes(Configuration(), changes or {}))
+        configuration = with_changes(Configuration(), changes or {})
+        self.run = DrivenRun(self.robot, configuration, Explorer(configuration))
         self.outcome = self.run.do(Errand("explore"), 400.0) if explore else None
         self.length = len(path_of(self))
 
@@ -108,11 +109,11 @@ def test_explores_all_of_a_floor_hallways_first() -> None:
 
 def test_rooms_have_names_and_the_robot_goes_there() -> None:
     own = explored()
-    names = [name for name in own.run.explorer.atlas.places() if name.startswith("room")]
+    names = [name for name in own.run.driver.atlas.places() if name.startswith("room")]
     assert names == ["room 1", "room 2"]
     for name in names:
         assert done(own.run.do(Errand("go", name), 120.0)).reached
-        place = own.run.true_place(name)
+        place = true_place(own.run, name)
         assert np.hypot(*(own.robot.pose - place)[:2]) < 0.3
         assert np.abs(ROOMS - place[:2]).max(axis=1).min() < 2.0
     assert own.robot.contacts == 0
@@ -135,7 +136,7 @@ def goes(own: _Explored, *probabilities: float) -> Heading | None:
 
     They are all the same map.
     """
-    explorer, atlas = own.run.explorer, own.run.explorer.atlas
+    explorer, atlas = own.run.driver, own.run.driver.atlas
     best, area, sequence = atlas.replica.best, atlas.pose.area, max(atlas.replica.scans)
     leaves = tuple(Leaf(best + k, best, share, area) for k, share in enumerate(probabilities))
     explorer.handle(Hypotheses(sequence, leaves, 0.0))
@@ -161,16 +162,16 @@ def test_it_turns_back_while_several_topological_paths_are_probable() -> None:
 def test_it_explores_on_where_nobody_asks_it_to_turn_back() -> None:
     own = _Explored(explore=False)
     assert own.run.do(Errand("explore"), 25.0) is None
-    assert own.run.explorer.atlas.entropy == 0.0
+    assert own.run.driver.atlas.entropy == 0.0
     on = goes(own, 0.6, 0.4)
-    assert own.run.explorer.atlas.entropy == pytest.approx(0.673, abs=0.001)
+    assert own.run.driver.atlas.entropy == pytest.approx(0.673, abs=0.001)
     assert on is None or np.hypot(*on.goal[:2]) > 1.0
 
 
 def test_scans_may_come_after_any_message_of_the_chain() -> None:
     own = _Explored(explore=False)
     assert own.run.do(Errand("explore"), 25.0) is None
-    explorer, atlas = own.run.explorer, own.run.explorer.atlas
+    explorer, atlas = own.run.driver, own.run.driver.atlas
     replica, pose = atlas.replica, atlas.pose
     new = max(replica.scans) + 1
     scan = replace(scan_at((1.0, 0.0, 0.0)), stamp=pose.stamp)
@@ -190,7 +191,7 @@ def test_unknown_places_are_told() -> None:
 
 
 def test_a_known_map_is_known_from_the_start() -> None:
-    known = explored(1).run.explorer.atlas
+    known = explored(1).run.driver.atlas
     atlas = Explorer(Configuration(), Replica.of(known.replica.state)).atlas
     assert set(atlas.places()) >= set(known.places())
     for name in ("room 1", "room 2"):
@@ -204,7 +205,7 @@ def test_it_stands_where_nothing_tells_the_pose_any_more() -> None:
     own.run.do(Errand("explore"), 5.0)
     scan = own.robot.measure()[1] or scan_at((1.0, 0.0, 0.0))
     moving, lost = (
-        own.run.explorer.handle(replace(scan, stamp=own.robot.stamp + after))[-1] for after in (0, 2 * NANOSECONDS)
+        own.run.driver.handle(replace(scan, stamp=own.robot.stamp + after))[-1] for after in (0, 2 * NANOSECONDS)
     )
     assert isinstance(moving, Steering)
     assert moving.speed > 0.0

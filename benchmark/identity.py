@@ -1,0 +1,241 @@
+"""Are results the same, byte for byte, as those of the code that ``benchmark/identity.toml`` was written with?
+
+A change of layout, of names or of speed changes no bit of any result. A fixed set of runs has a digest each of its
+trajectories, probabilities, graph, closures and map; ``python -m benchmark identity`` compares them with the recorded
+ones, and ``--write-expected`` records them anew. Digests hold for one kind of processor and one version of each
+library, which stand in the file: elsewhere, record those of the older code first.
+"""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import io
+import json
+import multiprocessing
+import tomllib
+from collections.abc import Iterable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from itertools import groupby
+from pathlib import Path
+
+import numpy as np
+
+from benchmark.circumstances import circumstances
+from benchmark.driven_run import DrivenRun
+from benchmark.logs import BUNDLED, MeasuredLog, missing, opened
+from benchmark.report import Report, Requirement, table
+from benchmark.runs import PARAMETERS, Case, Run
+from benchmark.settings import Settings
+from hmt_slam_ros.configuration import load_configuration
+from hmt_slam_ros.errors import HmtSlamError
+from hmt_slam_ros.exploration.explorer import Explorer
+from hmt_slam_ros.exploration.missions import Missions
+from hmt_slam_ros.logs.records import SIMULATED
+from hmt_slam_ros.logs.stamps import NANOSECONDS
+from hmt_slam_ros.offline.saved_map import read_run_state
+from hmt_slam_ros.persistence.hmt_map import HMT_MAP
+from hmt_slam_ros.processes.errands import Errand, Outcome
+from hmt_slam_ros.simulation import open_simulated
+from hmt_slam_ros.simulation.driven_robot import DrivenRobot
+from hmt_slam_ros.simulation.scenario import START
+
+EXPECTED = Path(__file__).with_name("identity.toml")
+
+_INSTITUTE = "institute,seed=1,laps=1,people=4,field_of_view=360,beams=720"
+_EXPLORATION, _MISSION = 150.0, 120.0  # s, of the simulation
+
+
+@dataclass(frozen=True)
+class Fixed:
+    """A run of the set.
+
+    :ivar log: the name of a recorded log, or ``sim:WORLD,...``.
+    :ivar changes: parameters that differ from the file, as ``name=value``.
+    :ivar duration: seconds of the log that are used, 0 for all.
+    :ivar source: name of the run whose map it goes on from, empty for none.
+    """
+
+    log: str
+    changes: tuple[str, ...] = ()
+    duration: float = 0.0
+    source: str = ""
+
+
+RUNS = {
+    "bundled": Fixed(BUNDLED),
+    "aces": Fixed("aces"),
+    "intel": Fixed("intel"),
+    "office": Fixed("sim:office,seed=2"),
+    "nested": Fixed("sim:nested,seed=2"),
+    "grid": Fixed("sim:grid,seed=2"),
+    "ring": Fixed("sim:ring,seed=2"),
+    "hall": Fixed("sim:hall,seed=2"),
+    "twins": Fixed("sim:twins,seed=2"),
+    "busy": Fixed("sim:busy,seed=2"),
+    "lines": Fixed("sim:office,laps=1,seed=4", ("local_map.kind=lines",)),
+    "carried": Fixed("sim:office,seed=3,carried=0.55,to=0.72,turned=30"),
+    "institute": Fixed(f"{SIMULATED}{_INSTITUTE}"),
+    "half": Fixed("sim:office,seed=5", duration=100.0),
+    "gone on": Fixed("sim:office,seed=5", source="half"),
+    "awakened": Fixed("sim:office,seed=5,visit=1", source="half"),
+    "localization": Fixed("sim:office,seed=2,visit=1", ("mode=localization",), source="office"),
+    "lifelong": Fixed("sim:busy,seed=2,visit=1", ("mode=lifelong",), source="busy"),
+}
+"""{name of a run: what is run}; runs whose maps others go on from stand before these."""
+
+Digests = dict[str, str]
+"""{what of a run: its digest}."""
+
+
+def measure_identity(settings: Settings) -> Report:
+    """Run the set, and compare its digests with the recorded ones, or record them."""
+    report = Report("identity", "Are results the same, byte for byte?", seeds=(0,))
+    found = _measured(settings, report)
+    here = _machine()
+    if settings.write_expected:
+        write_expected(EXPECTED, found, here)
+    expected, recorded = read_expected(EXPECTED)
+    if recorded != here:
+        report.body.append(f"Recorded on another machine ({recorded}), so digests may differ: this is {here}.")
+    report.requirements += differences(found, expected)
+    rows = [[run, what, own, _beside(own, expected.get(run, {}).get(what))] for run, what, own in _listed(found)]
+    report.body.append(table(["run", "of", "digest", ""], rows))
+    report.data["digests"] = found
+    return report
+
+
+def differences(found: Mapping[str, Digests], expected: Mapping[str, Digests]) -> list[Requirement]:
+    """For each run, how many of its digests are not the recorded ones."""
+    return [
+        Requirement(f"{run}: digests that differ", sum(expected.get(run, {}).get(what) != own[what] for what in own), 0)
+        for run, own in found.items()
+    ]
+
+
+def _beside(own: str, expected: str | None) -> str:
+    if expected is None:
+        return "not recorded"
+    return "the same" if own == expected else f"was {expected}"
+
+
+def _listed(found: Mapping[str, Digests]) -> Iterable[tuple[str, str, str]]:
+    return ((run, what, digest) for run, own in found.items() for what, digest in own.items())
+
+
+def _measured(settings: Settings, report: Report) -> dict[str, Digests]:
+    """{run: digests} of all whose logs are there."""
+    recorded = {one.log for one in RUNS.values() if not one.log.startswith(SIMULATED)}
+    absent = {log: reason for log in recorded if (reason := missing(log))}
+    report.body += [f"Skipped {log}: {reason}." for log, reason in absent.items()]
+    chosen = {name: one for name, one in RUNS.items() if one.log not in absent and name in (settings.logs or RUNS)}
+    with opened(sorted(recorded - set(absent))) as logs:
+        runs = _made(chosen, {log.name: log for log in logs}, settings)
+    found = {name: digests_of(run.folder) for name, run in runs.items()}
+    return found | _driven(runs, settings) if "institute" in runs else found
+
+
+def _made(chosen: Mapping[str, Fixed], logs: Mapping[str, MeasuredLog], settings: Settings) -> dict[str, Run]:
+    """The runs, those that others go on from before these."""
+    made: dict[str, Run] = {}
+    for _, group in groupby(chosen.items(), lambda item: bool(item[1].source)):
+        own = dict(group)
+        cases = [_case(one, logs, made, settings.changes) for one in own.values()]
+        made |= zip(own, settings.runner.runs(cases), strict=True)
+    return made
+
+
+def _case(one: Fixed, logs: Mapping[str, MeasuredLog], made: Mapping[str, Run], changes: Sequence[str]) -> Case:
+    log = logs.get(one.log) or MeasuredLog(one.log.removeprefix(SIMULATED), Path(one.log))
+    source = made[one.source].folder if one.source else None
+    return Case(log, 0, "", (*one.changes, *changes), one.duration, source=source)
+
+
+def digests_of(folder: Path) -> Digests:
+    """The digests of an output folder."""
+    report = json.loads((folder / "report.json").read_text(encoding="utf-8"))
+    events = list(csv.reader(io.StringIO((folder / "pmf.csv").read_text(encoding="utf-8"))))
+    closures = [[*row[:1], *row[3:5], *row[7:10]] for row in events[1:]]
+    counts = [report[name] for name in ("keyframes", "areas", "arcs", "loop_closures")]
+    return {
+        "trajectory": _digest((folder / "trajectory.tum").read_bytes()),
+        "online": _digest((folder / "trajectory_online.tum").read_bytes()),
+        "probabilities": _digest(repr(events[1:]).encode()),
+        "graph": _digest((folder / "graph.g2o").read_bytes()),
+        "closures": _digest(repr((closures, counts)).encode()),
+        "map": _digest((folder / "map.pgm").read_bytes()),
+    }
+
+
+def _digest(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()[:16]
+
+
+def _driven(runs: Mapping[str, Run], settings: Settings) -> dict[str, Digests]:
+    """The digests of a robot that the explorer drives, and of one that the pilot drives on a map."""
+    folder = runs["institute"].folder / HMT_MAP
+    with ProcessPoolExecutor(settings.runner.jobs, multiprocessing.get_context("spawn")) as pool:
+        explorer = pool.submit(_explored, settings.changes)
+        pilot = pool.submit(_piloted, folder, settings.changes)
+        return {"explorer": explorer.result(), "pilot": pilot.result()}
+
+
+def _explored(changes: Sequence[str]) -> Digests:
+    """An exploration up to a time, and the robot's way."""
+    configuration = load_configuration(PARAMETERS, list(changes))
+    run = DrivenRun(_robot(0), configuration, Explorer(configuration))
+    outcome = run.do(Errand("explore"), _EXPLORATION)
+    return {"way": _way(run.robot), "outcome": _end(outcome)}
+
+
+def _piloted(folder: Path, changes: Sequence[str]) -> Digests:
+    """A mission to the last room of a saved map, by a robot that woke up in it, and the robot's way."""
+    configuration = load_configuration(PARAMETERS, list(changes))
+    state, _ = read_run_state(folder)
+    pilot = Missions(configuration, state.tsbi.replica)
+    run = DrivenRun(_robot(1), configuration, pilot, state)
+    outcome = run.do(Errand("go", list(pilot.rooms)[-1]), _MISSION)
+    return {"way": _way(run.robot), "outcome": _end(outcome)}
+
+
+def _end(outcome: Outcome | None) -> str:
+    return "none yet" if outcome is None else f"{outcome.reached}: {outcome.why}"
+
+
+def _robot(visit: int) -> DrivenRobot:
+    return DrivenRobot(open_simulated(f"{SIMULATED}{_INSTITUTE},visit={visit}").scenario)
+
+
+def _way(robot: DrivenRobot) -> str:
+    return _digest(robot.true_poses(np.arange(START, robot.stamp, NANOSECONDS // 10)).tobytes())
+
+
+def _machine() -> str:
+    facts = circumstances((0,), 1, ())
+    return f"{facts['machine'].split(',')[0]}; {facts['versions']}"
+
+
+def read_expected(path: Path) -> tuple[dict[str, Digests], str]:
+    """{run: digests}, and the machine on which they were recorded.
+
+    :raises HmtSlamError: where there is no such file.
+    """
+    try:
+        content = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as fault:
+        raise HmtSlamError(f"{path} cannot be read: run 'python -m benchmark identity --write-expected'") from fault
+    return content["digests"], content["machine"]
+
+
+def write_expected(path: Path, found: Mapping[str, Digests], machine: str) -> None:
+    """Record digests."""
+    lines = [
+        "# Digests of a fixed set of runs; benchmark/identity.py says of what.",
+        "# Written by `python -m benchmark identity --write-expected`; do not edit.",
+        f'commit = "{circumstances((0,), 1, ())["commit"]}"',
+        f'machine = "{machine}"',
+    ]
+    for run, own in found.items():
+        lines += ["", f'[digests."{run}"]', *(f"{what} = {json.dumps(digest)}" for what, digest in own.items())]
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
