@@ -140,9 +140,7 @@ def _look_for_double_walls(report: Report, by_log: dict[MeasuredLog, list[Run]])
     }
 
 
-def _walls_table(
-    walls: dict[str, list[Walls]], areas: dict[str, list[int]], closures: dict[str, list[int]]
-) -> str:
+def _walls_table(walls: dict[str, list[Walls]], areas: dict[str, list[int]], closures: dict[str, list[int]]) -> str:
     head = ["log without truth", "areas", "loop closures", "stretches over known ground", "torn", "where", "agreement"]
     rows = [
         [

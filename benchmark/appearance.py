@@ -111,10 +111,16 @@ def _keyframes(poses: NDArray[np.float64]) -> list[int]:
 
 def _families_table(asked: dict[str, list[Question]]) -> str:
     rows = [
-        [family, str(len(own)), f"{np.mean([q.told_apart for q in own]):.3f}",
-         f"{np.mean([q.among_most for q in own]):.2f}", f"{np.mean([q.by_chance for q in own]):.2f}"]
-        for family, own in asked.items() if own
-    ]  # fmt: skip
+        [
+            family,
+            str(len(own)),
+            f"{np.mean([q.told_apart for q in own]):.3f}",
+            f"{np.mean([q.among_most for q in own]):.2f}",
+            f"{np.mean([q.by_chance for q in own]):.2f}",
+        ]
+        for family, own in asked.items()
+        if own
+    ]
     return table(["family", "questions", "told apart", f"right among the {MOST}", "by chance"], rows)
 
 
@@ -125,6 +131,8 @@ def _ratio_table(asked: list[Question]) -> str:
     weights = np.where(right, 0.5 / right.mean(), 0.5 / (1.0 - right.mean()))
     constant, slope = fitted(likeness[:, None], right, weights)[0]
     deserved = fitted(log_ratio(likeness)[:, None], right, weights)[0][1]
-    rows = [["fitted", f"{constant:.2f}", f"{slope:.2f}", ""],
-            ["in use", f"{RATIO_AT_MEDIAN:.2f}", f"{RATIO_SLOPE:.2f}", f"{deserved:.2f}"]]  # fmt: skip
+    rows = [
+        ["fitted", f"{constant:.2f}", f"{slope:.2f}", ""],
+        ["in use", f"{RATIO_AT_MEDIAN:.2f}", f"{RATIO_SLOPE:.2f}", f"{deserved:.2f}"],
+    ]
     return table(["log-likelihood ratio", "of the median area [nat]", "slope", "weight"], rows)

@@ -83,7 +83,11 @@ def _crossings(random: np.random.Generator, count: int) -> Float64:
 
 
 def _hallway(
-    random: np.random.Generator, corridors: Corridors, crossings: Sequence[int], places: Float64, heading: int,
+    random: np.random.Generator,
+    corridors: Corridors,
+    crossings: Sequence[int],
+    places: Float64,
+    heading: int,
     density: float,
 ) -> None:
     """Add the doors and the two ends of a hallway, and its edges."""

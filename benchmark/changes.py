@@ -190,10 +190,15 @@ def visited_twice(world: str, seed: int, size: float = SIZE, rate: float = RATE)
     images = [one.image for one in (first, second)]
     judgement = judged(images, frames, surfaces)
     return Visit(
-        judgement.new, judgement.gone, judgement.kept, unexplained(images[0], frames[0], surfaces[0].walls),
+        judgement.new,
+        judgement.gone,
+        judgement.kept,
+        unexplained(images[0], frames[0], surfaces[0].walls),
         unexplained(images[1], frames[1], np.concatenate((surfaces[1].walls, judgement.hidden))),
-        *_errors(second.recording, logs), (first.keyframes, second.keyframes), judgement.metres,
-    )  # fmt: skip
+        *_errors(second.recording, logs),
+        (first.keyframes, second.keyframes),
+        judgement.metres,
+    )
 
 
 def visited_often(world: str, seed: int, size: float = SIZE, rate: float = RATE, returns: int = RETURNS) -> list[int]:
@@ -300,6 +305,12 @@ def _row(name: str, one: Visit) -> list[str]:
     shares = [f"{100.0 * one.gone:.0f} %", f"{100.0 * one.kept:.1f} %"]
     shares += [f"{100.0 * share:.2f} %" for share in (one.before, one.after)]
     return [
-        name, f"{one.metres[0]:.0f}", f"{100.0 * one.new:.0f} %", f"{one.metres[1]:.0f}", *shares,
-        f"{one.error:.3f}", f"{one.worst:.3f}", f"{one.keyframes[0]}, {one.keyframes[1]}",
-    ]  # fmt: skip
+        name,
+        f"{one.metres[0]:.0f}",
+        f"{100.0 * one.new:.0f} %",
+        f"{one.metres[1]:.0f}",
+        *shares,
+        f"{one.error:.3f}",
+        f"{one.worst:.3f}",
+        f"{one.keyframes[0]}, {one.keyframes[1]}",
+    ]

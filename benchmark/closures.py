@@ -38,9 +38,7 @@ def closure_errors(saved: SavedMap, truth: Mapping[int, NDArray[np.float64]]) ->
     return [_error(saved, a, b, arc, truth) for a, b, arc in arcs if arc.closure]
 
 
-def _error(
-    saved: SavedMap, a: int, b: int, arc: ArcValue, truth: Mapping[int, NDArray[np.float64]]
-) -> ClosureError:
+def _error(saved: SavedMap, a: int, b: int, arc: ArcValue, truth: Mapping[int, NDArray[np.float64]]) -> ClosureError:
     (a_T_keyframes, true_in_a), (b_T_keyframes, true_in_b) = (_keyframes(saved, area, truth) for area in (a, b))
     distances = np.hypot(*(true_in_a[:, None, :2] - true_in_b[None, :, :2]).transpose(2, 0, 1))
     k, m = np.unravel_index(np.argmin(distances), distances.shape)

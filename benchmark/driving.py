@@ -73,8 +73,9 @@ def measure_driving(settings: Settings) -> Report:
     seeds = chosen_seeds(settings, SEEDS)
     legs = {
         (family, laser): [leg for seed in seeds for leg in driven(scenario_of(family, seed, laser))]
-        for family in chosen for laser in LASERS
-    }  # fmt: skip
+        for family in chosen
+        for laser in LASERS
+    }
     every = [leg for own in legs.values() for leg in own]
     report = Report("driving", "Driving among obstacles", seeds=seeds)
     report.requirements = [
@@ -128,9 +129,13 @@ def driven(scenario: Scenario, most: int | None = None) -> Iterator[Leg]:
     """
     settings = scenario.settings
     limits = Limits(
-        settings.speed, math.radians(settings.turn_rate), ACCELERATION, TURN_ACCELERATION, settings.radius,
+        settings.speed,
+        math.radians(settings.turn_rate),
+        ACCELERATION,
+        TURN_ACCELERATION,
+        settings.radius,
         period=1.0 / settings.rate,
-    )  # fmt: skip
+    )
     robot = DrivenRobot(scenario)
     for goal in goals_of(scenario)[:most]:
         steps: list[float] = []
@@ -170,6 +175,11 @@ def _steps(legs: Sequence[Leg]) -> NDArray[np.float64]:
 def _cells(legs: Sequence[Leg]) -> list[str]:
     median, most = 1e3 * np.quantile(_steps(legs), (0.5, 0.95))
     return [
-        str(len(legs)), str(sum(leg.reached for leg in legs)), str(sum(leg.contacts for leg in legs)),
-        f"{sum(leg.metres for leg in legs):.0f}", f"{_speed(legs):.2f}", f"{median:.1f}", f"{most:.1f}",
-    ]  # fmt: skip
+        str(len(legs)),
+        str(sum(leg.reached for leg in legs)),
+        str(sum(leg.contacts for leg in legs)),
+        f"{sum(leg.metres for leg in legs):.0f}",
+        f"{_speed(legs):.2f}",
+        f"{median:.1f}",
+        f"{most:.1f}",
+    ]

@@ -47,9 +47,15 @@ class _EverywhereSearch(ClosureSearch):
         self._settings = replace(self._settings, gate=gate(_EVERYWHERE), margin=25.0, max_modes=1000)
 
     def compare(
-        self, hybrid_map: HybridMap, area: int, query: Query, compared: Mapping[int, Collection[int]],
-        excluded: Collection[int], most: int, only: Collection[int] = (),
-    ) -> Comparison:  # fmt: skip
+        self,
+        hybrid_map: HybridMap,
+        area: int,
+        query: Query,
+        compared: Mapping[int, Collection[int]],
+        excluded: Collection[int],
+        most: int,
+        only: Collection[int] = (),
+    ) -> Comparison:
         """As in the model, over all areas, however many they are."""
         del most, only
         options = self._options
@@ -75,7 +81,11 @@ class _EverywhereSearch(ClosureSearch):
             fit
             for known, share in shares.items()
             for fit in self._fits(
-                hybrid_map, places[known], candidates[known], modes[known] or (), entries[known],
+                hybrid_map,
+                places[known],
+                candidates[known],
+                modes[known] or (),
+                entries[known],
                 (1.0 - new) * share / total,
             )
         ]

@@ -110,9 +110,12 @@ def _comparisons(records: Sequence[Record]) -> Iterator[Comparison]:
 
 
 def _weights_table(comparisons: Sequence[Comparison], right: NDArray[np.bool_]) -> str:
-    parts = np.column_stack((
-        contradictions(comparisons, MAPS), [[each.look, each.rest, each.prior] for each in comparisons],
-    ))  # fmt: skip
+    parts = np.column_stack(
+        (
+            contradictions(comparisons, MAPS),
+            [[each.look, each.rest, each.prior] for each in comparisons],
+        )
+    )
     together = {"what contradicts": 0, "look": 1, "rarity and distance": 2, "the arcs": 3}
     alone = {name: fitted(parts[:, [k]], right)[0][1] for name, k in together.items()}
     joint, whole = fitted(parts, right)[0][1:], fitted(parts[:, [0, 2, 3]].sum(axis=1)[:, None], right)[0][1]
@@ -149,8 +152,14 @@ def _constants_table(comparisons: Sequence[Comparison], right: NDArray[np.bool_]
     ranked = sorted(models, key=lambda model: scores[model][0])
     shown = [*ranked[:3], *([MAPS] if MAPS not in ranked[:3] else []), ranked[-1]]
     rows = [
-        [f"{model.extra:g}", f"{model.strength:g}", f"{model.stretch:g}", f"{scores[model][0]:.4f}",
-         f"{scores[model][1]:.2f}", "in use" if model == MAPS else ""]
+        [
+            f"{model.extra:g}",
+            f"{model.strength:g}",
+            f"{model.stretch:g}",
+            f"{scores[model][0]:.4f}",
+            f"{scores[model][1]:.2f}",
+            "in use" if model == MAPS else "",
+        ]
         for model in shown
-    ]  # fmt: skip
+    ]
     return table(["extra", "strength", "stretch", "log score [nat]", "weight", ""], rows)

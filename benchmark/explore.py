@@ -119,10 +119,16 @@ def _explored(run: DrivenRun[Explorer], configuration: Configuration) -> Explore
     atlas = run.driver.atlas
     institute = charted(scenario, atlas.hybrid_map, atlas.replica.scans, robot.true_poses, configuration)
     return Explored(
-        outcome is not None, robot.travelled, (robot.stamp - START) / NANOSECONDS, robot.contacts,
-        sum(distance <= _PASSED for distance in away), sum(is_within(room, path) for room in rooms), len(rooms),
-        sum(name.startswith("room ") for name in atlas.places()), judged(institute),
-    )  # fmt: skip
+        outcome is not None,
+        robot.travelled,
+        (robot.stamp - START) / NANOSECONDS,
+        robot.contacts,
+        sum(distance <= _PASSED for distance in away),
+        sum(is_within(room, path) for room in rooms),
+        len(rooms),
+        sum(name.startswith("room ") for name in atlas.places()),
+        judged(institute),
+    )
 
 
 def is_within(room: Float64, path: Float64) -> bool:
@@ -178,17 +184,32 @@ def _requirements(explorations: Sequence[Explored], missions: Sequence[Mission])
 
 def _table_of_explorations(seeds: Sequence[int], explorations: Sequence[Explored]) -> str:
     head = [
-        "exploration", "way [m]", "time [s]", "states", "passed", "on the chart", "confused", "rooms entered",
-        "rooms named", "contacts",
-    ]  # fmt: skip
+        "exploration",
+        "way [m]",
+        "time [s]",
+        "states",
+        "passed",
+        "on the chart",
+        "confused",
+        "rooms entered",
+        "rooms named",
+        "contacts",
+    ]
     rows = [
         [
-            str(seed), f"{one.metres:.0f}", f"{one.seconds:.0f}", str(one.chart.states), str(one.passed),
-            str(one.chart.detected), str(one.chart.confused), f"{one.entered} of {one.rooms}", str(one.named),
+            str(seed),
+            f"{one.metres:.0f}",
+            f"{one.seconds:.0f}",
+            str(one.chart.states),
+            str(one.passed),
+            str(one.chart.detected),
+            str(one.chart.confused),
+            f"{one.entered} of {one.rooms}",
+            str(one.named),
             str(one.contacts),
         ]
         for seed, one in zip(seeds, explorations, strict=True)
-    ]  # fmt: skip
+    ]
     return table(head, rows)
 
 
@@ -203,6 +224,11 @@ def _cells(missions: Sequence[Mission]) -> list[str]:
     metres, off = sum(one.metres for one in missions), np.array([one.off for one in missions])
     speed = metres / max(1e-9, sum(one.seconds for one in missions))
     return [
-        str(len(missions)), str(sum(one.success for one in missions)), f"{metres:.0f}", f"{speed:.2f}",
-        f"{np.median(off):.2f}", f"{off.max():.2f}", str(sum(one.contacts for one in missions)),
-    ]  # fmt: skip
+        str(len(missions)),
+        str(sum(one.success for one in missions)),
+        f"{metres:.0f}",
+        f"{speed:.2f}",
+        f"{np.median(off):.2f}",
+        f"{off.max():.2f}",
+        str(sum(one.contacts for one in missions)),
+    ]

@@ -64,8 +64,10 @@ def measure_hallways(settings: Settings) -> Report:
     configuration = load_configuration(PARAMETERS, list(settings.changes))
     drives = {
         (laser, family, seed): list(places_of(World(family, seed), laser, configuration))
-        for laser in LASERS for family in chosen for seed in seeds
-    }  # fmt: skip
+        for laser in LASERS
+        for family in chosen
+        for seed in seeds
+    }
     report = Report("hallways", "Hallway or room", seeds=seeds)
     groups: dict[tuple[str, str], list[list[Place]]] = {}
     for (laser, family, _), places in drives.items():

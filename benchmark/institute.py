@@ -112,14 +112,23 @@ def _relocation_requirements(runs: Sequence[Sequence[Estimate]]) -> list[Require
 
 def _mission_table(missions: dict[str, list[Mission]]) -> str:
     rows = [
-        ["Number of missions", "25"], ["Success", "25 / 100 %"], ["Place in the room reached", "-"], ["Contacts", "-"],
-        ["Total travelled distance [m]", "899"], ["Mean travel distance [m]", "36"],
-        ["Mean travel speed [m/s]", "0.31"], ["Total state transitions", "181"],
-        ["False state transitions", "21 / 12 %"], ["Total estimates", "27870"], ["Unconfident states", "3413 / 12 %"],
-        ["False estimates", "404 / 1.4 %"], ["Confident false estimates", "149 / 0.5 %"],
-        ["Metric start: mean error [cm]", "-"], ["Metric start: mean error [deg]", "-"],
+        ["Number of missions", "25"],
+        ["Success", "25 / 100 %"],
+        ["Place in the room reached", "-"],
+        ["Contacts", "-"],
+        ["Total travelled distance [m]", "899"],
+        ["Mean travel distance [m]", "36"],
+        ["Mean travel speed [m/s]", "0.31"],
+        ["Total state transitions", "181"],
+        ["False state transitions", "21 / 12 %"],
+        ["Total estimates", "27870"],
+        ["Unconfident states", "3413 / 12 %"],
+        ["False estimates", "404 / 1.4 %"],
+        ["Confident false estimates", "149 / 0.5 %"],
+        ["Metric start: mean error [cm]", "-"],
+        ["Metric start: mean error [deg]", "-"],
         ["Metric start: NEES, mean", "-"],
-    ]  # fmt: skip
+    ]
     columns = [_mission_column(own) for own in missions.values()]
     for row, *cells in zip(rows, *columns, strict=True):
         row.extend(cells)
@@ -132,30 +141,48 @@ def _mission_column(missions: Sequence[Mission]) -> list[str]:
     errors = np.array([one.errors for one in missions if one.errors is not None]).reshape(-1, 3)
     transitions = _transitions(missions)
     return [
-        str(len(missions)), _share([one.success for one in missions]), _share([one.reached for one in missions]),
-        str(sum(one.contacts for one in missions)), f"{metres:.0f}",
-        f"{metres / len(missions):.0f}", f"{metres / seconds:.2f}", str(len(transitions)), _share(transitions),
-        str(len(estimates)), _share([not one.confident for one in estimates]),
-        _share([not one.right for one in estimates]), _share([one.confident and not one.right for one in estimates]),
-        f"{100.0 * _mean(errors[:, 0]):.1f}", f"{math.degrees(_mean(errors[:, 1])):.2f}", f"{_mean(errors[:, 2]):.2f}",
-    ]  # fmt: skip
+        str(len(missions)),
+        _share([one.success for one in missions]),
+        _share([one.reached for one in missions]),
+        str(sum(one.contacts for one in missions)),
+        f"{metres:.0f}",
+        f"{metres / len(missions):.0f}",
+        f"{metres / seconds:.2f}",
+        str(len(transitions)),
+        _share(transitions),
+        str(len(estimates)),
+        _share([not one.confident for one in estimates]),
+        _share([not one.right for one in estimates]),
+        _share([one.confident and not one.right for one in estimates]),
+        f"{100.0 * _mean(errors[:, 0]):.1f}",
+        f"{math.degrees(_mean(errors[:, 1])):.2f}",
+        f"{_mean(errors[:, 2]):.2f}",
+    ]
 
 
 def _relocation_table(lost: dict[str, list[list[Estimate]]]) -> str:
     rows = [
-        ["Number of experiments", "10"], ["Recovered", "10"], ["Total travelled distance [m]", "250"],
-        ["Mean distance for recovering [m]", "13.7"], ["Min / max distance for recovering [m]", "1.21 / 20.31"],
-        ["Mean number of states for recovering", "2.11"], ["Min / max states for recovering", "1 / 4"],
-    ]  # fmt: skip
+        ["Number of experiments", "10"],
+        ["Recovered", "10"],
+        ["Total travelled distance [m]", "250"],
+        ["Mean distance for recovering [m]", "13.7"],
+        ["Min / max distance for recovering [m]", "1.21 / 20.31"],
+        ["Mean number of states for recovering", "2.11"],
+        ["Min / max states for recovering", "1 / 4"],
+    ]
     for runs in lost.values():
         found = [estimate for run in runs if (estimate := recovery(run)) is not None]
         metres, states = [one.metres for one in found], [one.arrivals for one in found]
         travelled = sum(run[-1].metres for run in runs if run)
         cells = [
-            str(len(runs)), str(len(found)), f"{travelled:.0f}", f"{_mean(metres):.1f}",
-            f"{min(metres, default=math.nan):.2f} / {max(metres, default=math.nan):.2f}", f"{_mean(states):.2f}",
+            str(len(runs)),
+            str(len(found)),
+            f"{travelled:.0f}",
+            f"{_mean(metres):.1f}",
+            f"{min(metres, default=math.nan):.2f} / {max(metres, default=math.nan):.2f}",
+            f"{_mean(states):.2f}",
             f"{min(states, default=0)} / {max(states, default=0)}",
-        ]  # fmt: skip
+        ]
         for row, cell in zip(rows, cells, strict=True):
             row.append(cell)
     return table(["relocations", "paper", *lost], rows)

@@ -73,18 +73,26 @@ class Steered:
     """
 
     def __init__(
-        self, institute: InstituteMap, scenario: Scenario, configuration: Configuration, start: Float64,
+        self,
+        institute: InstituteMap,
+        scenario: Scenario,
+        configuration: Configuration,
+        start: Float64,
         state: int | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         """:param start: ``world_T_base`` (3,).
 
         :param state: that the robot knows to be in, None for one that is lost.
         """
         settings = scenario.settings
         limits = Limits(
-            settings.speed, math.radians(settings.turn_rate), ACCELERATION, TURN_ACCELERATION, settings.radius,
+            settings.speed,
+            math.radians(settings.turn_rate),
+            ACCELERATION,
+            TURN_ACCELERATION,
+            settings.radius,
             period=1.0 / settings.rate,
-        )  # fmt: skip
+        )
         self._institute, self._configuration = institute, configuration
         self._known = known_of(institute, configuration)
         self.robot = DrivenRobot(scenario, start)
@@ -108,9 +116,14 @@ class Steered:
         reached = pilot.phase is Phase.THERE and math.dist(place, robot.pose[:2]) <= AT_PLACE
         success = found is not None and found[0] == goal.node
         return Mission(
-            success, reached, robot.travelled - metres, (robot.stamp - begin) / NANOSECONDS,
-            robot.contacts - contacts, self.estimates, None if found is None else found[1],
-        )  # fmt: skip
+            success,
+            reached,
+            robot.travelled - metres,
+            (robot.stamp - begin) / NANOSECONDS,
+            robot.contacts - contacts,
+            self.estimates,
+            None if found is None else found[1],
+        )
 
     def step(self) -> None:
         """Measure, and drive on until there is more to measure."""
@@ -131,9 +144,7 @@ class Steered:
         if self.pilot.room is None and belief is not None and estimator.in_hallway and not estimator.turning:
             right = is_right(self._institute, estimator, self.robot.pose)
             peak = float(belief.probabilities.max())
-            self.estimates.append(
-                Estimate(estimator.arrivals, self.robot.travelled, peak, belief.confident, right)
-            )
+            self.estimates.append(Estimate(estimator.arrivals, self.robot.travelled, peak, belief.confident, right))
 
     def _errors(self, start: MetricStart, pose: Float64) -> tuple[float, float, float]:
         true = se2.between(self._institute.frames[start.area], pose)

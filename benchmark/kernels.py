@@ -155,9 +155,7 @@ def _measure_matching(
     information = np.linalg.inv(np.diag([0.05, 0.05, 0.03]) ** 2)
     view, settings = mapping.pool.view(tables[0]), mapping.configuration.matching
     prior = matching.Prior(poses[0], information)
-    figures.timed(
-        "Gauss-Newton, a scan", 1, lambda: matching.align(points, poses[0], prior, view, mapping.alignment)
-    )
+    figures.timed("Gauss-Newton, a scan", 1, lambda: matching.align(points, poses[0], prior, view, mapping.alignment))
     figures.timed(
         "things that moved, a scan", 1, lambda: movers.standing(points, prior.mean, prior, view, mapping.alignment)
     )
@@ -170,10 +168,19 @@ def _measure_matching(
         "proposal, a scan and a particle",
         len(poses),
         lambda: batch.propose_all(
-            points, points, poses, poses, information, tables, view, mapping.alignment, mapping.model,
-            settings.sharpness, settings.temper,
+            points,
+            points,
+            poses,
+            poses,
+            information,
+            tables,
+            view,
+            mapping.alignment,
+            mapping.model,
+            settings.sharpness,
+            settings.temper,
         ),
-    )  # fmt: skip
+    )
 
 
 def _measure_overlaps(keyframes: Keyframes, configuration: Configuration, figures: Figures) -> None:

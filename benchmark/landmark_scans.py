@@ -169,8 +169,12 @@ def keyframes_of(poses: Array, configuration: Configuration) -> list[int]:
 
 
 def _judged(
-    found: Extracted, world: World, configuration: Configuration, virtual: VirtualScan | None,
-    cast: float, seconds: float,
+    found: Extracted,
+    world: World,
+    configuration: Configuration,
+    virtual: VirtualScan | None,
+    cast: float,
+    seconds: float,
 ) -> Scanned:
     corners, openings, evidence = found
     features = configuration.features

@@ -67,9 +67,7 @@ class World:
 
     def corners(self, features: Features) -> Truth:
         """All pairs of surfaces that meet at a right angle, on the sides that face the robot."""
-        parts = [
-            self._corners_of(sign_a, sign_b, features) for sign_a in (1.0, -1.0) for sign_b in (1.0, -1.0)
-        ]  # fmt: skip
+        parts = [self._corners_of(sign_a, sign_b, features) for sign_a in (1.0, -1.0) for sign_b in (1.0, -1.0)]
         return _joined(parts)
 
     def _corners_of(self, sign_a: float, sign_b: float, features: Features) -> Truth:

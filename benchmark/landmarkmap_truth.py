@@ -53,9 +53,7 @@ class Visit:
         return World(self.scenario, int(self.scenario.scan_stamps[self.numbers[k]]), self.poses[k])
 
 
-def truth_of(
-    visit: Visit, keyframes: Sequence[int], every: int, frame: Array, features: Features
-) -> TrueLandmarks:
+def truth_of(visit: Visit, keyframes: Sequence[int], every: int, frame: Array, features: Features) -> TrueLandmarks:
     """All that is true around keyframes, each once.
 
     :param every: one keyframe of so many is asked what had to be found from there.

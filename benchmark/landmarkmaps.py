@@ -253,12 +253,22 @@ def _row(laser: str, treatment: str, areas: Sequence[Area]) -> list[str]:
     true = [one for one in sure if one.is_true]
     kept, gone = [k for area in areas for k in area.kept], [k for area in areas for k in area.gone]
     return [
-        laser, treatment, str(len(judged)), _percent([one.again for one in true]), str(len(sure)),
-        _percent([one.is_true for one in sure]), str(sum(area.due[0] for area in areas)),
+        laser,
+        treatment,
+        str(len(judged)),
+        _percent([one.again for one in true]),
+        str(len(sure)),
+        _percent([one.is_true for one in sure]),
+        str(sum(area.due[0] for area in areas)),
         f"{100.0 * _found(areas):.1f} %",
-        f"{100.0 * float(np.median([one.error for one in true])):.1f}", f"{_mean([one.nees for one in true]):.2f}",
-        f"{_calibration_error(judged):.3f}", str(len(kept)), _percent(kept), str(len(gone)), _percent(gone),
-    ]  # fmt: skip
+        f"{100.0 * float(np.median([one.error for one in true])):.1f}",
+        f"{_mean([one.nees for one in true]):.2f}",
+        f"{_calibration_error(judged):.3f}",
+        str(len(kept)),
+        _percent(kept),
+        str(len(gone)),
+        _percent(gone),
+    ]
 
 
 def _mean(values: Sequence[float]) -> float:

@@ -63,8 +63,9 @@ def measure_landmarks(settings: Settings) -> Report:
     configuration = load_configuration(PARAMETERS, list(settings.changes))
     drives = {
         (laser, family): [scan for seed in seeds for scan in scans_of(World(family, seed), laser, configuration)]
-        for laser in LASERS for family in chosen
-    }  # fmt: skip
+        for laser in LASERS
+        for family in chosen
+    }
     report = Report("landmarks", "Corners and openings", seeds=seeds)
     for kind in (CORNERS, OPENINGS):
         for laser in LASERS:
@@ -138,14 +139,23 @@ def _table(kind: str, drives: dict[tuple[str, str], list[Scanned]]) -> str:
         every = [landmark for one in found for landmark in one.landmarks]
         sure = [landmark for landmark in every if landmark.confidence >= _CONFIDENT]
         values = np.array([one[2:5] for one in sure if one.is_true]).reshape(-1, 3)
-        rows.append([
-            laser, family, str(len(every)), _percent([one.is_true for one in every]), str(len(sure)),
-            _percent([one.is_true for one in sure]), str(sum(one.due for one in found)),
-            f"{100.0 * found_share(found):.1f} %",
-            *(f"{q:.1f}" for q in 100.0 * np.quantile(values[:, 1], (0.5, 0.95))),
-            *(f"{q:.2f}" for q in np.degrees(np.quantile(values[:, 2], (0.5, 0.95)))),
-            f"{np.median(values[:, 0]):.2f}", f"{values[:, 0].mean():.2f}", _percent(list(values[:, 0] <= COVERED)),
-        ])  # fmt: skip
+        rows.append(
+            [
+                laser,
+                family,
+                str(len(every)),
+                _percent([one.is_true for one in every]),
+                str(len(sure)),
+                _percent([one.is_true for one in sure]),
+                str(sum(one.due for one in found)),
+                f"{100.0 * found_share(found):.1f} %",
+                *(f"{q:.1f}" for q in 100.0 * np.quantile(values[:, 1], (0.5, 0.95))),
+                *(f"{q:.2f}" for q in np.degrees(np.quantile(values[:, 2], (0.5, 0.95)))),
+                f"{np.median(values[:, 0]):.2f}",
+                f"{values[:, 0].mean():.2f}",
+                _percent(list(values[:, 0] <= COVERED)),
+            ]
+        )
     return table(head, rows)
 
 

@@ -97,8 +97,10 @@ def measure_lines(settings: Settings) -> Report:
     features = load_configuration(PARAMETERS, list(settings.changes)).features
     drives = {
         (laser, family, seed): list(scans_of(World(family, seed), own, features))
-        for laser, own in LASERS.items() for family in chosen for seed in seeds
-    }  # fmt: skip
+        for laser, own in LASERS.items()
+        for family in chosen
+        for seed in seeds
+    }
     report = Report("lines", "Lines of scans", seeds=seeds)
     low, high = ALLOWED
     everything = list(drives.values())

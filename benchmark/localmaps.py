@@ -39,8 +39,7 @@ def measure_localmaps(settings: Settings) -> Report:
     chosen = chosen_families(settings, FAMILIES, tuple(SETTINGS))
     seeds = chosen_seeds(settings, SEEDS)
     cases = {
-        key: [_case(World(key[0], seed), key[1], settings.changes) for seed in seeds]
-        for key in product(chosen, KINDS)
+        key: [_case(World(key[0], seed), key[1], settings.changes) for seed in seeds] for key in product(chosen, KINDS)
     }
     settings.runner.runs([case for own in cases.values() for case in own])
     runs = {key: settings.runner.runs(own) for key, own in cases.items()}
@@ -79,9 +78,11 @@ def _table(runs: dict[tuple[str, str], list[Run]], means: dict[str, dict[tuple[s
     rows = []
     for key, own in runs.items():
         figures = [
-            figure for file in (FILTER, FINAL) for mean in [means[file][key]]
+            figure
+            for file in (FILTER, FINAL)
+            for mean in [means[file][key]]
             for figure in (f"{mean.translation:.4f}", f"{mean.worst:.4f}", f"{mean.rotation:.3f}")
-        ]  # fmt: skip
+        ]
         counts = [f"{np.mean([run.report[name] for run in own]):.1f}" for name in ("areas", "loop_closures")]
         rows.append([*key, *figures, *counts, f"{np.mean([run.cpu_seconds for run in own]):.1f}"])
     return table(head, rows)

@@ -19,6 +19,7 @@ from hmt_slam_ros.processes.messages import LocalEstimate
 
 NODES = ("slam", "aam", "tsbi", "tlca", "rtl", "robot")
 
+
 class Start(NamedTuple):
     """What a start takes: seconds on the wall, and of CPU time, which other programs of the machine do not change."""
 

@@ -34,6 +34,7 @@ WORLDS = {
 }
 """{name: simulated world}."""
 
+
 class Regime(NamedTuple):
     """Under what is compared.
 

@@ -188,6 +188,12 @@ def _row(one: Scored) -> list[str]:
     far, turned = (max((start[k] for start in one.starts), default=math.nan) for k in (0, 1))
     told = [f"{far:.2f}", f"{math.degrees(turned):.1f}"] if one.starts else ["-", "-"]
     return [
-        str(one.seed), errand, end, f"{one.off:.2f}", f"{one.ran.metres:.0f}", f"{one.ran.seconds:.0f}",
-        str(one.ran.contacts), *told,
-    ]  # fmt: skip
+        str(one.seed),
+        errand,
+        end,
+        f"{one.off:.2f}",
+        f"{one.ran.metres:.0f}",
+        f"{one.ran.seconds:.0f}",
+        str(one.ran.contacts),
+        *told,
+    ]

@@ -83,9 +83,14 @@ class Errands:
             stack.enter_context(listener.running(name, shared))
         listener.until(lambda: self._errands.get_subscription_count() == 1, _PATIENCE)
         robot: Parameters = {
-            "log": start.world, "robot.start": start.seconds, "robot.drive": "commands", "robot.rate": RATE,
-            "robot.scan_listeners": 2, "robot.odometry_listeners": 3, "robot.patience": _PATIENCE,
-        }  # fmt: skip
+            "log": start.world,
+            "robot.start": start.seconds,
+            "robot.drive": "commands",
+            "robot.rate": RATE,
+            "robot.scan_listeners": 2,
+            "robot.odometry_listeners": 3,
+            "robot.patience": _PATIENCE,
+        }
         stack.enter_context(listener.running("robot", robot))
         listener.until(lambda: bool(self._truths), _PATIENCE)
 

@@ -132,9 +132,11 @@ def plot_nees(path: Path, samples: Mapping[str, Sequence[float]]) -> None:
 
 
 def plot_scale(
-    path: Path, cuts: Mapping[int, Sequence[float]], scans: Mapping[int, Mapping[str, float]],
+    path: Path,
+    cuts: Mapping[int, Sequence[float]],
+    scans: Mapping[int, Mapping[str, float]],
     bounds: Mapping[int, float],
-) -> None:  # fmt: skip
+) -> None:
     """Cost against the number of areas.
 
     :param cuts: {number of areas: ms of each cut}.

@@ -115,8 +115,9 @@ def _table(records: Mapping[str, Sequence[Record]], families: Sequence[str]) -> 
     head += ["closures", "false", "loops", "in time"]
     rows = [
         [family, policy, *_cells([record for record in records[policy] if record["family"] == family])]
-        for family in families for policy in records
-    ]  # fmt: skip
+        for family in families
+        for policy in records
+    ]
     return table(head, rows)
 
 
@@ -153,8 +154,9 @@ def _score(report: Report, settings: Settings, logs: Sequence[MeasuredLog]) -> N
     seeds = settings.seeds_or(_LOG_SEEDS)
     cases = {
         (log, policy): [Case(log, seed, changes=_changes(settings, policy)) for seed in seeds]
-        for log in logs for policy in POLICIES
-    }  # fmt: skip
+        for log in logs
+        for policy in POLICIES
+    }
     runs = {key: settings.runner.runs(own) for key, own in cases.items()}
     means = {key: over_seeds([score(run.folder, key[0]) for run in own]) for key, own in runs.items()}
     for log in logs:

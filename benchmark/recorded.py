@@ -113,9 +113,7 @@ def scored(looks: Sequence[Look], configuration: Configuration) -> dict[str, Sco
     }
 
 
-def _score_rows(
-    looks: Mapping[str, Sequence[Look]], scores: Mapping[str, Mapping[str, Scored]]
-) -> Iterator[list[str]]:
+def _score_rows(looks: Mapping[str, Sequence[Look]], scores: Mapping[str, Mapping[str, Scored]]) -> Iterator[list[str]]:
     for log, own in looks.items():
         inside = sum(look.inside for look in own)
         for name, of in scores[log].items():

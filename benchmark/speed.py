@@ -54,9 +54,7 @@ def measure_speed(settings: Settings) -> Report:
     with opened(settings.logs_or(WITH_RELATIONS)) as logs:
         with tempfile.TemporaryDirectory(prefix="hmt_slam_benchmark_") as folder:
             Runner(Path(folder), jobs=1).runs([Case(log, 0, changes=settings.changes) for log in logs])
-        runs = {
-            log.name: runner.runs([Case(log, seed, changes=settings.changes) for seed in seeds]) for log in logs
-        }
+        runs = {log.name: runner.runs([Case(log, seed, changes=settings.changes) for seed in seeds]) for log in logs}
     _tell_runs(report, runs)
     for name, own in runs.items():
         shutil.copy(plot_cost(own[0].folder), settings.out / f"cost-{name}.png")
@@ -68,9 +66,7 @@ def measure_speed(settings: Settings) -> Report:
 
 def _tell_runs(report: Report, runs: dict[str, list[Run]]) -> None:
     for name, own in runs.items():
-        report.requirements += speed_requirements(
-            name, [run.cpu_seconds for run in own], [run.peak_rss for run in own]
-        )
+        report.requirements += speed_requirements(name, [run.cpu_seconds for run in own], [run.peak_rss for run in own])
     report.body += [_whole_table(runs), _process_table(runs), *_memory(runs)]
     report.data["runs"] = {
         name: [

@@ -128,5 +128,3 @@ def judged(run: Run, relations: Relations) -> RelationErrors:
     log = run.case.log
     odometry = None if log.name == CAMPUS else log.odometry
     return evaluate_relations(read_tum(run.folder / FINAL), relations, odometry)
-
-

@@ -111,8 +111,10 @@ class Drive(NamedTuple):
     @property
     def ways(self) -> list[float]:
         """From each loop that was closed the path from its begin to the first right closure, m."""
-        ways = (min((one.at - begin for one in self.accepted if one.right and one.at >= begin), default=None)
-                for begin in self.begins)
+        ways = (
+            min((one.at - begin for one in self.accepted if one.right and one.at >= begin), default=None)
+            for begin in self.begins
+        )
         return [way for way in ways if way is not None]
 
 
@@ -215,19 +217,31 @@ def _closed(drives: Sequence[Drive]) -> float:
 
 def _elsewhere_row(building: str, own: Drive) -> list[str]:
     return [
-        building, f"{own.travelled:.0f}", str(len(own.proposals)),
-        f"{max((one.seconds for one in own.proposals), default=0.0):.2f}", str(len(own.made)),
-        str(sum(not one.right for one in own.made)), str(len(own.accepted)),
+        building,
+        f"{own.travelled:.0f}",
+        str(len(own.proposals)),
+        f"{max((one.seconds for one in own.proposals), default=0.0):.2f}",
+        str(len(own.made)),
+        str(sum(not one.right for one in own.made)),
+        str(len(own.accepted)),
         str(sum(not one.right for one in own.accepted)),
-    ]  # fmt: skip
+    ]
 
 
 def _row(building: str, own: Drive, without: Drive) -> list[str]:
     before = [one for one in own.proposals if one.at < min(own.begins, default=own.travelled)]
     return [
-        building, f"{own.travelled:.0f}", str(len(own.begins)), str(len(before)),
-        str(sum(one.error is not None for one in before)), str(len(own.proposals) - len(before)), str(len(own.made)),
-        str(sum(not one.right for one in own.made)), str(len(own.accepted)),
-        str(sum(not one.right for one in own.accepted)), str(len(own.ways)),
-        ", ".join(f"{way:.0f}" for way in own.ways) or "-", str(len(without.ways)),
-    ]  # fmt: skip
+        building,
+        f"{own.travelled:.0f}",
+        str(len(own.begins)),
+        str(len(before)),
+        str(sum(one.error is not None for one in before)),
+        str(len(own.proposals) - len(before)),
+        str(len(own.made)),
+        str(sum(not one.right for one in own.made)),
+        str(len(own.accepted)),
+        str(sum(not one.right for one in own.accepted)),
+        str(len(own.ways)),
+        ", ".join(f"{way:.0f}" for way in own.ways) or "-",
+        str(len(without.ways)),
+    ]

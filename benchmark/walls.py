@@ -136,9 +136,7 @@ class _Agreement:
         return np.where(inside, self._values[y, x], 0.0)
 
 
-def _judged(
-    begin: float, points: NDArray[np.float64], centre: NDArray[np.float64], grid: _Agreement
-) -> Stretch | None:
+def _judged(begin: float, points: NDArray[np.float64], centre: NDArray[np.float64], grid: _Agreement) -> Stretch | None:
     """The stretch, or None where it leads over new ground."""
     here = grid.of(points)
     known = int(np.count_nonzero(here))

@@ -42,7 +42,9 @@ def generate_launch_description() -> LaunchDescription:
                 parameters=[
                     LaunchConfiguration("params_file"),
                     {
-                        "log": LaunchConfiguration("world"), "robot.rate": rate, "robot.drive": "commands",
+                        "log": LaunchConfiguration("world"),
+                        "robot.rate": rate,
+                        "robot.drive": "commands",
                         "use_sim_time": False,
                     },
                 ],
@@ -58,4 +60,4 @@ def generate_launch_description() -> LaunchDescription:
                 **common,
             ),
         ]
-    )  # fmt: skip
+    )

@@ -25,7 +25,9 @@ def _arguments() -> list[DeclareLaunchArgument]:
         DeclareLaunchArgument("namespace", default_value="", description="Namespace of the nodes and their topics."),
         DeclareLaunchArgument("start_from", default_value="", description="Saved map to go on from; empty for none."),
         DeclareLaunchArgument(
-            "mode", default_value="", choices=["", "mapping", "localization", "lifelong"],
+            "mode",
+            default_value="",
+            choices=["", "mapping", "localization", "lifelong"],
             description="What is done with known ground; empty for what the YAML file says.",
         ),
         _switch("start_carried", "true", "Whether the robot may be anywhere in that map; else it is where it was."),

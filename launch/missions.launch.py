@@ -19,7 +19,9 @@ def generate_launch_description() -> LaunchDescription:
             DeclareLaunchArgument("world", default_value="sim:institute,seed=3", description="A simulated world."),
             DeclareLaunchArgument("rate", default_value="1.0", description="Speed relative to real time."),
             DeclareLaunchArgument(
-                "drives", default_value="true", choices=["true", "false"],
+                "drives",
+                default_value="true",
+                choices=["true", "false"],
                 description="Whether the pilot drives; else it only says where the robot is.",
             ),
             DeclareLaunchArgument(
@@ -45,8 +47,10 @@ def generate_launch_description() -> LaunchDescription:
                 parameters=[
                     LaunchConfiguration("params_file"),
                     {
-                        "log": LaunchConfiguration("world"), "robot.rate": _value("rate", float),
-                        "robot.drive": "commands", "use_sim_time": False,
+                        "log": LaunchConfiguration("world"),
+                        "robot.rate": _value("rate", float),
+                        "robot.drive": "commands",
+                        "use_sim_time": False,
                     },
                 ],
                 **common,
@@ -57,7 +61,8 @@ def generate_launch_description() -> LaunchDescription:
                 parameters=[
                     LaunchConfiguration("params_file"),
                     {
-                        "start_from": _value("start_from", str), "pilot.drives": _value("drives", bool),
+                        "start_from": _value("start_from", str),
+                        "pilot.drives": _value("drives", bool),
                         "use_sim_time": True,
                     },
                 ],
@@ -67,7 +72,7 @@ def generate_launch_description() -> LaunchDescription:
                 **common,
             ),
         ]
-    )  # fmt: skip
+    )
 
 
 def _value(name: str, kind: type) -> ParameterValue:

@@ -30,6 +30,7 @@ else
     # While mypy reads, as both workers of the tests would otherwise compile the same kernels at the same time.
     [ "$#" != 0 ] || compile_kernels &
     check ruff check
+    check ruff format --check
     check mypy
     wait
     [ "$status" = 0 ] || echo "ruff or mypy found faults, see above; the tests run all the same"

@@ -11,10 +11,18 @@ import time
 
 PROGRAMS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 FLAGS = (
-    "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-sync",
-    "--disable-background-networking", "--disable-component-update", "--disable-dev-shm-usage", "--hide-scrollbars",
+    "--headless",
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-sync",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-dev-shm-usage",
+    "--hide-scrollbars",
     "--remote-debugging-pipe",
-)  # fmt: skip
+)
 PATIENCE = 30.0  # s
 FROM_BROWSER, TO_BROWSER = 4, 3  # file descriptors of the browser, as --remote-debugging-pipe has them
 
@@ -47,10 +55,13 @@ class Browser:
 
         self._process = subprocess.Popen(
             [find_browser(), *FLAGS, f"--user-data-dir={profile}", "about:blank"],
-            stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
             preexec_fn=take_pipes,  # noqa: PLW1509  no other way gives a child these two numbers
-            pass_fds=(TO_BROWSER, FROM_BROWSER), start_new_session=True,
-        )  # fmt: skip
+            pass_fds=(TO_BROWSER, FROM_BROWSER),
+            start_new_session=True,
+        )
         os.close(theirs_in)
         os.close(theirs_out)
         self._number, self._rest, self.complaints = 0, b"", []

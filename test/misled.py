@@ -1,6 +1,5 @@
 """A TSBI that closes a loop falsely once, in lock-step with the rest, the documents through JSON as between nodes."""
 
-
 import numpy as np
 
 from hmt_slam_ros.geometry import se2

@@ -15,11 +15,20 @@ from hmt_slam_ros.processes.replica import Replica
 from hmt_slam_ros.processes.tsbi import Tsbi
 
 # A ring of corridors, 2 m wide, with niches and pillars that differ from side to side.
-RING = np.concatenate((
-    box(0.0, 0.0, 18.0, 12.0), box(2.0, 2.0, 16.0, 10.0), box(5.0, 0.0, 6.0, 0.4), box(11.0, 1.7, 11.6, 2.0),
-    box(17.6, 4.0, 18.0, 5.5), box(16.0, 7.0, 16.3, 7.5), box(8.0, 11.5, 10.0, 12.0), box(4.0, 10.0, 4.4, 10.5),
-    box(0.0, 6.0, 0.5, 6.6), box(1.6, 3.0, 2.0, 4.4),
-))  # fmt: skip
+RING = np.concatenate(
+    (
+        box(0.0, 0.0, 18.0, 12.0),
+        box(2.0, 2.0, 16.0, 10.0),
+        box(5.0, 0.0, 6.0, 0.4),
+        box(11.0, 1.7, 11.6, 2.0),
+        box(17.6, 4.0, 18.0, 5.5),
+        box(16.0, 7.0, 16.3, 7.5),
+        box(8.0, 11.5, 10.0, 12.0),
+        box(4.0, 10.0, 4.4, 10.5),
+        box(0.0, 6.0, 0.5, 6.6),
+        box(1.6, 3.0, 2.0, 4.4),
+    )
+)
 STEP = np.diag([0.02, 0.02, math.radians(0.25)]) ** 2  # covariance of the odometry between keyframes
 
 
@@ -69,11 +78,17 @@ class Run:
         scan = scan_in(self.walls, true_pose, stamp=sequence, noise=0.01, seed=sequence, **self.laser)
         leaves = tuple(
             LeafEstimate(
-                h, self.replica.areas[h], PoseGaussian(self.poses[h], self.covariances[h]), self.stored,
-                self.evidence.get(h, 0.0), -self.evidence.get(h, 0.0), Clutter(), 12.0,
+                h,
+                self.replica.areas[h],
+                PoseGaussian(self.poses[h], self.covariances[h]),
+                self.stored,
+                self.evidence.get(h, 0.0),
+                -self.evidence.get(h, 0.0),
+                Clutter(),
+                12.0,
             )
             for h in sorted(self.poses)
-        )  # fmt: skip
+        )
         message = Keyframe(sequence, scan, 0.5 * sequence, leaves, mapping=mapping)
         assert self.tsbi.handle(message) == []
         self.replica.add(message)

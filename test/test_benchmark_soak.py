@@ -22,9 +22,14 @@ def test_a_run_that_leaves_something_behind_does_not_do():
     good = Soak(60.0, 600.0, 3000, {"slam": [100] * 100}, statuses={"slam": 0})
     assert all(one.met for one in requirements(good))
     for fault in (
-        {"leaked": {"/dev/shm/fastrtps_1"}}, {"zombies": 1}, {"dropped": 1}, {"errors": {"/slam": "x"}},
-        {"statuses": {"slam": -9}}, {"driven": 500.0}, {"resident": {"slam": [100 + k for k in range(100)]}},
-    ):  # fmt: skip
+        {"leaked": {"/dev/shm/fastrtps_1"}},
+        {"zombies": 1},
+        {"dropped": 1},
+        {"errors": {"/slam": "x"}},
+        {"statuses": {"slam": -9}},
+        {"driven": 500.0},
+        {"resident": {"slam": [100 + k for k in range(100)]}},
+    ):
         assert sum(not one.met for one in requirements(Soak(**{**vars(good), **fault}))) == 1
 
 

@@ -174,9 +174,11 @@ def test_odometry_that_was_reset_is_found(drive):
     first = drive[0].measurement.stamp
     log = changed(
         drive,
-        odometry=lambda reading: replace(reading, pose=reading.pose + np.array([9.0, 0.0, 0.0]))
-        if reading.stamp - first > 30 * 10**9
-        else reading,
+        odometry=lambda reading: (
+            replace(reading, pose=reading.pose + np.array([9.0, 0.0, 0.0]))
+            if reading.stamp - first > 30 * 10**9
+            else reading
+        ),
     )
     assert subjects(log) == {"odometry jumps": "wrong"}
 
@@ -309,9 +311,17 @@ def test_frames_and_stated_angles_that_do_not_fit_are_found(drive, expected, cha
 def test_what_a_scan_says_of_itself_is_read_without_its_ranges(frame):
     count = 7
     message = typestore().types[LASER_SCAN](
-        header=_header(5, frame), angle_min=-1.5, angle_max=1.5, angle_increment=0.5, time_increment=0.0, scan_time=0.0,
-        range_min=0.1, range_max=9.0, ranges=np.ones(count, np.float32), intensities=np.zeros(0, np.float32),
-    )  # fmt: skip
+        header=_header(5, frame),
+        angle_min=-1.5,
+        angle_max=1.5,
+        angle_increment=0.5,
+        time_increment=0.0,
+        scan_time=0.0,
+        range_min=0.1,
+        range_max=9.0,
+        ranges=np.ones(count, np.float32),
+        intensities=np.zeros(0, np.float32),
+    )
     content = bytes(typestore().serialize_cdr(message, LASER_SCAN))
     assert scan_head(content) == ScanHead(frame, -1.5, 1.5, 0.5, count)
 

@@ -63,9 +63,14 @@ class Robot:
             pose = se2.compose(pose, np.array([-3.0, 0.0, 0.0]))
         exactly = PoseGaussian.exactly(np.zeros(3))
         return RealTimePose(
-            self.stamp, NEW_AREA if self.rtl in {"door", "lost"} else area, exactly, PoseGaussian(pose, KNOWN), exactly,
-            self.odometry, np.zeros((3, 3)),
-        )  # fmt: skip
+            self.stamp,
+            NEW_AREA if self.rtl in {"door", "lost"} else area,
+            exactly,
+            PoseGaussian(pose, KNOWN),
+            exactly,
+            self.odometry,
+            np.zeros((3, 3)),
+        )
 
     def step(self, velocity=None):
         """Odometry, pose and scan, and on; what the pilot says."""

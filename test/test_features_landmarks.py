@@ -17,11 +17,24 @@ NOISE = 0.01
 FEATURES = Features(range_deviation=NOISE)
 ROOM = box(-3, -2, 5, 4)
 # A hallway of 2 m with a door of 1 m to a room on the left, and at its end another hallway to the right.
-HALLWAY = np.array([
-    [-6, -1, 4, -1], [4, -1, 4, -6], [6, -6, 6, 1], [6, 1, 2.5, 1], [2.5, 1, 2.5, 1.2], [2.5, 1.2, 4, 1.2],
-    [4, 1.2, 4, 5], [4, 5, -1, 5], [-1, 5, -1, 1.2], [-1, 1.2, 1.5, 1.2], [1.5, 1.2, 1.5, 1], [1.5, 1, -6, 1],
-    [-6, 1, -6, -1],
-], dtype=float)  # fmt: skip
+HALLWAY = np.array(
+    [
+        [-6, -1, 4, -1],
+        [4, -1, 4, -6],
+        [6, -6, 6, 1],
+        [6, 1, 2.5, 1],
+        [2.5, 1, 2.5, 1.2],
+        [2.5, 1.2, 4, 1.2],
+        [4, 1.2, 4, 5],
+        [4, 5, -1, 5],
+        [-1, 5, -1, 1.2],
+        [-1, 1.2, 1.5, 1.2],
+        [1.5, 1.2, 1.5, 1],
+        [1.5, 1, -6, 1],
+        [-6, 1, -6, -1],
+    ],
+    dtype=float,
+)
 
 
 def corners_in(walls, pose, seed=0, beams=720):
@@ -67,9 +80,9 @@ def test_corners_are_as_far_off_as_they_say():
         pose = np.array([np.sin(seed), 0.5 * np.cos(seed), 0.7 * seed])
         corners = corners_in(ROOM, pose, seed, beams=360)
         quarter = np.pi / 4
-        true = se2.between(pose, np.array([
-            [-3, -2, quarter], [5, -2, 3 * quarter], [5, 4, -3 * quarter], [-3, 4, -quarter]
-        ]))  # fmt: skip
+        true = se2.between(
+            pose, np.array([[-3, -2, quarter], [5, -2, 3 * quarter], [5, 4, -3 * quarter], [-3, 4, -quarter]])
+        )
         for k, nearest in enumerate(by_place(true, corners.poses[:, :2])[0]):
             error = se2.log(se2.between(corners.poses[k], true[nearest]))
             nees.append(error @ np.linalg.solve(corners.covariances[k], error))

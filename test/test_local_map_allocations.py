@@ -34,9 +34,18 @@ def test_proposals_take_their_results_alone_for_any_number_of_particles_and_beam
     pool, table = mapped(ROOM, [(0, 0, 0)])
     points, poses = seen(ROOM, (0.1, 0, 0), beams=beams), np.zeros((particles, 3))
     arguments = (
-        points, points, poses, poses, np.diag([100.0, 100.0, 400.0]), np.stack([table] * particles), pool.view(table),
-        ALIGNMENT, MODEL, 1.0, 0.05,
-    )  # fmt: skip
+        points,
+        points,
+        poses,
+        poses,
+        np.diag([100.0, 100.0, 400.0]),
+        np.stack([table] * particles),
+        pool.view(table),
+        ALIGNMENT,
+        MODEL,
+        1.0,
+        0.05,
+    )
     batch.propose_all(*arguments)
     with counted() as counts:
         batch.propose_all(*arguments)

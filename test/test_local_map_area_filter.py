@@ -185,9 +185,7 @@ def test_a_change_of_area_moves_frame_and_map_together():
     poses = [np.zeros(3)]
     for _ in range(3):
         poses.append(se2.compose(poses[-1], se2.exp(10.0 * STEP)))
-    content = [
-        PlacedKeyframe(k, 7, scan_in(ROOM, pose), se2.compose(new_T_old, pose)) for k, pose in enumerate(poses)
-    ]
+    content = [PlacedKeyframe(k, 7, scan_in(ROOM, pose), se2.compose(new_T_old, pose)) for k, pose in enumerate(poses)]
     area_filter.change_area(7, new_T_old, content)
     truth = se2.compose(truth, STEP)
     area_filter.track(Sighting(mapping, scan_in(ROOM, truth)), predicted(STEP))

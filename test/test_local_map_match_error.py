@@ -80,9 +80,14 @@ def error_of(points, block=0.0):
     found = points.copy()
     found[64:80, :2] += block * found[64:80, 2:]
     return match_error(
-        found, np.zeros(3), np.diag([1e4, 1e4, 1e4]), np.diag([400.0, 400.0, 1600.0]), area_filter._leading_view(),
-        mapping.alignment, mapping.noise,
-    )  # fmt: skip
+        found,
+        np.zeros(3),
+        np.diag([1e4, 1e4, 1e4]),
+        np.diag([400.0, 400.0, 1600.0]),
+        area_filter._leading_view(),
+        mapping.alignment,
+        mapping.noise,
+    )
 
 
 def test_beams_that_err_together_make_a_match_less_certain():

@@ -115,9 +115,18 @@ def test_correlation_finds_the_best_pose_of_its_grid(room):
 def propose(pool, table, points, truth, deviations):
     information = np.diag(1.0 / np.asarray(deviations) ** 2)
     return propose_all(
-        points, points, truth[None], truth[None], information, table[None], pool.view(table), ALIGNMENT, MODEL,
-        1.0, 0.05,
-    )  # fmt: skip
+        points,
+        points,
+        truth[None],
+        truth[None],
+        information,
+        table[None],
+        pool.view(table),
+        ALIGNMENT,
+        MODEL,
+        1.0,
+        0.05,
+    )
 
 
 def test_in_a_corridor_the_proposal_keeps_the_prior_along_it_and_is_sharp_across():

@@ -66,9 +66,7 @@ def test_a_sound_robot_gets_a_clean_bill(listener, doctor, start):
 def test_what_is_silent_missing_or_does_not_fit_is_told(listener, doctor):
     listener.node.create_publisher(LaserScan, "scan", BEST_EFFORT)
     listener.node.create_subscription(LaserScan, "scan", lambda _: None, 10)
-    simulated = Node(
-        "slam", context=listener.context, parameter_overrides=[Parameter("use_sim_time", value=True)]
-    )
+    simulated = Node("slam", context=listener.context, parameter_overrides=[Parameter("use_sim_time", value=True)])
     for _ in range(2):
         simulated.create_publisher(OdometryMessage, "odom", 10)
     listener.executor.add_node(simulated)
@@ -130,13 +128,13 @@ def test_stamps_frames_and_doubled_transforms_are_told_under_a_namespace(listene
             joint = conversions.transform_message(stamp, "odom", "base_link", pose)
             transforms.publish(TFMessage(transforms=[joint]))
 
-    status, findings = doctor(
-        4.0, "--ros-args", "-r", "__ns:=/robot1", "-r", "odom:=base/odom", meanwhile=publish
-    )
+    status, findings = doctor(4.0, "--ros-args", "-r", "__ns:=/robot1", "-r", "odom:=base/odom", meanwhile=publish)
     assert status == 1
     wrong = texts(findings, "wrong")
-    assert any(text.startswith("laser transform: No transform leads from 'base_link' to the scans' frame 'laser'")
-               for text in wrong), wrong  # fmt: skip
+    assert any(
+        text.startswith("laser transform: No transform leads from 'base_link' to the scans' frame 'laser'")
+        for text in wrong
+    ), wrong
     assert any(text.startswith("two transforms: The transform odom -> base_link was told differ") for text in wrong)
     doubtful = texts(findings, "doubtful")
     assert any(text.startswith("stamps against clock: The stamps of scan are 3.0") for text in doubtful), doubtful

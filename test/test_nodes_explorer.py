@@ -37,9 +37,13 @@ def system(tmp_path, start):
         nodes = [start(name) for name in PROCESSES]
         explorer = start("explorer", laser_pose="[0.0,0.0,0.0]", **parameters)
         robot = start(
-            "robot", log=f"sim:{world}", robot__drive="commands", robot__rate=3.0, robot__scan_listeners=2,
+            "robot",
+            log=f"sim:{world}",
+            robot__drive="commands",
+            robot__rate=3.0,
+            robot__scan_listeners=2,
             robot__patience=60.0,
-        )  # fmt: skip
+        )
         return [*nodes, explorer, robot]
 
     return start_all

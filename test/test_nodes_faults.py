@@ -322,7 +322,7 @@ def test_two_robots_that_drive_at_once_under_namespaces_share_nothing_but_a_tf_t
     one = Nodes(start, listener, namespace="/one", recovery=tmp_path)
     two = Nodes(
         start, listener, "-r", "tf:=/tf", "-r", "tf_static:=/tf_static", namespace="/two", recovery=tmp_path, **frames
-    )  # fmt: skip
+    )
     maps = {nodes: nodes.hear(OccupancyGrid, MAP, qos.LATCHED) for nodes in (one, two)}
     tf = {topic: listener.hear(TFMessage, topic, qos.TF_STATIC) for topic in ("/one/tf_static", "/tf_static")}
     tf |= {topic: listener.hear(TFMessage, topic, qos.STREAM) for topic in ("/one/tf", "/tf")}
@@ -349,11 +349,15 @@ def test_two_robots_that_drive_at_once_under_namespaces_share_nothing_but_a_tf_t
     assert {message.header.frame_id for message in [*one.poses, *maps[one]]} == {"map"}
     assert {message.header.frame_id for message in [*two.poses, *maps[two]]} == {"two/map"}
     assert joints(tf["/one/tf"] + tf["/one/tf_static"]) == {
-        ("map", "odom"), ("odom", "base_link"), ("base_link", "laser"),
-    }  # fmt: skip
+        ("map", "odom"),
+        ("odom", "base_link"),
+        ("base_link", "laser"),
+    }
     assert joints(tf["/tf"] + tf["/tf_static"]) == {
-        ("two/map", "two/odom"), ("two/odom", "two/base_link"), ("two/base_link", "two/laser"),
-    }  # fmt: skip
+        ("two/map", "two/odom"),
+        ("two/odom", "two/base_link"),
+        ("two/base_link", "two/laser"),
+    }
     shared = {"/clock", "/parameter_events", "/rosout", "/tf", "/tf_static"}
     for name, _ in listener.node.get_topic_names_and_types():
         assert name in shared or name.startswith(("/one/", "/two/")), name

@@ -67,8 +67,9 @@ def test_a_robot_is_recognized_and_tracked_in_a_map_that_is_saved_as_it_was_load
 
     kept = listener.call(Trigger, "slam/reset", Trigger.Request())
     assert (kept.success, kept.message) == (
-        False, "mode = localization keeps the map: set mode of slam to mapping first"
-    )  # fmt: skip
+        False,
+        "mode = localization keeps the map: set mode of slam to mapping first",
+    )
 
     refused = set_mode(listener, "sleeping")
     assert not refused.successful

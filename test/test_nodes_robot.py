@@ -161,9 +161,7 @@ def test_everything_but_the_clock_moves_into_a_namespace(tmp_path, listener, sta
     scans = listener.hear(LaserScan, "tower/scan", qos.SENSOR)
     listener.hear(OdometryMessage, "tower/odom", qos.SENSOR)
     times = listener.hear(Clock, "/clock", qos.STREAM)
-    start(
-        "robot", "-r", "__ns:=/tower", log=corridor_bag(tmp_path, 3), robot__rate=0.0, robot__paced=False
-    )
+    start("robot", "-r", "__ns:=/tower", log=corridor_bag(tmp_path, 3), robot__rate=0.0, robot__paced=False)
     listener.until(lambda: len(scans) == 3)
     listener.until(lambda: times and conversions.stamp_of(times[-1].clock) == SCANS[2].stamp)
 

@@ -167,8 +167,9 @@ def test_what_cannot_be_saved_is_told(tmp_path, listener, start):
     start("slam", save_to=tmp_path / "notes")
     answer = listener.call(Trigger, "slam/save", Trigger.Request())
     assert (answer.success, answer.message) == (
-        False, f"{tmp_path / 'notes'} cannot be saved: nothing is mapped yet, drive first"
-    )  # fmt: skip
+        False,
+        f"{tmp_path / 'notes'} cannot be saved: nothing is mapped yet, drive first",
+    )
 
 
 def test_a_map_that_is_damaged_or_made_with_other_particles_keeps_the_nodes_from_starting(tmp_path, start):

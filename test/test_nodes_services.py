@@ -156,5 +156,6 @@ def test_nothing_is_exchanged_where_not_all_processes_run(listener, start):
     start("slam")
     answer = listener.call(Trigger, "slam/reset", Trigger.Request())
     assert (answer.success, answer.message) == (
-        False, "the map cannot be exchanged: 0 of aam, tsbi, tlca, rtl are running: start all of them"
-    )  # fmt: skip
+        False,
+        "the map cannot be exchanged: 0 of aam, tsbi, tlca, rtl are running: start all of them",
+    )

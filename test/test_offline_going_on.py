@@ -25,6 +25,7 @@ from hmt_slam_ros.sensing import Scan
 
 LOG = Path(__file__).parents[1] / "data" / "malaga_one_loop"
 
+
 def contents(directory):
     return {path.name: path.read_bytes() for path in sorted(directory.iterdir())}
 
@@ -79,6 +80,7 @@ def compared(log, folder, stops, branching=lambda: Branching, configuration=None
     same_outcome(*(end.recorder.finish(end.log.stamps) for end in (run.finish(), whole.finish())))
     return stopped
 
+
 def test_a_run_that_forgot_keyframes_goes_on_without_them(tmp_path):
     known = [0]
 
@@ -88,7 +90,6 @@ def test_a_run_that_forgot_keyframes_goes_on_without_them(tmp_path):
 
     log = open_log("sim:office,size=0.7,rate=2.5,laps=3")
     assert len(compared(log, tmp_path, forgot)) > 2
-
 
 
 def once(*conditions):

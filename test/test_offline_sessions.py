@@ -128,7 +128,7 @@ def test_a_log_is_known_by_the_stamp_and_the_ranges_of_its_first_scan(first):
 
 def test_the_clock_of_a_map_goes_on_in_a_log_that_is_older(first, second_log):
     reading = Reading(first.log)
-    log = Restamped(second_log, -10**12)
+    log = Restamped(second_log, -(10**12))
     reading.begin(log)
     record = next(iter(reading.unread(log)))
     assert record.measurement.stamp > first.log.stamps[-1]

@@ -13,8 +13,14 @@ from hmt_slam_ros.offline.grid_files import export_grid
 from hmt_slam_ros.offline.saved_map import read_saved_map
 
 # What nav2_map_server's map_io wants of a yaml file, with the types as it reads them.
-REQUIRED = {"image": str, "resolution": float, "origin": list, "negate": int, "occupied_thresh": float,
-            "free_thresh": float}  # fmt: skip
+REQUIRED = {
+    "image": str,
+    "resolution": float,
+    "origin": list,
+    "negate": int,
+    "occupied_thresh": float,
+    "free_thresh": float,
+}
 OPTIONAL = {"mode": str}
 
 

@@ -86,7 +86,10 @@ def test_ros2_run_finds_an_executable_that_runs_the_node_of_its_name(setup_argum
     executable = tmp_path / node
     executable.write_bytes(source.read_bytes())
     result = subprocess.run(
-        [sys.executable, executable], env=os.environ | {"PYTHONPATH": str(tmp_path)}, capture_output=True, text=True,
+        [sys.executable, executable],
+        env=os.environ | {"PYTHONPATH": str(tmp_path)},
+        capture_output=True,
+        text=True,
         check=True,
     )
     assert result.stdout == f"this is {node}\n"

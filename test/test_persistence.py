@@ -205,7 +205,10 @@ def test_the_description_tells_every_field_of_every_object():
     lines = described({"notes": Notebook})
     assert "### Document `notes`" in lines
     assert "| `places` | list of [text, `Place`] | `a_T_b` by name. |" in lines
-    assert "| `pairs` | list of [[whole number, whole number], ordered list of whole number] | sets of numbers by pairs. |" in lines  # fmt: skip  # noqa: E501
+    assert (
+        "| `pairs` | list of [[whole number, whole number], ordered list of whole number] | sets of numbers by pairs. |"
+        in lines
+    )
     assert "| `scans` | list of name of a scan | some scans. |" in lines
     assert "| `doubt` | number, or null | a number, or None. |" in lines
     assert "| `pose` | array of float64 | shape (3,). |" in lines

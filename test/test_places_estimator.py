@@ -173,9 +173,12 @@ def test_an_opening_that_is_none_of_the_map_hides_no_end_of_a_hallway(chart, gra
         """Beside where the robot turns at the end."""
         found, away = seen(*args), next(ahead)
         new = Openings(
-            np.array([(away, -1.0, -0.5 * math.pi)]), np.diag((1e-4, 1e-4, 1e-6))[None], np.ones(1),
-            np.full(1, 0.02), np.full(1, 0.99),
-        )  # fmt: skip
+            np.array([(away, -1.0, -0.5 * math.pi)]),
+            np.diag((1e-4, 1e-4, 1e-6))[None],
+            np.ones(1),
+            np.full(1, 0.02),
+            np.full(1, 0.99),
+        )
         return Openings(*(np.concatenate(fields) for fields in zip(found, new, strict=True)))
 
     monkeypatch.setattr("hmt_slam_ros.places.estimator.openings_of", and_a_new_one)

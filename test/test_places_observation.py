@@ -38,11 +38,24 @@ PLACES = Places()
 MODEL = observation_model(PLACES, FEATURES)
 WHOLE = dataclasses.replace(PLACES, reach=6.0, aside=4.0)
 # A hallway of 2 m with a door of 1 m to a room on the left, and at its end another hallway to the right.
-HALLWAY = np.array([
-    [-6, -1, 4, -1], [4, -1, 4, -6], [6, -6, 6, 1], [6, 1, 2.5, 1], [2.5, 1, 2.5, 1.2], [2.5, 1.2, 4, 1.2],
-    [4, 1.2, 4, 5], [4, 5, -1, 5], [-1, 5, -1, 1.2], [-1, 1.2, 1.5, 1.2], [1.5, 1.2, 1.5, 1], [1.5, 1, -6, 1],
-    [-6, 1, -6, -1],
-], dtype=float)  # fmt: skip
+HALLWAY = np.array(
+    [
+        [-6, -1, 4, -1],
+        [4, -1, 4, -6],
+        [6, -6, 6, 1],
+        [6, 1, 2.5, 1],
+        [2.5, 1, 2.5, 1.2],
+        [2.5, 1.2, 4, 1.2],
+        [4, 1.2, 4, 5],
+        [4, 5, -1, 5],
+        [-1, 5, -1, 1.2],
+        [-1, 1.2, 1.5, 1.2],
+        [1.5, 1.2, 1.5, 1],
+        [1.5, 1, -6, 1],
+        [-6, 1, -6, -1],
+    ],
+    dtype=float,
+)
 
 
 def graph_at(pose, axis):
@@ -188,10 +201,12 @@ def mean_ratio(expected, model, draws=12000, variance=0.0, seed=1):
     """E[OS / OS of a place where nothing is expected] over what is seen in such a place, and its error."""
     random = np.random.default_rng(seed)
     state = one_state(expected)
-    ratios = np.exp([
-        log_observation(drawn_anywhere(random, model.new, model.false, model), state, 0.0, variance, model)[0]
-        for _ in range(draws)
-    ])  # fmt: skip
+    ratios = np.exp(
+        [
+            log_observation(drawn_anywhere(random, model.new, model.false, model), state, 0.0, variance, model)[0]
+            for _ in range(draws)
+        ]
+    )
     return ratios.mean(), ratios.std() / math.sqrt(draws)
 
 
@@ -199,7 +214,7 @@ def mean_ratio(expected, model, draws=12000, variance=0.0, seed=1):
 DENSE = MODEL._replace(reach=3.0, along=0.4, heading=0.6, width=0.06, new=0.15, false=0.05, detection=0.6)
 APART = landmarks(
     (0, -2.3, 0.5, 0, 0, 0.7), (0, 2.3, -2.0, 0, 0, 0.6), (5, 0.5, 1.8, 0, 0, 0.8), (1, 2.9, 0.0, 0, 0, 0.7)
-)  # fmt: skip
+)
 
 
 @pytest.mark.parametrize("variance", [0.0, 0.1])
@@ -212,9 +227,9 @@ def test_the_observation_function_is_a_density(variance):
 def test_unknown_ground_is_a_density_too():
     random = np.random.default_rng(2)
     model = DENSE._replace(usual=0.25)
-    ratios = np.exp([
-        log_unknown_ground(drawn_anywhere(random, model.new, model.false, model), model) for _ in range(8000)
-    ])  # fmt: skip
+    ratios = np.exp(
+        [log_unknown_ground(drawn_anywhere(random, model.new, model.false, model), model) for _ in range(8000)]
+    )
     error = ratios.std() / math.sqrt(len(ratios))
     assert error < 0.05
     assert ratios.mean() == pytest.approx(1.0, abs=4.0 * error)

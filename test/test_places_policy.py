@@ -56,9 +56,13 @@ def test_a_robot_that_is_sure_heads_for_its_goal_and_one_in_unknown_ground_for_n
 def corners(along):
     count = len(along)
     headings = np.full(count, 0.25 * math.pi)
-    return joined((
-        Landmarks(np.zeros(count, np.int64), np.array(along), headings, np.full((count, 2), 1e-3), np.full(count, 0.9)),
-    ))  # fmt: skip
+    return joined(
+        (
+            Landmarks(
+                np.zeros(count, np.int64), np.array(along), headings, np.full((count, 2), 1e-3), np.full(count, 0.9)
+            ),
+        )
+    )
 
 
 def test_a_robot_that_is_not_sure_goes_where_places_differ():

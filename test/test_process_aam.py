@@ -137,6 +137,7 @@ def test_the_keyframes_that_left_begin_the_new_area():
 def measured(monkeypatch):
     """The numbers of scan pairs that were compared, call by call."""
     counts = []
+
     def counted(original):
         def counting(one, pose, others, other_poses, radius):
             counts.append(len(others))

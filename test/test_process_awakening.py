@@ -56,7 +56,7 @@ def carried(office, records, scans):
 
 def test_it_begins_a_new_area_to_which_an_arc_leads_that_tells_nothing(office, begin):
     before = Replica.of(office.state.tsbi.replica)
-    run = carried(office, office.records[begin :], 10)
+    run = carried(office, office.records[begin:], 10)
     replica = Replica.of(run.state.tsbi.replica)
     (leaf,) = run.recorder.hypotheses[max(run.recorder.hypotheses)].leaves
     assert leaf.lost
@@ -112,7 +112,7 @@ def test_it_is_not_believed_to_be_where_one_look_alone_finds_it(office, begin, m
         return looks[-1]._replace(found=tuple(moved))
 
     monkeypatch.setattr(ClosureSearch, "everywhere", off_at_times)
-    run = carried(office, office.records[begin :], 150)
+    run = carried(office, office.records[begin:], 150)
     (leaf,) = run.recorder.hypotheses[max(run.recorder.hypotheses)].leaves
     assert sum(look.best is not None and look.best[1] > 0.9 for look in looks) >= 3
     assert leaf.lost
@@ -148,7 +148,7 @@ def test_a_robot_that_stands_still_is_recognized_where_somebody_says_that_it_is(
 
 
 def test_scans_are_counted_on_and_odometry_begins_anew(office, begin):
-    run = carried(office, office.records[begin :], 25)
+    run = carried(office, office.records[begin:], 25)
     assert run.state.slam.scans == office.state.slam.scans + 25
     assert run.state.slam.dropped == 0
 

@@ -149,8 +149,18 @@ def test_a_malformed_document_is_refused_by_name(old, new, sentence):
         decode(EVENTS.replace(old, new), AreaEvents)
 
 
-@pytest.mark.parametrize("covariance", ["[[1,0],[0,1]]", "[1,2,3]", '"wide"', "[[1,0,0],[0,1,0],[0,0,NaN]]",
-                                        "null", '[["1"]]', '[["1",0,0],[0,1,0],[0,0,1]]'])
+@pytest.mark.parametrize(
+    "covariance",
+    [
+        "[[1,0],[0,1]]",
+        "[1,2,3]",
+        '"wide"',
+        "[[1,0,0],[0,1,0],[0,0,NaN]]",
+        "null",
+        '[["1"]]',
+        '[["1",0,0],[0,1,0],[0,0,1]]',
+    ],
+)
 def test_an_array_of_another_shape_or_kind_is_refused(covariance):
     belief = PoseGaussian(np.zeros(3), np.eye(3))
     content = json.loads(encode(LocalEstimate(1, 0, 0, belief, np.zeros(3), 0)))

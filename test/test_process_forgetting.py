@@ -72,8 +72,13 @@ def test_the_map_of_later_laps_is_no_larger(rounds):
 def test_what_is_forgotten_was_stored_before_and_is_gone_in_every_process(rounds):
     state, gone = rounds.run.state, {one.keyframe for one in rounds.ears.forgotten}
     assert len(gone) >= 4 * (LAPS - 2)
-    for replica in (state.slam.replica, state.aam.replica, state.tsbi.replica, state.tlca.replica,
-                    state.recorder.replica):
+    for replica in (
+        state.slam.replica,
+        state.aam.replica,
+        state.tsbi.replica,
+        state.tlca.replica,
+        state.recorder.replica,
+    ):
         assert not gone & replica.scans.keys()
         assert replica.scans.keys() == state.slam.replica.scans.keys()
     assert not gone & rounds.placed

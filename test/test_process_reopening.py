@@ -148,11 +148,20 @@ def test_what_was_stored_in_areas_that_were_entered_falsely_becomes_an_area_of_i
     found = without(before, before.closures[0].name, 9)
     hybrid_map = found.hybrid_map
     assert {a: sorted(hybrid_map.keyframes(a)) for a in hybrid_map.area_ids()} == {
-        0: [0, 1], 1: [10, 11], 2: [20, 21], 3: [30, 31], 4: [50], 9: [39, 41, 42, 45],
-    }  # fmt: skip
+        0: [0, 1],
+        1: [10, 11],
+        2: [20, 21],
+        3: [30, 31],
+        4: [50],
+        9: [39, 41, 42, 45],
+    }
     assert [(a, b, arc.closure) for a, b, arc in hybrid_map.all_arcs()] == [
-        (0, 1, False), (1, 2, False), (2, 3, False), (3, 9, False), (4, 9, False),
-    ]  # fmt: skip
+        (0, 1, False),
+        (1, 2, False),
+        (2, 3, False),
+        (3, 9, False),
+        (4, 9, False),
+    ]
     assert found.closures == ()
     # The robot's own path is as it was, seen from where it came.
     was = in_frame_of(before.hybrid_map, 3, 0, 1, 4)
@@ -223,9 +232,13 @@ def test_an_area_that_became_part_of_another_is_that_one_in_the_account():
         history, step = history
         steps.insert(0, (step.event, step.before, step.after, step.arcs))
     assert steps[4:] == [
-        (50, 4, 5, ((4, 5),)), (60, 5, 3, ((3, 5),)), (70, 3, 7, ((3, 7),)),
-        (80, 3, 3, ()), (81, 7, 7, ((1, 7),)), (82, 3, 3, ((0, 3),)),
-    ]  # fmt: skip
+        (50, 4, 5, ((4, 5),)),
+        (60, 5, 3, ((3, 5),)),
+        (70, 3, 7, ((3, 7),)),
+        (80, 3, 3, ()),
+        (81, 7, 7, ((1, 7),)),
+        (82, 3, 3, ((0, 3),)),
+    ]
     history, closures = merged(account, Merged(6, 3, account.hybrid_map.arc(3, 6)))
     hybrid_map = account.hybrid_map.branch()
     hybrid_map.merge(6, 3, hybrid_map.arc(3, 6))

@@ -201,13 +201,17 @@ def split_at(event):
             return agree(keyframe)
         (leaf,) = keyframe.leaves
         reference = PoseGaussian(np.array([3.0, 0.0, 0.0]), np.diag([1e-4, 1e-4, 1e-5]))
-        moved = tuple(
-            Relabelled(k, 0, 1, np.array([0.5 * (k - 6), 0.0, 0.0])) for k in range(6, event + 1)
-        )
+        moved = tuple(Relabelled(k, 0, 1, np.array([0.5 * (k - 6), 0.0, 0.0])) for k in range(6, event + 1))
         change = Leaf(
-            1, leaf.hypothesis, 1.0, 1, reference.inverse(), moved, (Arc(0, 1, reference),),
+            1,
+            leaf.hypothesis,
+            1.0,
+            1,
+            reference.inverse(),
+            moved,
+            (Arc(0, 1, reference),),
             (LocalArea(1, np.zeros(3)), LocalArea(0, np.array([-3.0, 0.0, 0.0]))),
-        )  # fmt: skip
+        )
         return [Hypotheses(keyframe.sequence, (change,)), Accepted(keyframe.sequence, 1)]
 
     return answer

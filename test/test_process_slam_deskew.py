@@ -13,8 +13,15 @@ from hmt_slam_ros.offline.map_image import OCCUPIED, occupancy_image
 from hmt_slam_ros.processes.messages import EndOfLog, Keyframe, LocalEstimate, Notice
 from hmt_slam_ros.sensing import Odometry
 
-WALLS = np.concatenate((box(-6.02, -5.03, 8.03, 5.01), box(2.01, 2.52, 3.03, 3.52), box(-3.02, -3.51, -1.52, -2.49),
-                        box(5.3, -4.0, 6.1, -2.2), [[-2.02, 5.01, -2.02, 3.2]]))  # fmt: skip
+WALLS = np.concatenate(
+    (
+        box(-6.02, -5.03, 8.03, 5.01),
+        box(2.01, 2.52, 3.03, 3.52),
+        box(-3.02, -3.51, -1.52, -2.49),
+        box(5.3, -4.0, 6.1, -2.2),
+        [[-2.02, 5.01, -2.02, 3.2]],
+    )
+)
 BEAMS, PERIOD, ODOMETRY_PERIOD = 361, 0.1, 0.02
 SCANS = 160
 

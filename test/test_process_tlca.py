@@ -1,6 +1,5 @@
 """Topological Loop Closure Acceptance: which path becomes definite, and when."""
 
-
 import numpy as np
 import pytest
 import worlds

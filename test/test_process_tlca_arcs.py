@@ -1,6 +1,5 @@
 """Topological Loop Closure Acceptance: what becomes of an arc that is observed again."""
 
-
 import numpy as np
 from play_for_tlca import SPREAD, Play, belief, new_area, poses_of
 

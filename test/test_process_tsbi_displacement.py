@@ -26,9 +26,7 @@ FAR, HERE = (30.0, 20.0), (0.0, 0.0)
 PRIOR = math.log(1e-5)
 
 
-ANGLE = np.array(
-    [[0, 0, 6, 0], [6, 0, 6, 3], [6, 3, 4, 3], [4, 3, 4, 5], [4, 5, 0, 5], [0, 5, 0, 0]], dtype=np.float64
-)
+ANGLE = np.array([[0, 0, 6, 0], [6, 0, 6, 3], [6, 3, 4, 3], [4, 3, 4, 5], [4, 5, 0, 5], [0, 5, 0, 0]], dtype=np.float64)
 BEFORE = np.concatenate((ANGLE, box(1.0, 3.0, 2.0, 3.5)))
 MOVED = np.concatenate((ANGLE, box(2.6, 0.5, 3.4, 1.1)))
 NOWHERE = np.concatenate((box(-1.0, 1.0, 4.2, 6.5), box(2.6, 4.0, 3.6, 5.0)))

@@ -140,9 +140,7 @@ def test_scans_of_other_resolution_and_mounting_register_with_each_other() -> No
     pair = np.array([0]), seen, np.array([1])
     information, gradient, share = normal_equations(seen, *pair, start[None], 0.3, weighting(OPTIONS), 1)
     assert share[0] > 0.2
-    np.testing.assert_allclose(
-        -np.linalg.solve(information[0], gradient[0]), [-0.03, 0.03, -0.01], atol=0.008
-    )
+    np.testing.assert_allclose(-np.linalg.solve(information[0], gradient[0]), [-0.03, 0.03, -0.01], atol=0.008)
 
 
 def test_joint_refinement_takes_the_drift_of_odometry_away() -> None:

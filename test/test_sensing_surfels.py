@@ -70,8 +70,10 @@ def test_a_post_has_no_normal_and_stays():
 
 def test_a_point_that_only_shows_where_a_shadow_ends_is_left_out():
     # A niche in the wall, of which a single beam sees the back, beside the edge that hides the rest.
-    niche = np.array([[-100, 1.1, 4.0, 1.1], [4.0, 1.1, 4.0, 1.3], [4.0, 1.3, 4.9, 1.3], [4.9, 1.3, 4.9, 1.1],
-                      [4.9, 1.1, 100, 1.1]], dtype=float)  # fmt: skip
+    niche = np.array(
+        [[-100, 1.1, 4.0, 1.1], [4.0, 1.1, 4.0, 1.3], [4.0, 1.3, 4.9, 1.3], [4.9, 1.3, 4.9, 1.1], [4.9, 1.1, 100, 1.1]],
+        dtype=float,
+    )
     walls = np.concatenate((CORRIDOR[:1], niche))
     scan = scan_in(walls, (0.0, 0.0, 0.0))
     backs = np.abs(scan.points[:, 1] - 1.3) < 1e-5

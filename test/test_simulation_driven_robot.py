@@ -201,9 +201,7 @@ def test_wheels_do_not_notice_that_it_is_carried():
     assert robot.velocity == (0.0, 0.0)
     put = robot.pose
     drive(robot, 0.3, 0.1, 10)
-    np.testing.assert_allclose(
-        se2.between(wheels, robot.measure()[0].pose), se2.between(put, robot.pose), atol=1e-9
-    )
+    np.testing.assert_allclose(se2.between(wheels, robot.measure()[0].pose), se2.between(put, robot.pose), atol=1e-9)
     assert np.hypot(*(put - before)[:2]) > 1.0
 
 

@@ -194,9 +194,14 @@ def test_an_occupancy_image_becomes_walls_where_its_pixels_are_black(tmp_path, s
 
         imsave(tmp_path / "map.png", pixels, cmap="gray", vmin=0, vmax=255)
     world = {
-        "image": f"map.{suffix}", "resolution": 0.1, "origin": [-1.0, -2.0, 0.0], "negate": 0, "occupied_thresh": 0.65,
-        "free_thresh": 0.25, "route": [[0.0, 0.55], [1.0, 0.55]],
-    }  # fmt: skip
+        "image": f"map.{suffix}",
+        "resolution": 0.1,
+        "origin": [-1.0, -2.0, 0.0],
+        "negate": 0,
+        "occupied_thresh": 0.65,
+        "free_thresh": 0.25,
+        "route": [[0.0, 0.55], [1.0, 0.55]],
+    }
     (tmp_path / "map.yaml").write_text(yaml.safe_dump(world))
     building, _ = read_world(tmp_path / "map.yaml")
     occupied = pixels[::-1] == 0

@@ -53,9 +53,13 @@ def test_poses_place_the_scans():
     pose = np.array([2.0, 1.0, 0.7])
     grid = build_area_grid([scan_in(ROOM, pose, field_of_view=2 * np.pi, beams=721)], pose[None], MODEL)
     distance = np.minimum.reduce(
-        [np.abs(grid.points[:, 0]), np.abs(grid.points[:, 0] - 6.0), np.abs(grid.points[:, 1]),
-         np.abs(grid.points[:, 1] - 4.0)]
-    )  # fmt: skip
+        [
+            np.abs(grid.points[:, 0]),
+            np.abs(grid.points[:, 0] - 6.0),
+            np.abs(grid.points[:, 1]),
+            np.abs(grid.points[:, 1] - 4.0),
+        ]
+    )
     assert np.quantile(distance, 0.95) < 0.03
 
 

@@ -20,9 +20,9 @@ from hmt_slam_ros.topology.area_window import make_window
 
 MODEL = GridModel()
 SETTINGS = MatchSettings()
-ROOM = np.concatenate((
-    box(0.0, 0.0, 8.0, 6.0), box(2.0, 1.5, 3.0, 2.5), box(5.0, 4.0, 6.5, 4.5), np.array([[4.0, 0.0, 4.0, 1.2]])
-))  # fmt: skip
+ROOM = np.concatenate(
+    (box(0.0, 0.0, 8.0, 6.0), box(2.0, 1.5, 3.0, 2.5), box(5.0, 4.0, 6.5, 4.5), np.array([[4.0, 0.0, 4.0, 1.2]]))
+)
 OTHER_ROOM = np.concatenate((box(0.0, 0.0, 4.0, 9.0), box(1.0, 6.0, 2.0, 8.0)))
 
 
@@ -177,10 +177,16 @@ def test_each_of_three_like_niches_comes_back_as_a_mode():
     """A corridor with equal niches every 3 m: a visit to one of them fits all of them."""
     corridor = np.array([[-2.0, 0.0, 11.0, 0.0]])
     niches = [
-        np.array([[x, 2.0, x + 2.0, 2.0], [x + 2.0, 2.0, x + 2.0, 3.0], [x + 2.0, 3.0, x + 3.0, 3.0],
-                  [x + 3.0, 3.0, x + 3.0, 2.0]])
+        np.array(
+            [
+                [x, 2.0, x + 2.0, 2.0],
+                [x + 2.0, 2.0, x + 2.0, 3.0],
+                [x + 2.0, 3.0, x + 3.0, 3.0],
+                [x + 3.0, 3.0, x + 3.0, 2.0],
+            ]
+        )
         for x in (-3.0, 0.0, 3.0, 6.0, 9.0)
-    ]  # fmt: skip
+    ]
     walls = np.concatenate((corridor, *niches))
     known = area(walls, along((0.0, 1.0), (8.0, 1.0), 12, 0.0), field_of_view=2 * np.pi, beams=361)
     poses = along((4.0, 1.0), (5.0, 1.0), 3, 0.0)

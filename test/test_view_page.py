@@ -109,13 +109,21 @@ def test_events_are_told_once_in_order_when_both_halves_are_there_and_a_new_run_
     assert told(head(0, 20_000_000_000), answers[0]) == (True, [0])
     (event,) = board.news(Seen())["history"]["events"]
     assert event == {
-        "event": 0, "time": 20.0, "way": 0.0, "leaves": [[1, 4, 0.75, True], [3, 5, 0.25, False]], "live": 2
-    }  # fmt: skip
+        "event": 0,
+        "time": 20.0,
+        "way": 0.0,
+        "leaves": [[1, 4, 0.75, True], [3, 5, 0.25, False]],
+        "live": 2,
+    }
 
 
 def test_the_page_its_style_and_its_scripts_are_served_and_ask_for_nothing_from_elsewhere(server):
-    for path, kind in (("", "text/html"), ("view.css", "text/css"), ("view.js", "text/javascript"),
-                       ("draw.js", "text/javascript")):  # fmt: skip
+    for path, kind in (
+        ("", "text/html"),
+        ("view.css", "text/css"),
+        ("view.js", "text/javascript"),
+        ("draw.js", "text/javascript"),
+    ):
         with urlopen(server.url + path, timeout=10) as answer:
             assert answer.headers["Content-Type"].startswith(kind)
             assert "default-src 'none'" in answer.headers["Content-Security-Policy"]
@@ -198,8 +206,10 @@ def test_a_node_that_is_missing_or_fell_silent_is_named():
     well(health, 2.0)
     health.hear("slam", 0, "running", {}, 20.0)
     assert health.verdict(20.5) | {"advice": ""} == {
-        "level": "fault", "text": "rtl says nothing, for 18 s.", "advice": ""
-    }  # fmt: skip
+        "level": "fault",
+        "text": "rtl says nothing, for 18 s.",
+        "advice": "",
+    }
     assert [row["level"] for row in health.rows(20.5)] == ["good", "fault"]
 
 
@@ -231,8 +241,12 @@ def test_errors_come_before_warnings_and_warnings_grow_old():
     assert health.verdict(1.0) == {"level": "attention", "text": "slam warns.", "advice": "the wheels slip"}
     well(health, 99.0, slam=(1, "the wheels slip"))
     assert health.rows(100.0)[0] | {"values": 0} == {
-        "name": "slam", "level": "good", "message": "the wheels slip", "values": 0, "load": 0.25
-    }  # fmt: skip
+        "name": "slam",
+        "level": "good",
+        "message": "the wheels slip",
+        "values": 0,
+        "load": 0.25,
+    }
     assert health.verdict(100.0)["text"].startswith("The robot's place is not known yet")
     well(health, 100.0, slam=(1, "the wheels slip"), rtl=(2, "the chain has a gap"))
     assert health.verdict(100.0) == {"level": "fault", "text": "rtl has a fault.", "advice": "the chain has a gap"}

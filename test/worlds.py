@@ -46,9 +46,15 @@ def scan_in(
     ranges = distances(walls, se2.compose(pose, laser_pose), angles)
     ranges = np.minimum(ranges + noise * np.random.default_rng(seed).standard_normal(beams), RANGE_MAX)
     return Scan(
-        stamp, ranges.astype(np.float32), angles[0], angles[1] - angles[0], 0.0, RANGE_MAX,
-        np.asarray(laser_pose, dtype=float), sweep / (beams - 1),
-    )  # fmt: skip
+        stamp,
+        ranges.astype(np.float32),
+        angles[0],
+        angles[1] - angles[0],
+        0.0,
+        RANGE_MAX,
+        np.asarray(laser_pose, dtype=float),
+        sweep / (beams - 1),
+    )
 
 
 def blank_scan():

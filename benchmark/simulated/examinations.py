@@ -109,9 +109,15 @@ class _WatchedSearch(ClosureSearch):
         return self._views
 
     def compare(
-        self, hybrid_map: HybridMap, area: int, query: Query, compared: Mapping[int, Collection[int]],
-        excluded: Collection[int], most: int, only: Collection[int] = (),
-    ) -> Comparison:  # fmt: skip
+        self,
+        hybrid_map: HybridMap,
+        area: int,
+        query: Query,
+        compared: Mapping[int, Collection[int]],
+        excluded: Collection[int],
+        most: int,
+        only: Collection[int] = (),
+    ) -> Comparison:
         """As always."""
         found = super().compare(hybrid_map, area, query, compared, excluded, most, only)
         self._last = query, compared, frozenset(excluded), found

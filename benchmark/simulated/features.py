@@ -134,9 +134,13 @@ def rows(
         candidate = _Candidate(examination, truth, configuration, known)
         ours = travelled[event] - max(travelled[k] for k in examination.hybrid_map.keyframes(known))
         head = (
-            event, int(examination.kind == "recheck"), examination.parent.hypothesis,
-            examination.parent.log_weight, examination.parent.area, known,
-        )  # fmt: skip
+            event,
+            int(examination.kind == "recheck"),
+            examination.parent.hypothesis,
+            examination.parent.log_weight,
+            examination.parent.area,
+            known,
+        )
         middle = (travelled[event], ours, len(candidate.fresh), len(candidate.known), *candidate.transition())
         for mode, fit in enumerate(fits) if fits else [(-1, None)]:
             yield Row._make((*head, mode, *middle, *candidate.of(fit), *candidate.place_truth(), new, candidate.view()))
@@ -189,12 +193,19 @@ class _Candidate:
         log_prior = -0.5 * (mahalanobis2 + log_determinant) - 1.5 * math.log(2.0 * math.pi)
         measured = fit.mode.measured.covariance
         return (
-            look, fit.mode.log_mass, fit.log_weight, *deviations, log_prior, mahalanobis2,
-            *np.sqrt(np.diag(measured)), 0.5 * float(np.linalg.slogdet(measured)[1]),
+            look,
+            fit.mode.log_mass,
+            fit.log_weight,
+            *deviations,
+            log_prior,
+            mahalanobis2,
+            *np.sqrt(np.diag(measured)),
+            0.5 * float(np.linalg.slogdet(measured)[1]),
             *_match(self._grid.points, at, self._place.grid),
             *_match(self._place.grid.points, se2.inverse(at), self._grid),
-            *self._at_truth(), *self._claim(fit),
-        )  # fmt: skip
+            *self._at_truth(),
+            *self._claim(fit),
+        )
 
     def _claim(self, fit: Fit) -> tuple[float, ...]:
         asked = {k: se2.compose(fit.mode.pose.mean, pose) for k, pose in self._asked.query.poses.items()}

@@ -49,9 +49,7 @@ def watched(world: World, changes: Sequence[str] = ()) -> dict[str, Any]:
         "area_poses": watch.area_poses(),
         "poses": watch.poses,
         "pmf": watch.pmf,
-        "rivalries": [
-            vars(found) for found in rivalries(watch.log, watch.truth, watch.loops.found, watch.travelled)
-        ],
+        "rivalries": [vars(found) for found in rivalries(watch.log, watch.truth, watch.loops.found, watch.travelled)],
         "doors": doors(watch.truth, *watch.mapped(), watch.configuration),
         "cpu_s": time.process_time() - begin,
     }

@@ -56,22 +56,30 @@ def chosen_configuration(options: argparse.Namespace, base: Configuration | None
 def _map(command: argparse.ArgumentParser) -> None:
     _log_to_folder(command)
     command.add_argument(
-        "--from", type=Path, dest="source", metavar="MAP",
+        "--from",
+        type=Path,
+        dest="source",
+        metavar="MAP",
         help="output folder or hmt_map of a part of the log or of other logs, to go on from with its parameters",
-    )  # fmt: skip
+    )
     command.add_argument(
-        "--mode", choices=("mapping", "localization", "lifelong"),
+        "--mode",
+        choices=("mapping", "localization", "lifelong"),
         help="localization leaves the map of --from as it is, lifelong changes it only where the world has",
-    )  # fmt: skip
+    )
 
 
 def _replay(command: argparse.ArgumentParser) -> None:
     _log_to_folder(command)
     command.add_argument("--rate", type=float, help="speed relative to real time; also --set robot.rate=F")
     command.add_argument(
-        "--view", type=int, nargs="?", const=_VIEW_PORT, metavar="PORT",
+        "--view",
+        type=int,
+        nargs="?",
+        const=_VIEW_PORT,
+        metavar="PORT",
         help=f"serve the live page of the run on 127.0.0.1, port {_VIEW_PORT} where none is given",
-    )  # fmt: skip
+    )
 
 
 def _log_to_folder(command: argparse.ArgumentParser) -> None:
@@ -148,9 +156,13 @@ def _doctor(command: argparse.ArgumentParser) -> None:
     command.add_argument("--json", action="store_true", help="print the findings as JSON")
     _part(command)
     command.add_argument(
-        "--ros-args", nargs=argparse.REMAINDER, default=[], dest="ros_arguments", metavar="ARG",
+        "--ros-args",
+        nargs=argparse.REMAINDER,
+        default=[],
+        dest="ros_arguments",
+        metavar="ARG",
         help="with --live: namespace and remappings, such as -r __ns:=/robot1",
-    )  # fmt: skip
+    )
 
 
 def _parameters(command: argparse.ArgumentParser) -> None:

@@ -19,7 +19,8 @@ class Exploration:
     )
     explores: bool = parameter(True, "Explore from the start on; otherwise wait for an errand.")
     backtracks: bool = parameter(
-        False, "Go back along the robot's own path where the probability of topological paths has several peaks, until "
+        False,
+        "Go back along the robot's own path where the probability of topological paths has several peaks, until "
         "its entropy is below `places.max_entropy`, before it explores on.",
     )
     speed: float = parameter(0.6, "Speed at most.", unit="m/s", low=0.05, high=5.0)
@@ -41,6 +42,4 @@ class Piloting:
     """The pilot, who goes by the belief over places: whether it drives the robot, and when it gives up."""
 
     drives: bool = parameter(True, "Take errands and drive; otherwise only say where the robot is that others drive.")
-    patience: float = parameter(
-        300.0, "An errand is given up that takes longer.", unit="s", low=1.0, high=1e5
-    )
+    patience: float = parameter(300.0, "An errand is given up that takes longer.", unit="s", low=1.0, high=1e5)

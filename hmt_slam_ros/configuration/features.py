@@ -15,39 +15,50 @@ class Features:
         0.015, "Deviation of a range, which the covariance of a line follows from.", unit="m", low=1e-4, high=0.5
     )
     line_penalty: float = parameter(
-        14.0, "What one more line costs when beams are sorted into lines, in squared deviations of a range.",
-        low=1.0, high=1000.0,
+        14.0,
+        "What one more line costs when beams are sorted into lines, in squared deviations of a range.",
+        low=1.0,
+        high=1000.0,
     )
-    stray_penalty: float = parameter(
-        12.0, "What a beam on no line costs, likewise.", low=1.0, high=1000.0
-    )
+    stray_penalty: float = parameter(12.0, "What a beam on no line costs, likewise.", low=1.0, high=1000.0)
     min_beams: int = parameter(6, "Beams of a line at least.", low=3, high=1000)
     min_length: float = parameter(0.5, "What has to be seen of a line.", unit="m", low=0.05, high=10.0)
     max_gap: float = parameter(
         0.3, "A stretch of a line ends where nothing more is seen of it for this far.", unit="m", low=0.02, high=10.0
     )
     merge_probability: float = parameter(
-        0.99, "Share of the segments of one line, and of a map's lines of one wall, that chi-square (2 degrees of "
+        0.99,
+        "Share of the segments of one line, and of a map's lines of one wall, that chi-square (2 degrees of "
         "freedom) finds to be one.",
-        low=0.5, high=0.999999,
+        low=0.5,
+        high=0.999999,
     )
     merge_deviation: float = parameter(
-        0.01, "Segments are joined only where the distance of the one from the other's line is known this well.",
-        unit="m", low=0.001, high=1.0,
+        0.01,
+        "Segments are joined only where the distance of the one from the other's line is known this well.",
+        unit="m",
+        low=0.001,
+        high=1.0,
     )
     map_merge_deviation: float = parameter(
         0.005, "The same of the lines of a map, and of what it observes.", unit="m", low=0.001, high=1.0
     )
     pair_probability: float = parameter(
-        0.99999, "Share of true pairings of a scan's lines with the map's that chi-square admits, each and together.",
-        low=0.5, high=0.99999999,
+        0.99999,
+        "Share of true pairings of a scan's lines with the map's that chi-square admits, each and together.",
+        low=0.5,
+        high=0.99999999,
     )
     min_overlap: float = parameter(
-        0.5, "Two lines are compared where they have this share of the shorter one in common along them.",
-        low=0.01, high=1.0,
+        0.5,
+        "Two lines are compared where they have this share of the shorter one in common along them.",
+        low=0.01,
+        high=1.0,
     )
     min_sightings: int = parameter(
-        3, "A line of a map that fewer scans than this showed is forgotten at the first one that does not.", low=1,
+        3,
+        "A line of a map that fewer scans than this showed is forgotten at the first one that does not.",
+        low=1,
         high=100,
     )
     corner_angle: float = parameter(
@@ -57,8 +68,11 @@ class Features:
         0.2, "Both walls of a corner are seen up to so near to it.", unit="m", low=0.01, high=2.0
     )
     landmark_size: float = parameter(
-        0.2, "Length of each of a landmark's two walls that makes one believe in it by 1 - 1/e.", unit="m",
-        low=0.01, high=10.0,
+        0.2,
+        "Length of each of a landmark's two walls that makes one believe in it by 1 - 1/e.",
+        unit="m",
+        low=0.01,
+        high=10.0,
     )
     opening_min: float = parameter(0.6, "Width of an opening at least.", unit="m", low=0.1, high=10.0)
     opening_max: float = parameter(3.0, "Width of an opening at most.", unit="m", low=0.1, high=50.0)
@@ -66,19 +80,28 @@ class Features:
         0.8, "So far behind the wall an opening is free; niches are less deep.", unit="m", low=0.1, high=10.0
     )
     opening_bias: float = parameter(
-        3.3, "Log-odds of an opening of which a metre of the wall, a metre at either jamb and all behind is seen.",
-        unit="nat", low=-100.0, high=100.0,
+        3.3,
+        "Log-odds of an opening of which a metre of the wall, a metre at either jamb and all behind is seen.",
+        unit="nat",
+        low=-100.0,
+        high=100.0,
     )
     opening_wall: float = parameter(
         0.8, "How they change with the logarithm of what is seen of the wall.", unit="nat", low=-100.0, high=100.0
     )
     opening_jambs: float = parameter(
-        1.3, "How they change with the logarithm of what is seen of the wall up to either jamb.", unit="nat",
-        low=-100.0, high=100.0,
+        1.3,
+        "How they change with the logarithm of what is seen of the wall up to either jamb.",
+        unit="nat",
+        low=-100.0,
+        high=100.0,
     )
     opening_share: float = parameter(
-        1.3, "How they change with the logarithm of the share of the width that is seen through.", unit="nat",
-        low=-100.0, high=100.0,
+        1.3,
+        "How they change with the logarithm of the share of the width that is seen through.",
+        unit="nat",
+        low=-100.0,
+        high=100.0,
     )
     landmark_reach: float = parameter(
         6.0, "Landmarks that are known and farther away do not have to be seen.", unit="m", low=0.5, high=100.0
@@ -89,9 +112,7 @@ class Features:
     landmark_detected: float = parameter(
         0.9, "Probability that a landmark which a scan should show is shown, if it is there.", low=0.01, high=0.999
     )
-    landmark_detected_in_map: float = parameter(
-        0.8, "The same of a virtual scan.", low=0.01, high=0.999
-    )
+    landmark_detected_in_map: float = parameter(0.8, "The same of a virtual scan.", low=0.01, high=0.999)
     landmark_by_chance: float = parameter(
         0.05, "Probability that it is seen if it is there no more.", low=0.001, high=0.99
     )
@@ -101,12 +122,13 @@ class Features:
     landmark_lasting_away: float = parameter(
         0.8, "Times this, if the robot was away for a minute or more since the last one.", low=0.1, high=1.0
     )
-    landmark_least: float = parameter(
-        0.1, "Landmarks that are less probable are deleted.", low=0.0, high=0.9
-    )
+    landmark_least: float = parameter(0.1, "Landmarks that are less probable are deleted.", low=0.0, high=0.9)
     portal_reach: float = parameter(
-        2.0, "An opening is a portal between two areas where the path passes it so near to where the area changes.",
-        unit="m", low=0.1, high=20.0,
+        2.0,
+        "An opening is a portal between two areas where the path passes it so near to where the area changes.",
+        unit="m",
+        low=0.1,
+        high=20.0,
     )
     map_deviation: float = parameter(
         0.02, "Deviation of a local map's surfaces, across them.", unit="m", low=1e-3, high=0.5
@@ -124,6 +146,8 @@ class Features:
         14.1, "How they change with the logarithm of length by width.", unit="nat", low=-100.0, high=100.0
     )
     hallway_sure: float = parameter(
-        0.7, "An area that was taken for a room is taken for a hallway from this probability on, and the other way.",
-        low=0.5, high=0.999,
+        0.7,
+        "An area that was taken for a room is taken for a hallway from this probability on, and the other way.",
+        low=0.5,
+        high=0.999,
     )

@@ -15,7 +15,9 @@ class RealTimeLocalization:
     correction_time: float = parameter(
         0.0,
         "Time in which a correction of map -> odom falls to a third, for those who steer by it; 0 corrects at once.",
-        unit="s", low=0.0, high=60.0,
+        unit="s",
+        low=0.0,
+        high=60.0,
     )
     precedence: bool = parameter(
         True, "Let the node come before all that computes for long (SCHED_RR), where the system permits it."

@@ -50,7 +50,8 @@ class LocalMap:
     """Metric map of one area: occupancy grid and distance field, or lines, built from the keyframes' scans."""
 
     kind: str = parameter(
-        "grid", "What maps of areas are made of: occupancy grids under particles, lines in a Kalman filter, or by what "
+        "grid",
+        "What maps of areas are made of: occupancy grids under particles, lines in a Kalman filter, or by what "
         "an area is, grids in hallways and lines in rooms.",
         choices=("grid", "lines", "by_class"),
     )
@@ -62,12 +63,13 @@ class LocalMap:
         0.5, "Distance at which the distance field is cut off.", unit="m", low=0.05, high=5.0
     )
     extent: float = parameter(
-        56.0, "Half side of the local map; what lies farther from the area's origin is not kept.", unit="m",
-        low=5.0, high=500.0,
+        56.0,
+        "Half side of the local map; what lies farther from the area's origin is not kept.",
+        unit="m",
+        low=5.0,
+        high=500.0,
     )
-    log_odds_hit: float = parameter(
-        0.85, "Evidence of occupancy where a beam ends.", unit="nat", low=0.05, high=3.0
-    )
+    log_odds_hit: float = parameter(0.85, "Evidence of occupancy where a beam ends.", unit="nat", low=0.05, high=3.0)
     log_odds_miss: float = parameter(
         0.4, "Evidence of free space where beams of a scan pass.", unit="nat", low=0.05, high=3.0
     )
@@ -89,8 +91,11 @@ class Matching:
         0.04, "Deviation of a beam's end point from its wall when a pose is refined.", unit="m", low=0.002, high=1.0
     )
     robust_scale: float = parameter(
-        0.15, "Scale of the Cauchy weight on the distance of a beam's end point to the nearest wall.", unit="m",
-        low=0.01, high=5.0,
+        0.15,
+        "Scale of the Cauchy weight on the distance of a beam's end point to the nearest wall.",
+        unit="m",
+        low=0.01,
+        high=5.0,
     )
     random_returns: float = parameter(
         0.1, "Share z_rand of returns that no wall of the map explains.", low=1e-4, high=0.9
@@ -102,12 +107,16 @@ class Matching:
         1.0, "Exponent on a scan's likelihood in the proposal of a particle's pose.", low=1e-3, high=10.0
     )
     temper: float = parameter(
-        0.05, "Exponent on a scan's likelihood in the weights, since neighbouring beams are correlated.",
-        low=1e-4, high=1.0,
+        0.05,
+        "Exponent on a scan's likelihood in the weights, since neighbouring beams are correlated.",
+        low=1e-4,
+        high=1.0,
     )
     beam_noise: float = parameter(
-        0.5, "Variance of single beams in the covariance of a match, in units of ``sigma_match`` squared.",
-        low=0.0, high=100.0,
+        0.5,
+        "Variance of single beams in the covariance of a match, in units of ``sigma_match`` squared.",
+        low=0.0,
+        high=100.0,
     )
     block_noise: float = parameter(
         1.5, "Factor on the variance that neighbouring beams, taken together, show in a match.", low=0.0, high=100.0
@@ -131,14 +140,15 @@ class Matching:
     search_angle: float = parameter(
         15.0, "Half width of the angular window of the correlative search.", unit="deg", low=0.0, high=180.0
     )
-    search_step: float = parameter(
-        1.5, "Angular step of the correlative search.", unit="deg", low=0.1, high=30.0
-    )
+    search_step: float = parameter(1.5, "Angular step of the correlative search.", unit="deg", low=0.1, high=30.0)
     wide_distance: float = parameter(
         1.5, "Half side of the window at most, where the prediction is uncertain.", unit="m", low=0.0, high=10.0
     )
     wide_angle: float = parameter(
-        90.0, "Half width of the angular window at most, where the prediction is uncertain.", unit="deg", low=0.0,
+        90.0,
+        "Half width of the angular window at most, where the prediction is uncertain.",
+        unit="deg",
+        low=0.0,
         high=180.0,
     )
 

@@ -14,15 +14,16 @@ class Places:
     reach: float = parameter(
         2.0, "Landmarks count that are so far ahead or back along the hallway.", unit="m", low=0.5, high=100.0
     )
-    aside: float = parameter(
-        2.0, "Landmarks count that are so far to its sides.", unit="m", low=0.1, high=100.0
-    )
+    aside: float = parameter(2.0, "Landmarks count that are so far to its sides.", unit="m", low=0.1, high=100.0)
     detection: float = parameter(
         0.955, "Probability p_det that a landmark within reach is extracted, if it is there.", low=0.01, high=0.99
     )
     position_deviation: float = parameter(
-        0.04, "Deviation of a landmark's place along the hallway beyond what map and measurement say.",
-        unit="m", low=0.001, high=2.0,
+        0.04,
+        "Deviation of a landmark's place along the hallway beyond what map and measurement say.",
+        unit="m",
+        low=0.001,
+        high=2.0,
     )
     heading_deviation: float = parameter(
         0.5, "Deviation of a corner's heading, likewise.", unit="deg", low=0.1, high=30.0
@@ -58,24 +59,31 @@ class Places:
         5.0, "Mean distance between places where the map does not tell it.", unit="m", low=0.1, high=100.0
     )
     unmapped: float = parameter(
-        0.05, "Probability that the robot is in unknown ground when nothing is known of where it is.",
-        low=1e-9, high=0.999,
+        0.05,
+        "Probability that the robot is in unknown ground when nothing is known of where it is.",
+        low=1e-9,
+        high=0.999,
     )
     prior: bool = parameter(
         True, "Whether landmarks weigh the places where a robot may be that woke up somewhere or was carried."
     )
     prior_temper: float = parameter(
-        0.2, "Exponent on their likelihood where it speaks against a place, being made of the same scans as surfaces.",
-        low=0.0, high=1.0,
+        0.2,
+        "Exponent on their likelihood where it speaks against a place, being made of the same scans as surfaces.",
+        low=0.0,
+        high=1.0,
     )
     loops: bool = parameter(
-        False, "Whether landmarks propose loops: known areas where a map's last places are a second time, wherever the "
+        False,
+        "Whether landmarks propose loops: known areas where a map's last places are a second time, wherever the "
         "arcs have these.",
     )
     max_entropy: float = parameter(
         0.4, "The belief is confident below this entropy U_max.", unit="nat", low=1e-6, high=20.0
     )
     twin_share: float = parameter(
-        0.9, "The second peak in the search for a loop holds this share of all that is left without the first one.",
-        low=0.5, high=0.999999,
+        0.9,
+        "The second peak in the search for a loop holds this share of all that is left without the first one.",
+        low=0.5,
+        high=0.999999,
     )

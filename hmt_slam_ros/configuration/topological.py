@@ -21,8 +21,11 @@ class AreaAbstraction:
         0.1, "By both: factor on the overlap of keyframes with an opening between them.", low=0.0, high=1.0
     )
     area_limit: float = parameter(
-        10.0, "By portal: an area in which two keyframes are farther apart is cut where overlap is least.", unit="m",
-        low=1.0, high=1000.0,
+        10.0,
+        "By portal: an area in which two keyframes are farther apart is cut where overlap is least.",
+        unit="m",
+        low=1.0,
+        high=1000.0,
     )
 
     ncut_threshold: float = parameter(
@@ -36,15 +39,15 @@ class AreaAbstraction:
     overlap_radius: float = parameter(
         0.2, "Two scan points this close count as the same sensed space.", unit="m", low=0.01, high=2.0
     )
-    overlap_points: int = parameter(
-        180, "Points of a scan that are compared; evenly thinned.", low=10, high=5000
-    )
+    overlap_points: int = parameter(180, "Points of a scan that are compared; evenly thinned.", low=10, high=5000)
     persistence: int = parameter(
         2, "Keyframes in a row at which a cut, or a move into a known area, has to be found.", low=1, high=100
     )
     move_margin: float = parameter(
-        0.1, "The robot moves into a known area that overlaps this much more with its scan than the present one.",
-        low=0.0, high=1.0,
+        0.1,
+        "The robot moves into a known area that overlaps this much more with its scan than the present one.",
+        low=0.0,
+        high=1.0,
     )
 
 
@@ -58,8 +61,10 @@ class TopologicalInference:
     )
     max_candidates: int = parameter(16, "Known areas that a hypothesis is compared with at a cut.", low=1, high=1000)
     max_comparisons: int = parameter(
-        64, "Comparisons with known areas at a cut, shared among hypotheses by probability; each has four at least.",
-        low=1, high=100000,
+        64,
+        "Comparisons with known areas at a cut, shared among hypotheses by probability; each has four at least.",
+        low=1,
+        high=100000,
     )
     max_modes: int = parameter(3, "Ways to fit one known area that become hypotheses of their own.", low=1, high=100)
     gate_probability: float = parameter(
@@ -90,12 +95,17 @@ class TopologicalInference:
         high=1.0,
     )
     place_radius: float = parameter(
-        2.0, "A robot this close to a keyframe of an area, and in its sight, is in the area's place.", unit="m",
-        low=0.1, high=20.0,
+        2.0,
+        "A robot this close to a keyframe of an area, and in its sight, is in the area's place.",
+        unit="m",
+        low=0.1,
+        high=20.0,
     )
     temper: float = parameter(
-        0.3, "Exponent on the likelihood of an area's surface samples in the weight of a hypothesis.",
-        low=1e-4, high=1.0,
+        0.3,
+        "Exponent on the likelihood of an area's surface samples in the weight of a hypothesis.",
+        low=1e-4,
+        high=1.0,
     )
     sample_spacing: float = parameter(
         0.2, "Distance between the surface samples that areas are compared by.", unit="m", low=0.02, high=2.0
@@ -116,12 +126,18 @@ class TopologicalInference:
         5, "Keyframes stored without a cut after which known ground is looked for.", low=1, high=1000
     )
     local_sigma: float = parameter(
-        0.1, "An area whose position is at least this certain, about as certain as a wall, is in the local map.",
-        unit="m", low=0.01, high=5.0,
+        0.1,
+        "An area whose position is at least this certain, about as certain as a wall, is in the local map.",
+        unit="m",
+        low=0.01,
+        high=5.0,
     )
     local_reach: float = parameter(
-        12.0, "An area with a keyframe this close to the robot's area is part of the local map.", unit="m",
-        low=0.5, high=200.0,
+        12.0,
+        "An area with a keyframe this close to the robot's area is part of the local map.",
+        unit="m",
+        low=0.5,
+        high=200.0,
     )
 
 
@@ -188,14 +204,22 @@ class Refinement:
         0.3, "Exponent on the likelihood, since beams and overlapping pairs are correlated.", low=1e-4, high=1.0
     )
     certainty: float = parameter(
-        0.1, "Share of the registrations' information that counts in the covariances of refined arcs.",
-        low=1e-4, high=1.0,
+        0.1,
+        "Share of the registrations' information that counts in the covariances of refined arcs.",
+        low=1e-4,
+        high=1.0,
     )
     scan_sigma: float = parameter(
-        0.1, "Deviation of a scan's place relative to its keyframe before it is registered.", unit="m",
-        low=0.001, high=5.0,
+        0.1,
+        "Deviation of a scan's place relative to its keyframe before it is registered.",
+        unit="m",
+        low=0.001,
+        high=5.0,
     )
     scan_angle: float = parameter(
-        3.0, "Deviation of a scan's heading relative to its keyframe before it is registered.", unit="deg",
-        low=0.01, high=90.0,
+        3.0,
+        "Deviation of a scan's heading relative to its keyframe before it is registered.",
+        unit="deg",
+        low=0.01,
+        high=90.0,
     )

@@ -184,9 +184,18 @@ def _with_mounting(
     moving = _moving(scanned, 1.0)
     slipped = _slipped(differences, motions, moving & ~frozen)
     return Comparison(
-        offset, mirrored, rotation, translation, yaw, forward, left, len(scanned), int(moving.sum()),
-        int(frozen.sum()), slipped,
-    )  # fmt: skip
+        offset,
+        mirrored,
+        rotation,
+        translation,
+        yaw,
+        forward,
+        left,
+        len(scanned),
+        int(moving.sum()),
+        int(frozen.sum()),
+        slipped,
+    )
 
 
 def _mounting(driven: Float64, motions: ScanMotions, *, lever: bool) -> tuple[Float64, Float64]:
@@ -195,9 +204,7 @@ def _mounting(driven: Float64, motions: ScanMotions, *, lever: bool) -> tuple[Fl
     cos, sin = np.cos(scanned[:, 2]), np.sin(scanned[:, 2])
     x, y = scanned[:, 0], scanned[:, 1]
     # (R - 1) e - scale R(yaw) t = -t_odometry, two rows each.
-    rows = np.stack(
-        [np.stack([cos - 1.0, -sin, -x, y], axis=1), np.stack([sin, cos - 1.0, -y, -x], axis=1)], axis=1
-    )
+    rows = np.stack([np.stack([cos - 1.0, -sin, -x, y], axis=1), np.stack([sin, cos - 1.0, -y, -x], axis=1)], axis=1)
     if not lever:
         rows[:, :, :2] = 0.0
     weights = _shown(motions)
@@ -225,9 +232,7 @@ def _slipped(differences: Float64, motions: ScanMotions, moving: Bool) -> float:
     away = np.hypot(differences[:, 0], differences[:, 1])
     length = np.hypot(motions.motions[:, 0], motions.motions[:, 1])
     turned = np.abs(differences[:, 2])
-    slips = (turned > np.radians(4.0) + 0.3 * np.abs(motions.motions[:, 2])) | (
-        shown & (away > 0.15 + 0.3 * length)
-    )
+    slips = (turned > np.radians(4.0) + 0.3 * np.abs(motions.motions[:, 2])) | (shown & (away > 0.15 + 0.3 * length))
     return float(slips[moving].mean()) if moving.any() else 0.0
 
 

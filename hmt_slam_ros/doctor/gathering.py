@@ -67,9 +67,15 @@ class Gatherer:
         rows = np.array(self._scan_rows, np.float64).reshape(-1, 8)
         counts = BeamCounts(*np.array(self._counts, np.int64).reshape(-1, 6).T)
         scans = ScanStatistics(
-            stamps[:, 0], stamps[:, 1], rows[:, :5], rows[:, 5:], counts, self._each_beam, self._sweep_faults,
+            stamps[:, 0],
+            stamps[:, 1],
+            rows[:, :5],
+            rows[:, 5:],
+            counts,
+            self._each_beam,
+            self._sweep_faults,
             self._sweep_fault,
-        )  # fmt: skip
+        )
         stamps = np.array(self._odometry_stamps, np.int64).reshape(-1, 2)
         poses = np.array(self._odometry_rows, np.float64).reshape(-1, 3)
         odometry = OdometryStatistics(stamps[:, 0], stamps[:, 1], poses, self._not_finite)

@@ -105,9 +105,7 @@ def turn_between(start: Scan, end: Scan) -> float:
     around = size * abs(increment) > 2.0 * math.pi - 1.5 * abs(increment)
     shift = max(1, round(_TURN_STEP / abs(increment)))
     steps = int(_MOST_TURN / abs(increment)) // shift
-    best = _best_shift(
-        _returns(start), _returns(end), shift, steps, max(1, size // _COMPARED), around
-    )
+    best = _best_shift(_returns(start), _returns(end), shift, steps, max(1, size // _COMPARED), around)
     return best * increment + start.angle_min - end.angle_min
 
 

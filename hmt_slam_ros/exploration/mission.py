@@ -73,9 +73,13 @@ class MissionPilot:
     """
 
     def __init__(
-        self, known: KnownBuilding, configuration: Configuration, limits: Limits, belief: PositionBelief | None = None,
+        self,
+        known: KnownBuilding,
+        configuration: Configuration,
+        limits: Limits,
+        belief: PositionBelief | None = None,
         ways: WatchedWays | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         """:param belief: of a robot that begins at a node.
 
         :param ways: what is known of whether ways are open; nothing unless given.
@@ -96,9 +100,12 @@ class MissionPilot:
         self._way = Pilot(limits, _AT_PLACE)
         self._velocity = (0.0, 0.0)
         self._drives = {
-            Phase.HALLWAY: self._along, Phase.TURN: self._around, Phase.DOOR: self._to_door, Phase.ROOM: self._inside,
+            Phase.HALLWAY: self._along,
+            Phase.TURN: self._around,
+            Phase.DOOR: self._to_door,
+            Phase.ROOM: self._inside,
             Phase.LEAVING: self._outside,
-        }  # fmt: skip
+        }
 
     def go(self, goal: Destination | None) -> None:
         """Take on a mission.

@@ -216,10 +216,15 @@ class Missions:
         facing = estimator.facing
         share = float(belief.probabilities.max() if facing else belief.probabilities[-1])
         return PlaceEstimate(
-            self._stamp, chart.name(facing[0]) if facing else None, DIRECTION_NAMES[facing[1]] if facing else None,
-            estimator.frame.away if facing else 0.0, share, max(0.0, belief.entropy), belief.confident,
+            self._stamp,
+            chart.name(facing[0]) if facing else None,
+            DIRECTION_NAMES[facing[1]] if facing else None,
+            estimator.frame.away if facing else 0.0,
+            share,
+            max(0.0, belief.entropy),
+            belief.confident,
             None if self.pilot.room is None else self._room,
-        )  # fmt: skip
+        )
 
     def _follow_out(self) -> None:
         """Where somebody drove the robot out of a room it is at the node before the door."""

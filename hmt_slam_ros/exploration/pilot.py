@@ -26,9 +26,13 @@ _PROGRESS = 0.3
 def limits_of(robot: Exploration) -> Limits:
     """Those of the robot that the parameters describe."""
     return Limits(
-        robot.speed, math.radians(robot.turn_rate), robot.acceleration, math.radians(robot.turn_acceleration),
-        robot.radius, robot.margin,
-    )  # fmt: skip
+        robot.speed,
+        math.radians(robot.turn_rate),
+        robot.acceleration,
+        math.radians(robot.turn_acceleration),
+        robot.radius,
+        robot.margin,
+    )
 
 
 class Pilot:

@@ -60,9 +60,13 @@ def extract_lines(scan: Scan, features: Features, deviations: Float64 | None = N
         deviations = np.full(len(points), features.range_deviation)
     beams = Beams(points, rays / np.maximum(np.hypot(*rays.T), 1e-9)[:, None], deviations)
     count = segments(
-        points - scan.laser_pose[:2], _begins(points, numbers, features.max_gap), deviations, features.line_penalty,
-        features.stray_penalty, labels,
-    )  # fmt: skip
+        points - scan.laser_pose[:2],
+        _begins(points, numbers, features.max_gap),
+        deviations,
+        features.line_penalty,
+        features.stray_penalty,
+        labels,
+    )
     gate = Gate(bound(features.merge_probability, 2), features.merge_deviation)
     found = _extract(beams, labels, count, features.min_beams, gate)
     pieces, owners = _pieces(points, numbers, labels, found, features.max_gap)

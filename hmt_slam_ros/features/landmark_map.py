@@ -140,9 +140,13 @@ class LandmarkMap:
     def _new(self, pose: PoseGaussian, seen: Landmarks, i: int) -> Landmark:
         into = np.linalg.inv(np.linalg.cholesky(pose.covariance))
         return Landmark(
-            int(seen.kinds[i]), pose, float(seen.widths[i]), float(seen.width_deviations[i]),
-            self._begin(float(seen.confidences[i])), by_scans=into @ seen.covariances[i] @ into.T,
-        )  # fmt: skip
+            int(seen.kinds[i]),
+            pose,
+            float(seen.widths[i]),
+            float(seen.width_deviations[i]),
+            self._begin(float(seen.confidences[i])),
+            by_scans=into @ seen.covariances[i] @ into.T,
+        )
 
     def _beside_known(self, pose: PoseGaussian, kind: int, known: int) -> bool:
         """Whether a landmark is so near to a known one of its kind that it is no other one."""

@@ -34,9 +34,7 @@ class Marks(NamedTuple):
 
     def and_robot(self, mean: Float64, covariance: Float64) -> Marks:
         """With one more where the robot is, by the mean (n,) and the covariance (n, n) of the state."""
-        return Marks(
-            np.concatenate((self.poses, mean[None, :3])), np.concatenate((self.common, covariance[None, :3]))
-        )  # fmt: skip
+        return Marks(np.concatenate((self.poses, mean[None, :3])), np.concatenate((self.common, covariance[None, :3])))
 
     def only(self, rows: Sequence[int]) -> Marks:
         """Some of them, in this order."""

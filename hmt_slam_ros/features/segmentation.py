@@ -46,9 +46,7 @@ def segments(
 
 
 @njit(cache=True)
-def _cheapest(
-    rays: Float64, begins: Int32, deviations: Float64, line_penalty: float, stray_penalty: float
-) -> Int32:
+def _cheapest(rays: Float64, begins: Int32, deviations: Float64, line_penalty: float, stray_penalty: float) -> Int32:
     """Where the line begins that ends with each beam in the cheapest partition up to it; -1 where it is on none."""
     count = len(rays)
     costs, starts = np.zeros(count + 1), np.empty(count, np.int32)

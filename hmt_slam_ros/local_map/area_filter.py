@@ -85,10 +85,22 @@ class AreaFilter:
     def state(self) -> FilterState:
         """All but the patches, to which the tables refer by their numbers in the pool."""
         return FilterState(
-            self.hypothesis, self.area, self.poses, self.log_weights, tuple(self.keyframes),
-            tuple(self.keyframe_areas), self.keyframe_poses, self._tables, self._priors, self._last_poses,
-            self._since_update, self.leader, self.tracking_covariance, self.left_open, self.experience,
-        )  # fmt: skip
+            self.hypothesis,
+            self.area,
+            self.poses,
+            self.log_weights,
+            tuple(self.keyframes),
+            tuple(self.keyframe_areas),
+            self.keyframe_poses,
+            self._tables,
+            self._priors,
+            self._last_poses,
+            self._since_update,
+            self.leader,
+            self.tracking_covariance,
+            self.left_open,
+            self.experience,
+        )
 
     @property
     def pose(self) -> Float64:
@@ -170,9 +182,14 @@ class AreaFilter:
         self.poses[leader] = drawn.modes[leader]
         self.poses[:, 2] = se2.wrap(self.poses[:, 2])
         error = match_error(
-            still, self.poses[leader], drawn.hessians[leader], prior, self.mapping.pool.view(self._tables[leader]),
-            self.mapping.alignment, self.mapping.noise,
-        )  # fmt: skip
+            still,
+            self.poses[leader],
+            drawn.hessians[leader],
+            prior,
+            self.mapping.pool.view(self._tables[leader]),
+            self.mapping.alignment,
+            self.mapping.noise,
+        )
         information = turned(settings.matching.temper * drawn.hessians[leader], -self.poses[leader, 2])
         effective = 1.0 / float(np.sum(_normalised(self.log_weights) ** 2))
         moved = se2.between(self._last_poses[leader], self.poses[leader])

@@ -224,4 +224,3 @@ def _positive(odds: Int8, row: int, columns: np.uint32) -> np.uint32:
             positive |= np.uint32(1) << np.uint32(c)
         columns &= columns - np.uint32(1)
     return positive
-

@@ -89,10 +89,18 @@ class LineFilter:
     def state(self) -> LineFilterState:
         """All that is remembered."""
         return LineFilterState(
-            self.hypothesis, self.area, self.room.state, tuple(self.keyframes), tuple(self.keyframe_areas),
-            self._told, self._last_covariance, self._since_update, self._information, self.tracking_covariance,
+            self.hypothesis,
+            self.area,
+            self.room.state,
+            tuple(self.keyframes),
+            tuple(self.keyframe_areas),
+            self._told,
+            self._last_covariance,
+            self._since_update,
+            self._information,
+            self.tracking_covariance,
             self.experience,
-        )  # fmt: skip
+        )
 
     @property
     def pose(self) -> Float64:

@@ -59,7 +59,12 @@ class MatchError(NamedTuple):
 
 
 def match_error(
-    points: Float64, pose: Float64, hessian: Float64, prior: Float64, view: MapView, settings: Alignment,
+    points: Float64,
+    pose: Float64,
+    hessian: Float64,
+    prior: Float64,
+    view: MapView,
+    settings: Alignment,
     noise: MatchNoise,
 ) -> MatchError:
     """The error of the pose to which points were aligned.
@@ -68,7 +73,7 @@ def match_error(
     :param pose: ``map_T_base`` (3,), the mode.
     :param hessian: information of the points at the mode, map coordinates, (3, 3).
     :param prior: information of the prediction, likewise.
-    """  # fmt: skip
+    """
     # All in the frame of the pose.
     share, scatter = 1.0 / settings.inflation, np.zeros((3, 3))
     _add_scatter(points, pose, view, settings, scatter)

@@ -243,9 +243,7 @@ def misfit(points: Float64, pose: Float64, prior: Prior, view: MapView, settings
 
 
 @njit(cache=True)
-def align(
-    points: Float64, start: Float64, prior: Prior, view: MapView, settings: Alignment
-) -> tuple[Float64, Float64]:
+def align(points: Float64, start: Float64, prior: Prior, view: MapView, settings: Alignment) -> tuple[Float64, Float64]:
     """Gauss-Newton on the distance field with a Gaussian prior.
 
     Minimises sum rho(d(T p)^2) / (inflation sigma^2) + (T - prior)' information (T - prior), rho being Cauchy's.

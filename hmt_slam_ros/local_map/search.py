@@ -56,9 +56,7 @@ def correlative_search(
 
 
 @njit(cache=True)
-def _find_cells(
-    points: Float64, x: float, y: float, theta: float, view: MapView, columns: Int64, rows: Int64
-) -> None:
+def _find_cells(points: Float64, x: float, y: float, theta: float, view: MapView, columns: Int64, rows: Int64) -> None:
     """Write the columns and rows, each (n,), of the points at the pose (x, y, theta)."""
     cos, sin = np.cos(theta) / view.cell, np.sin(theta) / view.cell
     half = 0.5 * view.table.shape[0] * PATCH
@@ -68,9 +66,7 @@ def _find_cells(
 
 
 @njit(cache=True)
-def _log_ratio_of_cells(
-    columns: Int64, rows: Int64, right: int, up: int, view: MapView, model: BeamModel
-) -> float:
+def _log_ratio_of_cells(columns: Int64, rows: Int64, right: int, up: int, view: MapView, model: BeamModel) -> float:
     """Sum of the log-likelihood ratios of end points in these cells, all shifted, nats."""
     total = 0.0
     for n in range(columns.size):

@@ -160,9 +160,14 @@ class ScanMatcher:
             return match
         lattice = self._lattice(predicted)
         starts = search.correlative_search(
-            points[:: max(1, len(points) // _SEARCH_POINTS)], prior, lattice, view, self._mapping.model,
-            self._settings.temper, _PEAKS,
-        )  # fmt: skip
+            points[:: max(1, len(points) // _SEARCH_POINTS)],
+            prior,
+            lattice,
+            view,
+            self._mapping.model,
+            self._settings.temper,
+            _PEAKS,
+        )
         found = [self._refined(points, points, start, prior, step, view) for start in starts]
         best = self._best(points, [match, *found], view)
         # Relative to unknown space: where nothing fits, the scan shows nothing of the map.
@@ -186,9 +191,7 @@ class ScanMatcher:
         self, points: Float64, still: Float64, start: Float64, prior: matching.Prior, step: Step, view: MapView
     ) -> Match:
         pose, hessian = matching.align(still, start, prior, view, self._mapping.alignment)
-        log_evidence = matching.evidence(
-            points, pose, hessian, prior, view, self._mapping.model, self._settings.temper
-        )
+        log_evidence = matching.evidence(points, pose, hessian, prior, view, self._mapping.model, self._settings.temper)
         return Match(pose, hessian, prior, step, log_evidence)
 
     def _lattice(self, predicted: PoseGaussian) -> search.Lattice:

@@ -64,9 +64,7 @@ class Command(NamedTuple):
     arrived: bool
 
 
-def command_towards(
-    scan: Scan, goal: NDArray[np.float64], velocity: tuple[float, float], limits: Limits
-) -> Command:
+def command_towards(scan: Scan, goal: NDArray[np.float64], velocity: tuple[float, float], limits: Limits) -> Command:
     """The velocities with which to drive towards a goal around what the newest scan shows.
 
     It does not see behind what hides the rest, and remembers nothing: goals are to be in sight, or nearly.

@@ -131,9 +131,13 @@ class Inbox:
             self._listen(String, FINISHED, self._hear_closing)
         elif kind is Odometry:
             self._odometry = SensorSubscription(
-                self._node, self._figures, OdometryMessage, ODOM,
-                lambda message: self.receive(conversions.odometry_from(message)), self._after.get("Odometry"),
-            )  # fmt: skip
+                self._node,
+                self._figures,
+                OdometryMessage,
+                ODOM,
+                lambda message: self.receive(conversions.odometry_from(message)),
+                self._after.get("Odometry"),
+            )
             self._odometry.begin()
         elif kind in DOCUMENTS:
             profile = self._estimates if kind is LocalEstimate else qos.CHAIN

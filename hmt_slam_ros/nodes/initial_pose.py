@@ -76,9 +76,7 @@ def place_of(process: MetricSlam, areas: Mapping[int, AreaPose], belief: PoseGau
     return Place(area, PoseGaussian(pose, belief.covariance + _LEAST))
 
 
-def _nearest(
-    process: MetricSlam, areas: Mapping[int, AreaPose], pose: NDArray[np.float64]
-) -> tuple[int, float] | None:
+def _nearest(process: MetricSlam, areas: Mapping[int, AreaPose], pose: NDArray[np.float64]) -> tuple[int, float] | None:
     """The area with the keyframe nearest to a pose in the map (3,), and its distance, m; None where there is none.
 
     What a robot maps that may be anywhere is no part of the map.

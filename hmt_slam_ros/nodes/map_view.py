@@ -148,9 +148,7 @@ class MapView:
         marker.pose.position, marker.pose.orientation, marker.text = at, quaternion(ellipse.angle), text
         return [marker]
 
-    def _marker(
-        self, group: str, number: int, kind: int, size: tuple[float, float, float], color: ColorRGBA
-    ) -> Marker:
+    def _marker(self, group: str, number: int, kind: int, size: tuple[float, float, float], color: ColorRGBA) -> Marker:
         marker = Marker(header=header(self.stamp, self._frame), ns=group, id=number, type=kind, color=color)
         marker.scale = Vector3(x=size[0], y=size[1], z=size[2])
         marker.pose.orientation.w = 1.0

@@ -17,8 +17,16 @@ from hmt_slam_ros.errors import HmtSlamError
 # Names that are not in the tree but in a node's parameters all the same.
 _FRAMES = ("base_frame", "odom_frame", "map_frame", "laser_frame", "laser_pose")
 _NODE_PARAMETERS = (
-    *_FRAMES, "log", "save_to", "save_at_end", "start_from", "start_carried", "initial_pose", "recovery", "autostart",
-)  # fmt: skip
+    *_FRAMES,
+    "log",
+    "save_to",
+    "save_at_end",
+    "start_from",
+    "start_carried",
+    "initial_pose",
+    "recovery",
+    "autostart",
+)
 _ROS_PARAMETERS = ("use_sim_time", "start_type_description_service", "qos_overrides.")
 
 

@@ -52,9 +52,7 @@ class Player:
     @property
     def held(self) -> bool:
         """Whether the next measurement waits for an acknowledgement."""
-        return (
-            self.settings.paced and isinstance(self._next, Scan) and len(self._open) >= self.settings.window
-        )  # fmt: skip
+        return self.settings.paced and isinstance(self._next, Scan) and len(self._open) >= self.settings.window
 
     def wait(self, now: float) -> float | None:
         """Seconds until the next measurement is due, 0 where it is due now, None where it is not known.

@@ -95,9 +95,14 @@ class ProcessNode(ManagedNode):
         tell_of_compilation(self.get_logger().info)
         self.outbox = Outbox(self, self._said, self._answered)
         self.inbox = Inbox(
-            self, HEARD_BY[self._name], self.deliver, self.figures, first=self.beginning.events, begun=self._answered,
+            self,
+            HEARD_BY[self._name],
+            self.deliver,
+            self.figures,
+            first=self.beginning.events,
+            begun=self._answered,
             after=self.after,
-        )  # fmt: skip
+        )
         self._part = Part(self, self._name) if self._name in PARTS else None
 
     def take_part(self) -> None:
@@ -167,9 +172,15 @@ class ProcessNode(ManagedNode):
         """What the node is that begins anew."""
         beginning = self.beginning
         return Base(
-            False, beginning.events, str(beginning.folder or ""), beginning.carried, beginning.scans, self._answered,
-            received=dict(self.figures.received), stamps=self.recovery.stamps,
-        )  # fmt: skip
+            False,
+            beginning.events,
+            str(beginning.folder or ""),
+            beginning.carried,
+            beginning.scans,
+            self._answered,
+            received=dict(self.figures.received),
+            stamps=self.recovery.stamps,
+        )
 
     def _where_it_was(self, found: Found) -> Beginning:
         """The beginning of a node that goes on for another one that was killed."""
@@ -283,9 +294,17 @@ class ProcessNode(ManagedNode):
         if not self.recovery.due or events is None or not self.at_rest:
             return
         base = Base(
-            True, events, str(self.beginning.folder or ""), False, 0, self._answered, dict(self.figures.received),
-            dict(self.outbox.sent), self.recovery.stamps, self.recovery.arriving,
-        )  # fmt: skip
+            True,
+            events,
+            str(self.beginning.folder or ""),
+            False,
+            0,
+            self._answered,
+            dict(self.figures.received),
+            dict(self.outbox.sent),
+            self.recovery.stamps,
+            self.recovery.arriving,
+        )
         begin = time.perf_counter()
         self.recovery.checkpoint(base, {self._name: self.process.state, **self.memory()})
         self._checkpoints += 1

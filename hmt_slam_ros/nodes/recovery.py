@@ -240,9 +240,7 @@ class Recovery:
     @property
     def due(self) -> bool:
         """Whether a checkpoint is worth what it costs."""
-        return self._journal is not None and (
-            self._worked > _WORTH * self._cost or self._journal.size > _LARGEST
-        )  # fmt: skip
+        return self._journal is not None and (self._worked > _WORTH * self._cost or self._journal.size > _LARGEST)
 
     def begin(self, base: Base) -> None:
         """Begin a journal without a checkpoint; what was heard and said before is of no use any more."""

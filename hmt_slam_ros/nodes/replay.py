@@ -187,9 +187,7 @@ class _Run:
         finally:
             context.try_shutdown()
 
-    def _start(
-        self, children: Children, log: Path, slam_settings: list[str], domain: int, scratch: Path
-    ) -> None:
+    def _start(self, children: Children, log: Path, slam_settings: list[str], domain: int, scratch: Path) -> None:
         parameters = scratch / "parameters.yaml"
         parameters.write_text(ros_yaml(self._configuration), encoding="utf-8")
         environment = {**os.environ, "ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}

@@ -208,9 +208,14 @@ class RobotNode(ConfiguredNode):
         if self._state != "waiting":
             self._state = "ended" if player.ended else "paused" if player.paused else "playing"
         status = RobotStatus(
-            self._state, self._log.name, player.stamp, player.scans, self._log.scan_count, player.odometry,
+            self._state,
+            self._log.name,
+            player.stamp,
+            player.scans,
+            self._log.scan_count,
+            player.odometry,
             player.acknowledged,
-        )  # fmt: skip
+        )
         self._statuses.publish(String(data=encode(status)))
         if self._state == "playing" and player.held and time.monotonic() - self._last_progress > _SILENCE:
             self._last_progress = time.monotonic()

@@ -34,7 +34,11 @@ class Round(ABC):
     """
 
     def __init__(
-        self, node: SlamNode, release: Callable[[], None], topics: tuple[str, str], kind: type[SavedPart | BegunPart],
+        self,
+        node: SlamNode,
+        release: Callable[[], None],
+        topics: tuple[str, str],
+        kind: type[SavedPart | BegunPart],
         failing: str,
     ) -> None:
         """Listen.
@@ -43,7 +47,7 @@ class Round(ABC):
         :param topics: of the requests and of the answers.
         :param kind: of the answers.
         :param failing: what cannot be done where something goes wrong.
-        """  # fmt: skip
+        """
         self.holding = False
         self._node, self._release, self._kind, self._failing = node, release, kind, failing
         self._asked: Future | None = None

@@ -80,9 +80,7 @@ def spin_until(node: Node, over: Callable[[], bool] | None = None) -> None:
         executor.shutdown()
 
 
-def _live(
-    make: Callable[[], NodeType], spin: Callable[[NodeType], None], stop: _Stop, nodes: list[NodeType]
-) -> int:
+def _live(make: Callable[[], NodeType], spin: Callable[[NodeType], None], stop: _Stop, nodes: list[NodeType]) -> int:
     """Make a node, which is also put into ``nodes``, and spin it; return the exit status."""
     try:
         _end_with_parent()

@@ -45,7 +45,6 @@ class TsbiNode(ProcessNode):
             if isinstance(message, Hypotheses):
                 self._pmf.publish(pmf_message(message))
 
-
     def begin_anew(self, folder: str, request: int = 0) -> None:
         """As any process node, and say that the robot's place is not known."""
         super().begin_anew(folder, request)

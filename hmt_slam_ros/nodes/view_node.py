@@ -66,9 +66,16 @@ _PORT = ParameterDescriptor(
 )
 _EXPECTED = ("slam", "aam", "tsbi", "tlca", "rtl")
 _WHO = {
-    POSE: "rtl", HMT_POSE: "rtl", GRAPH: "tlca", MAP: "tlca", KEYFRAMES: "slam", DOCUMENTS[Hypotheses]: "tsbi",
-    IS_LOCALIZED: "tsbi", ENTROPY: "tsbi", DIAGNOSTICS: "every node",
-}  # fmt: skip
+    POSE: "rtl",
+    HMT_POSE: "rtl",
+    GRAPH: "tlca",
+    MAP: "tlca",
+    KEYFRAMES: "slam",
+    DOCUMENTS[Hypotheses]: "tsbi",
+    IS_LOCALIZED: "tsbi",
+    ENTROPY: "tsbi",
+    DIAGNOSTICS: "every node",
+}
 
 
 class ViewNode(Node):

@@ -43,26 +43,35 @@ def _place(name: str, frame: PoseGaussian, node: ChartNode) -> dict[str, object]
         for one in node.openings
     ]
     return {
-        "name": name, "kind": NAMES[node.kind], "area": node.area, "area_T_place": node.pose.tolist(),
+        "name": name,
+        "kind": NAMES[node.kind],
+        "area": node.area,
+        "area_T_place": node.pose.tolist(),
         "map_T_place": se2.compose(frame.mean, node.pose).tolist(),
-        "existence": node.existence, "openings": openings,
-    }  # fmt: skip
+        "existence": node.existence,
+        "openings": openings,
+    }
 
 
 def _way(edge: Edge) -> dict[str, object]:
     return {
-        "start": edge.start, "end": edge.end, "direction": DIRECTION_NAMES[edge.leaving],
-        "distance": edge.distance[0], "deviation": float(np.sqrt(edge.distance[1])),
+        "start": edge.start,
+        "end": edge.end,
+        "direction": DIRECTION_NAMES[edge.leaving],
+        "distance": edge.distance[0],
+        "deviation": float(np.sqrt(edge.distance[1])),
         "landmarks": _landmarks(edge.landmarks),
-    }  # fmt: skip
+    }
 
 
 def _landmarks(landmarks: Landmarks) -> list[dict[str, object]]:
     """In the order in which they are met."""
     return [
         {
-            "along": float(landmarks.along[k]), "track": TRACK_NAMES[landmarks.tracks[k]],
-            "form": float(landmarks.forms[k]), "existence": float(landmarks.probabilities[k]),
+            "along": float(landmarks.along[k]),
+            "track": TRACK_NAMES[landmarks.tracks[k]],
+            "form": float(landmarks.forms[k]),
+            "existence": float(landmarks.probabilities[k]),
         }
         for k in np.argsort(landmarks.along, kind="stable").tolist()
-    ]  # fmt: skip
+    ]

@@ -128,15 +128,26 @@ def _draw_areas(axes: Axes, saved: SavedMap, visible: float) -> None:
         x, y = saved.area_poses[area].mean[:2].tolist()
         axes.add_patch(
             Ellipse(
-                (x, y), 2.0 * factor * ellipse.longer, 2.0 * factor * ellipse.shorter, zorder=5,
-                angle=float(np.degrees(ellipse.angle)), facecolor=(*_colour(area), 0.25), edgecolor=_colour(area),
+                (x, y),
+                2.0 * factor * ellipse.longer,
+                2.0 * factor * ellipse.shorter,
+                zorder=5,
+                angle=float(np.degrees(ellipse.angle)),
+                facecolor=(*_colour(area), 0.25),
+                edgecolor=_colour(area),
                 linewidth=1.0,
             )
-        )  # fmt: skip
+        )
         axes.annotate(
-            str(area), (x, y), ha="center", va="center", fontsize=7, fontweight="bold", zorder=6,
+            str(area),
+            (x, y),
+            ha="center",
+            va="center",
+            fontsize=7,
+            fontweight="bold",
+            zorder=6,
             bbox={"boxstyle": "circle,pad=0.25", "facecolor": "white", "edgecolor": _colour(area), "linewidth": 1.5},
-        )  # fmt: skip
+        )
     enlarged = f", enlarged {factor} times" if factor > 1 else ""
     axes.plot([], [], "o", markerfacecolor="none", color="black", label=f"area, 95 % ellipse{enlarged}")
 

@@ -174,9 +174,13 @@ class TrailTable:
         kept = np.isin(self.hypotheses, list(hypotheses))
         scans = np.repeat(kept, self.sizes)
         return TrailTable(
-            self.hypotheses[kept], self.first_scans[kept], self.sizes[kept], self.stamps[scans], self.anchors[scans],
+            self.hypotheses[kept],
+            self.first_scans[kept],
+            self.sizes[kept],
+            self.stamps[scans],
+            self.anchors[scans],
             self.poses[scans],
-        )  # fmt: skip
+        )
 
     def related_to(self, successors: Mapping[int, Successor]) -> TrailTable:
         """With scans that are related to forgotten keyframes related to others.

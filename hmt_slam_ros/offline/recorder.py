@@ -326,9 +326,7 @@ def placed_areas(hybrid_map: HybridMap, given: Sequence[AreaPose]) -> dict[int, 
     return {area: known[area] if area in known else origin.compose(along_arcs[area]) for area in areas}
 
 
-def keyframe_poses(
-    hybrid_map: HybridMap, area_poses: Mapping[int, PoseGaussian]
-) -> dict[int, NDArray[np.float64]]:
+def keyframe_poses(hybrid_map: HybridMap, area_poses: Mapping[int, PoseGaussian]) -> dict[int, NDArray[np.float64]]:
     """{keyframe: ``map_T_base``, shape (3,)} in the order of the areas."""
     return {
         keyframe: se2.compose(area_poses[area].mean, pose)

@@ -130,9 +130,14 @@ class Run:
     def state(self) -> RunState:
         """All that is known, between two records of the log."""
         return RunState(
-            self._reading.state, self._slam.state, self._aam.state, self._tsbi.state,
-            self._tlca.state, self._rtl.state, self.recorder.record(),
-        )  # fmt: skip
+            self._reading.state,
+            self._slam.state,
+            self._aam.state,
+            self._tsbi.state,
+            self._tlca.state,
+            self._rtl.state,
+            self.recorder.record(),
+        )
 
     def unread(self, log: Log) -> Iterator[LogRecord]:
         """The records of a log that were not read.

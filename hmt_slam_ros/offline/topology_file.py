@@ -84,17 +84,25 @@ def _landmark(landmark: Landmark) -> dict[str, object]:
     existence = landmark.existence
     opening = {"width": landmark.width, "width_deviation": landmark.width_deviation} if landmark.width else {}
     return {
-        "kind": KINDS[landmark.kind], **_numbers(landmark.pose), **opening, "existence": existence.probability,
-        "seen": existence.seen, "missed": existence.missed,
-    }  # fmt: skip
+        "kind": KINDS[landmark.kind],
+        **_numbers(landmark.pose),
+        **opening,
+        "existence": existence.probability,
+        "seen": existence.seen,
+        "missed": existence.missed,
+    }
 
 
 def _portal(portal: Portal) -> dict[str, object]:
     return {
-        "areas": list(portal.areas), "in_first": _numbers(portal.pose_in_a), "in_second": _numbers(portal.pose_in_b),
-        "width": portal.width, "width_deviation": portal.width_deviation, "existence": portal.existence,
+        "areas": list(portal.areas),
+        "in_first": _numbers(portal.pose_in_a),
+        "in_second": _numbers(portal.pose_in_b),
+        "width": portal.width,
+        "width_deviation": portal.width_deviation,
+        "existence": portal.existence,
         "passages": portal.passages,
-    }  # fmt: skip
+    }
 
 
 def _numbers(belief: PoseGaussian) -> dict[str, float]:

@@ -67,17 +67,26 @@ class ScanTable:
         begins = np.zeros(self.ranges.size, dtype=np.float32)
         begins[self.cut] = self.starts
         rows = zip(
-            self.names.tolist(), self.stamps.tolist(), (ends - self.beams).tolist(), ends.tolist(),
-            self.geometry.tolist(), self.laser_poses, self.motions, strict=True,
-        )  # fmt: skip
+            self.names.tolist(),
+            self.stamps.tolist(),
+            (ends - self.beams).tolist(),
+            ends.tolist(),
+            self.geometry.tolist(),
+            self.laser_poses,
+            self.motions,
+            strict=True,
+        )
         return {
             name: Scan(
-                stamp=stamp, ranges=self.ranges[begin:end], laser_pose=laser_pose, motion=motion,
+                stamp=stamp,
+                ranges=self.ranges[begin:end],
+                laser_pose=laser_pose,
+                motion=motion,
                 starts=begins[begin:end] if begins[begin:end].any() else None,
                 **dict(zip(_GEOMETRY, geometry, strict=True)),
             )
             for name, stamp, begin, end, geometry, laser_pose, motion in rows
-        }  # fmt: skip
+        }
 
 
 class WrittenScans:

@@ -91,10 +91,18 @@ class Expected(NamedTuple):
 def observation_model(places: Places, features: Features) -> ObservationModel:
     """The model that parameters say."""
     return ObservationModel(
-        places.reach, places.detection, places.position_deviation**2, math.radians(places.heading_deviation) ** 2,
-        places.width_deviation**2, places.false_density, places.new_density, places.usual_density, places.true_share,
-        0.5 / math.pi, 1.0 / (features.opening_max - features.opening_min),
-    )  # fmt: skip
+        places.reach,
+        places.detection,
+        places.position_deviation**2,
+        math.radians(places.heading_deviation) ** 2,
+        places.width_deviation**2,
+        places.false_density,
+        places.new_density,
+        places.usual_density,
+        places.true_share,
+        0.5 / math.pi,
+        1.0 / (features.opening_max - features.opening_min),
+    )
 
 
 def log_observation(
@@ -119,10 +127,12 @@ def place_along(
     own = chosen(expected.landmarks, slice(*expected.starts[state : state + 2].tolist()))
     alone = Expected(np.array([0, len(own.tracks)]), own)
     matched = _matched(observed, model)
-    logs = np.array([
-        _log_ratios(observed, tracks, matched, alone, np.array([away + shift]), np.array([weight]), model)[0]
-        for shift, weight in zip(shifts.tolist(), weights.tolist(), strict=True)
-    ])  # fmt: skip
+    logs = np.array(
+        [
+            _log_ratios(observed, tracks, matched, alone, np.array([away + shift]), np.array([weight]), model)[0]
+            for shift, weight in zip(shifts.tolist(), weights.tolist(), strict=True)
+        ]
+    )
     shares = np.exp(logs - logs.max())
     shares /= shares.sum()
     mean = float(shares @ shifts)
@@ -158,7 +168,12 @@ def _places_along(variance: float, model: ObservationModel) -> tuple[Float64, Fl
 
 @njit(cache=True)
 def _log_ratios(
-    observed: Landmarks, tracks: Int64, matched: Float64, expected: Expected, aways: Float64, weights: Float64,
+    observed: Landmarks,
+    tracks: Int64,
+    matched: Float64,
+    expected: Expected,
+    aways: Float64,
+    weights: Float64,
     model: ObservationModel,
 ) -> Float64:
     states = len(expected.starts) - 1
@@ -176,8 +191,15 @@ def _log_ratios(
 
 @njit(cache=True)
 def _log_pairings(
-    observed: Landmarks, tracks: Int64, matched: Float64, landmarks: Landmarks, begin: int, end: int, away: float,
-    model: ObservationModel, row: Float64,
+    observed: Landmarks,
+    tracks: Int64,
+    matched: Float64,
+    landmarks: Landmarks,
+    begin: int,
+    end: int,
+    away: float,
+    model: ObservationModel,
+    row: Float64,
 ) -> float:
     """Log of the sum over all pairings, the product over the tracks."""
     total, own = 0.0, begin
@@ -193,8 +215,15 @@ def _log_pairings(
 
 @njit(cache=True)
 def _forward(
-    observed: Landmarks, matched: Float64, landmarks: Landmarks, own: int, first: int, count: int, away: float,
-    model: ObservationModel, row: Float64,
+    observed: Landmarks,
+    matched: Float64,
+    landmarks: Landmarks,
+    own: int,
+    first: int,
+    count: int,
+    away: float,
+    model: ObservationModel,
+    row: Float64,
 ) -> float:
     """Take one more expected landmark into the sums over pairings of it and those before; return what was scaled off.
 

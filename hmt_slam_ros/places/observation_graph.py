@@ -25,9 +25,15 @@ TRACKS = 8
 5 left, 6 back, 7 right."""
 
 TRACK_NAMES = (
-    "left corner", "right corner", "left convex corner", "right convex corner", "opening ahead", "opening left",
-    "opening back", "opening right",
-)  # fmt: skip
+    "left corner",
+    "right corner",
+    "left convex corner",
+    "right convex corner",
+    "opening ahead",
+    "opening left",
+    "opening back",
+    "opening right",
+)
 """What the tracks are called."""
 
 CONVEX = 2
@@ -109,18 +115,23 @@ def _within(landmarks: Landmarks, positions: Float64, places: Places) -> Landmar
 def chosen(landmarks: Landmarks, which: Bool | Int64 | slice) -> Landmarks:
     """Some of a list."""
     return Landmarks(
-        landmarks.tracks[which], landmarks.along[which], landmarks.forms[which], landmarks.variances[which],
+        landmarks.tracks[which],
+        landmarks.along[which],
+        landmarks.forms[which],
+        landmarks.variances[which],
         landmarks.probabilities[which],
-    )  # fmt: skip
+    )
 
 
 def one_after_the_other(lists: Sequence[Landmarks]) -> Landmarks:
     """Several lists, each in its own order."""
     return Landmarks(
-        np.concatenate([each.tracks for each in lists]), np.concatenate([each.along for each in lists]),
-        np.concatenate([each.forms for each in lists]), np.concatenate([each.variances for each in lists]),
+        np.concatenate([each.tracks for each in lists]),
+        np.concatenate([each.along for each in lists]),
+        np.concatenate([each.forms for each in lists]),
+        np.concatenate([each.variances for each in lists]),
         np.concatenate([each.probabilities for each in lists]),
-    )  # fmt: skip
+    )
 
 
 def joined(lists: Sequence[Landmarks]) -> Landmarks:

@@ -125,9 +125,7 @@ def numbered(watch: Watch, numbers: Mapping[int, int]) -> WatchState:
         for pair, joint in watch.joints.items()
     }
     graphs = {area: numbers[id(graph)] for area, graph in watch.graphs.items()}
-    return WatchState(
-        watch.area, graphs, watch.own, watch.separate, watch.beyond, joints, watch.way, watch.parted
-    )  # fmt: skip
+    return WatchState(watch.area, graphs, watch.own, watch.separate, watch.beyond, joints, watch.way, watch.parted)
 
 
 def watch_of(state: WatchState, graphs: Sequence[OverlapGraph]) -> Watch:

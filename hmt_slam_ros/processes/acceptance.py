@@ -106,9 +106,7 @@ class Acceptance:
         }
         return list(({r.keyframe: r for r in relabelled} | moved).values()), before
 
-    def _aligned(
-        self, hybrid_map: HybridMap, scans: Scans, seen: Observation
-    ) -> tuple[Observation, list[Relabelled]]:
+    def _aligned(self, hybrid_map: HybridMap, scans: Scans, seen: Observation) -> tuple[Observation, list[Relabelled]]:
         """A closure that was found by matching areas, finely aligned."""
         if not seen.closure:
             return seen, []
@@ -116,9 +114,7 @@ class Acceptance:
             return self._joined(hybrid_map, scans, seen)
         return self._linked(hybrid_map, scans, seen), []
 
-    def _joined(
-        self, hybrid_map: HybridMap, scans: Scans, seen: Observation
-    ) -> tuple[Observation, list[Relabelled]]:
+    def _joined(self, hybrid_map: HybridMap, scans: Scans, seen: Observation) -> tuple[Observation, list[Relabelled]]:
         """The keyframes that joined a known area, moved to where their scans fit the area's own, and the arc likewise.
 
         Keyframes that the robot stored in the area since then are on neither side: they were matched against both.

@@ -131,9 +131,7 @@ class _Layer:
         before = self.on
         if before:
             self.stay(step.before, step.event)
-            self.arcs |= {
-                pair: step.before for pair in step.arcs if step.before in pair and pair != self.closure.pair
-            }
+            self.arcs |= {pair: step.before for pair in step.arcs if step.before in pair and pair != self.closure.pair}
         if step.before != step.after:
             self.on, self.since = self._crossed(step), step.event
         if self.on:
@@ -212,9 +210,7 @@ def _taken_back(account: Account, k: int) -> Account:
     back, hybrid_map = Return(closure.undo, account.hybrid_map), account.hybrid_map.branch()
     back.keyframes(hybrid_map)
     back.arcs(hybrid_map, measured)
-    later = (
-        replace(other, pose=back.arc(other.near, other.far, other.pose)) for other in account.closures[k + 1 :]
-    )
+    later = (replace(other, pose=back.arc(other.near, other.far, other.pose)) for other in account.closures[k + 1 :])
     closures = (*account.closures[:k], replace(closure, undo=None), *later)
     found = replace(account, hybrid_map=hybrid_map, closures=closures)
     return found.moved(account.area, back.at(account.area, account.pose))

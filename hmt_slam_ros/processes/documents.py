@@ -68,9 +68,15 @@ class KeyframeHead:
         scan = keyframe.scan
         geometry = ScanGeometry(**{entry.name: getattr(scan, entry.name) for entry in fields(ScanGeometry)})
         return cls(
-            keyframe.sequence, geometry, keyframe.travelled, keyframe.leaves, keyframe.carried, keyframe.place,
-            keyframe.mapping, keyframe.outdated,
-        )  # fmt: skip
+            keyframe.sequence,
+            geometry,
+            keyframe.travelled,
+            keyframe.leaves,
+            keyframe.carried,
+            keyframe.place,
+            keyframe.mapping,
+            keyframe.outdated,
+        )
 
     def with_ranges(self, ranges: NDArray[np.float32]) -> Keyframe:
         """The keyframe.
@@ -80,9 +86,15 @@ class KeyframeHead:
         geometry = {entry.name: getattr(self.scan, entry.name) for entry in fields(self.scan)}
         scan = Scan(ranges=ranges, **geometry)
         return Keyframe(
-            self.sequence, scan, self.travelled, self.leaves, self.carried, self.place, self.mapping,
+            self.sequence,
+            scan,
+            self.travelled,
+            self.leaves,
+            self.carried,
+            self.place,
+            self.mapping,
             self.outdated,
-        )  # fmt: skip
+        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -129,20 +129,39 @@ class LiveHypothesis:
         own = state.grid or state.lines
         assert own is not None
         return cls(
-            filter_of(mapping, own), mapping.configuration.filter, state.event_pose, state.moved,
-            state.information, state.error, state.anchor, state.fresh.by_keyframe(), state.placed.by_keyframe(),
-            state.drift, list(state.trail), state.contradicted, state.looks,
-        )  # fmt: skip
+            filter_of(mapping, own),
+            mapping.configuration.filter,
+            state.event_pose,
+            state.moved,
+            state.information,
+            state.error,
+            state.anchor,
+            state.fresh.by_keyframe(),
+            state.placed.by_keyframe(),
+            state.drift,
+            list(state.trail),
+            state.contradicted,
+            state.looks,
+        )
 
     def state(self) -> LiveState:
         """All that is remembered; tables of grids name patches by their numbers in the pool."""
         own = self.filter.state
         return LiveState(
-            own if isinstance(own, FilterState) else None, None if isinstance(own, FilterState) else own,
-            self.event_pose, self.moved, self.information, self.error,
-            self.anchor, KeyframeCovariances.of(self.fresh), KeyframeCovariances.of(self.placed), self.drift,
-            tuple(self.trail), self.contradicted, self.looks,
-        )  # fmt: skip
+            own if isinstance(own, FilterState) else None,
+            None if isinstance(own, FilterState) else own,
+            self.event_pose,
+            self.moved,
+            self.information,
+            self.error,
+            self.anchor,
+            KeyframeCovariances.of(self.fresh),
+            KeyframeCovariances.of(self.placed),
+            self.drift,
+            tuple(self.trail),
+            self.contradicted,
+            self.looks,
+        )
 
     def branch(self, hypothesis: int) -> LiveHypothesis:
         """A child with its own filter, in the same state."""
@@ -177,7 +196,12 @@ class LiveHypothesis:
         return self.filter.experience.judge(self.filter.compared(sighting)).doubt > _CONTRADICTING
 
     def event(
-        self, sequence: int, sighting: Sighting, *, arriving: bool = False, storing: bool = True,
+        self,
+        sequence: int,
+        sighting: Sighting,
+        *,
+        arriving: bool = False,
+        storing: bool = True,
         wanted: Callable[[], bool] | None = None,
     ) -> LeafEstimate:
         """One filter step with a keyframe's scan, which enters the map where it adds something new.
@@ -187,7 +211,7 @@ class LiveHypothesis:
         :param arriving: whether nothing tells how the robot came there: the scan is matched with nothing.
         :param storing: whether the hypothesis's map may change.
         :param wanted: asked after the filter step whether the scan adds something; a new place does if None.
-        """  # fmt: skip
+        """
         if arriving:
             unmoved, nothing = np.zeros(3), np.zeros((3, 3))
             step = FilterStep(unmoved, _NO_ERROR, nothing, float(len(self.filter.poses)), False)

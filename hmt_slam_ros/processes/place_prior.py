@@ -70,9 +70,7 @@ class PlacePrior:
         self._views = views
         self._between_looks = max(1, configuration.tsbi.recheck_keyframes - 1)
 
-    def weighed(
-        self, where: Whereabouts, hybrid_map: HybridMap, poses: Mapping[int, Pose], before: int
-    ) -> Whereabouts:
+    def weighed(self, where: Whereabouts, hybrid_map: HybridMap, poses: Mapping[int, Pose], before: int) -> Whereabouts:
         """Places with what landmarks say of them.
 
         :param poses: {keyframe: ``reference_T_base``} of what the robot saw.
@@ -206,9 +204,7 @@ def _others(hybrid_map: HybridMap, newest: Pose, before: int) -> Iterator[Place]
     :param newest: ``reference_T_base`` of the newest keyframe, with which it would stand there, shape (3,).
     """
     known = [
-        (area, pose)
-        for area in hybrid_map.area_ids()
-        for k, pose in sorted(_before(hybrid_map, area, before).items())
+        (area, pose) for area in hybrid_map.area_ids() for k, pose in sorted(_before(hybrid_map, area, before).items())
     ]
     back = se2.inverse(newest)
     for n in np.unique(np.linspace(0, len(known) - 1, _OTHERS).round().astype(np.int64)).tolist():

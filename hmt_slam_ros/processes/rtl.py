@@ -100,9 +100,14 @@ class Rtl:
     def state(self) -> RtlState:
         """All that RTL knows, as a value."""
         return RtlState(
-            tuple(self._readings), self._newest, self._estimate, self._start, self._areas.areas, self._area_pose,
+            tuple(self._readings),
+            self._newest,
+            self._estimate,
+            self._start,
+            self._areas.areas,
+            self._area_pose,
             self._ambiguity,
-        )  # fmt: skip
+        )
 
     def handle(self, message: Message) -> list[Message]:
         """Take in one message; an odometry reading is answered with the pose at its stamp, once one is known."""
@@ -182,9 +187,7 @@ class Rtl:
             se2.between(start.smooth, now.smooth),
             path_covariance(now.distance - start.distance, min(now.angle - start.angle, math.pi), self._motion),
         )
-        return [
-            RealTimePose(now.stamp, estimate.area, self._area_pose, estimate.pose, since, now.raw, self._ambiguity)
-        ]
+        return [RealTimePose(now.stamp, estimate.area, self._area_pose, estimate.pose, since, now.raw, self._ambiguity)]
 
 
 def _reset_notice(stamp: int, distance: float, angle: float) -> Notice:

@@ -129,10 +129,22 @@ class MetricSlam:
         """All that metric SLAM knows, as a value."""
         live, patches = self._without_pool()
         return SlamState(
-            self._replica.state, self._motion.state, self._watch.state, self._queue.state, patches,
-            live, self._events, self._waiting, self._travelled, self._scans, self._dropped, self._first_of_trail,
-            self._arriving, self._lost, self._place,
-        )  # fmt: skip
+            self._replica.state,
+            self._motion.state,
+            self._watch.state,
+            self._queue.state,
+            patches,
+            live,
+            self._events,
+            self._waiting,
+            self._travelled,
+            self._scans,
+            self._dropped,
+            self._first_of_trail,
+            self._arriving,
+            self._lost,
+            self._place,
+        )
 
     def _without_pool(self) -> tuple[dict[int, LiveState], PatchState | None]:
         """The live hypotheses, with the patches of their grids, whose numbers are those in the tables."""
@@ -270,16 +282,17 @@ class MetricSlam:
         news: list[tuple[News, float]] = []
         leaves = tuple(
             live.event(
-                sequence, sighting, arriving=self._arriving, storing=storing,
+                sequence,
+                sighting,
+                arriving=self._arriving,
+                storing=storing,
                 wanted=partial(self._is_news, live, scan, news) if self._lifelong else None,
             )
             for live in self._live.values()
-        )  # fmt: skip
+        )
         self._motion.keyframe(self._best.moved, self._best.information)
         carried, place = self._arriving and sequence > 0, self._place
-        keyframe = Keyframe(
-            sequence, scan, self._travelled, leaves, carried, place, self.mapping, outdated(news)
-        )  # fmt: skip
+        keyframe = Keyframe(sequence, scan, self._travelled, leaves, carried, place, self.mapping, outdated(news))
         self._replica.add(keyframe)
         self._events += 1
         # With the scan of its arrival the robot is put where somebody says, with the next one it is looked for there,

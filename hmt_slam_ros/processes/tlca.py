@@ -84,9 +84,15 @@ class PathState:
     def path(self) -> _Path:
         """The path."""
         return _Path(
-            self.version, self.parted, self.held, self.definite, self.observations, dict(self.witnesses),
-            history_of(self.past.steps), self.past.closures,
-        )  # fmt: skip
+            self.version,
+            self.parted,
+            self.held,
+            self.definite,
+            self.observations,
+            dict(self.witnesses),
+            history_of(self.past.steps),
+            self.past.closures,
+        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -104,9 +104,14 @@ class Tsbi:
     def state(self) -> TsbiState:
         """All that TSBI knows between two keyframe events, as a value."""
         return TsbiState(
-            self._replica.state, self._branching.state, dict(self._notes), self._next_hypothesis, self._unexamined,
-            self._global_poses.areas, self._reopened,
-        )  # fmt: skip
+            self._replica.state,
+            self._branching.state,
+            dict(self._notes),
+            self._next_hypothesis,
+            self._unexamined,
+            self._global_poses.areas,
+            self._reopened,
+        )
 
     @property
     def localization(self) -> Localization:
@@ -307,10 +312,18 @@ class Tsbi:
             self._next_hypothesis += 1
         lost, newest = child.notes.lost, -1 if self._keyframe is None else self._keyframe.sequence
         return Leaf(
-            hypothesis, child.parent, probability, child.area, child.rebase, child.relabelled, child.arcs,
-            withdrawn=child.withdrawn, merged=child.merged, lost=lost is not None,
+            hypothesis,
+            child.parent,
+            probability,
+            child.area,
+            child.rebase,
+            child.relabelled,
+            child.arcs,
+            withdrawn=child.withdrawn,
+            merged=child.merged,
+            lost=lost is not None,
             arriving=lost is not None and lost > newest,
-        )  # fmt: skip
+        )
 
     def _loaded(self, leaf: Leaf, child: Child) -> Leaf:
         """The leaf with the areas that its local map must hold, where that is to be loaded anew."""

@@ -150,7 +150,7 @@ def looked_for(branching: Branching, parent: Parent) -> Branches:
     log_weight = noted.log_weight + math.log(probability)
     notes = replace(
         noted.notes, lost=None, stay=None, told=None, sighted=None, found=located.area, claim=None, credit=0.0
-    )  # fmt: skip
+    )
     found = Child(parent.hypothesis, log_weight, parent.area, notes, arcs=(arc,), reload=True)
     # What speaks for the place from here on is the other's.
     still_lost = replace(sighted, credit=None)

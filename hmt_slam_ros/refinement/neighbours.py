@@ -68,7 +68,7 @@ def neighbours(
     allowed = np.array([[other in linked[area] for other in known.tolist()] for area in known.tolist()])
     rows = _nearest(
         poses, np.searchsorted(known, areas), seen_from, np.searchsorted(known, seen_from_areas), allowed, reach, count
-    )  # fmt: skip
+    )
     return [own[own >= 0] for own in rows]
 
 

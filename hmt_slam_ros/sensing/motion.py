@@ -49,7 +49,6 @@ class Step(NamedTuple):
         before = carried(self.covariance, other.increment)
         return Step(se2.compose(self.increment, other.increment), before + other.covariance)
 
-
     def and_also(self, other: Step) -> Step:
         """The same motion, of which two sources tell independently: the product of both Gaussians."""
         gain = self.covariance @ inverse(self.covariance + other.covariance)
@@ -303,9 +302,15 @@ class MotionModel:
     def state(self) -> MotionState:
         """All that is known."""
         return MotionState(
-            self.odometry.readings, self.odometry_pose, self.noise.state, self._inertia.state, self._stamp, self._gap,
-            self._leg, self._step,
-        )  # fmt: skip
+            self.odometry.readings,
+            self.odometry_pose,
+            self.noise.state,
+            self._inertia.state,
+            self._stamp,
+            self._gap,
+            self._leg,
+            self._step,
+        )
 
     def predict(self, stamp: int) -> Prediction:
         """The motion from the last scan to the one at ``stamp``, ns; at the first scan, which sets the start, none."""

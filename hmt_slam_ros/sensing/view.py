@@ -77,9 +77,7 @@ def behind(view: View, points: Float64) -> Float64:
 
 
 @njit(cache=True)
-def _binned(
-    points: Float64, starts: Float64, first: float, step: float, count: int
-) -> tuple[Float64, Float64]:
+def _binned(points: Float64, starts: Float64, first: float, step: float, count: int) -> tuple[Float64, Float64]:
     """The nearest of points (n, 2), laser frame, in every direction, and the start of its beam."""
     ranges, begins = np.full(count, np.nan), np.zeros(count)
     for n in range(points.shape[0]):
@@ -99,9 +97,7 @@ def _direction(x: float, y: float, first: float, step: float, count: int) -> int
 
 
 @njit(cache=True)
-def _window(
-    point: Float64, laser: Float64, first: float, step: float, count: int
-) -> tuple[float, int, int]:
+def _window(point: Float64, laser: Float64, first: float, step: float, count: int) -> tuple[float, int, int]:
     """Distance of a point from the laser, and the first and the last direction that are asked; 0, -1 for none."""
     dx, dy = point[0] - laser[0], point[1] - laser[1]
     cos, sin = math.cos(laser[2]), math.sin(laser[2])

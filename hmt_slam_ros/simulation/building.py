@@ -74,8 +74,7 @@ class Building:
     def placed(self, pose: NDArray[np.float64]) -> Building:
         """The same building, its origin at a pose (3,)."""
         pieces, rooms = (
-            np.concatenate((se2.compose(pose, own[:, :3]), own[:, 3:]), axis=1)
-            for own in (self.furniture, self.rooms)
+            np.concatenate((se2.compose(pose, own[:, :3]), own[:, 3:]), axis=1) for own in (self.furniture, self.rooms)
         )
         places = {name: se2.compose(pose, place) for name, place in self.places.items()}
         states = self.states._replace(poses=se2.compose(pose, self.states.poses))

@@ -31,23 +31,22 @@ class Family:
 FAMILIES: dict[str, Family] = {
     "office": Family(corridors.office, "Offices with furniture on both sides of a ring of corridors."),
     "busy": Family(
-        corridors.office, "The same with people in the corridors, and furniture that is moved between visits.",
+        corridors.office,
+        "The same with people in the corridors, and furniture that is moved between visits.",
         {"people": 6, "moved": 0.5},
     ),
     "nested": Family(
-        corridors.nested, "Loops inside loops, 0.5 km of corridors with niches; size=4 makes 2 km of them.",
+        corridors.nested,
+        "Loops inside loops, 0.5 km of corridors with niches; size=4 makes 2 km of them.",
         {"laps": 1},
     ),
     "grid": Family(corridors.grid, "Corridors that cross at equal distances and look all alike.", {"laps": 1}),
     "ring": Family(corridors.symmetric_ring, "A square ring of corridors whose four sides are alike."),
-    "straight": Family(
-        corridors.straight, "A ring with two long halls without any feature.", {"range": 10.0}
-    ),
-    "hall": Family(
-        halls.hall, "An open hall in whose middle the laser reaches nothing.", {"range": 8.0, "laps": 1}
-    ),
+    "straight": Family(corridors.straight, "A ring with two long halls without any feature.", {"range": 10.0}),
+    "hall": Family(halls.hall, "An open hall in whose middle the laser reaches nothing.", {"range": 8.0, "laps": 1}),
     "twins": Family(
-        halls.twins, "Two identical rooms; lost in a hall in between, the robot enters one of them again.",
+        halls.twins,
+        "Two identical rooms; lost in a hall in between, the robot enters one of them again.",
         {"range": 4.0, "laps": 1},
     ),
     "institute": Family(
@@ -56,4 +55,4 @@ FAMILIES: dict[str, Family] = {
         "finds others open.",
         {"laps": 1, "people": 4, "field_of_view": 360.0, "beams": 720},
     ),
-}  # fmt: skip
+}

@@ -27,10 +27,20 @@ def hall(draw: np.random.Generator, settings: Settings) -> Building:
     x, y = half_x - 2.5, half_y - 2.5
     middle_x, middle_y = half_x - 11.0, half_y - 11.0
     route = [
-        (-x, -y), (-0.5 * x, -y), (-middle_x, -middle_y), (middle_x, -middle_y), (middle_x, middle_y), (0.5 * x, y),
-        (x, y), (x, 0.5 * y), (middle_x, -middle_y), (-middle_x, -middle_y), (-middle_x, middle_y), (-x, -0.5 * y),
         (-x, -y),
-    ]  # fmt: skip
+        (-0.5 * x, -y),
+        (-middle_x, -middle_y),
+        (middle_x, -middle_y),
+        (middle_x, middle_y),
+        (0.5 * x, y),
+        (x, y),
+        (x, 0.5 * y),
+        (middle_x, -middle_y),
+        (-middle_x, -middle_y),
+        (-middle_x, middle_y),
+        (-x, -0.5 * y),
+        (-x, -y),
+    ]
     return Building(plan.walls(), np.array(route))
 
 
@@ -54,8 +64,20 @@ def twins(draw: np.random.Generator, settings: Settings) -> Building:
     far, behind = depth - 8.0, back - 0.5 * _BACK
     again = _OFF if draw.random() < 0.5 else -_OFF
     route = [
-        (-_OFF, 3.0), (-_OFF, behind), (_OFF, behind), (_OFF, 3.0), (_OFF, behind), (-_OFF, behind), (-_OFF, 8.0),
-        (0.0, 14.0), (0.0, far), (again, far), (again, behind), (-again, behind), (-again, 3.0), (-_OFF, 3.0),
-    ]  # fmt: skip
+        (-_OFF, 3.0),
+        (-_OFF, behind),
+        (_OFF, behind),
+        (_OFF, 3.0),
+        (_OFF, behind),
+        (-_OFF, behind),
+        (-_OFF, 8.0),
+        (0.0, 14.0),
+        (0.0, far),
+        (again, far),
+        (again, behind),
+        (-again, behind),
+        (-again, 3.0),
+        (-_OFF, 3.0),
+    ]
     places = {name: np.array([x, 0.0, -0.5 * np.pi]) for name, x in (("first", -_OFF), ("second", _OFF))}
     return Building(plan.walls(), np.array(route), places=places)

@@ -147,9 +147,7 @@ def _opened(draw: np.random.Generator, floor: Floor, sites: Sequence[Site], sett
     return set(opened)
 
 
-def _filled(
-    floor: Floor, sites: Sequence[Site], opened: Sequence[int], order: Sequence[int], wanted: int
-) -> list[int]:
+def _filled(floor: Floor, sites: Sequence[Site], opened: Sequence[int], order: Sequence[int], wanted: int) -> list[int]:
     """Open more doors in an order, none near to another, a crossing or the end of its hallway, up to as many."""
     filled = list(opened)
     for k in order:
@@ -169,9 +167,18 @@ def _route(floor: Floor, sites: Sequence[Site], rooms: Sequence[Room]) -> list[P
     for site, room in sorted(zip(sites, rooms, strict=True), key=lambda pair: pair[0].door):
         visits[site.hallway].extend((room.front, room.inside, room.front))
     return [
-        (-end, y0), *visits[0], (end, y0), (x1, y0), (x1, y1), (end, y1), *visits[1][::-1], (-end, y1), (x0, y1),
-        (x0, y0), (-end, y0),
-    ]  # fmt: skip
+        (-end, y0),
+        *visits[0],
+        (end, y0),
+        (x1, y0),
+        (x1, y1),
+        (end, y1),
+        *visits[1][::-1],
+        (-end, y1),
+        (x0, y1),
+        (x0, y0),
+        (-end, y0),
+    ]
 
 
 def _states(floor: Floor, sites: Sequence[Site], rooms: Sequence[Room]) -> States:

@@ -18,8 +18,10 @@ class Settings:
 
     seed: int = parameter(0, "Seed of building, noise, people and furniture.", low=0, high=2**31 - 1)
     visit: int = parameter(
-        0, "Which visit of the building it is: from 1 on, furniture was moved and doors were closed since the first.",
-        low=0, high=1000,
+        0,
+        "Which visit of the building it is: from 1 on, furniture was moved and doors were closed since the first.",
+        low=0,
+        high=1000,
     )
     changed: float = parameter(
         0.5, "Probability that a piece of furniture was moved, a door closed, before a later visit.", low=0.0, high=1.0
@@ -55,8 +57,10 @@ class Settings:
         0.0, "Probability that a piece of furniture is moved while the robot does not see it.", low=0.0, high=1.0
     )
     carried: float = parameter(
-        0.0, "Share of the drive after which the robot is carried elsewhere, unknown to its wheels; 0 for never.",
-        low=0.0, high=1.0,
+        0.0,
+        "Share of the drive after which the robot is carried elsewhere, unknown to its wheels; 0 for never.",
+        low=0.0,
+        high=1.0,
     )
     to: float = parameter(0.0, "Share of the drive from which it goes on then.", low=0.0, high=1.0)
     turned: float = parameter(

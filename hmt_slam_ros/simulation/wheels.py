@@ -31,9 +31,7 @@ def noisy_increments(
     return noised(increments, factor, random.standard_normal(increments.shape))
 
 
-def noised(
-    increments: NDArray[np.float64], factor: float, draws: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def noised(increments: NDArray[np.float64], factor: float, draws: NDArray[np.float64]) -> NDArray[np.float64]:
     """What `noisy_increments` makes of standard normal draws (n, 3)."""
     motion = Motion()
     measured = increments

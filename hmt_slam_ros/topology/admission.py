@@ -94,7 +94,10 @@ class Admission:
         return entry_bounds(found, query.belief, lever, reach, self._options.prior_scale, math.sqrt(self.gate))
 
     def candidates(
-        self, hybrid_map: HybridMap, query: Query, compared: Mapping[int, Collection[int]],
+        self,
+        hybrid_map: HybridMap,
+        query: Query,
+        compared: Mapping[int, Collection[int]],
         within: Mapping[int, PoseGaussian],
     ) -> dict[int, Candidate]:
         """The known areas within reach with which most of the query was not compared yet."""
@@ -114,9 +117,7 @@ class Admission:
         prior = belief.inverse().compose(query.belief)
         return PoseGaussian(prior.mean, self._options.prior_scale**2 * prior.covariance)
 
-    def _within_reach(
-        self, hybrid_map: HybridMap, area: int, prior: PoseGaussian, poses: Mapping[int, Pose]
-    ) -> bool:
+    def _within_reach(self, hybrid_map: HybridMap, area: int, prior: PoseGaussian, poses: Mapping[int, Pose]) -> bool:
         """Whether a keyframe of the area is near enough to one of the query's, somewhere within the gate."""
         asked = se2.compose(prior.mean, stacked(poses))[:, :2]
         lever = float(np.hypot(*(asked - prior.mean[:2]).T).max())

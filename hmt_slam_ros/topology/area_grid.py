@@ -52,9 +52,13 @@ class GridModel:
         """As configured."""
         options = configuration.tsbi
         return cls(
-            options.search_cell, options.surface_sigma, options.surface_ratio, options.free_ratio,
-            configuration.local_map.max_range, options.sample_spacing,
-        )  # fmt: skip
+            options.search_cell,
+            options.surface_sigma,
+            options.surface_ratio,
+            options.free_ratio,
+            configuration.local_map.max_range,
+            options.sample_spacing,
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,9 +225,7 @@ def _mark_free(free: NDArray[np.bool_], origin: Points, cell: float, lasers: Poi
 
 
 @njit(cache=True)
-def _lower_distances(
-    distance2: NDArray[np.float32], origin: Points, cell: float, points: Points, reach: float
-) -> None:
+def _lower_distances(distance2: NDArray[np.float32], origin: Points, cell: float, points: Points, reach: float) -> None:
     """Lower every cell near a point to the squared distance from its centre to that point, m^2."""
     span = int(np.ceil(reach / cell))
     rows, columns = distance2.shape

@@ -99,7 +99,11 @@ class Match:
 
 
 def match(
-    query: AreaGrid, candidate: AreaGrid, prior: PoseGaussian, settings: MatchSettings, bounds: Float64 | None = None,
+    query: AreaGrid,
+    candidate: AreaGrid,
+    prior: PoseGaussian,
+    settings: MatchSettings,
+    bounds: Float64 | None = None,
     ground: Ground | None = None,
 ) -> Match:
     """Find all poses of the query in the candidate that the prior admits.
@@ -110,7 +114,7 @@ def match(
     :param bounds: shape (2, 2), the smallest and the largest (x, y) in the candidate where the middle of the query's
         points may be, m; what lies beyond is not searched.
     :param ground: where one of the query's keyframes has to be, if anywhere.
-    """  # fmt: skip
+    """
     searched = _searched(query, candidate, prior, settings, bounds, ground)
     if searched is None:
         return Match()
@@ -134,9 +138,13 @@ def best_pose(
 
 
 def _searched(
-    query: AreaGrid, candidate: AreaGrid, prior: PoseGaussian, settings: MatchSettings, bounds: Float64 | None = None,
+    query: AreaGrid,
+    candidate: AreaGrid,
+    prior: PoseGaussian,
+    settings: MatchSettings,
+    bounds: Float64 | None = None,
     ground: Ground | None = None,
-) -> _Searched | None:  # fmt: skip
+) -> _Searched | None:
     if not query.points.size or not candidate.points.size:
         return None
     # About the middle of the samples turns and shifts are least correlated, and the lattice of turns coarsest.
@@ -148,13 +156,18 @@ def _searched(
     window = make_window(prior.mean, prior.covariance, candidate.cell, turn, settings.gate, bounds)
     surface, log_cell = _fine(candidate), _log_cell_mass(prior, candidate.cell, turn)
     back_points = _within_reach(candidate.points[: None if settings.reverse else 0], window, centred)
-    threshold = max(
-        math.log(_NEGLIGIBLE) - min(0.0, log_cell), settings.temper * settings.least * len(query.points)
-    )
+    threshold = max(math.log(_NEGLIGIBLE) - min(0.0, log_cell), settings.temper * settings.least * len(query.points))
     cells = search(
-        window, _coarse(candidate), centred.points, _coarse(centred), back_points, settings.temper, threshold,
-        settings.margin, None if ground is None else ground._replace(keyframes=ground.keyframes - middle),
-    )  # fmt: skip
+        window,
+        _coarse(candidate),
+        centred.points,
+        _coarse(centred),
+        back_points,
+        settings.temper,
+        threshold,
+        settings.margin,
+        None if ground is None else ground._replace(keyframes=ground.keyframes - middle),
+    )
     if not cells.score.size:
         return None
     problem = _Problem(surface, centred.points, window, prior, settings, to_middle)
@@ -287,9 +300,7 @@ def _radian_step(problem: _Problem, distance: float) -> float:
     return distance / max(radius, distance)
 
 
-def _spread(
-    problem: _Problem, peak: Float64, masses: Float64, poses: Float64, explained: Float64
-) -> Float64:
+def _spread(problem: _Problem, peak: Float64, masses: Float64, poses: Float64, explained: Float64) -> Float64:
     """How much wider the cells of a cluster lie around the peak than ``explained`` and the lattice account for."""
     away = se2.log(se2.between(peak, poses))
     weights = np.exp(masses - np.logaddexp.reduce(masses))

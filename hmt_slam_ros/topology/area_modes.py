@@ -109,9 +109,13 @@ class _Points(NamedTuple):
 def _points(samples: Float64) -> _Points:
     n = samples.shape[0]
     return _Points(
-        samples[:, 0].copy(), samples[:, 1].copy(), np.empty(n, np.int32), np.empty(n, np.int32), np.empty(n),
+        samples[:, 0].copy(),
+        samples[:, 1].copy(),
+        np.empty(n, np.int32),
+        np.empty(n, np.int32),
         np.empty(n),
-    )  # fmt: skip
+        np.empty(n),
+    )
 
 
 @njit(cache=True)

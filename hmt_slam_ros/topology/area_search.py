@@ -23,7 +23,7 @@ from hmt_slam_ros.topology.area_bounds import (
     bounds_of_quarters,
     pyramid,
     sample_cells,
-)  # fmt: skip
+)
 from hmt_slam_ros.topology.area_ground import Ground, Passable, anywhere, may_be, passable
 from hmt_slam_ros.topology.area_reverse import Reverse, contradiction, points_of_block, reverse_check
 from hmt_slam_ros.topology.area_window import Window, prior_bound
@@ -61,8 +61,15 @@ class _Task(NamedTuple):
 
 
 def search(
-    window: Window, surface: Surface, samples: Float64, back: Surface, back_samples: Float64, temper: float,
-    threshold: float, margin: float, ground: Ground | None = None,
+    window: Window,
+    surface: Surface,
+    samples: Float64,
+    back: Surface,
+    back_samples: Float64,
+    temper: float,
+    threshold: float,
+    margin: float,
+    ground: Ground | None = None,
 ) -> Cells:
     """All cells of the window whose score is within ``margin`` of the best and not below ``threshold``.
 
@@ -79,10 +86,15 @@ def search(
     edge = max(1, int((window.last - window.first).max()))
     height = min(_HIGHEST, max(_LOWEST, int(np.ceil(np.log2(edge))) - 2))
     task = _Task(
-        window, surface, pyramid(surface.log_ratio, height), sample_cells(window, surface, samples),
-        passable(ground or anywhere(window.cell), window, height), reverse_check(window, back, back_samples), temper,
+        window,
+        surface,
+        pyramid(surface.log_ratio, height),
+        sample_cells(window, surface, samples),
+        passable(ground or anywhere(window.cell), window, height),
+        reverse_check(window, back, back_samples),
+        temper,
         margin,
-    )  # fmt: skip
+    )
     found = _search(task, height, threshold)
     kept = found[found[:, 3] >= max(threshold, found[:, 3].max(initial=-np.inf) - margin)]
     return Cells(kept[:, :3].astype(np.int64), kept[:, 3].copy(), kept[:, 4].copy())

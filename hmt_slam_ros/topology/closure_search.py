@@ -172,8 +172,14 @@ class ClosureSearch:
         return KNOWN.log_ratio(grid.agreement(points, pose), MAPS_USUAL)
 
     def compare(
-        self, hybrid_map: HybridMap, area: int, query: Query, compared: Mapping[int, Collection[int]],
-        excluded: Collection[int], most: int, only: Collection[int] = (),
+        self,
+        hybrid_map: HybridMap,
+        area: int,
+        query: Query,
+        compared: Mapping[int, Collection[int]],
+        excluded: Collection[int],
+        most: int,
+        only: Collection[int] = (),
     ) -> Comparison:
         """Prior and evidence of all admitted areas.
 
@@ -182,7 +188,7 @@ class ClosureSearch:
         :param excluded: areas that are neither candidates nor part of a candidate's map.
         :param most: this many areas are examined at most, those that the keyframes are most probably in.
         :param only: if there are any, none but these.
-        """  # fmt: skip
+        """
         within, distant, elsewhere = self.admission.divided(hybrid_map, area, query, excluded)
         if only:
             within, distant = {known: prior for known, prior in within.items() if known in only}, {}
@@ -269,7 +275,12 @@ class ClosureSearch:
         return [mode for mode, owner in zip(modes, owners, strict=True) if owner == place.area]
 
     def _fits(
-        self, hybrid_map: HybridMap, place: Place, candidate: Candidate, modes: Sequence[Mode], entered: Entry,
+        self,
+        hybrid_map: HybridMap,
+        place: Place,
+        candidate: Candidate,
+        modes: Sequence[Mode],
+        entered: Entry,
         pi: float,
     ) -> Iterator[Fit]:
         """The modes share the probability of the candidate's place by their masses.
@@ -277,7 +288,7 @@ class ClosureSearch:
         The probability of the place is that of all poses in it. A mode that is farther off than these usually are has
         less, as the prior has there. Where a loop that the hypothesis closed has the robot in that place anyway, the
         fit was to be expected even if that loop is none.
-        """  # fmt: skip
+        """
         foretold = entered.share > 0.5 and bool(hybrid_map.claimed_closures)
         points = self._views.grid(candidate.fresh).points
         whole = np.logaddexp.reduce([mode.log_mass for mode in modes]) if modes else 0.0

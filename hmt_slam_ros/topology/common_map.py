@@ -110,9 +110,12 @@ class CommonMap:
         table = self._table
         if row >= len(table.means):
             table = self._table = ArcTable(
-                table.first, _doubled(table.following), _doubled(table.beyond), _doubled(table.means),
+                table.first,
+                _doubled(table.following),
+                _doubled(table.beyond),
+                _doubled(table.means),
                 _doubled(table.covariances),
-            )  # fmt: skip
+            )
         for side, (area, other) in enumerate((pair, pair[::-1]), 2 * row):
             table.beyond[side], table.following[side] = other, table.first[area]
             table.first[area] = side

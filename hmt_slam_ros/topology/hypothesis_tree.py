@@ -153,9 +153,17 @@ class LeafNotes:
         kept = {area: keyframes & covariances.keys() for area, keyframes in self.compared.items()}
         compared = {area: keyframes for area, keyframes in kept.items() if keyframes}
         return LeafNotes(
-            covariances, compared, doubts=self.doubts, spots=self.spots, lost=self.lost, stay=self.stay,
-            told=self.told, sighted=self.sighted, claim=self.claim, credit=self.credit,
-        )  # fmt: skip
+            covariances,
+            compared,
+            doubts=self.doubts,
+            spots=self.spots,
+            lost=self.lost,
+            stay=self.stay,
+            told=self.told,
+            sighted=self.sighted,
+            claim=self.claim,
+            credit=self.credit,
+        )
 
 
 def relative_covariance(
@@ -186,7 +194,11 @@ class Settled(NamedTuple):
 
 
 def settle(
-    log_weights: NDArray[np.float64], log_skipped: float, unexamined: float, most: int, least: float,
+    log_weights: NDArray[np.float64],
+    log_skipped: float,
+    unexamined: float,
+    most: int,
+    least: float,
     generator: np.random.Generator,
 ) -> Settled:
     """Normalise, drop what is tiny, reduce to N.
@@ -197,7 +209,7 @@ def settle(
         for it.
     :param most: N.
     :param least: probability below which a hypothesis is dropped.
-    """  # fmt: skip
+    """
     scale = np.logaddexp(np.logaddexp.reduce(log_weights), log_skipped)
     probabilities = (1.0 - unexamined) * np.exp(log_weights - scale)
     probabilities[(probabilities < least) & (probabilities < probabilities.max())] = 0.0

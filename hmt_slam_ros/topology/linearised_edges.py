@@ -17,9 +17,7 @@ _SMALL_ANGLE, _SERIES_ANGLE = 1e-4, 1e-2
 
 
 @njit(cache=True)
-def linearised(
-    poses: Float64, sources: Int64, targets: Int64, measured: Float64
-) -> tuple[Float64, Float64, Float64]:
+def linearised(poses: Float64, sources: Int64, targets: Int64, measured: Float64) -> tuple[Float64, Float64, Float64]:
     """Residuals (m, 3) of the edges and their Jacobians (m, 3, 3) with respect to source and target.
 
     :param poses: shape (n, 3), of the nodes.

@@ -73,9 +73,8 @@ class Way:
         known.landmarks = list(self.openings)
         known.observe(pose, _openings(seen), rays)
         openings = tuple(
-            one for one in known.landmarks
-            if np.hypot(*(one.pose.mean[:2] - pose.mean[:2])) <= features.landmark_reach
-        )  # fmt: skip
+            one for one in known.landmarks if np.hypot(*(one.pose.mean[:2] - pose.mean[:2])) <= features.landmark_reach
+        )
         steps = (*self.steps, Step(event, pose.mean))[-_LATE - 1 :]
         passages = list(self.passages)
         for passage in _passed(steps, openings):

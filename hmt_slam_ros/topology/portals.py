@@ -82,9 +82,7 @@ def _same(one: Portal, other: Portal) -> bool:
     return one.areas == other.areas and float(np.hypot(*away)) < SAME
 
 
-def _passed(
-    hybrid_map: HybridMap, landmarks: Mapping[int, Sequence[Landmark]], features: Features
-) -> Iterator[Portal]:
+def _passed(hybrid_map: HybridMap, landmarks: Mapping[int, Sequence[Landmark]], features: Features) -> Iterator[Portal]:
     """The portal at every change of areas along the path that passes one."""
     poses = {area: hybrid_map.keyframes(area) for area in hybrid_map.area_ids()}
     own = {area: sorted(within) for area, within in poses.items()}

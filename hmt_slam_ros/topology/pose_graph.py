@@ -102,9 +102,7 @@ def optimise(
     return Solution(poses, covariances, state.cost, state.chi2, steps)
 
 
-def relative_covariances(
-    poses: NDArray[np.float64], edges: Edges, between: NDArray[np.int64]
-) -> NDArray[np.float64]:
+def relative_covariances(poses: NDArray[np.float64], edges: Edges, between: NDArray[np.int64]) -> NDArray[np.float64]:
     """Covariances of the poses of nodes j seen from nodes i, right tangent frame, shape (k, 3, 3).
 
     :param poses: shape (n, 3), that agree best with the edges.
@@ -158,9 +156,7 @@ class _System:
 
     def evaluate(self, poses: NDArray[np.float64]) -> _State:
         """Residuals, Jacobians and cost at given poses, shape (n, 3)."""
-        residuals, of_source, of_target = linearised(
-            poses, self._edges.sources, self._edges.targets, self._edges.poses
-        )
+        residuals, of_source, of_target = linearised(poses, self._edges.sources, self._edges.targets, self._edges.poses)
         chi2 = np.einsum("mi,mij,mj->m", residuals, self._information, residuals)
         return _State(residuals, of_source, of_target, chi2, float(chi2.sum()))
 

@@ -147,9 +147,17 @@ def _search(
                 place = low + np.searchsorted(own.end[low:high], there)
                 if place == high or own.end[place] != there:
                     last = _step(
-                        row, there, table.means[arc], table.covariances[arc], side % 2 == 1, cost, limit, seen, last,
+                        row,
+                        there,
+                        table.means[arc],
+                        table.covariances[arc],
+                        side % 2 == 1,
+                        cost,
+                        limit,
+                        seen,
+                        last,
                         queue,
-                    )  # fmt: skip
+                    )
             side = np.int64(table.following[side])
         seen.cost[row] = -1.0
     rows = rows[:count]
@@ -165,8 +173,16 @@ def _cheaper(seen: _Frontier, area: int, cost: float) -> bool:
 
 @njit(cache=True)
 def _step(
-    row: int, there: int, mean: Float64, covariance: Float64, backwards: bool, cost: float, limit: float,
-    seen: _Frontier, last: int, queue: list[tuple[float, int]],
+    row: int,
+    there: int,
+    mean: Float64,
+    covariance: Float64,
+    backwards: bool,
+    cost: float,
+    limit: float,
+    seen: _Frontier,
+    last: int,
+    queue: list[tuple[float, int]],
 ) -> int:
     """See an area over an arc from the area in ``row``; the last row that is in use."""
     if backwards:

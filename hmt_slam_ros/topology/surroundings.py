@@ -98,15 +98,19 @@ def entry_bounds(
     :param scale: factor on the deviations of the prior.
     :param deviations: how many deviations are admitted.
     """
-    return _entry_bounds(
-        found.means, found.covariances, query.mean, query.covariance, reach, lever, scale, deviations
-    )
+    return _entry_bounds(found.means, found.covariances, query.mean, query.covariance, reach, lever, scale, deviations)
 
 
 @njit(cache=True)
 def _entry_bounds(
-    means: Float64, covariances: Float64, mean: Float64, covariance: Float64, reach: Float64, lever: float,
-    scale: float, deviations: float,
+    means: Float64,
+    covariances: Float64,
+    mean: Float64,
+    covariance: Float64,
+    reach: Float64,
+    lever: float,
+    scale: float,
+    deviations: float,
 ) -> Float64:
     bounds = np.zeros(len(means))
     own = np.sqrt(covariance[0, 0] + covariance[1, 1])
@@ -151,9 +155,7 @@ def agreeing(
 class Views:
     """Grids and places, built from the keyframes' scans and kept while they are in use."""
 
-    def __init__(
-        self, scans: Mapping[int, Scan], model: GridModel, nearness: Nearness, kept: int = _KEPT
-    ) -> None:
+    def __init__(self, scans: Mapping[int, Scan], model: GridModel, nearness: Nearness, kept: int = _KEPT) -> None:
         """:param scans: {keyframe: scan}, which may grow.
 
         :param kept: size of the grids that are kept, bytes.
@@ -222,9 +224,7 @@ class Views:
         around = areas_around(hybrid_map, area, nearness, without)
         return self.place_of(hybrid_map, area, {other: belief.mean for other, belief in around.items()}, before)
 
-    def place_of(
-        self, hybrid_map: HybridMap, area: int, poses: Mapping[int, Pose], before: float = math.inf
-    ) -> Place:
+    def place_of(self, hybrid_map: HybridMap, area: int, poses: Mapping[int, Pose], before: float = math.inf) -> Place:
         """The place of ``area`` among the areas that stand at ``poses``, {other area: ``area_T_other``}."""
         keyframes: dict[int, Pose] = {}
         owners: list[int] = []

@@ -98,9 +98,7 @@ def entry(place: Place, belief: PoseGaussian, poses: NDArray[np.float64], radius
     return Entry(float(np.mean(inside)), float(np.median(distances)) if inside.any() else 0.0)
 
 
-def entry_bound(
-    known: NDArray[np.float64], belief: PoseGaussian, poses: NDArray[np.float64], radius: float
-) -> float:
+def entry_bound(known: NDArray[np.float64], belief: PoseGaussian, poses: NDArray[np.float64], radius: float) -> float:
     """No less than the share of :func:`entry`, whatever is around the area, from its keyframes' positions (k, 2) alone.
 
     One of the keyframes in question at least has to be near to one of the area's.
@@ -132,9 +130,7 @@ def _placed(
 
 
 @njit(cache=True)
-def _any_near(
-    positions: NDArray[np.float64], known: NDArray[np.float64], radius: float
-) -> NDArray[np.bool_]:
+def _any_near(positions: NDArray[np.float64], known: NDArray[np.float64], radius: float) -> NDArray[np.bool_]:
     """Which of n draws of m positions (n, m, 2) have one within ``radius`` of one of (k, 2), shape (n,)."""
     near = np.zeros(positions.shape[0], np.bool_)
     for n in range(positions.shape[0]):
@@ -164,9 +160,14 @@ def _owners(place: Place, positions: NDArray[np.float64], radius: float) -> NDAr
     """The area that most of the m positions (n, m, 2) belong to, shape (n,); of equals the smallest."""
     count, size = positions.shape[:2]
     nearest = _nearest_in_sight(
-        positions.reshape(-1, 2), place.positions, radius, place.grid.log_ratio, place.grid.free, place.grid.origin,
+        positions.reshape(-1, 2),
+        place.positions,
+        radius,
+        place.grid.log_ratio,
+        place.grid.free,
+        place.grid.origin,
         place.grid.cell,
-    )  # fmt: skip
+    )
     owners = np.where(nearest < 0, _NOWHERE, place.owners[nearest]).reshape(count, size)
     areas = np.unique(place.owners)
     votes = np.sum(owners[:, :, None] == areas, axis=1)
@@ -176,8 +177,13 @@ def _owners(place: Place, positions: NDArray[np.float64], radius: float) -> NDAr
 
 @njit(cache=True)
 def _nearest_in_sight(
-    positions: NDArray[np.float64], keyframes: NDArray[np.float64], radius: float, log_ratio: NDArray[np.float32],
-    free: NDArray[np.bool_], origin: NDArray[np.float64], cell: float,
+    positions: NDArray[np.float64],
+    keyframes: NDArray[np.float64],
+    radius: float,
+    log_ratio: NDArray[np.float32],
+    free: NDArray[np.bool_],
+    origin: NDArray[np.float64],
+    cell: float,
 ) -> NDArray[np.int64]:
     """Index of the nearest keyframe within ``radius`` that can be seen from every position, or -1."""
     found = np.full(positions.shape[0], -1)
@@ -197,8 +203,12 @@ def _nearest_in_sight(
 
 @njit(cache=True)
 def _in_sight(
-    start: NDArray[np.float64], end: NDArray[np.float64], log_ratio: NDArray[np.float32], free: NDArray[np.bool_],
-    origin: NDArray[np.float64], cell: float,
+    start: NDArray[np.float64],
+    end: NDArray[np.float64],
+    log_ratio: NDArray[np.float32],
+    free: NDArray[np.bool_],
+    origin: NDArray[np.float64],
+    cell: float,
 ) -> bool:
     """Whether no known surface lies between two points and most of the way is known to be free."""
     rows, columns = free.shape

@@ -57,9 +57,7 @@ class Walls:
         return Agreement(met + passed, met, passed)
 
 
-def _seen_in(
-    mapping: LocalMapping, scans: list[Scan], poses: Pose, seeing: list[Scan], at: Pose
-) -> NDArray[np.int64]:
+def _seen_in(mapping: LocalMapping, scans: list[Scan], poses: Pose, seeing: list[Scan], at: Pose) -> NDArray[np.int64]:
     """Samples that beams of some scans end on, and that they pass, in a map of others, shape (2,).
 
     :param poses: shape (len(scans), 3), where the map's were taken; ``at`` is where the others were.

@@ -144,11 +144,13 @@ def whereabouts(
     likeness.count(sorted(best.values())[:-1])
     logs = [
         (log_flat if told is None or near is None else _log_prior(told, near[fit.area], fit))
-        + fit.mode.log_mass - whole[fit.area] + _BETWEEN * (whole[fit.area] - most)
+        + fit.mode.log_mass
+        - whole[fit.area]
+        + _BETWEEN * (whole[fit.area] - most)
         + MAPS.log_ratio(fit.found, usual)
         + likeness.log_rarity(fit.found.share, foretold=False)
         for fit in found
-    ]  # fmt: skip
+    ]
     first = _probabilities(logs)
     passed = max(WALLS_USUAL, _LONG_AGO * clutter.walls)
     for n in np.flatnonzero(first >= _PROBABLE):

@@ -118,9 +118,7 @@ class WholeMap:
         some, known = (replace(grid, points=grid.points[::_EVERY]) for grid in (query, place.grid))
         temper = _EVERY * self._settings.temper
         margin = max(self._settings.margin, _WORSE * _SURE * temper * len(some.points))
-        settings = replace(
-            self._settings, temper=temper, margin=margin, least=least, max_modes=_FITS, reverse=False
-        )
+        settings = replace(self._settings, temper=temper, margin=margin, least=least, max_modes=_FITS, reverse=False)
         near = place.positions[np.isin(place.owners, list(own))]
         ground = ground_around(near, stacked(poses)[:, :2], self._radius, place.grid.cell)
         for mode in match(some, known, _FLAT, settings, reach_of(near, query, poses, self._radius), ground).modes:
