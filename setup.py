@@ -48,7 +48,7 @@ setup(
     entry_points={
         "console_scripts": [
             f"hmt_slam = {NAME}.cli.main:main",
-            *(f"hmt_slam_{node} = {NAME}.nodes.{node}_node:main" for node in NODES),
+            *(f"hmt_slam_{node} = {NAME}.ros.{node}_node:main" for node in NODES),
         ],
     },
 )

@@ -16,8 +16,8 @@ from benchmark.simulated.records import Record
 from benchmark.simulated.rivals import BEAMS, RADIUS, VIEW
 from benchmark.stories import DECIDED, HIGH, LATER, LOW, SOON, SURE, Moment, Verdict, story, told, verdict
 from hmt_slam_ros.configuration import load_configuration
-from hmt_slam_ros.logs import open_log
 from hmt_slam_ros.offline.runtime import run_log
+from hmt_slam_ros.open_log import open_log
 
 WORLDS = ("twins", "ring")
 

@@ -16,7 +16,7 @@ from benchmark.simulated.truth import RADIUS
 from benchmark.simulated.worlds import FAMILIES, World, seeds
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.simulation import open_simulated
-from hmt_slam_ros.topology.appearance import RATIO_AT_MEDIAN, RATIO_SLOPE, Looks, log_ratio
+from hmt_slam_ros.topological_inference.place_recognition import RATIO_AT_MEDIAN, RATIO_SLOPE, Looks, log_ratio
 
 SEEDS = 4
 """Training worlds of every family."""

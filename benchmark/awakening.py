@@ -23,16 +23,17 @@ from benchmark.simulated.records import Records, code
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration import Configuration, load_configuration
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.logs import LogRecord, open_log
+from hmt_slam_ros.logs import LogRecord
 from hmt_slam_ros.logs.records import SIMULATED
-from hmt_slam_ros.offline.recorder import placed_areas
+from hmt_slam_ros.messages.map_changes import AreaPose
+from hmt_slam_ros.messages.messages import Carried
+from hmt_slam_ros.messages.replica import Replica
+from hmt_slam_ros.metric_slam.slam import MetricSlam
 from hmt_slam_ros.offline.runtime import Run
-from hmt_slam_ros.offline.saved_map import RunState
-from hmt_slam_ros.processes.map_parts import AreaPose
-from hmt_slam_ros.processes.messages import Carried
-from hmt_slam_ros.processes.replica import Replica
-from hmt_slam_ros.processes.slam import MetricSlam
-from hmt_slam_ros.sensing import Scan
+from hmt_slam_ros.open_log import open_log
+from hmt_slam_ros.results.hmt_map import RunState
+from hmt_slam_ros.results.recorder import placed_areas
+from hmt_slam_ros.sensors import Scan
 
 LOGS = ("aces", "intel")
 WORLDS = ("office", "nested", "grid")

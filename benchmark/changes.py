@@ -19,16 +19,15 @@ from benchmark.surfaces import Surfaces, judged, unexplained
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.grids.occupancy_map import OccupancyImage, occupancy_image
 from hmt_slam_ros.logs.records import Log
-from hmt_slam_ros.offline.corrected_scans import corrected_scans
-from hmt_slam_ros.offline.final_map import final_map
-from hmt_slam_ros.offline.map_image import OccupancyImage, occupancy_image
-from hmt_slam_ros.offline.recorder import Recording, keyframe_poses
+from hmt_slam_ros.messages.map_changes import Place
+from hmt_slam_ros.messages.messages import Carried
+from hmt_slam_ros.messages.replica import Replica
 from hmt_slam_ros.offline.runtime import Run
-from hmt_slam_ros.offline.saved_map import RunState
-from hmt_slam_ros.processes.map_parts import Place
-from hmt_slam_ros.processes.messages import Carried
-from hmt_slam_ros.processes.replica import Replica
+from hmt_slam_ros.results.final_map import corrected_scans, final_map
+from hmt_slam_ros.results.hmt_map import RunState
+from hmt_slam_ros.results.recorder import Recording, keyframe_poses
 from hmt_slam_ros.simulation import SimulatedLog, open_simulated
 
 WORLDS = {"quiet": "office", "people": "busy"}

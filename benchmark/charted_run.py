@@ -18,17 +18,17 @@ from typing import Any
 
 import numpy as np
 
+from hmt_slam_ros.area_abstraction.aam import Aam
 from hmt_slam_ros.cli.arguments import chosen_configuration, parser
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.evaluation import StampedPoses, write_tum
-from hmt_slam_ros.logs import Log, LogRecord, open_log
-from hmt_slam_ros.offline.corrected_scans import corrected_scans
-from hmt_slam_ros.offline.final_map import FinalMap, final_map
+from hmt_slam_ros.logs import Log, LogRecord
+from hmt_slam_ros.messages.messages import AreaEvents, Keyframe, Message
+from hmt_slam_ros.messages.routing import Process
 from hmt_slam_ros.offline.runtime import RunResult, run_log
-from hmt_slam_ros.processes.aam import Aam
-from hmt_slam_ros.processes.messages import AreaEvents, Keyframe, Message
-from hmt_slam_ros.processes.routing import Process
+from hmt_slam_ros.open_log import open_log
+from hmt_slam_ros.results.final_map import FinalMap, corrected_scans, final_map
 
 SAMPLES = 200
 """Points of the curve of memory over time, at least, where the log has as many scans."""

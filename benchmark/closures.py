@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.offline.saved_map import SavedMap
-from hmt_slam_ros.topology.common_map import ArcValue
+from hmt_slam_ros.hybrid_map.common_map import ArcValue
+from hmt_slam_ros.results.hmt_map import SavedMap
 
 
 @dataclass(frozen=True)

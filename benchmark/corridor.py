@@ -18,12 +18,11 @@ from benchmark.report import table
 from hmt_slam_ros.cli.arguments import OneSentenceParser
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.local_map.area_filter import AreaFilter
-from hmt_slam_ros.local_map.local_mapping import LocalMapping
-from hmt_slam_ros.local_map.sighting import Sighting
-from hmt_slam_ros.processes.live_hypothesis import LiveHypothesis
-from hmt_slam_ros.sensing import Odometry, Scan
-from hmt_slam_ros.sensing.motion import MotionModel, increment_covariance
+from hmt_slam_ros.metric_slam.live_hypothesis import LiveHypothesis
+from hmt_slam_ros.sensors import Odometry, Scan
+from hmt_slam_ros.sensors.motion_model import MotionModel, increment_covariance
+from hmt_slam_ros.submap.local_mapping import LocalMapping, Sighting
+from hmt_slam_ros.submap.particle_filter import AreaFilter
 
 SEEDS = 24
 LEGS = {"a keyframe on": 1, "an arc, 20 keyframes on": 20}

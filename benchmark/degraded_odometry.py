@@ -24,11 +24,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from hmt_slam_ros.configuration.metric import Motion
+from hmt_slam_ros.configuration.metric_slam import Motion
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.logs.records import Log, LogRecord
 from hmt_slam_ros.logs.stamps import NANOSECONDS
-from hmt_slam_ros.sensing import Odometry
+from hmt_slam_ros.sensors import Odometry
 
 KINDS = ("noise-2x", "noise-4x", "slip", "missing", "none")
 

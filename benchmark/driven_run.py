@@ -10,15 +10,15 @@ from numpy.typing import NDArray
 
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.exploration.explorer import Explorer
-from hmt_slam_ros.exploration.missions import Missions
+from hmt_slam_ros.exploration.pilot import Missions
 from hmt_slam_ros.logs.stamps import NANOSECONDS
-from hmt_slam_ros.offline.output_folder import map_writer
-from hmt_slam_ros.offline.recorder import Recording
+from hmt_slam_ros.messages.messages import Message
+from hmt_slam_ros.messages.tasks import Errand, Outcome, Steering
 from hmt_slam_ros.offline.runtime import Run
-from hmt_slam_ros.offline.saved_map import RunState
-from hmt_slam_ros.processes.errands import Errand, Outcome, Steering
-from hmt_slam_ros.processes.messages import Message
-from hmt_slam_ros.sensing import Scan
+from hmt_slam_ros.results.hmt_map import RunState
+from hmt_slam_ros.results.output_folder import map_writer
+from hmt_slam_ros.results.recorder import Recording
+from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.simulation.driven_robot import DrivenLog, DrivenRobot
 
 

@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 from benchmark.report import Report, Requirement, table
 from benchmark.settings import Settings
 from benchmark.simulated.measured import chosen_families, chosen_seeds
+from hmt_slam_ros.exploration.local_motion import Limits, command_towards
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.logs.stamps import NANOSECONDS
-from hmt_slam_ros.motion import Limits, command_towards
 from hmt_slam_ros.simulation import open_simulated
 from hmt_slam_ros.simulation.building import Building, FloorPlan
+from hmt_slam_ros.simulation.drive import ACCELERATION, TURN_ACCELERATION
 from hmt_slam_ros.simulation.driven_robot import DrivenRobot
-from hmt_slam_ros.simulation.driver import ACCELERATION, TURN_ACCELERATION
 from hmt_slam_ros.simulation.scenario import Scenario
 from hmt_slam_ros.simulation.settings import Settings as WorldSettings
 

@@ -17,18 +17,16 @@ import numpy as np
 from benchmark.scripted import Robot
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration import Configuration
-from hmt_slam_ros.geometry.chi_square import gate
-from hmt_slam_ros.processes.replica import FIRST_HYPOTHESIS, Replica
-from hmt_slam_ros.processes.tsbi_branches import Child, Parent
-from hmt_slam_ros.processes.tsbi_branching import Branching
-from hmt_slam_ros.sensing import Scan
-from hmt_slam_ros.topology.admission import Candidate, Query
-from hmt_slam_ros.topology.closure_search import ClosureSearch, Comparison
-from hmt_slam_ros.topology.hybrid_map import HybridMap
-from hmt_slam_ros.topology.hypothesis_tree import LeafNotes
-from hmt_slam_ros.topology.shortest_path import reachable
-from hmt_slam_ros.topology.surroundings import areas_around
-from hmt_slam_ros.topology.transition import Transition
+from hmt_slam_ros.geometry.gaussian import gate
+from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
+from hmt_slam_ros.hybrid_map.shortest_path import reachable
+from hmt_slam_ros.hybrid_map.surroundings import Transition, areas_around
+from hmt_slam_ros.messages.replica import FIRST_HYPOTHESIS, Replica
+from hmt_slam_ros.sensors import Scan
+from hmt_slam_ros.topological_inference.admission import Candidate, Query
+from hmt_slam_ros.topological_inference.branching import Branching, Child, Parent
+from hmt_slam_ros.topological_inference.closure_search import ClosureSearch, Comparison
+from hmt_slam_ros.topological_inference.hypothesis_tree import LeafNotes
 
 Path = tuple[int, ...]
 """The area of every visit, named by the visit in which it was entered first."""

@@ -17,7 +17,7 @@ from benchmark.report import Report, table
 from benchmark.settings import Settings
 from benchmark.simulated.measured import chosen_seeds, records_of
 from benchmark.simulated.records import Record
-from hmt_slam_ros.agreement import MAPS, MAPS_USUAL, Agreement, Contradiction
+from hmt_slam_ros.registration.consistency import MAPS, MAPS_USUAL, Agreement, Contradiction
 
 SEEDS = 4
 """Training worlds of every family: 32 runs in all."""

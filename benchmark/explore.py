@@ -20,7 +20,7 @@ from hmt_slam_ros.configuration import Configuration, load_configuration
 from hmt_slam_ros.exploration.explorer import Explorer
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.logs.stamps import NANOSECONDS
-from hmt_slam_ros.processes.errands import Errand
+from hmt_slam_ros.messages.tasks import Errand
 from hmt_slam_ros.simulation.driven_robot import DrivenRobot
 from hmt_slam_ros.simulation.scenario import START
 

@@ -16,10 +16,10 @@ from benchmark.settings import Settings
 from benchmark.simulated.measured import chosen_families, chosen_seeds
 from benchmark.simulated.worlds import World
 from hmt_slam_ros.configuration import Configuration, load_configuration
-from hmt_slam_ros.features.hallway import FreeSpace, area_class, free_space, log_odds
-from hmt_slam_ros.features.rays import rays_of
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.local_map.virtual_lines import rays_of_map
+from hmt_slam_ros.landmarks.area_classes import FreeSpace, area_class, free_space, log_odds
+from hmt_slam_ros.landmarks.beam_labels import rays_of
+from hmt_slam_ros.landmarks.virtual_lines import rays_of_map
 from hmt_slam_ros.simulation import open_simulated
 from hmt_slam_ros.simulation.scenario import Scenario
 

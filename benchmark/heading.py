@@ -18,10 +18,10 @@ from benchmark.settings import Settings
 from benchmark.simulated.measured import chosen_families, chosen_seeds
 from benchmark.simulated.worlds import World
 from hmt_slam_ros.configuration import Configuration, load_configuration
-from hmt_slam_ros.features.extraction import extract_lines
-from hmt_slam_ros.features.heading import QUARTER, BuildingHeading
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.sensing.motion import Step, increment_covariance
+from hmt_slam_ros.landmarks.heading import QUARTER, BuildingHeading
+from hmt_slam_ros.landmarks.line_extraction import extract_lines
+from hmt_slam_ros.sensors.motion_model import Step, increment_covariance
 from hmt_slam_ros.simulation import open_simulated
 from hmt_slam_ros.simulation.scenario import Scenario
 

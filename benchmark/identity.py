@@ -31,12 +31,12 @@ from benchmark.settings import Settings
 from hmt_slam_ros.configuration import load_configuration
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.exploration.explorer import Explorer
-from hmt_slam_ros.exploration.missions import Missions
+from hmt_slam_ros.exploration.pilot import Missions
 from hmt_slam_ros.logs.records import SIMULATED
 from hmt_slam_ros.logs.stamps import NANOSECONDS
-from hmt_slam_ros.offline.saved_map import read_run_state
-from hmt_slam_ros.persistence.hmt_map import HMT_MAP
-from hmt_slam_ros.processes.errands import Errand, Outcome
+from hmt_slam_ros.messages.tasks import Errand, Outcome
+from hmt_slam_ros.results.hmt_map import read_run_state
+from hmt_slam_ros.saved_map.folder import HMT_MAP
 from hmt_slam_ros.simulation import open_simulated
 from hmt_slam_ros.simulation.driven_robot import DrivenRobot
 from hmt_slam_ros.simulation.scenario import START

@@ -10,15 +10,15 @@ import numpy as np
 from hmt_slam_ros.arrays import Float64, Int64
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.local_map.local_mapping import LocalMapping
+from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
+from hmt_slam_ros.hybrid_map.surroundings import stacked
 from hmt_slam_ros.offline.runtime import run_log
 from hmt_slam_ros.places.area_views import AreaView, AreaViews
 from hmt_slam_ros.places.chart import Chart, chart_of
-from hmt_slam_ros.sensing import Scan
+from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.simulation import open_simulated
 from hmt_slam_ros.simulation.scenario import Scenario
-from hmt_slam_ros.topology.hybrid_map import HybridMap
-from hmt_slam_ros.topology.surroundings import stacked
+from hmt_slam_ros.submap.local_mapping import LocalMapping
 
 LASER = "field_of_view=360,beams=720"
 """As the paper's robot has it."""

@@ -13,19 +13,19 @@ from benchmark.belief import Estimate
 from benchmark.institute_maps import InstituteMap
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration import Configuration
-from hmt_slam_ros.exploration.destinations import Destination, KnownBuilding, destinations
-from hmt_slam_ros.exploration.mission import MissionPilot, Phase
+from hmt_slam_ros.exploration.local_motion import Limits
+from hmt_slam_ros.exploration.mission_controller import MissionPilot, Phase
+from hmt_slam_ros.exploration.rooms import Destination, KnownBuilding, destinations
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.logs.stamps import NANOSECONDS
-from hmt_slam_ros.motion import Limits
 from hmt_slam_ros.places.estimator import PlaceEstimator
 from hmt_slam_ros.places.place_graph import heading_of, node_of, state_of
+from hmt_slam_ros.places.policy import MetricStart
 from hmt_slam_ros.places.position_belief import certain_belief
-from hmt_slam_ros.places.switching import MetricStart
-from hmt_slam_ros.sensing import Odometry, Scan
-from hmt_slam_ros.sensing.motion import Step, increment_covariance
+from hmt_slam_ros.sensors import Odometry, Scan
+from hmt_slam_ros.sensors.motion_model import Step, increment_covariance
+from hmt_slam_ros.simulation.drive import ACCELERATION, TURN_ACCELERATION
 from hmt_slam_ros.simulation.driven_robot import DrivenRobot
-from hmt_slam_ros.simulation.driver import ACCELERATION, TURN_ACCELERATION
 from hmt_slam_ros.simulation.scenario import Scenario
 
 MISSIONS = 5

@@ -14,18 +14,19 @@ from benchmark.allocations import counted, requirements_on, told
 from benchmark.logs import BUNDLED, opened
 from benchmark.report import Report, table
 from benchmark.settings import Settings
+from hmt_slam_ros.area_abstraction.overlap import overlaps, sensed_points
 from hmt_slam_ros.configuration import Configuration, load_configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.local_map import batch, matching, movers
-from hmt_slam_ros.local_map.local_mapping import LocalMapping
-from hmt_slam_ros.logs import Log, open_log
+from hmt_slam_ros.logs import Log
+from hmt_slam_ros.messages.messages import LocalEstimate
 from hmt_slam_ros.offline.runtime import run_log
-from hmt_slam_ros.processes.messages import LocalEstimate
-from hmt_slam_ros.processes.rtl import Rtl
-from hmt_slam_ros.sensing import Odometry, Scan
+from hmt_slam_ros.open_log import open_log
+from hmt_slam_ros.real_time_localization.rtl import Rtl
+from hmt_slam_ros.registration import dynamic_rejection, scan_to_map
+from hmt_slam_ros.sensors import Odometry, Scan
 from hmt_slam_ros.simulation import open_simulated
-from hmt_slam_ros.topology.overlap import overlaps, sensed_points
+from hmt_slam_ros.submap.local_mapping import LocalMapping
 
 _KEYFRAMES, _PER_AREA = 400, 40
 _APART = 0.03  # m
@@ -154,20 +155,24 @@ def _measure_matching(
 ) -> None:
     information = np.linalg.inv(np.diag([0.05, 0.05, 0.03]) ** 2)
     view, settings = mapping.pool.view(tables[0]), mapping.configuration.matching
-    prior = matching.Prior(poses[0], information)
-    figures.timed("Gauss-Newton, a scan", 1, lambda: matching.align(points, poses[0], prior, view, mapping.alignment))
+    prior = scan_to_map.Prior(poses[0], information)
     figures.timed(
-        "things that moved, a scan", 1, lambda: movers.standing(points, prior.mean, prior, view, mapping.alignment)
+        "Gauss-Newton, a scan", 1, lambda: scan_to_map.align(points, poses[0], prior, view, mapping.alignment)
+    )
+    figures.timed(
+        "things that moved, a scan",
+        1,
+        lambda: dynamic_rejection.standing(points, prior.mean, prior, view, mapping.alignment),
     )
     figures.timed(
         "likelihood, a point",
         len(points),
-        lambda: matching.log_ratio(points, *poses[0].tolist(), view, mapping.model),
+        lambda: scan_to_map.log_ratio(points, *poses[0].tolist(), view, mapping.model),
     )
     figures.timed(
         "proposal, a scan and a particle",
         len(poses),
-        lambda: batch.propose_all(
+        lambda: scan_to_map.propose_all(
             points,
             points,
             poses,

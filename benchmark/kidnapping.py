@@ -22,11 +22,11 @@ from benchmark.settings import Settings
 from hmt_slam_ros.configuration import load_configuration
 from hmt_slam_ros.evaluation import StampedPoses, evaluate_relations, true_relations
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.logs import open_log
 from hmt_slam_ros.logs.records import SIMULATED
+from hmt_slam_ros.metric_slam.slam import MetricSlam
 from hmt_slam_ros.offline.runtime import Run
-from hmt_slam_ros.processes.slam import MetricSlam
-from hmt_slam_ros.sensing import Scan
+from hmt_slam_ros.open_log import open_log
+from hmt_slam_ros.sensors import Scan
 
 WORLDS = ("office", "busy", "nested", "hall", "ring")
 LOGS = ("aces", "intel")

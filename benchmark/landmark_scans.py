@@ -14,16 +14,16 @@ from numpy.typing import NDArray
 from benchmark.landmark_truth import Truth, World, alike
 from benchmark.simulated.worlds import World as Drive
 from hmt_slam_ros.configuration import Configuration
-from hmt_slam_ros.features.corners import Corners, corners_of
-from hmt_slam_ros.features.extraction import extract_lines
-from hmt_slam_ros.features.openings import Openings, openings_and_evidence
-from hmt_slam_ros.features.rays import rays_of
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.local_map.local_mapping import LocalMapping
-from hmt_slam_ros.local_map.virtual_lines import lines_of_map, rays_of_map
-from hmt_slam_ros.local_map.virtual_scan import VirtualScan, virtual_scan
+from hmt_slam_ros.grids.virtual_scan import VirtualScan, virtual_scan
+from hmt_slam_ros.landmarks.beam_labels import rays_of
+from hmt_slam_ros.landmarks.corners import Corners, corners_of
+from hmt_slam_ros.landmarks.line_extraction import extract_lines
+from hmt_slam_ros.landmarks.openings import Openings, openings_and_evidence
+from hmt_slam_ros.landmarks.virtual_lines import lines_of_map, rays_of_map
 from hmt_slam_ros.simulation import open_simulated
 from hmt_slam_ros.simulation.scenario import Scenario
+from hmt_slam_ros.submap.local_mapping import LocalMapping
 
 Array = NDArray[np.float64]
 

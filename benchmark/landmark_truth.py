@@ -1,4 +1,4 @@
-"""True corners and openings around a simulated robot, by the definitions of `hmt_slam_ros.features`."""
+"""True corners and openings around a simulated robot, by the definitions of `hmt_slam_ros.landmarks`."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hmt_slam_ros.configuration.features import Features
+from hmt_slam_ros.configuration.landmarks import Features
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.simulation.building import boxes
-from hmt_slam_ros.simulation.raycast import WallIndex, clear_between, wall_index
+from hmt_slam_ros.simulation.laser import WallIndex, clear_between, wall_index
 from hmt_slam_ros.simulation.scenario import Scenario
 
 Array = NDArray[np.float64]

@@ -12,10 +12,10 @@ from benchmark.landmark_scans import LASERS, keyframes_of
 from benchmark.landmark_truth import World, alike
 from benchmark.simulated.worlds import World as Drive
 from hmt_slam_ros.configuration import Configuration
-from hmt_slam_ros.configuration.features import Features
-from hmt_slam_ros.features.landmark_map import Landmark
-from hmt_slam_ros.features.landmarks import INNER, OPENING, OUTER
+from hmt_slam_ros.configuration.landmarks import Features
 from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.landmarks.landmark_map import Landmark
+from hmt_slam_ros.landmarks.landmarks import INNER, OPENING, OUTER
 from hmt_slam_ros.simulation import open_simulated
 from hmt_slam_ros.simulation.scenario import Scenario
 

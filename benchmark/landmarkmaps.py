@@ -19,13 +19,12 @@ from benchmark.settings import Settings
 from benchmark.simulated.measured import chosen_families, chosen_seeds
 from benchmark.simulated.worlds import World as Drive
 from hmt_slam_ros.configuration import Configuration, load_configuration
-from hmt_slam_ros.configuration.features import Features
-from hmt_slam_ros.features.existence import Existence
-from hmt_slam_ros.features.landmark_map import Landmark, LandmarkMap
-from hmt_slam_ros.features.landmarks import OPENING
+from hmt_slam_ros.configuration.landmarks import Features
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.local_map.area_landmarks import AreaLandmarks
-from hmt_slam_ros.local_map.local_mapping import LocalMapping
+from hmt_slam_ros.landmarks.area_landmarks import AreaLandmarks
+from hmt_slam_ros.landmarks.landmark_map import Existence, Landmark, LandmarkMap
+from hmt_slam_ros.landmarks.landmarks import OPENING
+from hmt_slam_ros.submap.local_mapping import LocalMapping
 
 Array = NDArray[np.float64]
 

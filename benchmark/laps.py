@@ -25,14 +25,14 @@ from hmt_slam_ros.evaluation import (
     true_relations,
     truth_of,
 )
-from hmt_slam_ros.logs import open_log
 from hmt_slam_ros.logs.records import SIMULATED, Log, LogRecord
 from hmt_slam_ros.logs.stamps import NANOSECONDS
-from hmt_slam_ros.offline.memory import scan_bytes
+from hmt_slam_ros.messages.messages import Carried
+from hmt_slam_ros.metric_slam.slam import MetricSlam
 from hmt_slam_ros.offline.runtime import Run
-from hmt_slam_ros.processes.messages import Carried
-from hmt_slam_ros.processes.slam import MetricSlam
-from hmt_slam_ros.sensing import Scan
+from hmt_slam_ros.open_log import open_log
+from hmt_slam_ros.results.report import scan_bytes
+from hmt_slam_ros.sensors import Scan
 
 WORLDS = ("office", "nested", "hall")
 LAPS, STEADY = 20, 3

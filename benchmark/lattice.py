@@ -16,10 +16,10 @@ import numpy as np
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.processes.map_parts import AreaPose
-from hmt_slam_ros.sensing import Scan
-from hmt_slam_ros.simulation.raycast import WallIndex, cast, wall_index
-from hmt_slam_ros.topology.hybrid_map import HybridMap
+from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
+from hmt_slam_ros.messages.map_changes import AreaPose
+from hmt_slam_ros.sensors import Scan
+from hmt_slam_ros.simulation.laser import WallIndex, cast, wall_index
 
 SPACING = 8.0
 """From crossing to crossing, m."""

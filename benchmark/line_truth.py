@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.sensing import Scan
+from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.simulation.building import boxes
 from hmt_slam_ros.simulation.scenario import Scenario
 

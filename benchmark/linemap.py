@@ -21,10 +21,10 @@ from benchmark.settings import Settings
 from benchmark.simulated.measured import chosen_seeds
 from hmt_slam_ros.configuration import Configuration, load_configuration
 from hmt_slam_ros.errors import HmtSlamError
-from hmt_slam_ros.features.extraction import extract_for_map
-from hmt_slam_ros.features.stochastic_map import LineMap
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.sensing.motion import Step, increment_covariance
+from hmt_slam_ros.landmarks.line_extraction import extract_for_map
+from hmt_slam_ros.landmarks.stochastic_map import LineMap
+from hmt_slam_ros.sensors.motion_model import Step, increment_covariance
 from hmt_slam_ros.simulation.scenario import Scenario
 
 SEEDS = 8

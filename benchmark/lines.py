@@ -18,8 +18,8 @@ from benchmark.settings import Settings
 from benchmark.simulated.measured import chosen_families, chosen_seeds
 from benchmark.simulated.worlds import World
 from hmt_slam_ros.configuration import load_configuration
-from hmt_slam_ros.configuration.features import Features
-from hmt_slam_ros.features.extraction import Lines, extract_lines
+from hmt_slam_ros.configuration.landmarks import Features
+from hmt_slam_ros.landmarks.line_extraction import Lines, extract_lines
 from hmt_slam_ros.simulation import open_simulated
 from hmt_slam_ros.simulation.scenario import Scenario
 

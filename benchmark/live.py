@@ -22,12 +22,12 @@ from benchmark.logs import WITH_RELATIONS, opened
 from benchmark.report import Report, Requirement, table
 from benchmark.running_nodes import Listener
 from benchmark.settings import Settings
-from hmt_slam_ros.logs import open_log
-from hmt_slam_ros.nodes import qos
-from hmt_slam_ros.nodes.conversions import stamp_of
-from hmt_slam_ros.nodes.topics import DOCUMENTS, ODOM, POSE, ROBOT_STATUS, SCAN
-from hmt_slam_ros.processes.documents import RobotStatus, decode
-from hmt_slam_ros.processes.messages import LocalEstimate
+from hmt_slam_ros.messages.documents import RobotStatus, decode
+from hmt_slam_ros.messages.messages import LocalEstimate
+from hmt_slam_ros.open_log import open_log
+from hmt_slam_ros.ros import topics
+from hmt_slam_ros.ros.conversions import stamp_of
+from hmt_slam_ros.ros.topics import DOCUMENTS, ODOM, POSE, ROBOT_STATUS, SCAN
 
 PROCESSES = ("slam", "aam", "tsbi", "tlca", "rtl")
 BUSY = "sim:office,rate=10,readings=10"
@@ -111,8 +111,8 @@ def measure_live(settings: Settings) -> Report:
 def saturated(log: str, seconds: float) -> Passed:
     """From odometry to pose, while the machine is busy otherwise."""
     with _running() as listener, _burning():
-        asked = _moments(listener, Odometry, ODOM, qos.SENSOR)
-        answered = _moments(listener, PoseWithCovarianceStamped, POSE, qos.STREAM)
+        asked = _moments(listener, Odometry, ODOM, topics.SENSOR)
+        answered = _moments(listener, PoseWithCovarianceStamped, POSE, topics.STREAM)
         _drive(listener, log, seconds, ODOM)
         return Passed(asked, answered)
 
@@ -120,14 +120,14 @@ def saturated(log: str, seconds: float) -> Passed:
 def fast(log: str, seconds: float) -> Passed:
     """From scan to estimate."""
     with _running() as listener:
-        asked = _moments(listener, LaserScan, SCAN, qos.SENSOR)
+        asked = _moments(listener, LaserScan, SCAN, topics.SENSOR)
         answered: Stamped = {}
 
         def hear(message: String, info: dict[str, int]) -> None:
             estimate = decode(message.data, LocalEstimate)
             answered[estimate.stamp] = 1e-9 * info["source_timestamp"]
 
-        listener.node.create_subscription(String, DOCUMENTS[LocalEstimate], hear, qos.CHAIN)
+        listener.node.create_subscription(String, DOCUMENTS[LocalEstimate], hear, topics.CHAIN)
         _drive(listener, log, seconds, SCAN)
         listener.until(lambda: len(answered) >= len(asked))
         return Passed(asked, answered)
@@ -167,7 +167,7 @@ def unanswered(passed: Passed) -> int:
 def _counted(listener: Listener, topic: str) -> Callable[[], int]:
     """How many documents of a topic there were."""
     heard: list[None] = []
-    listener.node.create_subscription(String, topic, lambda _message: heard.append(None), qos.CHAIN)
+    listener.node.create_subscription(String, topic, lambda _message: heard.append(None), topics.CHAIN)
     return lambda: len(heard)
 
 
@@ -208,7 +208,7 @@ def _drive(
     """
     statuses: list[RobotStatus] = []
     listener.node.create_subscription(
-        String, ROBOT_STATUS, lambda message: statuses.append(decode(message.data, RobotStatus)), qos.LATCHED
+        String, ROBOT_STATUS, lambda message: statuses.append(decode(message.data, RobotStatus)), topics.LATCHED
     )
     parameters: dict[str, str | float | list[float]] = {
         "log": log,

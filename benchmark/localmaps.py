@@ -16,7 +16,7 @@ from benchmark.settings import Settings
 from benchmark.simulated.measured import chosen_families, chosen_seeds
 from benchmark.simulated.worlds import SETTINGS, World
 from hmt_slam_ros.evaluation import RelationErrors, evaluate_relations, read_tum, true_relations, truth_of
-from hmt_slam_ros.logs import open_log
+from hmt_slam_ros.open_log import open_log
 
 SEEDS = 4
 """Of the worlds of every family."""

@@ -14,8 +14,8 @@ from pathlib import Path
 
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.evaluation import Relations, StampedPoses, odometry_of, read_relations
-from hmt_slam_ros.logs import open_log
-from hmt_slam_ros.sensing import Scan
+from hmt_slam_ros.open_log import open_log
+from hmt_slam_ros.sensors import Scan
 
 ROOT = Path(__file__).resolve().parents[1]
 VARIABLE = "HMT_SLAM_DATASETS"

@@ -13,23 +13,23 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from benchmark.landmark_scans import keyframes_of
-from hmt_slam_ros.agreement import Clutter
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.local_map.area_kind import AreaKinds
-from hmt_slam_ros.local_map.local_mapping import LocalMapping
+from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
+from hmt_slam_ros.hybrid_map.surroundings import stacked
+from hmt_slam_ros.landmarks.area_classes import AreaKinds
 from hmt_slam_ros.logs import LogRecord
+from hmt_slam_ros.messages.replica import Replica
 from hmt_slam_ros.offline.runtime import Run
 from hmt_slam_ros.places.area_views import AreaViews
-from hmt_slam_ros.processes.place_prior import PlacePrior
-from hmt_slam_ros.processes.replica import Replica
-from hmt_slam_ros.sensing import Scan
+from hmt_slam_ros.places.relocalization_prior import PlacePrior
+from hmt_slam_ros.registration.consistency import Clutter
+from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.simulation import open_simulated
-from hmt_slam_ros.topology.closure_search import ClosureSearch
-from hmt_slam_ros.topology.hybrid_map import HybridMap
-from hmt_slam_ros.topology.located import Located
-from hmt_slam_ros.topology.surroundings import stacked
-from hmt_slam_ros.topology.whereabouts import Whereabouts
+from hmt_slam_ros.submap.local_mapping import LocalMapping
+from hmt_slam_ros.topological_inference.closure_search import ClosureSearch
+from hmt_slam_ros.topological_inference.global_localization import Whereabouts
+from hmt_slam_ros.topological_inference.global_scan_matching import Located
 
 Array = NDArray[np.float64]
 

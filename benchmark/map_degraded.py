@@ -11,8 +11,8 @@ from benchmark.degraded_odometry import degraded
 from hmt_slam_ros.cli.arguments import chosen_configuration, parser
 from hmt_slam_ros.cli.map_command import measured_run
 from hmt_slam_ros.errors import HmtSlamError
-from hmt_slam_ros.logs import open_log
-from hmt_slam_ros.offline.output_folder import replacing, write_output
+from hmt_slam_ros.open_log import open_log
+from hmt_slam_ros.results.output_folder import replacing, write_output
 
 
 def main(arguments: list[str]) -> int:

@@ -13,9 +13,9 @@ from std_msgs.msg import String
 
 from benchmark.logs import BUNDLED, opened
 from benchmark.running_nodes import Listener, Parameters
-from hmt_slam_ros.nodes import qos
-from hmt_slam_ros.nodes.topics import DOCUMENTS
-from hmt_slam_ros.processes.messages import LocalEstimate
+from hmt_slam_ros.messages.messages import LocalEstimate
+from hmt_slam_ros.ros import topics
+from hmt_slam_ros.ros.topics import DOCUMENTS
 
 NODES = ("slam", "aam", "tsbi", "tlca", "rtl", "robot")
 
@@ -43,7 +43,7 @@ def until_first_pose() -> Start:
     """From the start of metric SLAM until it has placed the first scan, with scans waiting for it."""
     with Listener() as listener, opened([BUNDLED]) as (log,):
         heard: list[String] = []
-        listener.node.create_subscription(String, DOCUMENTS[LocalEstimate], heard.append, qos.CHAIN)
+        listener.node.create_subscription(String, DOCUMENTS[LocalEstimate], heard.append, topics.CHAIN)
         robot = listener.node.create_client(ListParameters, "robot/list_parameters")
         with listener.running("robot", _waiting(log.path)):
             listener.until(robot.service_is_ready)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.logs.records import LogRecord
 from hmt_slam_ros.logs.stamps import NANOSECONDS
-from hmt_slam_ros.sensing import Odometry
+from hmt_slam_ros.sensors import Odometry
 from hmt_slam_ros.simulation import SimulatedLog
 
 # ns between two visits.

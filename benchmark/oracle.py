@@ -18,10 +18,10 @@ from benchmark.settings import Settings
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration import Configuration, load_configuration
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.processes.replica import FIRST_HYPOTHESIS
-from hmt_slam_ros.processes.tsbi import Tsbi
-from hmt_slam_ros.sensing import Scan
+from hmt_slam_ros.messages.replica import FIRST_HYPOTHESIS
+from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.simulation import open_simulated
+from hmt_slam_ros.topological_inference.tsbi import Tsbi
 
 WORLDS = {
     "ring": "ring,size=0.7",

@@ -25,11 +25,11 @@ from benchmark.simulated.measured import chosen_seeds
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration import Configuration, load_configuration
 from hmt_slam_ros.errors import HmtSlamError
-from hmt_slam_ros.exploration.destinations import rooms
 from hmt_slam_ros.exploration.explorer import Explorer
+from hmt_slam_ros.exploration.rooms import rooms
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.logs.stamps import NANOSECONDS
-from hmt_slam_ros.processes.errands import Errand
+from hmt_slam_ros.messages.tasks import Errand
 from hmt_slam_ros.simulation import open_simulated
 from hmt_slam_ros.simulation.driven_robot import DrivenRobot
 from hmt_slam_ros.simulation.scenario import START

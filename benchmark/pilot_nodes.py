@@ -15,9 +15,9 @@ from benchmark.live import PROCESSES
 from benchmark.running_nodes import Listener, Parameters
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.logs.stamps import NANOSECONDS
-from hmt_slam_ros.nodes import qos
-from hmt_slam_ros.nodes.conversions import planar_pose, stamp_of
-from hmt_slam_ros.nodes.topics import DIAGNOSTICS, ERRANDS, GROUND_TRUTH, INITIAL_POSE, OUTCOMES
+from hmt_slam_ros.ros import topics
+from hmt_slam_ros.ros.conversions import planar_pose, stamp_of
+from hmt_slam_ros.ros.topics import DIAGNOSTICS, ERRANDS, GROUND_TRUTH, INITIAL_POSE, OUTCOMES
 
 RATE = 2.0
 """Times real time at most; the robot waits for slam."""
@@ -72,12 +72,12 @@ class Errands:
         self._contacts, self._reports = 0, 0
         node = listener.node
         node.create_subscription(
-            String, OUTCOMES["pilot"], lambda message: self._outcomes.append(message.data), qos.LATCHED
+            String, OUTCOMES["pilot"], lambda message: self._outcomes.append(message.data), topics.LATCHED
         )
-        node.create_subscription(PoseStamped, GROUND_TRUTH, self._hear_truth, qos.STREAM)
-        node.create_subscription(PoseWithCovarianceStamped, INITIAL_POSE, self._hear_start, qos.STREAM)
-        node.create_subscription(DiagnosticArray, DIAGNOSTICS, self._hear_diagnostics, qos.STREAM)
-        self._errands = node.create_publisher(String, ERRANDS["pilot"], qos.STREAM)
+        node.create_subscription(PoseStamped, GROUND_TRUTH, self._hear_truth, topics.STREAM)
+        node.create_subscription(PoseWithCovarianceStamped, INITIAL_POSE, self._hear_start, topics.STREAM)
+        node.create_subscription(DiagnosticArray, DIAGNOSTICS, self._hear_diagnostics, topics.STREAM)
+        self._errands = node.create_publisher(String, ERRANDS["pilot"], topics.STREAM)
         shared: Parameters = {"start_from": str(start.folder), "mode": "localization"}
         for name in (*PROCESSES, "pilot"):
             stack.enter_context(listener.running(name, shared))

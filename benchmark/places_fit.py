@@ -12,15 +12,15 @@ from benchmark.institute_maps import InstituteMap, scenario_of
 from benchmark.report import table
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration import Configuration
-from hmt_slam_ros.features.corners import corners_of
-from hmt_slam_ros.features.extraction import extract_lines
-from hmt_slam_ros.features.openings import openings_of
-from hmt_slam_ros.features.rays import rays_of
 from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.landmarks.beam_labels import rays_of
+from hmt_slam_ros.landmarks.corners import corners_of
+from hmt_slam_ros.landmarks.line_extraction import extract_lines
+from hmt_slam_ros.landmarks.openings import openings_of
 from hmt_slam_ros.places.observation import reach_of
 from hmt_slam_ros.places.observation_graph import OPENINGS, TRACKS, Landmarks, chosen, observation_graph, of_walls
 from hmt_slam_ros.places.place_graph import PlaceGraph, state_of
-from hmt_slam_ros.sensing import Scan
+from hmt_slam_ros.sensors import Scan
 
 _EVERY = 5  # scans
 _CHANGED = 0.25  # of the doors, that were closed before the further drive, and others opened

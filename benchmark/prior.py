@@ -16,8 +16,8 @@ from benchmark.settings import Settings
 from benchmark.simulated.measured import chosen_families, chosen_seeds
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration import Configuration, load_configuration
-from hmt_slam_ros.processes.place_prior import counted
-from hmt_slam_ros.topology.whereabouts import UNMAPPED
+from hmt_slam_ros.places.relocalization_prior import counted
+from hmt_slam_ros.topological_inference.global_localization import UNMAPPED
 
 SEEDS = 2
 """Buildings of every kind."""

@@ -18,10 +18,11 @@ from benchmark.report import Report, Requirement, table
 from benchmark.runs import PARAMETERS
 from benchmark.settings import Settings
 from hmt_slam_ros.configuration import Configuration, load_configuration
-from hmt_slam_ros.logs import LogRecord, open_log
+from hmt_slam_ros.logs import LogRecord
 from hmt_slam_ros.offline.runtime import Run
-from hmt_slam_ros.sensing import Scan
-from hmt_slam_ros.topology.whereabouts import UNMAPPED
+from hmt_slam_ros.open_log import open_log
+from hmt_slam_ros.sensors import Scan
+from hmt_slam_ros.topological_inference.global_localization import UNMAPPED
 
 Array = NDArray[np.float64]
 

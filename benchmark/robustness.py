@@ -16,7 +16,7 @@ from benchmark.runs import Case, Run
 from benchmark.scoring import FINAL, over_seeds, score
 from benchmark.settings import Settings
 from hmt_slam_ros.evaluation import RelationErrors, read_tum
-from hmt_slam_ros.offline.saved_map import read_saved_map
+from hmt_slam_ros.results.hmt_map import read_saved_map
 
 SEEDS = 5
 LONG_LIMIT = 1.0

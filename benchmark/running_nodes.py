@@ -16,7 +16,7 @@ from rclpy.node import Node
 
 from benchmark.logs import ROOT
 from hmt_slam_ros.errors import HmtSlamError
-from hmt_slam_ros.nodes.domain import own_domain
+from hmt_slam_ros.ros.domain import own_domain
 
 Parameters = Mapping[str, str | float | list[float]]
 
@@ -67,7 +67,7 @@ class Listener:
         """A node as a process of its own, which ends with the context."""
         words = [word for key, value in parameters.items() for word in ("-p", f"{key}:={value}")]
         process = subprocess.Popen(
-            [sys.executable, "-m", f"hmt_slam_ros.nodes.{name}_node", "--ros-args", *words],
+            [sys.executable, "-m", f"hmt_slam_ros.ros.{name}_node", "--ros-args", *words],
             cwd=ROOT,
             env=os.environ | {"ROS_DOMAIN_ID": str(self._domain)},
             stdin=subprocess.DEVNULL,

@@ -19,7 +19,7 @@ from benchmark.scale_memory import Stored, stored
 from benchmark.scale_scans import cost_of_scans
 from benchmark.settings import Settings
 from hmt_slam_ros.configuration import Configuration, load_configuration
-from hmt_slam_ros.processes.tsbi_branching import FEWEST
+from hmt_slam_ros.topological_inference.branching import FEWEST
 
 SMALL = (Lattice(5, 2), Lattice(10, 10), Lattice(50, 20))
 LARGE = (Lattice(100, 100), Lattice(1000, 100))

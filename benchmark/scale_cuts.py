@@ -12,10 +12,10 @@ from benchmark.scripted import STEP, Script
 from benchmark.simulated.examinations import Examination, WatchedBranching
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.processes.messages import Message
-from hmt_slam_ros.processes.replica import FIRST_HYPOTHESIS, Replica
-from hmt_slam_ros.processes.tsbi import Tsbi
-from hmt_slam_ros.processes.tsbi_branching import Branching
+from hmt_slam_ros.messages.messages import Message
+from hmt_slam_ros.messages.replica import FIRST_HYPOTHESIS, Replica
+from hmt_slam_ros.topological_inference.branching import Branching
+from hmt_slam_ros.topological_inference.tsbi import Tsbi
 
 _EXCURSIONS = 6
 _LONGEST = 8  # crossings along the map

@@ -12,22 +12,22 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from benchmark.lattice import ARC, FIRST_KEYFRAME, PER_AREA, Lattice, shared_scan
+from hmt_slam_ros.area_abstraction.overlap_graph import OverlapGraph
+from hmt_slam_ros.area_abstraction.partition import WatchState
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.logs import open_log
-from hmt_slam_ros.offline.reading import LogState
-from hmt_slam_ros.offline.record import EstimateTable, ProbabilityTable, TopologyProbability, TrailTable
+from hmt_slam_ros.loop_closure.closure_history import Step
+from hmt_slam_ros.loop_closure.closure_revision import Past
+from hmt_slam_ros.messages.messages import LocalEstimate, Trail
+from hmt_slam_ros.messages.replica import FIRST_HYPOTHESIS, Replica
+from hmt_slam_ros.metric_slam.live_hypothesis import KeyframeCovariances
 from hmt_slam_ros.offline.runtime import Run
-from hmt_slam_ros.offline.saved_map import MapWriter, RunState, read_run_state, read_saved_map
-from hmt_slam_ros.persistence.replacing import put_in_place
-from hmt_slam_ros.processes.aam_watch import WatchState
-from hmt_slam_ros.processes.closure_account import Step
-from hmt_slam_ros.processes.live_hypothesis import KeyframeCovariances
-from hmt_slam_ros.processes.messages import LocalEstimate, Trail
-from hmt_slam_ros.processes.reopening import Past
-from hmt_slam_ros.processes.replica import FIRST_HYPOTHESIS, Replica
-from hmt_slam_ros.sensing import Scan
-from hmt_slam_ros.topology.overlap_graph import OverlapGraph
+from hmt_slam_ros.open_log import open_log
+from hmt_slam_ros.results.hmt_map import MapWriter, RunState, read_run_state, read_saved_map
+from hmt_slam_ros.results.log_reading import LogState
+from hmt_slam_ros.results.record import EstimateTable, ProbabilityTable, TopologyProbability, TrailTable
+from hmt_slam_ros.saved_map.folder import put_in_place
+from hmt_slam_ros.sensors import Scan
 
 BEAMS = 181
 """Of the scans that are saved."""

@@ -9,7 +9,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 
 from benchmark.lattice import PER_AREA, Lattice, scan_at
-from hmt_slam_ros.sensing import Scan
+from hmt_slam_ros.sensors import Scan
 
 BEAMS = 181
 """Of the scans that are weighed."""

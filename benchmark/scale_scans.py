@@ -10,19 +10,19 @@ from itertools import pairwise
 import numpy as np
 
 from benchmark.lattice import SPACING, Lattice, LatticeScans, scan_at
+from hmt_slam_ros.area_abstraction.aam import Aam
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration import Configuration
+from hmt_slam_ros.loop_closure.tlca import Tlca
+from hmt_slam_ros.messages.messages import Message
+from hmt_slam_ros.messages.replica import FIRST_HYPOTHESIS, Replica
+from hmt_slam_ros.messages.routing import Process
+from hmt_slam_ros.metric_slam.slam import MetricSlam
 from hmt_slam_ros.offline.runtime import LockStep
-from hmt_slam_ros.processes.aam import Aam
-from hmt_slam_ros.processes.messages import Message
-from hmt_slam_ros.processes.replica import FIRST_HYPOTHESIS, Replica
-from hmt_slam_ros.processes.routing import Process
-from hmt_slam_ros.processes.rtl import Rtl
-from hmt_slam_ros.processes.slam import MetricSlam
-from hmt_slam_ros.processes.tlca import Tlca
-from hmt_slam_ros.processes.tsbi import Tsbi
-from hmt_slam_ros.processes.tsbi_branching import Branching
-from hmt_slam_ros.sensing import Odometry
+from hmt_slam_ros.real_time_localization.rtl import Rtl
+from hmt_slam_ros.sensors import Odometry
+from hmt_slam_ros.topological_inference.branching import Branching
+from hmt_slam_ros.topological_inference.tsbi import Tsbi
 
 _REPEATS = 5
 _STEP, _TURN = 0.1, 10  # m and degrees between scans

@@ -11,12 +11,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from hmt_slam_ros.agreement import Clutter
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.processes.map_parts import AreaPose
-from hmt_slam_ros.processes.messages import (
+from hmt_slam_ros.messages.map_changes import AreaPose
+from hmt_slam_ros.messages.messages import (
     Accepted,
     AreaEvent,
     AreaEvents,
@@ -26,9 +25,10 @@ from hmt_slam_ros.processes.messages import (
     LeafEstimate,
     Message,
 )
-from hmt_slam_ros.processes.replica import FIRST_AREA, FIRST_HYPOTHESIS
-from hmt_slam_ros.processes.routing import Process
-from hmt_slam_ros.sensing import Scan
+from hmt_slam_ros.messages.replica import FIRST_AREA, FIRST_HYPOTHESIS
+from hmt_slam_ros.messages.routing import Process
+from hmt_slam_ros.registration.consistency import Clutter
+from hmt_slam_ros.sensors import Scan
 
 STEP = np.diag([0.02, 0.02, math.radians(0.5)]) ** 2
 """Covariance of the odometry between two keyframes."""

@@ -13,8 +13,8 @@ from benchmark.runs import Case, Run
 from benchmark.scoring import FINAL, SeedMeans, over_seeds, score, scored
 from benchmark.settings import Settings
 from hmt_slam_ros.evaluation import RelationErrors, StampedPoses, read_tum
-from hmt_slam_ros.logs import open_log
-from hmt_slam_ros.offline.output_folder import EARLIER
+from hmt_slam_ros.open_log import open_log
+from hmt_slam_ros.results.output_folder import EARLIER
 
 SEEDS = 5
 WORSE = 1.2

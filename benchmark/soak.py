@@ -21,17 +21,16 @@ from std_msgs.msg import String
 
 from benchmark.report import Report, Requirement, table
 from benchmark.settings import Settings
-from hmt_slam_ros.logs import open_log
 from hmt_slam_ros.logs.records import SIMULATED
-from hmt_slam_ros.nodes import qos
-from hmt_slam_ros.nodes.children import Children
-from hmt_slam_ros.nodes.departure import await_departures
-from hmt_slam_ros.nodes.domain import own_domain
-from hmt_slam_ros.nodes.replay import PROCESSES
-from hmt_slam_ros.nodes.topics import DIAGNOSTICS, ROBOT_STATUS
-from hmt_slam_ros.nodes.transforms import TFMessage
-from hmt_slam_ros.processes.documents import RobotStatus, decode
-from hmt_slam_ros.sensing import Scan
+from hmt_slam_ros.messages.documents import RobotStatus, decode
+from hmt_slam_ros.open_log import open_log
+from hmt_slam_ros.ros import topics
+from hmt_slam_ros.ros.domain import own_domain
+from hmt_slam_ros.ros.execution import await_departures
+from hmt_slam_ros.ros.replay import PROCESSES, Children
+from hmt_slam_ros.ros.topics import DIAGNOSTICS, ROBOT_STATUS
+from hmt_slam_ros.ros.transforms import TFMessage
+from hmt_slam_ros.sensors import Scan
 
 WORLD = "office"
 RATE = 10.0
@@ -236,6 +235,6 @@ def _listening(domain: int, found: Soak) -> Iterator[SingleThreadedExecutor]:
         executor = SingleThreadedExecutor(context=context)
         stack.callback(executor.shutdown)
         executor.add_node(node)
-        node.create_subscription(String, ROBOT_STATUS, hear_status, qos.LATCHED)
-        node.create_subscription(DiagnosticArray, DIAGNOSTICS, hear_diagnostics, qos.STREAM)
+        node.create_subscription(String, ROBOT_STATUS, hear_status, topics.LATCHED)
+        node.create_subscription(DiagnosticArray, DIAGNOSTICS, hear_diagnostics, topics.STREAM)
         yield executor

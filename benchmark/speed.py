@@ -20,7 +20,7 @@ from benchmark.logs import ROOT, WITH_RELATIONS, opened
 from benchmark.report import Report, Requirement, table
 from benchmark.runs import Case, Run, Runner
 from benchmark.settings import Settings
-from hmt_slam_ros.offline.plots import plot_cost
+from hmt_slam_ros.results.plots import plot_cost
 
 SEEDS = 3
 CPU_BOUNDS = {"aces": 15.0, "intel": 25.0}

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from hmt_slam_ros.offline.recorder import Recorder
+from hmt_slam_ros.results.recorder import Recorder
 
 LOW, HIGH = 0.2, 0.8
 """Between these probabilities a hypothesis is alive, and does not rule the other out."""

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.offline.map_image import OCCUPIED, OccupancyImage
+from hmt_slam_ros.grids.occupancy_map import OCCUPIED, OccupancyImage
 from hmt_slam_ros.simulation import SimulatedLog
 from hmt_slam_ros.simulation.building import boxes
-from hmt_slam_ros.simulation.raycast import clear_between, clearance, wall_index
+from hmt_slam_ros.simulation.laser import clear_between, clearance, wall_index
 
 Points = NDArray[np.float64]
 

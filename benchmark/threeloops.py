@@ -22,13 +22,12 @@ from benchmark.simulated.truth import NEAR, TURN
 from benchmark.simulated.watch import Watch
 from hmt_slam_ros.configuration import Configuration, load_configuration
 from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
+from hmt_slam_ros.messages.replica import Replica
 from hmt_slam_ros.places.area_views import AreaViews
-from hmt_slam_ros.places.map_loops import MapLoop
-from hmt_slam_ros.processes.loop_proposals import LoopProposals
-from hmt_slam_ros.processes.replica import Replica
-from hmt_slam_ros.processes.tsbi_branching import Branching
+from hmt_slam_ros.places.loop_proposals import LoopProposals, MapLoop
 from hmt_slam_ros.simulation import open_simulated
-from hmt_slam_ros.topology.hybrid_map import HybridMap
+from hmt_slam_ros.topological_inference.branching import Branching
 
 SEEDS = 3
 """Buildings, each with one loop."""

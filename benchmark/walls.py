@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.offline.map_image import FREE, OCCUPIED, occupancy_image
-from hmt_slam_ros.sensing import Scan
+from hmt_slam_ros.grids.occupancy_map import FREE, OCCUPIED, occupancy_image
+from hmt_slam_ros.sensors import Scan
 
 POLICY = (
     "Every 10 m of the path are laid over the map of all that lies more than 20 m of path before. The agreement of a "

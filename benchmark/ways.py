@@ -20,12 +20,12 @@ from benchmark.simulated.measured import chosen_seeds
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration import Configuration, load_configuration
 from hmt_slam_ros.errors import HmtSlamError
-from hmt_slam_ros.exploration.destinations import Destination, destinations
+from hmt_slam_ros.exploration.rooms import Destination, destinations
 from hmt_slam_ros.logs.stamps import NANOSECONDS
 from hmt_slam_ros.offline.runtime import run_log
+from hmt_slam_ros.places.edge_existence import WatchedWays
 from hmt_slam_ros.places.place_graph import state_of, turned
 from hmt_slam_ros.places.policy import turn_towards
-from hmt_slam_ros.places.watched_ways import WatchedWays
 from hmt_slam_ros.simulation import SimulatedLog, open_simulated
 
 WORLDS = {"office": 0.7, "institute": 0.8}

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from hmt_slam_ros.nodes.domain import own_domain
+from hmt_slam_ros.ros.domain import own_domain
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "test"))
@@ -40,7 +40,7 @@ def main() -> None:
         def start(name: str, **parameters: object) -> subprocess.Popen[bytes]:
             named = [f"{key.replace('__', '.')}:={value}" for key, value in parameters.items()]
             settings = [word for setting in named for word in ("-p", setting)]
-            module = f"hmt_slam_ros.nodes.{name}_node"
+            module = f"hmt_slam_ros.ros.{name}_node"
             return subprocess.Popen([sys.executable, "-m", module, "--ros-args", *settings], env=environment)
 
         nodes = [start(name) for name in ("slam", "aam", "tsbi", "tlca", "rtl")] + [start("view", port=PORT)]

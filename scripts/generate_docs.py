@@ -8,12 +8,11 @@ from string import Template
 
 from hmt_slam_ros.configuration import Configuration, flat_parameters
 from hmt_slam_ros.configuration.documents import parameter_table, reference, ros_yaml
-from hmt_slam_ros.offline.going_on import SHAPING
-from hmt_slam_ros.offline.saved_map import PARTS, ChainState, MapDocument
-from hmt_slam_ros.persistence.folder import SCANS
-from hmt_slam_ros.persistence.hmt_map import FORMAT, VERSION
-from hmt_slam_ros.persistence.reference import described
-from hmt_slam_ros.persistence.scans import ScanTable
+from hmt_slam_ros.results.hmt_map import PARTS, ChainState, MapDocument
+from hmt_slam_ros.results.log_reading import SHAPING
+from hmt_slam_ros.saved_map.folder import FORMAT, SCANS, VERSION
+from hmt_slam_ros.saved_map.reference import described
+from hmt_slam_ros.saved_map.scans import ScanTable
 from hmt_slam_ros.simulation.families import FAMILIES
 from hmt_slam_ros.simulation.settings import Settings
 

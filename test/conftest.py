@@ -47,7 +47,7 @@ def pytest_xdist_make_scheduler(config, log):
 def domain(monkeypatch):
     """A ROS domain in which nobody else is; set for this process and its children."""
     pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
-    from hmt_slam_ros.nodes.domain import own_domain  # noqa: PLC0415  only where there is ROS
+    from hmt_slam_ros.ros.domain import own_domain  # noqa: PLC0415  only where there is ROS
 
     with own_domain() as number:
         monkeypatch.setenv("ROS_DOMAIN_ID", str(number))
@@ -99,7 +99,7 @@ class Listener:
         return future.result()
 
     def close(self):
-        from hmt_slam_ros.nodes.departure import await_departures  # noqa: PLC0415  only where there is ROS
+        from hmt_slam_ros.ros.execution import await_departures  # noqa: PLC0415  only where there is ROS
 
         self.executor.shutdown()
         await_departures(self.node, 2.0)
@@ -125,7 +125,7 @@ def start(domain):
     def start(name, *arguments, before=(), **parameters):
         words = [word for key, value in parameters.items() for word in ("-p", f"{key.replace('__', '.')}:={value}")]
         process = subprocess.Popen(
-            [*before, sys.executable, "-m", f"hmt_slam_ros.nodes.{name}_node", "--ros-args", *words, *arguments],
+            [*before, sys.executable, "-m", f"hmt_slam_ros.ros.{name}_node", "--ros-args", *words, *arguments],
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,

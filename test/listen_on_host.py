@@ -10,9 +10,9 @@ from diagnostic_msgs.msg import DiagnosticArray
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
-from hmt_slam_ros.nodes import qos
-from hmt_slam_ros.nodes.topics import DIAGNOSTICS, DOCUMENTS
-from hmt_slam_ros.processes.messages import LocalEstimate
+from hmt_slam_ros.messages.messages import LocalEstimate
+from hmt_slam_ros.ros import topics
+from hmt_slam_ros.ros.topics import DIAGNOSTICS, DOCUMENTS
 
 PATIENCE = 240.0  # s
 
@@ -20,8 +20,8 @@ PATIENCE = 240.0  # s
 def main(domain, scans):
     """Exit with a sentence where the map is not saved."""
     listener = Listener(domain)
-    estimates = listener.hear(String, DOCUMENTS[LocalEstimate], qos.CHAIN)
-    health = listener.hear(DiagnosticArray, DIAGNOSTICS, qos.STREAM)
+    estimates = listener.hear(String, DOCUMENTS[LocalEstimate], topics.CHAIN)
+    health = listener.hear(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
     print("listens", flush=True)
     try:
         # What is lost may be asked for again after three seconds only, by Fast DDS's heartbeat.

@@ -8,7 +8,7 @@ from worlds import box, scan_in
 
 from hmt_slam_ros.logs import LogRecord
 from hmt_slam_ros.logs.writer import write_bag
-from hmt_slam_ros.sensing import Odometry
+from hmt_slam_ros.sensors import Odometry
 
 SECOND = 1_000_000_000
 START = 1_700_000_000 * SECOND

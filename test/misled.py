@@ -2,22 +2,21 @@
 
 import numpy as np
 
+from hmt_slam_ros.area_abstraction.aam import Aam
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.offline.recorder import Recorder
+from hmt_slam_ros.hybrid_map.shortest_path import reachable
+from hmt_slam_ros.loop_closure.tlca import Tlca
+from hmt_slam_ros.messages.documents import decode, encode
+from hmt_slam_ros.messages.map_changes import Arc
+from hmt_slam_ros.messages.messages import Accepted, EndOfLog, Hypotheses
+from hmt_slam_ros.metric_slam.slam import MetricSlam
 from hmt_slam_ros.offline.runtime import LockStep
-from hmt_slam_ros.processes.aam import Aam
-from hmt_slam_ros.processes.documents import decode, encode
-from hmt_slam_ros.processes.map_parts import Arc
-from hmt_slam_ros.processes.messages import Accepted, EndOfLog, Hypotheses
-from hmt_slam_ros.processes.rtl import Rtl
-from hmt_slam_ros.processes.slam import MetricSlam
-from hmt_slam_ros.processes.tlca import Tlca
-from hmt_slam_ros.processes.tsbi import Tsbi
-from hmt_slam_ros.processes.tsbi_branches import Branches, Child
-from hmt_slam_ros.processes.tsbi_branching import Branching
-from hmt_slam_ros.sensing import Scan
-from hmt_slam_ros.topology.shortest_path import reachable
+from hmt_slam_ros.real_time_localization.rtl import Rtl
+from hmt_slam_ros.results.recorder import Recorder
+from hmt_slam_ros.sensors import Scan
+from hmt_slam_ros.topological_inference.branching import Branches, Branching, Child
+from hmt_slam_ros.topological_inference.tsbi import Tsbi
 
 SIGMA = np.diag([0.05, 0.05, np.radians(0.5)]) ** 2
 

@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import worlds
 
-from hmt_slam_ros.agreement import Clutter
 from hmt_slam_ros.configuration import Configuration, with_changes
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.processes.map_parts import Arc, Relabelled
-from hmt_slam_ros.processes.messages import Accepted, Hypotheses, Keyframe, Leaf, LeafEstimate, Notice
-from hmt_slam_ros.processes.tlca import Tlca
+from hmt_slam_ros.loop_closure.tlca import Tlca
+from hmt_slam_ros.messages.map_changes import Arc, Relabelled
+from hmt_slam_ros.messages.messages import Accepted, Hypotheses, Keyframe, Leaf, LeafEstimate, Notice
+from hmt_slam_ros.registration.consistency import Clutter
 
 WORLD = worlds.two_rooms()
 SPREAD = np.diag([0.1**2, 0.1**2, 0.02**2])

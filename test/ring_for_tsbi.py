@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from worlds import box, scan_in
 
-from hmt_slam_ros.agreement import Clutter
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.processes.messages import Accepted, AreaEvent, AreaEvents, Hypotheses, Keyframe, LeafEstimate
-from hmt_slam_ros.processes.replica import Replica
-from hmt_slam_ros.processes.tsbi import Tsbi
+from hmt_slam_ros.messages.messages import Accepted, AreaEvent, AreaEvents, Hypotheses, Keyframe, LeafEstimate
+from hmt_slam_ros.messages.replica import Replica
+from hmt_slam_ros.registration.consistency import Clutter
+from hmt_slam_ros.topological_inference.tsbi import Tsbi
 
 # A ring of corridors, 2 m wide, with niches and pillars that differ from side to side.
 RING = np.concatenate(

@@ -8,11 +8,11 @@ from worlds import scan_at
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.local_map.local_mapping import LocalMapping
+from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.places.area_views import AreaViews
 from hmt_slam_ros.places.chart import chart_of
 from hmt_slam_ros.simulation.building import FloorPlan
-from hmt_slam_ros.topology.hybrid_map import HybridMap
+from hmt_slam_ros.submap.local_mapping import LocalMapping
 
 CONFIGURATION = Configuration()
 # The world's pose of the second area, which begins behind the first door, and where the building stands.

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from worlds import box, drive, scan_in
 
-from hmt_slam_ros.agreement import MAPS, MAPS_USUAL, SCAN, Agreement, Usual
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.topology.area_grid import GridModel, build_area_grid
+from hmt_slam_ros.registration.consistency import MAPS, MAPS_USUAL, SCAN, Agreement, Usual
+from hmt_slam_ros.registration.likelihood_grid import GridModel, build_area_grid
 
 ROOM = box(-4.0, -3.0, 4.0, 3.0)
 PATH = drive((-2.0, 0.0), (2.0, 0.0))

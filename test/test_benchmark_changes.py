@@ -6,7 +6,7 @@ import pytest
 from benchmark.changes import Localized, Visit, localized, requirements, visited_twice
 from benchmark.documents import VALIDATION, marks
 from benchmark.surfaces import Surfaces, judged, unexplained
-from hmt_slam_ros.offline.map_image import FREE, OCCUPIED, OccupancyImage
+from hmt_slam_ros.grids.occupancy_map import FREE, OCCUPIED, OccupancyImage
 
 FRAME = np.zeros(3)
 BEFORE = np.array([[0.0, 0.0, 4.0, 0.0], [1.0, 2.0, 2.0, 2.0]])

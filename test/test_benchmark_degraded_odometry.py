@@ -8,7 +8,7 @@ import pytest
 from benchmark.degraded_odometry import KINDS, degraded
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.logs.records import LogRecord
-from hmt_slam_ros.sensing import Odometry, Scan
+from hmt_slam_ros.sensors import Odometry, Scan
 
 
 @dataclass

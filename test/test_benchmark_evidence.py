@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from benchmark.evidence import Comparison, contradictions, fitted
-from hmt_slam_ros.agreement import MAPS, MAPS_USUAL, Agreement
+from hmt_slam_ros.registration.consistency import MAPS, MAPS_USUAL, Agreement
 
 
 @pytest.mark.parametrize("overstated", [1.0, 4.0])

@@ -8,14 +8,13 @@ from benchmark.documents import VALIDATION, marks
 from benchmark.institute import _mission_requirements, _transitions
 from benchmark.institute_maps import InstituteMap, scenario_of
 from benchmark.institute_missions import Mission, open_doors, way_length
-from hmt_slam_ros.exploration.destinations import Destination
-from hmt_slam_ros.features.existence import Existence
-from hmt_slam_ros.features.landmark_map import Landmark
-from hmt_slam_ros.features.landmarks import OPENING
+from hmt_slam_ros.exploration.rooms import Destination
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.landmarks.landmark_map import Existence, Landmark
+from hmt_slam_ros.landmarks.landmarks import OPENING
 from hmt_slam_ros.places.chart import CROSSING, DOOR, Chart, ChartNode
-from hmt_slam_ros.places.leading_off import LeadingOff
+from hmt_slam_ros.places.floor import LeadingOff
 from hmt_slam_ros.places.observation_graph import no_landmarks
 from hmt_slam_ros.places.place_graph import EAST, NORTH, Edge
 

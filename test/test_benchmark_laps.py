@@ -5,7 +5,7 @@ import pytest
 from benchmark.documents import VALIDATION, marks
 from benchmark.laps import Lap, Laps, driven, requirements
 from hmt_slam_ros.configuration import Configuration
-from hmt_slam_ros.logs import open_log
+from hmt_slam_ros.open_log import open_log
 
 
 def laps(last, error=0.03, count=20):

@@ -8,7 +8,7 @@ from benchmark.enumeration import Enumeration
 from benchmark.oracle import Regime, compared, filtered, mean_distances, oracle_requirements, stops, total_variation
 from benchmark.runs import PARAMETERS
 from hmt_slam_ros.configuration import load_configuration
-from hmt_slam_ros.processes import tsbi
+from hmt_slam_ros.topological_inference import tsbi
 
 WORLD, SEED, NOISE = "four crossings", 1, 2.0
 VAGUE = Regime("vague", (WORLD,), (NOISE,), ("tsbi.temper=0.03",))

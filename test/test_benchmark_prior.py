@@ -8,7 +8,7 @@ import pytest
 from benchmark.looks import Look
 from benchmark.prior import EXPONENTS, best_constant, by_a_constant, by_landmarks, fitted, looks_of, scored_with
 from hmt_slam_ros.configuration import Configuration
-from hmt_slam_ros.topology.whereabouts import Whereabouts
+from hmt_slam_ros.topological_inference.global_localization import Whereabouts
 
 
 def look(probabilities, right=(), ratios=None, inside=True):

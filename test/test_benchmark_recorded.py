@@ -8,7 +8,7 @@ import pytest
 from benchmark.looks import Look, same_kind
 from benchmark.recorded import BOTH, KINDS, LANDMARKS, NONE, roc_area, scored
 from hmt_slam_ros.configuration import Configuration, with_changes
-from hmt_slam_ros.topology.whereabouts import Whereabouts
+from hmt_slam_ros.topological_inference.global_localization import Whereabouts
 
 
 def test_the_area_under_the_curve_is_the_share_of_pairs_in_the_right_order():

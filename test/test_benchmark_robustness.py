@@ -15,9 +15,9 @@ from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.evaluation import Relations, StampedPoses, evaluate_relations, read_tum
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.offline.saved_map import SavedMap
-from hmt_slam_ros.processes.replica import Replica
-from hmt_slam_ros.topology.hybrid_map import HybridMap
+from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
+from hmt_slam_ros.messages.replica import Replica
+from hmt_slam_ros.results.hmt_map import SavedMap
 
 # Keyframes of a robot that comes back to where it began: area 0 holds the first two, area 1 the last two.
 TRUTH = {0: [0.0, 0.0, 0.0], 1: [5.0, 0.0, 0.3], 2: [5.2, 1.0, -2.0], 3: [0.3, 0.1, 3.0]}

@@ -11,7 +11,7 @@ from benchmark.scale_maps import lasting, state_of
 from benchmark.scale_memory import stored
 from benchmark.scale_scans import cost_of_scans
 from hmt_slam_ros.configuration import Configuration
-from hmt_slam_ros.topology.shortest_path import reachable
+from hmt_slam_ros.hybrid_map.shortest_path import reachable
 
 
 def test_every_crossing_lies_where_the_arcs_place_it():

@@ -14,11 +14,11 @@ from hmt_slam_ros.configuration import load_configuration
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
+from hmt_slam_ros.messages.messages import Keyframe
 from hmt_slam_ros.offline.runtime import run_log
-from hmt_slam_ros.processes.messages import Keyframe
-from hmt_slam_ros.sensing import Scan
+from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.simulation import open_simulated
-from hmt_slam_ros.topology.hybrid_map import HybridMap
 
 WORLD = World("ring", 5)
 TIGHT = 1e-4 * np.eye(3)

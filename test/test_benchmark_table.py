@@ -12,9 +12,9 @@ from benchmark.table import Comparison, Entry, comparison_table, requirements
 from benchmark.table_runs import KeptRunner, compared, metric_case
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.errors import HmtSlamError
-from hmt_slam_ros.logs import open_log
+from hmt_slam_ros.messages.messages import AreaEvents, Hypotheses
 from hmt_slam_ros.offline.runtime import run_log
-from hmt_slam_ros.processes.messages import AreaEvents, Hypotheses
+from hmt_slam_ros.open_log import open_log
 
 LOG = MeasuredLog("aces", Path("aces.clf"))
 

@@ -4,7 +4,7 @@ import io
 
 import pytest
 
-from hmt_slam_ros.cli.progress import Progress
+from hmt_slam_ros.cli.terminal import Progress
 
 
 class Stream(io.StringIO):

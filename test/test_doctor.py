@@ -8,15 +8,14 @@ import numpy as np
 import pytest
 
 from hmt_slam_ros.cli.main import main
-from hmt_slam_ros.doctor.bag_messages import scan_head
 from hmt_slam_ros.doctor.examination import findings_of_log
-from hmt_slam_ros.doctor.statistics import Joint, Messages, ScanHead
+from hmt_slam_ros.doctor.statistics import Joint, Messages, ScanHead, scan_head
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.logs import open_log
 from hmt_slam_ros.logs.records import LogRecord
 from hmt_slam_ros.logs.ros_types import LASER_SCAN, typestore
 from hmt_slam_ros.logs.writer import _header, write_bag
-from hmt_slam_ros.sensing import Scan
+from hmt_slam_ros.open_log import open_log
+from hmt_slam_ros.sensors import Scan
 
 WORLD = "sim:office,seed=3,beams=181,readings=4"
 

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.evaluation import StampedPoses, odometry_of, read_tum, write_tum
-from hmt_slam_ros.logs import open_log
-from hmt_slam_ros.sensing import Odometry
+from hmt_slam_ros.open_log import open_log
+from hmt_slam_ros.sensors import Odometry
 
 MALAGA = Path(__file__).parents[1] / "data" / "malaga_one_loop"
 

@@ -10,31 +10,29 @@ import numpy as np
 import pytest
 
 from benchmark.driven_run import DrivenRun, true_place
-from hmt_slam_ros.agreement import Clutter
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.configuration.flat import with_changes
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.exploration.explorer import Explorer
-from hmt_slam_ros.exploration.ground import Ground
-from hmt_slam_ros.exploration.outlook import crosses, outlook_of
-from hmt_slam_ros.exploration.pilot import Pilot
-from hmt_slam_ros.exploration.survey import Opened, Survey
-from hmt_slam_ros.features.doors import jambs_of, up_to_doors
+from hmt_slam_ros.exploration.frontiers import Ground
+from hmt_slam_ros.exploration.local_motion import Command, Limits, command_towards
+from hmt_slam_ros.exploration.path_follower import Pilot
+from hmt_slam_ros.exploration.roadmap import Opened, Survey, crosses, outlook_of
 from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
+from hmt_slam_ros.landmarks.openings import jambs_of, up_to_doors
 from hmt_slam_ros.logs.stamps import NANOSECONDS
-from hmt_slam_ros.motion import Command, Limits, command_towards
-from hmt_slam_ros.processes.errands import OF_EXPLORER, Errand, Heading, Outcome, Steering, errand_of
-from hmt_slam_ros.processes.messages import Accepted, Hypotheses, Keyframe, Leaf, LeafEstimate
-from hmt_slam_ros.processes.replica import Replica
-from hmt_slam_ros.sensing import Scan
+from hmt_slam_ros.messages.messages import Accepted, Hypotheses, Keyframe, Leaf, LeafEstimate
+from hmt_slam_ros.messages.replica import Replica
+from hmt_slam_ros.messages.tasks import OF_EXPLORER, Errand, Heading, Outcome, Steering, errand_of
+from hmt_slam_ros.registration.consistency import Clutter
+from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.simulation.building import Building, FloorPlan
 from hmt_slam_ros.simulation.driven_robot import DrivenRobot
-from hmt_slam_ros.simulation.laser import Laser
-from hmt_slam_ros.simulation.raycast import wall_index
+from hmt_slam_ros.simulation.laser import Laser, wall_index
 from hmt_slam_ros.simulation.scenario import START, Scenario
 from hmt_slam_ros.simulation.settings import Settings
-from hmt_slam_ros.topology.hybrid_map import HybridMap
 
 ROOMS = np.array([[3.0, -3.2], [9.0, -3.2]])
 """Middles of the rooms, m."""
@@ -326,7 +324,7 @@ def test_it_does_not_aim_behind_a_wall(monkeypatch: pytest.MonkeyPatch) -> None:
         aims.append(goal)
         return command_towards(scan, goal, velocity, limits)
 
-    monkeypatch.setattr("hmt_slam_ros.exploration.pilot.command_towards", towards)
+    monkeypatch.setattr("hmt_slam_ros.exploration.path_follower.command_towards", towards)
     # From the northern arm around the eastern corner; the wall of the arm is at x = 7 up to y = 1.
     at = np.array([6.6, 1.6, 0.0])
     way = se2.transform(se2.inverse(at), np.array([(6.6, 1.6), (6.6, 0.5), (8.5, 0.5)]))

@@ -9,14 +9,14 @@ import pytest
 from small_floor import AREAS, CONFIGURATION, charted, mapped, seen_at
 from worlds import blank_scan
 
-from hmt_slam_ros.exploration import mission
-from hmt_slam_ros.exploration.destinations import Destination, KnownBuilding, destinations
-from hmt_slam_ros.exploration.mission import MissionPilot, Phase
+from hmt_slam_ros.exploration import mission_controller
+from hmt_slam_ros.exploration.local_motion import Limits
+from hmt_slam_ros.exploration.mission_controller import MissionPilot, Phase
+from hmt_slam_ros.exploration.rooms import Destination, KnownBuilding, destinations
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.motion import Limits
 from hmt_slam_ros.places.place_graph import opposite, state_of
 from hmt_slam_ros.places.position_belief import certain_belief
-from hmt_slam_ros.sensing.motion import Step, increment_covariance
+from hmt_slam_ros.sensors.motion_model import Step, increment_covariance
 
 LIMITS = Limits(0.6, math.radians(45.0), 0.5, math.radians(90.0), 0.25)
 STEPS = 900
@@ -193,8 +193,8 @@ def test_a_robot_that_left_a_room_looks_where_the_metric_filter_says(known):
 
 def test_a_robot_that_is_out_of_a_room_where_it_went_in_has_got_on_and_turns_as_it_should(known, monkeypatch):
     # In the time and the way of a visit to the room it would not have got anywhere.
-    monkeypatch.setattr(mission, "_PROGRESS", 2.0)
-    monkeypatch.setattr(mission, "_ELSEWHERE", np.array((2.0, 0.0, 0.0)))
+    monkeypatch.setattr(mission_controller, "_PROGRESS", 2.0)
+    monkeypatch.setattr(mission_controller, "_ELSEWHERE", np.array((2.0, 0.0, 0.0)))
     goal = destinations(known)[node_at(known, 5.0)]
     west = state_of(node_at(known, 10.0), opposite(eastwards(known)))
     belief = certain_belief(known.graph, CONFIGURATION.places, west)

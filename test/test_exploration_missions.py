@@ -9,14 +9,14 @@ from small_floor import AREAS, CONFIGURATION, mapped, seen_at
 
 from hmt_slam_ros.configuration.flat import with_changes
 from hmt_slam_ros.errors import HmtSlamError
-from hmt_slam_ros.exploration.missions import Missions
+from hmt_slam_ros.exploration.pilot import Missions
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.processes.errands import OF_PILOT, Heading, Outcome, PlaceEstimate, Steering, errand_of
-from hmt_slam_ros.processes.messages import Carried, RealTimePose
-from hmt_slam_ros.processes.replica import Replica
-from hmt_slam_ros.sensing import Odometry
-from hmt_slam_ros.topology.hybrid_map import HybridMap
+from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
+from hmt_slam_ros.messages.messages import Carried, RealTimePose
+from hmt_slam_ros.messages.replica import Replica
+from hmt_slam_ros.messages.tasks import OF_PILOT, Heading, Outcome, PlaceEstimate, Steering, errand_of
+from hmt_slam_ros.sensors import Odometry
 
 PERIOD = 0.2
 BEGIN = 5_000_000_000

@@ -2,8 +2,8 @@
 
 import pytest
 
-from hmt_slam_ros.configuration.features import Features
-from hmt_slam_ros.features.existence import Existence
+from hmt_slam_ros.configuration.landmarks import Features
+from hmt_slam_ros.landmarks.landmark_map import Existence
 
 FEATURES = Features(landmark_detected=0.9, landmark_by_chance=0.1, landmark_lasting=0.99)
 

@@ -5,13 +5,20 @@ import pytest
 from worlds import box, drive, scan_at, scan_in
 
 from benchmark.hallways import depth_in_rooms
-from hmt_slam_ros.configuration.features import Features
+from hmt_slam_ros.configuration.landmarks import Features
 from hmt_slam_ros.configuration.tree import Configuration
-from hmt_slam_ros.features.hallway import FreeSpace, after, area_class, free_space, log_odds, shortest_hallway
-from hmt_slam_ros.features.rays import rays_of
-from hmt_slam_ros.local_map.area_kind import AreaKinds
-from hmt_slam_ros.local_map.local_mapping import LocalMapping
+from hmt_slam_ros.landmarks.area_classes import (
+    AreaKinds,
+    FreeSpace,
+    after,
+    area_class,
+    free_space,
+    log_odds,
+    shortest_hallway,
+)
+from hmt_slam_ros.landmarks.beam_labels import rays_of
 from hmt_slam_ros.simulation import open_simulated
+from hmt_slam_ros.submap.local_mapping import LocalMapping
 
 FEATURES = Features()
 HALLWAY, ROOM = box(-12, -1, 12, 1), box(-2.5, -2, 2.5, 2)

@@ -9,10 +9,10 @@ from worlds import blank_scan, box, scan_in
 from benchmark import heading as measured
 from benchmark.simulated.worlds import World
 from hmt_slam_ros.configuration import Configuration
-from hmt_slam_ros.configuration.features import Features
-from hmt_slam_ros.features.extraction import extract_lines
-from hmt_slam_ros.features.heading import QUARTER, BuildingHeading
-from hmt_slam_ros.sensing.motion import Step
+from hmt_slam_ros.configuration.landmarks import Features
+from hmt_slam_ros.landmarks.heading import QUARTER, BuildingHeading
+from hmt_slam_ros.landmarks.line_extraction import extract_lines
+from hmt_slam_ros.sensors.motion_model import Step
 
 FEATURES = Features(range_deviation=0.01)
 ROOM = box(-3.0, -2.0, 5.0, 4.0)

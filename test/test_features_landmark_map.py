@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 from worlds import box, scan_at
 
-from hmt_slam_ros.configuration.features import Features
-from hmt_slam_ros.features.extraction import extract_lines
-from hmt_slam_ros.features.landmark_map import LandmarkMap, scatter_ratio
-from hmt_slam_ros.features.landmarks import INNER, OPENING, OUTER, due, landmarks_of
-from hmt_slam_ros.features.rays import rays_of
+from hmt_slam_ros.configuration.landmarks import Features
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.landmarks.beam_labels import rays_of
+from hmt_slam_ros.landmarks.landmark_map import LandmarkMap, scatter_ratio
+from hmt_slam_ros.landmarks.landmarks import INNER, OPENING, OUTER, due, landmarks_of
+from hmt_slam_ros.landmarks.line_extraction import extract_lines
 
 NOISE = 0.01
 FEATURES = Features(range_deviation=NOISE)

@@ -5,12 +5,12 @@ import pytest
 from worlds import box, scan_at, scan_in
 
 from benchmark.landmark_truth import World
-from hmt_slam_ros.configuration.features import Features
-from hmt_slam_ros.features.corners import corners_of
-from hmt_slam_ros.features.extraction import Lines, extract_lines
-from hmt_slam_ros.features.openings import openings_of
-from hmt_slam_ros.features.rays import rays_of
+from hmt_slam_ros.configuration.landmarks import Features
 from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.landmarks.beam_labels import rays_of
+from hmt_slam_ros.landmarks.corners import corners_of
+from hmt_slam_ros.landmarks.line_extraction import Lines, extract_lines
+from hmt_slam_ros.landmarks.openings import openings_of
 from hmt_slam_ros.simulation import open_simulated
 
 NOISE = 0.01

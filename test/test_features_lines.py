@@ -9,11 +9,10 @@ from worlds import box, scan_at, scan_in
 from benchmark import lines as measured
 from benchmark.line_truth import difference, lines_of, seen_in
 from benchmark.simulated.worlds import World
-from hmt_slam_ros.configuration.features import Features
-from hmt_slam_ros.features.extraction import extract_for_map, extract_lines
-from hmt_slam_ros.features.line_fit import Beams, fit
-from hmt_slam_ros.features.merging import distance2
+from hmt_slam_ros.configuration.landmarks import Features
 from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.landmarks.line_extraction import extract_for_map, extract_lines
+from hmt_slam_ros.landmarks.line_fit import Beams, distance2, fit
 from hmt_slam_ros.simulation import open_simulated
 
 NOISE = 0.015

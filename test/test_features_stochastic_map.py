@@ -5,13 +5,13 @@ import pytest
 
 from benchmark.linemap import mapped
 from hmt_slam_ros.configuration import Configuration
-from hmt_slam_ros.configuration.features import Features
-from hmt_slam_ros.features.extraction import Lines
-from hmt_slam_ros.features.line_fit import wrapped
-from hmt_slam_ros.features.stochastic_map import LineMap
+from hmt_slam_ros.configuration.landmarks import Features
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.sensing.motion import Step
+from hmt_slam_ros.landmarks.line_extraction import Lines
+from hmt_slam_ros.landmarks.line_fit import wrapped
+from hmt_slam_ros.landmarks.stochastic_map import LineMap
+from hmt_slam_ros.sensors.motion_model import Step
 
 FEATURES = Features()
 SIGMAS = np.array([0.004, 0.01])  # rad, m

@@ -10,8 +10,7 @@ from hypothesis.extra.numpy import arrays
 from scipy.stats import chi2
 
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.geometry.chi_square import gate
-from hmt_slam_ros.geometry.gaussian import PoseGaussian, fuse
+from hmt_slam_ros.geometry.gaussian import PoseGaussian, fuse, gate
 
 SAMPLES = 200_000
 

@@ -9,9 +9,9 @@ from test_local_map_matching import ALIGNMENT, MODEL, ROOM, mapped, seen
 
 from benchmark.allocations import ARRAYS, counted, requirements_on
 from hmt_slam_ros.configuration import Configuration
-from hmt_slam_ros.local_map import batch, matching
-from hmt_slam_ros.logs import open_log
 from hmt_slam_ros.offline.runtime import run_log
+from hmt_slam_ros.open_log import open_log
+from hmt_slam_ros.registration import scan_to_map
 
 BAG = Path(__file__).resolve().parents[1] / "data" / "malaga_one_loop"
 FREE = {"insertion.insert", "insertion.patches_needed", "matching.evidence", "matching.log_prior"}
@@ -46,9 +46,9 @@ def test_proposals_take_their_results_alone_for_any_number_of_particles_and_beam
         1.0,
         0.05,
     )
-    batch.propose_all(*arguments)
+    scan_to_map.propose_all(*arguments)
     with counted() as counts:
-        batch.propose_all(*arguments)
+        scan_to_map.propose_all(*arguments)
     assert counts["local_map.batch.propose_all"] == [4]
 
 
@@ -58,12 +58,12 @@ def test_a_kernel_that_takes_memory_is_found_out(monkeypatch):
         difference = pose - prior.mean
         return -0.5 * np.dot(difference, prior.information @ difference)
 
-    log_prior.py_func.__module__ = matching.__name__
-    monkeypatch.setattr(matching, "log_prior", log_prior)
-    prior = matching.Prior(np.zeros(3), np.eye(3))
+    log_prior.py_func.__module__ = scan_to_map.__name__
+    monkeypatch.setattr(scan_to_map, "log_prior", log_prior)
+    prior = scan_to_map.Prior(np.zeros(3), np.eye(3))
     log_prior(np.ones(3), prior)
     with counted() as counts:
-        assert matching.log_prior(np.ones(3), prior) == -1.5
+        assert scan_to_map.log_prior(np.ones(3), prior) == -1.5
     assert counts["local_map.matching.log_prior"] == [2]
     assert [requirement.met for requirement in requirements_on(counts)] == [False]
-    assert matching.log_prior is log_prior
+    assert scan_to_map.log_prior is log_prior

@@ -7,9 +7,9 @@ import pytest
 from worlds import box, scan_at, scan_in
 
 from hmt_slam_ros.configuration.tree import Configuration
-from hmt_slam_ros.features.landmarks import INNER
-from hmt_slam_ros.local_map.area_landmarks import AreaLandmarks
-from hmt_slam_ros.local_map.local_mapping import LocalMapping
+from hmt_slam_ros.landmarks.area_landmarks import AreaLandmarks
+from hmt_slam_ros.landmarks.landmarks import INNER
+from hmt_slam_ros.submap.local_mapping import LocalMapping
 
 ROOM = box(-2.02, -1.51, 2.53, 2.02)
 POSES = np.array([(0.2 * k, 0.1, 0.8 * k) for k in range(9)])

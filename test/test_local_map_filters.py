@@ -4,18 +4,17 @@ import numpy as np
 import pytest
 from worlds import box, drive, scan_in
 
-from hmt_slam_ros.agreement import Agreement
 from hmt_slam_ros.configuration import Configuration, with_changes
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.local_map.area_filter import AreaFilter
-from hmt_slam_ros.local_map.filters import Kinds, new_filter
-from hmt_slam_ros.local_map.judgement import Compared
-from hmt_slam_ros.local_map.line_filter import LineFilter
-from hmt_slam_ros.local_map.local_filter import PlacedKeyframe
-from hmt_slam_ros.local_map.local_mapping import LocalMapping
-from hmt_slam_ros.local_map.sighting import Sighting
-from hmt_slam_ros.sensing.motion import Prediction, Step
+from hmt_slam_ros.landmarks.line_filter import LineFilter
+from hmt_slam_ros.registration.consistency import Agreement
+from hmt_slam_ros.sensors.motion_model import Prediction, Step
+from hmt_slam_ros.submap.filter_selection import Kinds, new_filter
+from hmt_slam_ros.submap.local_filter import PlacedKeyframe
+from hmt_slam_ros.submap.local_mapping import LocalMapping, Sighting
+from hmt_slam_ros.submap.particle_filter import AreaFilter
+from hmt_slam_ros.submap.scan_evidence import Compared
 
 WALLS = {AreaFilter: box(-12.02, -1.03, 12.01, 1.02), LineFilter: box(-2.51, -2.03, 2.52, 2.01)}
 TURN = np.array([0.0, 0.0, 0.3])

@@ -7,11 +7,10 @@ from worlds import blank_scan, drive, scan_in, two_rooms
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.local_map.area_filter import AreaFilter
-from hmt_slam_ros.local_map.local_mapping import LocalMapping
-from hmt_slam_ros.local_map.match_error import match_error
-from hmt_slam_ros.local_map.sighting import Sighting
-from hmt_slam_ros.sensing.motion import Prediction, Step
+from hmt_slam_ros.registration.match_covariance import match_error
+from hmt_slam_ros.sensors.motion_model import Prediction, Step
+from hmt_slam_ros.submap.local_mapping import LocalMapping, Sighting
+from hmt_slam_ros.submap.particle_filter import AreaFilter
 
 CORRIDOR = np.array([[-200.0, -1.0, 200.0, -1.0], [-200.0, 1.0, 200.0, 1.0]])
 ODOMETRY = np.diag([0.05, 0.05, 0.025]) ** 2

@@ -7,20 +7,12 @@ from hypothesis import strategies as st
 from worlds import box, scan_in
 
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.local_map.batch import propose_all
-from hmt_slam_ros.local_map.insertion import InverseModel
-from hmt_slam_ros.local_map.matching import (
-    Alignment,
-    Prior,
-    agreement,
-    align,
-    beam_model,
-    log_ratio,
-)
-from hmt_slam_ros.local_map.patch_pool import Beams, PatchPool
-from hmt_slam_ros.local_map.patches import FAR, PATCH, field_at, odds_at
-from hmt_slam_ros.local_map.search import Lattice, correlative_search
-from hmt_slam_ros.sensing.surfels import surfels
+from hmt_slam_ros.grids.insertion import InverseModel
+from hmt_slam_ros.grids.patch_pool import Beams, PatchPool
+from hmt_slam_ros.grids.patches import FAR, PATCH, field_at, odds_at
+from hmt_slam_ros.registration.correlative_search import Lattice, correlative_search
+from hmt_slam_ros.registration.scan_to_map import Alignment, Prior, agreement, align, beam_model, log_ratio, propose_all
+from hmt_slam_ros.sensors.surfels import surfels
 
 CELL, RADIUS = 0.05, 0.5
 MODEL = beam_model(RADIUS, 0.1, 10.0, 0.1)

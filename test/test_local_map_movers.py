@@ -7,11 +7,10 @@ from worlds import box, scan_in
 
 from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.local_map.local_mapping import LocalMapping
-from hmt_slam_ros.local_map.matching import Prior
-from hmt_slam_ros.local_map.movers import standing
-from hmt_slam_ros.local_map.sighting import Sighting
-from hmt_slam_ros.sensing.motion import Step, increment_covariance
+from hmt_slam_ros.registration.dynamic_rejection import standing
+from hmt_slam_ros.registration.scan_to_map import Prior
+from hmt_slam_ros.sensors.motion_model import Step, increment_covariance
+from hmt_slam_ros.submap.local_mapping import LocalMapping, Sighting
 
 STEP = np.array([0.12, 0.0, 0.0])
 

@@ -9,10 +9,10 @@ from scipy.ndimage import distance_transform_edt
 from worlds import box, scan_in
 
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.local_map.bits import lowest
-from hmt_slam_ros.local_map.insertion import InverseModel
-from hmt_slam_ros.local_map.patch_pool import Beams, PatchPool
-from hmt_slam_ros.local_map.patches import FAR, PATCH, field_at, odds_at
+from hmt_slam_ros.grids.distance_field import lowest
+from hmt_slam_ros.grids.insertion import InverseModel
+from hmt_slam_ros.grids.patch_pool import Beams, PatchPool
+from hmt_slam_ros.grids.patches import FAR, PATCH, field_at, odds_at
 
 CELL, RADIUS = 0.05, 0.5
 MODEL = InverseModel(17, -8, 70)

@@ -4,11 +4,10 @@ import numpy as np
 import pytest
 from worlds import box, scan_in
 
-from hmt_slam_ros.agreement import SIGHT
 from hmt_slam_ros.configuration import Configuration
-from hmt_slam_ros.local_map.area_filter import AreaFilter
-from hmt_slam_ros.local_map.local_mapping import LocalMapping
-from hmt_slam_ros.local_map.sighting import Sighting
+from hmt_slam_ros.registration.consistency import SIGHT
+from hmt_slam_ros.submap.local_mapping import LocalMapping, Sighting
+from hmt_slam_ros.submap.particle_filter import AreaFilter
 
 ROOM = box(-3.0, -2.0, 5.0, 2.0)
 HERE = np.zeros(3)

@@ -6,10 +6,9 @@ from worlds import blank_scan, box, scan_in
 
 from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.local_map.area_filter import AreaFilter
-from hmt_slam_ros.local_map.local_mapping import LocalMapping
-from hmt_slam_ros.local_map.sighting import Sighting
-from hmt_slam_ros.sensing.motion import Prediction, Step
+from hmt_slam_ros.sensors.motion_model import Prediction, Step
+from hmt_slam_ros.submap.local_mapping import LocalMapping, Sighting
+from hmt_slam_ros.submap.particle_filter import AreaFilter
 
 ROOM = np.concatenate((box(-6.02, -4.03, 6.03, 7.01), box(3.51, 1.02, 4.53, 2.52), box(-4.02, 3.03, -3.52, 7.01)))
 CORRIDOR = np.array([[-100.0, -1.22, 100.0, -1.22], [-100.0, 1.22, 100.0, 1.22]])

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from worlds import box, distances, scan_in
 
-from hmt_slam_ros.configuration.features import Features
+from hmt_slam_ros.configuration.landmarks import Features
 from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.local_map.local_mapping import LocalMapping
-from hmt_slam_ros.local_map.virtual_lines import lines_of_map, rays_of_map
-from hmt_slam_ros.local_map.virtual_scan import virtual_scan
+from hmt_slam_ros.grids.virtual_scan import virtual_scan
+from hmt_slam_ros.landmarks.virtual_lines import lines_of_map, rays_of_map
+from hmt_slam_ros.submap.local_mapping import LocalMapping
 
 ROOM = box(-3.02, -2.01, 5.03, 4.02)
 EYE = np.array([0.7, 0.4, 0.3])

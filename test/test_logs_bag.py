@@ -5,9 +5,9 @@ import pytest
 from rosbags.rosbag2 import StoragePlugin, Writer
 
 from hmt_slam_ros.errors import HmtSlamError
-from hmt_slam_ros.logs import open_log
 from hmt_slam_ros.logs.ros_types import LASER_SCAN, ODOMETRY, TRANSFORMS, typestore
-from hmt_slam_ros.sensing import Odometry, Scan
+from hmt_slam_ros.open_log import open_log
+from hmt_slam_ros.sensors import Odometry, Scan
 
 INF, NAN = np.inf, np.nan
 

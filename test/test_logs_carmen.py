@@ -8,9 +8,9 @@ import pytest
 
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.logs import open_log
-from hmt_slam_ros.logs.saturation import smallest_saturated
-from hmt_slam_ros.sensing import Odometry, Scan
+from hmt_slam_ros.logs.carmen import smallest_saturated
+from hmt_slam_ros.open_log import open_log
+from hmt_slam_ros.sensors import Odometry, Scan
 
 
 def flaser(ranges, pose=(0, 0, 0), odometry=(0, 0, 0), stamp="1.5"):

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from hmt_slam_ros.errors import HmtSlamError
-from hmt_slam_ros.logs import open_log
-from hmt_slam_ros.logs.entries import Entry, EntryLog, Window
+from hmt_slam_ros.logs.records import Entry, EntryLog, Window
 from hmt_slam_ros.logs.writer import convert, write_bag
-from hmt_slam_ros.sensing import Odometry, Scan
+from hmt_slam_ros.open_log import open_log
+from hmt_slam_ros.sensors import Odometry, Scan
 
 DATASETS = Path(os.environ.get("HMT_SLAM_DATASETS", Path(__file__).parents[1] / "../shared/datasets"))
 MALAGA = Path(__file__).parents[1] / "data" / "malaga_one_loop"

@@ -8,8 +8,8 @@ import pytest
 
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.logs import open_log
-from hmt_slam_ros.sensing import Odometry, Scan
+from hmt_slam_ros.open_log import open_log
+from hmt_slam_ros.sensors import Odometry, Scan
 
 TICKS_1970 = 116_444_736_000_000_000
 

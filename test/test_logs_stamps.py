@@ -7,9 +7,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hmt_slam_ros.errors import HmtSlamError
-from hmt_slam_ros.logs.entries import Entry, EntryLog, Window
+from hmt_slam_ros.logs.records import Entry, EntryLog, Window
 from hmt_slam_ros.logs.stamps import running_stamps, seconds_from_stamp, stamp_from_seconds
-from hmt_slam_ros.sensing import Odometry, Scan
+from hmt_slam_ros.sensors import Odometry, Scan
 
 
 @pytest.mark.parametrize(

@@ -6,11 +6,9 @@ import numpy as np
 import pytest
 
 from benchmark.driving import driven, scenario_of
+from hmt_slam_ros.exploration.local_motion import _FAR, Limits, _free, command_towards, path_ahead
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.motion import Limits, command_towards
-from hmt_slam_ros.motion.driver import _FAR, _free
-from hmt_slam_ros.motion.local_path import path_ahead
-from hmt_slam_ros.sensing import Scan
+from hmt_slam_ros.sensors import Scan
 
 LIMITS = Limits(0.6, math.radians(45.0), 0.5, math.radians(90.0), 0.25)
 NOTHING = np.empty((0, 2))

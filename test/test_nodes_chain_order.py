@@ -6,8 +6,8 @@ from hypothesis import strategies as st
 
 pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
 
-from hmt_slam_ros.nodes.chain_order import CHAIN, ChainOrder
-from hmt_slam_ros.processes.messages import Accepted, AreaEvents, Hypotheses, Keyframe
+from hmt_slam_ros.messages.messages import Accepted, AreaEvents, Hypotheses, Keyframe
+from hmt_slam_ros.ros.inbox import CHAIN, ChainOrder
 
 
 def message(kind, sequence):

@@ -14,12 +14,12 @@ from sensor_msgs.msg import LaserScan
 
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.nodes import conversions
-from hmt_slam_ros.nodes.map_view import grid_message
-from hmt_slam_ros.nodes.tsbi_node import pmf_message
-from hmt_slam_ros.offline.map_image import FREE, OCCUPIED, UNKNOWN, OccupancyImage
-from hmt_slam_ros.processes.messages import Hypotheses, Leaf, Trail
-from hmt_slam_ros.sensing import Odometry, Scan
+from hmt_slam_ros.grids.occupancy_map import FREE, OCCUPIED, UNKNOWN, OccupancyImage
+from hmt_slam_ros.messages.messages import Hypotheses, Leaf, Trail
+from hmt_slam_ros.ros import conversions
+from hmt_slam_ros.ros.map_view import grid_message
+from hmt_slam_ros.ros.tsbi_node import pmf_message
+from hmt_slam_ros.sensors import Odometry, Scan
 
 STAMPS = st.integers(0, 2**31 * 10**9 - 1)
 # The smallest doubles have too few bits for half of them to be told.

@@ -12,9 +12,9 @@ pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, 
 from diagnostic_msgs.msg import DiagnosticArray
 
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.nodes import qos
-from hmt_slam_ros.nodes.correction import Correction
-from hmt_slam_ros.nodes.topics import DIAGNOSTICS
+from hmt_slam_ros.real_time_localization.correction import Correction
+from hmt_slam_ros.ros import topics
+from hmt_slam_ros.ros.topics import DIAGNOSTICS
 
 STEP = 10_000_000  # ns
 ORDINARY = ("setpriv", "--bounding-set=-sys_nice")
@@ -66,7 +66,7 @@ def test_time_that_jumps_back_begins_anew():
 
 @pytest.mark.parametrize(("before", "said"), [((), "yes"), (ORDINARY, "not permitted")], ids=["permitted", "ordinary"])
 def test_rtl_comes_before_what_computes_for_long_where_that_is_permitted(listener, start, before, said):
-    told = listener.hear(DiagnosticArray, DIAGNOSTICS, qos.STREAM)
+    told = listener.hear(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
     process = start("rtl", before=before)
 
     def answer():

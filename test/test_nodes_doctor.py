@@ -17,10 +17,10 @@ from sensor_msgs.msg import LaserScan
 from test_nodes_states import SHUTDOWN, Manager
 
 from hmt_slam_ros.cli.main import main
-from hmt_slam_ros.logs import open_log
-from hmt_slam_ros.nodes import conversions
-from hmt_slam_ros.nodes.transforms import TFMessage
-from hmt_slam_ros.sensing import Odometry, Scan
+from hmt_slam_ros.open_log import open_log
+from hmt_slam_ros.ros import conversions
+from hmt_slam_ros.ros.transforms import TFMessage
+from hmt_slam_ros.sensors import Odometry, Scan
 
 WORLD = "sim:office,seed=3,beams=181"
 BEST_EFFORT = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)

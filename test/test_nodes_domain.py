@@ -6,8 +6,8 @@ import pytest
 
 pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
 
-from hmt_slam_ros.nodes import domain as domains
-from hmt_slam_ros.nodes.domain import own_domain
+from hmt_slam_ros.ros import domain as domains
+from hmt_slam_ros.ros.domain import own_domain
 
 
 def test_two_at_a_time_get_different_domains():

@@ -12,9 +12,9 @@ from sensor_msgs.msg import LaserScan
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
-from hmt_slam_ros.nodes import qos
-from hmt_slam_ros.nodes.conversions import keyframe_frame, planar_pose
-from hmt_slam_ros.nodes.topics import KEYFRAME_SCANS, KEYFRAMES
+from hmt_slam_ros.ros import topics
+from hmt_slam_ros.ros.conversions import keyframe_frame, planar_pose
+from hmt_slam_ros.ros.topics import KEYFRAME_SCANS, KEYFRAMES
 
 WORLD = """
 walls: [[0, -1, 5, -1], [5, -1, 5, 1], [5, 1, 3, 1], [3, 1, 3, 4],
@@ -50,9 +50,9 @@ def system(tmp_path, start):
 
 
 def test_it_explores_and_goes_where_it_is_sent(listener, system):
-    outcomes = listener.hear(String, "explorer/outcome", qos.LATCHED)
-    goals = listener.hear(PoseStamped, "goal_pose", qos.STREAM)
-    truths = listener.hear(PoseStamped, "ground_truth", qos.STREAM)
+    outcomes = listener.hear(String, "explorer/outcome", topics.LATCHED)
+    goals = listener.hear(PoseStamped, "goal_pose", topics.STREAM)
+    truths = listener.hear(PoseStamped, "ground_truth", topics.STREAM)
     nodes = system()
     listener.until(lambda: outcomes, alive=nodes)
     assert outcomes[0].data == "explore: all is known that can be reached; 0 places were given up"
@@ -73,7 +73,7 @@ def test_it_explores_and_goes_where_it_is_sent(listener, system):
 def test_with_another_map_it_begins_anew_also_where_it_was_not_there_when_the_map_was_exchanged(
     listener, system, start
 ):
-    outcomes = listener.hear(String, "explorer/outcome", qos.LATCHED)
+    outcomes = listener.hear(String, "explorer/outcome", topics.LATCHED)
     nodes = system()
     *others, explorer, robot = nodes
     listener.until(lambda: outcomes, alive=nodes)
@@ -90,15 +90,15 @@ def test_with_another_map_it_begins_anew_also_where_it_was_not_there_when_the_ma
 
 def test_where_a_part_of_the_map_never_comes_it_ends_with_a_sentence(listener, system, start):
     """Slam comes back without what it said before its last checkpoint, and the explorer has not heard that."""
-    keyframes = listener.hear(String, KEYFRAMES, qos.CHAIN)
+    keyframes = listener.hear(String, KEYFRAMES, topics.CHAIN)
     nodes = system()
     listener.until(lambda: len(keyframes) > 2, alive=nodes)
     explorer, slam = nodes[-2], nodes[0]
     for node in (explorer, slam):
         node.kill()
         node.communicate()
-    writer = listener.node.create_publisher(String, KEYFRAMES, qos.CHAIN)
-    scans = listener.node.create_publisher(LaserScan, KEYFRAME_SCANS, qos.CHAIN)
+    writer = listener.node.create_publisher(String, KEYFRAMES, topics.CHAIN)
+    scans = listener.node.create_publisher(LaserScan, KEYFRAME_SCANS, topics.CHAIN)
     document = json.loads(keyframes[2].data)
     assert document["sequence"] == 2
     late = start("explorer", laser_pose="[0.0,0.0,0.0]")
@@ -113,8 +113,8 @@ def test_where_a_part_of_the_map_never_comes_it_ends_with_a_sentence(listener, s
 
 
 def test_others_drive_to_its_goals(listener, system):
-    goals = listener.hear(PoseStamped, "goal_pose", qos.STREAM)
-    truths = listener.hear(PoseStamped, "ground_truth", qos.STREAM)
+    goals = listener.hear(PoseStamped, "goal_pose", topics.STREAM)
+    truths = listener.hear(PoseStamped, "ground_truth", topics.STREAM)
     nodes = system(explorer__drive="goals")
     listener.until(lambda: goals and len(truths) > 30, alive=nodes)
     assert np.ptp([planar_pose(message.pose) for message in truths], axis=0).max() < 1e-9

@@ -22,14 +22,13 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.nodes import conversions, qos
-from hmt_slam_ros.nodes.topics import DIAGNOSTICS, DOCUMENTS, KEYFRAMES, MAP, POSE, ROBOT_STATUS, SCAN
-from hmt_slam_ros.nodes.transforms import TFMessage
-from hmt_slam_ros.persistence.folder import FolderReader
-from hmt_slam_ros.persistence.hmt_map import FORMAT, VERSION
-from hmt_slam_ros.processes.documents import decode, encode
-from hmt_slam_ros.processes.messages import LocalEstimate
-from hmt_slam_ros.sensing import Odometry, Scan
+from hmt_slam_ros.messages.documents import decode, encode
+from hmt_slam_ros.messages.messages import LocalEstimate
+from hmt_slam_ros.ros import conversions, topics
+from hmt_slam_ros.ros.topics import DIAGNOSTICS, DOCUMENTS, KEYFRAMES, MAP, POSE, ROBOT_STATUS, SCAN
+from hmt_slam_ros.ros.transforms import TFMessage
+from hmt_slam_ros.saved_map.folder import FORMAT, VERSION, FolderReader
+from hmt_slam_ros.sensors import Odometry, Scan
 
 
 @pytest.fixture(scope="module")
@@ -59,8 +58,8 @@ class Driver:
 
     def __init__(self, nodes, domain):
         self._nodes, self._own = nodes, Listener(domain)
-        self._scans = self._own.node.create_publisher(LaserScan, SCAN, qos.SENSOR)
-        self._odom = self._own.node.create_publisher(OdometryMessage, "odom", qos.SENSOR)
+        self._scans = self._own.node.create_publisher(LaserScan, SCAN, topics.SENSOR)
+        self._odom = self._own.node.create_publisher(OdometryMessage, "odom", topics.SENSOR)
         listening = (self._scans.get_subscription_count, self._odom.get_subscription_count)
         nodes.until(lambda: [count() for count in listening] == [1, 2])
 
@@ -80,10 +79,10 @@ class Driver:
 
 
 def test_rtl_that_is_killed_goes_on_with_the_pose_and_the_parameters_that_it_had(tmp_path, listener, start):
-    told = listener.hear(DiagnosticArray, DIAGNOSTICS, qos.STREAM)
-    odom = listener.node.create_publisher(OdometryMessage, "odom", qos.SENSOR)
-    estimates = listener.node.create_publisher(String, DOCUMENTS[LocalEstimate], qos.CHAIN)
-    placed = listener.hear(PoseWithCovarianceStamped, POSE, qos.STREAM)
+    told = listener.hear(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
+    odom = listener.node.create_publisher(OdometryMessage, "odom", topics.SENSOR)
+    estimates = listener.node.create_publisher(String, DOCUMENTS[LocalEstimate], topics.CHAIN)
+    placed = listener.hear(PoseWithCovarianceStamped, POSE, topics.STREAM)
     process = start("rtl", recovery=tmp_path)
     listener.until(lambda: odom.get_subscription_count() and estimates.get_subscription_count(), alive=[process])
     belief = PoseGaussian(np.array([1.0, 2.0, 0.0]), 1e-4 * np.eye(3))
@@ -274,11 +273,11 @@ def test_a_laser_falls_silent_a_disk_is_full_and_time_jumps_back(listener, start
 
 @pytest.mark.skipif(TFMessage is None, reason="tf2_msgs is not installed: run scripts/test.sh, which builds it")
 def test_a_missing_transform_and_clocks_that_are_apart_are_told_with_the_remedy(listener, start):
-    told = listener.hear(DiagnosticArray, DIAGNOSTICS, qos.STREAM)
-    keyframes = listener.hear(String, KEYFRAMES, qos.CHAIN)
-    scans = listener.node.create_publisher(LaserScan, SCAN, qos.SENSOR)
-    odom = listener.node.create_publisher(OdometryMessage, "odom", qos.SENSOR)
-    static = listener.node.create_publisher(TFMessage, "tf_static", qos.LATCHED)
+    told = listener.hear(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
+    keyframes = listener.hear(String, KEYFRAMES, topics.CHAIN)
+    scans = listener.node.create_publisher(LaserScan, SCAN, topics.SENSOR)
+    odom = listener.node.create_publisher(OdometryMessage, "odom", topics.SENSOR)
+    static = listener.node.create_publisher(TFMessage, "tf_static", topics.LATCHED)
     process = start("slam", filter__patience=8)
     listener.until(lambda: scans.get_subscription_count() and odom.get_subscription_count(), alive=[process])
     hour = 3600 * SECOND
@@ -323,9 +322,9 @@ def test_two_robots_that_drive_at_once_under_namespaces_share_nothing_but_a_tf_t
     two = Nodes(
         start, listener, "-r", "tf:=/tf", "-r", "tf_static:=/tf_static", namespace="/two", recovery=tmp_path, **frames
     )
-    maps = {nodes: nodes.hear(OccupancyGrid, MAP, qos.LATCHED) for nodes in (one, two)}
-    tf = {topic: listener.hear(TFMessage, topic, qos.TF_STATIC) for topic in ("/one/tf_static", "/tf_static")}
-    tf |= {topic: listener.hear(TFMessage, topic, qos.STREAM) for topic in ("/one/tf", "/tf")}
+    maps = {nodes: nodes.hear(OccupancyGrid, MAP, topics.LATCHED) for nodes in (one, two)}
+    tf = {topic: listener.hear(TFMessage, topic, topics.TF_STATIC) for topic in ("/one/tf_static", "/tf_static")}
+    tf |= {topic: listener.hear(TFMessage, topic, topics.STREAM) for topic in ("/one/tf", "/tf")}
     drives = {one: 40, two: 60}
     for nodes, scans in drives.items():
         folder = tmp_path / f"log_{scans}"
@@ -341,7 +340,7 @@ def test_two_robots_that_drive_at_once_under_namespaces_share_nothing_but_a_tf_t
         nodes.until(lambda nodes=nodes, scans=scans: nodes.diagnosis("slam")["received Scan"] == str(scans))
         nodes.until(lambda nodes=nodes: maps[nodes])
         # The robot goes on to say that its log has ended.
-        statuses = nodes.hear(String, ROBOT_STATUS, qos.LATCHED)
+        statuses = nodes.hear(String, ROBOT_STATUS, topics.LATCHED)
         nodes.until(lambda heard=statuses: len(heard) >= 8)
         awaited = len(nodes.diagnostics) + 2 * len(NODES)
         nodes.until(lambda nodes=nodes, awaited=awaited: len(nodes.diagnostics) > awaited)

@@ -18,11 +18,11 @@ from nav_msgs.msg import Odometry as OdometryMessage
 from std_msgs.msg import Float64MultiArray, String
 
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.nodes import conversions, qos
-from hmt_slam_ros.nodes.topics import DIAGNOSTICS, DOCUMENTS, HMT_POSE, KEYFRAMES, POSE
-from hmt_slam_ros.processes.documents import encode
-from hmt_slam_ros.processes.messages import Accepted, AreaEvents, Hypotheses, Leaf, LocalEstimate
-from hmt_slam_ros.sensing import Odometry
+from hmt_slam_ros.messages.documents import encode
+from hmt_slam_ros.messages.messages import Accepted, AreaEvents, Hypotheses, Leaf, LocalEstimate
+from hmt_slam_ros.ros import conversions, topics
+from hmt_slam_ros.ros.topics import DIAGNOSTICS, DOCUMENTS, HMT_POSE, KEYFRAMES, POSE
+from hmt_slam_ros.sensors import Odometry
 
 NODES = ("slam", "aam", "tsbi", "tlca", "rtl", "robot")
 
@@ -33,7 +33,7 @@ def parameters(name, tmp_path):
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=lambda number: number.name)
 def test_every_node_that_runs_ends_well_when_told_to(tmp_path, listener, start, number):
-    told = listener.hear(DiagnosticArray, DIAGNOSTICS, qos.STREAM)
+    told = listener.hear(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
     processes = {name: start(name, **parameters(name, tmp_path)) for name in NODES}
     listener.until(lambda: all(level(told, name) for name in NODES), alive=processes.values())
     for name, process in processes.items():
@@ -76,7 +76,7 @@ def heeds_sigterm(pid):
 
 
 def test_two_signals_in_a_row_do_no_harm(listener, start):
-    told = listener.hear(DiagnosticArray, DIAGNOSTICS, qos.STREAM)
+    told = listener.hear(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
     process = start("rtl")
     listener.until(lambda: told)
     process.send_signal(signal.SIGINT)
@@ -91,8 +91,8 @@ def level(told, name):
 
 
 def test_a_malformed_document_is_told_and_survived(listener, start):
-    told = listener.hear(DiagnosticArray, DIAGNOSTICS, qos.STREAM)
-    events = listener.node.create_publisher(String, DOCUMENTS[Accepted], qos.CHAIN)
+    told = listener.hear(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
+    events = listener.node.create_publisher(String, DOCUMENTS[Accepted], topics.CHAIN)
     process = start("rtl")
     events.publish(String(data='{"document":"accepted","version":99}'))
     listener.until(lambda: (status := level(told, "rtl")) and status.level == DiagnosticStatus.ERROR, alive=[process])
@@ -100,8 +100,8 @@ def test_a_malformed_document_is_told_and_survived(listener, start):
 
 
 def test_a_lost_message_of_the_chain_is_told(listener, start):
-    told = listener.hear(DiagnosticArray, DIAGNOSTICS, qos.STREAM)
-    accepted = listener.node.create_publisher(String, DOCUMENTS[Accepted], qos.CHAIN)
+    told = listener.hear(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
+    accepted = listener.node.create_publisher(String, DOCUMENTS[Accepted], topics.CHAIN)
     process = start("rtl")
     accepted.publish(String(data=encode(Accepted(0))))
     accepted.publish(String(data=encode(Accepted(2))))
@@ -111,10 +111,10 @@ def test_a_lost_message_of_the_chain_is_told(listener, start):
 
 def test_a_node_that_starts_late_catches_up(listener, start):
     """What was said before a node started is latched, and reaches it in the order of the chain."""
-    keyframes = listener.node.create_publisher(String, KEYFRAMES, qos.CHAIN)
-    hypotheses = listener.node.create_publisher(String, DOCUMENTS[Hypotheses], qos.CHAIN)
-    accepted = listener.node.create_publisher(String, DOCUMENTS[Accepted], qos.CHAIN)
-    told = listener.hear(DiagnosticArray, DIAGNOSTICS, qos.STREAM)
+    keyframes = listener.node.create_publisher(String, KEYFRAMES, topics.CHAIN)
+    hypotheses = listener.node.create_publisher(String, DOCUMENTS[Hypotheses], topics.CHAIN)
+    accepted = listener.node.create_publisher(String, DOCUMENTS[Accepted], topics.CHAIN)
+    told = listener.hear(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
     assert keyframes
     for sequence in range(3):
         hypotheses.publish(String(data=encode(Hypotheses(sequence, (Leaf(0, 0, 1.0, 0),)))))
@@ -131,10 +131,10 @@ def test_a_node_that_starts_late_catches_up(listener, start):
 
 
 def test_rtl_answers_every_odometry_reading(listener, start):
-    odom = listener.node.create_publisher(OdometryMessage, "odom", qos.SENSOR)
-    estimates = listener.node.create_publisher(String, DOCUMENTS[LocalEstimate], qos.CHAIN)
-    local = listener.hear(PoseWithCovarianceStamped, HMT_POSE, qos.STREAM)
-    placed = listener.hear(PoseWithCovarianceStamped, POSE, qos.STREAM)
+    odom = listener.node.create_publisher(OdometryMessage, "odom", topics.SENSOR)
+    estimates = listener.node.create_publisher(String, DOCUMENTS[LocalEstimate], topics.CHAIN)
+    local = listener.hear(PoseWithCovarianceStamped, HMT_POSE, topics.STREAM)
+    placed = listener.hear(PoseWithCovarianceStamped, POSE, topics.STREAM)
     process = start("rtl")
     matched = (odom, estimates)
     listener.until(lambda: all(publisher.get_subscription_count() for publisher in matched), alive=[process])
@@ -160,9 +160,9 @@ def test_rtl_answers_every_odometry_reading(listener, start):
 def test_rtl_publishes_the_transform_from_map_to_odom(listener, start):
     reason = "tf2_msgs is not installed: run scripts/test.sh, which builds it"
     TFMessage = pytest.importorskip("tf2_msgs.msg", reason=reason).TFMessage
-    moving = listener.hear(TFMessage, "tf", qos.STREAM)
-    odom = listener.node.create_publisher(OdometryMessage, "odom", qos.SENSOR)
-    estimates = listener.node.create_publisher(String, DOCUMENTS[LocalEstimate], qos.CHAIN)
+    moving = listener.hear(TFMessage, "tf", topics.STREAM)
+    odom = listener.node.create_publisher(OdometryMessage, "odom", topics.SENSOR)
+    estimates = listener.node.create_publisher(String, DOCUMENTS[LocalEstimate], topics.CHAIN)
     start("rtl")
     listener.until(lambda: all(publisher.get_subscription_count() for publisher in (odom, estimates)))
     belief = PoseGaussian(np.array([1.0, 2.0, 0.0]), 1e-4 * np.eye(3))
@@ -178,8 +178,8 @@ def test_rtl_publishes_the_transform_from_map_to_odom(listener, start):
 
 
 def test_a_driver_that_may_lose_messages_is_heard_too(listener, start):
-    live = listener.node.create_publisher(OdometryMessage, "odom", qos.LIVE_SENSOR)
-    told = listener.hear(DiagnosticArray, DIAGNOSTICS, qos.STREAM)
+    live = listener.node.create_publisher(OdometryMessage, "odom", topics.LIVE_SENSOR)
+    told = listener.hear(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
     process = start("rtl")
     reading = Odometry(0, np.zeros(3))
 
@@ -195,9 +195,9 @@ def test_a_driver_that_may_lose_messages_is_heard_too(listener, start):
 
 
 def test_aam_answers_nothing_it_was_not_asked(listener, start):
-    answers = listener.hear(String, DOCUMENTS[AreaEvents], qos.CHAIN)
-    costs = listener.hear(Float64MultiArray, "hmt/cost", qos.CHAIN)
-    told = listener.hear(DiagnosticArray, DIAGNOSTICS, qos.STREAM)
+    answers = listener.hear(String, DOCUMENTS[AreaEvents], topics.CHAIN)
+    costs = listener.hear(Float64MultiArray, "hmt/cost", topics.CHAIN)
+    told = listener.hear(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
     start("aam")
     listener.until(lambda: told)
     assert not answers
@@ -209,11 +209,11 @@ def test_a_node_ends_with_the_program_that_started_it(listener):
     script = (
         "import os, subprocess, sys, time\n"
         "environment = {**os.environ, 'HMT_SLAM_PARENT': str(os.getpid())}\n"
-        "node = subprocess.Popen([sys.executable, '-m', 'hmt_slam_ros.nodes.rtl_node'], env=environment)\n"
+        "node = subprocess.Popen([sys.executable, '-m', 'hmt_slam_ros.ros.rtl_node'], env=environment)\n"
         "print(node.pid, flush=True)\n"
         "time.sleep(600)\n"
     )
-    told = listener.hear(DiagnosticArray, DIAGNOSTICS, qos.STREAM)
+    told = listener.hear(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
     parent = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True)
     node = int(parent.stdout.readline())
     listener.until(lambda: told, alive=[parent])

@@ -18,10 +18,10 @@ from std_msgs.msg import Bool, Float64, String
 from std_srvs.srv import Trigger
 
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.nodes import qos
-from hmt_slam_ros.nodes.conversions import planar_pose, pose_with_covariance, stamp_of
-from hmt_slam_ros.nodes.topics import DIAGNOSTICS, DOCUMENTS, ENTROPY, IS_LOCALIZED, POSE
-from hmt_slam_ros.processes.messages import LocalEstimate, Notice
+from hmt_slam_ros.messages.messages import LocalEstimate, Notice
+from hmt_slam_ros.ros import topics
+from hmt_slam_ros.ros.conversions import planar_pose, pose_with_covariance, stamp_of
+from hmt_slam_ros.ros.topics import DIAGNOSTICS, DOCUMENTS, ENTROPY, IS_LOCALIZED, POSE
 
 NODES = ("slam", "aam", "tsbi", "tlca", "rtl")
 SCANS = 120
@@ -48,12 +48,12 @@ class Nodes:
     def __init__(self, start, listener, *arguments, namespace="", **parameters):
         self.start, self.listener, self.namespace = start, listener, namespace
         self.arguments = (*arguments, *(["-r", f"__ns:={namespace}"] if namespace else []))
-        self.localized = self.hear(Bool, IS_LOCALIZED, qos.LATCHED)
-        self.entropies = self.hear(Float64, ENTROPY, qos.LATCHED)
-        self.estimates = self.hear(String, DOCUMENTS[LocalEstimate], qos.CHAIN)
-        self.notices = self.hear(String, DOCUMENTS[Notice], qos.CHAIN)
-        self.poses = self.hear(PoseWithCovarianceStamped, POSE, qos.STREAM)
-        self.diagnostics = self.hear(DiagnosticArray, DIAGNOSTICS, qos.STREAM)
+        self.localized = self.hear(Bool, IS_LOCALIZED, topics.LATCHED)
+        self.entropies = self.hear(Float64, ENTROPY, topics.LATCHED)
+        self.estimates = self.hear(String, DOCUMENTS[LocalEstimate], topics.CHAIN)
+        self.notices = self.hear(String, DOCUMENTS[Notice], topics.CHAIN)
+        self.poses = self.hear(PoseWithCovarianceStamped, POSE, topics.STREAM)
+        self.diagnostics = self.hear(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
         self.alive = [start(name, *self.arguments, **parameters) for name in NODES]
 
     def hear(self, kind, topic, profile):
@@ -163,7 +163,7 @@ def initial_pose(at, frame="map", deviations=(0.5, 0.5, 0.26)):
 def test_a_person_says_where_the_robot_is_and_where_it_cannot_be(corridor, listener, start):
     log, out = corridor
     nodes = Nodes(start, listener, start_from=out)
-    publisher = listener.node.create_publisher(PoseWithCovarianceStamped, "initialpose", qos.STREAM)
+    publisher = listener.node.create_publisher(PoseWithCovarianceStamped, "initialpose", topics.STREAM)
     listener.until(lambda: publisher.get_subscription_count() == 1)
     nodes.until(lambda: nodes.localized and any(m.status[0].name == "/slam" for m in nodes.diagnostics))
     publisher.publish(initial_pose(np.array([100.0, 50.0, 0.0])))

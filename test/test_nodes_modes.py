@@ -16,10 +16,10 @@ from rclpy.parameter import Parameter
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
-from hmt_slam_ros.nodes import qos
-from hmt_slam_ros.nodes.conversions import planar_pose
-from hmt_slam_ros.nodes.topics import INITIAL_POSE, KEYFRAMES
-from hmt_slam_ros.processes.documents import KeyframeHead, decode
+from hmt_slam_ros.messages.documents import KeyframeHead, decode
+from hmt_slam_ros.ros import topics
+from hmt_slam_ros.ros.conversions import planar_pose
+from hmt_slam_ros.ros.topics import INITIAL_POSE, KEYFRAMES
 
 
 @pytest.fixture(scope="module")
@@ -48,8 +48,8 @@ def head(message):
 def test_a_robot_is_recognized_and_tracked_in_a_map_that_is_saved_as_it_was_loaded(corridor, listener, start, tmp_path):
     log, out = corridor
     nodes = Nodes(start, listener, start_from=out, mode="localization", save_to=tmp_path / "saved")
-    keyframes = listener.hear(String, KEYFRAMES, qos.CHAIN)
-    pointing = listener.node.create_publisher(PoseWithCovarianceStamped, INITIAL_POSE, qos.STREAM)
+    keyframes = listener.hear(String, KEYFRAMES, topics.CHAIN)
+    pointing = listener.node.create_publisher(PoseWithCovarianceStamped, INITIAL_POSE, topics.STREAM)
     nodes.drive(log, first=20, rate=8.0)
     nodes.until(nodes.is_localized)
     nodes.until(lambda: len(nodes.estimates) == SCANS - 20)

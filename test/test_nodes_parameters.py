@@ -12,7 +12,7 @@ from rclpy.parameter import Parameter, parameter_value_to_python
 
 from hmt_slam_ros.configuration import Configuration, flat_parameters
 from hmt_slam_ros.errors import HmtSlamError
-from hmt_slam_ros.nodes.parameters import ConfiguredNode, declare_laser_pose
+from hmt_slam_ros.ros.parameters import ConfiguredNode, declare_laser_pose
 
 
 @pytest.fixture

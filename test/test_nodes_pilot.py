@@ -17,11 +17,11 @@ from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from std_msgs.msg import Bool, String
 
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.nodes import qos
-from hmt_slam_ros.nodes.conversions import planar_pose
-from hmt_slam_ros.nodes.topics import DIAGNOSTICS, GOALS, INITIAL_POSE, IS_LOCALIZED, PLACE
-from hmt_slam_ros.processes.documents import decode
-from hmt_slam_ros.processes.errands import PlaceEstimate
+from hmt_slam_ros.messages.documents import decode
+from hmt_slam_ros.messages.tasks import PlaceEstimate
+from hmt_slam_ros.ros import topics
+from hmt_slam_ros.ros.conversions import planar_pose
+from hmt_slam_ros.ros.topics import DIAGNOSTICS, GOALS, INITIAL_POSE, IS_LOCALIZED, PLACE
 
 PROCESSES = ("slam", "aam", "tsbi", "tlca", "rtl")
 
@@ -40,16 +40,16 @@ def test_it_goes_to_a_room_and_has_slam_begin_at_the_door(mapped, listener, star
     world, out = mapped
     # Slam alone would not look for the robot before it is there.
     shared = {"start_from": out, "mode": "localization", "tsbi__recheck_keyframes": 100}
-    outcomes = listener.hear(String, "pilot/outcome", qos.LATCHED)
-    places = listener.hear(String, PLACE, qos.LATCHED)
-    starts = listener.hear(PoseWithCovarianceStamped, INITIAL_POSE, qos.STREAM)
-    goals = listener.hear(PoseStamped, GOALS, qos.STREAM)
-    truths = listener.hear(PoseStamped, "ground_truth", qos.STREAM)
-    localized = listener.hear(Bool, IS_LOCALIZED, qos.LATCHED)
-    diagnostics = listener.hear(DiagnosticArray, DIAGNOSTICS, qos.STREAM)
+    outcomes = listener.hear(String, "pilot/outcome", topics.LATCHED)
+    places = listener.hear(String, PLACE, topics.LATCHED)
+    starts = listener.hear(PoseWithCovarianceStamped, INITIAL_POSE, topics.STREAM)
+    goals = listener.hear(PoseStamped, GOALS, topics.STREAM)
+    truths = listener.hear(PoseStamped, "ground_truth", topics.STREAM)
+    localized = listener.hear(Bool, IS_LOCALIZED, topics.LATCHED)
+    diagnostics = listener.hear(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
     pilot = start("pilot", **shared)
     others = [start(name, **shared) for name in PROCESSES]
-    errands = listener.node.create_publisher(String, "pilot/errand", qos.STREAM)
+    errands = listener.node.create_publisher(String, "pilot/errand", topics.STREAM)
     listener.until(lambda: errands.get_subscription_count() == 1, alive=[pilot])
     errands.publish(String(data="go cellar"))
     errands.publish(String(data="dance"))

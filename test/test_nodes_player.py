@@ -7,9 +7,9 @@ from logs_for_nodes import START, Corridor
 
 pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
 
-from hmt_slam_ros.configuration.live import Robot
-from hmt_slam_ros.nodes.player import Player
-from hmt_slam_ros.sensing import Odometry, Scan
+from hmt_slam_ros.configuration.robot import Robot
+from hmt_slam_ros.ros.player import Player
+from hmt_slam_ros.sensors import Odometry, Scan
 
 
 def play(player, until, step=0.001, acknowledge=True):

@@ -17,13 +17,13 @@ from logs_for_nodes import corridor_bag, is_alive
 
 from hmt_slam_ros.configuration import Configuration, load_configuration
 from hmt_slam_ros.evaluation import read_tum
-from hmt_slam_ros.logs import open_log
 from hmt_slam_ros.offline.runtime import Run
-from hmt_slam_ros.offline.saved_map import read_saved_map
+from hmt_slam_ros.open_log import open_log
+from hmt_slam_ros.results.hmt_map import read_saved_map
 
 pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
 
-from hmt_slam_ros.nodes.replay import PROCESSES, replay
+from hmt_slam_ros.ros.replay import PROCESSES, replay
 
 ROOT = Path(__file__).resolve().parent.parent
 BUNDLED = ROOT / "data" / "malaga_one_loop"
@@ -41,9 +41,9 @@ def children_of(pid):
                 words = (folder / "cmdline").read_text().split("\0")
             except (OSError, ValueError):
                 continue
-            module = next((word for word in words if word.startswith("hmt_slam_ros.nodes.")), None)
+            module = next((word for word in words if word.startswith("hmt_slam_ros.ros.")), None)
             if parent == pid and module:
-                found[module.removeprefix("hmt_slam_ros.nodes.").removesuffix("_node")] = int(folder.name)
+                found[module.removeprefix("hmt_slam_ros.ros.").removesuffix("_node")] = int(folder.name)
     return found
 
 
@@ -216,7 +216,7 @@ def test_a_run_that_stands_still_names_the_node_it_waits_for(tmp_path):
         "from pathlib import Path\n"
         "from hmt_slam_ros.configuration import load_configuration\n"
         "from hmt_slam_ros.errors import HmtSlamError\n"
-        "from hmt_slam_ros.nodes.replay import replay\n"
+        "from hmt_slam_ros.ros.replay import replay\n"
         "try:\n"
         f"    replay(Path({str(corridor_bag(tmp_path, 200))!r}), Path({str(tmp_path / 'out')!r}),\n"
         "           load_configuration(settings=['robot.rate=1.0']), stall=15.0)\n"

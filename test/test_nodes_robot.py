@@ -22,13 +22,13 @@ from std_srvs.srv import SetBool
 
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.logs import open_log
-from hmt_slam_ros.nodes import conversions, qos
-from hmt_slam_ros.nodes.topics import DIAGNOSTICS, DOCUMENTS, ROBOT_STATUS
-from hmt_slam_ros.nodes.transforms import TFMessage
-from hmt_slam_ros.processes.documents import encode
-from hmt_slam_ros.processes.messages import LocalEstimate
-from hmt_slam_ros.sensing import Scan
+from hmt_slam_ros.messages.documents import encode
+from hmt_slam_ros.messages.messages import LocalEstimate
+from hmt_slam_ros.open_log import open_log
+from hmt_slam_ros.ros import conversions, topics
+from hmt_slam_ros.ros.topics import DIAGNOSTICS, DOCUMENTS, ROBOT_STATUS
+from hmt_slam_ros.ros.transforms import TFMessage
+from hmt_slam_ros.sensors import Scan
 
 SCANS = [record.measurement for record in Corridor().records() if isinstance(record.measurement, Scan)]
 
@@ -41,11 +41,11 @@ def heard(listener):
     made, so the others are there by then too.
     """
     return {
-        "clock": listener.hear(Clock, "/clock", qos.STREAM),
-        "tf": listener.hear(TFMessage, "tf", qos.STREAM) if TFMessage else [],
-        "scan": listener.hear(LaserScan, "scan", qos.SENSOR),
-        "odom": listener.hear(OdometryMessage, "odom", qos.SENSOR),
-        "status": listener.hear(String, ROBOT_STATUS, qos.LATCHED),
+        "clock": listener.hear(Clock, "/clock", topics.STREAM),
+        "tf": listener.hear(TFMessage, "tf", topics.STREAM) if TFMessage else [],
+        "scan": listener.hear(LaserScan, "scan", topics.SENSOR),
+        "odom": listener.hear(OdometryMessage, "odom", topics.SENSOR),
+        "status": listener.hear(String, ROBOT_STATUS, topics.LATCHED),
     }
 
 
@@ -78,7 +78,7 @@ def test_the_transforms_come_on_tf_and_tf_static(tmp_path, listener, start, hear
     start("robot", log=corridor_bag(tmp_path), robot__rate=0.0, robot__paced=False)
     listener.until(lambda: len(moving) == 45)
     # The static ones are latched, for those who come later.
-    static = listener.hear(TFMessage, "tf_static", qos.TF_STATIC)
+    static = listener.hear(TFMessage, "tf_static", topics.TF_STATIC)
     listener.until(lambda: static)
     (laser,) = static[0].transforms
     assert isinstance(laser, TransformStamped)
@@ -112,7 +112,7 @@ def test_a_pause_stops_the_robot_and_its_end_lets_it_go_on(tmp_path, listener, s
 
 
 def test_a_paced_robot_waits_for_the_acknowledgement(tmp_path, listener, start, heard):
-    estimates = listener.node.create_publisher(String, DOCUMENTS[LocalEstimate], qos.CHAIN)
+    estimates = listener.node.create_publisher(String, DOCUMENTS[LocalEstimate], topics.CHAIN)
     start("robot", log=corridor_bag(tmp_path), robot__rate=0.0, robot__window=4, filter__patience=3)
     listener.until(lambda: len(heard["scan"]) == 4)
     listener.spin(0.5)
@@ -129,7 +129,7 @@ def test_a_paced_robot_waits_for_the_acknowledgement(tmp_path, listener, start, 
 
 
 def test_the_robot_waits_for_those_who_have_to_hear_it_and_answer(tmp_path, listener, start):
-    listener.hear(LaserScan, "scan", qos.SENSOR)  # as a recorder does
+    listener.hear(LaserScan, "scan", topics.SENSOR)  # as a recorder does
     robot = start(
         "robot", log=corridor_bag(tmp_path), robot__patience=3.0, robot__scan_listeners=1, robot__odometry_listeners=0
     )
@@ -158,9 +158,9 @@ def test_start_and_duration_play_a_part(tmp_path, listener, start, heard):
 
 
 def test_everything_but_the_clock_moves_into_a_namespace(tmp_path, listener, start):
-    scans = listener.hear(LaserScan, "tower/scan", qos.SENSOR)
-    listener.hear(OdometryMessage, "tower/odom", qos.SENSOR)
-    times = listener.hear(Clock, "/clock", qos.STREAM)
+    scans = listener.hear(LaserScan, "tower/scan", topics.SENSOR)
+    listener.hear(OdometryMessage, "tower/odom", topics.SENSOR)
+    times = listener.hear(Clock, "/clock", topics.STREAM)
     start("robot", "-r", "__ns:=/tower", log=corridor_bag(tmp_path, 3), robot__rate=0.0, robot__paced=False)
     listener.until(lambda: len(scans) == 3)
     listener.until(lambda: times and conversions.stamp_of(times[-1].clock) == SCANS[2].stamp)
@@ -194,7 +194,7 @@ class Driver:
     """Drives the robot node's robot and listens to where it truly is."""
 
     def __init__(self, listener, heard):
-        self.truths = listener.hear(PoseStamped, "ground_truth", qos.STREAM)
+        self.truths = listener.hear(PoseStamped, "ground_truth", topics.STREAM)
         self._publisher = listener.node.create_publisher(Twist, "cmd_vel", 1)
         self._listener, self._heard = listener, heard
 
@@ -254,7 +254,7 @@ def test_commands_drive_the_robot_and_silence_stops_it(listener, start, heard, d
 
 def test_the_driven_robot_does_not_pass_a_wall(listener, start, driver):
     # It begins a metre before the end of a hallway, with its back to it.
-    reports = listener.hear(DiagnosticArray, DIAGNOSTICS, qos.STREAM)
+    reports = listener.hear(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
     contacts = lambda: [v.value for r in reports[-1:] for v in r.status[0].values if v.key == "contacts"]  # noqa: E731
     robot = start_driven(start)
     listener.until(driver.stands, alive=[robot])

@@ -12,9 +12,9 @@ import rclpy
 from rclpy.node import Node
 
 from hmt_slam_ros.errors import HmtSlamError
-from hmt_slam_ros.nodes import last_save
-from hmt_slam_ros.nodes.outbox import RCLError
-from hmt_slam_ros.nodes.running import run
+from hmt_slam_ros.ros import map_services
+from hmt_slam_ros.ros.execution import run
+from hmt_slam_ros.ros.outbox import RCLError
 
 
 def shut_down_while_made():
@@ -42,7 +42,7 @@ def fail_in_rcl():
 
 
 def status_of(make):
-    raise SystemExit(run(make, last_save.spin))
+    raise SystemExit(run(make, map_services.spin))
 
 
 @pytest.mark.parametrize(

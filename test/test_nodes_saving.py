@@ -15,18 +15,17 @@ from nav_msgs.msg import OccupancyGrid
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
+from hmt_slam_ros.area_abstraction.partition import AamState
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.nodes import qos
-from hmt_slam_ros.nodes.topics import DOCUMENTS, KEYFRAMES, MAP
-from hmt_slam_ros.offline.saved_map import ChainState, read_saved_map
-from hmt_slam_ros.persistence.folder import FolderReader
-from hmt_slam_ros.persistence.hmt_map import FORMAT, VERSION
-from hmt_slam_ros.processes.aam_watch import AamState
-from hmt_slam_ros.processes.documents import KeyframeHead, decode
-from hmt_slam_ros.processes.messages import LocalEstimate
-from hmt_slam_ros.processes.slam import SlamState
-from hmt_slam_ros.processes.tlca import TlcaState
-from hmt_slam_ros.processes.tsbi import TsbiState
+from hmt_slam_ros.loop_closure.tlca import TlcaState
+from hmt_slam_ros.messages.documents import KeyframeHead, decode
+from hmt_slam_ros.messages.messages import LocalEstimate
+from hmt_slam_ros.metric_slam.slam import SlamState
+from hmt_slam_ros.results.hmt_map import ChainState, read_saved_map
+from hmt_slam_ros.ros import topics
+from hmt_slam_ros.ros.topics import DOCUMENTS, KEYFRAMES, MAP
+from hmt_slam_ros.saved_map.folder import FORMAT, VERSION, FolderReader
+from hmt_slam_ros.topological_inference.tsbi import TsbiState
 
 NODES = ("slam", "aam", "tsbi", "tlca", "rtl")
 STATES = {"slam": SlamState, "aam": AamState, "tsbi": TsbiState, "tlca": TlcaState}
@@ -37,8 +36,8 @@ class Nodes:
 
     def __init__(self, start, listener, log, folder, rate, **robot):
         self.listener = listener
-        self.estimates = listener.hear(String, DOCUMENTS[LocalEstimate], qos.CHAIN)
-        self.keyframes = listener.hear(String, KEYFRAMES, qos.CHAIN)
+        self.estimates = listener.hear(String, DOCUMENTS[LocalEstimate], topics.CHAIN)
+        self.keyframes = listener.hear(String, KEYFRAMES, topics.CHAIN)
         self.processes = [start(name, save_to=folder) if name == "slam" else start(name) for name in NODES]
         self.robot = start("robot", log=log, robot__rate=rate, **robot)
 
@@ -146,7 +145,7 @@ def test_nodes_show_a_map_of_the_command_line_at_once_and_go_on_from_it(tmp_path
     log, out = corridor_bag(tmp_path, scans=60), tmp_path / "out"
     command = [sys.executable, "-m", "hmt_slam_ros.cli.main", "map", str(log), "--out", str(out), "--duration", "6"]
     subprocess.run(command, check=True, timeout=120)
-    grids = listener.hear(OccupancyGrid, MAP, qos.LATCHED)
+    grids = listener.hear(OccupancyGrid, MAP, topics.LATCHED)
     stayed = start_with(start, start_from=out, start_carried=False)
     nodes = Nodes(stayed, listener, log, tmp_path / "hmt_map", 0.0, robot__start=6.001)
     nodes.until(lambda: grids and nodes.estimates and nodes.last.scan_index == 59)

@@ -17,13 +17,13 @@ from recording import Recording
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
-from hmt_slam_ros.logs import open_log
-from hmt_slam_ros.nodes import qos, topics
-from hmt_slam_ros.nodes.conversions import planar_pose
-from hmt_slam_ros.nodes.topics import KEYFRAMES, MAP
-from hmt_slam_ros.nodes.transforms import TFMessage
-from hmt_slam_ros.processes.documents import KeyframeHead, decode
-from hmt_slam_ros.processes.messages import LocalEstimate
+from hmt_slam_ros.messages.documents import KeyframeHead, decode
+from hmt_slam_ros.messages.messages import LocalEstimate
+from hmt_slam_ros.open_log import open_log
+from hmt_slam_ros.ros import topics
+from hmt_slam_ros.ros.conversions import planar_pose
+from hmt_slam_ros.ros.topics import KEYFRAMES, MAP
+from hmt_slam_ros.ros.transforms import TFMessage
 
 TRANSFORMS = {"tf", "tf_static"} if TFMessage else set()
 NAMED = {value for name, value in vars(topics).items() if name.isupper() and isinstance(value, str)}
@@ -70,7 +70,7 @@ def test_a_map_is_loaded_while_the_nodes_run_and_the_robot_recognized_in_it(corr
     nodes.until(lambda: "tlca.json is truncated or damaged" in nodes.diagnosis("slam")["last error"])
     assert nodes.is_localized()
 
-    grids = listener.hear(OccupancyGrid, MAP, qos.LATCHED)
+    grids = listener.hear(OccupancyGrid, MAP, topics.LATCHED)
     answer = load(listener, f"file://{out}")
     assert answer.result == LoadMap.Response.RESULT_SUCCESS
     assert occupied(answer.map) > 2 * occupied(little)
@@ -89,7 +89,7 @@ def test_after_a_reset_a_new_map_begins_where_the_robot_is_and_all_that_is_said_
     log, out = corridor
     recording = Recording(listener, tmp_path / "bag")
     nodes = Nodes(start, listener, start_from=out, start_carried=False, save_to=tmp_path / "saved")
-    keyframes = listener.hear(String, KEYFRAMES, qos.CHAIN)
+    keyframes = listener.hear(String, KEYFRAMES, topics.CHAIN)
     nodes.until(lambda: {m.status[0].name for m in nodes.diagnostics} == {f"/{name}" for name in NODES})
     answer = listener.call(Trigger, "slam/reset", Trigger.Request())
     assert (answer.success, answer.message) == (True, "the map is forgotten, a new one begins")
@@ -118,7 +118,7 @@ def assert_documented(offered):
             continue
         package, name, profile = tables[topic]
         assert kind == f"{package}/msg/{name}", topic
-        promised = getattr(qos, profile)
+        promised = getattr(topics, profile)
         for told in profiles:
             assert (told.reliability, told.durability) == (promised.reliability, promised.durability), topic
 

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from hmt_slam_ros.nodes.stamp_order import BACK, StampOrder
+from hmt_slam_ros.ros.sensor_input import BACK, StampOrder
 
 
 def let_through(stamps, newest=None):
@@ -50,7 +50,7 @@ def test_the_order_goes_on_after_what_was_heard_before_and_what_comes_next_may_b
 )
 def test_a_laser_is_silent_only_where_the_node_could_hear_it(monkeypatch, looks, silent):
     pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
-    from hmt_slam_ros.nodes.sensor_watch import SensorWatch  # noqa: PLC0415  only where there is ROS
+    from hmt_slam_ros.ros.sensor_input import SensorWatch  # noqa: PLC0415  only where there is ROS
 
     said = []
     monkeypatch.setattr(time, "monotonic", lambda: 0.0)

@@ -16,11 +16,10 @@ from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from std_srvs.srv import Trigger
 
-from hmt_slam_ros.nodes import qos
-from hmt_slam_ros.nodes.conversions import planar_pose, stamp_of
-from hmt_slam_ros.nodes.topics import DIAGNOSTICS, KEYFRAMES, ODOM, POSE, SCAN
-from hmt_slam_ros.persistence.folder import FolderReader
-from hmt_slam_ros.persistence.hmt_map import FORMAT, VERSION
+from hmt_slam_ros.ros import topics
+from hmt_slam_ros.ros.conversions import planar_pose, stamp_of
+from hmt_slam_ros.ros.topics import DIAGNOSTICS, KEYFRAMES, ODOM, POSE, SCAN
+from hmt_slam_ros.saved_map.folder import FORMAT, VERSION, FolderReader
 
 SCANS = 110  # so that some are left when the last node comes back, whatever came while the others were away
 SHUTDOWN = {
@@ -194,7 +193,7 @@ def test_a_node_that_cannot_be_configured_says_why_and_stays(listener, start, tm
 
 
 def test_a_node_that_is_killed_comes_back_in_the_state_in_which_it_was(listener, start, tmp_path):
-    told = listener.hear(DiagnosticArray, DIAGNOSTICS, qos.STREAM)
+    told = listener.hear(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
     node = start("rtl", recovery=tmp_path)
     assert Manager(listener).change("rtl", "deactivate")
     node.send_signal(signal.SIGKILL)

@@ -23,17 +23,17 @@ from rclpy.qos import HistoryPolicy, QoSProfile
 from std_msgs.msg import Float64MultiArray, String
 from visualization_msgs.msg import MarkerArray
 
-from hmt_slam_ros.agreement import Clutter
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.nodes import qos
-from hmt_slam_ros.nodes.map_view import MapView, Seen
-from hmt_slam_ros.nodes.topics import DIAGNOSTICS, FINISHED, GRAPH, HMT_POSE, MAP, PARTICLES, PMF, POSE
-from hmt_slam_ros.nodes.transforms import TFMessage
-from hmt_slam_ros.processes.map_parts import Arc, AreaPose
-from hmt_slam_ros.processes.messages import Accepted, Hypotheses, Keyframe, Leaf, LeafEstimate
-from hmt_slam_ros.sensing import Scan
-from hmt_slam_ros.topology.unknown import unknown
+from hmt_slam_ros.hybrid_map.shortest_path import unknown
+from hmt_slam_ros.messages.map_changes import Arc, AreaPose
+from hmt_slam_ros.messages.messages import Accepted, Hypotheses, Keyframe, Leaf, LeafEstimate
+from hmt_slam_ros.registration.consistency import Clutter
+from hmt_slam_ros.ros import topics
+from hmt_slam_ros.ros.map_view import MapView, Seen
+from hmt_slam_ros.ros.topics import DIAGNOSTICS, FINISHED, GRAPH, HMT_POSE, MAP, PARTICLES, PMF, POSE
+from hmt_slam_ros.ros.transforms import TFMessage
+from hmt_slam_ros.sensors import Scan
 
 BUNDLED = Path(__file__).resolve().parent.parent / "data" / "malaga_one_loop"
 PROCESSES = ("slam", "aam", "tsbi", "tlca", "rtl")
@@ -73,15 +73,15 @@ def snapshot(port):
 
 
 def test_a_run_of_the_bundled_log_shows_itself_on_the_topics_and_in_a_browser(listener, start, browser, screenshots):
-    maps = listener.hear(OccupancyGrid, MAP, qos.LATCHED)
-    graphs = listener.hear(MarkerArray, GRAPH, qos.LATCHED)
-    particles = listener.hear(PoseArray, PARTICLES, qos.STREAM)
+    maps = listener.hear(OccupancyGrid, MAP, topics.LATCHED)
+    graphs = listener.hear(MarkerArray, GRAPH, topics.LATCHED)
+    particles = listener.hear(PoseArray, PARTICLES, topics.STREAM)
     poses = listener.hear(PoseWithCovarianceStamped, POSE, ALL)
     local_poses = listener.hear(PoseWithCovarianceStamped, HMT_POSE, ALL)
-    pmfs = listener.hear(Float64MultiArray, PMF, qos.LATCHED)
-    health = listener.hear(DiagnosticArray, DIAGNOSTICS, qos.STREAM)
+    pmfs = listener.hear(Float64MultiArray, PMF, topics.LATCHED)
+    health = listener.hear(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
     transforms = listener.hear(TFMessage, "tf", ALL) if TFMessage else None
-    finished = listener.hear(String, FINISHED, qos.CHAIN)
+    finished = listener.hear(String, FINISHED, topics.CHAIN)
     port = free_port()
     nodes = [start("view", port=port)]
     page = Page(browser, listener, nodes)
@@ -237,7 +237,7 @@ def test_a_page_shows_the_robot_of_its_namespace_alone_and_has_its_port_alone(li
     port = free_port()
     view = start("view", "-r", "__ns:=/left", port=port)
     mouths = {
-        robot: listener.node.create_publisher(DiagnosticArray, f"/{robot}/diagnostics", qos.STREAM)
+        robot: listener.node.create_publisher(DiagnosticArray, f"/{robot}/diagnostics", topics.STREAM)
         for robot in ("left", "right")
     }
     listener.until(lambda: is_served(port) and mouths["left"].get_subscription_count() > 0, alive=[view])

@@ -6,9 +6,9 @@ import numpy as np
 from test_output_folder import EVERY, SCANS, STAMPS, TRUTH, recorded, scan
 
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.offline.final_map import final_map
-from hmt_slam_ros.offline.recorder import Recording
-from hmt_slam_ros.sensing import Scan
+from hmt_slam_ros.results.final_map import final_map
+from hmt_slam_ros.results.recorder import Recording
+from hmt_slam_ros.sensors import Scan
 
 
 def with_wrong_odometry(recording: Recording) -> Recording:

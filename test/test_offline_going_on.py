@@ -14,14 +14,14 @@ from hmt_slam_ros.cli import map_command
 from hmt_slam_ros.cli.arguments import parser
 from hmt_slam_ros.configuration import Configuration, load_configuration, with_changes
 from hmt_slam_ros.errors import HmtSlamError
-from hmt_slam_ros.logs import open_log
-from hmt_slam_ros.offline.going_on import differences, map_folder
 from hmt_slam_ros.offline.runtime import Run, run_log
-from hmt_slam_ros.offline.saved_map import PARTS, RunState, read_run_state
-from hmt_slam_ros.persistence.folder import FolderReader, FolderWriter
-from hmt_slam_ros.processes.tsbi import Tsbi
-from hmt_slam_ros.processes.tsbi_branching import Branching
-from hmt_slam_ros.sensing import Scan
+from hmt_slam_ros.open_log import open_log
+from hmt_slam_ros.results.hmt_map import PARTS, RunState, read_run_state
+from hmt_slam_ros.results.log_reading import differences, map_folder
+from hmt_slam_ros.saved_map.folder import FolderReader, FolderWriter
+from hmt_slam_ros.sensors import Scan
+from hmt_slam_ros.topological_inference.branching import Branching
+from hmt_slam_ros.topological_inference.tsbi import Tsbi
 
 LOG = Path(__file__).parents[1] / "data" / "malaga_one_loop"
 

@@ -11,12 +11,11 @@ import pytest
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.evaluation import read_tum
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.logs import open_log
-from hmt_slam_ros.offline.corrected_scans import corrected_scans
-from hmt_slam_ros.offline.final_map import final_map
-from hmt_slam_ros.offline.reading import LogState, Reading, goes_on
 from hmt_slam_ros.offline.runtime import Run, run_log
-from hmt_slam_ros.sensing import Scan
+from hmt_slam_ros.open_log import open_log
+from hmt_slam_ros.results.final_map import corrected_scans, final_map
+from hmt_slam_ros.results.log_reading import LogState, Reading, goes_on
+from hmt_slam_ros.sensors import Scan
 
 WORLD = "sim:office,seed=3,size=0.7"
 BUNDLED = Path(__file__).parents[1] / "data" / "malaga_one_loop"

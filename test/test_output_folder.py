@@ -6,21 +6,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hmt_slam_ros.agreement import Clutter
 from hmt_slam_ros.configuration import Configuration, with_changes
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.evaluation import read_tum
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.offline import plots
-from hmt_slam_ros.offline.final_map import FinalMap, final_map
-from hmt_slam_ros.offline.map_image import read_map
-from hmt_slam_ros.offline.output_folder import replacing, write_output
-from hmt_slam_ros.offline.recorder import Recorder
-from hmt_slam_ros.offline.report import RunFigures, read_table
-from hmt_slam_ros.offline.saved_map import MapWriter, read_run_state, read_saved_map
-from hmt_slam_ros.processes.map_parts import Arc, ArcEnds, AreaPose, LocalArea, Relabelled
-from hmt_slam_ros.processes.messages import (
+from hmt_slam_ros.grids.occupancy_map import read_map
+from hmt_slam_ros.messages.map_changes import Arc, ArcEnds, AreaPose, LocalArea, Relabelled
+from hmt_slam_ros.messages.messages import (
     Accepted,
     Finished,
     Hypotheses,
@@ -31,7 +24,14 @@ from hmt_slam_ros.processes.messages import (
     Notice,
     Trail,
 )
-from hmt_slam_ros.sensing import Scan
+from hmt_slam_ros.registration.consistency import Clutter
+from hmt_slam_ros.results import plots
+from hmt_slam_ros.results.final_map import FinalMap, final_map
+from hmt_slam_ros.results.hmt_map import MapWriter, read_run_state, read_saved_map
+from hmt_slam_ros.results.output_folder import replacing, write_output
+from hmt_slam_ros.results.recorder import Recorder
+from hmt_slam_ros.results.report import RunFigures, read_table
+from hmt_slam_ros.sensors import Scan
 
 SCANS, EVERY, CUT, VERDICT = 24, 4, 3, 4
 STAMPS = 10**9 + 10**8 * np.arange(SCANS, dtype=np.int64)

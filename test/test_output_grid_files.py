@@ -9,8 +9,8 @@ from logs_for_nodes import WALLS, corridor_bag
 
 from hmt_slam_ros.cli.main import main
 from hmt_slam_ros.errors import HmtSlamError
-from hmt_slam_ros.offline.grid_files import export_grid
-from hmt_slam_ros.offline.saved_map import read_saved_map
+from hmt_slam_ros.results.export import export_grid
+from hmt_slam_ros.results.hmt_map import read_saved_map
 
 # What nav2_map_server's map_io wants of a yaml file, with the types as it reads them.
 REQUIRED = {

@@ -9,9 +9,17 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from hmt_slam_ros.errors import HmtSlamError
-from hmt_slam_ros.offline.map_image import FREE, OCCUPIED, UNKNOWN, OccupancyImage, occupancy_image, read_map, write_map
-from hmt_slam_ros.offline.plots import _draw_grid
-from hmt_slam_ros.sensing import Scan
+from hmt_slam_ros.grids.occupancy_map import (
+    FREE,
+    OCCUPIED,
+    UNKNOWN,
+    OccupancyImage,
+    occupancy_image,
+    read_map,
+    write_map,
+)
+from hmt_slam_ros.results.plots import _draw_grid
+from hmt_slam_ros.sensors import Scan
 
 AHEAD = np.zeros(3)
 

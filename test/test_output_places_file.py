@@ -9,7 +9,7 @@ from small_floor import AREAS, charted
 
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.offline.places_file import write_places
+from hmt_slam_ros.results.export import write_places
 
 BACK = {"north": "south", "south": "north", "east": "west", "west": "east"}
 

@@ -10,17 +10,16 @@ import pytest
 from test_output_folder import COVARIANCE, MAP_T_AREA_1, recorded, write
 
 from hmt_slam_ros.errors import HmtSlamError
-from hmt_slam_ros.features.existence import Existence
-from hmt_slam_ros.features.landmark_map import Landmark, LandmarkMap
-from hmt_slam_ros.features.landmarks import INNER, OPENING
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.local_map.area_kind import AreaKinds
-from hmt_slam_ros.local_map.local_mapping import LocalMapping
-from hmt_slam_ros.offline import topology_file
-from hmt_slam_ros.offline.output_folder import check_replaceable
-from hmt_slam_ros.offline.saved_map import read_saved_map
-from hmt_slam_ros.offline.topology_file import export_topology
-from hmt_slam_ros.topology.portals import Portal
+from hmt_slam_ros.landmarks.area_classes import AreaKinds
+from hmt_slam_ros.landmarks.landmark_map import Existence, Landmark, LandmarkMap
+from hmt_slam_ros.landmarks.landmarks import INNER, OPENING
+from hmt_slam_ros.landmarks.portals import Portal
+from hmt_slam_ros.results import export
+from hmt_slam_ros.results.export import export_topology
+from hmt_slam_ros.results.hmt_map import read_saved_map
+from hmt_slam_ros.results.output_folder import check_replaceable
+from hmt_slam_ros.submap.local_mapping import LocalMapping
 
 NUMBERS = ("x", "y", "theta", "xx", "xy", "xt", "yy", "yt", "tt")
 
@@ -72,7 +71,7 @@ def test_portals_stand_at_their_arcs_and_landmarks_in_a_file_of_their_own(
     door = Landmark(OPENING, belief, 0.9, 0.05, Existence(0.8, seen=4, missed=1))
     corner = Landmark(INNER, belief, 0.0, 0.0, Existence(0.7))
     monkeypatch.setattr(LandmarkMap, "observe", lambda found, *_, **__: setattr(found, "landmarks", [door, corner]))
-    monkeypatch.setattr(topology_file, "portals_of", lambda *_: (portal,))
+    monkeypatch.setattr(export, "portals_of", lambda *_: (portal,))
     graph_file, landmarks_file, _ = export_topology(folder)
     attributes = nx.read_graphml(graph_file, node_type=int).edges[0, 1]
     assert [attributes[f"portal_{name}"] for name in NUMBERS] == of(belief)

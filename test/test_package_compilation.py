@@ -14,7 +14,7 @@ for _ in range(2):
 {use}
 """
 """It asks twice, as a node does that is taken down and brought up again."""
-LOAD = "import numpy as np; from hmt_slam_ros.local_map.bits import any_set"
+LOAD = "import numpy as np; from hmt_slam_ros.grids.distance_field import any_set"
 USE = "any_set(np.zeros(3, np.uint32)); any_set(np.zeros((1, 3), np.uint32)[0, ::2])"
 
 
@@ -72,14 +72,13 @@ def test_a_node_says_it_once_and_never_again(tmp_path, listener, start, monkeypa
     from logs_for_nodes import corridor_bag  # noqa: PLC0415  see the import of rclpy in the fixtures
     from std_msgs.msg import String  # noqa: PLC0415
 
-    from hmt_slam_ros.nodes import qos  # noqa: PLC0415
-    from hmt_slam_ros.nodes.topics import DOCUMENTS  # noqa: PLC0415
-    from hmt_slam_ros.processes.messages import LocalEstimate  # noqa: PLC0415
+    from hmt_slam_ros.messages.messages import LocalEstimate  # noqa: PLC0415
+    from hmt_slam_ros.ros.topics import CHAIN, DOCUMENTS  # noqa: PLC0415
 
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
     log = corridor_bag(tmp_path)
     for times in (1, 0):
-        heard = listener.hear(String, DOCUMENTS[LocalEstimate], qos.CHAIN)
+        heard = listener.hear(String, DOCUMENTS[LocalEstimate], CHAIN)
         slam = start("slam")
         start("robot", log=log, robot__rate=0.0, robot__paced=False)
         listener.until(lambda heard=heard: heard, seconds=120.0, alive=[slam])

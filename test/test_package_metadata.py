@@ -199,7 +199,7 @@ def test_launch_file_describes_its_arguments(path):
 def topics_of_the_nodes():
     """Every topic of the nodes with a slash before it."""
     pytest.importorskip("rclpy", reason="the nodes need rclpy, which is not installed here")
-    topics = import_module("hmt_slam_ros.nodes.topics")
+    topics = import_module("hmt_slam_ros.ros.topics")
     names = {value for name, value in vars(topics).items() if name.isupper() and isinstance(value, str)}
     return {f"/{name.lstrip('/')}" for name in names | set(topics.DOCUMENTS.values())}
 

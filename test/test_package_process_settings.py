@@ -8,7 +8,7 @@ import pytest
 
 # Modules that a console script, `ros2 run` or `python -m` starts.
 NODES = ("slam", "aam", "tsbi", "tlca", "rtl", "robot")
-ENTRIES = ("hmt_slam_ros.cli.main", *(f"hmt_slam_ros.nodes.{node}_node" for node in NODES))
+ENTRIES = ("hmt_slam_ros.cli.main", *(f"hmt_slam_ros.ros.{node}_node" for node in NODES))
 WORK = """
 import numpy as np, scipy.linalg
 scipy.linalg.eigh(np.eye(300) @ np.eye(300))
@@ -37,7 +37,7 @@ def run(code, **variables):
 
 @pytest.mark.parametrize("entry", ENTRIES)
 def test_blas_has_one_thread_in_every_program(entry):
-    if ".nodes." in entry:
+    if ".ros." in entry:
         pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
     # rclpy has threads of its own.
     load = f"import {entry}\n"

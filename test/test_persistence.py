@@ -15,10 +15,9 @@ import pytest
 
 from hmt_slam_ros.arrays import Bool, Float32, Float64
 from hmt_slam_ros.errors import HmtSlamError
-from hmt_slam_ros.persistence.folder import FolderReader, FolderWriter
-from hmt_slam_ros.persistence.reference import described
-from hmt_slam_ros.persistence.replacing import put_in_place
-from hmt_slam_ros.sensing import Scan
+from hmt_slam_ros.saved_map.folder import FolderReader, FolderWriter, put_in_place
+from hmt_slam_ros.saved_map.reference import described
+from hmt_slam_ros.sensors import Scan
 
 
 class Place(NamedTuple):
@@ -230,7 +229,7 @@ import sys
 from pathlib import Path
 sys.path.insert(0, sys.argv[2])
 from test_persistence import written
-from hmt_slam_ros.persistence.replacing import put_in_place
+from hmt_slam_ros.saved_map.folder import put_in_place
 
 target, turn = Path(sys.argv[1]), 0
 while True:

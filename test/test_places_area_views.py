@@ -8,9 +8,9 @@ import pytest
 from small_floor import CONFIGURATION, mapped
 
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.local_map.area_landmarks import Growing
-from hmt_slam_ros.local_map.local_mapping import LocalMapping
+from hmt_slam_ros.landmarks.area_landmarks import Growing
 from hmt_slam_ros.places.area_views import AreaViews
+from hmt_slam_ros.submap.local_mapping import LocalMapping
 
 
 def ahead(scan):

@@ -9,8 +9,7 @@ import pytest
 
 from benchmark.belief_corridors import random_corridors
 from benchmark.belief_world import drawn_anywhere, drawn_observation
-from hmt_slam_ros.configuration.features import Features
-from hmt_slam_ros.configuration.places import Places
+from hmt_slam_ros.configuration.landmarks import Features, Places
 from hmt_slam_ros.places.observation import log_observation, log_unknown_ground, observation_model
 from hmt_slam_ros.places.observation_graph import Landmarks, joined, no_landmarks
 from hmt_slam_ros.places.place_graph import EAST, NORTH, SOUTH, WEST, Edge, Node, place_graph, state_of

@@ -9,20 +9,18 @@ import pytest
 from small_floor import AREAS, CONFIGURATION, charted
 from worlds import box, scan_at
 
-from hmt_slam_ros.features.existence import Existence
-from hmt_slam_ros.features.landmark_map import Landmark
-from hmt_slam_ros.features.landmarks import OPENING
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.local_map.local_mapping import LocalMapping
+from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
+from hmt_slam_ros.landmarks.landmark_map import Existence, Landmark
+from hmt_slam_ros.landmarks.landmarks import OPENING
 from hmt_slam_ros.places.area_views import AreaViews
 from hmt_slam_ros.places.chart import CROSSING, DOOR, END, _place_of, chart_of
-from hmt_slam_ros.places.floor import floors
-from hmt_slam_ros.places.leading_off import LeadingOff
+from hmt_slam_ros.places.floor import LeadingOff, floors
 from hmt_slam_ros.places.observation_graph import OPENINGS
 from hmt_slam_ros.places.place_graph import EAST, WEST
 from hmt_slam_ros.simulation.building import FloorPlan
-from hmt_slam_ros.topology.hybrid_map import HybridMap
+from hmt_slam_ros.submap.local_mapping import LocalMapping
 
 
 @pytest.fixture(scope="module")

@@ -7,15 +7,15 @@ import pytest
 from small_floor import AREAS, BUILDING, CONFIGURATION, charted, seen_at, walls
 from worlds import scan_at
 
-from hmt_slam_ros.features.openings import Openings, openings_of
 from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.landmarks.openings import Openings, openings_of
 from hmt_slam_ros.places.chart import DOOR
 from hmt_slam_ros.places.estimator import PlaceEstimator
 from hmt_slam_ros.places.observation_graph import QUARTERS, chosen, turned_back
 from hmt_slam_ros.places.place_graph import heading_of, node_of, opposite, state_of
+from hmt_slam_ros.places.policy import metric_start
 from hmt_slam_ros.places.position_belief import PositionBelief, certain_belief
-from hmt_slam_ros.places.switching import metric_start
-from hmt_slam_ros.sensing.motion import Step, increment_covariance
+from hmt_slam_ros.sensors.motion_model import Step, increment_covariance
 
 
 @pytest.fixture(scope="module")

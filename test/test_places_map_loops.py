@@ -9,14 +9,13 @@ from worlds import scan_at
 
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.local_map.local_mapping import LocalMapping
+from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.places.area_views import AreaViews
 from hmt_slam_ros.places.chart import chart_of
-from hmt_slam_ros.places.map_loops import MapLoops
-from hmt_slam_ros.places.way_back import ways
-from hmt_slam_ros.processes.loop_proposals import LoopProposals
+from hmt_slam_ros.places.loop_detector import ways
+from hmt_slam_ros.places.loop_proposals import LoopProposals, MapLoops
 from hmt_slam_ros.simulation.building import FloorPlan
-from hmt_slam_ros.topology.hybrid_map import HybridMap
+from hmt_slam_ros.submap.local_mapping import LocalMapping
 
 # The areas of another visit, the first of which is a step long: where both truly begin, and where the arcs have them.
 THIRD, ARCS = np.array([4.0, 0.1, 0.7]), np.array([30.0, 40.0, -1.0])

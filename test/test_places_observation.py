@@ -9,12 +9,11 @@ import pytest
 from worlds import scan_at
 
 from benchmark.belief_world import drawn_anywhere, drawn_observation
-from hmt_slam_ros.configuration.features import Features
-from hmt_slam_ros.configuration.places import Places
-from hmt_slam_ros.features.corners import Corners, corners_of
-from hmt_slam_ros.features.extraction import extract_lines
-from hmt_slam_ros.features.openings import Openings, openings_of
-from hmt_slam_ros.features.rays import rays_of
+from hmt_slam_ros.configuration.landmarks import Features, Places
+from hmt_slam_ros.landmarks.beam_labels import rays_of
+from hmt_slam_ros.landmarks.corners import Corners, corners_of
+from hmt_slam_ros.landmarks.line_extraction import extract_lines
+from hmt_slam_ros.landmarks.openings import Openings, openings_of
 from hmt_slam_ros.places.observation import (
     Expected,
     log_observation,

@@ -6,8 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from hmt_slam_ros.configuration.features import Features
-from hmt_slam_ros.configuration.places import Places
+from hmt_slam_ros.configuration.landmarks import Features, Places
 from hmt_slam_ros.places.observation import observation_model
 from hmt_slam_ros.places.observation_graph import Landmarks, joined, no_landmarks
 from hmt_slam_ros.places.place_graph import EAST, NORTH, SOUTH, WEST, Edge, Node, place_graph, state_of

@@ -7,13 +7,12 @@ import pytest
 
 from benchmark.belief_corridors import Corridors, drawn_building, random_corridors
 from benchmark.belief_world import drawn_of_present
-from hmt_slam_ros.configuration.features import Features
-from hmt_slam_ros.configuration.places import Places
+from hmt_slam_ros.configuration.landmarks import Features, Places
+from hmt_slam_ros.places.loop_detector import TwinPeaks, belief_of_twins
 from hmt_slam_ros.places.observation import observation_model
 from hmt_slam_ros.places.observation_graph import Landmarks, chosen, no_landmarks
 from hmt_slam_ros.places.place_graph import EAST, Edge, Node, heading_of, place_graph, state_of
 from hmt_slam_ros.places.position_belief import PositionBelief, Travel, certain_belief, flat_belief
-from hmt_slam_ros.places.twin_peaks import TwinPeaks, belief_of_twins
 
 PLACES = Places()
 MODEL = observation_model(PLACES, Features())

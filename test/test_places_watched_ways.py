@@ -5,11 +5,10 @@ import math
 import numpy as np
 import pytest
 
-from hmt_slam_ros.configuration.features import Features
-from hmt_slam_ros.configuration.places import Places
+from hmt_slam_ros.configuration.landmarks import Features, Places
+from hmt_slam_ros.places.edge_existence import WatchedWays
 from hmt_slam_ros.places.observation_graph import no_landmarks
 from hmt_slam_ros.places.place_graph import EAST, NORTH, SOUTH, WEST, Edge, Node, place_graph, state_of
-from hmt_slam_ros.places.watched_ways import WatchedWays
 
 EMPTY, NOWHERE = no_landmarks(), math.nan
 FROM_WEST, FROM_EAST, OFF = state_of(0, EAST), state_of(1, WEST), state_of(0, NORTH)

@@ -4,22 +4,14 @@ import numpy as np
 import pytest
 import worlds
 
-from hmt_slam_ros.agreement import Clutter
+from hmt_slam_ros.area_abstraction import aam as aam_module
+from hmt_slam_ros.area_abstraction.aam import Aam
 from hmt_slam_ros.configuration import Configuration, with_changes
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.processes import aam as aam_module
-from hmt_slam_ros.processes.aam import Aam
-from hmt_slam_ros.processes.map_parts import Arc, Merged, Relabelled
-from hmt_slam_ros.processes.messages import (
-    Accepted,
-    AreaEvents,
-    Hypotheses,
-    Keyframe,
-    Leaf,
-    LeafEstimate,
-    LocalEstimate,
-)
+from hmt_slam_ros.messages.map_changes import Arc, Merged, Relabelled
+from hmt_slam_ros.messages.messages import Accepted, AreaEvents, Hypotheses, Keyframe, Leaf, LeafEstimate, LocalEstimate
+from hmt_slam_ros.registration.consistency import Clutter
 
 WORLD = worlds.two_rooms()
 THERE = worlds.drive((1.0, 2.0), (4.0, 3.0), (8.0, 3.0), (10.5, 3.5), (10.5, 5.0), (7.5, 5.0), (7.5, 2.0))

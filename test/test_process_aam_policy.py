@@ -5,13 +5,13 @@ import pytest
 import worlds
 from test_process_aam import OPTIONS, WORLD, drive_until_cut, estimate, exact, keyframe, stay
 
+from hmt_slam_ros.area_abstraction.aam import Aam
+from hmt_slam_ros.area_abstraction.partition import AamState
 from hmt_slam_ros.configuration import Configuration, with_changes
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.persistence.folder import FolderReader, FolderWriter
-from hmt_slam_ros.processes.aam import Aam
-from hmt_slam_ros.processes.aam_watch import AamState
-from hmt_slam_ros.processes.map_parts import Arc, Relabelled
-from hmt_slam_ros.processes.messages import Accepted, Hypotheses, Keyframe, Leaf
+from hmt_slam_ros.messages.map_changes import Arc, Relabelled
+from hmt_slam_ros.messages.messages import Accepted, Hypotheses, Keyframe, Leaf
+from hmt_slam_ros.saved_map.folder import FolderReader, FolderWriter
 
 # Straight on through the door, in the first room and behind it.
 THROUGH = worlds.drive((1.2, 3.0), (10.5, 3.0))

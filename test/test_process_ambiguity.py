@@ -6,8 +6,8 @@ from play_for_tlca import Play, belief
 
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.processes.map_parts import Arc
-from hmt_slam_ros.processes.messages import Leaf, RealTimePose
+from hmt_slam_ros.messages.map_changes import Arc
+from hmt_slam_ros.messages.messages import Leaf, RealTimePose
 
 THERE = np.array([4.0, 1.0, 0.5])
 ELSEWHERE = np.array([4.5, 4.0, 0.7])

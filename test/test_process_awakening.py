@@ -10,15 +10,15 @@ from benchmark.kidnapping import SOON, kidnapped
 from hmt_slam_ros.configuration import Configuration, with_changes
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.logs import open_log
+from hmt_slam_ros.hybrid_map.shortest_path import tells_nothing, unknown
+from hmt_slam_ros.messages.map_changes import Place
+from hmt_slam_ros.messages.messages import Carried
+from hmt_slam_ros.messages.replica import Replica
 from hmt_slam_ros.offline.runtime import Run
-from hmt_slam_ros.processes.map_parts import Place
-from hmt_slam_ros.processes.messages import Carried
-from hmt_slam_ros.processes.replica import Replica
-from hmt_slam_ros.sensing import Odometry, Scan
+from hmt_slam_ros.open_log import open_log
+from hmt_slam_ros.sensors import Odometry, Scan
 from hmt_slam_ros.simulation.scenario import START
-from hmt_slam_ros.topology.closure_search import ClosureSearch
-from hmt_slam_ros.topology.unknown import tells_nothing, unknown
+from hmt_slam_ros.topological_inference.closure_search import ClosureSearch
 
 WORLD = "sim:office,seed=3,size=0.7"
 CARRIED = f"{WORLD},carried=0.6,to=0.75,turned=120"

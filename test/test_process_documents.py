@@ -12,11 +12,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hmt_slam_ros.agreement import Clutter
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.plain_data import is_record, names_in
-from hmt_slam_ros.processes.documents import (
+from hmt_slam_ros.messages.documents import (
     BeginRequest,
     BegunPart,
     Closing,
@@ -27,8 +25,7 @@ from hmt_slam_ros.processes.documents import (
     decode,
     encode,
 )
-from hmt_slam_ros.processes.errands import PlaceEstimate
-from hmt_slam_ros.processes.messages import (
+from hmt_slam_ros.messages.messages import (
     Accepted,
     AreaEvents,
     Arriving,
@@ -38,7 +35,10 @@ from hmt_slam_ros.processes.messages import (
     LocalEstimate,
     Notice,
 )
-from hmt_slam_ros.sensing import Scan
+from hmt_slam_ros.messages.tasks import PlaceEstimate
+from hmt_slam_ros.plain_data import is_record, names_in
+from hmt_slam_ros.registration.consistency import Clutter
+from hmt_slam_ros.sensors import Scan
 
 KINDS = (
     KeyframeHead,

@@ -5,11 +5,11 @@ import pytest
 
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.logs import open_log
-from hmt_slam_ros.offline.recorder import Recorder
+from hmt_slam_ros.messages.messages import Hypotheses
 from hmt_slam_ros.offline.runtime import Run
-from hmt_slam_ros.processes.messages import Hypotheses
-from hmt_slam_ros.sensing import Scan
+from hmt_slam_ros.open_log import open_log
+from hmt_slam_ros.results.recorder import Recorder
+from hmt_slam_ros.sensors import Scan
 
 LAPS = 6
 

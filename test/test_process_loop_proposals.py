@@ -10,8 +10,7 @@ from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.configuration.flat import with_changes
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.places.map_loops import MapLoop
-from hmt_slam_ros.processes.loop_proposals import LoopProposals
+from hmt_slam_ros.places.loop_proposals import LoopProposals, MapLoop
 
 SPREAD = np.diag([0.15, 0.15, math.radians(1.5)]) ** 2
 # Areas whose position is less certain than this are not looked at, m: none behind the ring.

@@ -6,8 +6,8 @@ from misled import run
 
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.logs import open_log
-from hmt_slam_ros.offline.saved_map import MapWriter, read_saved_map
+from hmt_slam_ros.open_log import open_log
+from hmt_slam_ros.results.hmt_map import MapWriter, read_saved_map
 
 # Corridors around four blocks: crossings are entered from several sides and at first taken for new ground.
 LOG = "sim:grid,seed=1,count=2"

@@ -8,16 +8,16 @@ from worlds import box, scan_in
 
 from benchmark.one_drive import OneDrive
 from hmt_slam_ros.configuration import Configuration
-from hmt_slam_ros.local_map.local_filter import PlacedKeyframe
+from hmt_slam_ros.lifelong.change_detection import Look, looked, news_of, outdated
+from hmt_slam_ros.messages.documents import KeyframeHead, encode
+from hmt_slam_ros.messages.map_changes import Outdated
 from hmt_slam_ros.offline.runtime import Run
-from hmt_slam_ros.offline.saved_map import MapWriter, read_run_state
-from hmt_slam_ros.processes.documents import KeyframeHead, encode
-from hmt_slam_ros.processes.map_parts import Outdated
-from hmt_slam_ros.processes.news import Look, looked, news_of, outdated
-from hmt_slam_ros.sensing import Scan
-from hmt_slam_ros.sensing.scan import Revision
-from hmt_slam_ros.sensing.view import FREE, SURFACE, UNSEEN, behind, seen, view_of
+from hmt_slam_ros.results.hmt_map import MapWriter, read_run_state
+from hmt_slam_ros.sensors import Scan
+from hmt_slam_ros.sensors.polar_scan import FREE, SURFACE, UNSEEN, behind, seen, view_of
+from hmt_slam_ros.sensors.scan import Revision
 from hmt_slam_ros.simulation import open_simulated
+from hmt_slam_ros.submap.local_filter import PlacedKeyframe
 
 ROOM = box(-5.0, -3.0, 5.0, 3.0)
 CUPBOARD = box(2.0, 0.5, 2.6, 1.7)

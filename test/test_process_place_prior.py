@@ -6,19 +6,19 @@ import numpy as np
 import pytest
 
 from benchmark.landmark_scans import keyframes_of
-from hmt_slam_ros.agreement import Agreement
 from hmt_slam_ros.configuration import Configuration, with_changes
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.local_map.area_landmarks import Growing
-from hmt_slam_ros.local_map.local_mapping import LocalMapping
+from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
+from hmt_slam_ros.landmarks.area_landmarks import Growing
 from hmt_slam_ros.places.area_views import AreaViews
-from hmt_slam_ros.processes.place_prior import PlacePrior
+from hmt_slam_ros.places.relocalization_prior import PlacePrior
+from hmt_slam_ros.registration.area_to_area import Mode
+from hmt_slam_ros.registration.consistency import Agreement
 from hmt_slam_ros.simulation import open_simulated
-from hmt_slam_ros.topology.area_matching import Mode
-from hmt_slam_ros.topology.hybrid_map import HybridMap
-from hmt_slam_ros.topology.located import Located
-from hmt_slam_ros.topology.whereabouts import UNMAPPED, Whereabouts
+from hmt_slam_ros.submap.local_mapping import LocalMapping
+from hmt_slam_ros.topological_inference.global_localization import UNMAPPED, Whereabouts
+from hmt_slam_ros.topological_inference.global_scan_matching import Located
 
 CONFIGURATION = with_changes(Configuration(), {"places.prior_temper": 0.5})
 

@@ -10,19 +10,16 @@ from ring_for_tsbi import RING, Run, ring_drive
 
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.geometry.chi_square import gate
-from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.logs import open_log
-from hmt_slam_ros.offline.final_map import final_map
-from hmt_slam_ros.processes.closure_account import Account, Closure, Step, unrefined, without
-from hmt_slam_ros.processes.doubts import Doubts
-from hmt_slam_ros.processes.map_parts import Arc, ArcEnds, Merged, Relabelled
-from hmt_slam_ros.processes.merged_account import merged
-from hmt_slam_ros.processes.messages import Leaf
-from hmt_slam_ros.processes.undo import Undo
-from hmt_slam_ros.sensing import Scan
-from hmt_slam_ros.topology.common_map import ArcValue
-from hmt_slam_ros.topology.hybrid_map import HybridMap
+from hmt_slam_ros.geometry.gaussian import PoseGaussian, gate
+from hmt_slam_ros.hybrid_map.common_map import ArcValue
+from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
+from hmt_slam_ros.loop_closure.closure_history import Account, Closure, Step, Undo, merged, unrefined, without
+from hmt_slam_ros.loop_closure.closure_revision import Doubts
+from hmt_slam_ros.messages.map_changes import Arc, ArcEnds, Merged, Relabelled
+from hmt_slam_ros.messages.messages import Leaf
+from hmt_slam_ros.open_log import open_log
+from hmt_slam_ros.results.final_map import final_map
+from hmt_slam_ros.sensors import Scan
 
 BOUND = gate(Configuration().tlca.contradiction_probability)
 ODOMETRY, MATCH = np.diag([0.3, 0.3, 0.02]) ** 2, np.diag([0.05, 0.05, 0.01]) ** 2

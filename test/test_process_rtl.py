@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.processes.map_parts import AreaPose
-from hmt_slam_ros.processes.messages import Accepted, LocalEstimate, Notice
-from hmt_slam_ros.processes.rtl import Rtl
-from hmt_slam_ros.sensing import Odometry
+from hmt_slam_ros.messages.map_changes import AreaPose
+from hmt_slam_ros.messages.messages import Accepted, LocalEstimate, Notice
+from hmt_slam_ros.real_time_localization.rtl import Rtl
+from hmt_slam_ros.sensors import Odometry
 
 SECOND = 1_000_000_000
 

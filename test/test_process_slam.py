@@ -10,8 +10,8 @@ from worlds import box, scan_in
 from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.processes.map_parts import Arc, LocalArea, Merged, Relabelled
-from hmt_slam_ros.processes.messages import (
+from hmt_slam_ros.messages.map_changes import Arc, LocalArea, Merged, Relabelled
+from hmt_slam_ros.messages.messages import (
     Accepted,
     EndOfLog,
     Finished,
@@ -22,8 +22,8 @@ from hmt_slam_ros.processes.messages import (
     Notice,
     Trail,
 )
-from hmt_slam_ros.processes.slam import MetricSlam
-from hmt_slam_ros.sensing import Odometry
+from hmt_slam_ros.metric_slam.slam import MetricSlam
+from hmt_slam_ros.sensors import Odometry
 
 WALLS = np.concatenate((box(-3.02, -4.03, 12.03, 4.01), box(4.01, 1.52, 5.03, 2.52), box(7.02, -2.51, 7.52, -1.49)))
 STEP = np.array([0.1, 0.0, 0.0])

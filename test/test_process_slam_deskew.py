@@ -9,9 +9,9 @@ from test_process_slam import SECOND, Dialogue
 from worlds import box, scan_in
 
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.offline.map_image import OCCUPIED, occupancy_image
-from hmt_slam_ros.processes.messages import EndOfLog, Keyframe, LocalEstimate, Notice
-from hmt_slam_ros.sensing import Odometry
+from hmt_slam_ros.grids.occupancy_map import OCCUPIED, occupancy_image
+from hmt_slam_ros.messages.messages import EndOfLog, Keyframe, LocalEstimate, Notice
+from hmt_slam_ros.sensors import Odometry
 
 WALLS = np.concatenate(
     (

@@ -7,15 +7,14 @@ from worlds import drive, scan_in
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.local_map.area_filter import AreaFilter
-from hmt_slam_ros.local_map.filters import Kinds
-from hmt_slam_ros.local_map.local_filter import PlacedKeyframe
-from hmt_slam_ros.local_map.local_mapping import LocalMapping
-from hmt_slam_ros.local_map.sighting import Sighting
-from hmt_slam_ros.processes.live_hypothesis import LiveHypothesis
-from hmt_slam_ros.processes.map_parts import Relabelled
-from hmt_slam_ros.processes.messages import Leaf
-from hmt_slam_ros.sensing.motion import Prediction, Step
+from hmt_slam_ros.messages.map_changes import Relabelled
+from hmt_slam_ros.messages.messages import Leaf
+from hmt_slam_ros.metric_slam.live_hypothesis import LiveHypothesis
+from hmt_slam_ros.sensors.motion_model import Prediction, Step
+from hmt_slam_ros.submap.filter_selection import Kinds
+from hmt_slam_ros.submap.local_filter import PlacedKeyframe
+from hmt_slam_ros.submap.local_mapping import LocalMapping, Sighting
+from hmt_slam_ros.submap.particle_filter import AreaFilter
 
 CORRIDOR = np.array([[-200.0, -1.0, 200.0, -1.0], [-200.0, 1.0, 200.0, 1.0]])
 ODOMETRY = np.diag([0.05, 0.05, 0.025]) ** 2

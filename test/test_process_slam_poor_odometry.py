@@ -9,8 +9,8 @@ from test_process_slam import WALLS, Dialogue
 from worlds import scan_in
 
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.processes.messages import EndOfLog, LocalEstimate, Notice
-from hmt_slam_ros.sensing import Odometry
+from hmt_slam_ros.messages.messages import EndOfLog, LocalEstimate, Notice
+from hmt_slam_ros.sensors import Odometry
 
 SECOND = 10**9
 

@@ -5,7 +5,7 @@ import pytest
 import worlds
 from play_for_tlca import HOME, SPREAD, WORLD, Play, new_area, poses_of
 
-from hmt_slam_ros.processes.messages import AreaEvents, Leaf
+from hmt_slam_ros.messages.messages import AreaEvents, Leaf
 
 
 def test_the_first_area_lies_at_the_origin_of_the_map_with_hardly_any_uncertainty():

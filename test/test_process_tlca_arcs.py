@@ -5,8 +5,8 @@ from play_for_tlca import SPREAD, Play, belief, new_area, poses_of
 
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import fuse
-from hmt_slam_ros.processes.map_parts import Arc, Merged, Relabelled
-from hmt_slam_ros.processes.messages import Leaf
+from hmt_slam_ros.messages.map_changes import Arc, Merged, Relabelled
+from hmt_slam_ros.messages.messages import Leaf
 
 
 def revisit(pose, area=1, source=0, closure=False):

@@ -7,8 +7,8 @@ import worlds
 from play_for_tlca import SPREAD, Play, belief, new_area, poses_of
 
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.processes.map_parts import Arc, Relabelled
-from hmt_slam_ros.processes.messages import Leaf
+from hmt_slam_ros.messages.map_changes import Arc, Relabelled
+from hmt_slam_ros.messages.messages import Leaf
 
 ROOM_A = worlds.drive((1.0, 2.0), (4.5, 3.0), (4.0, 5.0))
 ROOM_B = worlds.drive((7.0, 3.0), (10.0, 4.0))

@@ -11,8 +11,8 @@ from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.processes.map_parts import Arc, AreaPose
-from hmt_slam_ros.processes.messages import AreaEvents, Hypotheses, Leaf
+from hmt_slam_ros.messages.map_changes import Arc, AreaPose
+from hmt_slam_ros.messages.messages import AreaEvents, Hypotheses, Leaf
 
 
 def test_without_an_event_the_hypothesis_stays():

@@ -9,10 +9,9 @@ from worlds import box, scan_in
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.processes.replica import Replica
-from hmt_slam_ros.processes.tsbi_branches import Parent
-from hmt_slam_ros.processes.tsbi_branching import Branching
-from hmt_slam_ros.topology.hypothesis_tree import LeafNotes
+from hmt_slam_ros.messages.replica import Replica
+from hmt_slam_ros.topological_inference.branching import Branching, Parent
+from hmt_slam_ros.topological_inference.hypothesis_tree import LeafNotes
 
 PATH = np.array([[1.2 + 0.5 * k, 2.2, 0.1 * math.sin(k)] for k in range(6)])
 ROOM = np.concatenate((box(0.0, 0.0, 5.0, 5.0), box(1.0, 3.0, 2.0, 3.5)))

@@ -12,15 +12,15 @@ from worlds import box, scan_in
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.processes import tsbi_awakening
-from hmt_slam_ros.processes.map_parts import Place
-from hmt_slam_ros.processes.messages import AreaEvents, Forgotten, Keyframe
-from hmt_slam_ros.processes.tsbi import Tsbi
-from hmt_slam_ros.processes.tsbi_awakening import UNKNOWN
-from hmt_slam_ros.processes.tsbi_displacement import displaced_or_not, with_displaced
-from hmt_slam_ros.topology.hypothesis_tree import LeafNotes, Spot, Stay
-from hmt_slam_ros.topology.unknown import tells_nothing
-from hmt_slam_ros.topology.whereabouts import Whereabouts
+from hmt_slam_ros.hybrid_map.shortest_path import tells_nothing
+from hmt_slam_ros.messages.map_changes import Place
+from hmt_slam_ros.messages.messages import AreaEvents, Forgotten, Keyframe
+from hmt_slam_ros.topological_inference import relocalization
+from hmt_slam_ros.topological_inference.global_localization import Whereabouts
+from hmt_slam_ros.topological_inference.hypothesis_tree import LeafNotes, Spot, Stay
+from hmt_slam_ros.topological_inference.kidnapping import displaced_or_not, with_displaced
+from hmt_slam_ros.topological_inference.relocalization import UNKNOWN
+from hmt_slam_ros.topological_inference.tsbi import Tsbi
 
 FAR, HERE = (30.0, 20.0), (0.0, 0.0)
 PRIOR = math.log(1e-5)
@@ -74,11 +74,11 @@ def test_that_the_place_is_known_elsewhere_speaks_for_it_and_one_look_has_found_
 def test_it_is_believed_to_be_where_two_looks_find_it():
     parent, branching, newest = rooms_apart((ROOM, OTHER, ROOM), [FAR, FAR], 0.1)
     notes = replace(parent.notes, lost=newest[0], claim=Spot(2, newest[0], np.zeros(3)), credit=None)
-    (still,) = tsbi_awakening.looked_for(branching, replace(parent, notes=notes)).children
+    (still,) = relocalization.looked_for(branching, replace(parent, notes=notes)).children
     assert still.notes.sighted.area == 0
-    looked = tsbi_awakening.looked_for(branching, replace(parent, notes=still.notes))
+    looked = relocalization.looked_for(branching, replace(parent, notes=still.notes))
     _, found = looked.children
-    assert tsbi_awakening.surely_found(looked).children == [found]
+    assert relocalization.surely_found(looked).children == [found]
     assert (found.notes.lost, found.notes.claim, found.notes.found) == (None, None, 0)
     assert (found.arcs[0].source, found.arcs[0].target) == (2, 0)
 
@@ -160,7 +160,7 @@ def test_where_it_would_be_if_it_had_not_been_displaced_is_where_odometry_has_it
     notes = replace(parent.notes, lost=lost, stay=Stay(Spot(1, 10, PATH[2]), 0.4))
     scan = scan_in(ROOM, PATH[3], field_of_view=2 * np.pi, beams=361)
     keyframe = Keyframe(11, scan, 1.0, (), carried=True, mapping=False)
-    (child,) = tsbi_awakening.arrived(branching, replace(parent, notes=notes), keyframe, PATH[3]).children
+    (child,) = relocalization.arrived(branching, replace(parent, notes=notes), keyframe, PATH[3]).children
     assert child.notes.lost == 11
     if not stays:
         assert child.notes.stay is None
@@ -176,7 +176,7 @@ def test_a_place_is_believed_sooner_where_it_would_be_if_it_had_not_been_displac
     for probability in (0.0, 0.4):
         stay = Stay(Spot(0, newest[0], np.array([at, 0.0, 0.0])), probability)
         notes = replace(parent.notes, lost=newest[0], stay=stay)
-        where = tsbi_awakening.looked_for(branching, replace(parent, notes=notes)).where
+        where = relocalization.looked_for(branching, replace(parent, notes=notes)).where
         looked[probability] = max(p for p, fit in zip(where.probabilities, where.found, strict=True) if fit.area == 0)
     assert (looked[0.4] > looked[0.0]) == found
 
@@ -187,7 +187,7 @@ def test_who_says_where_it_is_knows_better_than_where_it_would_be_if_it_had_not_
     told = Place(0, PoseGaussian(se2.between(PATH[0], PATH[5]), np.diag([0.3, 0.3, 0.2]) ** 2))
     pose = parent.hybrid_map.keyframes(2)[newest[-1]]
     keyframe = Keyframe(newest[-1], branching._replica.scans[newest[-1]], 1.0, (), place=told, mapping=False)
-    looked = tsbi_awakening.arrived(branching, replace(parent, notes=notes), keyframe, pose)
+    looked = relocalization.arrived(branching, replace(parent, notes=notes), keyframe, pose)
     assert all(child.notes.stay is None for child in looked.children)
 
 

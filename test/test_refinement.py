@@ -6,16 +6,21 @@ import numpy as np
 import pytest
 from worlds import drive, scan_in, two_rooms
 
-from hmt_slam_ros.configuration.topological import Refinement
+from hmt_slam_ros.configuration.topology import Refinement
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.refinement.joint import refine_jointly
-from hmt_slam_ros.refinement.neighbours import certain_areas, linked_areas, neighbours, pairs_of, with_other_ways
-from hmt_slam_ros.refinement.placement import place
-from hmt_slam_ros.refinement.registration import normal_equations, weighting
-from hmt_slam_ros.refinement.surfaces import surfaces_of
-from hmt_slam_ros.topology.hybrid_map import HybridMap
-from hmt_slam_ros.topology.pose_graph import Edges
+from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
+from hmt_slam_ros.hybrid_map.pose_graph import Edges
+from hmt_slam_ros.loop_closure.joint_refinement import (
+    certain_areas,
+    linked_areas,
+    neighbours,
+    pairs_of,
+    refine_jointly,
+    with_other_ways,
+)
+from hmt_slam_ros.registration.scan_to_scan import normal_equations, surfaces_of, weighting
+from hmt_slam_ros.results.final_map import place
 
 OPTIONS = Refinement()
 CORRIDOR = np.array([[-200.0, -1.0, 200.0, -1.0], [-200.0, 1.0, 200.0, 1.0]])

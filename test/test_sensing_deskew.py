@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from worlds import box, scan_in
 
-from hmt_slam_ros.configuration.live import RealTimeLocalization
+from hmt_slam_ros.configuration.robot import RealTimeLocalization
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.sensing import Odometry, Scan
-from hmt_slam_ros.sensing.deskew import SweepCheck, deskewed
-from hmt_slam_ros.sensing.odometry import OdometryBuffer
+from hmt_slam_ros.sensors import Odometry, Scan
+from hmt_slam_ros.sensors.deskew import SweepCheck, deskewed
+from hmt_slam_ros.sensors.odometry import OdometryBuffer
 
 ROOM = box(-3, -4, 5, 4)
 START = np.array([0.5, -0.3, 0.4])

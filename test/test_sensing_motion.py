@@ -3,17 +3,11 @@
 import numpy as np
 import pytest
 
-from hmt_slam_ros.configuration.metric import Motion
+from hmt_slam_ros.configuration.metric_slam import Motion
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.sensing import Odometry
-from hmt_slam_ros.sensing.motion import (
-    Inertia,
-    MotionModel,
-    OdometryNoise,
-    Step,
-    increment_covariance,
-)
-from hmt_slam_ros.sensing.odometry import OdometryBuffer
+from hmt_slam_ros.sensors import Odometry
+from hmt_slam_ros.sensors.motion_model import Inertia, MotionModel, OdometryNoise, Step, increment_covariance
+from hmt_slam_ros.sensors.odometry import OdometryBuffer
 
 SECOND = 10**9
 SHARP = np.diag([1e4, 1e4, 1e6])

@@ -5,7 +5,7 @@ import pytest
 from worlds import box, scan_in
 
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.sensing.surfels import moved, surfels
+from hmt_slam_ros.sensors.surfels import moved, surfels
 
 REACH = 8.0
 CORRIDOR = np.array([[-100.0, -1.1, 100.0, -1.1], [-100.0, 1.1, 100.0, 1.1]])

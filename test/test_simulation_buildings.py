@@ -3,14 +3,13 @@
 import numpy as np
 import pytest
 
-from hmt_slam_ros.configuration.metric import Motion
+from hmt_slam_ros.configuration.metric_slam import Motion
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.sensing.motion import NO_STEP, Step, increment_covariance
+from hmt_slam_ros.sensors.motion_model import NO_STEP, Step, increment_covariance
 from hmt_slam_ros.simulation import FAMILIES, open_simulated
-from hmt_slam_ros.simulation.building import Building, boxes
-from hmt_slam_ros.simulation.outline import outline_of_rectangles
-from hmt_slam_ros.simulation.raycast import cast, clear_between, clearance
+from hmt_slam_ros.simulation.building import Building, boxes, outline_of_rectangles
+from hmt_slam_ros.simulation.laser import cast, clear_between, clearance
 from hmt_slam_ros.simulation.scenario import Scenario
 from hmt_slam_ros.simulation.settings import Settings
 

@@ -11,8 +11,8 @@ from hmt_slam_ros.random_streams import Purpose, stream
 from hmt_slam_ros.simulation import open_simulated
 from hmt_slam_ros.simulation.building import Building, boxes
 from hmt_slam_ros.simulation.driven_robot import DrivenLog, DrivenRobot
+from hmt_slam_ros.simulation.laser import clearance
 from hmt_slam_ros.simulation.people import People, Walkers
-from hmt_slam_ros.simulation.raycast import clearance
 from hmt_slam_ros.simulation.scenario import START, Scenario
 from hmt_slam_ros.simulation.settings import Settings
 from hmt_slam_ros.simulation.wheels import chained, noisy_increments

@@ -7,8 +7,7 @@ import pytest
 
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.simulation.driver import drive_along
-from hmt_slam_ros.simulation.path import path_through
+from hmt_slam_ros.simulation.drive import drive_along, path_through
 from hmt_slam_ros.simulation.scenario import driven_route
 
 CORNERS = np.array([[0.0, 0.0], [6.0, 0.0], [6.0, 5.0], [9.0, 8.0], [6.0, 5.0], [2.0, 5.0], [2.0, 5.2]])

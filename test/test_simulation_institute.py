@@ -6,7 +6,7 @@ import pytest
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.simulation import open_simulated
 from hmt_slam_ros.simulation.building import Building
-from hmt_slam_ros.simulation.raycast import cast, clear_between
+from hmt_slam_ros.simulation.laser import cast, clear_between
 
 SEEDS = range(6)
 

@@ -14,12 +14,12 @@ from test_logs_convert import assert_same_log
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.evaluation import odometry_of, read_tum, true_relations, truth_of
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.logs import open_log
 from hmt_slam_ros.logs.ros_types import deserialize
 from hmt_slam_ros.logs.writer import write_bag
-from hmt_slam_ros.sensing import Odometry, Scan
+from hmt_slam_ros.open_log import open_log
+from hmt_slam_ros.sensors import Odometry, Scan
 from hmt_slam_ros.simulation import FAMILIES, SimulatedLog
-from hmt_slam_ros.simulation.outline import outline_of_cells
+from hmt_slam_ros.simulation.building import outline_of_cells
 from hmt_slam_ros.simulation.world_file import read_world
 
 MALAGA = Path(__file__).parents[1] / "data" / "malaga_one_loop"

@@ -8,7 +8,7 @@ import pytest
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.simulation import open_simulated
 from hmt_slam_ros.simulation.building import Building, boxes
-from hmt_slam_ros.simulation.raycast import clear_between
+from hmt_slam_ros.simulation.laser import clear_between
 from hmt_slam_ros.simulation.scenario import Scenario
 from hmt_slam_ros.simulation.settings import Settings
 

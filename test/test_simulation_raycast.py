@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hmt_slam_ros.simulation.building import boxes
-from hmt_slam_ros.simulation.raycast import cast, cast_discs, clear_between, clearance, wall_index
+from hmt_slam_ros.simulation.laser import cast, cast_discs, clear_between, clearance, wall_index
 
 
 def brute_force(walls, origins, angles, reach):

@@ -6,12 +6,12 @@ import sys
 import numpy as np
 import pytest
 
-from hmt_slam_ros.configuration.metric import Motion
+from hmt_slam_ros.configuration.metric_slam import Motion
 from hmt_slam_ros.evaluation import evaluate_relations, read_tum, true_relations, truth_of
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.logs import open_log
-from hmt_slam_ros.sensing import Odometry, Scan
-from hmt_slam_ros.sensing.motion import MotionModel
+from hmt_slam_ros.open_log import open_log
+from hmt_slam_ros.sensors import Odometry, Scan
+from hmt_slam_ros.sensors.motion_model import MotionModel
 
 LOG = "sim:ring,seed=2,size=0.8"
 

@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from hmt_slam_ros.configuration.metric import Motion
+from hmt_slam_ros.configuration.metric_slam import Motion
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.sensing.motion import NO_STEP, Step, increment_covariance
+from hmt_slam_ros.sensors.motion_model import NO_STEP, Step, increment_covariance
 from hmt_slam_ros.simulation import open_simulated
 from hmt_slam_ros.simulation.wheels import chained, noisy_increments, slips
 

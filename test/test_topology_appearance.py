@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from worlds import box, scan_in, two_rooms
 
-from hmt_slam_ros.topology.appearance import RATIO_AT_MEDIAN, SIZE, Looks, log_ratio, look
+from hmt_slam_ros.topological_inference.place_recognition import RATIO_AT_MEDIAN, SIZE, Looks, log_ratio, look
 
 SMALL, LARGE = box(-1.0, -1.0, 1.0, 1.0), box(-8.0, -8.0, 8.0, 8.0)
 

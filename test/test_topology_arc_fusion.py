@@ -5,7 +5,7 @@ import pytest
 
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian, fuse
-from hmt_slam_ros.topology.arc_fusion import floored, fused
+from hmt_slam_ros.hybrid_map.hybrid_map import floored, fused
 
 SPREAD = np.diag([0.1**2, 0.05**2, 0.02**2])
 ARC = PoseGaussian(np.array([6.0, 1.0, 0.4]), SPREAD)

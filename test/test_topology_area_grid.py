@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from worlds import box, scan_in
 
-from hmt_slam_ros.topology.area_grid import GridModel, build_area_grid, thinned
+from hmt_slam_ros.registration.likelihood_grid import GridModel, build_area_grid, thinned
 
 ROOM = box(0.0, 0.0, 6.0, 4.0)
 MODEL = GridModel()

@@ -10,13 +10,11 @@ from worlds import box, scan_in
 
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.topology import area_modes
-from hmt_slam_ros.topology.area_bounds import Surface
-from hmt_slam_ros.topology.area_grid import GridModel, build_area_grid
-from hmt_slam_ros.topology.area_ground import ground_around
-from hmt_slam_ros.topology.area_matching import MatchSettings, match
-from hmt_slam_ros.topology.area_search import Cells, search
-from hmt_slam_ros.topology.area_window import make_window
+from hmt_slam_ros.registration import match_modes
+from hmt_slam_ros.registration.area_to_area import MatchSettings, match
+from hmt_slam_ros.registration.branch_and_bound import Cells, ground_around, search
+from hmt_slam_ros.registration.likelihood_grid import GridModel, build_area_grid
+from hmt_slam_ros.registration.search_bounds import Surface, make_window
 
 MODEL = GridModel()
 SETTINGS = MatchSettings()
@@ -159,7 +157,7 @@ def test_the_evidence_is_the_mean_of_the_likelihood_over_the_prior(known, visit)
     twists = rng.standard_normal((4000, 3)) @ np.linalg.cholesky(prior.covariance).T
     fine = Surface(known.fine, known.origin, 0.5 * known.cell)
     forward = [
-        SETTINGS.temper * area_modes.log_ratio_at(fine, visit.points, pose)
+        SETTINGS.temper * match_modes.log_ratio_at(fine, visit.points, pose)
         for pose in se2.compose(prior.mean, se2.exp(twists))
     ]
     expected = np.logaddexp.reduce(forward) - math.log(len(forward))
@@ -231,7 +229,7 @@ def test_peaks_apart_are_two_clusters_and_ripples_are_one():
     steps = np.arange(40)
     score = -0.5 * np.minimum(np.abs(steps - 8), np.abs(steps - 30)) ** 2 * 0.3 + 0.8 * (steps % 2)
     cells = Cells(np.stack((np.zeros(40, int), steps, np.zeros(40, int)), axis=1), score, np.zeros(40))
-    labels = area_modes.clusters(cells, 3.0)
+    labels = match_modes.clusters(cells, 3.0)
     assert labels.max() == 1
     assert labels[8] != labels[30]
     assert labels[6] == labels[8] == labels[10]

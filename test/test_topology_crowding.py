@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from hmt_slam_ros.configuration.metric import Filter
+from hmt_slam_ros.configuration.metric_slam import Filter
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.topology.crowding import crowded, in_place, successor
+from hmt_slam_ros.hybrid_map.keyframe_pruning import crowded, in_place, successor
 
 SETTINGS = Filter(keyframe_distance=0.5, keyframe_angle=20.0)
 

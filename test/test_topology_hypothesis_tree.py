@@ -9,7 +9,7 @@ import pytest
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.random_streams import Purpose, stream
-from hmt_slam_ros.topology.hypothesis_tree import LeafNotes, relative_covariance, settle
+from hmt_slam_ros.topological_inference.hypothesis_tree import LeafNotes, relative_covariance, settle
 
 
 def settled(weights, skipped=0.0, unexamined=0.0, most=16, least=1e-6):

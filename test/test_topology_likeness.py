@@ -7,9 +7,9 @@ import pytest
 from worlds import box, drive, scan_in
 
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.topology.area_grid import GridModel, build_area_grid
-from hmt_slam_ros.topology.area_matching import MatchSettings
-from hmt_slam_ros.topology.likeness import Elsewhere, Likeness, best_shares
+from hmt_slam_ros.registration.area_to_area import MatchSettings
+from hmt_slam_ros.registration.likelihood_grid import GridModel, build_area_grid
+from hmt_slam_ros.topological_inference.place_recognition import Elsewhere, Likeness, best_shares
 
 MODEL, SETTINGS = GridModel(), MatchSettings(temper=0.3)
 PATH = drive((-4.0, 0.0), (4.0, 0.0))

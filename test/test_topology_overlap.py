@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
+from hmt_slam_ros.area_abstraction.overlap import Sensed, overlaps, sensed_overlaps, sensed_points
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.sensing import Scan
-from hmt_slam_ros.topology.overlap import Sensed, overlaps, sensed_overlaps, sensed_points
+from hmt_slam_ros.sensors import Scan
 
 HERE = np.zeros(3)
 

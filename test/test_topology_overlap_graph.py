@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hmt_slam_ros.topology.overlap_graph import (
+from hmt_slam_ros.area_abstraction.overlap_graph import (
     OverlapGraph,
     bisection,
     separation,

@@ -3,14 +3,13 @@
 import numpy as np
 import pytest
 
-from hmt_slam_ros.configuration.features import Features
-from hmt_slam_ros.features.existence import Existence
-from hmt_slam_ros.features.landmark_map import Landmark
-from hmt_slam_ros.features.landmarks import INNER, OPENING
+from hmt_slam_ros.configuration.landmarks import Features
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.topology.hybrid_map import HybridMap
-from hmt_slam_ros.topology.portals import portals_of
+from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
+from hmt_slam_ros.landmarks.landmark_map import Existence, Landmark
+from hmt_slam_ros.landmarks.landmarks import INNER, OPENING
+from hmt_slam_ros.landmarks.portals import portals_of
 
 FEATURES = Features()
 # Area 1 begins at x = 2.25 m of area 0, turned to the left.

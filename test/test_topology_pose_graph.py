@@ -6,9 +6,9 @@ from scipy.stats import chi2
 
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian, fuse
-from hmt_slam_ros.topology.global_map import consistent_map, shortest_path_map
-from hmt_slam_ros.topology.hybrid_map import HybridMap
-from hmt_slam_ros.topology.pose_graph import Edges, optimise, relative_covariances
+from hmt_slam_ros.hybrid_map.global_map import consistent_map, shortest_path_map
+from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
+from hmt_slam_ros.hybrid_map.pose_graph import Edges, optimise, relative_covariances
 
 SPREAD = np.diag([0.05**2, 0.03**2, 0.01**2])
 

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hmt_slam_ros.random_streams import Purpose, stream
-from hmt_slam_ros.topology.reduction import reduce_hypotheses, threshold
+from hmt_slam_ros.topological_inference.hypothesis_tree import reduce_hypotheses, threshold
 
 some_weights = st.lists(st.floats(1e-6, 1.0), min_size=2, max_size=40).map(np.array)
 

@@ -5,8 +5,8 @@ import pytest
 
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.topology.hybrid_map import HybridMap
-from hmt_slam_ros.topology.shortest_path import reachable
+from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
+from hmt_slam_ros.hybrid_map.shortest_path import reachable
 
 
 def arc(x, y, theta, sigma_xy=0.1, sigma_theta=0.0):

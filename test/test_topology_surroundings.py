@@ -6,11 +6,10 @@ from worlds import box, scan_in
 
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.topology.area_grid import GridModel
-from hmt_slam_ros.topology.hybrid_map import HybridMap
-from hmt_slam_ros.topology.shortest_path import Reached
-from hmt_slam_ros.topology.surroundings import Nearness, Views, agreeing, areas_around, entry_bounds
-from hmt_slam_ros.topology.transition import entry_bound
+from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
+from hmt_slam_ros.hybrid_map.shortest_path import Reached
+from hmt_slam_ros.hybrid_map.surroundings import Nearness, Views, agreeing, areas_around, entry_bound, entry_bounds
+from hmt_slam_ros.registration.likelihood_grid import GridModel
 
 NEAR = Nearness(sigma=0.3, reach=6.0)
 

@@ -7,8 +7,8 @@ import pytest
 from worlds import box, scan_in
 
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.topology.area_grid import GridModel, build_area_grid
-from hmt_slam_ros.topology.transition import Place, entry, entry_bound, owner_at, transition
+from hmt_slam_ros.hybrid_map.surroundings import Place, entry, entry_bound, owner_at, transition
+from hmt_slam_ros.registration.likelihood_grid import GridModel, build_area_grid
 
 RADIUS = 2.0
 # Two corridors side by side, a wall between them.

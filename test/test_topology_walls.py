@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from worlds import box, scan_in
 
-from hmt_slam_ros.agreement import WALLS, WALLS_USUAL
 from hmt_slam_ros.configuration import Configuration
-from hmt_slam_ros.topology.walls import Walls
+from hmt_slam_ros.registration.consistency import WALLS, WALLS_USUAL
+from hmt_slam_ros.topological_inference.global_scan_matching import Walls
 
 OUTER, SHELF = box(-3.0, -2.0, 5.0, 2.0), box(1.0, 1.0, 2.5, 1.3)
 OPEN = np.array([[-3.0, 2.0, 0.0, 2.0], [1.2, 2.0, 5.0, 2.0], *OUTER[[0, 1, 3]], *box(-1.0, 2.1, 2.5, 6.0)[1:]])

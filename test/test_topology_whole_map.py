@@ -8,12 +8,11 @@ from worlds import box, scan_in
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.topology.area_grid import GridModel
-from hmt_slam_ros.topology.area_matching import MatchSettings
-from hmt_slam_ros.topology.hybrid_map import HybridMap
-from hmt_slam_ros.topology.surroundings import Nearness, Views
-from hmt_slam_ros.topology.walls import Walls
-from hmt_slam_ros.topology.whole_map import WholeMap, regions
+from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
+from hmt_slam_ros.hybrid_map.surroundings import Nearness, Views
+from hmt_slam_ros.registration.area_to_area import MatchSettings
+from hmt_slam_ros.registration.likelihood_grid import GridModel
+from hmt_slam_ros.topological_inference.global_scan_matching import Walls, WholeMap, regions
 
 REACH = 6.0
 ASKED = se2.compose(np.array([3.6, 2.6, 2.5]), np.array([[0.3 * k, 0.0, 0.05 * k] for k in range(4)]))

@@ -13,14 +13,12 @@ from PIL import Image
 
 from hmt_slam_ros.cli.arguments import parser
 from hmt_slam_ros.errors import HmtSlamError
-from hmt_slam_ros.processes.documents import KeyframeHead
-from hmt_slam_ros.processes.messages import Hypotheses, Keyframe, Leaf
-from hmt_slam_ros.sensing import Scan
-from hmt_slam_ros.view.board import HISTORY, Board, Seen
+from hmt_slam_ros.messages.documents import KeyframeHead
+from hmt_slam_ros.messages.messages import Hypotheses, Keyframe, Leaf
+from hmt_slam_ros.sensors import Scan
+from hmt_slam_ros.view.board import HISTORY, Board, History, Seen
 from hmt_slam_ros.view.health import Health
-from hmt_slam_ros.view.history import History
-from hmt_slam_ros.view.png import grid_png
-from hmt_slam_ros.view.server import PORT, PageServer
+from hmt_slam_ros.view.server import PORT, PageServer, grid_png
 
 NODES = ("slam", "rtl")
 

@@ -11,11 +11,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hmt_slam_ros.area_abstraction.overlap import overlaps, sensed_points
 from hmt_slam_ros.evaluation import read_tum
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.logs import open_log
-from hmt_slam_ros.sensing import Scan
-from hmt_slam_ros.topology.overlap import overlaps, sensed_points
+from hmt_slam_ros.open_log import open_log
+from hmt_slam_ros.sensors import Scan
 
 LOG = Path(__file__).parents[1] / "data" / "malaga_one_loop"
 SCANS = 225

@@ -8,8 +8,8 @@ from itertools import pairwise
 import numpy as np
 
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.sensing import Scan
-from hmt_slam_ros.simulation.raycast import cast, wall_index
+from hmt_slam_ros.sensors import Scan
+from hmt_slam_ros.simulation.laser import cast, wall_index
 
 RANGE_MAX = 30.0
 

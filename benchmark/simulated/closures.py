@@ -9,10 +9,10 @@ from benchmark.simulated.examinations import Examination
 from benchmark.simulated.features import known_is_right, new_is_right
 from benchmark.simulated.truth import Claim, Truth
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.processes.map_parts import Arc
-from hmt_slam_ros.processes.messages import Hypotheses, Leaf
-from hmt_slam_ros.processes.replica import FIRST_HYPOTHESIS, Replica
-from hmt_slam_ros.topology.hybrid_map import HybridMap
+from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
+from hmt_slam_ros.messages.map_changes import Arc
+from hmt_slam_ros.messages.messages import Hypotheses, Leaf
+from hmt_slam_ros.messages.replica import FIRST_HYPOTHESIS, Replica
 
 # Keyframes of the robot's area by which it is judged that this area joins another.
 _RECENT = 5

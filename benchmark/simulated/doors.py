@@ -14,12 +14,12 @@ from benchmark.landmark_truth import World
 from benchmark.simulated.truth import Truth
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.local_map.area_landmarks import AreaLandmarks
-from hmt_slam_ros.local_map.local_mapping import LocalMapping
-from hmt_slam_ros.sensing import Scan
+from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
+from hmt_slam_ros.landmarks.area_landmarks import AreaLandmarks
+from hmt_slam_ros.landmarks.portals import STEP, crossings, portals_of
+from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.simulation.building import Building
-from hmt_slam_ros.topology.hybrid_map import HybridMap
-from hmt_slam_ros.topology.portals import STEP, crossings, portals_of
+from hmt_slam_ros.submap.local_mapping import LocalMapping
 
 Array = NDArray[np.float64]
 

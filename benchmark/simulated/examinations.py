@@ -6,16 +6,15 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 from hmt_slam_ros.configuration import Configuration
-from hmt_slam_ros.processes.replica import Replica
-from hmt_slam_ros.processes.tsbi_branches import Branches, Parent
-from hmt_slam_ros.processes.tsbi_branching import Branching
-from hmt_slam_ros.sensing import Scan
-from hmt_slam_ros.topology.admission import Query
-from hmt_slam_ros.topology.appearance import Looks
-from hmt_slam_ros.topology.area_grid import AreaGrid
-from hmt_slam_ros.topology.closure_search import ClosureSearch, Comparison, Pose
-from hmt_slam_ros.topology.hybrid_map import HybridMap
-from hmt_slam_ros.topology.surroundings import Views
+from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
+from hmt_slam_ros.hybrid_map.surroundings import Views
+from hmt_slam_ros.messages.replica import Replica
+from hmt_slam_ros.registration.likelihood_grid import AreaGrid
+from hmt_slam_ros.sensors import Scan
+from hmt_slam_ros.topological_inference.admission import Query
+from hmt_slam_ros.topological_inference.branching import Branches, Branching, Parent
+from hmt_slam_ros.topological_inference.closure_search import ClosureSearch, Comparison, Pose
+from hmt_slam_ros.topological_inference.place_recognition import Looks
 
 
 @dataclass(frozen=True, eq=False)

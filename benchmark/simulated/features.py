@@ -14,13 +14,13 @@ from benchmark.simulated.truth import GREY, RADIUS, Pose, Truth
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.topology.appearance import log_ratio
-from hmt_slam_ros.topology.area_bounds import Surface
-from hmt_slam_ros.topology.area_grid import AreaGrid
-from hmt_slam_ros.topology.area_modes import log_ratio_at
-from hmt_slam_ros.topology.closure_search import Fit
-from hmt_slam_ros.topology.shortest_path import reachable
-from hmt_slam_ros.topology.transition import entry
+from hmt_slam_ros.hybrid_map.shortest_path import reachable
+from hmt_slam_ros.hybrid_map.surroundings import entry
+from hmt_slam_ros.registration.likelihood_grid import AreaGrid
+from hmt_slam_ros.registration.match_modes import log_ratio_at
+from hmt_slam_ros.registration.search_bounds import Surface
+from hmt_slam_ros.topological_inference.closure_search import Fit
+from hmt_slam_ros.topological_inference.place_recognition import log_ratio
 
 _VIEWS = 3
 _NAN = math.nan

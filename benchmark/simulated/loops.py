@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from benchmark.simulated.truth import Truth
-from hmt_slam_ros.topology.hybrid_map import HybridMap
+from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 
 OLD = 10.0
 """Path between two keyframes from which on the second enters again, m."""

@@ -14,10 +14,10 @@ import numpy as np
 
 from benchmark.simulated.loops import OLD, Loop
 from benchmark.simulated.truth import Pose, Truth
-from hmt_slam_ros.configuration.metric import Motion
+from hmt_slam_ros.configuration.metric_slam import Motion
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.sensing.motion import increment_covariance
+from hmt_slam_ros.sensors.motion_model import increment_covariance
 from hmt_slam_ros.simulation import SimulatedLog
 from hmt_slam_ros.simulation.sight import same_place
 

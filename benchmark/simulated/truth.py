@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.processes.messages import Keyframe
+from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
+from hmt_slam_ros.messages.messages import Keyframe
 from hmt_slam_ros.simulation import SimulatedLog
-from hmt_slam_ros.topology.hybrid_map import HybridMap
 
 Pose = NDArray[np.float64]
 

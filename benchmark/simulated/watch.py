@@ -13,22 +13,22 @@ from benchmark.simulated.examinations import Examination, WatchedBranching
 from benchmark.simulated.features import Row, rows
 from benchmark.simulated.loops import Loops
 from benchmark.simulated.truth import Pose, Truth, nees
+from hmt_slam_ros.area_abstraction.aam import Aam
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
+from hmt_slam_ros.loop_closure.tlca import Tlca
+from hmt_slam_ros.messages.messages import Accepted, EndOfLog, Hypotheses, Keyframe, Message, RealTimePose
+from hmt_slam_ros.messages.replica import FIRST_AREA, Replica
+from hmt_slam_ros.messages.routing import Process
+from hmt_slam_ros.metric_slam.slam import MetricSlam
 from hmt_slam_ros.offline.runtime import LockStep
-from hmt_slam_ros.processes.aam import Aam
-from hmt_slam_ros.processes.messages import Accepted, EndOfLog, Hypotheses, Keyframe, Message, RealTimePose
-from hmt_slam_ros.processes.replica import FIRST_AREA, Replica
-from hmt_slam_ros.processes.routing import Process
-from hmt_slam_ros.processes.rtl import Rtl
-from hmt_slam_ros.processes.slam import MetricSlam
-from hmt_slam_ros.processes.tlca import Tlca
-from hmt_slam_ros.processes.tsbi import Tsbi
-from hmt_slam_ros.processes.tsbi_branching import Branching
-from hmt_slam_ros.sensing import Scan
+from hmt_slam_ros.real_time_localization.rtl import Rtl
+from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.simulation import SimulatedLog
-from hmt_slam_ros.topology.hybrid_map import HybridMap
+from hmt_slam_ros.topological_inference.branching import Branching
+from hmt_slam_ros.topological_inference.tsbi import Tsbi
 
 Entry = dict[str, Any]
 

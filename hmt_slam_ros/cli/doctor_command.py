@@ -29,7 +29,7 @@ def _log(options: argparse.Namespace) -> list[Finding]:
 
 def _live(options: argparse.Namespace) -> list[Finding]:
     try:
-        from hmt_slam_ros.nodes.doctor_node import examine_running  # noqa: PLC0415  it needs ROS
+        from hmt_slam_ros.ros.doctor_node import examine_running  # noqa: PLC0415  it needs ROS
     except ImportError as fault:
         raise HmtSlamError(f"doctor --live needs ROS ({fault}): source Jazzy or install its wheels") from fault
     return examine_running(options.seconds, options.ros_arguments)

@@ -12,7 +12,7 @@ from hmt_slam_ros.evaluation import (
     true_relations,
     truth_of,
 )
-from hmt_slam_ros.logs import open_log
+from hmt_slam_ros.open_log import open_log
 
 
 def run(options: argparse.Namespace) -> None:

@@ -5,8 +5,7 @@ from __future__ import annotations
 import argparse
 
 from hmt_slam_ros.errors import HmtSlamError
-from hmt_slam_ros.offline.grid_files import export_grid
-from hmt_slam_ros.offline.topology_file import export_topology
+from hmt_slam_ros.results.export import export_grid, export_topology
 
 
 def run(options: argparse.Namespace) -> None:

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from importlib import import_module
 
 from hmt_slam_ros.cli.arguments import parser
-from hmt_slam_ros.cli.stopping import heed_signals
+from hmt_slam_ros.cli.terminal import heed_signals
 from hmt_slam_ros.compilation import tell_of_compilation
 from hmt_slam_ros.errors import HmtSlamError
 

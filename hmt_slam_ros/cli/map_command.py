@@ -16,21 +16,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmt_slam_ros.cli.arguments import chosen_configuration
-from hmt_slam_ros.cli.progress import Progress
-from hmt_slam_ros.cli.summary import summary
+from hmt_slam_ros.cli.terminal import Progress, summary
 from hmt_slam_ros.configuration import Configuration, with_changes
 from hmt_slam_ros.errors import HmtSlamError
-from hmt_slam_ros.logs import Log, open_log
-from hmt_slam_ros.offline.corrected_scans import corrected_scans
-from hmt_slam_ros.offline.final_map import FinalMap, final_map
-from hmt_slam_ros.offline.going_on import differences, map_folder, which_log
-from hmt_slam_ros.offline.memory import code_bytes
-from hmt_slam_ros.offline.output_folder import map_writer, replacing, write_output
-from hmt_slam_ros.offline.reading import goes_on
-from hmt_slam_ros.offline.report import RunFigures
+from hmt_slam_ros.logs import Log
 from hmt_slam_ros.offline.runtime import run_log
-from hmt_slam_ros.offline.saved_map import RunState, read_run_state, read_saved_map
-from hmt_slam_ros.persistence.hmt_map import HMT_MAP
+from hmt_slam_ros.open_log import open_log
+from hmt_slam_ros.results.final_map import FinalMap, corrected_scans, final_map
+from hmt_slam_ros.results.hmt_map import RunState, read_run_state, read_saved_map
+from hmt_slam_ros.results.log_reading import differences, goes_on, map_folder, which_log
+from hmt_slam_ros.results.output_folder import map_writer, replacing, write_output
+from hmt_slam_ros.results.report import RunFigures, code_bytes
+from hmt_slam_ros.saved_map.folder import HMT_MAP
 
 
 def run(options: argparse.Namespace) -> None:

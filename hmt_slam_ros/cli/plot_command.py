@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from hmt_slam_ros.offline.plots import plot_all
+from hmt_slam_ros.results.plots import plot_all
 
 
 def run(options: argparse.Namespace) -> None:

@@ -6,11 +6,10 @@ import argparse
 import sys
 
 from hmt_slam_ros.cli.arguments import chosen_configuration
-from hmt_slam_ros.cli.progress import Progress
-from hmt_slam_ros.cli.summary import summary
+from hmt_slam_ros.cli.terminal import Progress, summary
 from hmt_slam_ros.errors import HmtSlamError
-from hmt_slam_ros.logs import open_log
-from hmt_slam_ros.offline.output_folder import check_replaceable
+from hmt_slam_ros.open_log import open_log
+from hmt_slam_ros.results.output_folder import check_replaceable
 from hmt_slam_ros.view.server import LOCAL, check_port
 
 
@@ -20,7 +19,7 @@ def run(options: argparse.Namespace) -> None:
     check_replaceable(options.out.absolute())
     log = open_log(options.log, start=configuration.robot.start, duration=configuration.robot.duration or None)
     try:
-        from hmt_slam_ros.nodes.replay import replay  # noqa: PLC0415  the only command that needs ROS
+        from hmt_slam_ros.ros.replay import replay  # noqa: PLC0415  the only command that needs ROS
     except ImportError as fault:
         raise HmtSlamError(f"replay needs ROS ({fault}): source Jazzy or install its wheels, or use map") from fault
     if options.view is not None:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import argparse
 
 from hmt_slam_ros.evaluation import truth_of, write_tum
-from hmt_slam_ros.logs import open_log
 from hmt_slam_ros.logs.records import SIMULATED
 from hmt_slam_ros.logs.writer import write_bag
+from hmt_slam_ros.open_log import open_log
 
 
 def run(options: argparse.Namespace) -> None:

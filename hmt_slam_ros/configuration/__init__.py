@@ -1,7 +1,13 @@
 """The one configuration tree."""
 
-from hmt_slam_ros.configuration.flat import FlatParameter, as_flat, as_nested, flat_parameters, with_changes
-from hmt_slam_ros.configuration.loading import load_configuration
+from hmt_slam_ros.configuration.flat import (
+    FlatParameter,
+    as_flat,
+    as_nested,
+    flat_parameters,
+    load_configuration,
+    with_changes,
+)
 from hmt_slam_ros.configuration.tree import Configuration
 
 __all__ = [

@@ -13,18 +13,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-from hmt_slam_ros.configuration.explorer import Exploration, Piloting
-from hmt_slam_ros.configuration.features import Features
-from hmt_slam_ros.configuration.live import RealTimeLocalization, Robot
-from hmt_slam_ros.configuration.metric import Filter, LocalMap, Matching, Motion
+from hmt_slam_ros.configuration.landmarks import Features, Places
+from hmt_slam_ros.configuration.metric_slam import Filter, LocalMap, Matching, Motion
 from hmt_slam_ros.configuration.parameter import parameter
-from hmt_slam_ros.configuration.places import Places
-from hmt_slam_ros.configuration.topological import (
-    AreaAbstraction,
-    LoopClosureAcceptance,
-    Refinement,
-    TopologicalInference,
-)
+from hmt_slam_ros.configuration.robot import Exploration, Piloting, RealTimeLocalization, Robot
+from hmt_slam_ros.configuration.topology import AreaAbstraction, LoopClosureAcceptance, Refinement, TopologicalInference
 
 
 @dataclass(frozen=True)

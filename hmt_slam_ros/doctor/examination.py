@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from hmt_slam_ros.doctor import beams, frames, odometry, rates, stamps
+from hmt_slam_ros.doctor import beams, frames, odometry, timing
 from hmt_slam_ros.doctor.comparison import compared
 from hmt_slam_ros.doctor.finding import SEVERITIES, Finding
 from hmt_slam_ros.doctor.gathering import gather
 from hmt_slam_ros.doctor.statistics import Messages, Statistics
-from hmt_slam_ros.logs import Log, open_log
-from hmt_slam_ros.logs.open_log import is_bag
+from hmt_slam_ros.logs import Log
+from hmt_slam_ros.open_log import is_bag, open_log
 
 
 def examine(path: Path, *, start: float = 0.0, duration: float | None = None) -> list[Finding]:
@@ -34,8 +34,8 @@ def findings(statistics: Statistics) -> list[Finding]:
     """All findings on what was gathered."""
     comparison = compared(statistics.odometry, statistics.motions)
     return [
-        *rates.findings(statistics),
-        *stamps.findings(statistics, comparison),
+        *timing.findings_of_rates(statistics),
+        *timing.findings_of_stamps(statistics, comparison),
         *beams.findings(statistics),
         *odometry.findings(statistics, comparison),
         *frames.findings(statistics),
@@ -51,6 +51,6 @@ def _messages(path: Path) -> Messages | None:
     if not is_bag(path):
         return None
     # Its library takes memory that the other formats need not pay for.
-    from hmt_slam_ros.doctor.bag_messages import messages_of_bag  # noqa: PLC0415
+    from hmt_slam_ros.doctor.statistics import messages_of_bag  # noqa: PLC0415
 
     return messages_of_bag(path)

@@ -19,8 +19,8 @@ from hmt_slam_ros.doctor.statistics import (
 )
 from hmt_slam_ros.logs import Log
 from hmt_slam_ros.logs.records import LogRecord
-from hmt_slam_ros.sensing import Odometry, Scan
-from hmt_slam_ros.sensing.deskew import SweepCheck
+from hmt_slam_ros.sensors import Odometry, Scan
+from hmt_slam_ros.sensors.deskew import SweepCheck
 
 
 class Gatherer:

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from hmt_slam_ros.configuration.live import RealTimeLocalization
+from hmt_slam_ros.configuration.robot import RealTimeLocalization
 from hmt_slam_ros.doctor.comparison import Comparison, Estimate
 from hmt_slam_ros.doctor.finding import Finding, Severity, graded, times
 from hmt_slam_ros.doctor.statistics import OdometryStatistics, Statistics, seconds_between

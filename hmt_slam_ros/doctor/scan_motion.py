@@ -13,12 +13,11 @@ import numpy as np
 from numba import njit
 
 from hmt_slam_ros.arrays import Float32
-from hmt_slam_ros.configuration.topological import Refinement
+from hmt_slam_ros.configuration.topology import Refinement
 from hmt_slam_ros.doctor.statistics import ScanMotions
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.refinement.registration import Weighting, normal_equations
-from hmt_slam_ros.refinement.surfaces import surfaces_of
-from hmt_slam_ros.sensing import Scan
+from hmt_slam_ros.registration.scan_to_scan import Weighting, normal_equations, surfaces_of
+from hmt_slam_ros.sensors import Scan
 
 # Scans closer in time are passed over: over a shorter time, a robot moves no farther than the match errs, s.
 _LEAST_TIME = 0.15

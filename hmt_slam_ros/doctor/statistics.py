@@ -2,13 +2,28 @@
 
 from __future__ import annotations
 
+import struct
+from collections import Counter
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from rosbags.rosbag2 import Reader
 
 from hmt_slam_ros.arrays import Bool, Float64, Int64
+from hmt_slam_ros.logs.bag import (
+    DEFAULT_ODOM_TOPIC,
+    DEFAULT_SCAN_TOPIC,
+    choose_odom_topic,
+    choose_scan_topic,
+    header_of,
+    read_messages,
+    read_topics,
+)
+from hmt_slam_ros.logs.mounting import frame_name, transform_from_quaternion
+from hmt_slam_ros.logs.ros_types import ODOMETRY, TRANSFORMS, RosMessage, deserialize
 
 _NANOSECOND = 1e-9
 
@@ -205,3 +220,68 @@ class Statistics:
 def seconds_between(stamps: Int64) -> Float64:
     """From each stamp to the next, s, shape (n - 1,)."""
     return np.diff(stamps) * _NANOSECOND
+
+
+class JointCollector:
+    """Collects transforms."""
+
+    def __init__(self) -> None:
+        self._first: dict[tuple[str, str, str], NDArray[np.float64]] = {}
+        self._messages: Counter[tuple[str, str, str]] = Counter()
+        self._moved: dict[tuple[str, str, str], float] = {}
+
+    @property
+    def joints(self) -> tuple[Joint, ...]:
+        """All of them."""
+        return tuple(
+            Joint(*key[:2], key[2], first, self._messages[key], self._moved[key]) for key, first in self._first.items()
+        )
+
+    def add(self, topic: str, message: RosMessage) -> None:
+        """Take in a tf2_msgs/TFMessage."""
+        for joint in message.transforms:
+            key = (frame_name(joint.header.frame_id), frame_name(joint.child_frame_id), topic)
+            move, turn = joint.transform.translation, joint.transform.rotation
+            transform = transform_from_quaternion((move.x, move.y, move.z), (turn.x, turn.y, turn.z, turn.w))
+            first = self._first.setdefault(key, transform)
+            self._messages[key] += 1
+            self._moved[key] = max(self._moved.get(key, 0.0), float(np.abs(transform - first).max()))
+
+
+def messages_of_bag(path: Path) -> Messages:
+    """Read a bag that `open_log` took."""
+    types = read_topics(path)
+    scan_topic = choose_scan_topic(types, DEFAULT_SCAN_TOPIC, path.name)
+    odom_topic = choose_odom_topic(types, DEFAULT_ODOM_TOPIC, path.name)
+    heads = Counter(scan_head(message.content) for message in read_messages(path, {scan_topic}))
+    joints = JointCollector()
+    for topic in ("/tf_static", "/tf"):
+        for message in read_messages(path, {topic}):
+            if message.kind == TRANSFORMS:
+                joints.add(topic, deserialize(message.content, TRANSFORMS))
+    return Messages(_counts(path), types, dict(heads), _odometry_frames(path, odom_topic, joints), joints.joints)
+
+
+def _counts(path: Path) -> dict[str, int]:
+    with Reader(path) as reader:
+        return {topic: info.msgcount for topic, info in reader.topics.items()}
+
+
+def _odometry_frames(path: Path, topic: str | None, joints: JointCollector) -> tuple[str, str]:
+    if topic is not None:
+        for message in read_messages(path, {topic}):
+            reading = deserialize(message.content, ODOMETRY)
+            return frame_name(reading.header.frame_id), frame_name(reading.child_frame_id)
+    child = next((joint.child for joint in joints.joints if joint.parent == "odom"), "")
+    return "odom", child
+
+
+def scan_head(content: bytes) -> ScanHead:
+    """What a LaserScan (CDR) says of itself, without reading its ranges."""
+    order = "<" if content[1] & 1 else ">"
+    frame = header_of(content).frame
+    (length,) = struct.unpack_from(order + "I", content, 12)
+    # CDR aligns to four bytes, counted from behind its own header of four.
+    at = -(-(16 + length) // 4) * 4
+    first, last, increment, *_, beams = struct.unpack_from(order + "7fI", content, at)
+    return ScanHead(frame_name(frame), first, last, increment, beams)

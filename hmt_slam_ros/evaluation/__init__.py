@@ -11,9 +11,9 @@ from hmt_slam_ros.evaluation.relations import (
     format_table,
     pair_errors,
     read_relations,
+    true_relations,
 )
 from hmt_slam_ros.evaluation.trajectory import StampedPoses, odometry_of, read_tum, truth_of, write_tum
-from hmt_slam_ros.evaluation.truth import true_relations
 
 __all__ = [
     "ErrorStatistics",

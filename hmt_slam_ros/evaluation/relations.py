@@ -1,4 +1,4 @@
-"""Errors of a trajectory at relations between two of its poses (Kuemmerle et al. 2009).
+"""Errors of a trajectory at relations between two of its poses (Kuemmerle et al. 2009), and true relations.
 
 A relation is the true pose at one time in the frame of the pose at another. It needs no common frame and does not
 count an early error of heading again and again, as a comparison of absolute poses would.
@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.evaluation.trajectory import StampedPoses, odometry_of, read_tum
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.logs import open_log
 from hmt_slam_ros.logs.stamps import NANOSECONDS, stamp_from_seconds
+from hmt_slam_ros.open_log import open_log
 
 NEAR = NANOSECONDS // 10
 """Largest time between a relation's end and the pose taken for it, ns."""
@@ -220,3 +220,39 @@ def _row(name: str, score: RelationScore) -> str:
         f"{f'{e.mean:.3f} +- {e.std:.3f}':>18} {e.rms:>7.3f} {e.max:>7.3f}" for e in (score.translation, score.rotation)
     ]
     return f"{name:<10} {matched:>18} {score.carried:>8} {errors[0]} {errors[1]}"
+
+
+_SPACING = 1.0  # m, driven from one pose to the next
+_FAR = 10  # poses
+_NEAR = 3.0  # m, within which a place is the same
+
+
+def true_relations(truth: StampedPoses) -> Relations:
+    """Relations of every metre of a drive: to the next, to the tenth, and to where the robot was before.
+
+    The third kind joins each pose to the nearest one, within 3 m, of more than 60 s before; over these a missed loop
+    shows.
+
+    :param truth: in the order of time.
+    """
+    steps = np.hypot(*np.diff(truth.poses[:, :2], axis=0).T)
+    metres = np.floor(np.concatenate(([0.0], np.cumsum(steps))) / _SPACING)
+    chosen = np.flatnonzero(np.diff(metres, prepend=-1.0) > 0.0)
+    stamps, poses = truth.stamps[chosen], truth.poses[chosen]
+    ahead = np.arange(len(chosen))
+    pairs = [np.stack((ahead[:-gap], ahead[gap:]), axis=1) for gap in (1, _FAR) if len(chosen) > gap]
+    starts, ends = np.concatenate([*pairs, _revisits(stamps, poses)]).T
+    return Relations(stamps[starts], stamps[ends], se2.between(poses[starts], poses[ends]))
+
+
+def _revisits(stamps: NDArray[np.int64], poses: NDArray[np.float64]) -> NDArray[np.intp]:
+    """Pairs (n, 2) of an earlier pose and the later one that is nearest to it."""
+    pairs = []
+    for k in range(len(stamps)):
+        long_ago = int(np.searchsorted(stamps, stamps[k] - LONG_SPAN, side="left"))
+        if long_ago:
+            distances = np.hypot(*(poses[:long_ago, :2] - poses[k, :2]).T)
+            nearest = int(np.argmin(distances))
+            if distances[nearest] < _NEAR:
+                pairs.append((nearest, k))
+    return np.array(pairs, dtype=np.intp).reshape(-1, 2)

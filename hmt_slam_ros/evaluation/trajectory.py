@@ -12,7 +12,7 @@ from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.logs import Log
 from hmt_slam_ros.logs.mounting import heading_of_quaternion
 from hmt_slam_ros.logs.stamps import seconds_from_stamp, stamp_from_seconds
-from hmt_slam_ros.sensing import Odometry, Scan
+from hmt_slam_ros.sensors import Odometry, Scan
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,16 +11,15 @@ import math
 
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration import Configuration
-from hmt_slam_ros.exploration.atlas import Atlas
-from hmt_slam_ros.exploration.pilot import Pilot, limits_of
-from hmt_slam_ros.exploration.route import Route
-from hmt_slam_ros.exploration.survey import Here, Opened
+from hmt_slam_ros.exploration.exploration_map import Atlas
+from hmt_slam_ros.exploration.path_follower import Pilot, Route, limits_of
+from hmt_slam_ros.exploration.roadmap import Here, Opened
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.logs.stamps import NANOSECONDS
-from hmt_slam_ros.processes.errands import Errand, Heading, Outcome, Steering
-from hmt_slam_ros.processes.messages import Message
-from hmt_slam_ros.processes.replica import Replica
-from hmt_slam_ros.sensing import Scan
+from hmt_slam_ros.messages.messages import Message
+from hmt_slam_ros.messages.replica import Replica
+from hmt_slam_ros.messages.tasks import Errand, Heading, Outcome, Steering
+from hmt_slam_ros.sensors import Scan
 
 # So near a frontier and a place are reached, m.
 _AT_FRONTIER, _AT_PLACE = 0.5, 0.15
@@ -36,7 +35,7 @@ _STAND = (0.0, 0.0)
 
 
 class Explorer:
-    """The explorer as a process. Consumes Errand, Scan, RealTimePose and the chain; says what errands.py has.
+    """The explorer as a process. Consumes Errand, Scan, RealTimePose and the chain; says what tasks.py has.
 
     :ivar atlas: what it knows.
     """

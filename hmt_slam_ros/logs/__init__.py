@@ -3,7 +3,6 @@
 What reads and writes bags loads the rosbags library; only those who do either load it.
 """
 
-from hmt_slam_ros.logs.open_log import is_simulated, open_log
 from hmt_slam_ros.logs.records import Log, LogRecord
 
-__all__ = ["Log", "LogRecord", "is_simulated", "open_log"]
+__all__ = ["Log", "LogRecord"]

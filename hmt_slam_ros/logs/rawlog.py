@@ -1,19 +1,310 @@
-"""MRPT rawlogs: scans with the actions between them, or a plain sequence of observations."""
+"""MRPT rawlogs: scans with the actions between them, or a plain sequence of observations.
+
+An object is: one byte with bit 7 set and the length of the class name in the others; the name; one byte with the
+version; the fields, little endian, which may be objects themselves; the byte 0x88. The fields of each class and
+version are facts of the format, taken from MRPT's documentation and source (``serializeFrom`` of each class).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+import struct
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.logs.entries import Entry, EntryLog, Window
-from hmt_slam_ros.logs.mounting import planar_mounting
-from hmt_slam_ros.logs.mrpt_objects import Actions, Frame, Movement, ObjectStream, OdometryReading, RangeScan
-from hmt_slam_ros.sensing import Odometry, Scan
+from hmt_slam_ros.logs.mounting import planar_mounting, transform_from_quaternion
+from hmt_slam_ros.logs.records import Entry, EntryLog, Window
+from hmt_slam_ros.sensors import Odometry, Scan
+
+_END_OF_OBJECT = 0x88
+_ODOMETRY_METHOD = 0
+
+_Kind = TypeVar("_Kind")
+
+
+@dataclass(frozen=True, eq=False)
+class RangeScan:
+    """A planar scan.
+
+    :ivar ticks: time in units of 100 ns since 1601.
+    :ivar ranges: shape (n,), float32, metres.
+    :ivar valid: shape (n,), uint8, 0 for a beam that the sensor or its driver declared faulty.
+    :ivar aperture: angle from the first beam to the last, rad.
+    :ivar right_to_left: True where angles increase from beam to beam.
+    :ivar max_range: largest range of the sensor, metres.
+    :ivar sensor_pose: ``base_T_laser``, shape (4, 4), metres.
+    :ivar sweep_duration: seconds from the first beam to the last, 0 where unknown.
+    """
+
+    ticks: int
+    ranges: NDArray[np.float32]
+    valid: NDArray[np.uint8]
+    aperture: float
+    right_to_left: bool
+    max_range: float
+    sensor_pose: NDArray[np.float64]
+    sweep_duration: float
+
+
+@dataclass(frozen=True, eq=False)
+class OdometryReading:
+    """An absolute odometry reading: ``ticks`` of 100 ns since 1601, ``pose`` (3,) in m and rad."""
+
+    ticks: int
+    pose: NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Movement:
+    """A movement of the robot: ``increment`` (3,) in m and rad, in the frame of the pose before it."""
+
+    by_odometry: bool
+    increment: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Actions:
+    """What the robot did between two frames."""
+
+    actions: list[object]
+
+
+@dataclass(frozen=True)
+class Frame:
+    """Observations made together."""
+
+    observations: list[object]
+
+
+def looks_like_rawlog(content: bytes) -> bool:
+    """Whether the content begins as an object does: with the marked length of a class name, and that name."""
+    length = content[0] & 0x7F if content else 0
+    name = content[1 : 1 + length]
+    return bool(content) and content[0] > 0x80 and name.replace(b":", b"").isalnum() and len(name) == length
+
+
+class ObjectStream:
+    """The top-level objects of a rawlog, in order.
+
+    :param content: the file, decompressed.
+    :param name: of the log, for messages.
+    """
+
+    def __init__(self, content: bytes, name: str) -> None:
+        self._content = content
+        self._name = name
+        self._at = 0
+
+    def __iter__(self) -> Iterator[object]:
+        """Every object.
+
+        :raises HmtSlamError: where the content ends inside an object or is of an unknown class or version.
+        """
+        while self._at < len(self._content):
+            yield self.next_object()
+
+    def next_object(self) -> object:
+        """The object that starts here, read to its end."""
+        name_length = self.integer("B") & 0x7F
+        class_name = self._bytes(name_length).decode("ascii", "replace").removeprefix("mrpt::").split("::")[-1]
+        reader = _READERS.get(class_name)
+        if reader is None:
+            raise HmtSlamError(
+                f"{self._name} holds an object of class {class_name!r}, which is not known here: "
+                "remove such objects with MRPT's rawlog-edit first."
+            )
+        result = reader(self, self.integer("B"))
+        if self.integer("B") != _END_OF_OBJECT:
+            raise HmtSlamError(f"{self._name} is damaged inside an object of class {class_name}: copy the file anew.")
+        return result
+
+    def nested(self, kind: type[_Kind]) -> _Kind:
+        """The object that starts here, of the kind that its owner's class demands.
+
+        :raises HmtSlamError: where it is of another.
+        """
+        result = self.next_object()
+        if not isinstance(result, kind):
+            raise HmtSlamError(f"{self._name} is damaged, one object lies where another belongs: copy the file anew.")
+        return result
+
+    def pose(self) -> NDArray[np.float64]:
+        """A nested object that stands for a pose or matrix."""
+        return self.nested(np.ndarray)
+
+    def integer(self, code: str) -> int:
+        """One integer, by its code of the struct module."""
+        return int(struct.unpack("<" + code, self._bytes(struct.calcsize(code)))[0])
+
+    def real(self, code: str) -> float:
+        """One floating-point number, by its code of the struct module."""
+        return float(struct.unpack("<" + code, self._bytes(struct.calcsize(code)))[0])
+
+    def numbers(self, dtype: str, count: int) -> NDArray[Any]:
+        """``count`` numbers of a little-endian numpy type."""
+        kind = np.dtype(dtype).newbyteorder("<")
+        return np.frombuffer(self._bytes(kind.itemsize * count), dtype=kind)
+
+    def skip_text(self) -> None:
+        """Pass over a character string."""
+        self._bytes(self.integer("I"))
+
+    def version_of(self, class_name: str, version: int, newest: int, oldest: int = 0) -> None:
+        """Check that a version of a class is one that the reader knows.
+
+        :raises HmtSlamError: where it is not.
+        """
+        if not oldest <= version <= newest:
+            raise HmtSlamError(
+                f"{self._name} holds version {version} of {class_name}, and {oldest} to {newest} are known here: "
+                "convert the log with MRPT's rawlog-edit."
+            )
+
+    def _bytes(self, count: int) -> bytes:
+        piece = self._content[self._at : self._at + count]
+        if len(piece) < count:
+            raise HmtSlamError(f"{self._name} is truncated: it ends inside an object; copy the file anew.")
+        self._at += count
+        return piece
+
+
+def _matrix(dtype: str) -> Callable[[ObjectStream, int], NDArray[np.float64]]:
+    def read(stream: ObjectStream, version: int) -> NDArray[np.float64]:
+        stream.version_of("CMatrix", version, newest=0)
+        rows, columns = stream.numbers("u4", 2).tolist()
+        return stream.numbers(dtype, rows * columns).reshape(rows, columns).astype(np.float64)
+
+    return read
+
+
+def _pose_2d(stream: ObjectStream, version: int) -> NDArray[np.float64]:
+    stream.version_of("CPose2D", version, newest=1)
+    return stream.numbers("f8" if version else "f4", 3).astype(np.float64)
+
+
+def _pose_3d(stream: ObjectStream, version: int) -> NDArray[np.float64]:
+    """Homogeneous transform, shape (4, 4)."""
+    stream.version_of("CPose3D", version, newest=3)
+    if version < 2:
+        return stream.pose()
+    translation = stream.numbers("f8", 3)
+    if version == 2:
+        w, x, y, z = stream.numbers("f8", 4)
+        return transform_from_quaternion(translation, (x, y, z, w))
+    transform = np.eye(4)
+    transform[:3, 3] = translation
+    transform[:3, :3] = stream.numbers("f8", 9).reshape(3, 3)
+    return transform
+
+
+def _pose_gaussian(stream: ObjectStream, version: int) -> NDArray[np.float64]:
+    """The mean, shape (3,)."""
+    stream.version_of("CPosePDFGaussian", version, newest=2)
+    mean = stream.pose()
+    if version == 0:
+        stream.pose()
+    else:
+        stream.numbers("f8" if version == 2 else "f4", 6)  # upper triangle of the covariance
+    return mean
+
+
+def _movement(stream: ObjectStream, version: int) -> Movement:
+    stream.version_of("CActionRobotMovement2D", version, newest=7, oldest=4)
+    method = stream.integer("i")
+    increment = stream.pose()
+    if method == _ODOMETRY_METHOD:
+        stream.numbers("i4", 1)  # the motion model: its choice, ...
+        stream.numbers("f4", 6)  # ... Gaussian parameters, ...
+        stream.numbers("i4", 1)  # ... number of particles ...
+        stream.numbers("f4", 6 if version >= 5 else 4)  # ... and the parameters of the other model
+    _skip_velocities_and_encoders(stream, old=version < 7)
+    if version >= 6:
+        stream.integer("Q")
+    return Movement(method == _ODOMETRY_METHOD, increment)
+
+
+def _skip_velocities_and_encoders(stream: ObjectStream, *, old: bool) -> None:
+    """Old versions store both whether they are known or not, velocities as two floats."""
+    has_velocities = stream.integer("?")
+    if old:
+        stream.numbers("f4", 2)
+    elif has_velocities:
+        stream.numbers("f8", 3)
+    has_encoders = stream.integer("?")
+    if old or has_encoders:
+        stream.numbers("i4", 2)
+
+
+def _odometry_reading(stream: ObjectStream, version: int) -> OdometryReading:
+    stream.version_of("CObservationOdometry", version, newest=2)
+    pose = stream.pose()
+    stream.skip_text()
+    ticks = stream.integer("Q")
+    if version >= 1:
+        has_encoders = stream.integer("?")
+        if has_encoders or version < 2:
+            stream.numbers("i4", 2)
+        has_velocities = stream.integer("?")
+        if version < 2:
+            stream.numbers("f4", 2)
+        elif has_velocities:
+            stream.numbers("f8", 3)
+    return OdometryReading(ticks, pose)
+
+
+def _range_scan(stream: ObjectStream, version: int) -> RangeScan:
+    stream.version_of("CObservation2DRangeScan", version, newest=8, oldest=4)
+    aperture, right_to_left, max_range = stream.real("f"), bool(stream.integer("?")), stream.real("f")
+    sensor_pose = stream.pose()
+    if version < 6:
+        stream.pose()  # covariance of the sensor's pose
+    count = stream.integer("I")
+    ranges, valid = stream.numbers("f4", count), stream.numbers("u1", count)
+    stream.real("f")  # standard deviation of a range
+    ticks = stream.integer("Q")
+    stream.real("f")  # opening angle of a beam
+    if version >= 5:
+        stream.skip_text()
+        stream.real("d")  # a pitch that the sensor's pose already contains
+    if version >= 7 and stream.integer("?"):
+        stream.numbers("i4", count)  # intensities
+    sweep_duration = stream.real("f") if version >= 8 else 0.0
+    return RangeScan(ticks, ranges, valid, aperture, right_to_left, max_range, sensor_pose, sweep_duration)
+
+
+def _frame(stream: ObjectStream, version: int) -> Frame:
+    stream.version_of("CSensoryFrame", version, newest=2, oldest=1)
+    if version == 1:
+        stream.integer("I")  # a number of the frame
+    return Frame([stream.next_object() for _ in range(stream.integer("I"))])
+
+
+def _actions(stream: ObjectStream, version: int) -> Actions:
+    stream.version_of("CActionCollection", version, newest=0)
+    return Actions([stream.next_object() for _ in range(stream.integer("I"))])
+
+
+_READERS: dict[str, Callable[[ObjectStream, int], object]] = {
+    "CMatrixD": _matrix("f8"),
+    "CMatrixDouble": _matrix("f8"),
+    "CMatrixF": _matrix("f4"),
+    "CMatrix": _matrix("f4"),
+    "CPose2D": _pose_2d,
+    "CPose3D": _pose_3d,
+    "CPosePDFGaussian": _pose_gaussian,
+    "CActionRobotMovement2D": _movement,
+    "CActionCollection": _actions,
+    "CObservation2DRangeScan": _range_scan,
+    "CObservationOdometry": _odometry_reading,
+    "CSensoryFrame": _frame,
+}
+
 
 _TICKS_TO_1970 = 116_444_736_000_000_000  # MRPT counts 100 ns ticks from the year 1601
 

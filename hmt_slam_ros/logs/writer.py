@@ -13,11 +13,11 @@ from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, Qo
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
 from hmt_slam_ros.errors import HmtSlamError
-from hmt_slam_ros.logs.open_log import open_log
 from hmt_slam_ros.logs.records import Log, LogRecord
 from hmt_slam_ros.logs.ros_types import LASER_SCAN, ODOMETRY, POSE, TRANSFORMS, TRUTH_TOPIC, RosMessage, typestore
 from hmt_slam_ros.logs.stamps import NANOSECONDS
-from hmt_slam_ros.sensing import Odometry, Scan
+from hmt_slam_ros.open_log import open_log
+from hmt_slam_ros.sensors import Odometry, Scan
 
 ODOM_FRAME, BASE_FRAME, LASER_FRAME, WORLD_FRAME = "odom", "base_link", "laser", "world"
 

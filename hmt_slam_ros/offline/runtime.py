@@ -11,19 +11,19 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from hmt_slam_ros.area_abstraction.aam import Aam
 from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.logs.records import Log, LogRecord
-from hmt_slam_ros.offline.reading import LogState, Reading, goes_on
-from hmt_slam_ros.offline.recorder import Recorder
-from hmt_slam_ros.offline.saved_map import RunState
-from hmt_slam_ros.processes.aam import Aam
-from hmt_slam_ros.processes.messages import Carried, EndOfLog, Message
-from hmt_slam_ros.processes.routing import HEARD_BY, Process
-from hmt_slam_ros.processes.rtl import Rtl
-from hmt_slam_ros.processes.slam import MetricSlam
-from hmt_slam_ros.processes.tlca import Tlca
-from hmt_slam_ros.processes.tsbi import Tsbi
-from hmt_slam_ros.sensing import Scan
+from hmt_slam_ros.loop_closure.tlca import Tlca
+from hmt_slam_ros.messages.messages import Carried, EndOfLog, Message
+from hmt_slam_ros.messages.routing import HEARD_BY, Process
+from hmt_slam_ros.metric_slam.slam import MetricSlam
+from hmt_slam_ros.real_time_localization.rtl import Rtl
+from hmt_slam_ros.results.hmt_map import RunState
+from hmt_slam_ros.results.log_reading import LogState, Reading, goes_on
+from hmt_slam_ros.results.recorder import Recorder
+from hmt_slam_ros.sensors import Scan
+from hmt_slam_ros.topological_inference.tsbi import Tsbi
 
 
 @dataclass

@@ -11,14 +11,14 @@ from typing import NamedTuple
 import numpy as np
 
 from hmt_slam_ros.arrays import Float64, Int64
-from hmt_slam_ros.configuration.features import Features
-from hmt_slam_ros.features.hallway import distances_around, shortest_hallway, space_within
-from hmt_slam_ros.features.landmark_map import Landmark, LandmarkMap
-from hmt_slam_ros.local_map.area_landmarks import AreaLandmarks, Growing
-from hmt_slam_ros.local_map.local_mapping import LocalMapping
-from hmt_slam_ros.sensing import Scan
-from hmt_slam_ros.topology.hybrid_map import HybridMap
-from hmt_slam_ros.topology.surroundings import same_poses, stacked
+from hmt_slam_ros.configuration.landmarks import Features
+from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
+from hmt_slam_ros.hybrid_map.surroundings import same_poses, stacked
+from hmt_slam_ros.landmarks.area_classes import distances_around, shortest_hallway, space_within
+from hmt_slam_ros.landmarks.area_landmarks import AreaLandmarks, Growing
+from hmt_slam_ros.landmarks.landmark_map import Landmark, LandmarkMap
+from hmt_slam_ros.sensors import Scan
+from hmt_slam_ros.submap.local_mapping import LocalMapping
 
 # Of an area that differs from hypothesis to hypothesis so many are kept.
 _VERSIONS = 4

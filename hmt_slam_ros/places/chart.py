@@ -20,18 +20,16 @@ from typing import NamedTuple
 import numpy as np
 
 from hmt_slam_ros.arrays import Float64
-from hmt_slam_ros.configuration.features import Features
-from hmt_slam_ros.configuration.places import Places
+from hmt_slam_ros.configuration.landmarks import Features, Places
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.places.area_views import AreaView
-from hmt_slam_ros.places.floor import DIRECTIONS, Floor, floors
-from hmt_slam_ros.places.leading_off import LeadingOff, leading_off
+from hmt_slam_ros.places.edge_existence import existence_of
+from hmt_slam_ros.places.floor import DIRECTIONS, Floor, LeadingOff, floors, leading_off
 from hmt_slam_ros.places.observation_graph import QUARTERS
 from hmt_slam_ros.places.place_graph import EAST, NORTH, Edge, Node, PlaceGraph, opposite, place_graph
 from hmt_slam_ros.places.wall_landmarks import Known, Stretch, known_around, of_stretch, with_hallways
-from hmt_slam_ros.places.way_existence import existence_of
-from hmt_slam_ros.topology.hybrid_map import HybridMap
 
 DOOR, CROSSING, END = range(3)
 """What a node is."""

@@ -38,8 +38,7 @@ import numpy as np
 from numba import njit
 
 from hmt_slam_ros.arrays import Float64, Int64
-from hmt_slam_ros.configuration.features import Features
-from hmt_slam_ros.configuration.places import Places
+from hmt_slam_ros.configuration.landmarks import Features, Places
 from hmt_slam_ros.places.observation_graph import CONVEX, OPENINGS, TRACKS, Landmarks, chosen
 
 # Beyond so many deviations nothing is matched, and a landmark is not within reach.

@@ -15,10 +15,10 @@ from typing import NamedTuple
 import numpy as np
 
 from hmt_slam_ros.arrays import Bool, Float64, Int64
-from hmt_slam_ros.configuration.places import Places
-from hmt_slam_ros.features.corners import Corners
-from hmt_slam_ros.features.openings import Openings
+from hmt_slam_ros.configuration.landmarks import Places
 from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.landmarks.corners import Corners
+from hmt_slam_ros.landmarks.openings import Openings
 
 TRACKS = 8
 """Corners: 0 left and concave, 1 right and concave, 2 left and convex, 3 right and convex; openings that lead 4 ahead,

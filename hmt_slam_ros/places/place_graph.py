@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hmt_slam_ros.arrays import Bool, Float64, Int64
-from hmt_slam_ros.configuration.places import Places
+from hmt_slam_ros.configuration.landmarks import Places
 from hmt_slam_ros.places.observation import Expected
 from hmt_slam_ros.places.observation_graph import (
     QUARTERS,

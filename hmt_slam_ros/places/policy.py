@@ -1,8 +1,14 @@
-"""What the robot does next: the most likely state policy of Tomatis, Nourbakhsh and Siegwart (2003), section 3.3.
+"""What the robot does next: the most likely state policy of Tomatis et al. (2003), section 3.3, and its end at a door.
 
 A confident robot does what is best in the most likely state: it follows the shortest way to its goal. One that is not
 follows the hallway and, where that ends, goes where it expects to find more information: where less entropy would be
 left after the next opening, if it saw there what each of its likely states has it expect.
+
+Tomatis, Nourbakhsh and Siegwart (2003), section 3.4: only a robot that is confident switches, since in the frame of a
+wrong place all that follows is wrong. The first two moments of the door as the robot measures it, and of the same
+door in the map, are those of the robot's pose with which the filter starts,
+
+    area_T_base = area_T_door (base_T_door)^-1.
 """
 
 from __future__ import annotations
@@ -10,10 +16,14 @@ from __future__ import annotations
 from collections.abc import Collection
 from dataclasses import replace
 from itertools import pairwise
+from typing import NamedTuple
 
 import networkx
 import numpy as np
 
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.places.chart import Chart
+from hmt_slam_ros.places.estimator import PlaceEstimator
 from hmt_slam_ros.places.observation import ObservationModel
 from hmt_slam_ros.places.observation_graph import QUARTERS, Landmarks, chosen
 from hmt_slam_ros.places.place_graph import PlaceGraph, node_of, turned
@@ -98,3 +108,30 @@ def _most_expected(graph: PlaceGraph, state: int, model: ObservationModel) -> La
     near = chosen(every, np.abs(every.along) <= model.reach)
     sure = np.full(len(near.tracks), model.true_share)
     return near._replace(variances=np.zeros_like(near.variances), probabilities=sure)
+
+
+class MetricStart(NamedTuple):
+    """What a metric filter starts with.
+
+    :ivar node: the robot is before its opening.
+    :ivar area: in which the opening is known.
+    :ivar pose: the belief over ``area_T_base``.
+    """
+
+    node: int
+    area: int
+    pose: PoseGaussian
+
+
+def metric_start(estimator: PlaceEstimator, chart: Chart) -> MetricStart | None:
+    """What the opening before the robot tells of its pose; None where it is not confident, or before no opening."""
+    facing, seen = estimator.facing, estimator.openings.door_ahead()
+    if facing is None or seen is None or not estimator.at_node:
+        return None
+    if estimator.belief is None or not estimator.belief.confident:
+        return None
+    node, direction = facing
+    for opening in chart.nodes[node].openings:
+        if opening.direction == direction:
+            return MetricStart(node, opening.area, opening.located.compose(seen.inverse()))
+    return None

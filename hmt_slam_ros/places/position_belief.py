@@ -22,7 +22,7 @@ import numpy as np
 from numba import njit
 
 from hmt_slam_ros.arrays import Float64
-from hmt_slam_ros.configuration.places import Places
+from hmt_slam_ros.configuration.landmarks import Places
 from hmt_slam_ros.places.observation import ObservationModel, log_observation, log_unknown_ground
 from hmt_slam_ros.places.observation_graph import QUARTERS, Landmarks
 from hmt_slam_ros.places.place_graph import Arcs, PlaceGraph

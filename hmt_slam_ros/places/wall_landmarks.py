@@ -14,13 +14,13 @@ from typing import NamedTuple
 import numpy as np
 
 from hmt_slam_ros.arrays import Bool, Float64
-from hmt_slam_ros.configuration.places import Places
-from hmt_slam_ros.features.corners import Corners
-from hmt_slam_ros.features.landmark_map import Landmark
-from hmt_slam_ros.features.landmarks import OPENING, OUTER
-from hmt_slam_ros.features.openings import Openings
+from hmt_slam_ros.configuration.landmarks import Places
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.landmarks.corners import Corners
+from hmt_slam_ros.landmarks.landmark_map import Landmark
+from hmt_slam_ros.landmarks.landmarks import OPENING, OUTER
+from hmt_slam_ros.landmarks.openings import Openings
 from hmt_slam_ros.places.floor import DIRECTIONS, Floor
 from hmt_slam_ros.places.observation_graph import (
     OPENINGS,

@@ -14,10 +14,10 @@ from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.logs.records import LogRecord
 from hmt_slam_ros.logs.stamps import NANOSECONDS
 from hmt_slam_ros.random_streams import Purpose, stream
-from hmt_slam_ros.sensing import Odometry, Scan
-from hmt_slam_ros.simulation.driver import ACCELERATION, TURN_ACCELERATION
+from hmt_slam_ros.sensors import Odometry, Scan
+from hmt_slam_ros.simulation.drive import ACCELERATION, TURN_ACCELERATION
+from hmt_slam_ros.simulation.laser import clearance, wall_index
 from hmt_slam_ros.simulation.people import Walkers
-from hmt_slam_ros.simulation.raycast import clearance, wall_index
 from hmt_slam_ros.simulation.scenario import START, Scenario
 from hmt_slam_ros.simulation.wheels import noised
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from hmt_slam_ros.configuration.flat import Value
-from hmt_slam_ros.simulation import corridors, halls
+from hmt_slam_ros.simulation import corridors
 from hmt_slam_ros.simulation.building import Building
 from hmt_slam_ros.simulation.institute import institute
 from hmt_slam_ros.simulation.settings import Settings
@@ -43,9 +43,11 @@ FAMILIES: dict[str, Family] = {
     "grid": Family(corridors.grid, "Corridors that cross at equal distances and look all alike.", {"laps": 1}),
     "ring": Family(corridors.symmetric_ring, "A square ring of corridors whose four sides are alike."),
     "straight": Family(corridors.straight, "A ring with two long halls without any feature.", {"range": 10.0}),
-    "hall": Family(halls.hall, "An open hall in whose middle the laser reaches nothing.", {"range": 8.0, "laps": 1}),
+    "hall": Family(
+        corridors.hall, "An open hall in whose middle the laser reaches nothing.", {"range": 8.0, "laps": 1}
+    ),
     "twins": Family(
-        halls.twins,
+        corridors.twins,
         "Two identical rooms; lost in a hall in between, the robot enters one of them again.",
         {"range": 4.0, "laps": 1},
     ),

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.random_streams import Purpose, stream
 from hmt_slam_ros.simulation.building import Building, boxes
-from hmt_slam_ros.simulation.driver import Drive
-from hmt_slam_ros.simulation.raycast import WallIndex, clear_between, clearance, wall_index
+from hmt_slam_ros.simulation.drive import Drive
+from hmt_slam_ros.simulation.laser import WallIndex, clear_between, clearance, wall_index
 from hmt_slam_ros.simulation.settings import Settings
 
 Rectangle = tuple[float, float, float, float]

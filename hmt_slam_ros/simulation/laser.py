@@ -1,17 +1,201 @@
-"""The laser of the simulated robot."""
+"""The laser of the simulated robot: ray casting, and noise.
+
+The walls lie in a uniform grid; a beam walks from cell to cell (Amanatides and Woo 1987) and stops at the first cell
+whose walls it meets.
+"""
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
+from hmt_slam_ros.arrays import Bool, Float64, Int32, Int64
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.random_streams import Purpose, stream
-from hmt_slam_ros.sensing import Scan
-from hmt_slam_ros.simulation.raycast import WallIndex, cast, cast_discs
+from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.simulation.settings import Settings
+
+# A beam does not slip through between two walls that share a corner, whatever the last bits of the corner are.
+_SLACK = 1e-9
+# A wall is looked up in all cells that it comes this near to, in cells.
+_SKIN = 1e-6
+_CELL = 1.0  # m
+
+
+class WallIndex(NamedTuple):
+    """Walls by the cells of a grid that they pass through.
+
+    :ivar walls: shape (n, 4), x and y of both ends, m.
+    :ivar corner: shape (2,), lower left corner of the grid, m.
+    :ivar shape: shape (2,), columns and rows.
+    :ivar cell: side of a cell, m.
+    :ivar starts: shape (columns * rows + 1,), where the walls of each cell begin in ``members``.
+    :ivar members: numbers of the walls, cell by cell.
+    """
+
+    walls: Float64
+    corner: Float64
+    shape: Int64
+    cell: float
+    starts: Int32
+    members: Int32
+
+
+def wall_index(walls: NDArray[np.float64], cell: float = _CELL) -> WallIndex:
+    """Sort walls (n, 4), m, n >= 1, into cells."""
+    walls = np.ascontiguousarray(walls, dtype=np.float64)
+    ends = walls.reshape(-1, 2)
+    corner = ends.min(axis=0) - cell
+    shape = np.ceil((ends.max(axis=0) - corner) / cell).astype(np.int64) + 1
+    counts = np.zeros(shape[0] * shape[1] + 1, dtype=np.int32)
+    _sort(walls, corner, shape, cell, counts, np.empty(0, dtype=np.int32))
+    starts = np.cumsum(counts, dtype=np.int32)
+    members = np.empty(starts[-1], dtype=np.int32)
+    _sort(walls, corner, shape, cell, starts[:-1].copy(), members)
+    return WallIndex(walls, corner, shape, cell, starts, members)
+
+
+@njit(cache=True)
+def _sort(walls: Float64, corner: Float64, shape: Int64, cell: float, at: Int32, members: Int32) -> None:
+    """Count the walls of every cell, in the place behind it; or, given where each cell begins, fill the cells in."""
+    for k in range(walls.shape[0]):
+        ax, ay = (walls[k, 0] - corner[0]) / cell, (walls[k, 1] - corner[1]) / cell
+        bx, by = (walls[k, 2] - corner[0]) / cell, (walls[k, 3] - corner[1]) / cell
+        dx, dy = bx - ax, by - ay
+        length = math.hypot(dx, dy)
+        for row in range(int(min(ay, by) - _SKIN), int(max(ay, by) + _SKIN) + 1):
+            for column in range(int(min(ax, bx) - _SKIN), int(max(ax, bx) + _SKIN) + 1):
+                # Distance of the cell's middle from the wall's line, against that of its farthest corner.
+                away = abs(dx * (row + 0.5 - ay) - dy * (column + 0.5 - ax))
+                if away <= 0.5 * (abs(dx) + abs(dy)) + _SKIN * (1.0 + length):
+                    number = row * shape[0] + column
+                    if members.size:
+                        members[at[number]] = k
+                        at[number] += 1
+                    else:
+                        at[number + 1] += 1
+
+
+@njit(cache=True)
+def cast(index: WallIndex, origins: Float64, angles: Float64, reach: float) -> Float64:
+    """Distance to the nearest wall along each beam.
+
+    :param origins: shape (n, 2), m.
+    :param angles: shape (n,), rad.
+    :param reach: m.
+    :returns: shape (n,), m; inf where there is no wall within reach.
+    """
+    distances = np.empty(angles.shape[0])
+    for n in range(angles.shape[0]):
+        distances[n] = _cast_one(index, origins[n, 0], origins[n, 1], math.cos(angles[n]), math.sin(angles[n]), reach)
+    return distances
+
+
+@njit(cache=True)
+def clear_between(index: WallIndex, starts: Float64, ends: Float64) -> Bool:
+    """Whether there is no wall between two points, for each of n pairs (n, 2), m; shape (n,)."""
+    clear = np.empty(starts.shape[0], dtype=np.bool_)
+    for n in range(starts.shape[0]):
+        dx, dy = ends[n, 0] - starts[n, 0], ends[n, 1] - starts[n, 1]
+        away = math.hypot(dx, dy)
+        if away == 0.0:
+            clear[n] = True
+        else:
+            clear[n] = _cast_one(index, starts[n, 0], starts[n, 1], dx / away, dy / away, away) == math.inf
+    return clear
+
+
+@njit(cache=True)
+def _cast_one(index: WallIndex, x: float, y: float, cos: float, sin: float, reach: float) -> float:
+    columns, rows = index.shape[0], index.shape[1]
+    gx, gy = (x - index.corner[0]) / index.cell, (y - index.corner[1]) / index.cell
+    enter, leave_x = _crossing(gx, cos, columns)
+    other, leave_y = _crossing(gy, sin, rows)
+    enter, leave = max(enter, other), min(leave_x, leave_y, reach / index.cell)
+    if enter > leave:
+        return math.inf
+    column = min(max(int(gx + enter * cos), 0), columns - 1)
+    row = min(max(int(gy + enter * sin), 0), rows - 1)
+    step_x, step_y = (1 if cos > 0.0 else -1), (1 if sin > 0.0 else -1)
+    per_x = 1.0 / abs(cos) if cos != 0.0 else math.inf
+    per_y = 1.0 / abs(sin) if sin != 0.0 else math.inf
+    next_x = (column + (cos > 0.0) - gx) / cos if cos != 0.0 else math.inf
+    next_y = (row + (sin > 0.0) - gy) / sin if sin != 0.0 else math.inf
+    nearest = math.inf
+    while True:
+        number = row * columns + column
+        for place in range(index.starts[number], index.starts[number + 1]):
+            nearest = min(nearest, _meeting(index.walls, index.members[place], x, y, cos, sin))
+        border = min(next_x, next_y)
+        if nearest <= border * index.cell or border > leave:
+            break
+        if next_x < next_y:
+            column += step_x
+            next_x += per_x
+        else:
+            row += step_y
+            next_y += per_y
+        if not (0 <= column < columns and 0 <= row < rows):
+            break
+    return nearest if nearest <= reach else math.inf
+
+
+@njit(cache=True)
+def _crossing(start: float, direction: float, size: int) -> tuple[float, float]:
+    """Where a beam enters the stretch from 0 to ``size``, not before its start, and where it leaves it."""
+    if direction == 0.0:
+        return (0.0, math.inf) if 0.0 <= start <= size else (math.inf, 0.0)
+    a, b = -start / direction, (size - start) / direction
+    return max(0.0, min(a, b)), max(a, b)
+
+
+@njit(cache=True)
+def _meeting(walls: Float64, k: int, x: float, y: float, cos: float, sin: float) -> float:
+    """Distance along a beam to a wall, inf where it passes; a wall along the beam is not seen."""
+    ox, oy = walls[k, 0] - x, walls[k, 1] - y
+    dx, dy = walls[k, 2] - walls[k, 0], walls[k, 3] - walls[k, 1]
+    cross = cos * dy - sin * dx
+    if cross == 0.0:
+        return math.inf
+    share = (ox * sin - oy * cos) / cross
+    distance = (ox * dy - oy * dx) / cross
+    return distance if distance >= 0.0 and -_SLACK <= share <= 1.0 + _SLACK else math.inf
+
+
+@njit(cache=True)
+def cast_discs(discs: Float64, origins: Float64, angles: Float64, distances: Float64) -> None:
+    """Shorten distances (n,), m, to those discs that stand before them; a beam from within a disc does not see it.
+
+    :param discs: shape (k, 3), x, y and radius, m.
+    :param origins: shape (n, 2), m.
+    :param angles: shape (n,), rad.
+    """
+    for n in range(angles.shape[0]):
+        cos, sin = math.cos(angles[n]), math.sin(angles[n])
+        for k in range(discs.shape[0]):
+            dx, dy, radius = discs[k, 0] - origins[n, 0], discs[k, 1] - origins[n, 1], discs[k, 2]
+            ahead = dx * cos + dy * sin
+            inside = radius * radius - (dx * sin - dy * cos) ** 2
+            if ahead > 0.0 and inside > 0.0 and dx * dx + dy * dy > radius * radius:
+                distances[n] = min(distances[n], ahead - math.sqrt(inside))
+
+
+@njit(cache=True)
+def clearance(walls: Float64, points: Float64) -> Float64:
+    """Distance of each point (n, 2) from the nearest of the walls (k, 4), m; shape (n,)."""
+    nearest = np.full(points.shape[0], math.inf)
+    for n in range(points.shape[0]):
+        for k in range(walls.shape[0]):
+            dx, dy = walls[k, 2] - walls[k, 0], walls[k, 3] - walls[k, 1]
+            px, py = points[n, 0] - walls[k, 0], points[n, 1] - walls[k, 1]
+            share = min(1.0, max(0.0, (px * dx + py * dy) / max(dx * dx + dy * dy, 1e-300)))
+            nearest[n] = min(nearest[n], (px - share * dx) ** 2 + (py - share * dy) ** 2)
+    return np.sqrt(nearest)
+
 
 _RANGE_MIN = 0.02  # m
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmt_slam_ros.random_streams import Purpose, stream
-from hmt_slam_ros.simulation.driver import Drive
+from hmt_slam_ros.simulation.drive import Drive
 
 _RADIUS = 0.2  # m
 _BERTH = 0.8  # m, from the robot's middle to a person's

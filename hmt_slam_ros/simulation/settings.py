@@ -6,8 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from hmt_slam_ros.configuration.flat import Value, changed_one_by_one
-from hmt_slam_ros.configuration.loading import parse_setting
+from hmt_slam_ros.configuration.flat import Value, changed_one_by_one, parse_setting
 from hmt_slam_ros.configuration.parameter import parameter
 from hmt_slam_ros.logs.records import SIMULATED
 

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.simulation.laser import Laser
-from hmt_slam_ros.simulation.raycast import WallIndex, clear_between
+from hmt_slam_ros.simulation.laser import Laser, WallIndex, clear_between
 
 _SHORT_OF_WALL = 0.01  # m, where the view of a point on a wall ends
 _SLACK = 1e-9  # rad, that the outermost beam is counted in

@@ -9,11 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmt_slam_ros.errors import HmtSlamError
-from hmt_slam_ros.logs.entries import Window, require_scans
-from hmt_slam_ros.logs.records import SIMULATED, LogRecord
+from hmt_slam_ros.logs.records import SIMULATED, LogRecord, Window, require_scans
 from hmt_slam_ros.logs.stamps import NANOSECONDS
 from hmt_slam_ros.random_streams import Purpose, stream
-from hmt_slam_ros.sensing import Odometry
+from hmt_slam_ros.sensors import Odometry
 from hmt_slam_ros.simulation import sight
 from hmt_slam_ros.simulation.families import FAMILIES
 from hmt_slam_ros.simulation.scenario import Scenario

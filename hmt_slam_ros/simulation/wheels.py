@@ -7,9 +7,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from hmt_slam_ros.configuration.metric import Motion
+from hmt_slam_ros.configuration.metric_slam import Motion
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.sensing.motion import path_deviations
+from hmt_slam_ros.sensors.motion_model import path_deviations
 
 _SLIP = np.array([0.3, 0.0, math.radians(15.0)])  # deviation of a slip, m, m, rad
 _ITERATIONS = 40
@@ -21,7 +21,7 @@ def noisy_increments(
     """What odometry measures of motions from one scan to the next.
 
     The measured motion is the one for which the truth, seen from its end, is a draw from the covariance that
-    `hmt_slam_ros.sensing.motion.increment_covariance` states for that measured motion: what the filters assume of the
+    `motion_model.increment_covariance` states for that measured motion: what the filters assume of the
     odometry is exactly true.
 
     :param increments: shape (n, 3), true motions, m and rad.

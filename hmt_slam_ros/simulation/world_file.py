@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.simulation.building import Building
-from hmt_slam_ros.simulation.outline import outline_of_cells
+from hmt_slam_ros.simulation.building import Building, outline_of_cells
 
 _KEYS = ("walls", "furniture", "route", "settings", "image", "resolution", "origin", "negate", "occupied_thresh")
 # map_server's, that this needs not.

@@ -1,0 +1,220 @@
+"""Whether stamps can be believed, how often scans and odometry come, and whether there are gaps."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hmt_slam_ros.arrays import Bool, Float64, Int64
+from hmt_slam_ros.doctor.comparison import Comparison
+from hmt_slam_ros.doctor.finding import Finding, graded, times
+from hmt_slam_ros.doctor.statistics import Statistics, seconds_between
+from hmt_slam_ros.geometry import se2
+
+# Seconds between the clocks of laser and odometry: doubtful from the first on, wrong from the second on.
+_OFFSET = (0.05, 0.15)
+# Stamps that deviate by this share of a period are those of arrival.
+_JITTER = 0.5
+
+
+def findings_of_stamps(statistics: Statistics, comparison: Comparison | None) -> list[Finding]:
+    """What the stamps tell."""
+    found = [
+        *_backward("scan", statistics.scans.source_stamps),
+        *_backward("odometry", statistics.odometry.source_stamps),
+        *_equal("scan", statistics.scans.source_stamps),
+        *_uneven(statistics.scans.source_stamps),
+    ]
+    if comparison is not None and comparison.offset is not None:
+        found.append(_offset(comparison.offset))
+    return found or [Finding("fine", "stamps", "All stamps increase.")]
+
+
+def _backward(what: str, stamps: Int64) -> list[Finding]:
+    steps = seconds_between(stamps)
+    back = np.flatnonzero(steps < 0.0)
+    if not back.size:
+        return []
+    return [
+        Finding(
+            "doubtful",
+            f"{what} stamps jump back",
+            f"The {what} stamps jump back {times(back.size)}, by up to {-steps.min():.3f} s: the order of the messages "
+            "is believed and not the stamps, but other tools that sort by time will break the path; mend the clock or "
+            "the driver that stamps them.",
+        )
+    ]
+
+
+def _equal(what: str, stamps: Int64) -> list[Finding]:
+    equal = int((np.diff(stamps) == 0).sum())
+    if not equal:
+        return []
+    return [
+        Finding(
+            "doubtful",
+            f"{what} stamps equal",
+            f"{equal} {what} messages have the stamp of the one before: look for a second publisher of the same topic, "
+            "a recording of it twice, or a clock that is too coarse.",
+        )
+    ]
+
+
+def _uneven(stamps: Int64) -> list[Finding]:
+    """Stamps of arrival, in bursts."""
+    periods = seconds_between(stamps)
+    periods = periods[periods > 0.0]
+    if len(periods) < 20:
+        return []
+    usual = float(np.median(periods))
+    early = float((periods < (1.0 - _JITTER) * usual).mean())
+    if usual > 1.0 or early < 0.1:
+        return []
+    return [
+        Finding(
+            "doubtful",
+            "scan stamps uneven",
+            f"{100.0 * early:.0f} % of the scans follow the one before in less than half of the usual {usual:.3f} s: "
+            "the stamps seem to be those of arrival; let the driver stamp a scan when its first beam is measured.",
+        )
+    ]
+
+
+def _offset(offset: float) -> Finding:
+    severity = graded(abs(offset), *_OFFSET)
+    if severity == "fine":
+        return Finding("fine", "clock offset", "Scans and odometry are stamped by one clock, as far as turns show.")
+    late = "late" if offset < 0.0 else "early"
+    return Finding(
+        severity,
+        "clock offset",
+        f"The scans' stamps are {abs(offset):.2f} s {late} against the odometry's, by the turns that both show: "
+        "synchronise the clocks (chrony, PTP), or correct the stamp in the driver of the one that is off.",
+    )
+
+
+# A gap is a time between two messages of more than so many usual ones, and of so much, s.
+_GAP_PERIODS, _GAP = 5.0, 0.5
+# Scans farther apart than this see too little in common, m and rad; so many of them may be.
+_FAR, _TURNED, _FAR_SHARE = 0.7, np.radians(35.0), 0.1
+# Share of the scans without odometry around them that is doubtful, and wrong.
+_UNCOVERED = (0.0005, 0.01)
+# Between two keyframes of a sparse log the time says nothing of gaps, s.
+_SPARSE = 1.0
+
+
+def findings_of_rates(statistics: Statistics) -> list[Finding]:
+    """What the times between messages tell."""
+    scans, odometry = statistics.scans.stamps, statistics.odometry.stamps
+    if len(scans) < 2:
+        text = "There is not more than one scan: record for longer, or start the laser."
+        return [Finding("wrong", "scan rate", text)]
+    found = [_rate(statistics, scans), *_gaps("scan", "laser", scans)]
+    if len(odometry) < 2:
+        text = "There is no odometry: start its driver, or record its topic; mapping needs it."
+        return [*found, Finding("wrong", "odometry rate", text)]
+    found += [*_sparse(statistics), *_odometry_rate(scans, odometry), *_gaps("odometry", "odometry", odometry)]
+    return [*found, *_coverage(scans, odometry)]
+
+
+def _rate(statistics: Statistics, scans: Int64) -> Finding:
+    return Finding(
+        "fine",
+        "contents",
+        f"{len(scans)} scans at {_mean_rate(scans):.1f} Hz and {len(statistics.odometry.stamps)} odometry readings at "
+        f"{_mean_rate(statistics.odometry.stamps):.1f} Hz in {statistics.duration:.1f} s, over "
+        f"{statistics.odometry.distance:.1f} m by odometry.",
+    )
+
+
+def _mean_rate(stamps: Int64) -> float:
+    span = float(np.ptp(stamps)) * 1e-9 if len(stamps) else 0.0
+    return (len(stamps) - 1) / span if span > 0.0 else 0.0
+
+
+def _gap_limit(periods: Float64) -> float:
+    # Stamps of arrival come in bursts, so that the median alone is too short.
+    return max(_GAP, _GAP_PERIODS * float(max(np.median(periods), periods.mean())))
+
+
+def _gaps(what: str, driver: str, stamps: Int64) -> list[Finding]:
+    periods = seconds_between(stamps)
+    if np.median(periods) > _SPARSE:
+        return []
+    gaps = np.flatnonzero(periods > _gap_limit(periods))
+    if not gaps.size:
+        return []
+    longest = gaps[np.argmax(periods[gaps])]
+    at = (stamps[longest] - stamps[0]) * 1e-9
+    return [
+        Finding(
+            "doubtful",
+            f"{what} gaps",
+            f"The {what} messages stop {times(gaps.size)} for more than {_gap_limit(periods):.1f} s, the longest time "
+            f"for {periods[longest]:.1f} s, {at:.1f} s after the first: look whether the {driver} driver stalls or the "
+            "recorder or network drops messages.",
+        )
+    ]
+
+
+def _sparse(statistics: Statistics) -> list[Finding]:
+    """Scans between which the robot moves far."""
+    odometry = statistics.odometry
+    stamps = statistics.scans.stamps.astype(np.float64)
+    poses = odometry.at(stamps[(stamps >= odometry.stamps[0]) & (stamps <= odometry.stamps[-1])])
+    if len(poses) < 2:
+        return []
+    steps = se2.between(poses[:-1], poses[1:])
+    far = (np.hypot(steps[:, 0], steps[:, 1]) > _FAR) | (np.abs(steps[:, 2]) > _TURNED)
+    if far.mean() < _FAR_SHARE:
+        return []
+    return [
+        Finding(
+            "doubtful",
+            "sparse scans",
+            f"Between {100.0 * far.mean():.0f} % of the scans the robot goes more than {_FAR:g} m or turns by more "
+            f"than {np.degrees(_TURNED):.0f} degrees (usually {np.median(np.hypot(*steps[:, :2].T)):.2f} m), as "
+            "in a log of keyframes: give the whole recording, drive more slowly or raise the laser's rate.",
+        )
+    ]
+
+
+def _odometry_rate(scans: Int64, odometry: Int64) -> list[Finding]:
+    scan_rate, rate = len(scans), len(odometry)
+    if rate >= 0.8 * scan_rate:
+        return []
+    return [
+        Finding(
+            "doubtful",
+            "odometry rate",
+            f"There are {rate} odometry readings for {scan_rate} scans: raise the odometry's rate to at least that of "
+            "the scans, since the motion between two readings is guessed.",
+        )
+    ]
+
+
+def _coverage(scans: Int64, odometry: Int64) -> list[Finding]:
+    uncovered = ~_covered(scans, odometry)
+    share = float(uncovered.mean())
+    severity = graded(share, *_UNCOVERED)
+    # A scan or two before the first reading and after the last are nothing.
+    if severity == "fine" or uncovered.sum() <= 2:
+        return []
+    return [
+        Finding(
+            severity,
+            "scans without odometry",
+            f"{uncovered.sum()} of {len(scans)} scans ({100.0 * share:.1f} %) lie in gaps of the odometry or outside "
+            "of it: find out why it is missing there; until then the robot's motion is taken from its inertia and the "
+            "scans alone.",
+        )
+    ]
+
+
+def _covered(scans: Int64, odometry: Int64) -> Bool:
+    """Which scans (n,) lie between two odometry readings that are no gap apart."""
+    after = np.searchsorted(odometry, scans, side="left")
+    exact = odometry[np.minimum(after, len(odometry) - 1)] == scans
+    inside = (after > 0) & (after < len(odometry))
+    after = np.clip(after, 1, len(odometry) - 1)
+    between = (odometry[after] - odometry[after - 1]) * 1e-9
+    return exact | (inside & (between <= _gap_limit(seconds_between(odometry))))

@@ -1,0 +1,292 @@
+"""Local motion: obstacle avoidance with the dynamic window, along a short path around what a scan shows.
+
+What is out of the laser's field is taken to be free, but costs more. Each cell costs the more the nearer it is to a
+surface, so that a path keeps to the middle of a door. As in Brock and Khatib (1999), High-speed navigation using the
+global dynamic window approach, this is what keeps the dynamic window out of dead ends.
+
+Fox, Burgard and Thrun (1997), The dynamic window approach to collision avoidance. Of the velocities that can be reached
+until the next command, those are admissible from which the robot can stop before it touches anything; of these the one
+is taken that turns best towards the goal, is fast, and has far to go. The goal is what `local_path` finds.
+"""
+
+from __future__ import annotations
+
+import heapq
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from hmt_slam_ros.arrays import Float64, Int64
+from hmt_slam_ros.geometry.se2 import exp_shift
+from hmt_slam_ros.sensors import Scan
+
+_CELL = 0.1  # m
+_HALF = 40  # cells from the robot's to the grid's border
+_SIDE = 2 * _HALF + 1
+_SHY, _SHYNESS = 0.35, 4.0  # m beyond the radius, within which a cell costs up to so many times more
+_UNSEEN = 2.0  # what a cell costs more that is out of the laser's field
+_HUNGER = 2.0  # what a metre that is left to the goal counts, where the goal is not reached
+_CLEAR = 0.2  # m beyond the radius, what a straight line keeps away
+_AHEAD = 0.7  # m, along the path, at least
+
+
+def path_ahead(points: Float64, goal: Float64, radius: float, field: float = math.pi) -> Float64:
+    """Where to look on the shortest free path to a goal, or on that to the best place on the way there.
+
+    It is the farthest place on the path to which the straight line is well clear of surfaces, and at least 0.7 m along
+    the path.
+
+    :param points: shape (n, 2), where surfaces are seen, m, the robot's frame.
+    :param goal: shape (2,), m, the robot's frame; it may be beyond the grid, which reaches 4 m.
+    :param radius: that the middle of the robot has to keep off, m.
+    :param field: largest bearing at which surfaces are seen, rad.
+    :returns: shape (2,), m; the robot's own place where there is no better one.
+    """
+    return _path_ahead(np.ascontiguousarray(points), np.asarray(goal, dtype=np.float64), radius, field)
+
+
+@njit(cache=True)
+def _path_ahead(points: Float64, goal: Float64, radius: float, field: float) -> Float64:
+    away = _distances(points, radius + _SHY)
+    column, row = round(goal[0] / _CELL) + _HALF, round(goal[1] / _CELL) + _HALF
+    last = row * _SIDE + column if 0 <= column < _SIDE and 0 <= row < _SIDE else -1
+    before, reached = _search(away, goal, radius, field, last)
+    path = [reached]
+    while before[path[-1]] >= 0:
+        path.append(before[path[-1]])
+    path.reverse()
+    chosen, length = path[0], 0.0
+    for k in range(1, len(path)):
+        length += _length(path[k - 1], path[k])
+        if length <= _AHEAD or _on_line(away, path[k]) >= radius + _CLEAR:
+            chosen = path[k]
+    if chosen == last:
+        return goal.copy()
+    return np.array([_CELL * (chosen % _SIDE - _HALF), _CELL * (chosen // _SIDE - _HALF)])
+
+
+@njit(cache=True)
+def _on_line(away: Float64, cell: int) -> float:
+    """The smallest distance from surfaces on the straight line from the robot to a cell, m."""
+    columns, rows = cell % _SIDE - _HALF, cell // _SIDE - _HALF
+    steps, nearest = max(abs(columns), abs(rows)), math.inf
+    for k in range(steps + 1):
+        row, column = round(rows * k / steps) + _HALF, round(columns * k / steps) + _HALF
+        nearest = min(nearest, away[row * _SIDE + column])
+    return nearest
+
+
+@njit(cache=True)
+def _distances(points: Float64, farthest: float) -> Float64:
+    """Distance of the middle of every cell from the nearest point, m, ``farthest`` at most, shape (cells,)."""
+    away = np.full(_SIDE * _SIDE, farthest)
+    span = int(farthest / _CELL) + 1
+    for n in range(len(points)):
+        x, y = points[n, 0] / _CELL + _HALF, points[n, 1] / _CELL + _HALF
+        if not (-span <= x < _SIDE + span and -span <= y < _SIDE + span):
+            continue
+        for row in range(max(0, int(y) - span), min(_SIDE, int(y) + span + 2)):
+            for column in range(max(0, int(x) - span), min(_SIDE, int(x) + span + 2)):
+                distance = _CELL * math.hypot(column - x, row - y)
+                away[row * _SIDE + column] = min(away[row * _SIDE + column], distance)
+    return away
+
+
+@njit(cache=True)
+def _search(away: Float64, goal: Float64, radius: float, field: float, last: int) -> tuple[Int64, int]:
+    """The cell before each on the cheapest path from the robot, -1 for none, and the goal's or the best reached."""
+    start = _HALF * _SIDE + _HALF
+    costs = np.full(_SIDE * _SIDE, math.inf)
+    before = np.full(_SIDE * _SIDE, -1)
+    costs[start] = 0.0
+    best, least = start, math.inf
+    queue = [(0.0, start)]
+    while len(queue) > 0:
+        cost, cell = heapq.heappop(queue)
+        if cost > costs[cell]:
+            continue
+        if cell == last:
+            return before, cell
+        left = math.hypot(_CELL * (cell % _SIDE - _HALF) - goal[0], _CELL * (cell // _SIDE - _HALF) - goal[1])
+        if cost + _HUNGER * left < least:
+            best, least = cell, cost + _HUNGER * left
+        for row in range(max(0, cell // _SIDE - 1), min(_SIDE, cell // _SIDE + 2)):
+            for column in range(max(0, cell % _SIDE - 1), min(_SIDE, cell % _SIDE + 2)):
+                other = row * _SIDE + column
+                # Out of what is too near it may go away from the surfaces.
+                if away[other] < radius and (away[cell] >= radius or away[other] <= away[cell]):
+                    continue
+                price = 1.0 + _SHYNESS * min(1.0, (radius + _SHY - away[other]) / _SHY)
+                if abs(math.atan2(row - _HALF, column - _HALF)) > field:
+                    price += _UNSEEN
+                then = cost + _length(cell, other) * price
+                if then < costs[other]:
+                    costs[other], before[other] = then, cell
+                    heapq.heappush(queue, (then, other))
+    return before, best
+
+
+@njit(cache=True)
+def _length(cell: int, other: int) -> float:
+    """From one cell to another, m."""
+    return _CELL * math.hypot(cell % _SIDE - other % _SIDE, cell // _SIDE - other // _SIDE)
+
+
+_SPEEDS, _TURN_RATES = 9, 21  # velocities that are tried
+_HEADING, _CLEARANCE, _PROGRESS = 0.8, 0.1, 1.0  # alpha, beta and gamma of the objective; the last per m
+_LOOK = 0.6  # s, after which the heading and the progress of velocities are compared
+_FAR = 1.5  # m, beyond which nothing in the way counts
+_STRAIGHT = 1e-4  # rad/s
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What a robot can do, and how near it may come.
+
+    :ivar speed: at most, m/s.
+    :ivar turn_rate: at most, rad/s.
+    :ivar acceleration: m/s^2, to brake as well.
+    :ivar turn_acceleration: rad/s^2.
+    :ivar radius: of its body, m.
+    :ivar margin: that it keeps beyond that, m.
+    :ivar period: from one command to the next, s.
+    :ivar tolerance: distance from the goal at which it has arrived, m.
+    """
+
+    speed: float
+    turn_rate: float
+    acceleration: float
+    turn_acceleration: float
+    radius: float
+    margin: float = 0.05
+    period: float = 0.2
+    tolerance: float = 0.15
+
+
+class Command(NamedTuple):
+    """What to do until the next scan.
+
+    :ivar speed: m/s, never backwards.
+    :ivar turn_rate: rad/s.
+    :ivar arrived: whether the goal is reached, and the robot is to stand.
+    """
+
+    speed: float
+    turn_rate: float
+    arrived: bool
+
+
+def command_towards(scan: Scan, goal: NDArray[np.float64], velocity: tuple[float, float], limits: Limits) -> Command:
+    """The velocities with which to drive towards a goal around what the newest scan shows.
+
+    It does not see behind what hides the rest, and remembers nothing: goals are to be in sight, or nearly.
+
+    :param scan: of any field of view; where nothing is seen the way is taken to be free.
+    :param goal: shape (2,), m, the robot's frame.
+    :param velocity: of the robot now, m/s and rad/s.
+    """
+    if math.hypot(goal[0], goal[1]) <= limits.tolerance:
+        return Command(0.0, 0.0, arrived=True)
+    radius = limits.radius + limits.margin
+    ahead = path_ahead(scan.points, goal, radius, _field(scan))
+    near = scan.points[np.hypot(*scan.points.T) < _FAR + radius]
+    window = _window(velocity, math.hypot(goal[0], goal[1]) - 0.5 * limits.tolerance, limits)
+    speed, turn_rate = _best(near, ahead, window, radius, limits.period, limits.acceleration)
+    return Command(speed, turn_rate, arrived=False)
+
+
+def _field(scan: Scan) -> float:
+    """Largest bearing to both sides of the robot at which a laser sees, rad."""
+    first, last = scan.angle_min, scan.angle_min + scan.angle_increment * (scan.ranges.size - 1)
+    gap = abs(scan.angle_increment)
+    if abs(last - first) + 1.5 * gap >= 2.0 * math.pi:
+        return math.pi
+    turn = float(scan.laser_pose[2])
+    return max(0.0, min(max(first, last) + turn, -min(first, last) - turn)) + gap
+
+
+def _window(velocity: tuple[float, float], left: float, limits: Limits) -> NDArray[np.float64]:
+    """Smallest and largest speed and turn rate that can be reached, and from which it can stop at the goal, (2, 2).
+
+    :param left: to the goal, m.
+    """
+    change, turn = limits.acceleration * limits.period, limits.turn_acceleration * limits.period
+    fastest = min(limits.speed, math.sqrt(2.0 * limits.acceleration * left))
+    low = max(0.0, min(velocity[0], limits.speed) - change)
+    slow = max(-limits.turn_rate, min(velocity[1], limits.turn_rate) - turn)
+    quick = min(limits.turn_rate, max(velocity[1], -limits.turn_rate) + turn)
+    return np.array([[low, max(low, min(fastest, velocity[0] + change))], [slow, quick]])
+
+
+@njit(cache=True)
+def _best(
+    points: Float64, ahead: Float64, window: Float64, radius: float, period: float, brake: float
+) -> tuple[float, float]:
+    """The admissible velocity that is best; where there is none, braking, and turning towards the goal."""
+    best, speed, turn_rate = -math.inf, window[0, 0], 0.0
+    bearing = math.atan2(ahead[1], ahead[0])
+    turn_rate = min(max(bearing / period, window[1, 0]), window[1, 1])
+    for i in range(_SPEEDS):
+        v = window[0, 0] + (window[0, 1] - window[0, 0]) * i / (_SPEEDS - 1)
+        for k in range(_TURN_RATES):
+            omega = window[1, 0] + (window[1, 1] - window[1, 0]) * k / (_TURN_RATES - 1)
+            free = _free(points, v, omega, radius)
+            # Until the next command it goes on like this, and then it brakes.
+            if v * period + 0.5 * v * v / brake > free:
+                continue
+            facing, nearer = _gain(ahead, v, omega)
+            score = _HEADING * facing + _CLEARANCE * free / _FAR + _PROGRESS * nearer
+            if score > best:
+                best, speed, turn_rate = score, v, omega
+    return speed, turn_rate
+
+
+@njit(cache=True)
+def _gain(ahead: Float64, v: float, omega: float) -> tuple[float, float]:
+    """How well the robot looks towards a point in a while, from 0 to 1 for straight at it; how much nearer it is, m."""
+    heading = omega * _LOOK
+    shift_x, shift_y = exp_shift(v * _LOOK, 0.0, heading)
+    x, y = ahead[0] - shift_x, ahead[1] - shift_y
+    off = math.atan2(y, x) - heading
+    off = abs(math.atan2(math.sin(off), math.cos(off)))
+    return 1.0 - off / math.pi, math.hypot(ahead[0], ahead[1]) - math.hypot(x, y)
+
+
+@njit(cache=True)
+def _free(points: Float64, v: float, omega: float, radius: float) -> float:
+    """How far a disc goes on an arc before it touches any of the points, m, `_FAR` at most."""
+    free = _FAR
+    if v <= 0.0:
+        return free
+    side = 1.0 if omega >= 0.0 else -1.0
+    for n in range(len(points)):
+        # Mirrored, so that the arc bends to the left.
+        x, y = points[n, 0], side * points[n, 1]
+        if x * x + y * y <= radius * radius:
+            # Too near already: away from it, but no nearer.
+            free = 0.0 if x > 0.0 else free
+        elif abs(omega) < _STRAIGHT:
+            if x > 0.0 and abs(y) < radius:
+                free = min(free, x - math.sqrt(radius * radius - y * y))
+        else:
+            free = min(free, _along_arc(x, y, v / abs(omega), radius))
+    return free
+
+
+@njit(cache=True)
+def _along_arc(x: float, y: float, bend: float, radius: float) -> float:
+    """The way along an arc to the left of radius ``bend`` until a disc touches a point, m; inf where it never does."""
+    away = math.hypot(x, bend - y)
+    if abs(bend - away) >= radius or away == 0.0:
+        return math.inf
+    # The angle under which the middle of the arc sees the point, less that between contact and closest approach.
+    cosine = (bend * bend + away * away - radius * radius) / (2.0 * bend * away)
+    angle = math.atan2(x, bend - y) - math.acos(min(1.0, max(-1.0, cosine)))
+    return bend * (angle if angle >= 0.0 else angle + 2.0 * math.pi)
+
+
+__all__ = ["Command", "Limits", "command_towards"]

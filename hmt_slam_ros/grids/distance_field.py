@@ -1,0 +1,279 @@
+"""The distance field kept exact while cells become occupied and free again.
+
+A cell that becomes occupied lowers the field around it. Where one becomes free, the rows of a patch in which it was the
+nearest are measured anew from all occupied cells in reach, by the separable transform of squared distances: along the
+rows first, then across (Felzenszwalb and Huttenlocher 2012).
+
+What is called for every cell is inlined: a call with arrays counts references to them, which costs as much as the work.
+Squared distances are integers, as the minimum of floats in place is compiled to a store under a mask, which takes AMD's
+processors ten times as long as a whole one.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import njit, types
+from numba.core import cgutils
+from numba.extending import intrinsic
+
+from hmt_slam_ros.arrays import Int32, UInt8, UInt32
+from hmt_slam_ros.grids.patches import FAR, MASK, PATCH, SHIFT, Store, writable
+
+
+@intrinsic
+def lowest(_context: Any, word: Any) -> Any:  # noqa: ANN401  numba's own types
+    """The number of the lowest bit that is set; a word without any has no answer."""
+
+    def count_trailing_zeros(context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:  # noqa: ANN401
+        zeros = builder.cttz(arguments[0], cgutils.true_bit)
+        return builder.zext(zeros, context.get_value_type(types.int64))
+
+    return types.int64(word), count_trailing_zeros
+
+
+@njit(cache=True)
+def any_set(words: UInt32) -> bool:
+    """Whether a bit is set in any of the words (n,)."""
+    found = np.uint32(0)
+    for word in words:
+        found |= word
+    return found != 0
+
+
+class FieldWork(NamedTuple):
+    """Tables of distances, in cells around an occupied one, and room to work in; r is the field's radius in cells.
+
+    The tables have 31 columns of "far" on both sides, so that a row of a patch always takes 32 of theirs.
+
+    :ivar quanta: shape (r^2 + 2,), the field's value of a squared distance; the last is FAR.
+    :ivar stamp: shape (2r + 1, 2r + 63), the field's values around an occupied cell.
+    :ivar squares: shape (2r + 63,), squared distances along a row.
+    :ivar empty: shape (32, 32), the field of a patch never seen.
+    :ivar dirty: shape (T, T), a bit for each row of a patch that has to be measured anew; zeros between insertions.
+    :ivar across: shape (32,), squared distances to the occupied cells of one row.
+    :ivar nearest: shape (32, 32), squared distances to the nearest occupied cells.
+    """
+
+    quanta: UInt8
+    stamp: UInt8
+    squares: Int32
+    empty: UInt8
+    dirty: UInt32
+    across: Int32
+    nearest: Int32
+
+
+def field_work(table_size: int, cell: float, radius: float) -> FieldWork:
+    """The tables for cells of edge ``cell``, m, and a field that ends at ``radius``, m."""
+    reach = int(np.ceil(radius / cell))
+    far = reach * reach + 1
+    quanta = np.minimum(np.rint(np.sqrt(np.arange(far + 1)) * cell / radius * FAR), FAR).astype(np.uint8)
+    quanta[far] = FAR
+    square = np.arange(-reach, reach + 1) ** 2
+    stamp = quanta[np.minimum(square[:, None] + square, far)]
+    return FieldWork(
+        quanta,
+        np.pad(stamp, ((0, 0), (MASK, MASK)), constant_values=FAR),
+        np.pad(square, MASK, constant_values=far).astype(np.int32),
+        np.full((PATCH, PATCH), FAR, dtype=np.uint8),
+        np.zeros((table_size, table_size), dtype=np.uint32),
+        np.empty(PATCH, dtype=np.int32),
+        np.empty((PATCH, PATCH), dtype=np.int32),
+    )
+
+
+@njit(cache=True)
+def in_reach(work: FieldWork, table_size: int, patches: range) -> range:
+    """The rows of patches, or the columns of them, that the field around those in ``patches`` reaches."""
+    margin = (work.stamp.shape[0] // 2 + MASK) >> SHIFT
+    return range(max(0, patches.start - margin), min(table_size, patches.stop + margin))
+
+
+@njit(cache=True)
+def lower(table: Int32, store: Store, work: FieldWork, cells: UInt32, tr: int, tc: int) -> None:
+    """Enter the newly occupied cells of a patch, as bits of shape (32,)."""
+    for r in in_reach(work, table.shape[0], range(tr, tr + 1)):
+        for c in in_reach(work, table.shape[0], range(tc, tc + 1)):
+            row, column = (tr - r) << SHIFT, (tc - c) << SHIFT
+            patch = table[r, c]
+            if patch < 0 or store.references[patch] > 1:
+                field = work.empty if patch < 0 else store.field[patch]
+                if not _lowers(field, work.stamp, cells, row, column):
+                    continue
+                patch = writable(table, store, r, c)
+            _take_lower(store.field[patch], work.stamp, cells, row, column)
+
+
+@njit(cache=True)
+def mark_dirty(table: Int32, store: Store, work: FieldWork, cells: UInt32, tr: int, tc: int) -> None:
+    """Mark the rows in which cells of a patch that became free, as bits of shape (32,), were the nearest."""
+    for r in in_reach(work, table.shape[0], range(tr, tr + 1)):
+        for c in in_reach(work, table.shape[0], range(tc, tc + 1)):
+            patch = table[r, c]
+            if patch >= 0:
+                alike = _rows_alike(store.field[patch], work.stamp, cells, (tr - r) << SHIFT, (tc - c) << SHIFT)
+                work.dirty[r, c] |= alike
+
+
+@njit(cache=True)
+def _near(reach: int, at: int) -> tuple[int, int]:
+    """The rows or columns, from ... to, of a patch that begins ``at`` relative to another, which are in its reach."""
+    return max(0, -reach - at), max(0, min(PATCH, PATCH + reach - at))
+
+
+@njit(cache=True)
+def _between(begin: int, end: int) -> np.uint32:
+    """The bits of the columns from ... to."""
+    if begin >= end:
+        return np.uint32(0)
+    return (np.uint32(0xFFFFFFFF) >> np.uint32(PATCH - end + begin)) << np.uint32(begin)
+
+
+@njit(cache=True, inline="always")
+def _covered(stamp: UInt8, row: int, column: int) -> tuple[int, int, int, int]:
+    """What the stamp around a cell in reach covers of a patch: its rows, from ... to.
+
+    And where the stamp lies on it: the stamp's row on row 0, and its column on column 0.
+    """
+    reach = stamp.shape[0] // 2
+    return max(0, row - reach), min(PATCH, row + reach + 1), reach - row, MASK + reach - column
+
+
+@njit(cache=True)
+def _lowers(field: UInt8, stamp: UInt8, cells: UInt32, row: int, column: int) -> bool:
+    """Whether cells, in a patch that begins at (row, column) relative to the field's, lower the field."""
+    reach = stamp.shape[0] // 2
+    columns = _between(*_near(reach, column))
+    begin, end = _near(reach, row)
+    for r in range(begin, end):
+        bits = cells[r] & columns
+        while bits:
+            top, bottom, above, left = _covered(stamp, row + r, column + lowest(bits))
+            bits &= bits - np.uint32(1)
+            for k in range(top, bottom):
+                if _any_lower(field[k], stamp[above + k, left : left + PATCH]):
+                    return True
+    return False
+
+
+@njit(cache=True, inline="always")
+def _any_lower(field: UInt8, values: UInt8) -> bool:
+    found = False
+    for c in range(field.size):
+        found |= values[c] < field[c]
+    return found
+
+
+@njit(cache=True)
+def _take_lower(field: UInt8, stamp: UInt8, cells: UInt32, row: int, column: int) -> None:
+    """Lower a field by cells in a patch that begins at (row, column) relative to the field's."""
+    reach = stamp.shape[0] // 2
+    columns = _between(*_near(reach, column))
+    begin, end = _near(reach, row)
+    for r in range(begin, end):
+        bits = cells[r] & columns
+        while bits:
+            top, bottom, above, left = _covered(stamp, row + r, column + lowest(bits))
+            bits &= bits - np.uint32(1)
+            for k in range(top, bottom):
+                _take_minimum(field[k], stamp[above + k, left : left + PATCH])
+
+
+@njit(cache=True, inline="always")
+def _take_minimum(kept: UInt8 | Int32, values: UInt8 | Int32) -> None:
+    for c in range(kept.size):
+        kept[c] = min(kept[c], values[c])
+
+
+@njit(cache=True)
+def _rows_alike(field: UInt8, stamp: UInt8, cells: UInt32, row: int, column: int) -> np.uint32:
+    """The rows, as bits, of a field that may come from cells in a patch that begins at (row, column) relative to it."""
+    reach = stamp.shape[0] // 2
+    columns = _between(*_near(reach, column))
+    begin, end = _near(reach, row)
+    alike = np.uint32(0)
+    for r in range(begin, end):
+        bits = cells[r] & columns
+        while bits:
+            top, bottom, above, left = _covered(stamp, row + r, column + lowest(bits))
+            bits &= bits - np.uint32(1)
+            for k in range(top, bottom):
+                alike |= np.uint32(_alike(field[k], stamp[above + k, left : left + PATCH])) << np.uint32(k)
+    return alike
+
+
+@njit(cache=True, inline="always")
+def _alike(field: UInt8, values: UInt8) -> bool:
+    """Whether both have a value below FAR in common."""
+    found = False
+    for c in range(field.size):
+        found |= (values[c] == field[c]) & (values[c] < FAR)
+    return found
+
+
+@njit(cache=True)
+def measure_dirty(table: Int32, store: Store, work: FieldWork, rows: range, columns: range) -> None:
+    """Measure the dirty rows anew, in a part of the table and around it."""
+    for tr in in_reach(work, table.shape[0], rows):
+        for tc in in_reach(work, table.shape[0], columns):
+            dirty = work.dirty[tr, tc]
+            if dirty:
+                work.dirty[tr, tc] = 0
+                _find_nearest(table, store, work, dirty, tr, tc)
+                _write(store.field[writable(table, store, tr, tc)], dirty, work.nearest, work.quanta)
+
+
+@njit(cache=True)
+def _write(field: UInt8, rows: np.uint32, nearest: Int32, quanta: UInt8) -> None:
+    """Enter squared distances into rows, given as bits, of a field."""
+    while rows:
+        r = lowest(rows)
+        rows &= rows - np.uint32(1)
+        for c in range(PATCH):
+            field[r, c] = quanta[nearest[r, c]]
+
+
+@njit(cache=True)
+def _find_nearest(table: Int32, store: Store, work: FieldWork, rows: np.uint32, tr: int, tc: int) -> None:
+    """Squared distances from the cells in rows, given as bits, of a patch to their nearest occupied ones."""
+    reach = work.stamp.shape[0] // 2
+    top, bottom = lowest(rows), PATCH
+    while not rows >> np.uint32(bottom - 1):
+        bottom -= 1
+    work.nearest[top:bottom] = work.quanta.size - 1
+    patches = in_reach(work, table.shape[0], range(tc, tc + 1))
+    first = tr << SHIFT
+    for row in range(max(0, first + top - reach), min(table.shape[0] * PATCH, first + bottom + reach)):
+        found = False
+        for t in patches:
+            patch = table[row >> SHIFT, t]
+            if patch >= 0 and store.occupied[patch, row & MASK]:
+                if not found:
+                    work.across[:] = work.quanta.size - 1
+                found = True
+                _measure_across(store.occupied[patch, row & MASK], (t - tc) << SHIFT, work.squares, work.across)
+        if found:
+            begin, end = max(top, row - first - reach), min(bottom, row - first + reach + 1)
+            _take_nearer(work.nearest[begin:end], work.across, begin - row + first)
+
+
+@njit(cache=True, inline="always")
+def _measure_across(occupied: np.uint32, column: int, squares: Int32, across: Int32) -> None:
+    """Squared distances from the columns of a patch to occupied ones of a patch that begins at ``column``."""
+    reach = squares.size // 2 - MASK
+    occupied &= _between(*_near(reach, column))
+    while occupied:
+        left = reach + MASK - column - lowest(occupied)
+        occupied &= occupied - np.uint32(1)
+        _take_minimum(across, squares[left : left + PATCH])
+
+
+@njit(cache=True, inline="always")
+def _take_nearer(nearest: Int32, across: Int32, offset: int) -> None:
+    """Take what is nearer by way of the row ``offset`` rows before the first."""
+    for r in range(nearest.shape[0]):
+        square = (r + offset) * (r + offset)
+        for c in range(nearest.shape[1]):
+            nearest[r, c] = min(nearest[r, c], np.int32(across[c] + square))

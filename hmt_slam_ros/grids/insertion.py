@@ -1,0 +1,225 @@
+"""How a scan enters a map: what its beams passed and where they ended, counted once for each cell."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from hmt_slam_ros.arrays import Float64, Int8, Int32, UInt32
+from hmt_slam_ros.grids.distance_field import FieldWork, any_set, in_reach, lower, lowest, mark_dirty, measure_dirty
+from hmt_slam_ros.grids.patches import MASK, PATCH, SHIFT, Store, writable
+
+
+class InverseModel(NamedTuple):
+    """The inverse sensor model, in quanta of the odds.
+
+    :ivar hit: added to a cell with an end point.
+    :ivar miss: added to a cell that a beam passes, negative.
+    :ivar limit: bound of the odds' magnitude.
+    """
+
+    hit: int
+    miss: int
+    limit: int
+
+
+class Marks(NamedTuple):
+    """A bit for every cell of a map, by patch and row: shape (T, T, 32), uint32; zeros between insertions.
+
+    :ivar hit: first the cells in which a beam ends, then those of them that became occupied.
+    :ivar passed: first the cells that a beam passes, then those of them that became free.
+    """
+
+    hit: UInt32
+    passed: UInt32
+
+
+def marks(table_size: int) -> Marks:
+    """Nothing marked."""
+    shape = (table_size, table_size, PATCH)
+    return Marks(np.zeros(shape, dtype=np.uint32), np.zeros(shape, dtype=np.uint32))
+
+
+@njit(cache=True)
+def in_cells(points: Float64, poses: Float64, cell: float, table_size: int) -> Float64:
+    """Points (n, 2) of the base, m, in cells of a map, for each of several ``map_T_base`` (m, 3); shape (m, n, 2)."""
+    placed = np.empty((poses.shape[0], points.shape[0], 2))
+    half = 0.5 * table_size * PATCH
+    for i in range(poses.shape[0]):
+        cos, sin = np.cos(poses[i, 2]), np.sin(poses[i, 2])
+        for n in range(points.shape[0]):
+            placed[i, n, 0] = (poses[i, 0] + cos * points[n, 0] - sin * points[n, 1]) / cell + half
+            placed[i, n, 1] = (poses[i, 1] + sin * points[n, 0] + cos * points[n, 1]) / cell + half
+    return placed
+
+
+@njit(cache=True)
+def patches_needed(tables: Int32, store: Store, work: FieldWork, origins: Float64, ends: Float64) -> int:
+    """How many new patches :func:`insert` may take at most, with the same arguments."""
+    count = 0
+    for i in range(tables.shape[0]):
+        rows, columns = _patches_around(origins[i], ends[i], tables.shape[1])
+        for tr in in_reach(work, tables.shape[1], rows):
+            for tc in in_reach(work, tables.shape[1], columns):
+                patch = tables[i, tr, tc]
+                count += patch < 0 or store.references[patch] > 1
+    return count
+
+
+@njit(cache=True)
+def insert(
+    tables: Int32,
+    store: Store,
+    marks: Marks,
+    work: FieldWork,
+    origins: Float64,
+    ends: Float64,
+    hits: int,
+    model: InverseModel,
+) -> None:
+    """Enter beams into several maps.
+
+    :param tables: the maps, shape (m, T, T).
+    :param origins: where the beams begin in each, shape (m, n, 2), cells.
+    :param ends: likewise where they end; the first ``hits`` end on a surface.
+    """
+    for i in range(tables.shape[0]):
+        _insert(tables[i], store, marks, work, origins[i], ends[i], hits, model)
+
+
+@njit(cache=True)
+def _insert(
+    table: Int32,
+    store: Store,
+    marks: Marks,
+    work: FieldWork,
+    origins: Float64,
+    ends: Float64,
+    hits: int,
+    model: InverseModel,
+) -> None:
+    _mark(marks, origins, ends, hits)
+    rows, columns = _patches_around(origins, ends, table.shape[0])
+    for tr in rows:
+        for tc in columns:
+            hit, passed = marks.hit[tr, tc], marks.passed[tr, tc]
+            if any_set(hit) or any_set(passed):
+                patch = writable(table, store, tr, tc)
+                _count(store.odds[patch], store.occupied[patch], hit, passed, model)
+    _renew_field(table, store, marks, work, rows, columns)
+
+
+@njit(cache=True)
+def _renew_field(table: Int32, store: Store, marks: Marks, work: FieldWork, rows: range, columns: range) -> None:
+    """Bring the field up to date with the cells that became free or occupied, and empty the marks."""
+    for tr in rows:
+        for tc in columns:
+            if any_set(marks.passed[tr, tc]):
+                mark_dirty(table, store, work, marks.passed[tr, tc], tr, tc)
+                marks.passed[tr, tc] = 0
+    measure_dirty(table, store, work, rows, columns)
+    for tr in rows:
+        for tc in columns:
+            if any_set(marks.hit[tr, tc]):
+                lower(table, store, work, marks.hit[tr, tc], tr, tc)
+                marks.hit[tr, tc] = 0
+
+
+@njit(cache=True)
+def _patches_around(origins: Float64, ends: Float64, table_size: int) -> tuple[range, range]:
+    """The rows and the columns of a table that beams (n, 2), in cells, can touch."""
+    return _span(origins[:, 1], ends[:, 1], table_size), _span(origins[:, 0], ends[:, 0], table_size)
+
+
+@njit(cache=True)
+def _span(starts: Float64, ends: Float64, table_size: int) -> range:
+    if ends.size == 0:
+        return range(0, 0)
+    low, high = min(starts.min(), ends.min()), max(starts.max(), ends.max())
+    # Rounding may lead the traversal of a beam one cell astray.
+    first, last = (int(np.floor(low)) - 1) >> SHIFT, (int(np.floor(high)) + 1) >> SHIFT
+    return range(max(0, first), min(table_size, last + 1))
+
+
+@njit(cache=True)
+def _mark(marks: Marks, origins: Float64, ends: Float64, hits: int) -> None:
+    """Mark the cells in which beams end and which they pass."""
+    edge = marks.hit.shape[0] * PATCH
+    for i in range(hits):
+        column, row = int(np.floor(ends[i, 0])), int(np.floor(ends[i, 1]))
+        if 0 <= column < edge and 0 <= row < edge:
+            marks.hit[row >> SHIFT, column >> SHIFT, row & MASK] |= np.uint32(1) << np.uint32(column & MASK)
+    for i in range(ends.shape[0]):
+        _mark_beam(marks.passed, origins[i, 0], origins[i, 1], ends[i, 0], ends[i, 1])
+
+
+@njit(cache=True)
+def _mark_beam(passed: UInt32, from_x: float, from_y: float, to_x: float, to_y: float) -> None:
+    """Mark the cells from the laser to before the end point, by grid traversal (Amanatides and Woo 1987)."""
+    edge = passed.shape[0] * PATCH
+    column, row = int(np.floor(from_x)), int(np.floor(from_y))
+    steps = abs(int(np.floor(to_x)) - column) + abs(int(np.floor(to_y)) - row)
+    step_x, delta_x, next_x = _axis_steps(from_x, to_x)
+    step_y, delta_y, next_y = _axis_steps(from_y, to_y)
+    for _ in range(steps):
+        if 0 <= column < edge and 0 <= row < edge:
+            passed[row >> SHIFT, column >> SHIFT, row & MASK] |= np.uint32(1) << np.uint32(column & MASK)
+        if next_x < next_y:
+            next_x += delta_x
+            column += step_x
+        else:
+            next_y += delta_y
+            row += step_y
+
+
+@njit(cache=True)
+def _axis_steps(start: float, end: float) -> tuple[int, float, float]:
+    """Along one axis: the cell step, the beam's length per cell, and its length up to the first boundary."""
+    if end == start:
+        return 0, np.inf, np.inf
+    delta = 1.0 / abs(end - start)
+    if end > start:
+        return 1, delta, (np.floor(start) + 1.0 - start) * delta
+    return -1, delta, (start - np.floor(start)) * delta
+
+
+@njit(cache=True)
+def _count(odds: Int8, occupied: UInt32, hit: UInt32, passed: UInt32, model: InverseModel) -> None:
+    """Change the odds of a patch's marked cells; a cell in which a beam ends does not count as passed.
+
+    :param odds: shape (32, 32); ``occupied``: shape (32,).
+    :param hit: shape (32,), in: where beams end; out: the cells that became occupied.
+    :param passed: shape (32,), in: where beams pass; out: the cells that became free.
+    """
+    for r in range(PATCH):
+        if hit[r] | passed[r]:
+            passed[r] &= ~hit[r]
+            _add(odds, r, hit[r], model.hit, model.limit)
+            _add(odds, r, passed[r], model.miss, model.limit)
+            before = occupied[r]
+            kept = before & ~(hit[r] | passed[r])
+            occupied[r] = kept | _positive(odds, r, hit[r] | (passed[r] & before))
+            hit[r] = occupied[r] & ~before
+            passed[r] = before & ~occupied[r]
+
+
+@njit(cache=True, inline="always")
+def _add(odds: Int8, row: int, columns: np.uint32, change: int, limit: int) -> None:
+    while columns:
+        c = lowest(columns)
+        columns &= columns - np.uint32(1)
+        odds[row, c] = min(limit, max(-limit, odds[row, c] + change))
+
+
+@njit(cache=True)
+def _positive(odds: Int8, row: int, columns: np.uint32) -> np.uint32:
+    """Those of a row's columns, as bits, whose odds are positive."""
+    positive = np.uint32(0)
+    while columns:
+        c = lowest(columns)
+        if odds[row, c] > 0:
+            positive |= np.uint32(1) << np.uint32(c)
+        columns &= columns - np.uint32(1)
+    return positive

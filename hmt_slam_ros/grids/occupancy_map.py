@@ -1,0 +1,160 @@
+"""The occupancy grid of the whole map from the keyframes' scans, in the form that nav2's map_server reads."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import yaml
+from numba import njit
+from numpy.typing import NDArray
+
+from hmt_slam_ros.errors import HmtSlamError
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.sensors import Scan
+
+OCCUPIED, FREE, UNKNOWN = np.uint8(0), np.uint8(254), np.uint8(205)
+
+# A wall that the laser grazes is passed by beams as well as hit, so it keeps its colour down to this share of hits.
+_OCCUPIED_SHARE = 0.4
+_MARGIN = 0.5  # m of unknown space around everything that was seen
+_MAX_CELLS = 1 << 26
+_HITS, _MISSES, _LAST_SCAN = 0, 1, 2
+
+
+class OccupancyImage(NamedTuple):
+    """A trinary occupancy image.
+
+    :ivar pixels: shape (height, width), uint8, ``OCCUPIED``, ``FREE`` or ``UNKNOWN``; row 0 is the top, largest y.
+    :ivar resolution: side of a pixel, m.
+    :ivar origin: shape (2,), lower left corner of the image in the map frame, m.
+    """
+
+    pixels: NDArray[np.uint8]
+    resolution: float
+    origin: NDArray[np.float64]
+
+
+def occupancy_image(
+    scans: Sequence[Scan], poses: NDArray[np.float64], resolution: float, max_range: float
+) -> OccupancyImage:
+    """Count for every cell the scans that hit it and those that saw through it.
+
+    A beam without a return says nothing. One longer than ``max_range`` clears the way up to there.
+
+    :param scans: n scans.
+    :param poses: shape (n, 3), ``map_T_base``, m and rad.
+    :param resolution: side of a cell, m; doubled until the image is of a size that a computer can hold.
+    :param max_range: m.
+    """
+    beams = [_beams(scan, pose, max_range) for scan, pose in zip(scans, poses, strict=True)]
+    lasers = [se2.transform(pose, scan.laser_pose[:2])[None] for scan, pose in zip(scans, poses, strict=True)]
+    corners = np.concatenate([points for starts, ends, _ in beams for points in (starts, ends)] + lasers)
+    low, high = corners.min(axis=0) - _MARGIN, corners.max(axis=0) + _MARGIN
+    while np.prod((high - low) / resolution) > _MAX_CELLS:
+        resolution *= 2.0
+    origin = np.floor(low / resolution) * resolution
+    width, height = (np.ceil((high - origin) / resolution).astype(int) + 1).tolist()
+    votes = np.zeros((3, height, width), dtype=np.int32)
+    votes[_LAST_SCAN] = -1
+    for k, (starts, ends, returned) in enumerate(beams):
+        _vote((starts - origin) / resolution, (ends - origin) / resolution, returned, k, votes)
+    return OccupancyImage(_classified(votes[_HITS], votes[_MISSES])[::-1], resolution, origin)
+
+
+def _classified(hits: NDArray[np.int32], misses: NDArray[np.int32]) -> NDArray[np.uint8]:
+    seen = hits + misses
+    pixels = np.full(hits.shape, UNKNOWN)
+    pixels[seen > 0] = FREE
+    pixels[(seen > 0) & (hits >= _OCCUPIED_SHARE * seen)] = OCCUPIED
+    return pixels
+
+
+def _beams(
+    scan: Scan, pose: NDArray[np.float64], max_range: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
+    """Starts and ends (k, 2) of the valid beams cut off at ``max_range``, and whether each end is a return."""
+    ranges = np.hypot(*scan.beams.T)
+    cut = scan.beams * (np.minimum(ranges, max_range) / np.maximum(ranges, 1e-9))[:, None] + scan.origins
+    return se2.transform(pose, scan.origins), se2.transform(pose, cut), ranges <= max_range
+
+
+@njit(cache=True)
+def _vote(
+    starts: NDArray[np.float64],
+    ends: NDArray[np.float64],
+    returned: NDArray[np.bool_],
+    scan: int,
+    votes: NDArray[np.int32],
+) -> None:
+    """One scan's votes: at most one per cell, and a hit goes before a miss. Coordinates in cells."""
+    for k in range(ends.shape[0]):
+        i, j = math.floor(ends[k, 1]), math.floor(ends[k, 0])
+        if returned[k] and votes[_LAST_SCAN, i, j] != scan:
+            votes[_LAST_SCAN, i, j] = scan
+            votes[_HITS, i, j] += 1
+    for k in range(ends.shape[0]):
+        _clear(starts[k], ends[k], scan, votes)
+
+
+@njit(cache=True)
+def _clear(start: NDArray[np.float64], end: NDArray[np.float64], scan: int, votes: NDArray[np.int32]) -> None:
+    """Walk all cells that the beam crosses, without its last one (Amanatides and Woo 1987)."""
+    x, y = start
+    j, i = math.floor(x), math.floor(y)
+    dx, dy = end[0] - x, end[1] - y
+    step_j, step_i = (1 if dx > 0 else -1), (1 if dy > 0 else -1)
+    # Share of the beam from one vertical, horizontal grid line to the next, and to the first of them.
+    period_x = 1.0 / abs(dx) if dx != 0.0 else np.inf
+    period_y = 1.0 / abs(dy) if dy != 0.0 else np.inf
+    next_x = (j + 1 - x if dx > 0 else x - j) * period_x if dx != 0.0 else np.inf
+    next_y = (i + 1 - y if dy > 0 else y - i) * period_y if dy != 0.0 else np.inf
+    for _ in range(abs(math.floor(end[0]) - j) + abs(math.floor(end[1]) - i)):
+        if votes[_LAST_SCAN, i, j] != scan:
+            votes[_LAST_SCAN, i, j] = scan
+            votes[_MISSES, i, j] += 1
+        if next_x < next_y:
+            next_x += period_x
+            j += step_j
+        else:
+            next_y += period_y
+            i += step_i
+
+
+def write_map(directory: Path, image: OccupancyImage) -> None:
+    """Write map.pgm and map.yaml."""
+    height, width = image.pixels.shape
+    header = f"P5\n{width} {height}\n255\n".encode()
+    (directory / "map.pgm").write_bytes(header + np.ascontiguousarray(image.pixels).tobytes())
+    # 205 reads as (255 - 205) / 255 = 0.1961 occupied: unknown only if free_thresh is not above that.
+    description = {
+        "image": "map.pgm",
+        "mode": "trinary",
+        "resolution": image.resolution,
+        "origin": [*image.origin.tolist(), 0.0],
+        "negate": 0,
+        "occupied_thresh": 0.65,
+        "free_thresh": 0.196,
+    }
+    (directory / "map.yaml").write_text(yaml.safe_dump(description, sort_keys=False), encoding="utf-8")
+
+
+def read_map(directory: Path) -> OccupancyImage:
+    """Read map.pgm and map.yaml as :func:`write_map` wrote them.
+
+    :raises HmtSlamError: where they are missing or something else.
+    """
+    try:
+        description = yaml.safe_load((directory / "map.yaml").read_text(encoding="utf-8"))
+        content = (directory / "map.pgm").read_bytes()
+        magic, size, depth, pixels = content.split(b"\n", 3)
+        width, height = (int(number) for number in size.split())
+        if (magic, depth) != (b"P5", b"255"):
+            raise ValueError(magic)
+        image = np.frombuffer(pixels, dtype=np.uint8).reshape(height, width)
+        return OccupancyImage(image, float(description["resolution"]), np.array(description["origin"][:2], dtype=float))
+    except (OSError, ValueError, KeyError, TypeError) as fault:
+        raise HmtSlamError(f"{directory} holds no complete map.pgm and map.yaml: map the log again") from fault

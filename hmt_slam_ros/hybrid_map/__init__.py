@@ -1,0 +1,1 @@
+"""The HMT map: areas with keyframes, arcs between them, and where they lie in one frame."""

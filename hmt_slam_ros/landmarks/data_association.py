@@ -1,0 +1,118 @@
+"""Which observed lines are which lines of a map: the most pairings that are possible together.
+
+Joint compatibility branch and bound (Neira and Tardos 2001). Every pairing for itself may be within its gate and yet
+not all of them at once, since what is uncertain of the robot moves all lines alike.
+
+A wrong pairing is never undone: pose and map stay wrong by the distance of the two lines. So a line that might as well
+be another one of the map, with as many pairings in all and hardly a worse fit, is paired with none.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from hmt_slam_ros.arrays import Float64
+from hmt_slam_ros.geometry.gaussian import gate
+
+# Difference of the squared distances of two sets of pairings of which one is a hundred times as likely as the other.
+_DECIDED = 2.0 * math.log(100.0)
+
+
+class Pairing(NamedTuple):
+    """An observed line as a re-observation of a line of the map.
+
+    :ivar observed: number of the line in its scan.
+    :ivar line: number of the line in the map.
+    :ivar difference: (2,), alpha and r as observed minus as expected, rad and m.
+    :ivar jacobian: of what is expected by the state, (2, n).
+    :ivar noise: covariance of what is observed, (2, 2).
+    """
+
+    observed: int
+    line: int
+    difference: Float64
+    jacobian: Float64
+    noise: Float64
+
+    def distance2(self, covariance: Float64) -> float:
+        """Squared Mahalanobis distance, Eq. (13) of Tomatis et al.; chi-square with 2 degrees of freedom."""
+        spread = self.jacobian @ covariance @ self.jacobian.T + self.noise
+        return float(self.difference @ np.linalg.solve(spread, self.difference))
+
+
+def compatible(covariance: Float64, pairings: Sequence[Pairing], probability: float) -> list[Pairing]:
+    """The largest set of pairings, of those the one that fits best, that chi-square admits together.
+
+    :param covariance: of the state, (n, n).
+    :param pairings: those that are possible each for itself; an observed line is in one of the set at most.
+    :param probability: that chi-square admits a true set.
+    :returns: of the set, what no other one of as many, with another line in its place, puts in doubt.
+    """
+    if not pairings:
+        return []
+    search = _Search(covariance, pairings, probability)
+    best = search.largest()
+    return [pairings[k] for k in best.chosen if search.decided(k, best)]
+
+
+class _Set(NamedTuple):
+    """Pairings, by number, and their joint squared Mahalanobis distance."""
+
+    chosen: tuple[int, ...] = ()
+    distance2: float = 0.0
+
+    def before(self, other: _Set) -> bool:
+        """Whether it is the larger one or, where they are equally large, fits better."""
+        count = len(self.chosen) - len(other.chosen)
+        return count > 0 or (count == 0 and self.distance2 < other.distance2)
+
+
+class _Search:
+    """A search through the choices for one observed line after the other."""
+
+    def __init__(self, covariance: Float64, pairings: Sequence[Pairing], probability: float) -> None:
+        jacobian = np.concatenate([pairing.jacobian for pairing in pairings])
+        self._spread = jacobian @ covariance @ jacobian.T
+        for k, pairing in enumerate(pairings):
+            self._spread[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] += pairing.noise
+        self._difference = np.concatenate([pairing.difference for pairing in pairings])
+        observed = dict.fromkeys(pairing.observed for pairing in pairings)
+        self._choices = [[k for k, pairing in enumerate(pairings) if pairing.observed == each] for each in observed]
+        self._gates = [gate(probability, 2 * count) for count in range(1, len(observed) + 1)]
+
+    def largest(self, without: int | None = None) -> _Set:
+        """The largest set, of those the one that fits best.
+
+        :param without: the number of a pairing that is not to be in it.
+        """
+        return self._go_on(0, _Set(), _Set(), without)
+
+    def decided(self, k: int, best: _Set) -> bool:
+        """Whether a pairing of the best set has no alternative."""
+        if any(own == [k] for own in self._choices):
+            return True
+        other = self.largest(without=k)
+        return len(other.chosen) < len(best.chosen) or other.distance2 - best.distance2 > _DECIDED
+
+    def _go_on(self, level: int, chosen: _Set, best: _Set, without: int | None) -> _Set:
+        """The better of a set and the best one that ``chosen`` leads to by the observed lines from ``level`` on."""
+        left = len(self._choices) - level
+        if not left:
+            return chosen if chosen.before(best) else best
+        for k in self._choices[level]:
+            longer = self._with(chosen, k)
+            if k != without and longer.distance2 <= self._gates[len(chosen.chosen)]:
+                best = self._go_on(level + 1, longer, best, without)
+        if len(chosen.chosen) + left > len(best.chosen):
+            best = self._go_on(level + 1, chosen, best, without)
+        return best
+
+    def _with(self, chosen: _Set, k: int) -> _Set:
+        numbers = (*chosen.chosen, k)
+        rows = np.array([row for number in numbers for row in (2 * number, 2 * number + 1)])
+        difference = self._difference[rows]
+        return _Set(numbers, float(difference @ np.linalg.solve(self._spread[np.ix_(rows, rows)], difference)))

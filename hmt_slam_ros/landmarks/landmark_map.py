@@ -1,0 +1,249 @@
+"""The landmarks of one area in its frame, gathered over many scans, and whether each is still there.
+
+Tomatis, Nourbakhsh and Siegwart (2003), section 3.3: where a landmark is seen again, what the map believes of it is
+averaged with the extraction confidence p_l, Eq. (4); where it should be seen and is not, 1 - p_lmap takes the place of
+p_l, Eq. (5); below a minimum it is deleted. Taken literally that never falls below 1/2, however often a landmark is
+missed, and what was seen often has to be missed about as often before anything shows.
+
+Two things are in doubt. Whether what was extracted is a landmark at all: scans that show it again say the same again,
+and what is none is seen again as surely (94 % of the time where 98 % of the true ones are, on training seeds). So that
+stays the mean of p_l over the scans that showed it, Eq. (4). And whether it is still there, r, in a world that changes:
+it was still there after one more visit with probability p_S, is seen with p_D if it is, and with p_F if it is not,
+
+    r- = p_S r
+    r  = p_D r- / (p_D r- + p_F (1 - r-))                          where it is seen,
+    r  = (1 - p_D) r- / ((1 - p_D) r- + (1 - p_F) (1 - r-))        where it is missed, instead of Eq. (5).
+
+As r- is p_S at most, a few misses suffice for what was seen a hundred times. Doors are closed and furniture is moved
+while nobody looks rather than between two scans: at the first look after an absence r- is p_A p_S r, so that one look
+may suffice. p_lmap is the product of the two.
+
+Tomatis, Nourbakhsh and Siegwart (2003), section 3.3: a landmark that a scan shows is one of the map where the distance
+of the two is within chi-square's gate and they are of one kind, else it is new. Poses that a scan's landmarks have in
+common, as its own error, and the errors of the map that virtual scans are cast in make observations of one landmark
+depend on each other, in a way that nobody knows. So they are fused by covariance intersection (Julier and Uhlmann,
+1997), with a weight of 1/n for the n-th: what is known of a landmark is what its observations say on average.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from hmt_slam_ros.arrays import Bool, Float64
+from hmt_slam_ros.configuration.landmarks import Features
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.geometry.gaussian import PoseGaussian, fuse, gate
+from hmt_slam_ros.landmarks.beam_labels import Rays
+from hmt_slam_ros.landmarks.landmarks import OPENING, Landmarks, due
+
+
+@dataclass(frozen=True)
+class Existence:
+    """What is known of whether something is there.
+
+    :ivar confidence: mean of the extraction confidences, in [0, 1].
+    :ivar presence: r, the probability that it is still there, in [0, 1].
+    :ivar seen: at how many visits it was seen, 1 or more.
+    :ivar missed: at how many it should have been and was not.
+    :ivar away: whether the robot was away since.
+    """
+
+    confidence: float
+    presence: float = 1.0
+    seen: int = 1
+    missed: int = 0
+    away: bool = False
+
+    @property
+    def probability(self) -> float:
+        """p_lmap, in [0, 1]."""
+        return self.confidence * self.presence
+
+    def after_sight(self, confidence: float, features: Features) -> Existence:
+        """It was seen, with an extraction confidence p_l."""
+        seen = self.seen + 1
+        mean = self.confidence + (confidence - self.confidence) / seen  # Eq. (4)
+        presence = self._present(features.landmark_detected, features.landmark_by_chance, features)
+        return replace(self, confidence=mean, presence=presence, seen=seen, away=False)
+
+    def after_miss(self, features: Features) -> Existence:
+        """It should have been seen and was not."""
+        presence = self._present(1.0 - features.landmark_detected, 1.0 - features.landmark_by_chance, features)
+        return replace(self, presence=presence, missed=self.missed + 1, away=False)
+
+    def after_absence(self) -> Existence:
+        """Nobody looked for a while."""
+        return replace(self, away=True)
+
+    def _present(self, likelihood: float, otherwise: float, features: Features) -> float:
+        """Bayes' rule, for something that is there or not."""
+        lasting = features.landmark_lasting * (features.landmark_lasting_away if self.away else 1.0)
+        prior = lasting * self.presence
+        return likelihood * prior / (likelihood * prior + otherwise * (1.0 - prior))
+
+
+# Beyond this distance, m, nothing is compared.
+_FAR = 2.0
+
+
+@dataclass(frozen=True, eq=False)
+class Landmark:
+    """A landmark of an area.
+
+    :ivar kind: ``INNER``, ``OUTER`` or ``OPENING`` of `landmarks.landmarks`.
+    :ivar pose: the belief over its pose in the area's frame; that of an opening is the middle between its jambs, with
+        the heading through it, away from where it was seen from.
+    :ivar width: of an opening, m; 0 of a corner.
+    :ivar width_deviation: of this, m.
+    :ivar existence: whether it is there.
+    :ivar scatter: shape (3, 3), sum of the squares of its sightings about their mean, each in deviations.
+    :ivar by_scans: shape (3, 3), what part of their covariances is the scans' own, in deviations, on average.
+    """
+
+    kind: int
+    pose: PoseGaussian
+    width: float
+    width_deviation: float
+    existence: Existence
+    scatter: Float64 = field(default_factory=lambda: np.zeros((3, 3)))
+    by_scans: Float64 = field(default_factory=lambda: np.zeros((3, 3)))
+
+    def located(self, ratio: Float64) -> PoseGaussian:
+        """The belief over its pose by how far its sightings are apart.
+
+        What is stated of a sighting is scaled by the scatter of all n, one more being as those of its area. Errors of
+        n scans average out; those of the places that they were taken from may be one and the same, and do not.
+
+        :param ratio: of its area, see `scatter_ratio`.
+        """
+        n = self.existence.seen
+        own = np.linalg.cholesky(self.pose.covariance) @ np.linalg.cholesky((ratio + self.scatter) / n)
+        return PoseGaussian(self.pose.mean, own @ (np.eye(3) - (1.0 - 1.0 / n) * self.by_scans) @ own.T)
+
+
+def scatter_ratio(landmarks: Iterable[Landmark]) -> Float64:
+    """Birge's ratio of an area's openings, for all axes together: by how much what is stated of a sighting is too large
+    or too small, as sightings of one opening are apart. Shape (3, 3), in deviations; one more sighting is as stated.
+    """
+    openings = [one for one in landmarks if one.kind == OPENING]
+    again = sum(one.existence.seen - 1 for one in openings)
+    return np.asarray((np.eye(3) + sum(one.scatter for one in openings)) / (1 + again))
+
+
+class LandmarkMap:
+    """The landmarks of an area.
+
+    :ivar landmarks: all, in the order in which they were found.
+    """
+
+    def __init__(self, features: Features, begin: Callable[[float], Existence] = Existence) -> None:
+        """:param begin: what is known of a landmark's existence at first, by its extraction confidence."""
+        self._features, self._begin = features, begin
+        self._gate = gate(features.pair_probability)
+        self.landmarks: list[Landmark] = []
+
+    def observe(self, pose: PoseGaussian, seen: Landmarks, rays: Rays, *, in_map: bool = False) -> None:
+        """Learn what a scan shows, and what it does not show though it should.
+
+        :param pose: the belief over ``area_T_base``.
+        :param seen: the landmarks of the scan, in the frame of the base.
+        :param rays: its beams, likewise.
+        :param in_map: whether the scan is a virtual one.
+        """
+        features = self._features
+        if in_map:
+            features = replace(features, landmark_detected=features.landmark_detected_in_map)
+        expected = self._due(pose.mean, rays)
+        placed = [pose.compose(PoseGaussian(*each)) for each in zip(seen.poses, seen.covariances, strict=True)]
+        pairs = dict(self._paired(placed, seen))
+        known = len(self.landmarks)
+        for k, landmark in enumerate(self.landmarks):
+            if k in pairs:
+                self.landmarks[k] = _seen_again(landmark, placed[pairs[k]], seen, pairs[k], features)
+            elif expected[k]:
+                existence = landmark.existence.after_miss(features)
+                self.landmarks[k] = replace(landmark, existence=existence)
+        for i in sorted(set(range(len(placed))).difference(pairs.values())):
+            if not self._beside_known(placed[i], int(seen.kinds[i]), known):
+                self.landmarks.append(self._new(placed[i], seen, i))
+        least = self._features.landmark_least
+        self.landmarks = [one for one in self.landmarks if one.existence.probability >= least]
+
+    def come_back(self) -> None:
+        """The robot comes back after a while."""
+        self.landmarks = [replace(one, existence=one.existence.after_absence()) for one in self.landmarks]
+
+    def _due(self, pose: Float64, rays: Rays) -> Bool:
+        """Which landmarks the scan from a pose should show."""
+        kinds = np.array([landmark.kind for landmark in self.landmarks], dtype=np.int64)
+        poses = np.array([landmark.pose.mean for landmark in self.landmarks]).reshape(-1, 3)
+        widths = np.array([landmark.width for landmark in self.landmarks])
+        return due(kinds, se2.between(pose, poses), widths, rays, self._features)
+
+    def _paired(self, placed: list[PoseGaussian], seen: Landmarks) -> Iterator[tuple[int, int]]:
+        """Landmarks of the map and of the scan that are one, the nearest first."""
+        near = sorted(
+            (distance2, k, i)
+            for i, pose in enumerate(placed)
+            for k, landmark in enumerate(self.landmarks)
+            if landmark.kind == seen.kinds[i] and _apart(landmark.pose, pose) < _FAR
+            if (distance2 := landmark.pose.mahalanobis2(pose)) <= self._gate
+        )
+        taken: tuple[set[int], set[int]] = set(), set()
+        for _, k, i in near:
+            if k not in taken[0] and i not in taken[1]:
+                taken[0].add(k)
+                taken[1].add(i)
+                yield k, i
+
+    def _new(self, pose: PoseGaussian, seen: Landmarks, i: int) -> Landmark:
+        into = np.linalg.inv(np.linalg.cholesky(pose.covariance))
+        return Landmark(
+            int(seen.kinds[i]),
+            pose,
+            float(seen.widths[i]),
+            float(seen.width_deviations[i]),
+            self._begin(float(seen.confidences[i])),
+            by_scans=into @ seen.covariances[i] @ into.T,
+        )
+
+    def _beside_known(self, pose: PoseGaussian, kind: int, known: int) -> bool:
+        """Whether a landmark is so near to a known one of its kind that it is no other one."""
+        return any(
+            landmark.kind == kind
+            and _apart(landmark.pose, pose) < self._features.landmark_apart
+            and abs(float(se2.wrap(landmark.pose.mean[2] - pose.mean[2]))) < 0.5
+            for landmark in self.landmarks[:known]
+        )
+
+
+def _seen_again(landmark: Landmark, pose: PoseGaussian, seen: Landmarks, i: int, features: Features) -> Landmark:
+    """A landmark after one more observation of it."""
+    n = landmark.existence.seen + 1
+    width, deviation = seen.widths[i], seen.width_deviations[i]
+    into = np.linalg.inv(np.linalg.cholesky(pose.covariance))
+    # Welford's update: by what a sighting and the mean of those before it may be apart.
+    spread = np.linalg.cholesky(pose.covariance + landmark.pose.covariance / (n - 1))
+    off = np.linalg.solve(spread, se2.log(se2.between(pose.mean, landmark.pose.mean)))
+    return replace(
+        landmark,
+        pose=_intersected(landmark.pose, pose, 1.0 / n),
+        scatter=landmark.scatter + np.outer(off, off),
+        by_scans=landmark.by_scans + (into @ seen.covariances[i] @ into.T - landmark.by_scans) / n,
+        width=landmark.width + float(width - landmark.width) / n,
+        width_deviation=landmark.width_deviation + float(deviation - landmark.width_deviation) / n,
+        existence=landmark.existence.after_sight(float(seen.confidences[i]), features),
+    )
+
+
+def _apart(one: PoseGaussian, other: PoseGaussian) -> float:
+    return float(np.hypot(*(one.mean[:2] - other.mean[:2])))
+
+
+def _intersected(known: PoseGaussian, seen: PoseGaussian, weight: float) -> PoseGaussian:
+    """Covariance intersection of two beliefs over one pose, the second with a weight."""
+    parts = ((known, 1.0 - weight), (seen, weight))
+    return fuse([PoseGaussian(part.mean, part.covariance / share) for part, share in parts])

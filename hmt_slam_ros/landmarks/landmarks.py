@@ -1,0 +1,146 @@
+"""The landmarks that a scan all around shows, and which of those that are known it should show.
+
+Corners and openings are landmarks (Tomatis, Nourbakhsh and Siegwart, 2003, section 2.1). One that is known has to be
+seen where beams reach what it is made of: both walls of a corner; the gap of an opening and both jambs, one of which
+may be hidden where no beam passes the gap, as at a door that was closed. A beam that ends before that tells nothing: a
+person who stands before an opening closes none. One that goes on behind it is in sight of what is not there any more:
+where beams pass one wall of a corner, the other one does not have to be in sight.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from hmt_slam_ros.arrays import Bool, Float64, Int64
+from hmt_slam_ros.configuration.landmarks import Features
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.landmarks.beam_labels import Rays
+from hmt_slam_ros.landmarks.corners import Corners, corners_of
+from hmt_slam_ros.landmarks.line_extraction import Lines
+from hmt_slam_ros.landmarks.openings import Openings, openings_of
+
+INNER, OUTER, OPENING = range(3)
+"""What a landmark is: the corner of a room, that of a pillar, or an opening."""
+
+KINDS = ("corner", "convex corner", "opening")
+"""Their names."""
+
+# What is asked whether it is in sight lies so far before its wall, m; and whether it is passed, so far behind it.
+_BEFORE, _BEHIND = 0.1, 0.15
+# Places along each wall of a corner, and over the width of an opening; and how far beside it its jambs are, m.
+_PLACES, _BESIDE = 4, 0.15
+# A landmark has to be shown under so wide an angle, and be faced so much (sine); of an opening this share.
+_WIDE, _FACED, _SHARE = math.radians(3.0), 0.4, 0.5
+# A beam tells of a place within this angle of it.
+_APART = math.radians(1.5)
+
+
+class Landmarks(NamedTuple):
+    """Landmarks of any kind, in one frame.
+
+    :ivar kinds: shape (n,), one of the constants above.
+    :ivar poses: shape (n, 3), as of `Corners` and `Openings`, m and rad.
+    :ivar covariances: shape (n, 3, 3), right tangent frame.
+    :ivar confidences: shape (n,), in (0, 1).
+    :ivar widths: shape (n,), of openings, m; 0 of corners.
+    :ivar width_deviations: shape (n,), of these, m; 0 of corners.
+    """
+
+    kinds: Int64
+    poses: Float64
+    covariances: Float64
+    confidences: Float64
+    widths: Float64
+    width_deviations: Float64
+
+
+def landmarks_of(lines: Lines, rays: Rays, features: Features) -> Landmarks:
+    """All that the lines and beams of a scan show."""
+    return both(corners_of(lines, features), openings_of(lines, rays, features))
+
+
+def both(corners: Corners, openings: Openings) -> Landmarks:
+    """Corners and openings as landmarks, in this order."""
+    none = np.zeros(len(corners.poses))
+    return Landmarks(
+        np.concatenate((np.where(corners.convex, OUTER, INNER), np.full(len(openings.poses), OPENING))),
+        np.concatenate((corners.poses, openings.poses)),
+        np.concatenate((corners.covariances, openings.covariances)),
+        np.concatenate((corners.confidences, openings.confidences)),
+        np.concatenate((none, openings.widths)),
+        np.concatenate((none, openings.width_deviations)),
+    )
+
+
+def due(kinds: Int64, poses: Float64, widths: Float64, rays: Rays, features: Features) -> Bool:
+    """Which landmarks (n,) beams should show.
+
+    :param poses: shape (n, 3), in the frame of the beams.
+    :param widths: shape (n,), of openings, m.
+    """
+    shown = np.hypot(*poses[:, :2].T) <= features.landmark_reach
+    corner = kinds != OPENING
+    shown[corner] &= _corners_due(poses[corner], kinds[corner] == OUTER, rays, features.min_length)
+    shown[~corner] &= _openings_due(poses[~corner], widths[~corner], rays, features.opening_depth)
+    return shown
+
+
+def _corners_due(poses: Float64, convex: Bool, rays: Rays, length: float) -> Bool:
+    """Which corners have both walls in sight for ``length``, m, under a wide enough angle, or one that beams pass."""
+    sign = np.where(convex, -1.0, 1.0)
+    shown, passed = np.ones(len(poses), np.bool_), np.zeros(len(poses), np.bool_)
+    for side in (1.0, -1.0):
+        # In the frame of the corner: along one of its walls, and before that, on the free side.
+        along = math.sqrt(0.5) * np.stack((sign, side * np.ones(len(poses))), axis=1)
+        before = math.sqrt(0.5) * np.stack((np.ones(len(poses)), -side * sign), axis=1)
+        places = np.linspace(_BEFORE, length, _PLACES)[:, None, None] * along
+        points = se2.transform(poses, places + _BEFORE * before)
+        bearings = np.arctan2(points[..., 1], points[..., 0])
+        wide = np.abs(se2.wrap(bearings[-1] - bearings[0])) >= _WIDE
+        shown &= in_sight(points, rays).all(axis=0) & wide
+        faced = _faced(poses, before)
+        passed |= faced & in_sight(se2.transform(poses, places - _BEHIND * before), rays).all(axis=0)
+    return shown | passed
+
+
+def _faced(poses: Float64, before: Float64) -> Bool:
+    """Which corners (n, 3) have a wall, with a normal (n, 2) in their frame, that the origin is well before."""
+    origin = se2.inverse(poses)[:, :2]
+    away = np.maximum(np.hypot(*origin.T), 1e-9)
+    return np.asarray((origin * before).sum(axis=1) >= _FACED * away)
+
+
+def _openings_due(poses: Float64, widths: Float64, rays: Rays, depth: float) -> Bool:
+    """Which openings have their gap and both jambs in sight, or are closed in half of the gap and show a jamb.
+
+    :param depth: so far behind its wall an opening is free, m.
+    """
+    away = np.hypot(*poses[:, :2].T)
+    faced = np.cos(np.arctan2(poses[:, 1], poses[:, 0]) - poses[:, 2]) >= _FACED
+    over = (np.arange(_PLACES) + 0.5)[:, None] / _PLACES - 0.5
+    gap = np.stack(np.broadcast_arrays(-_BEFORE, over * widths), axis=-1)
+    jambs = np.stack(np.broadcast_arrays(-_BEFORE, np.array([[-1.0], [1.0]]) * (0.5 * widths + _BESIDE)), axis=-1)
+    seen, sides = (in_sight(se2.transform(poses, points), rays) for points in (gap, jambs))
+    behind = in_sight(se2.transform(poses, gap + np.array([_BEFORE + depth, 0.0])), rays)
+    whole = seen.all(axis=0) & sides.all(axis=0)
+    closed = (seen.mean(axis=0) >= _SHARE) & sides.any(axis=0) & ~behind.any(axis=0)
+    return np.asarray(faced & (whole | closed) & (away > _BEFORE))
+
+
+def in_sight(points: Float64, rays: Rays) -> Bool:
+    """Which points (..., 2) a beam reaches, shape (...); beams begin near each other."""
+    if not len(rays.free):
+        return np.zeros(points.shape[:-1], np.bool_)
+    bearings = np.arctan2(rays.directions[:, 1], rays.directions[:, 0])
+    order = np.argsort(bearings)
+    away = points - rays.origins.mean(axis=0)
+    asked = np.arctan2(away[..., 1], away[..., 0])
+    after = np.searchsorted(bearings[order], asked)
+    beside = [order[(after - back) % len(order)] for back in (0, 1)]
+    apart = [np.abs(se2.wrap(bearings[beam] - asked)) for beam in beside]
+    nearest = np.where(apart[0] < apart[1], *beside)
+    reached = rays.free[nearest] >= np.hypot(away[..., 0], away[..., 1])
+    return np.asarray(reached & (np.minimum(*apart) <= _APART))

@@ -1,0 +1,201 @@
+"""The line through some beams with its covariance (Arras and Siegwart 1997), and which segments are one line.
+
+A line is n(alpha) p = r. A beam from o along the unit vector d meets it at the range (r - n o) / (n d). The ranges are
+uncertain and the directions exact, so that an error of a range is n d times as large across the line, and the weight of
+a point 1 / (sigma n d)^2: least squares over the ranges, by Gauss-Newton. Weights that do not depend on n d would lose
+most of what grazed walls say, and turn them.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from hmt_slam_ros.arrays import Float64, Int32
+
+_STEPS = 6
+_PARALLEL = 1e-4  # a beam along the line says nothing of it
+_SMALL = 1e-12
+
+
+class Beams(NamedTuple):
+    """The beams of a scan with a return, in their order.
+
+    :ivar points: shape (n, 2), end points, m.
+    :ivar directions: shape (n, 2), unit vectors along the beams.
+    :ivar deviations: shape (n,), of the ranges, m.
+    """
+
+    points: Float64
+    directions: Float64
+    deviations: Float64
+
+
+@njit(cache=True)
+def fit(beams: Beams, labels: Int32, line: int, fitted: Float64) -> int:
+    """Fit the line of the beams with a label.
+
+    :param labels: shape (n,).
+    :param line: the label.
+    :param fitted: shape (5,), written to: alpha in [-pi, pi), r >= 0, and var(alpha), cov(alpha, r), var(r); rad, m.
+    :returns: number of beams; below 2, or where they lie in one point, nothing is written.
+    """
+    points, directions = beams.points, beams.directions
+    count, alpha, r = _through(points, labels, line)
+    if count < 2:
+        return 0
+    aa = ar = rr = determinant = 0.0
+    for _ in range(_STEPS):
+        cos, sin = math.cos(alpha), math.sin(alpha)
+        aa = ar = rr = ga = gr = 0.0
+        for k in range(len(points)):
+            facing = cos * directions[k, 0] + sin * directions[k, 1]
+            if labels[k] != line or abs(facing) < _PARALLEL:
+                continue
+            # Residual of the range, and the derivatives of the range by alpha and r where the beam meets the line.
+            residual = (cos * points[k, 0] + sin * points[k, 1] - r) / facing
+            x, y = points[k, 0] - residual * directions[k, 0], points[k, 1] - residual * directions[k, 1]
+            weight = 1.0 / beams.deviations[k]
+            residual *= weight
+            by_alpha, by_r = weight * (sin * x - cos * y) / facing, weight / facing
+            aa, ar, rr = aa + by_alpha * by_alpha, ar + by_alpha * by_r, rr + by_r * by_r
+            ga, gr = ga + by_alpha * residual, gr + by_r * residual
+        determinant = aa * rr - ar * ar
+        if determinant <= _SMALL * aa * rr:
+            return 0
+        alpha += (rr * ga - ar * gr) / determinant
+        r += (aa * gr - ar * ga) / determinant
+    normalised(alpha, r, rr / determinant, -ar / determinant, aa / determinant, fitted)
+    return count
+
+
+@njit(cache=True)
+def normalised(alpha: float, r: float, aa: float, ar: float, rr: float, line: Float64) -> None:
+    """Write a line and its covariance (5,) with r >= 0 and alpha in [-pi, pi)."""
+    if r < 0.0:
+        alpha, r = alpha + math.pi, -r
+        ar = -ar
+    line[0] = wrapped(alpha)
+    line[1], line[2], line[3], line[4] = r, aa, ar, rr
+
+
+@njit(cache=True)
+def variance_at(aa: float, ar: float, rr: float, along: float) -> float:
+    """Variance, m^2, of the distance of a point on a line from it, by var(alpha), cov(alpha, r) and var(r).
+
+    :param along: where on the line the point is, m from the foot of the perpendicular.
+    """
+    return along * along * aa - 2.0 * along * ar + rr
+
+
+@njit(cache=True)
+def wrapped(angle: float) -> float:
+    """The angle in [-pi, pi)."""
+    return angle - 2.0 * math.pi * math.floor((angle + math.pi) / (2.0 * math.pi))
+
+
+@njit(cache=True)
+def _through(points: Float64, labels: Int32, line: int) -> tuple[int, float, float]:
+    """Number of the points with a label, and the line through them by equal weights (Arras), r of either sign."""
+    count, x, y, xx, xy, yy = 0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for k in range(len(points)):
+        if labels[k] == line:
+            count, x, y = count + 1, x + points[k, 0], y + points[k, 1]
+    if count < 2:
+        return 0, 0.0, 0.0
+    x, y = x / count, y / count
+    for k in range(len(points)):
+        if labels[k] == line:
+            dx, dy = points[k, 0] - x, points[k, 1] - y
+            xx, xy, yy = xx + dx * dx, xy + dx * dy, yy + dy * dy
+    alpha = 0.5 * math.atan2(-2.0 * xy, yy - xx)
+    return count, alpha, x * math.cos(alpha) + y * math.sin(alpha)
+
+
+class Gate(NamedTuple):
+    """When two segments are one line.
+
+    :ivar distance2: squared Mahalanobis distance at most.
+    :ivar deviation: of the distance of one's middle from the other at most, m.
+    """
+
+    distance2: float
+    deviation: float
+
+
+@njit(cache=True)
+def relabel(labels: Int32, old: int, new: int) -> None:
+    """Give the beams of one line to another."""
+    for k in range(len(labels)):
+        if labels[k] == old:
+            labels[k] = new
+
+
+@njit(cache=True)
+def merge(beams: Beams, labels: Int32, lines: Float64, count: int, gate: Gate) -> int:
+    """Join those two lines that differ least, as long as the gate allows; return how many are left."""
+    middles = np.empty((count, 2))
+    for line in range(count):
+        _middle(beams.points, labels, line, middles[line])
+    while True:
+        least, one, other = gate.distance2, 0, 0
+        for i in range(count):
+            for k in range(i):
+                away = distance2(lines[i], lines[k])
+                if away < least and _tell(lines[i], middles[i], lines[k], middles[k]) <= gate.deviation**2:
+                    least, one, other = away, k, i
+        if one == other:
+            return count
+        relabel(labels, other, one)
+        fit(beams, labels, one, lines[one])
+        _middle(beams.points, labels, one, middles[one])
+        count -= 1
+        if other != count:
+            lines[other], middles[other] = lines[count], middles[count]
+            relabel(labels, count, other)
+
+
+@njit(cache=True)
+def _middle(points: Float64, labels: Int32, line: int, middle: Float64) -> None:
+    """Write the mean of the points of a line, (2,)."""
+    count, x, y = 0, 0.0, 0.0
+    for k in range(len(labels)):
+        if labels[k] == line:
+            count, x, y = count + 1, x + points[k, 0], y + points[k, 1]
+    middle[0], middle[1] = x / count, y / count
+
+
+@njit(cache=True)
+def _tell(a: Float64, middle_a: Float64, b: Float64, middle_b: Float64) -> float:
+    """How well two lines tell that they are one: variance, m^2, of the distance of the one's middle from the other.
+
+    Of two short pieces far from each other that lie side by side, either could point at the other; that the one is
+    where the other points to says something only where it would not be so by chance.
+    """
+    return min(
+        _variance_at(a, middle_b) + _variance_at(b, middle_b), _variance_at(a, middle_a) + _variance_at(b, middle_a)
+    )
+
+
+@njit(cache=True)
+def _variance_at(line: Float64, point: Float64) -> float:
+    """Variance, m^2, of the distance of a point (2,) near a line (5,) from it."""
+    along = math.cos(line[0]) * point[1] - math.sin(line[0]) * point[0]
+    return variance_at(line[2], line[3], line[4], along)
+
+
+@njit(cache=True)
+def distance2(a: Float64, b: Float64) -> float:
+    """Squared Mahalanobis distance of two independent lines (5,); chi-square with 2 degrees of freedom.
+
+    The second is taken in that of its two representations, (alpha, r) and (alpha + pi, -r), whose angle is nearer.
+    """
+    turn = wrapped(b[0] - a[0])
+    away, sign = b[1] - a[1], 1.0
+    if abs(turn) > 0.5 * math.pi:
+        turn, away, sign = wrapped(turn - math.pi), -b[1] - a[1], -1.0
+    aa, ar, rr = a[2] + b[2], a[3] + sign * b[3], a[4] + b[4]
+    return (rr * turn * turn - 2.0 * ar * turn * away + aa * away * away) / (aa * rr - ar * ar)

@@ -1,0 +1,1 @@
+"""Lifelong mapping: what changed in a known map."""

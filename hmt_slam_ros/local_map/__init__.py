@@ -1,1 +1,0 @@
-"""The metric map of one area: occupancy grid, distance field, scan matching, particle filter."""

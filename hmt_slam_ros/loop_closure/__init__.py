@@ -1,0 +1,1 @@
+"""Topological Loop Closure Acceptance, process 4 of the paper: which topology is definite."""

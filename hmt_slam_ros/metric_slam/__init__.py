@@ -1,0 +1,1 @@
+"""Metric SLAM, process 1 of the paper: localization and mapping within the current area."""

@@ -1,0 +1,125 @@
+"""Scans that wait for odometry, or for the answer to a keyframe event; what is wrong with them is said once."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, field
+
+from hmt_slam_ros.messages.messages import Message, Notice
+from hmt_slam_ros.sensors import Odometry, Scan
+from hmt_slam_ros.sensors.deskew import SweepCheck, SweepState
+from hmt_slam_ros.sensors.odometry import OdometryBuffer
+
+# Odometry that has come before may only be late, by more scans than a paced robot runs ahead of its acknowledgements.
+_LATE = 4
+
+
+@dataclass(frozen=True, eq=False)
+class ScanQueueState:
+    """The queue between two messages.
+
+    :ivar scans: those that wait.
+    :ivar last_stamp: of the last scan received, ns, -1 before the first.
+    :ivar sweeps: what is known of the times between scans.
+    :ivar noticed: the faults of which something was said.
+    :ivar patient: whether scans wait for odometry.
+    """
+
+    scans: tuple[Scan, ...] = ()
+    last_stamp: int = -1
+    sweeps: SweepState = field(default_factory=SweepState)
+    noticed: frozenset[str] = frozenset()
+    patient: bool = True
+
+
+class ScanQueue:
+    """The queue of metric SLAM."""
+
+    def __init__(self, patience: int, odometry: OdometryBuffer, state: ScanQueueState) -> None:
+        """:param patience: scans that may wait for the first odometry.
+
+        :param odometry: what the scans wait for.
+        :param state: to go on from.
+        """
+        self._patience = patience
+        self._odometry = odometry
+        self._scans = deque(state.scans)
+        self._last_stamp = state.last_stamp
+        self._sweeps = SweepCheck(state.sweeps)
+        self._noticed = set(state.noticed)
+        self._patient = state.patient
+
+    def __len__(self) -> int:
+        return len(self._scans)
+
+    @property
+    def state(self) -> ScanQueueState:
+        """All that the queue knows."""
+        noticed = frozenset(self._noticed)
+        return ScanQueueState(tuple(self._scans), self._last_stamp, self._sweeps.state, noticed, self._patient)
+
+    def emptied(self, odometry: OdometryBuffer) -> ScanQueue:
+        """A queue for scans of any other time, of whose faults nothing is said twice.
+
+        :param odometry: what these wait for.
+        """
+        return ScanQueue(self._patience, odometry, ScanQueueState(noticed=frozenset(self._noticed)))
+
+    def hear(self, odometry: Odometry) -> None:
+        """Take in a reading."""
+        self._odometry.add(odometry)
+        self._patient = True
+
+    def receive(self, scan: Scan) -> list[Message]:
+        """Take in a scan; say, once for each fault, what is wrong with it."""
+        said: list[Message] = []
+        scan, fault = self._sweeps.checked(scan)
+        if fault is not None:
+            said += self._notice("sweep", fault)
+        if scan.stamp <= self._last_stamp:
+            said += self._notice(
+                "order",
+                f"A scan is stamped {scan.stamp / 1e9:.6f} s, not after its predecessor "
+                f"({self._last_stamp / 1e9:.6f} s); scans are taken in the order of their arrival: check the clocks or "
+                "the order of the log.",
+            )
+        if not scan.valid.any():
+            said += self._notice(
+                "empty",
+                f"The scan at {scan.stamp / 1e9:.6f} s has no return between {scan.range_min:g} and {scan.range_max:g} "
+                "m; such scans are placed by odometry alone: check the laser and its range limits.",
+            )
+        self._scans.append(scan)
+        self._last_stamp = scan.stamp
+        return said + self._lose_patience()
+
+    def ready(self, *, ended: bool) -> bool:
+        """Whether the next scan can be taken: its odometry is known, or not waited for.
+
+        :param ended: whether no more odometry will come.
+        """
+        return bool(self._scans) and (ended or not self._patient or self._odometry.covers(self._scans[0].end))
+
+    def take(self) -> Scan:
+        """The next scan."""
+        return self._scans.popleft()
+
+    def _lose_patience(self) -> list[Message]:
+        """Where enough scans wait for odometry, go on without until there is more."""
+        first = self._scans[0]
+        patience = self._patience * (1 if self._odometry.empty else _LATE)
+        waited = len(self._scans) > patience
+        if not waited or not self._patient or self._odometry.covers(first.end):
+            return []
+        self._patient = False
+        return self._notice(
+            "odometry",
+            f"{len(self._scans)} scans wait for odometry at {first.stamp / 1e9:.6f} s and are matched without from "
+            "here on, until there is a reading: check the odometry topic and its stamps.",
+        )
+
+    def _notice(self, fault: str, text: str) -> list[Message]:
+        if fault in self._noticed:
+            return []
+        self._noticed.add(fault)
+        return [Notice("slam", text)]

@@ -1,1 +1,0 @@
-"""The five processes of HMT-SLAM and the messages between them."""

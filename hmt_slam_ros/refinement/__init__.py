@@ -1,1 +1,0 @@
-"""Refinement of poses by registering the scans themselves with each other, free of the cells of any grid."""

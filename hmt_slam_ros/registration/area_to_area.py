@@ -1,0 +1,323 @@
+"""Where does one area's map lie in another's, and how well does it fit? All modes, and the evidence integral.
+
+The second factor pair of Eq. (6), integrated over x: the integral of p(x | gamma) p(z | x, gamma) / p(z | unknown).
+Blanco et al. leave it to an expectation over samples of the prior; a lattice does it without variance.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from hmt_slam_ros.arrays import Float64, Int64
+from hmt_slam_ros.configuration.topology import TopologicalInference
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.geometry.gaussian import PoseGaussian, gate, moments
+from hmt_slam_ros.registration import match_modes
+from hmt_slam_ros.registration.branch_and_bound import Cells, Ground, search
+from hmt_slam_ros.registration.likelihood_grid import AreaGrid
+from hmt_slam_ros.registration.search_bounds import Surface, Window, make_window
+
+# Peaks of one cluster have passes at most this deep, nats.
+_SADDLE = 3.0
+# A cell is kept where it alone could hold this share of the prior's weight.
+_NEGLIGIBLE = 1e-5
+_TURN_LIMITS = (math.radians(0.2), math.radians(2.0))
+# Share of the prior's information in what matching alone says of a direction of which it says nothing.
+_WEAK = 0.01
+_SAME_MODE = gate(0.95)
+# Modes this far below the best are looked at, nats: the best may lie in the place of another area.
+_MARGIN = 20.0
+
+
+@dataclass(frozen=True)
+class MatchSettings:
+    """How a match is searched for.
+
+    :ivar temper: exponent on the likelihood of the surface samples, which are not quite independent.
+    :ivar gate: squared Mahalanobis distance from the prior up to which is searched, 3 degrees of freedom.
+    :ivar margin: modes this far below the best, in nats, are still returned.
+    :ivar max_modes: at most this many modes are worked out, the heaviest; some may turn out to be the same.
+    :ivar sigma_floor: smallest deviation of a mode's translation, m.
+    :ivar angle_floor: smallest deviation of a mode's angle, rad.
+    :ivar reverse: whether surfaces of the candidate in what is free space to the query speak against a pose.
+    :ivar least: poses at which the samples' log-ratio is less than this on average are not looked for, nats.
+    """
+
+    temper: float = 0.1
+    gate: float = 16.27
+    margin: float = 10.0
+    max_modes: int = 8
+    sigma_floor: float = 0.01
+    angle_floor: float = math.radians(0.2)
+    least: float = -math.inf
+    reverse: bool = True
+
+    @classmethod
+    def of(cls, options: TopologicalInference) -> MatchSettings:
+        """As configured."""
+        return cls(options.temper, gate(options.gate_probability), _MARGIN, max(cls.max_modes, 2 * options.max_modes))
+
+
+class Mode(NamedTuple):
+    """One way in which the query fits into the candidate.
+
+    :ivar pose: belief over ``candidate_T_query``: prior and match.
+    :ivar measured: the same from the match alone, for an arc to which the prior's arcs are still joined.
+    :ivar log_mass: log of the mode's part of the evidence integral, nats.
+    """
+
+    pose: PoseGaussian
+    measured: PoseGaussian
+    log_mass: float
+
+
+@dataclass(frozen=True, eq=False)
+class Match:
+    """The fit of a query into a candidate.
+
+    :ivar log_evidence: log of the integral of p(x) (p(z | x, candidate) / p(z | unknown))^temper over the gate, nats;
+        -inf where nothing in the gate is worth mentioning.
+    """
+
+    log_evidence: float = -math.inf
+    _found: Callable[[], tuple[Mode, ...]] = tuple
+
+    # Some ask for the evidence alone.
+    @cached_property
+    def modes(self) -> tuple[Mode, ...]:
+        """By falling mass."""
+        return self._found()
+
+
+def match(
+    query: AreaGrid,
+    candidate: AreaGrid,
+    prior: PoseGaussian,
+    settings: MatchSettings,
+    bounds: Float64 | None = None,
+    ground: Ground | None = None,
+) -> Match:
+    """Find all poses of the query in the candidate that the prior admits.
+
+    :param query: the map of the keyframes in question, in the frame of their reference keyframe.
+    :param candidate: the map of the candidate and its surroundings.
+    :param prior: belief over ``candidate_T_query``.
+    :param bounds: shape (2, 2), the smallest and the largest (x, y) in the candidate where the middle of the query's
+        points may be, m; what lies beyond is not searched.
+    :param ground: where one of the query's keyframes has to be, if anywhere.
+    """
+    searched = _searched(query, candidate, prior, settings, bounds, ground)
+    if searched is None:
+        return Match()
+    return Match(float(np.logaddexp.reduce(searched.masses)), lambda: tuple(_modes(searched)))
+
+
+def best_pose(
+    query: AreaGrid, candidate: AreaGrid, prior: PoseGaussian, settings: MatchSettings
+) -> tuple[Float64, float] | None:
+    """Where the heaviest mode of :func:`match` peaks, ``candidate_T_query``, and the log of its mass; None without one.
+
+    That costs a fraction of the mode with its covariance.
+    """
+    searched = _searched(query, candidate, prior, settings)
+    if searched is None:
+        return None
+    labels, totals = _clustered(searched)
+    inside = labels == totals.argmax()
+    peak = _peak(searched.problem, searched.masses[inside], searched.poses[inside])
+    return se2.compose(peak, se2.inverse(searched.problem.to_middle.mean)), float(totals.max())
+
+
+def _searched(
+    query: AreaGrid,
+    candidate: AreaGrid,
+    prior: PoseGaussian,
+    settings: MatchSettings,
+    bounds: Float64 | None = None,
+    ground: Ground | None = None,
+) -> _Searched | None:
+    if not query.points.size or not candidate.points.size:
+        return None
+    # About the middle of the samples turns and shifts are least correlated, and the lattice of turns coarsest.
+    middle = query.points.mean(axis=0)
+    to_middle = PoseGaussian.exactly(np.array([*middle, 0.0]))
+    centred = query.moved(middle)
+    prior = prior.compose(to_middle)
+    turn = _turn(candidate.cell, centred.points)
+    window = make_window(prior.mean, prior.covariance, candidate.cell, turn, settings.gate, bounds)
+    surface, log_cell = _fine(candidate), _log_cell_mass(prior, candidate.cell, turn)
+    back_points = _within_reach(candidate.points[: None if settings.reverse else 0], window, centred)
+    threshold = max(math.log(_NEGLIGIBLE) - min(0.0, log_cell), settings.temper * settings.least * len(query.points))
+    cells = search(
+        window,
+        _coarse(candidate),
+        centred.points,
+        _coarse(centred),
+        back_points,
+        settings.temper,
+        threshold,
+        settings.margin,
+        None if ground is None else ground._replace(keyframes=ground.keyframes - middle),
+    )
+    if not cells.score.size:
+        return None
+    problem = _Problem(surface, centred.points, window, prior, settings, to_middle)
+    masses, poses = match_modes.quadrature(surface, centred.points, window, cells, settings.temper)
+    return _Searched(problem, cells, masses + log_cell, poses)
+
+
+@dataclass(frozen=True, eq=False)
+class _Problem:
+    surface: Surface
+    samples: Float64
+    window: Window
+    prior: PoseGaussian
+    settings: MatchSettings
+    to_middle: PoseGaussian
+
+
+class _Searched(NamedTuple):
+    """Where the query may lie: cells, the log of the mass of each, (n,), and the best pose found in it, (n, 3)."""
+
+    problem: _Problem
+    cells: Cells
+    masses: Float64
+    poses: Float64
+
+
+def _coarse(grid: AreaGrid) -> Surface:
+    return Surface(grid.log_ratio, grid.origin, grid.cell)
+
+
+def _fine(grid: AreaGrid) -> Surface:
+    return Surface(grid.fine, grid.origin, 0.5 * grid.cell)
+
+
+def _turn(cell: float, samples: Float64) -> float:
+    """The turn that moves nine samples of ten by less than a cell (the pixel rule of Hess et al. 2016)."""
+    radius = max(cell, float(np.quantile(np.hypot(samples[:, 0], samples[:, 1]), 0.9)))
+    turn = math.acos(max(-1.0, 1.0 - cell**2 / (2.0 * radius**2)))
+    return min(max(turn, _TURN_LIMITS[0]), _TURN_LIMITS[1])
+
+
+def _log_cell_mass(prior: PoseGaussian, cell: float, turn: float) -> float:
+    """Log of the prior's density at its mean times the volume of a cell."""
+    log_determinant = float(np.linalg.slogdet(prior.covariance)[1])
+    return math.log(cell * cell * turn) - 1.5 * math.log(2.0 * math.pi) - 0.5 * log_determinant
+
+
+def _within_reach(points: Float64, window: Window, query: AreaGrid) -> Float64:
+    """The candidate's points that can meet the query's grid at a pose of the window."""
+    rows, columns = query.log_ratio.shape
+    corners = query.origin + query.cell * np.array([[0, 0], [columns, 0], [0, rows], [columns, rows]])
+    farthest = np.hypot(*np.maximum(-window.first, window.last)) * window.cell
+    radius = np.hypot(corners[:, 0], corners[:, 1]).max() + farthest
+    near = np.hypot(points[:, 0] - window.mean[0], points[:, 1] - window.mean[1]) <= radius
+    return points[near]
+
+
+def _clustered(searched: _Searched) -> tuple[Int64, Float64]:
+    """The cluster of every cell, and the log of the mass of every cluster."""
+    labels = match_modes.clusters(searched.cells, _SADDLE)
+    totals = np.full(labels.max() + 1, -np.inf)
+    np.logaddexp.at(totals, labels, searched.masses)
+    return labels, totals
+
+
+def _modes(searched: _Searched) -> list[Mode]:
+    """The modes by falling mass, coinciding ones merged."""
+    problem, _, masses, poses = searched
+    labels, totals = _clustered(searched)
+    floor = totals.max() - problem.settings.margin
+    modes: list[Mode] = []
+    for label in np.argsort(-totals, kind="stable")[: problem.settings.max_modes]:
+        if totals[label] >= floor:
+            inside = labels == label
+            _add(modes, _mode(problem, masses[inside], poses[inside]))
+    return [_carried(mode, problem.to_middle) for mode in sorted(modes, key=lambda mode: -mode.log_mass)]
+
+
+def _add(modes: list[Mode], mode: Mode) -> None:
+    """Append a mode, or merge it with one that says the same; the heavier one, which is there first, keeps its mean."""
+    for place, other in enumerate(modes):
+        if other.pose.mahalanobis2(mode.pose) < _SAME_MODE:
+            both = (other, mode)
+            modes[place] = Mode(
+                moments([(each.pose, each.log_mass) for each in both]),
+                moments([(each.measured, each.log_mass) for each in both]),
+                float(np.logaddexp(other.log_mass, mode.log_mass)),
+            )
+            return
+    modes.append(mode)
+
+
+def _mode(problem: _Problem, masses: Float64, poses: Float64) -> Mode:
+    """Peak, covariances and mass of a cluster of cells.
+
+    The curvature at the peak gives the covariance of a sharp mode; cells that lie farther away than that explains, as
+    those along a corridor do, widen it.
+    """
+    settings, window = problem.settings, problem.window
+    peak = _peak(problem, masses, poses)
+    span = 0.3 * window.cell
+    bend = match_modes.curvature(
+        problem.surface, problem.samples, peak, np.array([span, span, _radian_step(problem, span)])
+    )
+    matched = _positive_part(settings.temper * bend)
+    held = np.linalg.inv(problem.prior.covariance_at(peak))
+    posterior = np.linalg.inv(matched + held)
+    spread = _spread(problem, peak, masses, poses, posterior)
+    floor = np.diag([settings.sigma_floor**2, settings.sigma_floor**2, settings.angle_floor**2])
+    peak = np.array([peak[0], peak[1], float(se2.wrap(peak[2]))])
+    return Mode(
+        PoseGaussian(peak, posterior + spread + floor),
+        PoseGaussian(peak, np.linalg.inv(matched + _WEAK * held) + spread + floor),
+        float(np.logaddexp.reduce(masses)),
+    )
+
+
+def _peak(problem: _Problem, masses: Float64, poses: Float64) -> Float64:
+    """Where a cluster of cells is highest."""
+    window, heaviest = problem.window, poses[int(np.argmax(masses))]
+    step = np.array([window.cell / 6.0, window.cell / 6.0, _radian_step(problem, window.cell / 6.0)])
+    return match_modes.climb(
+        problem.surface, problem.samples, window, problem.settings.temper, heaviest, step, 1.0 / 8.0
+    )
+
+
+def _radian_step(problem: _Problem, distance: float) -> float:
+    """The angle by which the samples move by ``distance`` in the quadratic mean."""
+    radius = math.sqrt(float(np.mean(np.sum(problem.samples**2, axis=1))))
+    return distance / max(radius, distance)
+
+
+def _spread(problem: _Problem, peak: Float64, masses: Float64, poses: Float64, explained: Float64) -> Float64:
+    """How much wider the cells of a cluster lie around the peak than ``explained`` and the lattice account for."""
+    away = se2.log(se2.between(peak, poses))
+    weights = np.exp(masses - np.logaddexp.reduce(masses))
+    second = np.einsum("n,ni,nj->ij", weights, away, away)
+    turn = float(problem.window.turns[1] - problem.window.turns[0]) if problem.window.turns.size > 1 else 0.0
+    lattice = np.diag([problem.window.cell**2, problem.window.cell**2, turn**2]) / 12.0
+    return _positive_part(second - explained - lattice)
+
+
+def _positive_part(matrix: Float64) -> Float64:
+    """The nearest positive semidefinite matrix to a symmetric one, both (3, 3) over (m, m, rad).
+
+    Angles are scaled to the metres that they move a point ten metres away, so that the axes compare.
+    """
+    scale = np.array([1.0, 1.0, 10.0])
+    values, vectors = np.linalg.eigh(0.5 * (matrix + matrix.T) * np.outer(scale, scale))
+    return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T / np.outer(scale, scale), dtype=np.float64)
+
+
+def _carried(mode: Mode, to_middle: PoseGaussian) -> Mode:
+    """The mode of the query's own frame from that of its middle."""
+    back = to_middle.inverse()
+    return Mode(mode.pose.compose(back), mode.measured.compose(back), mode.log_mass)

@@ -1,0 +1,275 @@
+"""From the cells that a search kept to modes: clusters, their mass by quadrature, their peak and its curvature."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from hmt_slam_ros.arrays import Float64, Int32, Int64
+from hmt_slam_ros.registration.branch_and_bound import Cells
+from hmt_slam_ros.registration.search_bounds import Surface, Window
+
+# Of a search's cells, at most this many are divided for the quadrature; the others count with their centre alone.
+_DIVIDED = 400
+
+
+def clusters(cells: Cells, saddle: float) -> Int64:
+    """The cluster of every cell, shape (n,), numbered from 0 by falling height of the peaks.
+
+    Two peaks stay apart where the lower one rises by more than ``saddle`` nats above the pass between them.
+    """
+    order = np.argsort(-cells.score, kind="stable")
+    at = cells.at - cells.at.min(axis=0) + 1
+    sides = at.max(axis=0) + 2
+    keys = (at[:, 0] * sides[1] + at[:, 1]) * sides[2] + at[:, 2]
+    by_key = np.argsort(keys, kind="stable")
+    peaks = _flood(order, by_key, keys[by_key], sides, cells.score, saddle)
+    rank = np.empty_like(order)
+    rank[order] = np.arange(order.size)
+    is_peak = np.zeros(order.size, dtype=np.bool_)
+    is_peak[rank[peaks]] = True
+    labels: Int64 = (np.cumsum(is_peak) - 1)[rank[peaks]]
+    return labels
+
+
+@njit(cache=True)
+def _flood(order: Int64, by_key: Int64, keys: Int64, sides: Int64, score: Float64, saddle: float) -> Int64:
+    """Flood from the top: the peak (a cell) that every cell belongs to.
+
+    :param keys: ascending, of the cells ``by_key``.
+    """
+    above, rank = np.full(order.size, -1), np.empty(order.size, np.int64)
+    rank[by_key] = np.arange(order.size)
+    rows = _rows_around(keys, sides)
+    for cell in order:
+        above[cell] = cell
+        for row in range(9):
+            for place in range(rows[rank[cell], row, 0], rows[rank[cell], row, 1]):
+                if above[by_key[place]] >= 0:
+                    _join(above, cell, by_key[place], score, saddle)
+    for cell in order:
+        above[cell] = _peak(above, cell)
+    return above
+
+
+@njit(cache=True)
+def _rows_around(keys: Int64, sides: Int64) -> Int32:
+    """The cells around every cell, by key: first and last + 1 in each of nine rows of three, shape (n, 9, 2)."""
+    found = np.empty((keys.size, 9, 2), np.int32)
+    for row in range(9):
+        middle = ((row // 3 - 1) * sides[1] + row % 3 - 1) * sides[2]
+        first, last = 0, 0
+        for n in range(keys.size):
+            while first < keys.size and keys[first] < keys[n] + middle - 1:
+                first += 1
+            while last < keys.size and keys[last] <= keys[n] + middle + 1:
+                last += 1
+            found[n, row, 0], found[n, row, 1] = first, last
+    return found
+
+
+@njit(cache=True)
+def _peak(above: Int64, cell: int) -> int:
+    while above[cell] != cell:
+        above[cell] = above[above[cell]]
+        cell = above[cell]
+    return cell
+
+
+@njit(cache=True)
+def _join(above: Int64, cell: int, other: int, score: Float64, saddle: float) -> None:
+    """Give the lower of two peaks that meet at ``cell`` to the higher, unless it stands out."""
+    a, b = _peak(above, cell), _peak(above, other)
+    if score[a] < score[b] or (score[a] == score[b] and a > b):
+        a, b = b, a
+    if a != b and score[b] - score[cell] <= saddle:
+        above[b] = a
+
+
+class _Points(NamedTuple):
+    """Samples, and where they lie in a grid of cells (n,).
+
+    :ivar x: shape (n,), m, as ``y``.
+    :ivar column: shape (n,), of the cell whose centre is to the left; ``row``, of that which is above.
+    :ivar right: shape (n,), distance from that centre, cells; ``down``, the same.
+    """
+
+    x: Float64
+    y: Float64
+    column: Int32
+    row: Int32
+    right: Float64
+    down: Float64
+
+
+@njit(cache=True)
+def _points(samples: Float64) -> _Points:
+    n = samples.shape[0]
+    return _Points(
+        samples[:, 0].copy(),
+        samples[:, 1].copy(),
+        np.empty(n, np.int32),
+        np.empty(n, np.int32),
+        np.empty(n),
+        np.empty(n),
+    )
+
+
+@njit(cache=True)
+def log_ratio_at(surface: Surface, samples: Float64, pose: Float64) -> float:
+    """Sum over the samples of the bilinearly interpolated log-ratio, nats, untempered.
+
+    :param samples: shape (n, 2), m, query frame.
+    :param pose: shape (3,), ``candidate_T_query``.
+    """
+    return _log_ratio_at(surface, _points(samples), pose)
+
+
+@njit(cache=True)
+def _log_ratio_at(surface: Surface, points: _Points, pose: Float64) -> float:
+    """In two loops, as the compiler takes several samples at once in the first."""
+    cos, sin = np.cos(pose[2]), np.sin(pose[2])
+    x0, y0 = pose[0] - surface.origin[0], pose[1] - surface.origin[1]
+    for n in range(points.x.size):
+        u = (x0 + cos * points.x[n] - sin * points.y[n]) / surface.cell - 0.5
+        v = (y0 + sin * points.x[n] + cos * points.y[n]) / surface.cell - 0.5
+        left, above = np.floor(u), np.floor(v)
+        points.column[n], points.row[n] = np.int32(left), np.int32(above)
+        points.right[n], points.down[n] = u - left, v - above
+    rows, columns = np.uint32(surface.log_ratio.shape[0] - 1), np.uint32(surface.log_ratio.shape[1] - 1)
+    one, total = np.uint32(1), 0.0
+    for n in range(points.x.size):
+        c, r = np.uint32(points.column[n]), np.uint32(points.row[n])
+        if c < columns and r < rows:
+            a, b = points.right[n], points.down[n]
+            low = (1.0 - a) * surface.log_ratio[r, c] + a * surface.log_ratio[r, c + one]
+            high = (1.0 - a) * surface.log_ratio[r + one, c] + a * surface.log_ratio[r + one, c + one]
+            total += (1.0 - b) * low + b * high
+    return total
+
+
+@njit(cache=True)
+def _score_at(surface: Surface, points: _Points, window: Window, temper: float, pose: Float64) -> float:
+    """Tempered log-ratio plus the prior's exponent, without the reverse check."""
+    dx, dy = pose[0] - window.mean[0], pose[1] - window.mean[1]
+    turn = pose[2] - window.mean[2]
+    cos, sin = np.cos(window.mean[2]), np.sin(window.mean[2])
+    x, y = cos * dx + sin * dy, cos * dy - sin * dx
+    half_cot = 1.0 if abs(turn) < 1e-5 else 0.5 * turn / np.tan(0.5 * turn)
+    twist = np.array((half_cot * x + 0.5 * turn * y, half_cot * y - 0.5 * turn * x, turn))
+    exponent = 0.0
+    for r in range(3):
+        exponent += (window.root[r, 0] * twist[0] + window.root[r, 1] * twist[1] + window.root[r, 2] * twist[2]) ** 2
+    return temper * _log_ratio_at(surface, points, pose) - 0.5 * exponent
+
+
+def quadrature(
+    surface: Surface, samples: Float64, window: Window, cells: Cells, temper: float
+) -> tuple[Float64, Float64]:
+    """log of the mean of exp(score) over every cell, shape (n,), and the best pose found in it, shape (n, 3).
+
+    The cells are divided as finely as the narrower of prior and likelihood asks for.
+    """
+    widths = 1.0 / np.linalg.norm(window.root, axis=0)  # conditional deviations of the prior
+    divisions = np.array([_odd(window.cell / widths[:2].min()), _odd(_step(window) / widths[2])])
+    order = np.argsort(-cells.score, kind="stable")
+    means, poses = cells.score.copy(), _centres(window, cells)
+    inside = order[:_DIVIDED]
+    fine = _divide(surface, samples, window, temper, poses[inside], divisions, _step(window))
+    means[inside], poses[inside] = fine[0] + cells.contradiction[inside], fine[1]
+    return means, poses
+
+
+def _step(window: Window) -> float:
+    return float(window.turns[1] - window.turns[0]) if window.turns.size > 1 else 0.0
+
+
+def _odd(ratio: float) -> int:
+    """3, 5 or 7 divisions, so that a step is at most 1.5 of the prior's deviations where that is possible."""
+    return 3 if ratio <= 4.5 else (5 if ratio <= 7.5 else 7)
+
+
+def _centres(window: Window, cells: Cells) -> Float64:
+    poses = np.empty((cells.score.size, 3))
+    poses[:, :2] = window.mean[:2] + cells.at[:, 1:] * window.cell
+    poses[:, 2] = window.mean[2] + window.turns[cells.at[:, 0]]
+    return poses
+
+
+@njit(cache=True)
+def _divide(
+    surface: Surface, samples: Float64, window: Window, temper: float, centres: Float64, divisions: Int64, turn: float
+) -> tuple[Float64, Float64]:
+    count, turns = divisions
+    means, best = np.empty(centres.shape[0]), centres.copy()
+    points, scores = _points(samples), np.empty(count * count * turns)
+    pose = np.empty(3)
+    for n in range(centres.shape[0]):
+        top = -np.inf
+        for s in range(scores.size):
+            pose[0] = centres[n, 0] + window.cell * ((s % count + 0.5) / count - 0.5)
+            pose[1] = centres[n, 1] + window.cell * ((s // count % count + 0.5) / count - 0.5)
+            pose[2] = centres[n, 2] + turn * ((s // (count * count) + 0.5) / turns - 0.5)
+            scores[s] = _score_at(surface, points, window, temper, pose)
+            if scores[s] > top:
+                top = scores[s]
+                best[n] = pose
+        means[n] = top + np.log(np.mean(np.exp(scores - top)))
+    return means, best
+
+
+@njit(cache=True)
+def climb(
+    surface: Surface, samples: Float64, window: Window, temper: float, start: Float64, step: Float64, finest: float
+) -> Float64:
+    """The highest pose near ``start``, by a pattern search over the 26 neighbours with halving steps.
+
+    :param step: shape (3,), first steps in m, m and rad.
+    :param finest: smallest share of the first steps.
+    """
+    points = _points(samples)
+    best, height = start.copy(), _score_at(surface, points, window, temper, start)
+    share = 1.0
+    while share >= finest:
+        centre = best.copy()
+        moved = False
+        for s in range(27):
+            pose = centre + share * step * np.array((s % 3 - 1.0, s // 3 % 3 - 1.0, s // 9 - 1.0))
+            score = _score_at(surface, points, window, temper, pose)
+            if score > height:
+                best, height, moved = pose, score, True
+        if not moved:
+            share *= 0.5
+    return best
+
+
+@njit(cache=True)
+def curvature(surface: Surface, samples: Float64, pose: Float64, step: Float64) -> Float64:
+    """Minus the Hessian of the untempered log-ratio in the right tangent space of ``pose``, shape (3, 3).
+
+    :param step: shape (3,), finite differences in m, m and rad.
+    """
+    points, corner = _points(samples), np.empty((3, 3))
+    hessian = np.empty((3, 3))
+    for a in range(3):
+        for b in range(a, 3):
+            for p in range(-1, 2):
+                for q in range(-1, 2):
+                    twist = np.zeros(3)
+                    twist[a] += p * step[a]
+                    twist[b] += q * step[b]
+                    corner[p + 1, q + 1] = _log_ratio_at(surface, points, _beside(pose, twist))
+            mixed = corner[2, 2] - corner[2, 0] - corner[0, 2] + corner[0, 0]
+            hessian[a, b] = -mixed / (4.0 * step[a] * step[b])
+            hessian[b, a] = hessian[a, b]
+    return hessian
+
+
+@njit(cache=True)
+def _beside(pose: Float64, twist: Float64) -> Float64:
+    """``pose * exp(twist)`` for a small twist, to second order."""
+    cos, sin = np.cos(pose[2]), np.sin(pose[2])
+    x, y = twist[0] - 0.5 * twist[2] * twist[1], twist[1] + 0.5 * twist[2] * twist[0]
+    return np.array((pose[0] + cos * x - sin * y, pose[1] + sin * x + cos * y, pose[2] + twist[2]))

@@ -1,0 +1,341 @@
+"""Scan to map: likelihood, and Gauss-Newton on the distance field, for one pose or a batch of particles.
+
+Poses are ``map_T_base`` (x, y, theta); points are (n, 2) in m in the base frame, surfels (n, 4) points with normals
+(``sensors/surfels.py``), which serve wherever points do. The likelihood of a beam is taken
+relative to unknown space, so that 0 means "nothing known here", and maps of different extent compare.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from hmt_slam_ros.arrays import Float64, Int32
+from hmt_slam_ros.geometry.symmetric import (
+    Symmetric,
+    Vector,
+    determinant,
+    dot,
+    into_array,
+    inverse,
+    of_array,
+    solved,
+    times,
+    total,
+)
+from hmt_slam_ros.grids.patches import FAR, PATCH, MapView, field_at, field_of_four, odds_at
+
+# Distance from its surface at which a point in unknown space counts, as a share of the robust scale.
+_UNSEEN = 0.6
+# Cells from a point to the free space on every side of it, where it is said to be in free space.
+_BESIDE = 3
+
+
+class BeamModel(NamedTuple):
+    """Log-likelihood ratio of an end point, tabulated over the quantised distance to the nearest surface.
+
+    :ivar in_unknown: shape (256,), nats, where the cell of the end point was never seen.
+    :ivar in_known: shape (256,), nats, where it was: far from surfaces the map contradicts the beam.
+    """
+
+    in_unknown: Float64
+    in_known: Float64
+
+
+class Prior(NamedTuple):
+    """A Gaussian over poses, in map coordinates (x, y, theta).
+
+    :ivar mean: shape (3,).
+    :ivar information: shape (3, 3), inverse of the covariance.
+    """
+
+    mean: Float64
+    information: Float64
+
+
+class Alignment(NamedTuple):
+    """How Gauss-Newton weighs the beams.
+
+    :ivar sigma: deviation of an end point from its surface, m.
+    :ivar robust: scale of the Cauchy weight, m.
+    :ivar inflation: of how many beams only one tells something of its own; the prior outweighs the others.
+    :ivar iterations: steps at most.
+    """
+
+    sigma: float
+    robust: float
+    inflation: float
+    iterations: int
+
+
+def beam_model(radius: float, sigma: float, unknown_range: float, random: float) -> BeamModel:
+    """The table of log p(z | map) / p(z | unknown).
+
+    :param radius: truncation of the distance field, m.
+    :param sigma: standard deviation of a return around a surface, sigma_hit, m.
+    :param unknown_range: scale over which a return is uniform in unknown space, m.
+    :param random: share of returns that no surface explains, z_rand, in (0, 1).
+    """
+    distance = np.arange(256) / FAR * radius
+    hit = (1.0 - random) * unknown_range * np.exp(-0.5 * (distance / sigma) ** 2) / (np.sqrt(2.0 * np.pi) * sigma)
+    return BeamModel(np.log(hit + 1.0), np.log(hit + random))
+
+
+@njit(cache=True)
+def log_ratio(points: Float64, x: float, y: float, theta: float, view: MapView, model: BeamModel) -> float:
+    """Sum over the points of the log-likelihood ratio at the pose (x, y, theta), nats."""
+    cos, sin = np.cos(theta) / view.cell, np.sin(theta) / view.cell
+    half = 0.5 * view.table.shape[0] * PATCH
+    u, v = x / view.cell + half, y / view.cell + half
+    total = 0.0
+    for i in range(points.shape[0]):
+        column = int(u + cos * points[i, 0] - sin * points[i, 1])
+        row = int(v + sin * points[i, 0] + cos * points[i, 1])
+        distance = field_at(view, column, row)
+        if odds_at(view, column, row) == 0:
+            total += model.in_unknown[distance]
+        else:
+            total += model.in_known[distance]
+    return total
+
+
+@njit(cache=True)
+def matched_fraction(points: Float64, pose: Float64, view: MapView, near: int) -> float:
+    """Share of the points whose quantised distance to a surface is below ``near``."""
+    cos, sin = np.cos(pose[2]) / view.cell, np.sin(pose[2]) / view.cell
+    half = 0.5 * view.table.shape[0] * PATCH
+    count = 0
+    for i in range(points.shape[0]):
+        column = int(pose[0] / view.cell + half + cos * points[i, 0] - sin * points[i, 1])
+        row = int(pose[1] / view.cell + half + sin * points[i, 0] + cos * points[i, 1])
+        if field_at(view, column, row) < near:
+            count += 1
+    return count / max(1, points.shape[0])
+
+
+@njit(cache=True)
+def agreement(points: Float64, pose: Float64, view: MapView, near: int, far: int) -> tuple[int, int]:
+    """How many of the points are on a known surface, and how many in space that is known to be free.
+
+    :param near: quantised distance to a surface below which a point is on it; ``far``: from which it is off.
+    """
+    cos, sin = np.cos(pose[2]), np.sin(pose[2])
+    half = 0.5 * view.table.shape[0] * PATCH
+    on, free = 0, 0
+    for i in range(points.shape[0]):
+        column = int((pose[0] + cos * points[i, 0] - sin * points[i, 1]) / view.cell + half)
+        row = int((pose[1] + sin * points[i, 0] + cos * points[i, 1]) / view.cell + half)
+        distance = field_at(view, column, row)
+        on += distance < near
+        free += distance >= far and odds_at(view, column, row) < 0 and _free_around(view, column, row)
+    return on, free
+
+
+@njit(cache=True)
+def _free_around(view: MapView, column: int, row: int) -> bool:
+    """Whether it is free to all sides: along the edge of what a beam passed there may be a wall that it grazed."""
+    across = max(odds_at(view, column - _BESIDE, row), odds_at(view, column + _BESIDE, row))
+    return bool(max(across, odds_at(view, column, row - _BESIDE), odds_at(view, column, row + _BESIDE)) < 0)
+
+
+@njit(cache=True)
+def log_prior(pose: Float64, prior: Prior) -> float:
+    """-1/2 of the squared Mahalanobis distance, without the normaliser."""
+    difference = _difference(pose[0], pose[1], pose[2], prior.mean)
+    return -0.5 * dot(difference, times(of_array(prior.information), difference))
+
+
+@njit(cache=True)
+def _difference(x: float, y: float, theta: float, mean: Float64) -> Vector:
+    return x - mean[0], y - mean[1], (theta - mean[2] + np.pi) % (2.0 * np.pi) - np.pi
+
+
+@njit(cache=True)
+def evidence(
+    points: Float64, mode: Float64, hessian: Float64, prior: Prior, view: MapView, model: BeamModel, temper: float
+) -> float:
+    """Log of the Laplace integral of prior times tempered likelihood around a mode, relative to unknown space, nats.
+
+    :param hessian: (3, 3) information of the points at the mode.
+    """
+    ratio = log_ratio(points, mode[0], mode[1], mode[2], view, model)
+    known = of_array(prior.information)
+    occam = determinant(known) / determinant(total(known, of_array(hessian), temper))
+    return log_prior(mode, prior) + temper * ratio + 0.5 * np.log(occam)
+
+
+@njit(cache=True)
+def _smooth_distance(view: MapView, u: float, v: float) -> tuple[float, float, float]:
+    """Bilinear distance and its gradient per cell at the continuous cell coordinates (u, v), in quanta."""
+    column, row = int(np.floor(u)), int(np.floor(v))
+    fu, fv = u - column, v - row
+    four = field_of_four(view, column, row)
+    d00, d10, d01, d11 = float(four[0]), float(four[1]), float(four[2]), float(four[3])
+    low, high = d00 + fu * (d10 - d00), d01 + fu * (d11 - d01)
+    gradient_u = (1.0 - fv) * (d10 - d00) + fv * (d11 - d01)
+    return low + fv * (high - low), gradient_u, high - low
+
+
+@njit(cache=True)
+def linearise(
+    points: Float64, x: float, y: float, theta: float, view: MapView, settings: Alignment
+) -> tuple[Symmetric, Vector, float]:
+    """Normal equations of the surfels (n, 4) at the pose (x, y, theta): J' W J and J' W r; and r' W r.
+
+    Distance and gradient of a point on a surface count by what they have in the direction of its normal.
+    """
+    half = 0.5 * view.table.shape[0] * PATCH - 0.5
+    quantum = view.radius / FAR
+    cos, sin = np.cos(theta), np.sin(theta)
+    # Sums in variables of their own stay in registers.
+    xx = xy = xt = yy = yt = tt = gx = gy = gt = square = 0.0
+    for n in range(points.shape[0]):
+        rx = cos * points[n, 0] - sin * points[n, 1]
+        ry = sin * points[n, 0] + cos * points[n, 1]
+        distance, gu, gv = _smooth_distance(view, (x + rx) / view.cell + half, (y + ry) / view.cell + half)
+        if distance >= FAR - 1:
+            continue
+        distance *= quantum
+        jx, jy = gu * quantum / view.cell, gv * quantum / view.cell
+        weight = 1.0 / ((1.0 + (distance / settings.robust) ** 2) * settings.sigma**2)
+        if points[n, 2] != 0.0 or points[n, 3] != 0.0:
+            normal_x, normal_y = cos * points[n, 2] - sin * points[n, 3], sin * points[n, 2] + cos * points[n, 3]
+            across = jx * normal_x + jy * normal_y
+            jx, jy = across * normal_x, across * normal_y
+            distance *= abs(across)
+        jt = jy * rx - jx * ry
+        wx, wy, wt, error = weight * jx, weight * jy, weight * jt, weight * distance
+        xx += wx * jx
+        xy += wx * jy
+        xt += wx * jt
+        yy += wy * jy
+        yt += wy * jt
+        tt += wt * jt
+        gx += error * jx
+        gy += error * jy
+        gt += error * jt
+        square += error * distance
+    return Symmetric(xx, xy, xt, yy, yt, tt), (gx, gy, gt), square
+
+
+@njit(cache=True)
+def misfit(points: Float64, pose: Float64, prior: Prior, view: MapView, settings: Alignment) -> float:
+    """What :func:`align` minimises, at a pose, nats; but a point counts by its distance in any direction.
+
+    One in unknown space counts as if its surface were at ``_UNSEEN``: were it worse, new space ahead would draw the
+    robot back, were it better, nothing would keep it in the map.
+
+    :param points: (n, 2) or surfels (n, 4).
+    """
+    half = 0.5 * view.table.shape[0] * PATCH - 0.5
+    cos, sin = np.cos(pose[2]), np.sin(pose[2])
+    quantum, unseen, cost = view.radius / FAR, _UNSEEN * settings.robust, 0.0
+    for n in range(points.shape[0]):
+        u = (pose[0] + cos * points[n, 0] - sin * points[n, 1]) / view.cell + half
+        v = (pose[1] + sin * points[n, 0] + cos * points[n, 1]) / view.cell + half
+        distance, _, _ = _smooth_distance(view, u, v)
+        distance *= quantum
+        if distance > unseen and odds_at(view, int(u + 0.5), int(v + 0.5)) == 0:
+            distance = unseen
+        cost += np.log(1.0 + (distance / settings.robust) ** 2)
+    return 0.5 * settings.robust**2 / (settings.inflation * settings.sigma**2) * cost - log_prior(pose, prior)
+
+
+@njit(cache=True)
+def align(points: Float64, start: Float64, prior: Prior, view: MapView, settings: Alignment) -> tuple[Float64, Float64]:
+    """Gauss-Newton on the distance field with a Gaussian prior.
+
+    Minimises sum rho(d(T p)^2) / (inflation sigma^2) + (T - prior)' information (T - prior), rho being Cauchy's.
+
+    :param points: surfels (n, 4).
+    :param start: (3,) pose to start from.
+    :returns: the mode (3,), and the information (3, 3) of the points alone, map coordinates.
+    """
+    mode, hessian = np.empty(3), np.empty((3, 3))
+    align_into(points, start, prior, view, settings, mode, hessian)
+    return mode, hessian
+
+
+@njit(cache=True)
+def align_into(
+    points: Float64, start: Float64, prior: Prior, view: MapView, settings: Alignment, mode: Float64, hessian: Float64
+) -> None:
+    """:func:`align` with its results written into ``mode`` and ``hessian``."""
+    if points.shape[1] != 4:
+        raise ValueError("points are aligned with their normals: give surfels (n, 4)")
+    x, y, theta = start[0], start[1], start[2]
+    known, information = of_array(prior.information), Symmetric(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    for _ in range(settings.iterations):
+        information, gradient, _ = linearise(points, x, y, theta, view, settings)
+        held = times(known, _difference(x, y, theta, prior.mean))
+        slope = (
+            gradient[0] + settings.inflation * held[0],
+            gradient[1] + settings.inflation * held[1],
+            gradient[2] + settings.inflation * held[2],
+        )
+        step = solved(total(information, known, settings.inflation), slope)
+        x, y, theta = x - step[0], y - step[1], theta - step[2]
+        if abs(step[0]) + abs(step[1]) < 1e-4 and abs(step[2]) < 1e-4:
+            break
+    mode[0], mode[1], mode[2] = x, y, theta
+    into_array(information, hessian)
+
+
+class Proposals(NamedTuple):
+    """The optimal proposals of m particles, in map coordinates.
+
+    :ivar modes: shape (m, 3).
+    :ivar hessians: information of the points at the modes, shape (m, 3, 3).
+    :ivar covariances: shape (m, 3, 3).
+    :ivar evidences: log p(z | x_{t-1}, u), shape (m,), nats.
+    """
+
+    modes: Float64
+    hessians: Float64
+    covariances: Float64
+    evidences: Float64
+
+
+@njit(cache=True)
+def propose_all(
+    points: Float64,
+    still: Float64,
+    starts: Float64,
+    priors: Float64,
+    information: Float64,
+    tables: Int32,
+    view: MapView,
+    settings: Alignment,
+    model: BeamModel,
+    sharpness: float,
+    temper: float,
+) -> Proposals:
+    """The optimal proposal of every particle, p(x_t | x_{t-1}, u, z, map), as a Gaussian around its mode.
+
+    Its covariance is that of Gauss-Newton, which asks of each beam only what the surface that it hit can tell. The
+    likelihood itself would not do: along a corridor it varies with the cells of the map, and not with the pose.
+
+    :param points: surfels (n, 4), which all count as evidence.
+    :param still: surfels (k, 4), those of them that are matched.
+    :param starts: (m, 3) poses to start matching from; ``priors``: (m, 3) poses that odometry predicts.
+    :param tables: (m, T, T), the particles' maps; ``view`` is any view of the same pool.
+    :param sharpness: exponent on the likelihood in the proposal.
+    :param temper: exponent on the likelihood in the evidence.
+    """
+    m = starts.shape[0]
+    modes, hessians = np.empty((m, 3)), np.empty((m, 3, 3))
+    covariances, evidences = np.empty((m, 3, 3)), np.empty(m)
+    known = of_array(information)
+    for i in range(m):
+        own = MapView(tables[i], view.odds, view.field, view.cell, view.radius)
+        prior = Prior(priors[i], information)
+        align_into(still, starts[i], prior, own, settings, modes[i], hessians[i])
+        into_array(inverse(total(known, of_array(hessians[i]), sharpness)), covariances[i])
+    # In a loop of its own: together with two arrays of points the compiler makes the alignment half as fast.
+    for i in range(m):
+        own = MapView(tables[i], view.odds, view.field, view.cell, view.radius)
+        prior = Prior(priors[i], information)
+        evidences[i] = evidence(points, modes[i], hessians[i], prior, own, model, temper)
+    return Proposals(modes, hessians, covariances, evidences)

@@ -1,0 +1,219 @@
+"""The lattice of relative poses that a search looks through, and bounds of the score on squares of it.
+
+The pyramid is of bytes, rounded up, so that a level of a large map stays in the processor's cache; and neighbouring
+squares are read together, sample by sample, which costs hardly more than one of them.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from hmt_slam_ros.arrays import Float32, Float64, Int8, Int32, Int64
+
+
+class Window(NamedTuple):
+    """The lattice of relative poses, and the Gaussian prior on it.
+
+    A pose of the lattice is the prior's mean shifted by (i, j) cells along the axes of the candidate's frame, and
+    turned by ``turns[k]``. Its twist from the mean is affine in the shift, so the prior's exponent is -1/2 of the
+    squared norm of ``whitening[k] @ shift + offsets[k]``.
+
+    :ivar mean: shape (3,), the prior's mean.
+    :ivar cell: edge of a cell, m.
+    :ivar turns: shape (t,), rad, ascending, equally spaced.
+    :ivar first: shape (2,), int64, smallest shift along x and y, cells; ``last``, the largest.
+    :ivar root: shape (3, 3), the square root of the prior's information, ``root.T @ root``.
+    :ivar whitening: shape (t, 3, 2), 1/m.
+    :ivar offsets: shape (t, 3).
+    :ivar gate: largest squared Mahalanobis distance that is searched.
+    """
+
+    mean: Float64
+    cell: float
+    turns: Float64
+    first: Int64
+    last: Int64
+    root: Float64
+    whitening: Float64
+    offsets: Float64
+    gate: float
+
+
+def make_window(
+    mean: Float64, covariance: Float64, cell: float, turn: float, gate: float, bounds: Float64 | None = None
+) -> Window:
+    """The smallest lattice that holds the gate's ellipsoid, as far as it lies within bounds.
+
+    :param mean: shape (3,), ``candidate_T_query``.
+    :param covariance: shape (3, 3), right tangent frame.
+    :param cell: edge of a cell, m.
+    :param turn: angle between turns, rad.
+    :param gate: squared Mahalanobis distance at the gate, 3 degrees of freedom.
+    :param bounds: shape (2, 2), the smallest and the largest (x, y) of the poses, m.
+    """
+    cos, sin = np.cos(mean[2]), np.sin(mean[2])
+    rotation = np.array([[cos, -sin], [sin, cos]])
+    half = np.sqrt(gate * np.diag(rotation @ covariance[:2, :2] @ rotation.T))
+    count = int(np.ceil(min(np.sqrt(gate * covariance[2, 2]), np.pi) / turn))
+    turns = np.asarray(np.arange(-count, count + 1) * turn, dtype=np.float64)
+    root = np.asarray(np.linalg.cholesky(np.linalg.inv(covariance)).T, dtype=np.float64)
+    # log() of the twist at a fixed turn: v = V(omega)^-1 R(mean)^T shift, geometry.se2.log.
+    half_cot = np.where(np.abs(turns) < 1e-5, 1.0, 0.5 * turns / np.tan(0.5 * np.where(turns == 0.0, 1.0, turns)))
+    inverse_v: Float64 = np.empty((turns.size, 2, 2))
+    inverse_v[:, 0, 0] = inverse_v[:, 1, 1] = half_cot
+    inverse_v[:, 0, 1], inverse_v[:, 1, 0] = 0.5 * turns, -0.5 * turns
+    whitening: Float64 = root[:, :2] @ inverse_v @ rotation.T
+    offsets: Float64 = turns[:, None] * root[:, 2]
+    reach = np.ceil(half / cell)
+    first, last = -reach, reach
+    if bounds is not None:
+        first = np.maximum(first, np.floor((bounds[0] - mean[:2]) / cell))
+        last = np.minimum(last, np.ceil((bounds[1] - mean[:2]) / cell))
+    return Window(mean, cell, turns, first.astype(np.int64), last.astype(np.int64), root, whitening, offsets, gate)
+
+
+@njit(cache=True)
+def prior_bound(window: Window, k: int, i: int, j: int, side: int) -> float:
+    """The largest exponent of the prior in the square of shifts that begins at a cell; -inf outside the gate."""
+    whitening, offset = window.whitening[k], window.offsets[k]
+    half = 0.5 * (side - 1) * window.cell
+    x, y = i * window.cell + half, j * window.cell + half
+    centre, spread_plus, spread_minus = 0.0, 0.0, 0.0
+    for r in range(3):
+        a, b = whitening[r, 0], whitening[r, 1]
+        centre += (a * x + b * y + offset[r]) ** 2
+        spread_plus += ((a + b) * half) ** 2
+        spread_minus += ((a - b) * half) ** 2
+    # Triangle inequality: the norm over the square is at least that at its centre less that of the farthest corner.
+    nearest = max(0.0, np.sqrt(centre) - np.sqrt(max(spread_plus, spread_minus)))
+    return -np.inf if nearest * nearest > window.gate else -0.5 * nearest * nearest
+
+
+BLOCK = 4
+"""Edge of a block of cells, a power of 2."""
+
+_TOP = 64  # the largest log-ratio in steps; what is below -128 steps is counted as that
+
+
+class Surface(NamedTuple):
+    """A log-ratio grid: ``log_ratio`` (rows, columns) float32, indexed [y, x], its corner ``origin`` (2,), ``cell``."""
+
+    log_ratio: Float32
+    origin: Float64
+    cell: float
+
+
+class Pyramid(NamedTuple):
+    """Running maxima of log-ratios.
+
+    :ivar levels: shape (h + 1, rows + 2 margin, columns + 2 margin), int8, steps. Element [l, y, x] is no less than the
+        log-ratios in the square of 2^l x 2^l cells that begins at cell (x, y) - margin; beyond the grid they are 0.
+    :ivar margin: 2^h.
+    :ivar step: nats.
+    """
+
+    levels: Int8
+    margin: int
+    step: float
+
+
+def pyramid(log_ratio: Float32, height: int) -> Pyramid:
+    """The pyramid of a grid, with levels 0 to ``height``."""
+    margin = 2**height
+    step = max(float(log_ratio.max()), 1e-6) / _TOP
+    rows, columns = log_ratio.shape
+    levels = np.zeros((height + 1, rows + 2 * margin, columns + 2 * margin), dtype=np.int8)
+    _round_up(log_ratio, 1.0 / step, levels[0, margin:, margin:])
+    for level in range(height):
+        _widen(levels[level], levels[level + 1], 2**level)
+    return Pyramid(levels, margin, step)
+
+
+@njit(cache=True)
+def _round_up(log_ratio: Float32, scale: float, steps: Int8) -> None:
+    for r in range(log_ratio.shape[0]):
+        for c in range(log_ratio.shape[1]):
+            steps[r, c] = np.int8(max(-128.0, np.ceil(log_ratio[r, c] * scale)))
+
+
+@njit(cache=True)
+def _widen(below: Int8, above: Int8, side: int) -> None:
+    """Maxima over squares twice as large; the last rows and columns are beyond the grid and stay 0."""
+    rows, columns = below.shape[0] - side, below.shape[1] - side
+    for r in range(rows):
+        first, right = below[r, :columns], below[r, side:]
+        second, both = below[r + side, :columns], below[r + side, side:]
+        for c in range(columns):
+            above[r, c] = max(first[c], right[c], second[c], both[c])
+
+
+@njit(cache=True)
+def sample_cells(window: Window, surface: Surface, samples: Float64) -> Int32:
+    """Column and row of every sample at every turn without a shift, shape (turns, samples, 2)."""
+    cells = np.empty((window.turns.size, samples.shape[0], 2), np.int32)
+    x0, y0 = window.mean[0] - surface.origin[0], window.mean[1] - surface.origin[1]
+    for k in range(window.turns.size):
+        angle = window.mean[2] + window.turns[k]
+        cos, sin = np.cos(angle), np.sin(angle)
+        for n in range(samples.shape[0]):
+            cells[k, n, 0] = np.floor((cos * samples[n, 0] - sin * samples[n, 1] + x0) / surface.cell)
+            cells[k, n, 1] = np.floor((sin * samples[n, 0] + cos * samples[n, 1] + y0) / surface.cell)
+    return cells
+
+
+# Unsigned, a negative index is a large one: one comparison tells whether it lies in the grid.
+
+
+@njit(cache=True)
+def bound_of_square(level: Int8, margin: int, cells: Int32, i: int, j: int) -> int:
+    """What the samples (n, 2) read at most in the square of shifts that begins at (i, j), steps.
+
+    :param level: of the pyramid, for squares of this size.
+    """
+    rows, columns = np.uint32(level.shape[0]), np.uint32(level.shape[1])
+    total = 0
+    for n in range(cells.shape[0]):
+        x, y = np.uint32(cells[n, 0] + i + margin), np.uint32(cells[n, 1] + j + margin)
+        if x < columns and y < rows:
+            total += level[y, x]
+    return total
+
+
+@njit(cache=True)
+def bounds_of_quarters(
+    level: Int8, margin: int, cells: Int32, i: int, j: int, side: int
+) -> tuple[tuple[int, int], tuple[int, int]]:
+    """:func:`bound_of_square` of the squares of edge ``side`` that begin at (i, j), right of it, and below both."""
+    rows, columns = np.uint32(level.shape[0] - side), np.uint32(level.shape[1] - side)
+    beside = np.uint32(side)
+    first, right, below, both = 0, 0, 0, 0
+    for n in range(cells.shape[0]):
+        x, y = np.uint32(cells[n, 0] + i + margin), np.uint32(cells[n, 1] + j + margin)
+        if x < columns and y < rows:
+            first += level[y, x]
+            right += level[y, x + beside]
+            below += level[y + beside, x]
+            both += level[y + beside, x + beside]
+    return (first, right), (below, both)
+
+
+@njit(cache=True)
+def add_block(log_ratio: Float32, cells: Int32, i: int, j: int, totals: Float64) -> None:
+    """Add the log-ratios that the samples (n, 2) read at every shift of the block that begins at (i, j), nats.
+
+    :param totals: shape (BLOCK, BLOCK), [j, i].
+    """
+    rows, columns = log_ratio.shape
+    for n in range(cells.shape[0]):
+        x, y = cells[n, 0] + i, cells[n, 1] + j
+        if 0 <= x <= columns - BLOCK and 0 <= y <= rows - BLOCK:
+            for r in range(BLOCK):
+                for c in range(BLOCK):
+                    totals[r, c] += log_ratio[y + r, x + c]
+        elif -BLOCK < x < columns and -BLOCK < y < rows:
+            for r in range(max(0, -y), min(BLOCK, rows - y)):
+                for c in range(max(0, -x), min(BLOCK, columns - x)):
+                    totals[r, c] += log_ratio[y + r, x + c]

@@ -1,0 +1,217 @@
+"""Parts of a saved map for other programs: its grid, its topology as GraphML, its chart of places as JSON."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from hmt_slam_ros.errors import HmtSlamError
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.grids.occupancy_map import occupancy_image, write_map
+from hmt_slam_ros.hybrid_map.surroundings import stacked
+from hmt_slam_ros.landmarks.area_classes import AreaKinds
+from hmt_slam_ros.landmarks.landmark_map import Landmark
+from hmt_slam_ros.landmarks.landmarks import KINDS
+from hmt_slam_ros.landmarks.portals import Portal, portals_of
+from hmt_slam_ros.places.area_views import AreaViews
+from hmt_slam_ros.places.chart import NAMES, Chart, ChartNode, chart_of
+from hmt_slam_ros.places.observation_graph import TRACK_NAMES, Landmarks
+from hmt_slam_ros.places.place_graph import DIRECTION_NAMES, Edge
+from hmt_slam_ros.results.hmt_map import read_saved_map
+from hmt_slam_ros.results.log_reading import map_folder
+from hmt_slam_ros.submap.local_mapping import LocalMapping
+
+_FINEST, _COARSEST = 0.005, 10.0  # m
+
+
+def export_grid(
+    directory: Path, to: Path, resolution: float | None = None, area: int | None = None
+) -> tuple[Path, Path]:
+    """Draw the keyframes of the most probable hypothesis anew, as map.pgm and map.yaml.
+
+    :param directory: output folder, or the hmt_map in it or of nodes.
+    :param to: folder, made where it is missing.
+    :param resolution: side of a cell, m; that of the local maps where None.
+    :param area: one area alone, in the frame of that area; the whole map in its own frame where None.
+    :returns: the two files.
+    :raises HmtSlamError: where the folder holds no complete map, no such area, or the resolution is none.
+    """
+    if resolution is not None and not _FINEST <= resolution <= _COARSEST:
+        raise HmtSlamError(f"--resolution {resolution:g} is none for a grid: give {_FINEST:g} to {_COARSEST:g} m")
+    saved = read_saved_map(map_folder(directory))
+    hybrid_map = saved.replica.maps[saved.replica.best]
+    areas = [known for known in hybrid_map.area_ids() if known in saved.area_poses]
+    if area is not None and area not in areas:
+        raise HmtSlamError(f"--area {area} is not in the map: its areas are {', '.join(map(str, areas))}")
+    frames = {area: np.zeros(3)} if area is not None else {known: saved.area_poses[known].mean for known in areas}
+    placed = {
+        keyframe: se2.compose(frame, pose)
+        for known, frame in frames.items()
+        for keyframe, pose in hybrid_map.keyframes(known).items()
+    }
+    scans = [saved.replica.scans[keyframe] for keyframe in placed]
+    settings = saved.configuration.local_map
+    try:
+        to.mkdir(parents=True, exist_ok=True)
+        image = occupancy_image(scans, np.array(list(placed.values())), resolution or settings.cell, settings.max_range)
+        write_map(to, image)
+    except OSError as fault:
+        raise HmtSlamError(f"{to} cannot be written ({fault.strerror}): choose another --grid") from fault
+    return to / "map.pgm", to / "map.yaml"
+
+
+PLACES = "places.json"
+
+
+def write_places(directory: Path, area_poses: Mapping[int, PoseGaussian], chart: Chart) -> Path:
+    """Write ``places.json``, with all numbers in m and rad.
+
+    ``places``, in order, are doors, crossings and ends of hallways, each with its ``name``, the ``area`` in whose frame
+    it is known, ``area_T_place`` and ``map_T_place`` (x, y, theta), heading north, the ``existence``, and the
+    ``openings`` that lead off there with their ``direction`` and ``width``. ``ways`` lead from one place to the next,
+    by their numbers, in both directions: ``distance`` and ``deviation``, and the ``landmarks`` on the way in the order
+    in which they are met, each so far ``along`` it, on its ``track``, with a ``form`` (a corner's heading against the
+    way, an opening's width) and its ``existence``.
+
+    :param area_poses: {area: the belief over ``map_T_area``}.
+    """
+    document = {
+        "places": [_place(chart.name(k), area_poses[node.area], node) for k, node in enumerate(chart.nodes)],
+        "ways": [_way(edge) for edge in chart.edges],
+    }
+    (directory / PLACES).write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+    return directory / PLACES
+
+
+def _place(name: str, frame: PoseGaussian, node: ChartNode) -> dict[str, object]:
+    openings = [
+        {"direction": DIRECTION_NAMES[one.direction], "width": one.landmark.width, "hallway": one.hallway}
+        for one in node.openings
+    ]
+    return {
+        "name": name,
+        "kind": NAMES[node.kind],
+        "area": node.area,
+        "area_T_place": node.pose.tolist(),
+        "map_T_place": se2.compose(frame.mean, node.pose).tolist(),
+        "existence": node.existence,
+        "openings": openings,
+    }
+
+
+def _way(edge: Edge) -> dict[str, object]:
+    return {
+        "start": edge.start,
+        "end": edge.end,
+        "direction": DIRECTION_NAMES[edge.leaving],
+        "distance": edge.distance[0],
+        "deviation": float(np.sqrt(edge.distance[1])),
+        "landmarks": _landmarks(edge.landmarks),
+    }
+
+
+def _landmarks(landmarks: Landmarks) -> list[dict[str, object]]:
+    """In the order in which they are met."""
+    return [
+        {
+            "along": float(landmarks.along[k]),
+            "track": TRACK_NAMES[landmarks.tracks[k]],
+            "form": float(landmarks.forms[k]),
+            "existence": float(landmarks.probabilities[k]),
+        }
+        for k in np.argsort(landmarks.along, kind="stable").tolist()
+    ]
+
+
+TOPOLOGY, LANDMARKS = "topology.graphml", "landmarks.json"
+
+_POSE = ("x", "y", "theta")
+_COVARIANCE = ("xx", "xy", "xt", "yy", "yt", "tt")
+
+
+def export_topology(directory: Path) -> tuple[Path, Path, Path]:
+    """Write ``topology.graphml``, ``landmarks.json`` and ``places.json`` of the most probable hypothesis.
+
+    In the graph a node is an area with ``map_T_area``, the number of its ``keyframes``, whether the ``robot`` was in it
+    at the end, and the probability that it is a ``hallway`` and no room, which is missing where too little is known
+    around it; an edge from a to b an arc with ``a_T_b`` and whether it is a loop ``closure``. Poses are x, y in m and
+    theta in rad, xx to tt the upper triangle of their covariance in the right tangent frame. ``portals`` is the number
+    of openings that the path passed between the two; the most probable one stands with it, as portal_x to portal_tt,
+    ``a_T_portal`` with the heading from a to b, ``portal_width``, m, and the probability of its ``portal_existence``.
+
+    :param directory: output folder of a run.
+    :returns: the three files.
+    :raises HmtSlamError: where the folder holds no complete map.
+    """
+    saved = read_saved_map(directory / "hmt_map")
+    best = saved.replica.best
+    hybrid_map = saved.replica.maps[best]
+    mapping = LocalMapping(saved.configuration)
+    kinds, views = AreaKinds(mapping), AreaViews(mapping, saved.replica.scans).of_map(hybrid_map)
+    landmarks = {area: view.landmarks for area, view in views.items()}
+    # Takes a fifth of a second and a dozen megabytes, for this command alone.
+    import networkx as nx  # noqa: PLC0415
+
+    graph = nx.DiGraph()
+    for area in hybrid_map.area_ids():
+        here = area == saved.replica.areas[best]
+        numbers = _numbers(saved.area_poses[area])
+        keyframes = hybrid_map.keyframes(area)
+        kind = kinds.of([saved.replica.scans[k] for k in keyframes], stacked(keyframes))
+        hallway = {} if kind is None else {"hallway": kind.probability}
+        graph.add_node(area, **numbers, keyframes=len(keyframes), robot=here, **hallway)
+    portals = portals_of(hybrid_map, landmarks, saved.configuration.features)
+    for a, b, arc in hybrid_map.all_arcs():
+        graph.add_edge(a, b, **_numbers(arc.pose), closure=arc.closure, **_annotation(portals, (a, b)))
+    nx.write_graphml_xml(graph, directory / TOPOLOGY)
+    document = {
+        "areas": {str(area): [_landmark(one) for one in own] for area, own in landmarks.items()},
+        "portals": [_portal(portal) for portal in portals],
+    }
+    (directory / LANDMARKS).write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+    chart = chart_of(hybrid_map, views, saved.configuration.features)
+    return directory / TOPOLOGY, directory / LANDMARKS, write_places(directory, saved.area_poses, chart)
+
+
+def _annotation(portals: Sequence[Portal], areas: tuple[int, int]) -> dict[str, float]:
+    """What an arc says of its portals."""
+    own = [portal for portal in portals if portal.areas == areas]
+    if not own:
+        return {"portals": 0}
+    best = max(own, key=lambda portal: portal.existence)
+    pose = {f"portal_{name}": value for name, value in _numbers(best.pose_in_a).items()}
+    return {"portals": len(own), **pose, "portal_width": best.width, "portal_existence": best.existence}
+
+
+def _landmark(landmark: Landmark) -> dict[str, object]:
+    existence = landmark.existence
+    opening = {"width": landmark.width, "width_deviation": landmark.width_deviation} if landmark.width else {}
+    return {
+        "kind": KINDS[landmark.kind],
+        **_numbers(landmark.pose),
+        **opening,
+        "existence": existence.probability,
+        "seen": existence.seen,
+        "missed": existence.missed,
+    }
+
+
+def _portal(portal: Portal) -> dict[str, object]:
+    return {
+        "areas": list(portal.areas),
+        "in_first": _numbers(portal.pose_in_a),
+        "in_second": _numbers(portal.pose_in_b),
+        "width": portal.width,
+        "width_deviation": portal.width_deviation,
+        "existence": portal.existence,
+        "passages": portal.passages,
+    }
+
+
+def _numbers(belief: PoseGaussian) -> dict[str, float]:
+    upper = belief.covariance[np.triu_indices(3)]
+    return dict(zip(_POSE + _COVARIANCE, [*belief.mean.tolist(), *upper.tolist()], strict=True))

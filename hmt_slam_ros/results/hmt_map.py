@@ -1,0 +1,166 @@
+"""hmt_map/: the HMT map as a folder, the same byte for byte for the same run, and read back complete.
+
+Part ``map`` is the map at its best, after the final refinement; the others are the state from which a run goes on, as
+it was before that. docs/map_format.md describes every file and field.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import get_type_hints
+
+from hmt_slam_ros.area_abstraction.partition import AamState
+from hmt_slam_ros.configuration import Configuration, load_configuration
+from hmt_slam_ros.configuration.documents import ros_yaml
+from hmt_slam_ros.errors import HmtSlamError
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.loop_closure.tlca import TlcaState
+from hmt_slam_ros.messages.map_changes import AreaPose
+from hmt_slam_ros.messages.messages import LocalEstimate
+from hmt_slam_ros.messages.replica import Replica, ReplicaState
+from hmt_slam_ros.metric_slam.slam import SlamState
+from hmt_slam_ros.real_time_localization.rtl import RtlState
+from hmt_slam_ros.results.log_reading import LogState
+from hmt_slam_ros.results.record import Record
+from hmt_slam_ros.results.trajectories import Anchored
+from hmt_slam_ros.saved_map.folder import CONFIGURATION, FORMAT, VERSION, File, FolderReader, FolderWriter
+from hmt_slam_ros.topological_inference.tsbi import TsbiState
+
+
+@dataclass(frozen=True, eq=False)
+class RunState:
+    """All that a run in lock-step knows between two records of a log, at first before the first one.
+
+    :ivar log: how far the logs were read.
+    :ivar slam: metric SLAM, and so on the other processes.
+    :ivar recorder: what the output folder needs of the run so far.
+    """
+
+    log: LogState = field(default_factory=LogState)
+    slam: SlamState = field(default_factory=SlamState)
+    aam: AamState = field(default_factory=AamState)
+    tsbi: TsbiState = field(default_factory=TsbiState)
+    tlca: TlcaState = field(default_factory=TlcaState)
+    rtl: RtlState = field(default_factory=RtlState)
+    recorder: Record = field(default_factory=Record)
+
+
+@dataclass(frozen=True, eq=False)
+class MapDocument:
+    """The map at its best.
+
+    :ivar replica: the maps of the live hypotheses; that of the most probable one is refined.
+    :ivar area_poses: ``map_T_area`` of all areas of the most probable hypothesis, ordered by id.
+    :ivar robot: where the robot was last.
+    :ivar scans: where the scans of all logs were taken; none in a map that nodes saved.
+    """
+
+    replica: ReplicaState
+    area_poses: tuple[AreaPose, ...]
+    robot: LocalEstimate
+    scans: Anchored
+
+
+@dataclass(frozen=True)
+class ChainState:
+    """Where the messages between the processes go on.
+
+    :ivar events: keyframe events up to now, which is the number of the next one.
+    """
+
+    events: int
+
+
+PARTS: Mapping[str, type] = get_type_hints(RunState)
+"""The parts of the state from which a run goes on."""
+
+
+@dataclass(frozen=True, eq=False)
+class SavedMap:
+    """A map as read back.
+
+    :ivar replica: scans and maps of the live hypotheses with their probabilities.
+    :ivar area_poses: {area: belief over ``map_T_area``} of the most probable hypothesis.
+    :ivar configuration: that of the run.
+    :ivar scans: where the scans of all logs were taken, if that is known.
+    """
+
+    replica: Replica
+    area_poses: dict[int, PoseGaussian]
+    configuration: Configuration
+    scans: Anchored = field(default_factory=Anchored.none)
+
+
+class MapWriter:
+    """Writes a map into a folder: first the state, if there is one to go on from, last the map at its best."""
+
+    def __init__(self, directory: Path) -> None:
+        """:param directory: to be made."""
+        self._folder = FolderWriter(directory)
+
+    def write_state(self, state: RunState) -> None:
+        """Write what a run goes on from."""
+        for name in PARTS:
+            self._folder.write(name, getattr(state, name))
+        self._folder.write("chain", ChainState(state.slam.events))
+
+    def write_slam(self, state: SlamState) -> None:
+        """Write metric SLAM's part of what nodes go on from; :meth:`join` takes those of the others."""
+        self._folder.write("slam", state)
+        self._folder.write("chain", ChainState(state.events))
+
+    def join(self, files: Iterable[File]) -> None:
+        """Take in files that others wrote into the folder."""
+        self._folder.join(files)
+
+    def write_map(
+        self,
+        replica: Replica,
+        area_poses: Mapping[int, PoseGaussian],
+        robot: LocalEstimate,
+        placed: Anchored | None = None,
+    ) -> None:
+        """Write the map at its best.
+
+        :param area_poses: {area: belief over ``map_T_area``} of the most probable hypothesis.
+        :param robot: the last of what metric SLAM said.
+        :param placed: where the scans of all logs were taken, where that is known.
+        """
+        mapped = sorted({k for own in replica.maps.values() for area in own.area_ids() for k in own.keyframes(area)})
+        scans = {keyframe: replica.scans[keyframe] for keyframe in mapped}
+        kept = Replica(scans, replica.maps, replica.probabilities, replica.areas)
+        poses = tuple(AreaPose(area, pose) for area, pose in sorted(area_poses.items()))
+        self._folder.write("map", MapDocument(kept.state, poses, robot, placed or Anchored.none()))
+
+    def finish(self, configuration: Configuration) -> None:
+        """Write the configuration, and last the manifest."""
+        self._folder.write_text(CONFIGURATION, ros_yaml(configuration))
+        self._folder.finish(FORMAT, VERSION)
+
+
+def read_saved_map(directory: Path) -> SavedMap:
+    """Read the map at its best.
+
+    :raises HmtSlamError: where the folder holds no map, one of another version, or a damaged one.
+    """
+    document = FolderReader(directory, FORMAT, VERSION).read("map", MapDocument)
+    poses = {entry.area: entry.pose for entry in document.area_poses}
+    configuration = load_configuration(directory / CONFIGURATION)
+    return SavedMap(Replica.of(document.replica), poses, configuration, document.scans)
+
+
+def read_run_state(directory: Path) -> tuple[RunState, Configuration]:
+    """Read what a run goes on from, and the configuration with which it was made.
+
+    :raises HmtSlamError: as :func:`read_saved_map`, and where the map was saved without its state.
+    """
+    folder = FolderReader(directory, FORMAT, VERSION)
+    if not {f"{part}.json" for part in PARTS} <= folder.names:
+        raise HmtSlamError(
+            f"{directory} holds a map without the state of a run, so that none can go on from it: give one that "
+            "hmt_slam map wrote, or start nodes from one that nodes saved"
+        )
+    state = RunState(**{name: folder.read(name, kind) for name, kind in PARTS.items()})
+    return state, load_configuration(directory / CONFIGURATION)

@@ -1,0 +1,240 @@
+"""Pictures of an output folder, from its files alone."""
+
+from __future__ import annotations
+
+import colorsys
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.backend_bases import RendererBase
+from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib.figure import Figure
+from matplotlib.patches import Ellipse
+from matplotlib.ticker import MaxNLocator
+from numpy.typing import NDArray
+
+from hmt_slam_ros.errors import HmtSlamError
+from hmt_slam_ros.evaluation import read_tum
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.grids.occupancy_map import OccupancyImage, read_map
+from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
+from hmt_slam_ros.results.hmt_map import SavedMap, read_saved_map
+from hmt_slam_ros.results.report import read_table
+
+Colour = tuple[float, float, float]
+
+_DPI = 150
+_CLOSURE, _ARC, _PATH = "#d62728", "#1f3b70", "#555555"
+_GOLDEN = 0.6180339887498949
+
+
+def plot_all(directory: Path) -> list[Path]:
+    """Draw map.png, pmf.png and cost.png.
+
+    :returns: the pictures.
+    :raises HmtSlamError: where the folder is no complete output folder.
+    """
+    return [plot_map(directory), plot_probabilities(directory), plot_cost(directory)]
+
+
+def plot_map(directory: Path) -> Path:
+    """map.png: the occupancy grid with path, areas, arcs and the 95 % ellipses of the areas' origins."""
+    image, saved = read_map(directory), read_saved_map(directory / "hmt_map")
+    path = read_tum(directory / "trajectory.tum").poses[:, :2]
+    height, width = (size * image.resolution for size in image.pixels.shape)
+    figure = Figure(figsize=_figure_size(width, height), layout="constrained")
+    axes = figure.add_subplot()
+    hybrid_map = saved.replica.maps[saved.replica.best]
+    _draw_grid(axes, image)
+    axes.plot(path[:, 0], path[:, 1], color=_PATH, linewidth=0.8, label="path", zorder=2)
+    _draw_keyframes(axes, hybrid_map, saved.area_poses)
+    _draw_arcs(axes, hybrid_map, saved.area_poses)
+    _draw_areas(axes, saved, 0.01 * max(width, height))
+    axes.set_title(_map_title(hybrid_map, path), fontsize=9)
+    axes.legend(loc="best", fontsize=7, framealpha=0.9)
+    return _save(figure, directory / "map.png")
+
+
+def _figure_size(width: float, height: float) -> tuple[float, float]:
+    longest = 11.0  # inches
+    return max(4.5, longest * min(1.0, width / height)), max(3.5, longest * min(1.0, height / width))
+
+
+def _draw_grid(axes: Axes, image: OccupancyImage) -> None:
+    axes.add_artist(_Grid(axes, image.pixels))
+    height, width = image.pixels.shape
+    left, bottom = image.origin
+    axes.set_xlim(left, left + width * image.resolution)
+    axes.set_ylim(bottom, bottom + height * image.resolution)
+    axes.set_aspect("equal")
+    axes.set_xlabel("x [m]")
+    axes.set_ylabel("y [m]")
+    axes.tick_params(labelsize=7)
+
+
+class _Grid(Artist):
+    """The occupancy grid, which fills the axes; ``imshow`` takes 60 MB more, for colours and interpolation."""
+
+    def __init__(self, axes: Axes, pixels: NDArray[np.uint8]) -> None:
+        super().__init__()
+        self._filled, self._pixels = axes, pixels
+        self.set_zorder(0)
+
+    def draw(self, renderer: RendererBase) -> None:
+        """Paint every pixel of the picture in the darkest gray of the cells that it shows, so that walls stay."""
+        box = self._filled.get_window_extent(renderer)
+        left, bottom = round(box.x0), round(box.y0)
+        width, height = round(box.x1) - left, round(box.y1) - bottom
+        gray = _darkest(_darkest(self._pixels, height).T, width).T[::-1]
+        colours = np.full((height, width, 4), 255, np.uint8)
+        colours[..., :3] = gray[..., None]
+        renderer.draw_image(renderer.new_gc(), left, bottom, colours)
+
+
+def _darkest(pixels: NDArray[np.uint8], count: int) -> NDArray[np.uint8]:
+    """As many rows as asked for: the minimum of the rows (n, m) that each covers, or the nearest where rows repeat."""
+    starts = np.arange(count) * len(pixels) // count
+    return pixels[starts] if count >= len(pixels) else np.minimum.reduceat(pixels, starts)
+
+
+def _draw_keyframes(axes: Axes, hybrid_map: HybridMap, area_poses: Mapping[int, PoseGaussian]) -> None:
+    for area in hybrid_map.area_ids():
+        poses = np.array(list(hybrid_map.keyframes(area).values())).reshape(-1, 3)
+        points = se2.transform(area_poses[area].mean, poses[:, :2])
+        axes.plot(points[:, 0], points[:, 1], ".", color=_colour(area), markersize=4, zorder=3)
+
+
+def _draw_arcs(axes: Axes, hybrid_map: HybridMap, area_poses: Mapping[int, PoseGaussian]) -> None:
+    for closure, colour, label in ((False, _ARC, "arc"), (True, _CLOSURE, "arc that closed a loop")):
+        ends = [
+            (area_poses[a].mean[:2], area_poses[b].mean[:2])
+            for a, b, arc in hybrid_map.all_arcs()
+            if arc.closure == closure
+        ]
+        if ends:
+            axes.add_collection(LineCollection(ends, colors=colour, linewidths=1.2, label=label, zorder=4))
+
+
+def _draw_areas(axes: Axes, saved: SavedMap, visible: float) -> None:
+    """Origins with their ids and ellipses; ellipses too small to see are drawn larger by a round factor, in metres."""
+    ellipses = {area: belief.ellipse() for area, belief in saved.area_poses.items()}
+    largest = max(ellipse.longer for ellipse in ellipses.values())
+    factor = 1 if largest <= 0.0 else int(10 ** np.clip(np.ceil(np.log10(visible / largest)), 0, 2))
+    for area, ellipse in ellipses.items():
+        x, y = saved.area_poses[area].mean[:2].tolist()
+        axes.add_patch(
+            Ellipse(
+                (x, y),
+                2.0 * factor * ellipse.longer,
+                2.0 * factor * ellipse.shorter,
+                zorder=5,
+                angle=float(np.degrees(ellipse.angle)),
+                facecolor=(*_colour(area), 0.25),
+                edgecolor=_colour(area),
+                linewidth=1.0,
+            )
+        )
+        axes.annotate(
+            str(area),
+            (x, y),
+            ha="center",
+            va="center",
+            fontsize=7,
+            fontweight="bold",
+            zorder=6,
+            bbox={"boxstyle": "circle,pad=0.25", "facecolor": "white", "edgecolor": _colour(area), "linewidth": 1.5},
+        )
+    enlarged = f", enlarged {factor} times" if factor > 1 else ""
+    axes.plot([], [], "o", markerfacecolor="none", color="black", label=f"area, 95 % ellipse{enlarged}")
+
+
+def _map_title(hybrid_map: HybridMap, path: NDArray[np.float64]) -> str:
+    arcs = [arc for _, _, arc in hybrid_map.all_arcs()]
+    length = float(np.hypot(*np.diff(path, axis=0).T).sum())
+    closures = sum(arc.closure for arc in arcs)
+    return f"areas: {len(hybrid_map.area_ids())}   arcs: {len(arcs)}   loop closures: {closures}   path: {length:.0f} m"
+
+
+def plot_probabilities(directory: Path) -> Path:
+    """pmf.png: the distribution over the live topologies at every keyframe event, Eq. (14), and how many there are."""
+    table = _table(directory / "pmf.csv")
+    if not table["stamp"].size:
+        raise HmtSlamError(f"{directory / 'pmf.csv'} holds no probabilities: map the log again")
+    minutes = (table["stamp"] - table["stamp"][0]) / 60e9
+    firsts = np.flatnonzero(np.diff(table["keyframe"], prepend=-1))
+    figure = Figure(figsize=(11.0, 5.0), layout="constrained")
+    upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
+    _draw_bars(upper, table, minutes, firsts)
+    accepted = np.flatnonzero(table["accepted"])
+    upper.plot(minutes[accepted], np.full(accepted.size, 1.03), "v", color="black", markersize=4, label="accepted")
+    upper.set_ylabel("P(topology | data)")
+    upper.set_ylim(0.0, 1.06)
+    upper.legend(loc="lower left", fontsize=7)
+    lower.stairs(np.diff(np.append(firsts, minutes.size)), _edges(minutes[firsts]), color=_ARC, baseline=None)
+    lower.yaxis.set_major_locator(MaxNLocator(integer=True))
+    lower.set_ylabel("live topologies")
+    lower.set_xlabel("time [min]")
+    return _save(figure, directory / "pmf.png")
+
+
+def _draw_bars(
+    axes: Axes, table: Mapping[str, NDArray[np.float64]], minutes: NDArray[np.float64], firsts: NDArray[np.intp]
+) -> None:
+    """One stack a keyframe event, from it to the next, one colour a topology."""
+    counts = np.diff(np.append(firsts, minutes.size))
+    tops = np.cumsum(table["probability"])
+    tops -= np.repeat(tops[firsts] - table["probability"][firsts], counts)
+    bottoms = tops - table["probability"]
+    edges = _edges(minutes[firsts])
+    left, right = edges[:-1].repeat(counts), edges[1:].repeat(counts)
+    corners = np.stack([(left, bottoms), (right, bottoms), (right, tops), (left, tops)]).transpose(2, 0, 1)
+    colours = [_colour(int(hypothesis)) for hypothesis in table["hypothesis"]]
+    axes.add_collection(PolyCollection(list(corners), facecolors=colours, edgecolors="none"))
+    axes.plot([], [], "s", color="none", markeredgecolor="gray", label="white: not examined or dropped")
+    axes.set_xlim(edges[0], edges[-1])
+
+
+def _edges(starts: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Starts of all bars and the end of the last one, which is as wide as most are."""
+    return np.append(starts, starts[-1] + (float(np.median(np.diff(starts))) if starts.size > 1 else 1.0))
+
+
+def plot_cost(directory: Path) -> Path:
+    """cost.png: what every process computed for every scan."""
+    table = _table(directory / "cost.csv")
+    figure = Figure(figsize=(11.0, 5.0), layout="constrained")
+    axes = figure.add_subplot()
+    for k, (name, cost) in enumerate(table.items()):
+        if cost.size:
+            spread = f"p95 {np.percentile(cost, 95):.2f}, max {cost.max():.1f} ms"
+            label = f"{name.removesuffix('_ms')}: mean {cost.mean():.2f}, {spread}"
+            busy = np.flatnonzero(cost)
+            axes.plot(busy, cost[busy], ".", markersize=3, color=f"C{k}", label=label)
+    axes.set_yscale("log")
+    axes.set_xlabel("scan")
+    axes.set_ylabel("computing time [ms]")
+    axes.grid(alpha=0.3)
+    if table:
+        axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=3, fontsize=7)
+    return _save(figure, directory / "cost.png")
+
+
+def _table(path: Path) -> dict[str, NDArray[np.float64]]:
+    try:
+        return read_table(path)
+    except (OSError, ValueError, StopIteration) as fault:
+        raise HmtSlamError(f"{path} is missing or damaged: map the log again") from fault
+
+
+def _colour(number: int) -> Colour:
+    """Colours of neighbouring numbers are far apart: hues by the golden section, in two shades."""
+    return colorsys.hsv_to_rgb((0.58 + number * _GOLDEN) % 1.0, 0.85, 0.85 if number % 2 else 0.65)
+
+
+def _save(figure: Figure, path: Path) -> Path:
+    figure.savefig(path, dpi=_DPI)
+    return path

@@ -1,0 +1,10 @@
+"""The five processes and the robot as ROS 2 nodes: thin shells that convert, call the process once, and publish."""
+
+import sys
+
+from hmt_slam_ros.process_settings import end_when_told, settle
+
+settle()
+# So Python calls a program of this package, `python -m hmt_slam_ros.ros.slam_node`, while it loads the package.
+if sys.argv[0] == "-m":
+    end_when_told()

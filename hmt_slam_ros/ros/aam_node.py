@@ -1,0 +1,34 @@
+"""Area abstraction as a node."""
+
+from __future__ import annotations
+
+import sys
+
+from hmt_slam_ros.configuration import Configuration
+from hmt_slam_ros.messages.messages import AreaEvents
+from hmt_slam_ros.messages.routing import Remembering
+from hmt_slam_ros.ros.execution import run
+from hmt_slam_ros.ros.initial_state import Beginning
+from hmt_slam_ros.ros.map_services import spin
+from hmt_slam_ros.ros.process_node import ProcessNode
+
+
+def make() -> ProcessNode:
+    """The node ``aam``."""
+    return ProcessNode("aam", _make_process, (AreaEvents,))
+
+
+def _make_process(configuration: Configuration, beginning: Beginning) -> Remembering:
+    from hmt_slam_ros.area_abstraction.aam import Aam  # noqa: PLC0415  takes time, in which a signal has to be heard
+    from hmt_slam_ros.area_abstraction.partition import AamState  # noqa: PLC0415
+
+    return Aam(configuration, beginning.part("aam", AamState))
+
+
+def main() -> None:
+    """Run the node."""
+    sys.exit(run(make, spin))
+
+
+if __name__ == "__main__":
+    main()

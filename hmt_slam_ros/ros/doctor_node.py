@@ -1,0 +1,284 @@
+"""A node that listens for a while to a running system, for ``hmt_slam doctor --live``."""
+
+from __future__ import annotations
+
+import heapq
+import os
+import time
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from nav_msgs.msg import Odometry as OdometryMessage
+from rcl_interfaces.msg import ParameterType, ParameterValue
+from rcl_interfaces.srv import GetParameters
+from rclpy.client import Client
+from rclpy.context import Context
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.node import Node
+from rclpy.qos import HistoryPolicy, QoSCompatibility, QoSProfile, ReliabilityPolicy, qos_check_compatible
+from rclpy.task import Future
+from sensor_msgs.msg import LaserScan
+from std_msgs.msg import String
+
+from hmt_slam_ros.doctor import running
+from hmt_slam_ros.doctor.examination import findings, sorted_findings
+from hmt_slam_ros.doctor.finding import Finding
+from hmt_slam_ros.doctor.gathering import Gatherer
+from hmt_slam_ros.doctor.running import Mismatch, Running, Told, Topic
+from hmt_slam_ros.doctor.statistics import JointCollector, Messages, ScanHead
+from hmt_slam_ros.errors import HmtSlamError
+from hmt_slam_ros.logs.mounting import FrameTree, Mounting, frame_name, planar_mounting
+from hmt_slam_ros.logs.records import LogRecord
+from hmt_slam_ros.logs.stamps import running_stamps
+from hmt_slam_ros.ros import conversions, topics
+from hmt_slam_ros.ros.diagnostics import STATE
+from hmt_slam_ros.ros.topics import DIAGNOSTICS
+from hmt_slam_ros.ros.transforms import TFMessage
+from hmt_slam_ros.sensors import Odometry, Scan
+
+_REFUSED = (rclpy_implementation.RCLError, rclpy_implementation.UnknownROSArgsError)
+# Heard by best effort, which every publisher offers.
+_ANYHOW = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
+# Nodes that are there at all are found in this time, s.
+_DISCOVERY = 5.0
+_SIMULATED, _LASER_POSE = "use_sim_time", "laser_pose"
+_ALSO = ("map", "pose", "hmt/keyframes", "hmt/hypotheses", "hmt/accepted")
+_ODOM_FRAME, _BASE_FRAME = "odom", "base_link"
+_MAP_TO_ODOM = "rtl"  # the node of ours that publishes that
+
+
+def examine_running(seconds: float, ros_arguments: Sequence[str]) -> list[Finding]:
+    """Listen to the running system and judge it.
+
+    :param ros_arguments: behind ``--ros-args``.
+    :raises HmtSlamError: for a time that is none, or arguments that ROS does not take.
+    """
+    if not 0.0 < seconds < float("inf"):
+        raise HmtSlamError(f"--seconds {seconds:g} is no time to listen: give more than 0")
+    with _node(ros_arguments) as (node, executor):
+        begin = time.monotonic()
+        while not node.others and time.monotonic() < begin + _DISCOVERY:
+            executor.spin_once(timeout_sec=0.05)
+        begin = time.monotonic()
+        while time.monotonic() < begin + seconds:
+            executor.spin_once(timeout_sec=0.05)
+            node.ask()
+        return sorted_findings(node.findings(seconds))
+
+
+@contextmanager
+def _node(ros_arguments: Sequence[str]) -> Iterator[tuple[DoctorNode, SingleThreadedExecutor]]:
+    context = Context()
+    try:
+        rclpy.init(args=["--ros-args", *ros_arguments], context=context)
+        node = DoctorNode(context)
+    except _REFUSED as fault:
+        raise HmtSlamError(f"--ros-args {' '.join(ros_arguments)} cannot be ({fault}): see ros2 run --help") from fault
+    executor = SingleThreadedExecutor(context=context)
+    executor.add_node(node)
+    try:
+        yield node, executor
+    except ExternalShutdownException:
+        raise KeyboardInterrupt from None
+    finally:
+        executor.shutdown()
+        node.destroy_node()
+        context.try_shutdown()
+
+
+class DoctorNode(Node):
+    """Hears sensors, transforms and diagnostics, and looks at the graph."""
+
+    def __init__(self, context: Context) -> None:
+        super().__init__(f"doctor_{os.getpid()}", context=context, enable_rosout=False)
+        self._scans: list[LaserScan] = []
+        self._readings: list[Odometry] = []
+        self._odometry_frames = ("", "")
+        self._by_transform: dict[str, list[Odometry]] = defaultdict(list)
+        self._counts: dict[str, int] = defaultdict(int)
+        self._away: dict[str, list[float]] = defaultdict(list)
+        self._tree, self._joints = FrameTree(), JointCollector()
+        self._last_joints: dict[tuple[str, str], tuple[int, bytes]] = {}
+        self._doubled: dict[str, int] = defaultdict(int)
+        self._told: dict[str, Told] = {}
+        self._askable: dict[str, Client] = {}
+        self._asked: dict[str, dict[str, Future]] = {}
+        self.create_subscription(LaserScan, running.SCAN, self._hear_scan, _ANYHOW)
+        self.create_subscription(OdometryMessage, running.ODOM, self._hear_odometry, _ANYHOW)
+        self.create_subscription(DiagnosticArray, DIAGNOSTICS, self._hear_diagnostics, _ANYHOW)
+        self.create_subscription(String, running.ESTIMATES, self._hear_estimate, _ANYHOW)
+        if TFMessage is not None:
+            self.create_subscription(TFMessage, running.TF, self._hear_moving, _ANYHOW)
+            self.create_subscription(TFMessage, running.TF_STATIC, self._hear_static, topics.TF_STATIC)
+
+    @property
+    def others(self) -> tuple[str, ...]:
+        """Names of all nodes but this one."""
+        return tuple(name for name in self.get_node_names() if name != self.get_name())
+
+    def ask(self) -> None:
+        """Ask every node that was not asked so far for the parameters that matter here."""
+        for name, namespace in self.get_node_names_and_namespaces():
+            full = f"{namespace.rstrip('/')}/{name}"
+            if full in self._asked or name == self.get_name():
+                continue
+            if full not in self._askable:
+                self._askable[full] = self.create_client(GetParameters, f"{full}/get_parameters")
+            client = self._askable[full]
+            if client.service_is_ready():
+                # One by one: a node that lacks one of them answers nothing to all.
+                self._asked[full] = {
+                    name: client.call_async(GetParameters.Request(names=[name])) for name in (_SIMULATED, _LASER_POSE)
+                }
+
+    def findings(self, seconds: float) -> list[Finding]:
+        """All that was found."""
+        system = self._running(seconds)
+        found = running.findings(system)
+        if not system.topics[running.SCAN].heard:
+            return found
+        return [*found, *findings(self._gathered().finish("the running system", self._messages()))]
+
+    def _hear_scan(self, message: LaserScan) -> None:
+        self._note(running.SCAN, conversions.stamp_of(message.header.stamp))
+        self._scans.append(message)
+
+    def _hear_odometry(self, message: OdometryMessage) -> None:
+        self._note(running.ODOM, conversions.stamp_of(message.header.stamp))
+        self._odometry_frames = (frame_name(message.header.frame_id), frame_name(message.child_frame_id))
+        self._readings.append(conversions.odometry_from(message))
+
+    def _note(self, topic: str, stamp: int) -> None:
+        self._counts[topic] += 1
+        self._away[topic].append(1e-9 * (time.time_ns() - stamp))
+
+    def _hear_estimate(self, _: String) -> None:
+        self._counts[running.ESTIMATES] += 1
+
+    def _hear_diagnostics(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            level = status.level[0] if isinstance(status.level, bytes) else int(status.level)
+            state = next((entry.value for entry in status.values if entry.key == STATE), "")
+            self._told[status.name] = Told(status.name, level, status.message, state)
+
+    def _hear_static(self, message: Any) -> None:  # noqa: ANN401  a TFMessage, where there is one
+        self._counts[running.TF_STATIC] += 1
+        self._tree.add(message)
+        self._joints.add(running.TF_STATIC, message)
+
+    def _hear_moving(self, message: Any) -> None:  # noqa: ANN401  a TFMessage, where there is one
+        self._counts[running.TF] += 1
+        self._joints.add(running.TF, message)
+        for joint in message.transforms:
+            parent, child = frame_name(joint.header.frame_id), frame_name(joint.child_frame_id)
+            stamp = conversions.stamp_of(joint.header.stamp)
+            move, turn = joint.transform.translation, joint.transform.rotation
+            value = np.array([move.x, move.y, turn.z, turn.w])
+            last = self._last_joints.get((parent, child))
+            if last is not None and last[0] == stamp and last[1] != value.tobytes():
+                self._doubled[f"{parent} -> {child}"] += 1
+            self._last_joints[parent, child] = (stamp, value.tobytes())
+            if parent == _ODOM_FRAME:
+                heading = 2.0 * float(np.arctan2(turn.z, turn.w))
+                self._by_transform[child].append(Odometry(stamp, np.array([move.x, move.y, heading])))
+
+    def _running(self, seconds: float) -> Running:
+        names = (running.SCAN, running.ODOM, running.TF, running.TF_STATIC, running.CLOCK, running.ESTIMATES)
+        topics = {name: self._topic(name, self._counts[name]) for name in names}
+        topics |= {name: self._topic(name, None) for name in _ALSO}
+        clock = bool(topics[running.CLOCK].publishers)
+        return Running(
+            seconds,
+            topics,
+            self.others,
+            tuple(sorted(full.lstrip("/") for full in self._asked if self._answer(full, _SIMULATED).bool_value)),
+            tuple(self._told.values()),
+            {} if clock else {name: float(np.median(away)) for name, away in self._away.items()},
+            dict(self._doubled),
+            self._missing_laser(),
+        )
+
+    def _topic(self, name: str, heard: int | None) -> Topic:
+        full = self.resolve_topic_name(name)
+        publishers = self.get_publishers_info_by_topic(full)
+        subscribers = [end for end in self.get_subscriptions_info_by_topic(full) if end.node_name != self.get_name()]
+        mismatches = []
+        for publisher in publishers:
+            for subscriber in subscribers:
+                fit, reason = qos_check_compatible(publisher.qos_profile, subscriber.qos_profile)
+                if fit == QoSCompatibility.ERROR:
+                    mismatches.append(Mismatch(publisher.node_name, subscriber.node_name, reason.strip().rstrip(".;")))
+        return Topic(heard, tuple(end.node_name for end in publishers), tuple(mismatches))
+
+    def _answer(self, full: str, parameter: str) -> ParameterValue:
+        """What a node has for a parameter; a value that is not set where it has none."""
+        future = self._asked[full][parameter]
+        answer = future.result() if future.done() and future.exception() is None else None
+        return answer.values[0] if answer is not None and answer.values else ParameterValue()
+
+    def _base(self) -> str:
+        return self._odometry_frames[1] or next(iter(self._by_transform), _BASE_FRAME)
+
+    def _given_laser(self) -> Mounting | None:
+        """Where the parameter of slam says that the laser is."""
+        for full in self._asked:
+            value = self._answer(full, _LASER_POSE)
+            if full.endswith("/slam") and value.type == ParameterType.PARAMETER_DOUBLE_ARRAY:
+                return Mounting(np.array(value.double_array_value), 1.0)
+        return None
+
+    def _mounting(self, frame: str) -> Mounting | None:
+        given, pose = self._given_laser(), self._tree.pose(self._base(), frame)
+        return given if given is not None or pose is None else planar_mounting(pose, f"the laser {frame!r}")
+
+    def _missing_laser(self) -> str:
+        missing = sorted({frame for frame in self._scan_frames() if self._mounting(frame) is None})
+        if not missing:
+            return ""
+        return (
+            f"No transform leads from {self._base()!r} to the scans' frame {missing[0]!r} on /tf_static: start "
+            "robot_state_publisher or static_transform_publisher, or set the parameter laser_pose of slam."
+        )
+
+    def _scan_frames(self) -> set[str]:
+        return {frame_name(message.header.frame_id) for message in self._scans}
+
+    def _gathered(self) -> Gatherer:
+        """The measurements in the order of their stamps, each kind as it came."""
+        mountings = {frame: self._mounting(frame) or Mounting(np.zeros(3), 1.0) for frame in self._scan_frames()}
+        scans: list[Scan | Odometry] = [self._scan(message, mountings) for message in self._scans]
+        readings: list[Scan | Odometry] = [*(self._readings or self._by_transform[self._base()])]
+        ordered = list(heapq.merge(readings, scans, key=lambda measurement: measurement.stamp))
+        sources = [measurement.stamp for measurement in ordered]
+        is_scan = [isinstance(measurement, Scan) for measurement in ordered]
+        stamps = running_stamps(sources, is_scan, [False] * len(ordered))
+        gatherer = Gatherer()
+        for source, stamp, measurement in zip(sources, stamps.tolist(), ordered, strict=True):
+            gatherer.add(LogRecord(source, _stamped(measurement, stamp)))
+        return gatherer
+
+    def _scan(self, message: LaserScan, mountings: dict[str, Mounting]) -> Scan:
+        return conversions.scan_from(message, *mountings[frame_name(message.header.frame_id)])
+
+    def _messages(self) -> Messages:
+        heads: dict[ScanHead, int] = defaultdict(int)
+        for scan in self._scans:
+            frame = frame_name(scan.header.frame_id)
+            heads[ScanHead(frame, scan.angle_min, scan.angle_max, scan.angle_increment, len(scan.ranges))] += 1
+        frames = self._odometry_frames if self._readings else (_ODOM_FRAME, self._base())
+        types = {name: kind[0] for name, kind in self.get_topic_names_and_types()}
+        joints = self._joints.joints
+        if _MAP_TO_ODOM in self.others:
+            joints = tuple(joint for joint in joints if joint.child != frames[0])
+        return Messages(dict(self._counts), types, dict(heads), frames, joints)
+
+
+def _stamped(measurement: Scan | Odometry, stamp: int) -> Scan | Odometry:
+    return measurement if measurement.stamp == stamp else replace(measurement, stamp=stamp)

@@ -1,0 +1,181 @@
+"""The map for people and other programs to see: an occupancy grid, and areas and arcs as markers."""
+
+from __future__ import annotations
+
+import math
+from array import array
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from geometry_msgs.msg import Point, Vector3
+from nav_msgs.msg import MapMetaData, OccupancyGrid
+from numpy.typing import NDArray
+from std_msgs.msg import ColorRGBA
+from visualization_msgs.msg import Marker, MarkerArray
+
+from hmt_slam_ros.configuration import Configuration
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.geometry.gaussian import ELLIPSE_95, PoseGaussian
+from hmt_slam_ros.hybrid_map.shortest_path import tells_nothing
+from hmt_slam_ros.messages.map_changes import AreaPose
+from hmt_slam_ros.messages.messages import Accepted, Hypotheses, Keyframe, Message
+from hmt_slam_ros.messages.replica import Replica, ReplicaState
+from hmt_slam_ros.ros.conversions import header, quaternion, time_message
+
+if TYPE_CHECKING:
+    from hmt_slam_ros.results.hmt_map import MapDocument
+
+_AREA = ColorRGBA(r=0.12, g=0.47, b=0.71, a=0.9)
+_ROBOT_AREA = ColorRGBA(r=0.84, g=0.15, b=0.16, a=0.9)
+_ARC = ColorRGBA(r=0.3, g=0.3, b=0.3, a=0.9)
+_CLOSURE = ColorRGBA(r=1.0, g=0.5, b=0.05, a=0.9)
+_TEXT = ColorRGBA(a=1.0)
+_UNCERTAIN = 0.3  # opacity of ellipses
+_VISIBLE = 1e-3  # m, since RViz complains of what has no size
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """What there is to be drawn.
+
+    :ivar stamp: of the newest keyframe, ns, 0 before the first.
+    :ivar replica: the maps of the live hypotheses.
+    :ivar area_poses: ``map_T_area`` of the areas of the most probable hypothesis.
+    """
+
+    stamp: int = 0
+    replica: ReplicaState = field(default_factory=ReplicaState)
+    area_poses: tuple[AreaPose, ...] = ()
+
+    @classmethod
+    def of(cls, known: MapDocument | None) -> Seen:
+        """Of a saved map, or of nothing."""
+        return cls() if known is None else cls(known.robot.stamp, known.replica, known.area_poses)
+
+
+class MapView:
+    """Follows the chain, and draws the most probable hypothesis.
+
+    :ivar stamp: of the newest keyframe, ns.
+    :ivar version: number of changes so far.
+    """
+
+    def __init__(self, configuration: Configuration, frame: str, seen: Seen) -> None:
+        """:param seen: what to begin with."""
+        self.stamp = seen.stamp
+        self.version = 1 if seen.area_poses else 0
+        self._settings, self._frame = configuration.local_map, frame
+        self._replica = Replica.of(seen.replica)
+        self._poses = {entry.area: entry.pose for entry in seen.area_poses}
+
+    @property
+    def seen(self) -> Seen:
+        """All that is drawn, as a value."""
+        poses = tuple(AreaPose(area, pose) for area, pose in self._poses.items())
+        return Seen(self.stamp, self._replica.state, poses)
+
+    def hear(self, message: Message) -> None:
+        """Take in a message of the chain."""
+        if isinstance(message, Keyframe | Hypotheses | Accepted):
+            self._replica.hear(message)
+        if isinstance(message, Keyframe):
+            self.stamp = message.scan.stamp
+        elif isinstance(message, Accepted):
+            if message.global_poses:
+                self._poses = {area.area: area.pose for area in message.global_poses}
+            self.version += 1
+
+    def _areas(self) -> list[int]:
+        return [area for area in self._replica.maps[self._replica.best].area_ids() if area in self._poses]
+
+    def grid(self) -> OccupancyGrid | None:
+        """The occupancy grid, None while there is no keyframe."""
+        from hmt_slam_ros.grids.occupancy_map import occupancy_image  # noqa: PLC0415  only where someone looks
+
+        best = self._replica.maps[self._replica.best]
+        placed = {
+            keyframe: se2.compose(self._poses[area].mean, pose)
+            for area in self._areas()
+            for keyframe, pose in best.keyframes(area).items()
+        }
+        if not placed:
+            return None
+        scans = [self._replica.scans[keyframe] for keyframe in placed]
+        poses = np.array(list(placed.values()))
+        image = occupancy_image(scans, poses, self._settings.cell, self._settings.max_range)
+        return grid_message(self.stamp, self._frame, image)
+
+    def graph(self) -> MarkerArray:
+        """Areas as labelled discs, arcs as lines, both with 95 % ellipses.
+
+        The robot's area and the arcs that closed a loop stand out. An arc's ellipse, in its middle, is that of one
+        area seen from the other; an area's, around it, that of its place in the map. Its text says it in words. There
+        is none where that could be any.
+        """
+        best, areas = self._replica.maps[self._replica.best], self._areas()
+        here = self._replica.areas[self._replica.best]
+        markers = [Marker(action=Marker.DELETEALL)]
+        for area in areas:
+            belief, color = self._poses[area], _ROBOT_AREA if area == here else _AREA
+            disc = self._marker("areas", area, Marker.CYLINDER, (0.6, 0.6, 0.1), color)
+            label = self._marker("labels", area, Marker.TEXT_VIEW_FACING, (0.0, 0.0, 0.5), _TEXT)
+            at = disc.pose.position = _point(belief.mean)
+            label.pose.position, label.text = Point(x=at.x, y=at.y, z=0.6), str(area)
+            text = f"Area {area} in the map: {_deviations(belief)}"
+            markers += [disc, label, *self._ellipse("area_uncertainty", area, belief, at, color, text)]
+        for number, (a, b, arc) in enumerate(best.all_arcs()):
+            if a in self._poses and b in self._poses:
+                color, group = (_CLOSURE, "closures") if arc.closure else (_ARC, "arcs")
+                line = self._marker(group, number, Marker.LINE_STRIP, (0.08, 0.0, 0.0), color)
+                start, end = line.points = [_point(self._poses[a].mean), _point(self._poses[b].mean)]
+                seen = PoseGaussian.exactly(self._poses[a].mean).compose(arc.pose)
+                middle = Point(x=0.5 * (start.x + end.x), y=0.5 * (start.y + end.y))
+                text = f"Area {b} seen from {a}: {_deviations(arc.pose)}{', closed a loop' * arc.closure}"
+                markers += [line, *self._ellipse("arc_uncertainty", number, seen, middle, color, text)]
+        return MarkerArray(markers=markers)
+
+    def _ellipse(
+        self, group: str, number: int, belief: PoseGaussian, at: Point, color: ColorRGBA, text: str
+    ) -> list[Marker]:
+        """The ellipse; none where it would only hide the map."""
+        if tells_nothing(belief):
+            return []
+        ellipse = belief.ellipse()
+        faint = ColorRGBA(r=color.r, g=color.g, b=color.b, a=_UNCERTAIN)
+        size = (max(2.0 * ellipse.longer, _VISIBLE), max(2.0 * ellipse.shorter, _VISIBLE), 0.02)
+        marker = self._marker(group, number, Marker.CYLINDER, size, faint)
+        marker.pose.position, marker.pose.orientation, marker.text = at, quaternion(ellipse.angle), text
+        return [marker]
+
+    def _marker(self, group: str, number: int, kind: int, size: tuple[float, float, float], color: ColorRGBA) -> Marker:
+        marker = Marker(header=header(self.stamp, self._frame), ns=group, id=number, type=kind, color=color)
+        marker.scale = Vector3(x=size[0], y=size[1], z=size[2])
+        marker.pose.orientation.w = 1.0
+        return marker
+
+
+def grid_message(stamp: int, frame: str, image: Any) -> OccupancyGrid:  # noqa: ANN401  an OccupancyImage, see grid()
+    """ROS's occupancy grid: row 0 is the smallest y, 100 occupied, 0 free, -1 unknown."""
+    from hmt_slam_ros.grids.occupancy_map import FREE, OCCUPIED  # noqa: PLC0415
+
+    pixels = image.pixels[::-1]
+    cells = np.full(pixels.shape, -1, dtype=np.int8)
+    cells[pixels == OCCUPIED] = 100
+    cells[pixels == FREE] = 0
+    info = MapMetaData(
+        map_load_time=time_message(stamp), resolution=image.resolution, width=cells.shape[1], height=cells.shape[0]
+    )
+    info.origin.position.x, info.origin.position.y = image.origin.tolist()
+    info.origin.orientation.w = 1.0
+    return OccupancyGrid(header=header(stamp, frame), info=info, data=array("b", cells.tobytes()))
+
+
+def _deviations(belief: PoseGaussian) -> str:
+    """Standard deviations of a pose, that of the position where it is largest."""
+    turn = math.degrees(math.sqrt(belief.covariance[2, 2]))
+    return f"±{belief.ellipse().longer / ELLIPSE_95:.2f} m, ±{turn:.1f}°"
+
+
+def _point(pose: NDArray[np.float64]) -> Point:
+    return Point(x=float(pose[0]), y=float(pose[1]))

@@ -1,0 +1,91 @@
+"""The names of the topics, and every quality-of-service profile in use."""
+
+from __future__ import annotations
+
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+
+from hmt_slam_ros.messages.messages import Accepted, AreaEvents, Arriving, Hypotheses, LocalEstimate, Notice
+
+# Scans and odometry between the robot node and the processes: nothing is lost, however fast the replay runs.
+# A reader that falls behind makes the writer wait, since the history of a reliable KEEP_ALL topic is bounded (5000).
+SENSOR = QoSProfile(history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.RELIABLE)
+
+# The same where what was sent is kept: of the robot node, and for slam that was killed and missed something.
+KEPT_SENSOR = QoSProfile(
+    history=HistoryPolicy.KEEP_ALL,
+    reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.TRANSIENT_LOCAL,
+)
+
+# Drivers of live lasers publish best effort, which a reliable reader never hears. The nodes begin with SENSOR and
+# change over to this profile when DDS reports such a writer. The depth bridges a second of a fast laser.
+LIVE_SENSOR = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)
+
+# The chain Keyframe -> AreaEvents -> Hypotheses -> Accepted and what belongs to it: who comes late catches up.
+CHAIN = QoSProfile(
+    history=HistoryPolicy.KEEP_ALL,
+    reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.TRANSIENT_LOCAL,
+)
+
+# A reader of a chain topic that has no use for the past.
+CHAIN_FROM_NOW = QoSProfile(history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.RELIABLE)
+
+# Maps, graphs, statuses: the newest one, also for who comes late.
+LATCHED = QoSProfile(
+    history=HistoryPolicy.KEEP_LAST,
+    depth=1,
+    reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.TRANSIENT_LOCAL,
+)
+
+# /tf_static has one latched message from each of several publishers.
+TF_STATIC = QoSProfile(
+    history=HistoryPolicy.KEEP_LAST,
+    depth=100,
+    reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.TRANSIENT_LOCAL,
+)
+
+# What passes by for people and other programs: /tf, /pose, /clock, /diagnostics.
+STREAM = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=100, reliability=ReliabilityPolicy.RELIABLE)
+
+# For the page, which looks at what passes by a few times a second, and for commands to a robot: older ones are
+# replaced inside of DDS.
+NEWEST = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+
+# A reader of a chain topic that wants to know its past, and for which nobody waits: what is too much is lost.
+LOOK_BACK = QoSProfile(
+    history=HistoryPolicy.KEEP_LAST,
+    depth=1000,
+    reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.TRANSIENT_LOCAL,
+)
+
+
+SCAN, ODOM, CLOCK = "scan", "odom", "/clock"
+COMMANDS, GROUND_TRUTH = "cmd_vel", "ground_truth"
+ERRANDS = {"explorer": "explorer/errand", "pilot": "pilot/errand"}
+OUTCOMES = {"explorer": "explorer/outcome", "pilot": "pilot/outcome"}
+GOALS, PLACE = "goal_pose", "pilot/place"
+KEYFRAMES, KEYFRAME_SCANS = "hmt/keyframes", "hmt/keyframe_scans"
+TRAIL = "hmt/trail"
+FINISHED = "hmt/finished"
+ROBOT_STATUS = "hmt/robot_status"
+SAVE, SAVED = "hmt/save", "hmt/saved"
+BEGIN, BEGUN = "hmt/begin", "hmt/begun"
+COST = "hmt/cost"
+HMT_POSE, POSE = "hmt/pose", "pose"
+MAP, GRAPH, PARTICLES, PMF = "map", "hmt/graph", "hmt/particles", "hmt/pmf"
+IS_LOCALIZED, ENTROPY = "hmt/is_localized", "hmt/entropy"
+INITIAL_POSE = "initialpose"
+DIAGNOSTICS = "diagnostics"
+
+DOCUMENTS: dict[type, str] = {
+    AreaEvents: "hmt/area_events",
+    Hypotheses: "hmt/hypotheses",
+    Accepted: "hmt/accepted",
+    LocalEstimate: "hmt/local_pose",
+    Arriving: "hmt/arriving",
+    Notice: "hmt/notices",
+}

@@ -1,0 +1,85 @@
+"""Topological inference as a node, with the distribution of Eq. (14) for people to see."""
+
+from __future__ import annotations
+
+import sys
+from typing import TYPE_CHECKING
+
+from std_msgs.msg import Bool, Float64, Float64MultiArray, MultiArrayDimension, MultiArrayLayout
+
+from hmt_slam_ros.configuration import Configuration
+from hmt_slam_ros.messages.messages import Accepted, Arriving, Hypotheses, Message
+from hmt_slam_ros.ros import topics
+from hmt_slam_ros.ros.conversions import rows_message_data
+from hmt_slam_ros.ros.execution import run
+from hmt_slam_ros.ros.initial_state import Beginning
+from hmt_slam_ros.ros.map_services import spin
+from hmt_slam_ros.ros.process_node import ProcessNode
+from hmt_slam_ros.ros.topics import ENTROPY, IS_LOCALIZED, PMF
+
+if TYPE_CHECKING:
+    from hmt_slam_ros.topological_inference.tsbi import Tsbi
+
+
+class TsbiNode(ProcessNode):
+    """The node ``tsbi``."""
+
+    process: Tsbi
+
+    def __init__(self) -> None:
+        super().__init__("tsbi", _make_process, (Hypotheses,))
+
+    def set_up(self) -> None:
+        """As any process node, and say whether the robot's place is known."""
+        super().set_up()
+        self._pmf = self.create_publisher(Float64MultiArray, PMF, topics.LATCHED)
+        self._localized = self.create_publisher(Bool, IS_LOCALIZED, topics.LATCHED)
+        self._entropy = self.create_publisher(Float64, ENTROPY, topics.LATCHED)
+        self._tell_whether_localized()
+
+    def show(self, heard: Message, said: list[Message]) -> None:
+        """Publish the distribution over the topological paths, Eq. (14), and whether the robot's place is known."""
+        if said or isinstance(heard, Accepted | Arriving):
+            self._tell_whether_localized()
+        for message in said:
+            if isinstance(message, Hypotheses):
+                self._pmf.publish(pmf_message(message))
+
+    def begin_anew(self, folder: str, request: int = 0) -> None:
+        """As any process node, and say that the robot's place is not known."""
+        super().begin_anew(folder, request)
+        self._tell_whether_localized()
+
+    def _tell_whether_localized(self) -> None:
+        found = self.process.localization
+        self._localized.publish(Bool(data=found.localized))
+        self._entropy.publish(Float64(data=found.entropy))
+        self.figures.state["localized"] = "yes" if found.localized else "no, the robot may be anywhere in the map"
+        self.figures.state["entropy of the area"] = f"{found.entropy:.3f} nats"
+
+
+def pmf_message(hypotheses: Hypotheses) -> Float64MultiArray:
+    """Rows of (hypothesis, area, probability), the most probable first; the last is (-1, -1, what was not examined)."""
+    leaves = sorted(hypotheses.leaves, key=lambda leaf: (-leaf.probability, leaf.hypothesis))
+    rows = [(leaf.hypothesis, leaf.area, leaf.probability) for leaf in leaves] + [(-1, -1, hypotheses.unexamined)]
+    layout = [
+        MultiArrayDimension(label="leaf", size=len(rows), stride=3 * len(rows)),
+        MultiArrayDimension(label="hypothesis,area,probability", size=3, stride=3),
+    ]
+    return Float64MultiArray(layout=MultiArrayLayout(dim=layout), data=rows_message_data(rows))
+
+
+def _make_process(configuration: Configuration, beginning: Beginning) -> Tsbi:
+    # It takes time, in which a signal has to be heard.
+    from hmt_slam_ros.topological_inference.tsbi import Tsbi, TsbiState  # noqa: PLC0415
+
+    return Tsbi(configuration, state=beginning.part("tsbi", TsbiState))
+
+
+def main() -> None:
+    """Run the node."""
+    sys.exit(run(TsbiNode, spin))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,6 @@
+"""What the robot measures: laser scans with their own geometry, odometry, and the motion model between two poses."""
+
+from hmt_slam_ros.sensors.odometry import Odometry
+from hmt_slam_ros.sensors.scan import Scan
+
+__all__ = ["Odometry", "Scan"]

@@ -1,0 +1,176 @@
+"""The robot's way through way-points, and when it is where on it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hmt_slam_ros.errors import HmtSlamError
+from hmt_slam_ros.geometry import se2
+
+_SHARPEST = math.radians(120.0)  # beyond it the robot stops and turns on the spot
+_NOTHING = 1e-9
+
+
+class Path(NamedTuple):
+    """Stretches of constant curvature, one after the other.
+
+    :ivar starts: shape (n, 3), ``world_T_base`` where each begins, m and rad.
+    :ivar lengths: shape (n,), m; 0 for a turn on the spot.
+    :ivar turns: shape (n,), rad, positive to the left.
+    """
+
+    starts: NDArray[np.float64]
+    lengths: NDArray[np.float64]
+    turns: NDArray[np.float64]
+
+    @property
+    def on_the_spot(self) -> NDArray[np.bool_]:
+        """Stretches on which the robot only turns, shape (n,)."""
+        return self.lengths == 0.0
+
+    @property
+    def sizes(self) -> NDArray[np.float64]:
+        """How far to go on each stretch, shape (n,): m, or rad on the spot."""
+        return np.where(self.on_the_spot, np.abs(self.turns), self.lengths)
+
+    def pose(self, stretch: NDArray[np.intp], gone: NDArray[np.float64]) -> NDArray[np.float64]:
+        """``world_T_base`` (k, 3) after going a part of a stretch, in the unit of `sizes`; both of shape (k,)."""
+        share = gone / self.sizes[stretch]
+        twists = np.stack((self.lengths[stretch], np.zeros(stretch.size), self.turns[stretch]), axis=1)
+        return se2.compose(self.starts[stretch], se2.exp(share[:, None] * twists))
+
+
+def path_through(points: NDArray[np.float64], rounding: float) -> Path:
+    """The way through way-points.
+
+    :param points: shape (k, 2), m.
+    :param rounding: radius of the arcs at corners, m; smaller where a leg is too short for it.
+    :raises HmtSlamError: where all way-points are one.
+    """
+    legs = np.diff(points, axis=0)
+    lengths = np.hypot(legs[:, 0], legs[:, 1])
+    apart = lengths > _NOTHING
+    if not apart.any():
+        raise HmtSlamError("the route has no two different way-points: give at least two.")
+    lengths, headings = lengths[apart], np.arctan2(legs[apart, 1], legs[apart, 0])
+    turns = se2.wrap(np.diff(headings))
+    cuts = _cuts(lengths, turns, rounding)
+    stretches: list[tuple[float, float]] = []
+    for k, length in enumerate(lengths.tolist()):
+        before, after = (cuts[k - 1] if k else 0.0), (cuts[k] if k < turns.size else 0.0)
+        stretches.append((length - before - after, 0.0))
+        if k < turns.size and abs(turns[k]) > _NOTHING:
+            radius = after / math.tan(0.5 * abs(turns[k])) if after else 0.0
+            stretches.append((radius * abs(turns[k]), turns[k]))
+    return _joined(np.array([*points[0], headings[0]]), [part for part in stretches if max(map(abs, part)) > _NOTHING])
+
+
+def _cuts(lengths: NDArray[np.float64], turns: NDArray[np.float64], rounding: float) -> NDArray[np.float64]:
+    """How far before and behind each corner its arc begins and ends, m; 0 for a turn on the spot."""
+    room = 0.5 * np.minimum(lengths[:-1], lengths[1:])
+    sharp = np.abs(turns) > _SHARPEST
+    half = 0.5 * np.where(sharp, 0.0, np.abs(turns))
+    return np.where(sharp, 0.0, np.minimum(rounding * np.tan(half), room))
+
+
+def _joined(start: NDArray[np.float64], stretches: list[tuple[float, float]]) -> Path:
+    starts = [start]
+    for length, turn in stretches:
+        starts.append(se2.compose(starts[-1], se2.exp(np.array([length, 0.0, turn]))))
+    lengths, turns = np.array(stretches).T
+    return Path(np.array(starts[:-1]), lengths, turns)
+
+
+ACCELERATION = 0.5
+"""Of the robot at most, m/s^2."""
+
+TURN_ACCELERATION = math.radians(90.0)
+"""Likewise, rad/s^2."""
+
+
+@dataclass(frozen=True, eq=False)
+class Drive:
+    """A drive along a path in phases of constant acceleration.
+
+    :ivar path: the way.
+    :ivar stretches: shape (n,), stretch of the path of each phase.
+    :ivar times: shape (n + 1,), s, when each phase begins, and the end of the last.
+    :ivar gone: shape (n,), what lies behind the robot on the stretch when the phase begins, m or rad.
+    :ivar speeds: shape (n,), when the phase begins, m/s or rad/s.
+    :ivar accelerations: shape (n,), m/s^2 or rad/s^2.
+    """
+
+    path: Path
+    stretches: NDArray[np.intp]
+    times: NDArray[np.float64]
+    gone: NDArray[np.float64]
+    speeds: NDArray[np.float64]
+    accelerations: NDArray[np.float64]
+
+    @property
+    def duration(self) -> float:
+        """Seconds from start to end."""
+        return float(self.times[-1])
+
+    def poses(self, seconds: NDArray[np.float64]) -> NDArray[np.float64]:
+        """``world_T_base`` (k, 3), m and rad, at times (k,), s; before the start and after the end the robot stands."""
+        within = np.clip(seconds, 0.0, self.duration)
+        phase = np.clip(np.searchsorted(self.times, within, side="right") - 1, 0, self.stretches.size - 1)
+        passed = within - self.times[phase]
+        gone = self.gone[phase] + (self.speeds[phase] + 0.5 * self.accelerations[phase] * passed) * passed
+        return self.path.pose(self.stretches[phase], gone)
+
+
+def drive_along(path: Path, speed: float, turn_rate: float) -> Drive:
+    """Drive a path from standstill to standstill.
+
+    :param speed: at most, m/s.
+    :param turn_rate: at most, rad/s.
+    """
+    sizes, spots = path.sizes, path.on_the_spot
+    limits = np.minimum(speed, turn_rate * path.lengths / np.maximum(np.abs(path.turns), 1e-12))
+    limits = np.where(spots, turn_rate, limits)
+    accelerations = np.where(spots, TURN_ACCELERATION, ACCELERATION)
+    joints = _speeds_at_joints(sizes, spots, limits, accelerations)
+    phases: list[tuple[float, ...]] = []
+    for k, (size, limit, acceleration) in enumerate(zip(sizes, limits, accelerations, strict=True)):
+        phases += [(k, *phase) for phase in _phases(size, joints[k], joints[k + 1], limit, acceleration)]
+    stretches, durations, gone, speeds, changes = np.array(phases).T
+    times = np.concatenate(([0.0], np.cumsum(durations)))
+    return Drive(path, stretches.astype(np.intp), times, gone, speeds, changes)
+
+
+def _speeds_at_joints(
+    sizes: NDArray[np.float64],
+    spots: NDArray[np.bool_],
+    limits: NDArray[np.float64],
+    accelerations: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Speed at the begin of every stretch and at the end of the last, shape (n + 1,); 0 beside turns on the spot."""
+    joints = np.zeros(sizes.size + 1)
+    moving = ~spots
+    joints[1:-1] = np.where(moving[1:] & moving[:-1], np.minimum(limits[1:], limits[:-1]), 0.0)
+    for k in range(sizes.size):
+        joints[k + 1] = min(joints[k + 1], math.sqrt(joints[k] ** 2 + 2.0 * accelerations[k] * sizes[k]))
+    for k in reversed(range(sizes.size)):
+        joints[k] = min(joints[k], math.sqrt(joints[k + 1] ** 2 + 2.0 * accelerations[k] * sizes[k]))
+    return joints
+
+
+def _phases(size: float, first: float, last: float, limit: float, acceleration: float) -> list[tuple[float, ...]]:
+    """Duration, distance gone before, speed and acceleration of: speeding up, going evenly, slowing down."""
+    top = min(limit, math.sqrt(acceleration * size + 0.5 * (first**2 + last**2)))
+    up, down = (top - first) / acceleration, (top - last) / acceleration
+    risen, fallen = 0.5 * (first + top) * up, 0.5 * (top + last) * down
+    even = max(0.0, size - risen - fallen)
+    phases = [
+        (up, 0.0, first, acceleration),
+        (even / top, risen, top, 0.0),
+        (down, risen + even, top, -acceleration),
+    ]
+    return [phase for phase in phases if phase[0] > 0.0]

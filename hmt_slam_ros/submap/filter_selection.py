@@ -1,0 +1,63 @@
+"""Which kind of filter an area has."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.landmarks.area_classes import AreaKinds
+from hmt_slam_ros.landmarks.line_filter import LineFilter
+from hmt_slam_ros.submap.local_filter import FilterState, LineFilterState, LocalFilter, PlacedKeyframe
+from hmt_slam_ros.submap.local_mapping import LocalMapping
+from hmt_slam_ros.submap.particle_filter import AreaFilter
+
+
+def new_filter(mapping: LocalMapping, hypothesis: int, area: int) -> LocalFilter:
+    """A filter that knows nothing yet, of the kind that ``local_map.kind`` names; by class, one with a grid."""
+    kind = LineFilter if mapping.configuration.local_map.kind == "lines" else AreaFilter
+    return kind(mapping, hypothesis, area)
+
+
+def filter_of(mapping: LocalMapping, state: FilterState | LineFilterState) -> LocalFilter:
+    """The filter of a state; the patches of grids are in the pool."""
+    if isinstance(state, LineFilterState):
+        return LineFilter.of(mapping, state)
+    return AreaFilter.of(mapping, state)
+
+
+class Kinds:
+    """Chooses the kind of filter for an area that is entered, after Tomatis et al. (2003), section 3.1."""
+
+    def __init__(self, mapping: LocalMapping) -> None:
+        self._mapping = mapping
+        self._classes = AreaKinds(mapping)
+
+    def entering(self, own: LocalFilter, area: int, content: Sequence[PlacedKeyframe]) -> LocalFilter:
+        """The filter to go on with: ``own``, or one of another kind that has the robot where ``own`` has it.
+
+        It knows nothing of what is around the robot until it changes to the area. ``own`` is given up if it is not it.
+
+        :param area: the one that is entered.
+        :param content: keyframes in its frame, of which those of the area tell what it is.
+        """
+        if self._mapping.configuration.local_map.kind != "by_class":
+            return own
+        kind = self._of(area, content)
+        if kind is None or isinstance(own, kind):
+            return own
+        other = kind(self._mapping, own.hypothesis, own.area)
+        other.stand(PoseGaussian.exactly(own.pose))
+        other.tracking_covariance, other.experience = own.tracking_covariance, own.experience
+        own.release()
+        return other
+
+    def _of(self, area: int, content: Sequence[PlacedKeyframe]) -> type[AreaFilter] | type[LineFilter] | None:
+        """None where too little is known of the area."""
+        within = [placed for placed in content if placed.area == area]
+        poses = np.array([placed.pose for placed in within]).reshape(-1, 3)
+        found = self._classes.of([placed.scan for placed in within], poses)
+        if found is None:
+            return None
+        return AreaFilter if found.hallway else LineFilter

@@ -1,0 +1,106 @@
+"""What all filters of a process share: pool of patches, models of the laser, how a scan enters a map."""
+
+from __future__ import annotations
+
+import math
+from functools import cached_property
+
+import numpy as np
+from numba import njit
+
+from hmt_slam_ros.arrays import Float64, Int32
+from hmt_slam_ros.configuration.tree import Configuration
+from hmt_slam_ros.grids.insertion import InverseModel
+from hmt_slam_ros.grids.patch_pool import Beams, PatchPool
+from hmt_slam_ros.grids.patches import FAR, PATCH
+from hmt_slam_ros.landmarks.line_extraction import Lines, extract_for_map
+from hmt_slam_ros.registration import scan_to_map
+from hmt_slam_ros.registration.match_covariance import MatchNoise
+from hmt_slam_ros.sensors import Scan
+from hmt_slam_ros.sensors.surfels import surfels
+
+_ODDS_PER_NAT = 20.0
+
+
+class LocalMapping:
+    """What all filters of a process share: the pool of patches, the beam model, the settings."""
+
+    def __init__(self, configuration: Configuration) -> None:
+        self.configuration = configuration
+        local_map, match = configuration.local_map, configuration.matching
+        patch = PATCH * local_map.cell
+        self.pool = PatchPool(2 * math.ceil(local_map.extent / patch), local_map.cell, local_map.field_radius)
+        self.model = scan_to_map.beam_model(
+            local_map.field_radius, match.sigma_hit, match.unknown_range, match.random_returns
+        )
+        self.alignment = scan_to_map.Alignment(
+            match.sigma_match, match.robust_scale, configuration.filter.covariance_inflation, match.iterations
+        )
+        self.noise = MatchNoise(match.beam_noise, match.block_noise, match.map_age)
+        self._inverse_model = InverseModel(
+            round(local_map.log_odds_hit * _ODDS_PER_NAT),
+            round(-local_map.log_odds_miss * _ODDS_PER_NAT),
+            round(local_map.log_odds_limit * _ODDS_PER_NAT),
+        )
+        self.near = int(match.matched_distance / local_map.field_radius * FAR)
+
+    def matching_points(self, scan: Scan) -> Float64:
+        """The surfels that are matched: within the map's range, evenly thinned; shape (n, 4), base frame."""
+        beams = self.mapped_beams(scan)
+        count = len(beams.points)
+        stride = -(-count // self.configuration.matching.max_points)
+        return surfels(beams.points, beams.origins[:count], max(1, stride))
+
+    def mapped_beams(self, scan: Scan) -> Beams:
+        """The part of a scan within the map's range."""
+        return Beams(*_cut_off(scan.points, scan.origins, self.configuration.local_map.max_range))
+
+    def insert(self, tables: Int32, poses: Float64, scan: Scan) -> None:
+        """Enter a scan into maps (m, T, T), into each at its own ``map_T_base`` (m, 3)."""
+        self.pool.insert(tables, poses, self.mapped_beams(scan), self._inverse_model)
+
+
+@njit(cache=True)
+def _cut_off(points: Float64, origins: Float64, limit: float) -> tuple[Float64, Float64, Float64]:
+    """Those of the points (n, 2) within a limit of their origins (n, 2), the others at the limit, and their origins."""
+    distance = np.hypot(points[:, 0] - origins[:, 0], points[:, 1] - origins[:, 1])
+    near = (distance <= limit).sum()
+    within, beyond, ordered = np.empty((near, 2)), np.empty((len(points) - near, 2)), np.empty((len(points), 2))
+    i = j = 0
+    for n in range(len(points)):
+        if distance[n] <= limit:
+            within[i, 0], within[i, 1] = points[n, 0], points[n, 1]
+            ordered[i, 0], ordered[i, 1] = origins[n, 0], origins[n, 1]
+            i += 1
+        else:
+            share, x, y = limit / distance[n], origins[n, 0], origins[n, 1]
+            beyond[j, 0], beyond[j, 1] = x + (points[n, 0] - x) * share, y + (points[n, 1] - y) * share
+            ordered[near + j, 0], ordered[near + j, 1] = x, y
+            j += 1
+    return within, beyond, ordered
+
+
+class Sighting:
+    """A scan and what filters of either kind make of it, once for all of them and only where one asks for it.
+
+    :ivar scan: the scan.
+    """
+
+    def __init__(self, mapping: LocalMapping, scan: Scan) -> None:
+        self.scan = scan
+        self._mapping = mapping
+
+    @cached_property
+    def surfels(self) -> Float64:
+        """What is matched with a grid, shape (n, 4), base frame."""
+        return self._mapping.matching_points(self.scan)
+
+    @cached_property
+    def lines(self) -> Lines:
+        """What is compared with a map of lines."""
+        return extract_for_map(self.scan, self._mapping.configuration.features)
+
+    @property
+    def laser(self) -> Float64:
+        """Where the beams begin, shape (2,), likewise."""
+        return self.scan.laser_pose[:2]

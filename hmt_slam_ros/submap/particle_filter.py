@@ -1,0 +1,299 @@
+"""The Rao-Blackwellized particle filter of one hypothesis in its current area, second step of Eq. (6).
+
+Every particle has a pose, its own map in shared patches, and its own poses of the keyframes taken since the area was
+entered. The map frame is the frame of the current area.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+
+import numpy as np
+
+from hmt_slam_ros.arrays import Float64
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.geometry.covariance import inverse, turned
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.grids.patches import MapView
+from hmt_slam_ros.random_streams import Purpose, stream
+from hmt_slam_ros.registration import scan_to_map
+from hmt_slam_ros.registration.match_covariance import match_error
+from hmt_slam_ros.registration.scan_to_map import Prior
+from hmt_slam_ros.sensors import Scan
+from hmt_slam_ros.sensors.motion_model import NO_STEP, Prediction
+from hmt_slam_ros.submap.local_filter import FilterState, FilterStep, PlacedKeyframe, Tracked
+from hmt_slam_ros.submap.local_mapping import LocalMapping, Sighting
+from hmt_slam_ros.submap.scan_evidence import Compared, Experience, compared
+from hmt_slam_ros.submap.scan_matcher import ScanMatcher, map_information
+
+# Another particle takes the lead when it is more likely by this much, nats.
+_CLEARLY = 3.0
+
+
+class AreaFilter:
+    """M particles of one hypothesis in one area.
+
+    :ivar hypothesis: id of the hypothesis.
+    :ivar area: the current area; the map frame is its frame.
+    :ivar poses: shape (M, 3), ``map_T_base``.
+    :ivar log_weights: shape (M,), nats, the largest is 0.
+    :ivar keyframes: the local map's keyframes, ids.
+    :ivar keyframe_areas: their areas.
+    :ivar keyframe_poses: shape (M, K, 3), ``map_T_base`` of each under each particle.
+    :ivar leader: the particle whose pose is the filter's.
+    :ivar tracking_covariance: of the leader's motion since the last filter step, shape (3, 3), right tangent frame.
+    :ivar left_open: covariance of the leader's pose that the scans since the last filter step leave, likewise.
+    :ivar experience: of the scans so far.
+    """
+
+    def __init__(self, mapping: LocalMapping, hypothesis: int, area: int) -> None:
+        self.mapping = mapping
+        self.hypothesis = hypothesis
+        self.area = area
+        count = mapping.configuration.filter.particles
+        self.poses = np.zeros((count, 3))
+        self.log_weights = np.zeros(count)
+        self.keyframes: list[int] = []
+        self.keyframe_areas: list[int] = []
+        self.keyframe_poses = np.zeros((count, 0, 3))
+        self._tables = np.stack([mapping.pool.empty_table()] * count)
+        self._priors = self.poses.copy()
+        self._last_poses = self.poses.copy()
+        self._since_update = NO_STEP
+        self.leader = 0
+        self._matcher = ScanMatcher(mapping)
+        self.tracking_covariance = np.zeros((3, 3))
+        self.left_open = NO_STEP.covariance
+        self.experience = Experience()
+
+    @classmethod
+    def of(cls, mapping: LocalMapping, state: FilterState) -> AreaFilter:
+        """The filter of a state, whose patches are in the pool and count its tables already."""
+        found = cls(mapping, state.hypothesis, state.area)
+        found.poses, found.log_weights = state.poses, state.log_weights
+        found.keyframes, found.keyframe_areas = list(state.keyframes), list(state.keyframe_areas)
+        found.keyframe_poses, found._tables = state.keyframe_poses, state.tables
+        found._priors, found._last_poses = state.priors, state.last_poses
+        found._since_update = state.since_update
+        found.leader, found.tracking_covariance = state.leader, state.tracking_covariance
+        found.left_open, found.experience = state.left_open, state.experience
+        return found
+
+    @property
+    def state(self) -> FilterState:
+        """All but the patches, to which the tables refer by their numbers in the pool."""
+        return FilterState(
+            self.hypothesis,
+            self.area,
+            self.poses,
+            self.log_weights,
+            tuple(self.keyframes),
+            tuple(self.keyframe_areas),
+            self.keyframe_poses,
+            self._tables,
+            self._priors,
+            self._last_poses,
+            self._since_update,
+            self.leader,
+            self.tracking_covariance,
+            self.left_open,
+            self.experience,
+        )
+
+    @property
+    def pose(self) -> Float64:
+        """The leading particle's ``area_T_base``, shape (3,)."""
+        return self.poses[self.leader]
+
+    def leading_keyframe_poses(self) -> Float64:
+        """``map_T_base`` of the local map's keyframes under the leading particle, shape (K, 3)."""
+        return self.keyframe_poses[self.leader]
+
+    def branch(self, hypothesis: int) -> AreaFilter:
+        """A filter of the same state for a child hypothesis; maps are shared until written to."""
+        child = AreaFilter(self.mapping, hypothesis, self.area)
+        child.poses, child.log_weights = self.poses.copy(), self.log_weights.copy()
+        child.keyframes, child.keyframe_areas = list(self.keyframes), list(self.keyframe_areas)
+        child.keyframe_poses = self.keyframe_poses.copy()
+        child._tables = np.stack([self.mapping.pool.share(table) for table in self._tables])
+        child._priors, child._last_poses = self._priors.copy(), self._last_poses.copy()
+        child._since_update = self._since_update
+        child.leader, child.tracking_covariance = self.leader, self.tracking_covariance
+        child.left_open = self.left_open
+        child.experience = self.experience
+        return child
+
+    def release(self) -> None:
+        """Give the maps back."""
+        for table in self._tables:
+            self.mapping.pool.release(table)
+
+    def track(self, sighting: Sighting, prediction: Prediction) -> Tracked:
+        """Move all particles by the leader's matched increment: a pose for a scan between two keyframes."""
+        points = sighting.surfels
+        before, view = PoseGaussian(self.pose, self.left_open), self._leading_view()
+        match = self._matcher.match(points, before, prediction, view)
+        self._priors = se2.compose(self._priors, match.step.increment)
+        self._since_update = self._since_update.then(match.step)
+        leg = PoseGaussian(self._priors[self.leader], self._since_update.covariance)
+        match = self._matcher.over_leg(points, match, leg, self._since_update, view)
+        moved = se2.between(before.mean, match.pose)
+        self.poses = se2.compose(self.poses, moved)
+        information = map_information(self._since_update.covariance, match.pose[2])
+        information = information + match.hessian / self.mapping.alignment.inflation
+        self.left_open = self._matcher.covariance(match)
+        self.tracking_covariance = turned(inverse(information), -match.pose[2])
+        return Tracked(moved, self._matcher.information(match), match.contradicted)
+
+    def _leading_view(self) -> MapView:
+        return self.mapping.pool.view(self._tables[self.leader])
+
+    def update(self, sighting: Sighting, step: int) -> FilterStep:
+        """Draw every particle from its optimal proposal, weigh it, resample where ESS fell below its bound.
+
+        :param sighting: of the keyframe's scan.
+        :param step: number of the keyframe event, for the random streams.
+        """
+        points, settings = sighting.surfels, self.mapping.configuration
+        prior = map_information(self._since_update.covariance, self.pose[2])
+        view, predicted = self._leading_view(), Prior(self._priors[self.leader], prior)
+        still = self._matcher.still(points, predicted, self._since_update.covariance, view)
+        drawn = scan_to_map.propose_all(
+            points,
+            still,
+            self.poses,
+            self._priors,
+            prior,
+            self._tables,
+            view,
+            self.mapping.alignment,
+            self.mapping.model,
+            settings.matching.sharpness,
+            settings.matching.temper,
+        )
+        self.log_weights = self.log_weights + drawn.evidences
+        self.log_weights -= self.log_weights.max()
+        leader = self._elected()
+        random = stream(settings.seed, Purpose.PARTICLES, step).standard_normal(drawn.modes.shape)
+        self.poses = drawn.modes + np.einsum("mij,mj->mi", np.linalg.cholesky(drawn.covariances), random)
+        # The leader keeps the mode, so that the published path has no sampling noise.
+        self.poses[leader] = drawn.modes[leader]
+        self.poses[:, 2] = se2.wrap(self.poses[:, 2])
+        error = match_error(
+            still,
+            self.poses[leader],
+            drawn.hessians[leader],
+            prior,
+            self.mapping.pool.view(self._tables[leader]),
+            self.mapping.alignment,
+            self.mapping.noise,
+        )
+        information = turned(settings.matching.temper * drawn.hessians[leader], -self.poses[leader, 2])
+        effective = 1.0 / float(np.sum(_normalised(self.log_weights) ** 2))
+        moved = se2.between(self._last_poses[leader], self.poses[leader])
+        changed, self.leader = leader != self.leader, leader
+        if effective < settings.filter.ess_fraction * len(self.poses):
+            self._resample(step)
+        self._restart()
+        return FilterStep(moved, error, information, effective, changed)
+
+    def compared(self, sighting: Sighting) -> Compared:
+        """A scan in the map of the leader, where that has the robot."""
+        return compared(sighting.surfels, sighting.laser, self.pose, self._leading_view(), self.mapping.near)
+
+    def _elected(self) -> int:
+        """The particle of largest weight; where none is clearly more likely, the one that led before.
+
+        Along a corridor nothing tells the particles apart, and the pose would jump from one to the other.
+        """
+        heaviest = int(np.argmax(self.log_weights))
+        lead = self.log_weights[heaviest] - self.log_weights[self.leader]
+        return heaviest if lead > _CLEARLY else self.leader
+
+    def _restart(self) -> None:
+        """Predict from here."""
+        self._priors = self.poses.copy()
+        self._last_poses = self.poses.copy()
+        self._since_update = NO_STEP
+        self.left_open = NO_STEP.covariance
+
+    def stand(self, pose: PoseGaussian) -> None:
+        """All particles stand at the mean of ``map_T_base``, and predict from there; its covariance is left open."""
+        self.poses = np.repeat(pose.mean[None], len(self.poses), axis=0)
+        self.log_weights = np.zeros(len(self.poses))
+        self.tracking_covariance = np.zeros((3, 3))
+        self._restart()
+        self.left_open = pose.covariance
+
+    def _resample(self, step: int) -> None:
+        """Systematic resampling; the leader is kept, and stands first afterwards."""
+        weights = _normalised(self.log_weights)
+        offset = stream(self.mapping.configuration.seed, Purpose.RESAMPLING, step).random()
+        positions = (np.arange(len(weights)) + offset) / len(weights)
+        ancestors = np.minimum(np.searchsorted(np.cumsum(weights), positions), len(weights) - 1)
+        leader = self.leader
+        if leader not in ancestors:
+            ancestors[0] = leader
+        ancestors = np.concatenate((ancestors[ancestors == leader], ancestors[ancestors != leader]))
+        tables = np.stack([self.mapping.pool.share(self._tables[a]) for a in ancestors])
+        self.release()
+        self._tables = tables
+        self.poses, self.keyframe_poses = self.poses[ancestors], self.keyframe_poses[ancestors]
+        self.log_weights = np.zeros(len(weights))
+        self.leader = 0
+
+    def add_keyframe(self, keyframe: int, scan: Scan) -> None:
+        """Enter the scan into every particle's map at that particle's pose."""
+        self.mapping.insert(self._tables, self.poses, scan)
+        self.keyframes.append(keyframe)
+        self.keyframe_areas.append(self.area)
+        self.keyframe_poses = np.concatenate((self.keyframe_poses, self.poses[:, None]), axis=1)
+
+    def drop(self, keyframes: Collection[int]) -> None:
+        """Forget keyframes, but not what the maps hold of them."""
+        kept = [k for k, keyframe in enumerate(self.keyframes) if keyframe not in keyframes]
+        self.keyframes = [self.keyframes[k] for k in kept]
+        self.keyframe_areas = [self.keyframe_areas[k] for k in kept]
+        self.keyframe_poses = self.keyframe_poses[:, kept]
+
+    def change_area(self, area: int, area_T_previous: Float64, content: Sequence[PlacedKeyframe]) -> None:
+        """Go over to the frame of another area and load its local map, the same for all particles.
+
+        :param area: the area now.
+        :param area_T_previous: shape (3,).
+        :param content: all keyframes of the local map, in the new frame.
+        """
+        self.area = area
+        self.poses = se2.compose(area_T_previous, self.poses)
+        self._priors = se2.compose(area_T_previous, self._priors)
+        self._last_poses = se2.compose(area_T_previous, self._last_poses)
+        self._load(content)
+
+    def reload(self, content: Sequence[PlacedKeyframe], anchor: int) -> None:
+        """Build the local map anew after its keyframes moved; all particles stay where they are from one of them.
+
+        :param content: all keyframes of the local map.
+        :param anchor: the keyframe by which the robot's place is known.
+        """
+        before = self.keyframe_poses[:, self.keyframes.index(anchor)]
+        seen = [se2.between(before, poses) for poses in (self.poses, self._priors, self._last_poses)]
+        self._load(content)
+        after = self.keyframe_poses[:, self.keyframes.index(anchor)]
+        self.poses, self._priors, self._last_poses = (se2.compose(after, poses) for poses in seen)
+
+    def _load(self, content: Sequence[PlacedKeyframe]) -> None:
+        self.release()
+        table = self.mapping.pool.empty_table()
+        for placed in content:
+            self.mapping.insert(table[None], placed.pose[None], placed.scan)
+        count = len(self.poses)
+        self._tables = np.stack([table] + [self.mapping.pool.share(table) for _ in range(count - 1)])
+        self.keyframes = [placed.keyframe for placed in content]
+        self.keyframe_areas = [placed.area for placed in content]
+        poses = np.array([placed.pose for placed in content]).reshape(-1, 3)
+        self.keyframe_poses = np.repeat(poses[None], count, axis=0)
+
+
+def _normalised(log_weights: Float64) -> Float64:
+    weights = np.exp(log_weights - log_weights.max())
+    return weights / weights.sum()

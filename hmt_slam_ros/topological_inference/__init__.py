@@ -1,0 +1,1 @@
+"""Topological Space Bayesian Inference, process 3 of the paper: the probability of every topology."""

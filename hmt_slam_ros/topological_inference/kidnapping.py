@@ -1,0 +1,92 @@
+"""The child of a hypothesis in which the robot was displaced unnoticed: it may be anywhere, as one that woke up.
+
+Arcs can lie: wheels slip where the scans do not tell, readings are lost, robots are carried. That is rare, but then the
+scans contradict what the hypothesis has the robot see, by as many nats as a place that looks alike would explain them
+better; so the odds of it are known (``LeafNotes.displaced``). The keyframes since then begin a new area, to which an
+arc leads that tells nothing, and what follows is as for any robot of which nobody knows how it came there
+(``tsbi_awakening``).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.hybrid_map.shortest_path import reachable, unknown
+from hmt_slam_ros.topological_inference.branching import Branches, Branching, Child, Parent
+from hmt_slam_ros.topological_inference.hypothesis_tree import Spot, Stay
+from hmt_slam_ros.topological_inference.relocalization import UNKNOWN, credit_of, is_rather, sighted_in
+
+# Log-odds of a displacement from which on it is a hypothesis, of hypotheses of at least such a probability, with at
+# least so many keyframes.
+_LOG_ODDS, _PROBABILITY, _KEYFRAMES = math.log(3e-5), 0.05, 3
+
+
+def with_displaced(branching: Branching, parent: Parent) -> Branches | None:
+    """To go on, or to have been displaced; None where that is not probable enough to be asked."""
+    log_odds, since = parent.notes.displaced
+    late = _since(parent, since)
+    if log_odds < _LOG_ODDS or parent.share < _PROBABILITY or len(late) < _KEYFRAMES:
+        return None
+    child = _displaced(branching, parent, late, log_odds)
+    noted = replace(parent.notes, doubts={})
+    return Branches([Child(parent.hypothesis, parent.log_weight, parent.area, noted), child], True)
+
+
+def displaced_or_not(branching: Branching, parent: Parent, event: int) -> Child:
+    """To go on, or, where that is less probable, to be lost: no keyframe is stored that could tell which.
+
+    Furniture that was moved contradicts as a wrong place does; but then what is seen beside it is where the robot has
+    it, and in no other place of the map.
+
+    :param event: the newest; metric SLAM arrives at the next one then.
+    """
+    log_odds, since = parent.notes.displaced
+    notes = parent.notes
+    if log_odds > 0.0:
+        if _recognized(branching, parent, since):
+            notes = replace(notes, doubts={}, spots={})
+        else:
+            stay = Stay(notes.spots[event], 1.0 / (1.0 + math.exp(log_odds)))
+            notes = replace(notes, doubts={}, spots={}, lost=event + 1, stay=stay)
+    return Child(parent.hypothesis, parent.log_weight, parent.area, notes)
+
+
+def _recognized(branching: Branching, parent: Parent, since: int) -> bool:
+    """Whether the scans since an event, which the map does not hold, lie in it where the robot has them."""
+    spots = [spot for event, spot in sorted(parent.notes.spots.items()) if event >= since]
+    frames = reachable(parent.hybrid_map, parent.area, until={spot.area for spot in spots})
+    seen = {spot.keyframe: se2.compose(frames[spot.area].mean, spot.pose) for spot in spots if spot.area in frames}
+    if not seen:
+        return False
+    first = min(seen)
+    poses = {keyframe: se2.between(seen[first], pose) for keyframe, pose in seen.items()}
+    where = branching.everywhere(parent, poses, first)
+    return is_rather(parent.hybrid_map, where, Spot(parent.area, first, seen[first]), poses)
+
+
+def _since(parent: Parent, event: int) -> list[int]:
+    """The keyframes of the robot's area since an event; an area is not left without any."""
+    return sorted(k for k in parent.hybrid_map.keyframes(parent.area) if k >= event)[
+        0 if min(parent.hybrid_map.keyframes(parent.area), default=0) < event else 1 :
+    ]
+
+
+def _displaced(branching: Branching, parent: Parent, keyframes: Sequence[int], log_odds: float) -> Child:
+    """The robot was displaced before the first of some keyframes of its area, which are a new one."""
+    query = branching.query(parent, keyframes)
+    where = branching.everywhere(parent, query.poses, keyframes[0])
+    where = where.with_unmapped(UNKNOWN)
+    claim = Spot(parent.area, keyframes[0], query.belief.mean)
+    credit = credit_of(parent.hybrid_map, where, claim, query.poses)
+    origin = PoseGaussian.exactly(np.zeros(3))
+    area = branching.new_area(parent, query)
+    child = branching.entered(parent, query, area, origin, unknown(query.belief.mean), log_odds + credit)
+    sighted = sighted_in(where, query.poses)
+    notes = replace(child.notes, doubts={}, lost=keyframes[0], claim=claim, credit=credit, sighted=sighted)
+    return replace(child, notes=notes)
