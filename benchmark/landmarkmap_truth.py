@@ -14,7 +14,7 @@ from benchmark.simulated.worlds import World as Drive
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.configuration.landmarks import Features
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.landmarks.landmark_map import Landmark
+from hmt_slam_ros.hybrid_map.landmark import Landmark
 from hmt_slam_ros.landmarks.landmarks import INNER, OPENING, OUTER
 from hmt_slam_ros.simulation import open_simulated
 from hmt_slam_ros.simulation.scenario import Scenario

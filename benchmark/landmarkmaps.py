@@ -21,8 +21,9 @@ from benchmark.simulated.worlds import World as Drive
 from hmt_slam_ros.configuration import Configuration, load_configuration
 from hmt_slam_ros.configuration.landmarks import Features
 from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.hybrid_map.landmark import Existence, Landmark
 from hmt_slam_ros.landmarks.area_landmarks import AreaLandmarks
-from hmt_slam_ros.landmarks.landmark_map import Existence, Landmark, LandmarkMap
+from hmt_slam_ros.landmarks.landmark_map import LandmarkMap
 from hmt_slam_ros.landmarks.landmarks import OPENING
 from hmt_slam_ros.submap.local_mapping import LocalMapping
 

@@ -16,7 +16,7 @@ from benchmark.simulated.measured import chosen_seeds
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration import load_configuration
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.landmarks.landmark_map import Landmark
+from hmt_slam_ros.hybrid_map.landmark import Landmark
 from hmt_slam_ros.landmarks.landmarks import OPENING
 from hmt_slam_ros.places.chart import CROSSING, END
 

@@ -25,6 +25,7 @@ from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.messages.replica import Replica
 from hmt_slam_ros.places.area_views import AreaViews
+from hmt_slam_ros.places.landmark_evidence import PlaceEvidence
 from hmt_slam_ros.places.loop_proposals import LoopProposals, MapLoop
 from hmt_slam_ros.simulation import open_simulated
 from hmt_slam_ros.topological_inference.branching import Branching
@@ -142,8 +143,9 @@ class _Watch(Watch):
     def branching(self, configuration: Configuration, replica: Replica) -> Branching:
         """As always, but for who proposes loops."""
         branching = super().branching(configuration, replica)
-        if branching.loops is not None:
-            branching.loops = _Listening(configuration, branching.views, self._proposed)
+        evidence = branching.landmarks
+        if isinstance(evidence, PlaceEvidence) and evidence.loops is not None:
+            evidence.loops = _Listening(configuration, evidence.views, self._proposed)
         return branching
 
     def _proposed(self, hybrid_map: HybridMap, loop: MapLoop | None, seconds: float) -> None:

@@ -11,7 +11,7 @@ from benchmark.institute_missions import Mission, open_doors, way_length
 from hmt_slam_ros.exploration.rooms import Destination
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.landmarks.landmark_map import Existence, Landmark
+from hmt_slam_ros.hybrid_map.landmark import Existence, Landmark
 from hmt_slam_ros.landmarks.landmarks import OPENING
 from hmt_slam_ros.places.chart import CROSSING, DOOR, Chart, ChartNode
 from hmt_slam_ros.places.floor import LeadingOff

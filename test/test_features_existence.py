@@ -3,7 +3,7 @@
 import pytest
 
 from hmt_slam_ros.configuration.landmarks import Features
-from hmt_slam_ros.landmarks.landmark_map import Existence
+from hmt_slam_ros.hybrid_map.landmark import Existence
 
 FEATURES = Features(landmark_detected=0.9, landmark_by_chance=0.1, landmark_lasting=0.99)
 

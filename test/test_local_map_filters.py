@@ -7,10 +7,10 @@ from worlds import box, drive, scan_in
 from hmt_slam_ros.configuration import Configuration, with_changes
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.landmarks.filter_selection import FilterSelector
 from hmt_slam_ros.landmarks.line_filter import LineFilter
 from hmt_slam_ros.registration.consistency import Agreement
 from hmt_slam_ros.sensors.motion_model import Prediction, Step
-from hmt_slam_ros.submap.filter_selection import Kinds, new_filter
 from hmt_slam_ros.submap.local_filter import PlacedKeyframe
 from hmt_slam_ros.submap.local_mapping import LocalMapping, Sighting
 from hmt_slam_ros.submap.particle_filter import AreaFilter
@@ -33,14 +33,14 @@ def content(walls, area):
 
 @pytest.mark.parametrize(("kind", "expected"), [("grid", AreaFilter), ("lines", LineFilter), ("by_class", AreaFilter)])
 def test_the_parameter_chooses_the_kind(kind, expected):
-    assert type(new_filter(mapping_of(kind), 0, 0)) is expected
+    assert type(FilterSelector(mapping_of(kind)).new(0, 0)) is expected
 
 
 @pytest.mark.parametrize("before", [AreaFilter, LineFilter])
 @pytest.mark.parametrize("after", [AreaFilter, LineFilter])
 def test_by_class_hallways_get_grids_and_rooms_lines_and_the_robot_goes_on_where_it_was(before, after):
     mapping, new_T_old = mapping_of("by_class"), np.array([-1.0, 0.5, 0.2])
-    kinds, own, here = Kinds(mapping), before(mapping, 3, 0), np.array([0.4, 0.1, 0.1])
+    kinds, own, here = FilterSelector(mapping), before(mapping, 3, 0), np.array([0.4, 0.1, 0.1])
     own.stand(PoseGaussian.exactly(se2.compose(se2.inverse(new_T_old), here)))
     own.experience = own.experience.after(Compared(Agreement(9, 3, 1), Agreement(4, 2, 1)))
     experience, loaded = own.experience, content(WALLS[after], 7)
@@ -63,14 +63,14 @@ def test_by_class_hallways_get_grids_and_rooms_lines_and_the_robot_goes_on_where
 @pytest.mark.parametrize("kind", ["grid", "lines"])
 def test_a_kind_that_is_chosen_stays(kind):
     mapping = mapping_of(kind)
-    own = new_filter(mapping, 0, 0)
-    assert all(Kinds(mapping).entering(own, 7, content(walls, 7)) is own for walls in WALLS.values())
+    own = FilterSelector(mapping).new(0, 0)
+    assert all(FilterSelector(mapping).entering(own, 7, content(walls, 7)) is own for walls in WALLS.values())
 
 
 def test_an_area_of_which_too_little_is_known_gets_a_map_of_the_kind_that_is_there():
     mapping = mapping_of("by_class")
     own = LineFilter(mapping, 0, 0)
-    assert Kinds(mapping).entering(own, 7, content(WALLS[AreaFilter], 0)) is own
+    assert FilterSelector(mapping).entering(own, 7, content(WALLS[AreaFilter], 0)) is own
 
 
 def test_the_map_that_is_left_gives_its_patches_back():
@@ -78,5 +78,5 @@ def test_the_map_that_is_left_gives_its_patches_back():
     own = AreaFilter(mapping, 0, 0)
     own.add_keyframe(0, content(WALLS[AreaFilter], 0)[0].scan)
     assert mapping.pool.used > 0
-    Kinds(mapping).entering(own, 7, content(WALLS[LineFilter], 7))
+    FilterSelector(mapping).entering(own, 7, content(WALLS[LineFilter], 7))
     assert mapping.pool.used == 0

@@ -7,9 +7,9 @@ from worlds import blank_scan, box, scan_in
 from hmt_slam_ros.configuration import Configuration, with_changes
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.landmarks.filter_selection import FilterSelector
 from hmt_slam_ros.registration.consistency import SIGHT
 from hmt_slam_ros.sensors.motion_model import Prediction, Step
-from hmt_slam_ros.submap.filter_selection import filter_of, new_filter
 from hmt_slam_ros.submap.local_filter import PlacedKeyframe
 from hmt_slam_ros.submap.local_mapping import LocalMapping, Sighting
 
@@ -32,7 +32,7 @@ def predicted(increment, inertia=INERTIA):
 
 def driven(mapping, odometry_error=(0.0, 0.0, 0.0), steps=60):
     """A filter after a drive on a circle, the true pose and the keyframes' scans."""
-    own, truth = new_filter(mapping, 0, 0), np.zeros(3)
+    own, truth = FilterSelector(mapping).new(0, 0), np.zeros(3)
     scans = [scan_in(ROOM, truth, noise=0.01)]
     own.add_keyframe(0, scans[0])
     for k in range(1, steps):
@@ -116,7 +116,7 @@ def test_where_keyframes_moved_the_robot_moves_with_one_of_them(mapping):
 def test_a_branch_goes_its_own_way_and_a_state_goes_on_to_the_bit(mapping):
     parent, truth, _ = driven(mapping, steps=20)
     before, child = parent.room.covariance.copy(), parent.branch(1)
-    again = filter_of(mapping, parent.state)
+    again = FilterSelector(mapping).restored(parent.state)
     sighting = Sighting(mapping, scan_in(ROOM, se2.compose(truth, STEP), noise=0.01, seed=3))
     child.track(sighting, predicted(STEP))
     child.add_keyframe(99, sighting.scan)
@@ -155,7 +155,7 @@ def test_keyframes_are_dropped_and_what_was_known_is_forgotten(mapping):
 def test_keyframes_of_a_drift_are_corrected_and_told(mapping):
     # A hallway whose end comes into sight only near it, as it does behind people.
     hallway = box(-2.0, -1.0, 12.0, 1.0)
-    own, truth, ahead = new_filter(mapping, 0, 0), np.zeros(3), np.array([0.1, 0.0, 0.0])
+    own, truth, ahead = FilterSelector(mapping).new(0, 0), np.zeros(3), np.array([0.1, 0.0, 0.0])
     own.add_keyframe(0, scan_in(hallway, truth, noise=0.01))
     for k in range(1, 81):
         truth = se2.compose(truth, ahead)

@@ -6,9 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hmt_slam_ros.cli.convert_command import convert
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.logs.records import Entry, EntryLog, Window
-from hmt_slam_ros.logs.writer import convert, write_bag
+from hmt_slam_ros.logs.writer import write_bag
 from hmt_slam_ros.open_log import open_log
 from hmt_slam_ros.sensors import Odometry, Scan
 

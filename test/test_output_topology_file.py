@@ -11,8 +11,9 @@ from test_output_folder import COVARIANCE, MAP_T_AREA_1, recorded, write
 
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.hybrid_map.landmark import Existence, Landmark
 from hmt_slam_ros.landmarks.area_classes import AreaKinds
-from hmt_slam_ros.landmarks.landmark_map import Existence, Landmark, LandmarkMap
+from hmt_slam_ros.landmarks.landmark_map import LandmarkMap
 from hmt_slam_ros.landmarks.landmarks import INNER, OPENING
 from hmt_slam_ros.landmarks.portals import Portal
 from hmt_slam_ros.results import export

@@ -12,7 +12,7 @@ from worlds import box, scan_at
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
-from hmt_slam_ros.landmarks.landmark_map import Existence, Landmark
+from hmt_slam_ros.hybrid_map.landmark import Existence, Landmark
 from hmt_slam_ros.landmarks.landmarks import OPENING
 from hmt_slam_ros.places.area_views import AreaViews
 from hmt_slam_ros.places.chart import CROSSING, DOOR, END, _place_of, chart_of

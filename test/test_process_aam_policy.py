@@ -7,7 +7,9 @@ from test_process_aam import OPTIONS, WORLD, drive_until_cut, estimate, exact, k
 
 from hmt_slam_ros.area_abstraction.aam import Aam
 from hmt_slam_ros.area_abstraction.partition import AamState
+from hmt_slam_ros.composition import area_abstraction
 from hmt_slam_ros.configuration import Configuration, with_changes
+from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.messages.map_changes import Arc, Relabelled
 from hmt_slam_ros.messages.messages import Accepted, Hypotheses, Keyframe, Leaf
@@ -19,7 +21,7 @@ DOOR = 6.0
 
 
 def by_policy(policy, **changes):
-    return Aam(configured(policy, **changes))
+    return area_abstraction(configured(policy, **changes))
 
 
 def configured(policy, **changes):
@@ -45,43 +47,22 @@ def all_around(process, poses=THROUGH):
         return None
 
 
-@pytest.mark.parametrize("driven", [looking_ahead, all_around])
-def test_by_portal_an_area_ends_in_the_door_whatever_overlaps(driven):
-    event, k = driven(by_policy("portal"))
-    assert event.kind == "cut"
-    assert [THROUGH[i, 0] > DOOR for i in range(k + 1)] == [i in event.keyframes for i in range(k + 1)]
-    # Three keyframes behind the door, and once more.
-    assert len(event.keyframes) == 4
-    assert driven(by_policy("ncut")) is None
-
-
 def test_by_both_the_door_makes_a_cut_of_what_is_none():
     assert drive_until_cut(by_policy("both", ncut_threshold=0.5), THROUGH)[0].keyframes[0] == 10
     assert all_around(by_policy("ncut", ncut_threshold=0.5)) is None
     assert all_around(by_policy("both", ncut_threshold=0.5, portal_factor=1.0)) is None
 
 
-def test_by_portal_an_area_without_doors_is_no_larger_than_its_limit():
-    there = worlds.drive((1.0, 1.0), (5.0, 1.0), (5.0, 5.0), (2.0, 5.0))
-    assert all_around(by_policy("portal"), there) is None
-    event, k = drive_until_cut(by_policy("portal", area_limit=4.0), there)
-    points = there[: k + 1, :2]
-    # Found once before.
-    assert np.hypot(*(points[k - 1] - points[: k - 1]).T).max() > 4.0
-    assert event.keyframes == tuple(range(event.keyframes[0], k + 1))
-
-
-@pytest.mark.parametrize("policy", ["portal", "both"])
 @pytest.mark.parametrize("stop", [3, 9, 12])
-def test_what_openings_were_seen_and_passed_is_part_of_the_state(policy, stop, tmp_path):
-    options = {"ncut_threshold": 0.5} if policy == "both" else {}
-    (event, k), process = looking_ahead(by_policy(policy, **options)), by_policy(policy, **options)
+def test_what_openings_were_seen_and_passed_is_part_of_the_state(stop, tmp_path):
+    options = {"ncut_threshold": 0.5}
+    (event, k), process = looking_ahead(by_policy("both", **options)), by_policy("both", **options)
     assert looking_ahead(process, THROUGH[:stop]) is None
     writer = FolderWriter(tmp_path)
     writer.write("aam", process.state)
     writer.finish("state", 1)
     state = FolderReader(tmp_path, "state", 1).read("aam", AamState)
-    again = Aam(configured(policy, **options), state)
+    again = area_abstraction(configured("both", **options), state)
     found, at = looking_ahead(again, THROUGH, stop)
     assert (found.keyframes, found.score, at) == (event.keyframes, event.score, k)
 
@@ -89,14 +70,14 @@ def test_what_openings_were_seen_and_passed_is_part_of_the_state(policy, stop, t
 def test_a_state_of_another_policy_goes_on_by_the_own_one():
     process = by_policy("ncut")
     assert looking_ahead(process, THROUGH[:8]) is None
-    event, _ = looking_ahead(Aam(configured("portal"), process.state), THROUGH, 8)
+    event, _ = looking_ahead(area_abstraction(configured("both", ncut_threshold=0.5), process.state), THROUGH, 8)
     assert event.keyframes[0] == 10
 
 
-@pytest.mark.parametrize(("policy", "merged"), [("ncut", True), ("both", False), ("portal", False)])
+@pytest.mark.parametrize(("policy", "merged"), [("ncut", True), ("both", False)])
 def test_areas_with_an_opening_between_them_are_not_one(policy, merged):
     """Played: a closure joins the two rooms, and by a radius of overlap of metres nothing separates them."""
-    process = by_policy("portal", overlap_radius=2.0)
+    process = by_policy("both", ncut_threshold=0.5, portal_factor=0.01)
     event, k = drive_until_cut(process, THROUGH)
     poses = {i: se2.between(THROUGH[0], THROUGH[i]) for i in event.keyframes}
     begun = tuple(Relabelled(i, 0, 1, pose) for i, pose in poses.items())
@@ -104,7 +85,12 @@ def test_areas_with_an_opening_between_them_are_not_one(policy, merged):
     process.handle(Hypotheses(k, (Leaf(0, 0, 1.0, 1, exact(np.zeros(3)), begun, (arc,)),)))
     process.handle(Accepted(k, 0, (arc,)))
     changed = {"ncut_threshold": 0.3, "overlap_radius": 2.0, "min_cluster": 5, "portal_factor": 0.01}
-    process = Aam(configured(policy, **changed), process.state)
+    process = area_abstraction(configured(policy, **changed), process.state)
     leaf = estimate(0, 1, poses[k], stored=False)
     (answer,) = process.handle(keyframe(k + 1, THROUGH[k], leaf))
     assert [event.kind for event in answer.events] == ["merged"] * merged
+
+
+def test_a_partition_by_doors_without_landmarks_is_refused():
+    with pytest.raises(HmtSlamError, match="area_policy = both needs landmarks"):
+        Aam(configured("both"))

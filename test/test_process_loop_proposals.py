@@ -10,6 +10,7 @@ from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.configuration.flat import with_changes
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.places.landmark_evidence import PlaceEvidence
 from hmt_slam_ros.places.loop_proposals import LoopProposals, MapLoop
 
 SPREAD = np.diag([0.15, 0.15, math.radians(1.5)]) ** 2
@@ -48,7 +49,9 @@ def twice_into_the_first_corridor(shift, proposing=GATED):
             own = run.replica.areas[run.replica.best]
             true = se2.between(frame(run, poses, own), frame(run, poses, 0))
             loop = MapLoop(own, 0, PoseGaussian(se2.compose(np.array((*shift, 0.0)), true), SPREAD), own)
-            run.tsbi._branching.loops = Told(loop, proposing, run.tsbi._branching.views)
+            branching = run.tsbi._branching
+            branching.landmarks = PlaceEvidence(GATED, run.tsbi._replica.scans)
+            branching.landmarks.loops = Told(loop, proposing, branching.landmarks.views)
         run.keyframe(pose, cut=7 if k and k % 14 == 0 else 0)
         if len(run.answers[-1].leaves) > 1:
             run.accept(run.replica.best)
@@ -57,7 +60,7 @@ def twice_into_the_first_corridor(shift, proposing=GATED):
 
 
 def test_nobody_proposes_where_nobody_asks_for_it():
-    assert Run(RING).tsbi._branching.loops is None
+    assert Run(RING).tsbi._branching.landmarks is None
 
 
 def test_what_is_out_of_reach_by_the_arcs_is_closed_where_it_is_proposed():
@@ -67,12 +70,12 @@ def test_what_is_out_of_reach_by_the_arcs_is_closed_where_it_is_proposed():
     assert math.hypot(off[0], off[1]) < 0.1
     (notice,) = run.notices
     assert "from area 7 to area 7 are those up to area 0" in notice
-    assert run.tsbi._branching.loops.asked == 1
+    assert run.tsbi._branching.landmarks.loops.asked == 1
 
 
 def test_nothing_is_proposed_where_the_arcs_tell_where_all_areas_are():
     run, _, closures = twice_into_the_first_corridor((0.0, 0.0), Configuration())
-    assert run.tsbi._branching.loops.asked == 0
+    assert run.tsbi._branching.landmarks.loops.asked == 0
     assert not closures
 
 

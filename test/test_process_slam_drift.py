@@ -11,10 +11,9 @@ from hmt_slam_ros.messages.map_changes import Relabelled
 from hmt_slam_ros.messages.messages import Leaf
 from hmt_slam_ros.metric_slam.live_hypothesis import LiveHypothesis
 from hmt_slam_ros.sensors.motion_model import Prediction, Step
-from hmt_slam_ros.submap.filter_selection import Kinds
 from hmt_slam_ros.submap.local_filter import PlacedKeyframe
 from hmt_slam_ros.submap.local_mapping import LocalMapping, Sighting
-from hmt_slam_ros.submap.particle_filter import AreaFilter
+from hmt_slam_ros.submap.particle_filter import AreaFilter, ParticleFilters
 
 CORRIDOR = np.array([[-200.0, -1.0, 200.0, -1.0], [-200.0, 1.0, 200.0, 1.0]])
 ODOMETRY = np.diag([0.05, 0.05, 0.025]) ** 2
@@ -92,7 +91,7 @@ def test_a_robot_that_enters_an_area_is_as_uncertain_in_it_as_the_newest_keyfram
     rebase = entry.compose(PoseGaussian(se2.inverse(newest), np.zeros((3, 3))))
     leaf, poses = entered(live, (12, 13, 14, 15), rebase)
     content = [PlacedKeyframe(k, 1, driven.scans[k], se2.compose(rebase.mean, poses[k])) for k in range(16)]
-    live.change_area(leaf, content, Kinds(live.filter.mapping))
+    live.change_area(leaf, content, ParticleFilters(live.filter.mapping))
     np.testing.assert_allclose(live.filter.pose, entry.mean, atol=1e-9)
     np.testing.assert_allclose(live.drift, entry.covariance, atol=1e-6)
     assert live.belief().covariance[0, 0] >= 0.9 * sigma**2
@@ -105,6 +104,6 @@ def test_a_robot_that_goes_back_into_an_area_is_as_far_off_as_the_map_there_and_
     before = live.drift
     leaf, poses = entered(live, (), rebase)
     content = [PlacedKeyframe(k, 1, drive_.scans[k], se2.compose(rebase.mean, poses[k])) for k in range(16)]
-    live.change_area(leaf, content, Kinds(live.filter.mapping))
+    live.change_area(leaf, content, ParticleFilters(live.filter.mapping))
     assert live.drift[0, 0] == pytest.approx(before[0, 0] + 0.16, rel=0.2)
     assert live.drift[1, 1] < 0.05

@@ -5,9 +5,7 @@ import pytest
 
 from hmt_slam_ros.area_abstraction.overlap_graph import (
     OverlapGraph,
-    bisection,
     separation,
-    separation_by_chambers,
     synchronised,
 )
 
@@ -118,21 +116,3 @@ def test_overlaps_between_chambers_are_weakened_and_no_others():
     assert weak.keyframes == graph.keyframes
     apart = np.array([[0, 1, 1, 0], [1, 0, 0, 1], [1, 0, 0, 1], [0, 1, 1, 0]], dtype=bool)
     np.testing.assert_allclose(weak.similarity, np.where(apart, 0.25, 1.0) * graph.similarity)
-
-
-def test_the_chamber_of_the_newest_keyframe_separates_however_much_it_overlaps():
-    graph = graph_of(np.full((10, 10), 0.8))
-    chambers = {k: int(k >= 6) for k in range(3, 10)}
-    found = separation_by_chambers(graph, chambers, 9, 4)
-    assert found.keyframes == (6, 7, 8, 9)
-    assert separation_by_chambers(graph, chambers, 9, 5) is None
-    assert separation_by_chambers(graph, dict.fromkeys(range(3, 10), 0), 9, 1) is None
-    # Back in the chamber in which the area began.
-    assert separation_by_chambers(graph, chambers | {9: 0}, 9, 1) is None
-
-
-def test_the_best_of_all_bisections_separates_new_ground_from_old():
-    graph = rooms(6, 6, between=0.5)
-    assert separation(graph, range(3, 12), 11, 0.3, 2) is None
-    assert bisection(graph, range(3, 12), 11, 2).keyframes == tuple(range(6, 12))
-    assert bisection(graph, range(3, 12), 5, 2) is None

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
+from hmt_slam_ros.area_abstraction.doors import Way
 from hmt_slam_ros.configuration.landmarks import Features
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.landmarks.beam_labels import Rays
 from hmt_slam_ros.landmarks.landmarks import INNER, OPENING, Landmarks
-from hmt_slam_ros.landmarks.portals import Way
 
 FEATURES = Features()
 # Beams that tell nothing: so no landmark is missed.

@@ -7,7 +7,7 @@ from hmt_slam_ros.configuration.landmarks import Features
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
-from hmt_slam_ros.landmarks.landmark_map import Existence, Landmark
+from hmt_slam_ros.hybrid_map.landmark import Existence, Landmark
 from hmt_slam_ros.landmarks.landmarks import INNER, OPENING
 from hmt_slam_ros.landmarks.portals import portals_of
 

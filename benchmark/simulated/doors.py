@@ -12,11 +12,12 @@ from numpy.typing import NDArray
 
 from benchmark.landmark_truth import World
 from benchmark.simulated.truth import Truth
+from hmt_slam_ros.area_abstraction.doors import STEP, crossings
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.landmarks.area_landmarks import AreaLandmarks
-from hmt_slam_ros.landmarks.portals import STEP, crossings, portals_of
+from hmt_slam_ros.landmarks.portals import portals_of
 from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.simulation.building import Building
 from hmt_slam_ros.submap.local_mapping import LocalMapping

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 
+from hmt_slam_ros import composition
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.hybrid_map.surroundings import Views
@@ -71,7 +72,7 @@ class WatchedBranching(Branching):
     """Makes the children of hypotheses, as always, and tells what they were made from."""
 
     def __init__(self, configuration: Configuration, replica: Replica, heard: Heard) -> None:
-        super().__init__(configuration, replica)
+        super().__init__(configuration, replica, composition.landmark_evidence)
         self.search = self._watched = _WatchedSearch(configuration, replica.scans)
         self._looks = Looks(replica.scans)
         self._heard = heard

@@ -13,7 +13,7 @@ from benchmark.simulated.examinations import Examination, WatchedBranching
 from benchmark.simulated.features import Row, rows
 from benchmark.simulated.loops import Loops
 from benchmark.simulated.truth import Pose, Truth, nees
-from hmt_slam_ros.area_abstraction.aam import Aam
+from hmt_slam_ros import composition
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
@@ -22,7 +22,6 @@ from hmt_slam_ros.loop_closure.tlca import Tlca
 from hmt_slam_ros.messages.messages import Accepted, EndOfLog, Hypotheses, Keyframe, Message, RealTimePose
 from hmt_slam_ros.messages.replica import FIRST_AREA, Replica
 from hmt_slam_ros.messages.routing import Process
-from hmt_slam_ros.metric_slam.slam import MetricSlam
 from hmt_slam_ros.offline.runtime import LockStep
 from hmt_slam_ros.real_time_localization.rtl import Rtl
 from hmt_slam_ros.sensors import Scan
@@ -87,8 +86,8 @@ class Watch:
         """Map the whole log."""
         configuration = self.configuration
         processes: dict[str, Process] = {
-            "slam": MetricSlam(configuration),
-            "aam": Aam(configuration),
+            "slam": composition.metric_slam(configuration),
+            "aam": composition.area_abstraction(configuration),
             "tsbi": Tsbi(configuration, self.branching),
             "tlca": Tlca(configuration),
             "rtl": Rtl(configuration),

@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from hmt_slam_ros.area_abstraction.doors import OpeningDetector, Way
 from hmt_slam_ros.area_abstraction.overlap import Sensed, overlaps, sensed_overlaps
 from hmt_slam_ros.area_abstraction.overlap_graph import OverlapGraph, Separation, least_cut, synchronised
 from hmt_slam_ros.area_abstraction.partition import AamState, AreaPolicy, Joint, Watch, numbered, watch_of
@@ -19,7 +20,6 @@ from hmt_slam_ros.hybrid_map.common_map import Keyframes, Pair
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.hybrid_map.keyframe_pruning import crowded, in_place
 from hmt_slam_ros.hybrid_map.shortest_path import telling_arc
-from hmt_slam_ros.landmarks.portals import Way
 from hmt_slam_ros.messages.map_changes import Forgotten, Merged
 from hmt_slam_ros.messages.messages import (
     Accepted,
@@ -60,13 +60,19 @@ class Aam:
     left, those of which a place holds too many.
     """
 
-    def __init__(self, configuration: Configuration, state: AamState | None = None) -> None:
-        """:param state: to go on from."""
+    def __init__(
+        self, configuration: Configuration, state: AamState | None = None, detector: OpeningDetector | None = None
+    ) -> None:
+        """:param state: to go on from.
+
+        :param detector: sees openings, for a partition that asks for doors.
+        :raises HmtSlamError: where that asks for them and there is no detector.
+        """
         state = state or AamState()
         self._options = configuration.aam
         self._filter = configuration.filter
         self._max_range = configuration.local_map.max_range
-        self._policy = AreaPolicy(configuration)
+        self._policy = AreaPolicy(configuration, detector)
         self._replica = Replica.of(state.replica)
         self._seen: dict[int, Sensed] = {}
         self._watches = {hypothesis: watch_of(own, state.graphs) for hypothesis, own in state.watches.items()}
@@ -184,7 +190,7 @@ class Aam:
         watch = self._watches[leaf.hypothesis]
         graph = self._graph(watch, leaf.hypothesis, watch.area)
         own = watch.own | {newest}
-        found = self._policy.separation(graph, own, newest, watch.way, self._keyframes(leaf.hypothesis, watch.area))
+        found = self._policy.separation(graph, own, newest, watch.way)
         watch = replace(
             watch, graphs=watch.graphs | {watch.area: graph}, own=own, separate=watch.separate + 1 if found else 0
         )

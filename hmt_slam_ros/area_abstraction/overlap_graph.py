@@ -119,29 +119,6 @@ def separation(
     return None
 
 
-def separation_by_chambers(
-    graph: OverlapGraph, chambers: Mapping[int, int], newest: int, min_size: int
-) -> Separation | None:
-    """The keyframes in the chamber of the newest one, where that is another than the one in which the area began.
-
-    :param chambers: {keyframe: number of its chamber}, 0 of those that are not in it.
-    :param min_size: keyframes on each side at least.
-    """
-    side = np.array([chambers.get(keyframe, 0) == chambers[newest] for keyframe in graph.keyframes])
-    if chambers[newest] == 0 or min(side.sum(), (~side).sum()) < min_size:
-        return None
-    return Separation(tuple(graph.keyframes[i] for i in np.flatnonzero(side)), ncut(graph.similarity, side))
-
-
-def bisection(graph: OverlapGraph, own: Collection[int], newest: int, min_size: int) -> Separation | None:
-    """The part of the newest keyframe at the best cut of an area in two, however much it cuts; as `separation`."""
-    similarity, sizes, nodes = _contracted(graph, own)
-    first = normalized_cut(similarity, min_size, sizes)
-    if first is None or not first.side[nodes.index(newest)]:
-        return None
-    return Separation(tuple(int(nodes[i]) for i in np.flatnonzero(first.side)), first.value)
-
-
 def least_cut(graph: OverlapGraph, part: Collection[int], min_size: int) -> float:
     """The least NCut at which a graph falls into two: that which sets ``part`` apart, or a better one.
 

@@ -1,8 +1,7 @@
 """Where an area ends: what the AAM remembers of every hypothesis, and its criteria of partition.
 
 Blanco et al. say that their areas are no rooms; for Tomatis, Nourbakhsh and Siegwart (2003), section 2.1, a place ends
-at an opening. By ``both``, overlaps through an opening that the path passed count less in the normalised cut. By
-``portal``, the keyframes behind an opening leave; an area that is too large for that is cut where overlap is least.
+at an opening. By ``both``, overlaps through an opening that the path passed count less in the normalized cut.
 """
 
 from __future__ import annotations
@@ -14,25 +13,17 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hmt_slam_ros.area_abstraction.overlap_graph import (
-    OverlapGraph,
-    Separation,
-    bisection,
-    least_cut,
-    separation,
-    separation_by_chambers,
-)
+from hmt_slam_ros.area_abstraction.doors import OpeningDetector, OpeningView, Way
+from hmt_slam_ros.area_abstraction.overlap_graph import OverlapGraph, Separation, least_cut, separation
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration import Configuration
+from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.common_map import Keyframes, Pair
 from hmt_slam_ros.hybrid_map.shortest_path import beside
-from hmt_slam_ros.landmarks.area_landmarks import AreaLandmarks, Sighting, sees_around
-from hmt_slam_ros.landmarks.portals import Way
 from hmt_slam_ros.messages.messages import Keyframe, LeafEstimate
 from hmt_slam_ros.messages.replica import FIRST_AREA, FIRST_HYPOTHESIS, Replica, ReplicaState
-from hmt_slam_ros.submap.local_mapping import LocalMapping
 
 
 class Joint(NamedTuple):
@@ -163,11 +154,15 @@ _AROUND = 10
 class AreaPolicy:
     """Says what separates from an area, and sees the openings that this takes."""
 
-    def __init__(self, configuration: Configuration) -> None:
-        self._options, self._features = configuration.aam, configuration.features
-        by_openings = self._options.area_policy != "ncut"
-        self._landmarks = AreaLandmarks(LocalMapping(configuration)) if by_openings else None
-        self._factor = {"ncut": 1.0, "portal": 0.0, "both": self._options.portal_factor}[self._options.area_policy]
+    def __init__(self, configuration: Configuration, detector: OpeningDetector | None = None) -> None:
+        """:param detector: sees openings; by policy ``both`` there has to be one.
+
+        :raises HmtSlamError: where there is none then.
+        """
+        self._options, self._detector = configuration.aam, detector
+        if configuration.aam.area_policy == "both" and detector is None:
+            raise HmtSlamError("aam.area_policy = both needs landmarks, which see openings: give the AAM a detector")
+        self._factor = self._options.portal_factor if self._options.area_policy == "both" else 1.0
 
     def seen(
         self, keyframe: Keyframe, leaves: Sequence[LeafEstimate], replica: Replica, watches: Mapping[int, Watch]
@@ -176,24 +171,26 @@ class AreaPolicy:
 
         All hypotheses see what the most probable one does: what is around the robot they have in common.
         """
-        if self._landmarks is None or not keyframe.mapping or not leaves:
+        if self._detector is None or not keyframe.mapping or not leaves:
             return {}
         best = max(leaves, key=lambda leaf: (replica.probabilities[leaf.hypothesis], -leaf.hypothesis))
-        around = self._around(self._landmarks, keyframe, best, replica)
+        around = self._around(self._detector, keyframe, best, replica)
         found = {}
         for leaf in leaves:
             watch = watches[leaf.hypothesis]
             way = watch.way.interrupted() if keyframe.carried else watch.way
             pose = PoseGaussian(leaf.pose.mean, around.pose.covariance)
-            way = way.seen(keyframe.sequence, pose, around.seen, around.rays, self._features)
+            way = way.seen(keyframe.sequence, pose, around)
             found[leaf.hypothesis] = replace(watch, way=way)
         return found
 
-    def _around(self, landmarks: AreaLandmarks, keyframe: Keyframe, leaf: LeafEstimate, replica: Replica) -> Sighting:
+    def _around(
+        self, detector: OpeningDetector, keyframe: Keyframe, leaf: LeafEstimate, replica: Replica
+    ) -> OpeningView:
         """What is around a keyframe, by the keyframes of its area and those beside it that were taken nearest."""
         hybrid_map, here = replica.maps[leaf.hypothesis], leaf.area
         placed: list[tuple[int, Float64]] = []
-        for area in () if sees_around(keyframe.scan) else (here, *beside(hybrid_map, here)):
+        for area in () if detector.sees_around(keyframe.scan) else (here, *beside(hybrid_map, here)):
             arc = hybrid_map.arc(here, area) if area != here else None
             frame = np.zeros(3) if arc is None else arc.mean
             placed += [(k, se2.compose(frame, at)) for k, at in hybrid_map.keyframes(area).items()]
@@ -202,34 +199,19 @@ class AreaPolicy:
         nearest = sorted(np.argsort(away, kind="stable")[:_AROUND].tolist())
         scans = [replica.scans[placed[i][0]] for i in nearest]
         poses = np.array([placed[i][1] for i in nearest]).reshape(-1, 3)
-        return landmarks.sighting(keyframe.scan, leaf.pose.mean, scans, poses)
+        return detector.view(keyframe.scan, leaf.pose.mean, scans, poses)
 
-    def separation(
-        self, graph: OverlapGraph, own: Collection[int], newest: int, way: Way, placed: Keyframes
-    ) -> Separation | None:
+    def separation(self, graph: OverlapGraph, own: Collection[int], newest: int, way: Way) -> Separation | None:
         """The part of the robot's own keyframes, the newest among them, that separates from its area.
 
         :param graph: of the area.
         :param own: the keyframes stored since the robot entered the area.
         :param newest: the newest keyframe, one of ``own``.
         :param way: of the robot.
-        :param placed: {keyframe: ``area_T_base``} of the area.
         """
-        threshold, least = self._options.ncut_threshold, self._options.min_cluster
-        if self._options.area_policy == "ncut":
-            return separation(graph, own, newest, threshold, least)
-        chambers = way.chambers(own)
         if self._options.area_policy == "both":
-            return separation(graph.weakened(chambers, self._factor), own, newest, threshold, least)
-        found = separation_by_chambers(graph, chambers, newest, least)
-        if found is None and self._is_large(placed, newest):
-            return bisection(graph, own, newest, least)
-        return found
-
-    def _is_large(self, placed: Keyframes, newest: int) -> bool:
-        """Whether an area reaches farther from the newest keyframe than it may."""
-        points = np.array([pose[:2] for pose in placed.values()])
-        return bool(np.hypot(*(points - placed[newest][:2]).T).max() > self._options.area_limit)
+            graph = graph.weakened(way.chambers(own), self._factor)
+        return separation(graph, own, newest, self._options.ncut_threshold, self._options.min_cluster)
 
     def least_cut(self, joint: Joint) -> float:
         """The least NCut of two areas as one between which the path went through an opening."""

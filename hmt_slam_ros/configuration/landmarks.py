@@ -211,7 +211,7 @@ class Places:
         high=0.999,
     )
     prior: bool = parameter(
-        True, "Whether landmarks weigh the places where a robot may be that woke up somewhere or was carried."
+        False, "Whether landmarks weigh the places where a robot may be that woke up somewhere or was carried."
     )
     prior_temper: float = parameter(
         0.2,

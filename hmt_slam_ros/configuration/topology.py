@@ -9,25 +9,17 @@ from hmt_slam_ros.configuration.parameter import parameter
 
 @dataclass(frozen=True)
 class AreaAbstraction:
-    """AAM: partition of the keyframes into areas by normalized cut, by openings that the path passes, or by both."""
+    """AAM: partition of the keyframes into areas by normalized cut, with doors or without."""
 
     area_policy: str = parameter(
         "ncut",
-        "Where an area ends: at normalized cuts (ncut), at openings that the path passes (portal), or at normalized "
-        "cuts of which openings are a part (both).",
-        choices=("ncut", "portal", "both"),
+        "Where an area ends: at normalized cuts (ncut), or at normalized cuts of which openings that the path passes "
+        "are a part (both).",
+        choices=("ncut", "both"),
     )
     portal_factor: float = parameter(
         0.1, "By both: factor on the overlap of keyframes with an opening between them.", low=0.0, high=1.0
     )
-    area_limit: float = parameter(
-        10.0,
-        "By portal: an area in which two keyframes are farther apart is cut where overlap is least.",
-        unit="m",
-        low=1.0,
-        high=1000.0,
-    )
-
     ncut_threshold: float = parameter(
         0.35,
         "Cut the area where Shi and Malik's NCut = cut/assoc(A,V) + cut/assoc(B,V) is below this; smaller values "

@@ -19,6 +19,7 @@ from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.hybrid_map.surroundings import Nearness, areas_around, stacked
+from hmt_slam_ros.landmarks.filter_selection import FilterSelector
 from hmt_slam_ros.places.area_views import AreaViews
 from hmt_slam_ros.places.chart import DOOR, Chart, chart_of
 from hmt_slam_ros.places.floor import LeadingOff
@@ -26,7 +27,6 @@ from hmt_slam_ros.places.place_graph import DIRECTION_NAMES, PlaceGraph
 from hmt_slam_ros.places.policy import MetricStart
 from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.sensors.motion_model import NO_STEP, Prediction, Step
-from hmt_slam_ros.submap.filter_selection import new_filter
 from hmt_slam_ros.submap.local_filter import PlacedKeyframe
 from hmt_slam_ros.submap.local_mapping import LocalMapping, Sighting
 
@@ -143,7 +143,7 @@ class RoomFilter:
             PlacedKeyframe(keyframe, start.area, known.scans[keyframe], pose)
             for keyframe, pose in known.surroundings(start.area).items()
         ]
-        self._filter = new_filter(mapping, 0, start.area)
+        self._filter = FilterSelector(mapping).new(0, start.area)
         self._filter.change_area(start.area, NO_STEP.increment, content)
         self._filter.stand(start.pose)
         self._step = NO_STEP

@@ -12,8 +12,9 @@ from hmt_slam_ros.arrays import Float64, Int32
 from hmt_slam_ros.configuration.landmarks import Features
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.grids.virtual_scan import virtual_scan
+from hmt_slam_ros.hybrid_map.landmark import Landmark
 from hmt_slam_ros.landmarks.beam_labels import Rays, rays_of
-from hmt_slam_ros.landmarks.landmark_map import Landmark, LandmarkMap
+from hmt_slam_ros.landmarks.landmark_map import LandmarkMap
 from hmt_slam_ros.landmarks.landmarks import Landmarks, landmarks_of
 from hmt_slam_ros.landmarks.line_extraction import extract_lines
 from hmt_slam_ros.landmarks.virtual_lines import lines_of_map, rays_of_map

@@ -19,18 +19,26 @@ import numpy as np
 from numba import njit
 
 from hmt_slam_ros.arrays import Float64
+from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.covariance import carried, inverse
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.landmarks.line_extraction import Lines, extract_for_map
-from hmt_slam_ros.landmarks.stochastic_map import LineMap, Marks, Observed
+from hmt_slam_ros.landmarks.stochastic_map import LineMap, Observed
 from hmt_slam_ros.registration.consistency import Agreement
 from hmt_slam_ros.registration.match_covariance import MatchError
 from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.sensors.motion_model import NO_STEP, Prediction, Step
+from hmt_slam_ros.submap.line_map_state import Marks
 from hmt_slam_ros.submap.local_filter import FilterStep, LineFilterState, PlacedKeyframe, Tracked
 from hmt_slam_ros.submap.local_mapping import LocalMapping, Sighting
 from hmt_slam_ros.submap.scan_evidence import Compared, Experience
+
+
+def lines_of_scan(scan: Scan, configuration: Configuration) -> Lines:
+    """The lines of a scan that a map of lines is compared with."""
+    return extract_for_map(scan, configuration.features)
+
 
 # A beam passes a wall if it does so at least so far from where the wall was seen to end, m.
 _INSIDE = 0.2
@@ -223,7 +231,7 @@ class LineFilter:
 
     def track(self, sighting: Sighting, prediction: Prediction) -> Tracked:
         """Predict and correct by the scan's lines."""
-        before, lines = self.pose, sighting.lines
+        before, lines = self.pose, sighting.derived(lines_of_scan)
         believed, contradicted = self._believed(lines, prediction)
         self.room = believed.room
         self._since_update = self._since_update.then(believed.step)

@@ -16,36 +16,12 @@ from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.logs.records import Log, LogRecord
 from hmt_slam_ros.logs.ros_types import LASER_SCAN, ODOMETRY, POSE, TRANSFORMS, TRUTH_TOPIC, RosMessage, typestore
 from hmt_slam_ros.logs.stamps import NANOSECONDS
-from hmt_slam_ros.open_log import open_log
 from hmt_slam_ros.sensors import Odometry, Scan
 
 ODOM_FRAME, BASE_FRAME, LASER_FRAME, WORLD_FRAME = "odom", "base_link", "laser", "world"
 
 _STORAGES = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}
 _NEVER = QosTime(9223372036, 854775807)  # "no deadline", as rosbag2 itself writes it
-
-
-def convert(
-    source: Path,
-    destination: Path,
-    *,
-    storage: str = "mcap",
-    scan_topic: str = "/scan",
-    odom_topic: str = "/odom",
-    start: float = 0.0,
-    duration: float | None = None,
-) -> Log:
-    """Write a log of any format, or a part of it, as a rosbag2 folder.
-
-    :param source: the log, as `open_log` takes it, with ``scan_topic`` ... ``duration``.
-    :param destination: folder to be made; it must not exist.
-    :param storage: ``mcap`` or ``sqlite3``.
-    :returns: the log that was read.
-    :raises HmtSlamError: where the log cannot be read or the folder not be made; nothing is left behind.
-    """
-    log = open_log(source, scan_topic=scan_topic, odom_topic=odom_topic, start=start, duration=duration)
-    write_bag(log, destination, storage=storage)
-    return log
 
 
 def write_bag(log: Log, destination: Path, *, storage: str = "mcap") -> None:

@@ -20,9 +20,15 @@ from hmt_slam_ros.messages.map_changes import Merged, Relabelled
 from hmt_slam_ros.messages.messages import Leaf, LeafEstimate, Trail
 from hmt_slam_ros.registration.match_covariance import MatchError
 from hmt_slam_ros.sensors import Scan
-from hmt_slam_ros.submap.filter_selection import Kinds, filter_of
-from hmt_slam_ros.submap.local_filter import FilterState, FilterStep, LineFilterState, LocalFilter, PlacedKeyframe
-from hmt_slam_ros.submap.local_mapping import LocalMapping, Sighting
+from hmt_slam_ros.submap.local_filter import (
+    FilterFactory,
+    FilterState,
+    FilterStep,
+    LineFilterState,
+    LocalFilter,
+    PlacedKeyframe,
+)
+from hmt_slam_ros.submap.local_mapping import Sighting
 from hmt_slam_ros.submap.scan_evidence import NOTHING_SAID, Judgement
 
 _FIRST_COVARIANCE = np.diag([1e-8, 1e-8, 1e-8])
@@ -122,13 +128,13 @@ class LiveHypothesis:
     looks: tuple[Look, ...] = ()
 
     @classmethod
-    def of(cls, mapping: LocalMapping, state: LiveState) -> LiveHypothesis:
+    def of(cls, filters: FilterFactory, settings: Filter, state: LiveState) -> LiveHypothesis:
         """The hypothesis of a state, whose patches are in the pool."""
         own = state.grid or state.lines
         assert own is not None
         return cls(
-            filter_of(mapping, own),
-            mapping.configuration.filter,
+            filters.restored(own),
+            settings,
             state.event_pose,
             state.moved,
             state.information,
@@ -352,15 +358,15 @@ class LiveHypothesis:
         ad = se2.adjoint(se2.between(self.filter.pose, self.event_pose))
         return PoseGaussian(self.filter.pose, ad @ self.drift @ ad.T + self.filter.tracking_covariance)
 
-    def change_area(self, leaf: Leaf, content: Sequence[PlacedKeyframe], kinds: Kinds) -> None:
+    def change_area(self, leaf: Leaf, content: Sequence[PlacedKeyframe], filters: FilterFactory) -> None:
         """Change the reference frame and load the local map, as TSBI decided.
 
         :param content: the keyframes of the areas that it names, in the frame of the robot's area.
-        :param kinds: chooses the kind of local map of an area that is entered.
+        :param filters: chooses the kind of local map of an area that is entered.
         """
         entered = leaf.area != self.filter.area
         if entered:
-            self.filter = kinds.entering(self.filter, leaf.area, content)
+            self.filter = filters.entering(self.filter, leaf.area, content)
         area_T_previous = np.zeros(3) if leaf.rebase is None else leaf.rebase.mean
         self.filter.change_area(leaf.area, area_T_previous, content)
         self.event_pose = se2.compose(area_T_previous, self.event_pose)

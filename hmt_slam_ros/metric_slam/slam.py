@@ -7,7 +7,7 @@ answer a keyframe event.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 
@@ -41,9 +41,9 @@ from hmt_slam_ros.metric_slam.scan_queue import ScanQueue, ScanQueueState
 from hmt_slam_ros.sensors import Odometry, Scan
 from hmt_slam_ros.sensors.deskew import deskewed
 from hmt_slam_ros.sensors.motion_model import MotionModel, MotionState, Prediction
-from hmt_slam_ros.submap.filter_selection import Kinds, new_filter
-from hmt_slam_ros.submap.local_filter import PlacedKeyframe
+from hmt_slam_ros.submap.local_filter import FilterFactory, PlacedKeyframe
 from hmt_slam_ros.submap.local_mapping import LocalMapping, Sighting
+from hmt_slam_ros.submap.particle_filter import ParticleFilters
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,13 +93,21 @@ class MetricSlam:
     :ivar mode: what is done with known ground; but a robot that may be anywhere maps what is around it.
     """
 
-    def __init__(self, configuration: Configuration, state: SlamState | None = None) -> None:
-        """:param state: to go on from."""
+    def __init__(
+        self,
+        configuration: Configuration,
+        state: SlamState | None = None,
+        filters: Callable[[LocalMapping], FilterFactory] = ParticleFilters,
+    ) -> None:
+        """:param state: to go on from.
+
+        :param filters: what makes the filters of areas.
+        """
         state = state or SlamState()
         self._configuration = configuration
         self.mode = configuration.mode
         self._mapping = LocalMapping(configuration)
-        self._kinds = Kinds(self._mapping)
+        self._filters = filters(self._mapping)
         self._in_sight = Nearness(CERTAIN, AROUND)
         self._replica = Replica.of(state.replica)
         self._motion = MotionModel(configuration.motion, state.motion)
@@ -116,12 +124,13 @@ class MetricSlam:
 
     def _live_in(self, state: SlamState) -> dict[int, LiveHypothesis]:
         if not state.live:
-            first = new_filter(self._mapping, FIRST_HYPOTHESIS, FIRST_AREA)
+            first = self._filters.new(FIRST_HYPOTHESIS, FIRST_AREA)
             return {FIRST_HYPOTHESIS: LiveHypothesis(first, self._configuration.filter)}
         grids = [live.grid.tables for live in state.live.values() if live.grid is not None]
         if state.patches is not None and grids:
             self._mapping.pool.load(state.patches, np.concatenate(grids))
-        return {hypothesis: LiveHypothesis.of(self._mapping, live) for hypothesis, live in state.live.items()}
+        settings = self._configuration.filter
+        return {name: LiveHypothesis.of(self._filters, settings, live) for name, live in state.live.items()}
 
     @property
     def state(self) -> SlamState:
@@ -345,7 +354,7 @@ class MetricSlam:
             live = parent if leaf.hypothesis == leaf.parent else parent.branch(leaf.hypothesis)
             if leaf.local:
                 areas = {local.area: local.pose for local in leaf.local}
-                live.change_area(leaf, self._content(leaf.hypothesis, areas), self._kinds)
+                live.change_area(leaf, self._content(leaf.hypothesis, areas), self._filters)
             children[leaf.hypothesis] = live
         for live in children.values() if hypotheses.outdated else ():
             if live.filter.keyframes[-1:] == [hypotheses.sequence]:

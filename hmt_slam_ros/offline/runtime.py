@@ -11,19 +11,17 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from hmt_slam_ros.area_abstraction.aam import Aam
+from hmt_slam_ros import composition
 from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.logs.records import Log, LogRecord
 from hmt_slam_ros.loop_closure.tlca import Tlca
 from hmt_slam_ros.messages.messages import Carried, EndOfLog, Message
 from hmt_slam_ros.messages.routing import HEARD_BY, Process
-from hmt_slam_ros.metric_slam.slam import MetricSlam
 from hmt_slam_ros.real_time_localization.rtl import Rtl
 from hmt_slam_ros.results.hmt_map import RunState
 from hmt_slam_ros.results.log_reading import LogState, Reading, goes_on
 from hmt_slam_ros.results.recorder import Recorder
 from hmt_slam_ros.sensors import Scan
-from hmt_slam_ros.topological_inference.tsbi import Tsbi
 
 
 @dataclass
@@ -95,9 +93,9 @@ class Run:
         :param others: {name: process}, which listen as well.
         """
         state = state or RunState()
-        self._slam = MetricSlam(configuration, state.slam)
-        self._aam = Aam(configuration, state.aam)
-        self._tsbi = Tsbi(configuration, state=state.tsbi)
+        self._slam = composition.metric_slam(configuration, state.slam)
+        self._aam = composition.area_abstraction(configuration, state.aam)
+        self._tsbi = composition.topological_inference(configuration, state.tsbi)
         self._tlca = Tlca(configuration, state.tlca)
         self._rtl = Rtl(configuration, state.rtl)
         self.recorder = Recorder(configuration, state.recorder)

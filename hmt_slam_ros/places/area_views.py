@@ -13,10 +13,11 @@ import numpy as np
 from hmt_slam_ros.arrays import Float64, Int64
 from hmt_slam_ros.configuration.landmarks import Features
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
+from hmt_slam_ros.hybrid_map.landmark import Landmark
 from hmt_slam_ros.hybrid_map.surroundings import same_poses, stacked
 from hmt_slam_ros.landmarks.area_classes import distances_around, shortest_hallway, space_within
 from hmt_slam_ros.landmarks.area_landmarks import AreaLandmarks, Growing
-from hmt_slam_ros.landmarks.landmark_map import Landmark, LandmarkMap
+from hmt_slam_ros.landmarks.landmark_map import LandmarkMap
 from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.submap.local_mapping import LocalMapping
 

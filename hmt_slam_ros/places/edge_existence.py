@@ -3,12 +3,12 @@
 Tomatis, Nourbakhsh and Siegwart (2003), section 3.3: what is expected and not seen loses existence, Eqs. (4) and (5),
 and is deleted below a minimum; so are ways between nodes here, as `landmark_map.Existence` has it for landmarks. A way
 was driven along, so that it was there. A keyframe in its middle that sees along it sees each piece of it free, which is
-a sight of that piece, or sees up to what stands in it, which is a miss of the piece where that stands, and tells nothing
-of those behind. A way is there as surely as the piece of it that is doubted most.
+a sight of that piece, or sees up to what stands in it, which is a miss of the piece where that stands, and tells
+nothing of those behind. A way is there as surely as the piece of it that is doubted most.
 
 Tomatis, Nourbakhsh and Siegwart (2003), section 3.3: what is expected and not seen loses existence, Eqs. (4) and (5),
-and where that is below a minimum it is deleted; so are ways here, see below. One that is seen free again, or
-passed, is there again.
+and where that is below a minimum it is deleted; so are ways here, see below. One that is seen free again, or passed, is
+there again.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 
 from hmt_slam_ros.arrays import Float64, Int8
 from hmt_slam_ros.configuration.landmarks import Features
-from hmt_slam_ros.landmarks.landmark_map import Existence
+from hmt_slam_ros.hybrid_map.landmark import Existence
 from hmt_slam_ros.places.floor import DIRECTIONS, Floor
 from hmt_slam_ros.places.observation_graph import QUARTERS
 from hmt_slam_ros.places.place_graph import PlaceGraph, opposite, turned

@@ -24,10 +24,11 @@ from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration.landmarks import Features
 from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.hybrid_map.landmark import Landmark
 from hmt_slam_ros.landmarks.beam_labels import Rays, rays_of
 from hmt_slam_ros.landmarks.corners import NO_CORNERS, corners_of
 from hmt_slam_ros.landmarks.heading import QUARTER
-from hmt_slam_ros.landmarks.landmark_map import Landmark, LandmarkMap
+from hmt_slam_ros.landmarks.landmark_map import LandmarkMap
 from hmt_slam_ros.landmarks.landmarks import OPENING, both
 from hmt_slam_ros.landmarks.line_extraction import Lines, extract_lines
 from hmt_slam_ros.landmarks.openings import NO_OPENINGS, Openings, openings_of

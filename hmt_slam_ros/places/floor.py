@@ -21,9 +21,10 @@ from hmt_slam_ros.arrays import Bool, Float64, Int64
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
+from hmt_slam_ros.hybrid_map.landmark import Landmark
 from hmt_slam_ros.hybrid_map.surroundings import Nearness, areas_around
 from hmt_slam_ros.landmarks.area_classes import sector_of
-from hmt_slam_ros.landmarks.landmark_map import Landmark, scatter_ratio
+from hmt_slam_ros.landmarks.landmark_map import scatter_ratio
 from hmt_slam_ros.landmarks.landmarks import OPENING
 from hmt_slam_ros.places.area_views import AreaView
 from hmt_slam_ros.places.observation_graph import QUARTERS

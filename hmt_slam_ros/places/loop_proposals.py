@@ -148,9 +148,6 @@ def _joining(chart: Chart, loop: Loop, begin: Loop, own: int) -> MapLoop:
     return MapLoop(node.area, other.area, pose, chart.nodes[min(begin.node, begin.other)].area)
 
 
-PROBABLE = 0.5
-"""Hypotheses of this probability are asked for loops."""
-
 # Keyframes that are looked at ahead, at a time.
 _AHEAD = 32
 

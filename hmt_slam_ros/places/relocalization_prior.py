@@ -25,9 +25,9 @@ from hmt_slam_ros.arrays import Bool, Float64
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
+from hmt_slam_ros.hybrid_map.landmark import Landmark
 from hmt_slam_ros.hybrid_map.surroundings import Nearness, areas_around, stacked
 from hmt_slam_ros.landmarks.area_landmarks import Sighting
-from hmt_slam_ros.landmarks.landmark_map import Landmark
 from hmt_slam_ros.landmarks.landmarks import due
 from hmt_slam_ros.places.area_views import AreaViews
 from hmt_slam_ros.places.floor import axis_of

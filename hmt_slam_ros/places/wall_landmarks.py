@@ -17,8 +17,8 @@ from hmt_slam_ros.arrays import Bool, Float64
 from hmt_slam_ros.configuration.landmarks import Places
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.hybrid_map.landmark import Landmark
 from hmt_slam_ros.landmarks.corners import Corners
-from hmt_slam_ros.landmarks.landmark_map import Landmark
 from hmt_slam_ros.landmarks.landmarks import OPENING, OUTER
 from hmt_slam_ros.landmarks.openings import Openings
 from hmt_slam_ros.places.floor import DIRECTIONS, Floor

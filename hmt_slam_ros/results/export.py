@@ -12,9 +12,9 @@ from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.grids.occupancy_map import occupancy_image, write_map
+from hmt_slam_ros.hybrid_map.landmark import Landmark
 from hmt_slam_ros.hybrid_map.surroundings import stacked
 from hmt_slam_ros.landmarks.area_classes import AreaKinds
-from hmt_slam_ros.landmarks.landmark_map import Landmark
 from hmt_slam_ros.landmarks.landmarks import KINDS
 from hmt_slam_ros.landmarks.portals import Portal, portals_of
 from hmt_slam_ros.places.area_views import AreaViews

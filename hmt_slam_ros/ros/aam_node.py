@@ -19,10 +19,11 @@ def make() -> ProcessNode:
 
 
 def _make_process(configuration: Configuration, beginning: Beginning) -> Remembering:
-    from hmt_slam_ros.area_abstraction.aam import Aam  # noqa: PLC0415  takes time, in which a signal has to be heard
+    # It takes time, in which a signal has to be heard.
+    from hmt_slam_ros import composition  # noqa: PLC0415
     from hmt_slam_ros.area_abstraction.partition import AamState  # noqa: PLC0415
 
-    return Aam(configuration, beginning.part("aam", AamState))
+    return composition.area_abstraction(configuration, beginning.part("aam", AamState))
 
 
 def main() -> None:

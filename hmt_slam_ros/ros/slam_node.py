@@ -371,12 +371,13 @@ class SlamNode(ProcessNode):
 
 def _make_process(configuration: Configuration, beginning: Beginning) -> MetricSlam:
     # It takes time, in which a signal has to be heard.
-    from hmt_slam_ros.metric_slam.slam import MetricSlam, SlamState  # noqa: PLC0415
+    from hmt_slam_ros import composition  # noqa: PLC0415
+    from hmt_slam_ros.metric_slam.slam import SlamState  # noqa: PLC0415
 
     state = beginning.part("slam", SlamState) or SlamState()
     more = max(0, beginning.scans - state.scans)
     numbered_on = replace(state, scans=state.scans + more, first_of_trail=state.first_of_trail + more)
-    return MetricSlam(configuration, numbered_on)
+    return composition.metric_slam(configuration, numbered_on)
 
 
 def main() -> None:

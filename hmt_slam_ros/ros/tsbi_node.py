@@ -71,9 +71,10 @@ def pmf_message(hypotheses: Hypotheses) -> Float64MultiArray:
 
 def _make_process(configuration: Configuration, beginning: Beginning) -> Tsbi:
     # It takes time, in which a signal has to be heard.
-    from hmt_slam_ros.topological_inference.tsbi import Tsbi, TsbiState  # noqa: PLC0415
+    from hmt_slam_ros import composition  # noqa: PLC0415
+    from hmt_slam_ros.topological_inference.tsbi import TsbiState  # noqa: PLC0415
 
-    return Tsbi(configuration, state=beginning.part("tsbi", TsbiState))
+    return composition.topological_inference(configuration, beginning.part("tsbi", TsbiState))
 
 
 def main() -> None:

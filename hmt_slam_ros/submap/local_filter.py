@@ -8,10 +8,10 @@ from typing import NamedTuple, Protocol
 
 from hmt_slam_ros.arrays import Float64, Int32
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.landmarks.stochastic_map import LineMapState
 from hmt_slam_ros.registration.match_covariance import MatchError
 from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.sensors.motion_model import Prediction, Step
+from hmt_slam_ros.submap.line_map_state import LineMapState
 from hmt_slam_ros.submap.local_mapping import Sighting
 from hmt_slam_ros.submap.scan_evidence import Compared, Experience
 
@@ -212,5 +212,30 @@ class LocalFilter(Protocol):
 
         :param content: all keyframes of the local map.
         :param anchor: the keyframe by which the robot's place is known.
+        """
+        ...
+
+
+class FilterFactory(Protocol):
+    """Makes filters, and chooses their kind for each area."""
+
+    def new(self, hypothesis: int, area: int) -> LocalFilter:
+        """A filter that knows nothing yet."""
+        ...
+
+    def restored(self, state: FilterState | LineFilterState) -> LocalFilter:
+        """The filter of a state; the patches of grids are in the pool.
+
+        :raises HmtSlamError: for a state of a kind that this factory does not make.
+        """
+        ...
+
+    def entering(self, own: LocalFilter, area: int, content: Sequence[PlacedKeyframe]) -> LocalFilter:
+        """The filter to go on with: ``own``, or one of another kind that has the robot where ``own`` has it.
+
+        It knows nothing of what is around the robot until it changes to the area. ``own`` is given up if it is not it.
+
+        :param area: the one that is entered.
+        :param content: keyframes in its frame, of which those of the area tell what it is.
         """
         ...

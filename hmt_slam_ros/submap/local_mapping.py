@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from functools import cached_property
+from typing import Any, TypeVar
 
 import numpy as np
 from numba import njit
@@ -13,13 +15,14 @@ from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.grids.insertion import InverseModel
 from hmt_slam_ros.grids.patch_pool import Beams, PatchPool
 from hmt_slam_ros.grids.patches import FAR, PATCH
-from hmt_slam_ros.landmarks.line_extraction import Lines, extract_for_map
 from hmt_slam_ros.registration import scan_to_map
 from hmt_slam_ros.registration.match_covariance import MatchNoise
 from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.sensors.surfels import surfels
 
 _ODDS_PER_NAT = 20.0
+
+T = TypeVar("T")
 
 
 class LocalMapping:
@@ -89,16 +92,19 @@ class Sighting:
     def __init__(self, mapping: LocalMapping, scan: Scan) -> None:
         self.scan = scan
         self._mapping = mapping
+        self._derived: dict[Callable[[Scan, Configuration], Any], Any] = {}
 
     @cached_property
     def surfels(self) -> Float64:
         """What is matched with a grid, shape (n, 4), base frame."""
         return self._mapping.matching_points(self.scan)
 
-    @cached_property
-    def lines(self) -> Lines:
-        """What is compared with a map of lines."""
-        return extract_for_map(self.scan, self._mapping.configuration.features)
+    def derived(self, make: Callable[[Scan, Configuration], T]) -> T:
+        """What a function makes of the scan, worked out once for all filters that ask for it."""
+        if make not in self._derived:
+            self._derived[make] = make(self.scan, self._mapping.configuration)
+        found: T = self._derived[make]
+        return found
 
     @property
     def laser(self) -> Float64:

@@ -11,6 +11,7 @@ from collections.abc import Collection, Sequence
 import numpy as np
 
 from hmt_slam_ros.arrays import Float64
+from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.covariance import inverse, turned
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
@@ -21,7 +22,14 @@ from hmt_slam_ros.registration.match_covariance import match_error
 from hmt_slam_ros.registration.scan_to_map import Prior
 from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.sensors.motion_model import NO_STEP, Prediction
-from hmt_slam_ros.submap.local_filter import FilterState, FilterStep, PlacedKeyframe, Tracked
+from hmt_slam_ros.submap.local_filter import (
+    FilterState,
+    FilterStep,
+    LineFilterState,
+    LocalFilter,
+    PlacedKeyframe,
+    Tracked,
+)
 from hmt_slam_ros.submap.local_mapping import LocalMapping, Sighting
 from hmt_slam_ros.submap.scan_evidence import Compared, Experience, compared
 from hmt_slam_ros.submap.scan_matcher import ScanMatcher, map_information
@@ -297,3 +305,31 @@ class AreaFilter:
 def _normalised(log_weights: Float64) -> Float64:
     weights = np.exp(log_weights - log_weights.max())
     return weights / weights.sum()
+
+
+class ParticleFilters:
+    """Makes particle filters for all areas."""
+
+    def __init__(self, mapping: LocalMapping) -> None:
+        """:raises HmtSlamError: where ``local_map.kind`` asks for lines."""
+        kind = mapping.configuration.local_map.kind
+        if kind != "grid":
+            raise HmtSlamError(f"local_map.kind = {kind} needs the filters of the landmarks: give them to metric SLAM")
+        self._mapping = mapping
+
+    def new(self, hypothesis: int, area: int) -> LocalFilter:
+        """A filter that knows nothing yet."""
+        return AreaFilter(self._mapping, hypothesis, area)
+
+    def restored(self, state: FilterState | LineFilterState) -> LocalFilter:
+        """The filter of a state; the patches of its grids are in the pool.
+
+        :raises HmtSlamError: where its local map is one of lines.
+        """
+        if isinstance(state, LineFilterState):
+            raise HmtSlamError("the saved map has local maps of lines: go on from it with its own local_map.kind")
+        return AreaFilter.of(self._mapping, state)
+
+    def entering(self, own: LocalFilter, area: int, content: Sequence[PlacedKeyframe]) -> LocalFilter:  # noqa: ARG002
+        """The filter to go on with, which is ``own`` in every area."""
+        return own

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections import ChainMap
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmt_slam_ros.configuration.tree import Configuration
+from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
@@ -25,16 +26,13 @@ from hmt_slam_ros.hybrid_map.surroundings import gap, positions
 from hmt_slam_ros.messages.map_changes import Arc, ArcEnds, Merged, Relabelled
 from hmt_slam_ros.messages.messages import Leaf
 from hmt_slam_ros.messages.replica import FIRST_AREA, Replica
-from hmt_slam_ros.places.area_views import AreaViews
-from hmt_slam_ros.places.loop_proposals import PROBABLE, LoopProposals
-from hmt_slam_ros.places.relocalization_prior import PlacePrior
 from hmt_slam_ros.registration.consistency import NO_CLUTTER, Clutter
 from hmt_slam_ros.sensors import Scan
-from hmt_slam_ros.submap.local_mapping import LocalMapping
 from hmt_slam_ros.topological_inference.admission import Query
 from hmt_slam_ros.topological_inference.closure_search import ClosureSearch, Comparison, Fit, SearchState
 from hmt_slam_ros.topological_inference.global_localization import Told, Whereabouts
 from hmt_slam_ros.topological_inference.hypothesis_tree import LeafNotes, relative_covariance
+from hmt_slam_ros.topological_inference.landmark_evidence import LandmarkEvidence
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,6 +96,9 @@ class Branches(NamedTuple):
     where: Whereabouts | None = None
 
 
+PROBABLE = 0.5
+"""Hypotheses of this probability are asked for loops that landmarks propose."""
+
 FEWEST = 4
 """Known areas that every hypothesis may examine at a cut, however improbable it is."""
 
@@ -123,18 +124,26 @@ class Branching:
     """Makes the children of hypotheses; numbers new areas.
 
     :ivar search: finds and compares known areas.
-    :ivar views: what areas show.
-    :ivar loops: proposes some, where landmarks are asked.
+    :ivar landmarks: what they say of places and loops, where they are asked.
     :ivar recent: {keyframe event: scan} of those that no map holds and that may be looked for.
     """
 
-    def __init__(self, configuration: Configuration, replica: Replica) -> None:
+    def __init__(
+        self,
+        configuration: Configuration,
+        replica: Replica,
+        landmarks: Callable[[Configuration, Mapping[int, Scan]], LandmarkEvidence | None] | None = None,
+    ) -> None:
+        """:param landmarks: makes the evidence of landmarks for the scans of keyframes.
+
+        :raises HmtSlamError: where the configuration asks for that and nothing makes it.
+        """
+        if landmarks is None and (configuration.places.prior or configuration.places.loops):
+            raise HmtSlamError("places.prior and places.loops need landmarks: give them to topological inference")
         self.recent: dict[int, Scan] = {}
         scans = ChainMap(self.recent, replica.scans)
         self.search = ClosureSearch(configuration, scans)
-        self.views = AreaViews(LocalMapping(configuration), scans)
-        self._prior = PlacePrior(configuration, self.views) if configuration.places.prior else None
-        self.loops = LoopProposals(configuration, self.views) if configuration.places.loops else None
+        self.landmarks = None if landmarks is None else landmarks(configuration, scans)
         self._options = configuration.tsbi
         self._replica = replica
         sigma, angle = configuration.tlca.arc_sigma_floor, math.radians(configuration.tlca.arc_angle_floor)
@@ -165,27 +174,28 @@ class Branching:
         :param told: where the reference is, if somebody says so.
         """
         where = self.search.everywhere(parent.hybrid_map, poses, before, parent.clutter, told)
-        if self._prior is None or parent.notes.sighted is None:
+        if self.landmarks is None or parent.notes.sighted is None:
             return where
-        return self._prior.weighed(where, parent.hybrid_map, poses, before)
+        return self.landmarks.weigh(where, parent.hybrid_map, poses, before)
 
     def look_ahead(self, parents: Sequence[Parent]) -> None:
         """At an event at which nothing was looked for, prepare what the next look will ask for."""
         self.search.look_ahead(max(parents, key=lambda parent: parent.log_weight).hybrid_map)
         lost = [(one.hybrid_map, one.notes.lost) for one in parents if one.notes.lost is not None]
-        if lost and self._prior is not None:
-            self._prior.look_ahead(lost)
+        if lost and self.landmarks is not None:
+            self.landmarks.prepare_places(lost)
 
     def found(self) -> None:
         """It is known where the robot is."""
         self.search.found()
-        if self.loops is None:
-            self.views.forget()
+        if self.landmarks is not None:
+            self.landmarks.localized()
 
     def forget_scans(self) -> None:
         """Work out anew what is made of scans, of which some have changed."""
         self.search.forget_scans()
-        self.views.forget()
+        if self.landmarks is not None:
+            self.landmarks.forget_scans()
 
     def remember(self, event: int, scan: Scan, wanted: Collection[int]) -> None:
         """Keep the scan of a keyframe event, and of those that were kept the ones that are wanted."""
@@ -223,8 +233,8 @@ class Branching:
             return Branches([self._enter_tracked(parent, query, tracked)])
         excluded = {parent.area, *parent.around()}
         supposed = parent
-        if self.loops is not None and parent.share >= PROBABLE:
-            supposed = replace(parent, hybrid_map=self.loops.supposed(parent.hybrid_map, parent.area))
+        if self.landmarks is not None and parent.share >= PROBABLE:
+            supposed = replace(parent, hybrid_map=self.landmarks.propose_loop(parent.hybrid_map, parent.area))
         found = self._compared(supposed, query, excluded)
         noted = replace(parent, notes=parent.notes.checked(found.examined, keyframes, found.beside))
         children = [self._enter_new(noted, query, math.log(found.transition.new))]
@@ -241,8 +251,8 @@ class Branching:
         keyframes = [k for k in (newest if only else parent.notes.unchecked) if k in placed]
         query = self.query(parent, keyframes)
         excluded = {parent.area, *parent.around(), *beside(parent.hybrid_map, parent.area)}
-        if self.loops is not None and parent.share >= PROBABLE:
-            self.loops.look_ahead(parent.hybrid_map, parent.area)
+        if self.landmarks is not None and parent.share >= PROBABLE:
+            self.landmarks.prepare_loops(parent.hybrid_map, parent.area)
         found = self._compared(parent, query, excluded, only)
         notes = parent.notes.checked(found.examined, keyframes, found.beside, all_areas=not only)
         noted = replace(parent, notes=notes)

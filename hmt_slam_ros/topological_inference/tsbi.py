@@ -132,7 +132,8 @@ class Tsbi:
             self._note(message)
         elif isinstance(message, AreaEvents):
             answer = self._infer(message)
-            return [*(self._branching.loops.notices() if self._branching.loops else ()), answer]
+            landmarks = self._branching.landmarks
+            return [*(landmarks.notices() if landmarks else ()), answer]
         elif isinstance(message, Accepted):
             self._accept(message)
         elif isinstance(message, Arriving):

@@ -1,4 +1,4 @@
-"""Which kind of filter an area has."""
+"""Which kind of filter an area has: one with a grid, one with lines, or by what the area is."""
 
 from __future__ import annotations
 
@@ -14,25 +14,24 @@ from hmt_slam_ros.submap.local_mapping import LocalMapping
 from hmt_slam_ros.submap.particle_filter import AreaFilter
 
 
-def new_filter(mapping: LocalMapping, hypothesis: int, area: int) -> LocalFilter:
-    """A filter that knows nothing yet, of the kind that ``local_map.kind`` names; by class, one with a grid."""
-    kind = LineFilter if mapping.configuration.local_map.kind == "lines" else AreaFilter
-    return kind(mapping, hypothesis, area)
-
-
-def filter_of(mapping: LocalMapping, state: FilterState | LineFilterState) -> LocalFilter:
-    """The filter of a state; the patches of grids are in the pool."""
-    if isinstance(state, LineFilterState):
-        return LineFilter.of(mapping, state)
-    return AreaFilter.of(mapping, state)
-
-
-class Kinds:
-    """Chooses the kind of filter for an area that is entered, after Tomatis et al. (2003), section 3.1."""
+class FilterSelector:
+    """Chooses the kind of filter by ``local_map.kind``; by class, after Tomatis et al. (2003), section 3.1."""
 
     def __init__(self, mapping: LocalMapping) -> None:
         self._mapping = mapping
+        self._kind = mapping.configuration.local_map.kind
         self._classes = AreaKinds(mapping)
+
+    def new(self, hypothesis: int, area: int) -> LocalFilter:
+        """A filter that knows nothing yet, of the kind that ``local_map.kind`` names; by class, one with a grid."""
+        kind = LineFilter if self._kind == "lines" else AreaFilter
+        return kind(self._mapping, hypothesis, area)
+
+    def restored(self, state: FilterState | LineFilterState) -> LocalFilter:
+        """The filter of a state; the patches of grids are in the pool."""
+        if isinstance(state, LineFilterState):
+            return LineFilter.of(self._mapping, state)
+        return AreaFilter.of(self._mapping, state)
 
     def entering(self, own: LocalFilter, area: int, content: Sequence[PlacedKeyframe]) -> LocalFilter:
         """The filter to go on with: ``own``, or one of another kind that has the robot where ``own`` has it.
@@ -42,7 +41,7 @@ class Kinds:
         :param area: the one that is entered.
         :param content: keyframes in its frame, of which those of the area tell what it is.
         """
-        if self._mapping.configuration.local_map.kind != "by_class":
+        if self._kind != "by_class":
             return own
         kind = self._of(area, content)
         if kind is None or isinstance(own, kind):
