@@ -14,8 +14,8 @@ import numpy as np
 
 from benchmark.driven_run import DrivenRun
 from benchmark.explore import is_within
+from benchmark.institute import AT_PLACE, known_of
 from benchmark.institute_maps import LASER, PEOPLE, charted, scenario_of
-from benchmark.institute_missions import AT_PLACE, known_of
 from benchmark.pilot_nodes import Errands, Ran, Start
 from benchmark.report import Report, Requirement, table
 from benchmark.running_nodes import Listener
