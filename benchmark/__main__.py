@@ -20,8 +20,7 @@ from benchmark.report import Report
 from benchmark.runs import Runner
 from benchmark.settings import Settings
 from benchmark.simulated.records import Records
-from benchmark.simulated.worlds import FAMILIES, INSTITUTE, LONG
-from benchmark.table_runs import CAMPUS
+from benchmark.simulated.worlds import CAMPUS, FAMILIES, INSTITUTE, LONG
 from hmt_slam_ros.cli.arguments import OneSentenceParser
 from hmt_slam_ros.errors import HmtSlamError
 

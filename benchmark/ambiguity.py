@@ -10,10 +10,9 @@ from benchmark.charts import Panel, plot_ambiguity
 from benchmark.logs import BUNDLED, opened
 from benchmark.report import Report, Requirement, table
 from benchmark.runs import PARAMETERS
-from benchmark.settings import Settings
-from benchmark.simulated.measured import chosen_seeds, records_of
+from benchmark.settings import Settings, chosen_seeds, records_of
+from benchmark.simulated.loops import ALIKE_BEAMS, ALIKE_RADIUS, ALIKE_VIEW
 from benchmark.simulated.records import Record
-from benchmark.simulated.rivals import BEAMS, RADIUS, VIEW
 from benchmark.stories import DECIDED, HIGH, LATER, LOW, SOON, SURE, Moment, Verdict, story, told, verdict
 from hmt_slam_ros.configuration import load_configuration
 from hmt_slam_ros.logs import open_log
@@ -28,10 +27,10 @@ _SHOWN = 15  # keyframe events before the question that are drawn, and after
 POLICY = (
     "A re-entry is the first keyframe event at which the robot, after new ground, is in a known place again that looks "
     f"the same as another known one: a laser without noise sees the same from the robot's true pose and from its image "
-    f"in the other place, but for {100.0 * BEAMS:.0f} % of the beams or {VIEW:g} m, and an old keyframe is within "
-    f"{RADIUS:g} m of the image. *By odometry* is the probability of the true place among all that look the same which "
-    "follows from the readings since the robot last saw anything (in the ring, where it always does, since it was "
-    "there a lap ago), under the covariance that their errors truly have. Where that is "
+    f"in the other place, but for {100.0 * ALIKE_BEAMS:.0f} % of the beams or {ALIKE_VIEW:g} m, and an old keyframe is "
+    f"within {ALIKE_RADIUS:g} m of the image. *By odometry* is the probability of the true place among all that look "
+    "the same which follows from the readings since the robot last saw anything (in the ring, where it always does, "
+    "since it was there a lap ago), under the covariance that their errors truly have. Where that is "
     f"{DECIDED:g} or more, odometry tells the places apart, and the evidence is there before the question; so it is in "
     "the ring, all of whose sides look alike for ever, but a quarter turn is more than odometry ever errs by in a lap. "
     "Elsewhere the evidence is the first keyframe at which the views differ. The question is the first event at which "

@@ -20,8 +20,7 @@ from benchmark.forecasts import (
 )
 from benchmark.plots import plot_reliability
 from benchmark.report import Report, Requirement, table
-from benchmark.settings import Settings
-from benchmark.simulated.measured import by_family, chosen_seeds, records_of
+from benchmark.settings import Settings, by_family, chosen_seeds, records_of
 from benchmark.simulated.records import Record
 
 RUNS = 300

@@ -9,8 +9,7 @@ import numpy as np
 
 from benchmark.plots import plot_nees
 from benchmark.report import Report, Requirement, table
-from benchmark.settings import Settings
-from benchmark.simulated.measured import by_family, chosen_seeds, records_of
+from benchmark.settings import Settings, by_family, chosen_seeds, records_of
 from benchmark.simulated.records import Record
 
 RUNS = 100

@@ -14,8 +14,7 @@ import numpy as np
 from benchmark.institute_maps import PEOPLE, InstituteMap, mapped, scenario_of
 from benchmark.report import Report, Requirement, table
 from benchmark.runs import PARAMETERS
-from benchmark.settings import Settings
-from benchmark.simulated.measured import chosen_seeds
+from benchmark.settings import Settings, chosen_seeds
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration import Configuration, load_configuration
 from hmt_slam_ros.exploration.destinations import Destination, KnownBuilding, destinations

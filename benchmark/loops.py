@@ -8,9 +8,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from benchmark.report import Report, Requirement, table
-from benchmark.settings import Settings
+from benchmark.settings import Settings, by_family, chosen_seeds, records_of
 from benchmark.simulated.loops import AWAY, GRACE, OLD, STAY, VIEW
-from benchmark.simulated.measured import by_family, chosen_seeds, records_of
 from benchmark.simulated.records import Record
 from benchmark.simulated.truth import FAR, GREY, NEAR, RADIUS, TURN
 

@@ -20,8 +20,7 @@ from benchmark.pilot_nodes import Errands, Ran, Start
 from benchmark.report import Report, Requirement, table
 from benchmark.running_nodes import Listener
 from benchmark.runs import PARAMETERS
-from benchmark.settings import Settings
-from benchmark.simulated.measured import chosen_seeds
+from benchmark.settings import Settings, chosen_seeds
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration import Configuration, load_configuration
 from hmt_slam_ros.errors import HmtSlamError

@@ -13,8 +13,7 @@ from benchmark.report import Report, Requirement, table
 from benchmark.runs import Case, Run
 from benchmark.scoring import POLICY as RELATIONS
 from benchmark.scoring import SeedMeans, over_seeds, score
-from benchmark.settings import Settings
-from benchmark.simulated.measured import chosen_seeds
+from benchmark.settings import Settings, chosen_seeds
 from benchmark.simulated.records import Record, Records
 from benchmark.simulated.worlds import INSTITUTE, World
 from hmt_slam_ros.errors import HmtSlamError

@@ -15,7 +15,8 @@ from benchmark.report import Report, Requirement, table
 from benchmark.robustness import LONG_LIMIT
 from benchmark.runs import Run, Runner
 from benchmark.settings import Settings
-from benchmark.table_runs import CAMPUS, CAMPUS_WORLD, EXTENTS, Charted, KeptRunner, compared, judged, metric_case
+from benchmark.simulated.worlds import CAMPUS, CAMPUS_WORLD
+from benchmark.table_runs import EXTENTS, Charted, KeptRunner, compared, judged, metric_case
 from benchmark.table_runs import reference as reference_of
 from hmt_slam_ros.errors import HmtSlamError
 

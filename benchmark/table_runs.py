@@ -21,7 +21,7 @@ from benchmark.logs import MeasuredLog, datasets, opened
 from benchmark.runs import PARAMETERS, Case, Run, Runner
 from benchmark.scoring import FINAL
 from benchmark.simulated.records import code
-from benchmark.simulated.worlds import FIRST_VALIDATION_SEED, LONG, World
+from benchmark.simulated.worlds import CAMPUS, CAMPUS_WORLD
 from hmt_slam_ros.evaluation import (
     RelationErrors,
     Relations,
@@ -32,11 +32,6 @@ from hmt_slam_ros.evaluation import (
     truth_of,
 )
 from hmt_slam_ros.simulation import open_simulated
-
-CAMPUS = "campus"
-
-CAMPUS_WORLD = World(LONG, FIRST_VALIDATION_SEED).log
-"""2 km of way through loops of corridors, one inside the other."""
 
 EXTENTS = {"edmonton": 100.0, CAMPUS: 200.0, "aces": 80.0}
 """Half side of the one map of a log, m, that holds all of it."""

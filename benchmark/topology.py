@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from benchmark.loops import closable
 from benchmark.report import Report, Requirement, table
-from benchmark.settings import Settings
-from benchmark.simulated.measured import chosen_seeds, records_of
+from benchmark.settings import Settings, chosen_seeds, records_of
 from benchmark.simulated.records import Record
 from benchmark.simulated.worlds import LONG
 

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from benchmark.ambiguity import Reentry, requirements, settling_table
-from benchmark.simulated.loops import Loop
-from benchmark.simulated.rivals import by_odometry, looks_alike, rivalries
+from benchmark.simulated.loops import Loop, by_odometry, looks_alike, rivalries
 from benchmark.simulated.truth import Truth
 from benchmark.stories import NEW, RIGHT, WRONG, Verdict, story, verdict
 from hmt_slam_ros.geometry import se2
