@@ -13,10 +13,8 @@ from datetime import UTC, datetime
 from importlib import import_module
 from pathlib import Path
 
-from benchmark.circumstances import circumstances, summary
-from benchmark.documents import ACCURACY, VALIDATION, shown, write_between_marks
 from benchmark.logs import LOGS, ROOT
-from benchmark.report import Report
+from benchmark.report import ACCURACY, VALIDATION, Report, circumstances, shown, summary, write_between_marks
 from benchmark.runs import Runner
 from benchmark.settings import Settings
 from benchmark.simulated.records import Records
@@ -55,6 +53,7 @@ MEASUREMENTS = {
     "identity": "whether results are the same, byte for byte, as those on record",
     "short": "for CI, whether accuracy became worse than benchmark/expected.toml beyond noise",
 }
+_MODULES = {"consistency": "calibration", "topology": "loops", "sessions": "accuracy"}
 _GROUPS = {
     "all": ("accuracy", "robustness", "sessions", "speed", "live"),
     "validation": (
@@ -102,7 +101,7 @@ def _measure(options: argparse.Namespace) -> list[Report]:
     )
     reports = []
     for kind in _kinds(options):
-        module = import_module(f"benchmark.{kind}")
+        module = import_module(f"benchmark.{_MODULES.get(kind, kind)}")
         report: Report = getattr(module, f"measure_{kind}")(settings)
         facts = circumstances(report.seeds, options.jobs, options.set)
         report.write(out, facts)

@@ -22,10 +22,9 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmark.circumstances import circumstances
 from benchmark.driven_run import DrivenRun
 from benchmark.logs import BUNDLED, MeasuredLog, missing, opened
-from benchmark.report import Report, Requirement, table
+from benchmark.report import Report, Requirement, circumstances, table
 from benchmark.runs import PARAMETERS, Case, Run
 from benchmark.settings import Settings
 from hmt_slam_ros.configuration import load_configuration

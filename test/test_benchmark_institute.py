@@ -5,7 +5,6 @@ import math
 import numpy as np
 import pytest
 
-from benchmark.documents import VALIDATION, marks
 from benchmark.institute import (
     Estimate,
     Mission,
@@ -16,6 +15,7 @@ from benchmark.institute import (
     way_length,
 )
 from benchmark.institute_maps import InstituteMap, judged, scenario_of
+from benchmark.report import VALIDATION, marks
 from hmt_slam_ros.exploration.destinations import Destination
 from hmt_slam_ros.features.existence import Existence
 from hmt_slam_ros.features.landmark_map import Landmark

@@ -8,9 +8,8 @@ import sys
 import numpy as np
 import pytest
 
-from benchmark.documents import ACCURACY, marks, write_between_marks
 from benchmark.logs import ROOT, missing, opened
-from benchmark.report import Report, Requirement
+from benchmark.report import ACCURACY, Report, Requirement, marks, write_between_marks
 from hmt_slam_ros.errors import HmtSlamError
 
 

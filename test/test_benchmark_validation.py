@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 
 from benchmark.__main__ import main
-from benchmark.consistency import KINDS, covered, mean_nees
-from benchmark.documents import VALIDATION, marks
-from benchmark.forecasts import (
+from benchmark.calibration import (
+    KINDS,
     Forecast,
+    covered,
     forecast,
     interval,
+    mean_nees,
     new_rate,
     of_arcs,
     of_base_rate,
@@ -20,10 +21,9 @@ from benchmark.forecasts import (
     of_top,
     reliability,
 )
-from benchmark.loops import distances, missed_share
-from benchmark.report import Requirement
+from benchmark.loops import distances, faults, missed_share
+from benchmark.report import VALIDATION, Requirement, marks
 from benchmark.simulated.closures import NEW, NOT_ASKED
-from benchmark.topology import faults
 
 
 def answer(area, probability, right):
