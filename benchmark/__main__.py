@@ -26,32 +26,32 @@ UNMET, FAULT = 1, 2
 _LEAST_MINUTES = 2.0
 
 MEASUREMENTS = {
-    "accuracy": "errors at true relations, torn walls where there is no truth",
+    "accuracy": "trajectory errors at true relations; torn walls where there is no truth",
     "robustness": "the same with degraded odometry",
-    "sessions": "whether a log mapped in two sessions is as accurate as in one go",
-    "speed": "CPU time, memory, cost of a scan, start",
-    "live": "how late the nodes' poses are, a fast laser, replays at ten times real time",
-    "kernels": "CPU time of the inner loops, and that they take no memory",
-    "calibration": "whether the probabilities of topological paths are right, on simulated worlds",
-    "loops": "precision and recall of loop closures, likewise",
-    "topology": "whether the world of nested loops ends with the exact topology",
-    "consistency": "whether covariances are as large as errors, on simulated worlds",
-    "institute": "whether robots in an institute know at which place they are, on missions and when they are lost",
-    "threeloops": "whether loops close that only the belief over places can propose",
-    "policies": "what areas that end at doors cost and gain, and portals against true doors",
-    "explore": "whether a robot explores an institute by itself, and goes on missions to rooms on its own map",
-    "pilot": "whether the pilot gets a robot to rooms of an explored institute, through nodes",
-    "table": "time and memory against a global metric RBPF at equal accuracy, the paper's Table II",
-    "ambiguity": "whether both answers stay alive where places are identical, until the evidence",
+    "sessions": "accuracy of a log mapped in two sessions instead of one",
+    "speed": "CPU time, memory, cost of a scan, start of the nodes",
+    "live": "latency of the nodes' poses, with a fast laser and in replays at ten times real time",
+    "calibration": "calibration of the probabilities of topological paths",
+    "loops": "precision and recall of loop closures",
+    "topology": "exactness of the final topology in the world of nested loops",
+    "consistency": "NEES of arcs, of areas' poses and of RTL's pose",
+    "institute": "missions and global localization over places in an institute",
+    "threeloops": "loop closures that only the belief over places proposes",
+    "explore": "exploration of an institute, and missions to its rooms",
+    "pilot": "errands of the pilot through nodes in an explored institute",
+    "policies": "areas that end at doors, and portals against true doors",
+    "ambiguity": "hypotheses in identical places until the evidence tells them apart",
+    "table": "time and memory against a global metric RBPF at equal accuracy (Table II)",
     "oracle": "TSBI's PMF against an exact enumeration of all topologies",
-    "awakening": "whether a robot that wakes up in a saved map finds out where, and after how many metres",
-    "kidnapping": "whether a robot that is carried while it drives notices, and is right in the end",
-    "laps": "whether memory, cost and errors grow where a robot drives over known ground again and again",
-    "changes": "whether a map follows furniture and doors in mode lifelong, and holds nobody who walked by",
+    "awakening": "global localization in a saved map",
+    "kidnapping": "recovery of a robot that is carried while it drives",
+    "laps": "memory, cost and errors over repeated laps on known ground",
+    "changes": "maps of changing worlds in mode lifelong, among people",
     "scale": "time and memory in maps of up to 100,000 areas",
-    "soak": "whether nodes that run for an hour keep their memory and leave nothing behind",
-    "identity": "whether results are the same, byte for byte, as those on record",
-    "short": "for CI, whether accuracy became worse than benchmark/expected.toml beyond noise",
+    "kernels": "CPU time and memory allocations of the inner loops",
+    "soak": "memory of nodes that run for an hour, and what they leave behind",
+    "identity": "byte-for-byte identity of results with those on record",
+    "short": "accuracy against benchmark/expected.toml, for CI",
 }
 _MODULES = {"consistency": "calibration", "topology": "loops", "sessions": "accuracy"}
 _GROUPS = {
@@ -132,9 +132,13 @@ def _folder(options: argparse.Namespace) -> Path:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = OneSentenceParser(prog="python -m benchmark", description="Measurements of hmt_slam_ros on logs.")
-    told = "; ".join(f"{name}: {text}" for name, text in MEASUREMENTS.items())
-    parser.add_argument("measurements", nargs="+", choices=(*MEASUREMENTS, *_GROUPS), metavar="KIND", help=told)
+    parser = OneSentenceParser(
+        prog="python -m benchmark",
+        description="Measurements of hmt_slam_ros on recorded and simulated logs.",
+        epilog=_told(),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("measurements", nargs="+", choices=(*MEASUREMENTS, *_GROUPS), metavar="KIND", help="see below")
     names = ", ".join((*LOGS, *FAMILIES, INSTITUTE, LONG, CAMPUS))
     parser.add_argument("--logs", type=_names, default=(), metavar="A,B", help=f"of {names}")
     parser.add_argument("--seeds", type=_count, default=0, metavar="N", help="seeds 0 to N-1; simulated: from 1000")
@@ -147,6 +151,13 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--write-expected", action="store_true", help="put what short measures on record")
     parser.add_argument("--write-docs", action="store_true", help="put the tables into docs/")
     return parser
+
+
+def _told() -> str:
+    """The kinds of measurements and their groups, one a line."""
+    kinds = [f"  {name:<12} {text}" for name, text in MEASUREMENTS.items()]
+    groups = [f"  {name:<12} {', '.join(kinds)}" for name, kinds in _GROUPS.items()]
+    return "\n".join(["kinds:", *kinds, "", "groups of kinds:", *groups])
 
 
 def _names(text: str) -> tuple[str, ...]:
