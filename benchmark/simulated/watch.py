@@ -20,11 +20,10 @@ import numpy as np
 
 from benchmark.runs import PARAMETERS
 from benchmark.simulated.closures import Closure, Paths, answers, by_arcs_alone
-from benchmark.simulated.doors import doors
 from benchmark.simulated.examinations import Examination, Row, WatchedBranching, rows
 from benchmark.simulated.loops import Loop, Loops, rivalries
 from benchmark.simulated.records import code
-from benchmark.simulated.truth import Pose, Truth, nees
+from benchmark.simulated.truth import Pose, Truth, doors, nees
 from benchmark.simulated.worlds import World
 from hmt_slam_ros.configuration import Configuration, load_configuration
 from hmt_slam_ros.errors import HmtSlamError
