@@ -1,4 +1,4 @@
-"""Identical places: do both hypotheses stay alive until something tells them apart, and does the true one win then?"""
+"""Hypotheses in identical places: probabilities until the evidence, and the outcome after it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A world that changes between visits: what of it gets into the map in mode lifelong, what stays, and who walked by."""
+"""Maps of changing worlds in mode lifelong: changed and kept surfaces, and traces of people."""
 
 from __future__ import annotations
 

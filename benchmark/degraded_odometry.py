@@ -1,4 +1,7 @@
-"""A log with worse odometry than it was recorded with, to measure what the system bears.
+"""Logs with degraded odometry, and the program that maps them.
+
+``python -m benchmark.degraded_odometry KIND LOG --out DIR ...`` maps a log as ``hmt_slam map`` does. The seed of the
+run is also the seed of what is drawn for the odometry.
 
 ==========  ==========================================================================================================
 kind        what is done to the odometry

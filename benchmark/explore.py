@@ -1,4 +1,4 @@
-"""A robot that explores the floors of institutes by its own map, and then goes to rooms that it names."""
+"""Exploration of institutes by the explorer, and missions to the rooms that it found."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Are results the same, byte for byte, as those of the code that ``benchmark/identity.toml`` was written with?
+"""Byte-for-byte comparison of results with those on record in ``benchmark/identity.toml``.
 
 A change of layout, of names or of speed changes no bit of any result. A fixed set of runs has a digest each of its
 trajectories, probabilities, graph, closures and map; ``python -m benchmark identity`` compares them with the recorded

@@ -1,4 +1,4 @@
-"""Maps that SLAM makes of scripted drives through a simulated institute, and their charts beside what is true."""
+"""Maps of scripted drives through a simulated institute, and their charts beside the truth."""
 
 from __future__ import annotations
 

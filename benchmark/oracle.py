@@ -1,4 +1,4 @@
-"""Is TSBI's PMF that of an exact enumeration of all topologies? On worlds small enough to enumerate."""
+"""TSBI's PMF against an exact enumeration of all topologies, on small worlds."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Errands of the pilot through nodes: a robot that wakes up in an institute that was explored goes to its rooms."""
+"""Errands of the pilot through nodes, in an institute that was explored."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What worse odometry does to accuracy and topology."""
+"""Accuracy and topology under degraded odometry."""
 
 from __future__ import annotations
 

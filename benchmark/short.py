@@ -1,4 +1,4 @@
-"""The short form for CI: has accuracy become worse than it was, by more than the noise between seeds?
+"""Accuracy check for CI: fails where accuracy became worse by more than the noise between seeds.
 
 ``benchmark/expected.toml`` holds, for every figure, mean and deviation over some seeds, normally ten, of the code that
 it was written with. The mean over the few seeds of the short form may exceed the expected mean by

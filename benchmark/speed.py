@@ -1,4 +1,4 @@
-"""What a run costs: CPU time, memory, a scan in each process, and the start of the programs."""
+"""Cost of a run: CPU time, memory, a scan in each process, and the start of the programs."""
 
 from __future__ import annotations
 

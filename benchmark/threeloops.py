@@ -1,4 +1,4 @@
-"""Three loops of three: institutes that are gone round twice, whose loops only the belief over places can propose.
+"""Loop closures that only the belief over places proposes, in institutes that are gone round twice.
 
 And what it proposes in other worlds, where a laser sees half a circle.
 """
