@@ -1,4 +1,4 @@
-"""Measurements of the whole system on logs: accuracy, robustness, speed."""
+"""Measurements of the whole system on recorded and simulated logs."""
 
 from hmt_slam_ros.process_settings import settle
 

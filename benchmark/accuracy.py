@@ -2,24 +2,63 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
-from benchmark.logs import LOGS, MeasuredLog, opened
-from benchmark.plots import plot_errors_by_seed, plot_errors_by_span
+from benchmark.logs import LOGS, WITH_RELATIONS, MeasuredLog, opened
 from benchmark.report import Report, Requirement, table
 from benchmark.runs import Case, Run
-from benchmark.scoring import FINAL, ONLINE, POLICY, SeedMeans, errors, over_seeds, score
+from benchmark.scoring import (
+    FINAL,
+    ONLINE,
+    POLICY,
+    WALLS_POLICY,
+    SeedMeans,
+    Walls,
+    errors,
+    judge_walls,
+    over_seeds,
+    score,
+    scored,
+)
 from benchmark.settings import Settings
-from benchmark.walls import POLICY as WALLS
-from benchmark.walls import Walls, judge_walls
-from hmt_slam_ros.evaluation import read_tum
+from hmt_slam_ros.evaluation import PairErrors, RelationErrors, StampedPoses, read_tum
+from hmt_slam_ros.open_log import open_log
+from hmt_slam_ros.results.output_folder import EARLIER
 
 SEEDS = 5
+
 LONG_FACTOR, WORST_FACTOR = 1.5, 1.25
 """Largest ratios to the mean error: of relations over more than 60 s, and of the worst seed."""
+
+_CLOSED = (
+    "Whether a map closes shows in what is seen twice, not in the number of loop closures: of areas that the local map "
+    "holds together there is no loop to close. A missed loop shows as torn stretches or, where the second pass "
+    "is far off, as fewer stretches over known ground than with other seeds."
+)
+
+WORSE = 1.2
+"""How much larger the mean error may be than that of the log mapped in one go."""
+
+# The scan at the middle is in the first half alone, s.
+_NEXT = 1e-3
+
+SESSIONS_POLICY = (
+    "The log is cut in the middle of its time. The first half is mapped; the second one extends that map "
+    "(`hmt_slam map --from`) as a log of another day would: the robot may be anywhere in it, and its odometry begins "
+    "anew. The relations are those of the whole log, also between poses of the first half and of the second, which the "
+    "output folder has in one frame. Matched as for accuracy; means over the seeds."
+)
+
+_DPI = 110
+_BINS = 12
+_LEAST = 20  # errors of a bin that is drawn
+_SHORTEST = 0.1  # s; shorter spans are drawn there
 
 
 @dataclass(frozen=True)
@@ -29,12 +68,6 @@ class Bound:
     translation: float
     rotation: float
 
-
-_CLOSED = (
-    "Whether a map closes shows in what is seen twice, not in the number of loop closures: of areas that the local map "
-    "holds together there is no loop to close. A missed loop shows as torn stretches or, where the second pass "
-    "is far off, as fewer stretches over known ground than with other seeds."
-)
 
 BOUNDS = {"aces": Bound(0.043, 0.9), "intel": Bound(0.022, 0.8)}
 
@@ -133,7 +166,7 @@ def _look_for_double_walls(report: Report, by_log: dict[MeasuredLog, list[Run]])
             Requirement(f"{name}: torn stretches, worst seed", max(len(judged.torn) for judged in own), 0),
             Requirement(f"{name}: seeds in which nothing is seen twice", [len(j.stretches) for j in own].count(0), 0),
         ]
-    report.body += [_walls_table(walls, areas, closures), WALLS, _CLOSED]
+    report.body += [_walls_table(walls, areas, closures), WALLS_POLICY, _CLOSED]
     report.data["walls"] = {
         name: [{"agreement": w.agreement, "stretches": [asdict(s) for s in w.stretches]} for w in own]
         for name, own in walls.items()
@@ -159,3 +192,116 @@ def _walls_table(walls: dict[str, list[Walls]], areas: dict[str, list[int]], clo
 
 def _span(counts: Sequence[int]) -> str:
     return str(min(counts)) if min(counts) == max(counts) else f"{min(counts)} to {max(counts)}"
+
+
+def measure_sessions(settings: Settings) -> Report:
+    """Map every log in one go and in two sessions, with every seed."""
+    seeds = settings.seeds_or(SEEDS)
+    report = Report("sessions", "A log in two sessions", seeds=seeds)
+    rows: list[list[str]] = []
+    with opened(settings.logs_or(WITH_RELATIONS)) as logs:
+        for log in logs:
+            scores = {
+                "in one go": [score(run.folder, log) for run in settings.runner.runs(_session_cases(log, settings))],
+                "in two sessions": [errors_of_all(run.folder, log) for run in _halves(log, settings)],
+            }
+            means = {name: over_seeds(own) for name, own in scores.items()}
+            whole, halves = means.values()
+            worse = halves.translation / whole.translation
+            report.requirements.append(Requirement(f"{log.name}: error in two sessions / in one go", worse, WORSE))
+            rows += [_session_row(log.name, name, mean) for name, mean in means.items()]
+            report.data[log.name] = {name: [asdict(one) for one in own] for name, own in scores.items()}
+    head = ["log", "mapped", "translation [m]", "between seeds", "worst seed", "over 60 s [m]", "its max"]
+    report.body += [table([*head, "rotation [deg]", "matched"], rows), SESSIONS_POLICY]
+    return report
+
+
+def _session_cases(log: MeasuredLog, settings: Settings) -> list[Case]:
+    return [Case(log, seed, "", settings.changes) for seed in settings.seeds_or(SEEDS)]
+
+
+def _halves(log: MeasuredLog, settings: Settings) -> list[Run]:
+    """The runs of the second half of a log, each on the map of the first."""
+    middle = round(0.5 * open_log(log.path).duration, 3)
+    first = settings.runner.runs([replace(case, duration=middle) for case in _session_cases(log, settings)])
+    second = [replace(run.case, duration=0.0, start=middle + _NEXT, source=run.folder) for run in first]
+    return settings.runner.runs(second)
+
+
+def errors_of_all(folder: Path, log: MeasuredLog) -> RelationErrors:
+    """Errors of the trajectories of all sessions in the final map of an output folder."""
+    parts = [read_tum(path) for path in (*sorted((folder / EARLIER).glob("*.tum")), folder / FINAL)]
+    stamps, poses = (np.concatenate(columns) for columns in zip(*((p.stamps, p.poses) for p in parts), strict=True))
+    return scored(StampedPoses(stamps, poses), log)
+
+
+def _session_row(name: str, mapped: str, mean: SeedMeans) -> list[str]:
+    return [
+        name,
+        mapped,
+        f"**{mean.translation:.4f}**",
+        f"± {mean.translation_std:.4f}",
+        f"{mean.worst:.4f}",
+        f"{mean.long:.4f}",
+        f"{mean.long_max:.2f}",
+        f"{mean.rotation:.3f}",
+        f"{100.0 * mean.matched:.1f} %",
+    ]
+
+
+def plot_errors_by_seed(
+    path: Path, scores: Mapping[str, Mapping[str, Sequence[RelationErrors]]], bounds: Mapping[str, float]
+) -> None:
+    """Mean translation errors of every seed, one panel for each log.
+
+    :param scores: {log: {file of the trajectory: score of each seed}}.
+    :param bounds: {log: largest mean over the seeds, m}.
+    """
+    figure = Figure(figsize=(5.0 * len(scores), 4.0), layout="constrained")
+    for axes, (name, own) in zip(_panels(figure, len(scores)), scores.items(), strict=True):
+        final = own[FINAL]
+        axes.plot([s.overall.translation.mean for s in final], "o-", color="C0", label="final, all relations")
+        axes.plot([s.over_60_s.translation.mean for s in final], "s-", color="C3", label="final, over 60 s")
+        axes.plot([s.overall.translation.mean for s in own[ONLINE]], "^:", color="C2", label="online, all relations")
+        if name in bounds:
+            axes.axhline(bounds[name], color="black", linewidth=0.8)
+        axes.set_xticks(range(len(final)))
+        axes.set_ylim(bottom=0.0)
+        axes.set_title(name)
+        axes.set_xlabel("number of the seed")
+        axes.set_ylabel("mean error of translation [m]")
+        axes.legend(fontsize=7)
+    figure.savefig(path, dpi=_DPI)
+
+
+def plot_errors_by_span(path: Path, pairs: Mapping[str, Sequence[PairErrors]]) -> None:
+    """Translation error against the time span of the relations, one panel for each log.
+
+    :param pairs: {log: errors of each seed}.
+    """
+    figure = Figure(figsize=(5.0 * len(pairs), 4.0), layout="constrained")
+    for axes, (name, own) in zip(_panels(figure, len(pairs)), pairs.items(), strict=True):
+        seconds = np.maximum(np.concatenate([errors.span[errors.found] for errors in own]) * 1e-9, _SHORTEST)
+        translation = np.concatenate([errors.translation[errors.found] for errors in own])
+        axes.plot(seconds, translation, ".", markersize=1.5, color="0.7", rasterized=True)
+        edges = np.geomspace(seconds.min(), seconds.max(), _BINS + 1)
+        bins = np.clip(np.searchsorted(edges, seconds, side="right") - 1, 0, _BINS - 1)
+        filled = np.flatnonzero(np.bincount(bins) >= _LEAST)
+        centres = [np.median(seconds[bins == k]) for k in filled]
+        for share, style in ((50, "o-"), (95, "^--")):
+            heights = [np.percentile(translation[bins == k], share) for k in filled]
+            axes.plot(centres, heights, style, label=f"{share} %")
+        axes.axvline(60.0, color="black", linewidth=0.8)
+        axes.set_xscale("log")
+        axes.set_yscale("log")
+        axes.set_ylim(bottom=1e-3)
+        axes.set_title(name)
+        axes.set_xlabel("time between the two poses [s]")
+        axes.set_ylabel("error of translation [m]")
+        axes.legend(fontsize=7)
+    figure.savefig(path, dpi=_DPI)
+
+
+def _panels(figure: Figure, count: int) -> Sequence[Axes]:
+    panels: Sequence[Axes] = figure.subplots(1, count, squeeze=False)[0]
+    return panels

@@ -1,4 +1,4 @@
-"""How often compiled kernels take memory from the heap while a log is mapped, as numba's runtime counts it."""
+"""Heap allocations of compiled kernels while a log is mapped, as numba's runtime counts them."""
 
 from __future__ import annotations
 

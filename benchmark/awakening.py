@@ -1,4 +1,4 @@
-"""A robot wakes up somewhere in a map that was saved: how far does it travel until it knows where, and is it right?"""
+"""Global localization in a saved map: distance until the robot is localized, and correctness."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a robot sees of landmarks, drawn from the very model that the belief over places is made of."""
+"""Observations of landmarks, drawn from the model of the belief over places."""
 
 from __future__ import annotations
 

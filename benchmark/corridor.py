@@ -1,4 +1,4 @@
-"""What a bare corridor does to the filter: ``python -m benchmark.corridor [--seeds N]``.
+"""The filter in a bare corridor: ``python -m benchmark.corridor [--seeds N]``.
 
 Between two straight walls without ends the scans show nothing of how far the robot came. So the motion along the walls
 has to be that of the odometry, whose noise is here drawn as the motion model has it, and its covariance must cover the

@@ -1,4 +1,7 @@
-"""A log with worse odometry than it was recorded with, to measure what the system bears.
+"""Logs with degraded odometry, and the program that maps them.
+
+``python -m benchmark.degraded_odometry KIND LOG --out DIR ...`` maps a log as ``hmt_slam map`` does. The seed of the
+run is also the seed of what is drawn for the odometry.
 
 ==========  ==========================================================================================================
 kind        what is done to the odometry
@@ -18,20 +21,25 @@ same readings, bit for bit.
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hmt_slam_ros.cli.arguments import chosen_configuration, parser
+from hmt_slam_ros.cli.map_command import measured_run
 from hmt_slam_ros.configuration.metric_slam import Motion
+from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.logs.records import Log, LogRecord
 from hmt_slam_ros.logs.stamps import NANOSECONDS
+from hmt_slam_ros.open_log import open_log
+from hmt_slam_ros.results.output_folder import replacing, write_output
 from hmt_slam_ros.sensors import Odometry
 
 KINDS = ("noise-2x", "noise-4x", "slip", "missing", "none")
-
 _MISSING_SHARE = 0.05
 _SLIP_SHARE = 0.2
 _SLIP = math.radians(20.0)
@@ -161,3 +169,25 @@ def _middles_of_turns(seconds: NDArray[np.float64], heading: NDArray[np.float64]
             half = begin + int(np.argmax(np.abs(heading[begin : end + 1] - heading[begin]) >= 0.5 * abs(turned)))
             middles.append(seconds[half])
     return np.array(middles)
+
+
+def main(arguments: list[str]) -> int:
+    """Run; return the exit status."""
+    kind, *rest = arguments
+    options = parser().parse_args(["map", *rest])
+    try:
+        configuration = chosen_configuration(options)
+        part = configuration.robot
+        recorded = open_log(options.log, start=part.start, duration=part.duration or None)
+        log = degraded(recorded, kind, configuration.seed)
+        with replacing(options.out) as folder:
+            final, source_stamps, figures = measured_run(log, configuration)
+            write_output(folder, final, source_stamps, figures, configuration)
+    except HmtSlamError as fault:
+        print(f"degraded_odometry: {fault}", file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,4 +1,4 @@
-"""A simulated robot that the explorer or the pilot drives by what the package's own processes say, all in lock-step."""
+"""Lock-step runs of a simulated robot that the explorer or the pilot drives."""
 
 from __future__ import annotations
 

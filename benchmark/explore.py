@@ -1,4 +1,4 @@
-"""A robot that explores the floors of institutes by its own map, and then goes to rooms that it names."""
+"""Exploration of institutes by the explorer, and missions to the rooms that it found."""
 
 from __future__ import annotations
 
@@ -9,12 +9,10 @@ from typing import NamedTuple
 import numpy as np
 
 from benchmark.driven_run import DrivenRun, true_place
-from benchmark.institute_maps import PEOPLE, charted, scenario_of
-from benchmark.places import Judged, judged
+from benchmark.institute_maps import NEAR, PEOPLE, Judged, charted, judged, scenario_of
 from benchmark.report import Report, Requirement, table
 from benchmark.runs import PARAMETERS
-from benchmark.settings import Settings
-from benchmark.simulated.measured import chosen_seeds
+from benchmark.settings import Settings, chosen_seeds
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration import Configuration, load_configuration
 from hmt_slam_ros.exploration.explorer import Explorer
@@ -39,8 +37,9 @@ _STATES, _CONFUSED, _PAPER_SPEED = 0.98, 0.092, 0.31  # paper, tables 1 and 2
 POLICY = (
     f"An institute of 13 states with {PEOPLE} people and a laser that sees all around. The robot knows nothing of it, "
     "and is driven by the explorer by what the package's own SLAM says, all in lock-step. Passed: states to whose "
-    f"place the robot came within {_PASSED:g} m. On the chart, confused: as of the scripted drives, see the places of "
-    "an institute. Rooms entered: true ones that the robot was in. "
+    f"place the robot came within {_PASSED:g} m. On the chart: states with a node of the chart within "
+    f"{NEAR:g} m. Confused: nodes that are a crossing where there is a door or the other way, or at no state; ends of "
+    "hallways are not counted. Rooms entered: true ones that the robot was in. "
     f"Then at least {MISSIONS} missions one after the other, until they are {METRES:g} m in all, each to another one, "
     "drawn by chance, of the rooms that the explorer found and named, with mapping going on. A mission is a success "
     "where the robot says that it is there, in "

@@ -1,4 +1,4 @@
-"""Are results the same, byte for byte, as those of the code that ``benchmark/identity.toml`` was written with?
+"""Byte-for-byte comparison of results with those on record in ``benchmark/identity.toml``.
 
 A change of layout, of names or of speed changes no bit of any result. A fixed set of runs has a digest each of its
 trajectories, probabilities, graph, closures and map; ``python -m benchmark identity`` compares them with the recorded
@@ -22,10 +22,9 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmark.circumstances import circumstances
 from benchmark.driven_run import DrivenRun
 from benchmark.logs import BUNDLED, MeasuredLog, missing, opened
-from benchmark.report import Report, Requirement, table
+from benchmark.report import Report, Requirement, circumstances, table
 from benchmark.runs import PARAMETERS, Case, Run
 from benchmark.settings import Settings
 from hmt_slam_ros.configuration import load_configuration

@@ -1,4 +1,4 @@
-"""Maps that SLAM makes of scripted drives through a simulated institute, and their charts beside what is true."""
+"""Maps of scripted drives through a simulated institute, and their charts beside the truth."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.hybrid_map.surroundings import stacked
 from hmt_slam_ros.offline.runtime import run_log
 from hmt_slam_ros.places.area_views import AreaView, AreaViews
-from hmt_slam_ros.places.chart import Chart, chart_of
+from hmt_slam_ros.places.chart import CROSSING, END, Chart, chart_of
 from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.simulation import open_simulated
 from hmt_slam_ros.simulation.scenario import Scenario
@@ -25,6 +25,9 @@ LASER = "field_of_view=360,beams=720"
 
 PEOPLE = 4
 """Who walk about."""
+
+NEAR = 1.0
+"""Largest distance from a state to the node of the chart that is it, m."""
 
 
 class InstituteMap(NamedTuple):
@@ -50,6 +53,21 @@ class InstituteMap(NamedTuple):
         """True poses of the chart's nodes, shape (n, 3)."""
         poses = [se2.compose(self.frames[node.area], node.pose) for node in self.chart.nodes]
         return np.array(poses).reshape(-1, 3)
+
+
+class Judged(NamedTuple):
+    """A chart against the truth.
+
+    :ivar states: how many there are.
+    :ivar detected: how many of these are nodes.
+    :ivar confused: how many nodes are confused.
+    :ivar off: distances of nodes from their states, m.
+    """
+
+    states: int
+    detected: int
+    confused: int
+    off: list[float]
 
 
 def scenario_of(seed: int, visit: int = 0, changed: float = 0.0, people: int = PEOPLE) -> Scenario:
@@ -86,3 +104,17 @@ def charted(
         true = true_poses(np.array([scans[keyframe].stamp for keyframe in own_poses]))
         frames[area] = se2.best_fit(stacked(own_poses), true)
     return InstituteMap(scenario, hybrid_map, scans, views, chart_of(hybrid_map, views, configuration.features), frames)
+
+
+def judged(institute: InstituteMap) -> Judged:
+    """A chart beside the truth."""
+    states, nodes = institute.scenario.building.states, institute.chart.nodes
+    away = np.hypot(*(institute.nodes[:, None, :2] - states.poses[None, :, :2]).transpose(2, 0, 1))
+    inner = np.array([node.kind != END for node in nodes])
+    crossing = np.array([node.kind == CROSSING for node in nodes])
+    own = away.argmin(axis=1)
+    near = inner & (away.min(axis=1) <= NEAR)
+    right = near & (states.crossings[own] == crossing)
+    found = len(set(own[near].tolist()))
+    off = away[near].min(axis=1).tolist()
+    return Judged(len(states.poses), found, int((inner & ~right).sum()), off)

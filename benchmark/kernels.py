@@ -1,4 +1,4 @@
-"""What the inner loops cost, in CPU time and in memory taken from the heap."""
+"""Cost of the inner loops: CPU time, and memory taken from the heap."""
 
 from __future__ import annotations
 

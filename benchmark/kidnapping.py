@@ -1,4 +1,4 @@
-"""A robot is carried elsewhere while it drives, and nobody says so: when does it notice, and is it right in the end?"""
+"""Recovery of a robot that is carried elsewhere while it drives: delay and correctness."""
 
 from __future__ import annotations
 

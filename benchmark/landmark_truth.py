@@ -1,4 +1,4 @@
-"""True corners and openings around a simulated robot, by the definitions of `hmt_slam_ros.landmarks`."""
+"""True corners and openings around a simulated robot, by the definitions of `hmt_slam_ros.features`."""
 
 from __future__ import annotations
 

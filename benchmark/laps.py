@@ -1,4 +1,4 @@
-"""What grows with time where a robot drives over known ground again and again?"""
+"""Growth of memory, cost and errors over repeated laps on known ground."""
 
 from __future__ import annotations
 

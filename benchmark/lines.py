@@ -1,4 +1,4 @@
-"""The lines of single scans against the true walls, on simulated worlds, for lasers of several kinds."""
+"""Lines of single simulated scans, compared with the true walls."""
 
 from __future__ import annotations
 
@@ -12,52 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmark.line_truth import Seen, difference, seen_in
-from benchmark.report import Report, Requirement, table
-from benchmark.runs import PARAMETERS
-from benchmark.settings import Settings
-from benchmark.simulated.measured import chosen_families, chosen_seeds
 from benchmark.simulated.worlds import World
-from hmt_slam_ros.configuration import load_configuration
 from hmt_slam_ros.configuration.landmarks import Features
 from hmt_slam_ros.landmarks.line_extraction import Lines, extract_lines
 from hmt_slam_ros.simulation import open_simulated
 from hmt_slam_ros.simulation.scenario import Scenario
 
-SEEDS = 4
-"""Worlds of every family."""
-
-FAMILIES = ("office", "busy", "nested", "twins", "hall")
-
-LASERS = {
-    "180°, 361 beams, 15 mm": "",
-    "180°, 91 beams, 15 mm": "beams=91",
-    "360°, 720 beams, 10 mm": "field_of_view=360,beams=720,range_noise=0.01",
-    "240°, 683 beams to 5.6 m, 30 mm": "field_of_view=240,beams=683,range=5.6,range_noise=0.03",
-    "270°, 1081 beams in 25 ms, 30 mm": (
-        "field_of_view=270,beams=1081,range=30,range_noise=0.03,sweep=0.025,forward=0.2"
-    ),
-}
-"""{name: settings of the simulated robot}."""
-
-ALLOWED = (1.8, 2.2)
-"""Between which the mean NEES has to be."""
-
-COVERED = 5.991
-"""Chi-square with 2 degrees of freedom at 95 %."""
-
 _SCANS = 60  # of every drive
-_STRAY = 0.01  # share of the lines that may lie on no wall
-_FASTEST = 2.0  # ms a scan
-
-POLICY = (
-    f"{_SCANS} scans of every drive, evenly spread, each for itself; features.range_deviation is that of the laser. A "
-    "line's wall is the one that most of its beams truly met, furniture being walls and walls on one line being one; "
-    "where most met a person, or none has half of them, the line is on no wall. NEES: squared Mahalanobis distance of "
-    "the true (alpha, r) from the line, under its covariance; 2 on average where the covariance is right. No line is "
-    "left out, however far off. What averages are of is the mean of each drive; noise is drawn anew for every scan, so "
-    "that errors of scans are independent. Found: share of the length of walls that beams truly met that lies within "
-    "what was seen of a line of that wall."
-)
 
 
 class Line(NamedTuple):
@@ -88,39 +49,6 @@ class Scanned(NamedTuple):
     shown: float
     found: float
     seconds: float
-
-
-def measure_lines(settings: Settings) -> Report:
-    """Extract the lines of scans of simulated drives and compare them with the walls."""
-    chosen = chosen_families(settings, FAMILIES)
-    seeds = chosen_seeds(settings, SEEDS)
-    features = load_configuration(PARAMETERS, list(settings.changes)).features
-    drives = {
-        (laser, family, seed): list(scans_of(World(family, seed), own, features))
-        for laser, own in LASERS.items()
-        for family in chosen
-        for seed in seeds
-    }
-    report = Report("lines", "Lines of scans", seeds=seeds)
-    low, high = ALLOWED
-    everything = list(drives.values())
-    for laser in LASERS:
-        own = [drive for (name, _, _), drive in drives.items() if name == laser]
-        report.requirements.append(Requirement(f"NEES of lines, {laser}", mean_nees(own), high, least=low))
-    report.requirements += [
-        Requirement("share of lines on no wall", stray_share(everything), _STRAY),
-        Requirement("time of a scan", milliseconds(everything), _FASTEST, "ms"),
-    ]
-    for column, name in ((0, "laser"), (1, "family")):
-        groups: dict[str, list[Sequence[Scanned]]] = {}
-        for key, drive in drives.items():
-            groups.setdefault(str(key[column]), []).append(drive)
-        report.body.append(_table(name, groups))
-    report.body.append(POLICY)
-    report.data["nees"] = {
-        ", ".join(map(str, key)): [line.nees for scan in drive for line in scan.lines] for key, drive in drives.items()
-    }
-    return report
 
 
 def scans_of(world: World, laser: str, features: Features) -> Iterator[Scanned]:
@@ -189,20 +117,3 @@ def stray_share(drives: Sequence[Sequence[Scanned]]) -> float:
 def milliseconds(drives: Sequence[Sequence[Scanned]]) -> float:
     """CPU time of a scan, mean."""
     return 1e3 * float(np.mean([scan.seconds for drive in drives for scan in drive]))
-
-
-def _table(name: str, groups: dict[str, list[Sequence[Scanned]]]) -> str:
-    head = [name, "lines", "NEES, mean over drives", "worst drive", "within 95 %", "on no wall", "found"]
-    head += ["2 sigma of alpha, mean [°]", "median", "2 sigma of r, mean [cm]", "median", "a scan [ms]"]
-    rows = []
-    for group, drives in groups.items():
-        lines = np.array([line for drive in drives for scan in drive for line in scan.lines]).reshape(-1, 3)
-        nees, alphas, radii = lines.T
-        alphas, radii = 2.0 * np.degrees(alphas), 200.0 * radii
-        shown, found = np.array([[scan.shown, scan.found] for drive in drives for scan in drive]).sum(axis=0)
-        worst = max(mean_nees([drive]) for drive in drives)
-        figures = [f"{mean_nees(drives):.2f}", f"{worst:.2f}", f"{100.0 * np.mean(nees <= COVERED):.1f} %"]
-        shares = [f"{100.0 * stray_share(drives):.2f} %", f"{100.0 * found / shown:.1f} %"]
-        sizes = [f"{value:.2f}" for values in (alphas, radii) for value in (values.mean(), np.median(values))]
-        rows.append([group, str(len(lines)), *figures, *shares, *sizes, f"{milliseconds(drives):.2f}"])
-    return table(head, rows)

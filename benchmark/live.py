@@ -1,4 +1,4 @@
-"""Whether the nodes keep time: how late a pose is, a fast laser, and replays at ten times real time."""
+"""Latency of the nodes' poses, with a fast laser and in replays at ten times real time."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The logs that are measured on, decompressed where they need to be."""
+"""Logs that are measured on, decompressed where needed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which loops of simulated worlds are closed, how soon, and whether any is closed that there is not."""
+"""Precision and recall of loop closures, and the topology that runs end with, on simulated worlds."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from benchmark.report import Report, Requirement, table
-from benchmark.settings import Settings
+from benchmark.settings import Settings, by_family, chosen_seeds, records_of
 from benchmark.simulated.loops import AWAY, GRACE, OLD, STAY, VIEW
-from benchmark.simulated.measured import by_family, chosen_seeds, records_of
 from benchmark.simulated.records import Record
 from benchmark.simulated.truth import FAR, GREY, NEAR, RADIUS, TURN
+from benchmark.simulated.worlds import LONG
 
 MISSED = 0.05
 """Largest share of loops that could be closed and were not."""
@@ -28,6 +28,16 @@ POLICY = (
     f"half of the keyframes of the first ten metres share {100.0 * VIEW:.0f} % of what they see with a keyframe of "
     f"before. It is closed in time where the definite map joins the two places before {GRACE:g} m beyond the known "
     "ground; the distance is the path from the loop's begin to that."
+)
+
+WORLDS = ("nested",)
+
+INEXACT = 0.05
+"""Largest share of runs that end otherwise."""
+
+TOPOLOGY_POLICY = (
+    "A run ends with the exact topology where no closure in its most probable map is false, none was accepted falsely "
+    "on the way, and every loop that can be closed is closed at the end, as defined for the closures above."
 )
 
 
@@ -107,3 +117,26 @@ def _wrong_table(wrong: list[tuple[Record, Record]]) -> str:
             for record, closure in wrong
         ],
     )
+
+
+def measure_topology(settings: Settings) -> Report:
+    """Map the worlds and judge how they end."""
+    records = records_of(settings, WORLDS, others=(LONG,))
+    report = Report("topology", "Exact topology of nested loops", seeds=chosen_seeds(settings))
+    inexact = [record for record in records if faults(record)]
+    share = len(inexact) / len(records)
+    report.requirements.append(Requirement("runs that do not end with the exact topology, share", share, INEXACT))
+    rows = [[record["world"], "; ".join(faults(record))] for record in inexact]
+    counted = f"{len(records) - len(inexact)} of {len(records)} runs end with the exact topology."
+    report.body += [counted, *([table(["run", "what is not exact"], rows)] if rows else []), TOPOLOGY_POLICY]
+    report.data["faults"] = {record["world"]: faults(record) for record in records}
+    return report
+
+
+def faults(record: Record) -> list[str]:
+    """What is not exact in the topology that a run ended with."""
+    accepted = sum(not closure["right"] for closure in record["accepted"])
+    pending = sum(not closure["right"] for closure in record["pending"])
+    unclosed = sum(loop["closed_at"] is None for loop in closable([record]))
+    told = {"closures accepted falsely": accepted, "false closures pending": pending, "loops not closed": unclosed}
+    return [f"{name}: {count}" for name, count in told.items() if count]

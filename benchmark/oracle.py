@@ -1,26 +1,36 @@
-"""Is TSBI's PMF that of an exact enumeration of all topologies? On worlds small enough to enumerate."""
+"""TSBI's PMF against an exact enumeration of all topologies, on small worlds."""
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import pairwise
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from matplotlib.figure import Figure
 
-from benchmark.enumeration import Enumeration, Path
-from benchmark.plots import plot_oracle
 from benchmark.report import Report, Requirement, table
 from benchmark.runs import PARAMETERS
-from benchmark.scripted import STEP, Script
+from benchmark.scripted import STEP, Robot, Script
 from benchmark.settings import Settings
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration import Configuration, load_configuration
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.messages.replica import FIRST_HYPOTHESIS
+from hmt_slam_ros.geometry.gaussian import gate
+from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
+from hmt_slam_ros.hybrid_map.shortest_path import reachable
+from hmt_slam_ros.hybrid_map.surroundings import Transition, areas_around
+from hmt_slam_ros.messages.replica import FIRST_HYPOTHESIS, Replica
 from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.simulation import open_simulated
+from hmt_slam_ros.topological_inference.admission import Candidate, Query
+from hmt_slam_ros.topological_inference.branching import Branching, Child, Parent
+from hmt_slam_ros.topological_inference.closure_search import ClosureSearch, Comparison
+from hmt_slam_ros.topological_inference.hypothesis_tree import LeafNotes
 from hmt_slam_ros.topological_inference.tsbi import Tsbi
 
 WORLDS = {
@@ -33,6 +43,40 @@ WORLDS = {
     "office": "office,size=0.7",
 }
 """{name: simulated world}."""
+
+HYPOTHESES = (1, 2, 4, 8, 16, 32)
+"""Values of tsbi.max_hypotheses."""
+
+SEEDS, VISITS = 2, 8
+
+LIMIT = 0.05
+"""Largest mean distance at the number of hypotheses of the parameter file."""
+
+_KEYFRAMES = 6  # of a visit
+_EQUAL = 1e-6  # distances that differ by less are the same
+
+POLICY = (
+    f"Drives of {VISITS} area visits, each of {_KEYFRAMES} keyframes at equal distances along the whole route; between "
+    "keyframes dead reckoning errs by 2 cm and half a degree, times the noise. Nothing is accepted on the way, and "
+    "known ground is looked for at cuts only (tsbi.recheck_keyframes is out of reach). The enumeration compares the "
+    "keyframes with every known area that the arcs do not rule out altogether, looks for ways to fit in all but 1e-9 "
+    "of the prior, and follows all of them down to a probability of 1e-9. Shared with TSBI are the transition model, "
+    "the likelihoods, and what a choice does to the map. Total variation distance of the distributions over the areas "
+    "of all visits so far, after every cut from the first one on at which a known area was possible; what TSBI did not "
+    "examine or dropped counts as wrong. Where scans tell little (tsbi.temper 0.03), many topologies stay alive and "
+    "the reduction has to choose. With odometry that errs by 8 cm and 2 degrees in 1 to 3 m nothing is required: "
+    "corridors that are alike fit so well that the enumeration believes in poses five deviations off, which the gate "
+    "on the prior (tsbi.gate_probability) keeps out on purpose, and topologies of 1e-9 come back."
+)
+
+Visits = tuple[int, ...]
+"""The area of every visit, named by the visit in which it was entered first."""
+
+NEGLIGIBLE = 1e-9
+"""Probability below which a topology is not followed any further."""
+
+_EVERYWHERE = 1.0 - 1e-9  # share of the prior in which poses are searched for
+_DPI = 110
 
 
 class Regime(NamedTuple):
@@ -56,30 +100,6 @@ REGIMES = (
     Regime("as it is", tuple(WORLDS), (1.0, 2.0, 3.0)),
     Regime("scans tell little", ("ring", "four crossings", "nine crossings"), (2.0, 4.0), ("tsbi.temper=0.03",)),
     Regime("odometry beyond use", tuple(WORLDS), (4.0,), required=False),
-)
-
-HYPOTHESES = (1, 2, 4, 8, 16, 32)
-"""Values of tsbi.max_hypotheses."""
-
-SEEDS, VISITS = 2, 8
-LIMIT = 0.05
-"""Largest mean distance at the number of hypotheses of the parameter file."""
-
-_KEYFRAMES = 6  # of a visit
-_EQUAL = 1e-6  # distances that differ by less are the same
-
-POLICY = (
-    f"Drives of {VISITS} area visits, each of {_KEYFRAMES} keyframes at equal distances along the whole route; between "
-    "keyframes dead reckoning errs by 2 cm and half a degree, times the noise. Nothing is accepted on the way, and "
-    "known ground is looked for at cuts only (tsbi.recheck_keyframes is out of reach). The enumeration compares the "
-    "keyframes with every known area that the arcs do not rule out altogether, looks for ways to fit in all but 1e-9 "
-    "of the prior, and follows all of them down to a probability of 1e-9. Shared with TSBI are the transition model, "
-    "the likelihoods, and what a choice does to the map. Total variation distance of the distributions over the areas "
-    "of all visits so far, after every cut from the first one on at which a known area was possible; what TSBI did not "
-    "examine or dropped counts as wrong. Where scans tell little (tsbi.temper 0.03), many topologies stay alive and "
-    "the reduction has to choose. With odometry that errs by 8 cm and 2 degrees in 1 to 3 m nothing is required: "
-    "corridors that are alike fit so well that the enumeration believes in poses five deviations off, which the gate "
-    "on the prior (tsbi.gate_probability) keeps out on purpose, and topologies of 1e-9 come back."
 )
 
 
@@ -189,15 +209,15 @@ def _configuration(changes: Sequence[str]) -> Configuration:
     return load_configuration(PARAMETERS, ["tsbi.recheck_keyframes=1000", *changes])
 
 
-def filtered(drive: Sequence[Stop], configuration: Configuration, noise: float) -> list[dict[Path, float]]:
+def filtered(drive: Sequence[Stop], configuration: Configuration, noise: float) -> list[dict[Visits, float]]:
     """TSBI's PMF after every cut; the sum lacks what it did not examine or dropped."""
     script = Script(Tsbi(configuration), noise=noise)
-    paths: dict[int, tuple[Path, dict[int, int]]] = {FIRST_HYPOTHESIS: ((0,), {0: 0})}
+    paths: dict[int, tuple[Visits, dict[int, int]]] = {FIRST_HYPOTHESIS: ((0,), {0: 0})}
     found = []
     for stop in drive:
         leaves = script.keyframe(*stop).leaves
         before, paths = paths, {}
-        pmf: dict[Path, float] = defaultdict(float)
+        pmf: dict[Visits, float] = defaultdict(float)
         for leaf in leaves:
             path, named = before[leaf.parent]
             if stop.cut:
@@ -210,7 +230,7 @@ def filtered(drive: Sequence[Stop], configuration: Configuration, noise: float) 
     return found
 
 
-def total_variation(exact: Mapping[Path, float], found: Mapping[Path, float]) -> float:
+def total_variation(exact: Mapping[Visits, float], found: Mapping[Visits, float]) -> float:
     """Total variation distance; what ``found`` lacks to 1 counts as probability of something else."""
     lacking = max(0.0, 1.0 - sum(found.values()))
     return 0.5 * (lacking + sum(abs(exact.get(path, 0.0) - found.get(path, 0.0)) for path in {**exact, **found}))
@@ -239,3 +259,171 @@ def _row(regime: str, world: str, drives: Sequence[Drive]) -> list[str]:
     most = max(drive.topologies for drive in drives)
     means = [f"{mean:.4f}" for mean in mean_distances(drives).values()]
     return [regime, world, str(len(drives)), str(cuts), str(most), *means]
+
+
+class _EverywhereSearch(ClosureSearch):
+    """Compares with all areas, by the same likelihoods."""
+
+    def __init__(self, configuration: Configuration, scans: Mapping[int, Scan]) -> None:
+        super().__init__(configuration, scans)
+        self._settings = replace(self._settings, gate=gate(_EVERYWHERE), margin=25.0, max_modes=1000)
+
+    def compare(
+        self,
+        hybrid_map: HybridMap,
+        area: int,
+        query: Query,
+        compared: Mapping[int, Collection[int]],
+        excluded: Collection[int],
+        most: int,
+        only: Collection[int] = (),
+    ) -> Comparison:
+        """As in the model, over all areas, however many they are."""
+        del most, only
+        options = self._options
+        fresh = {
+            known: {k: pose for k, pose in query.poses.items() if k not in compared.get(known, ())}
+            for known in hybrid_map.area_ids()
+            if known not in excluded
+        }
+        beliefs = reachable(hybrid_map, area)
+        asked = [known for known, own in fresh.items() if 2 * len(own) >= len(query.poses)]
+        priors = {known: self.admission.prior(beliefs[known], query) for known in asked}
+        candidates = {known: Candidate(prior, fresh[known], 1.0) for known, prior in priors.items()}
+        places = {known: self._views.place(hybrid_map, known, excluded) for known in candidates}
+        entries = {known: self._entry(place, candidates[known]) for known, place in places.items()}
+        shares = {known: found.share for known, found in entries.items() if found.share}
+        modes = {known: self._modes(places[known], candidates[known]) for known in shares}
+        total = sum(shares.values())
+        new = max(1.0 - total, options.new_probability) if total else 1.0
+        if shares:
+            elsewhere = self.admission.divided(hybrid_map, area, query, excluded)[2]
+            self._count_likeness(query, [self._elsewhere(hybrid_map, other, excluded) for other in elsewhere])
+        fits = [
+            fit
+            for known, share in shares.items()
+            for fit in self._fits(
+                hybrid_map,
+                places[known],
+                candidates[known],
+                modes[known] or (),
+                entries[known],
+                (1.0 - new) * share / total,
+            )
+        ]
+        beside = tuple(known for known, found in modes.items() if found is None)
+        examined = tuple(known for known in shares if known not in beside)
+        return Comparison(Transition({}, new), tuple(fits), examined, beside, 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class _Topology:
+    """One way in which it may have been.
+
+    :ivar path: its areas by visits.
+    :ivar named: {area: the visit in which it was entered first}.
+    :ivar log_weight: log of its probability.
+    """
+
+    path: Visits
+    named: dict[int, int]
+    hybrid_map: HybridMap
+    notes: LeafNotes
+    robot: Robot
+    log_weight: float
+
+    @property
+    def parent(self) -> Parent:
+        """The hypothesis that it is at the next event."""
+        return Parent(FIRST_HYPOTHESIS, self.robot.area, self.hybrid_map, self.notes, self.log_weight)
+
+
+class Enumeration:
+    """All topologies of a drive.
+
+    :ivar lost: probability of the topologies that were not followed any further, at most.
+    :ivar asked: whether there was a known area so far that the robot could be in, by the arcs.
+    """
+
+    def __init__(self, configuration: Configuration, noise: float = 1.0) -> None:
+        """:param noise: factor on the deviations of the odometry."""
+        self._noise = noise
+        self._replica = Replica()
+        self._branching = Branching(configuration, self._replica)
+        self._branching.search = _EverywhereSearch(configuration, self._replica.scans)
+        self._topologies = [_Topology((0,), {0: 0}, HybridMap(), LeafNotes(), Robot(), 0.0)]
+        self._sequence = -1
+        self.lost = 0.0
+        self.asked = False
+
+    @property
+    def followed(self) -> int:
+        """How many topologies there are now."""
+        return len(self._topologies)
+
+    def keyframe(self, step: Float64, scan: Scan, cut: int = 0) -> dict[Visits, float]:
+        """One keyframe event, as of :meth:`benchmark.scripted.Script.keyframe`; the probability of every path."""
+        self._sequence += 1
+        self._replica.scans[self._sequence] = scan
+        self._branching.begin_event()
+        points = self._branching.search.surface_points(scan)
+        noted = [self._recognized(self._noted(topology, step), points) for topology in self._topologies]
+        if cut:
+            newest = range(self._sequence + 1 - cut, self._sequence + 1)
+            noted = [child for topology in noted for child in self._children(topology, newest)]
+        self._topologies = self._normalised(noted)
+        pmf: dict[Visits, float] = defaultdict(float)
+        for topology in self._topologies:
+            pmf[topology.path] += math.exp(topology.log_weight)
+        return dict(pmf)
+
+    def _noted(self, topology: _Topology, step: Float64) -> _Topology:
+        """After the robot stored the newest keyframe in its area."""
+        robot = topology.robot.moved(step, self._noise)
+        topology.hybrid_map.place(self._sequence, robot.area, robot.pose.mean)
+        return replace(topology, robot=robot, notes=topology.notes.stored(self._sequence, robot.pose.covariance))
+
+    def _recognized(self, topology: _Topology, points: Float64) -> _Topology:
+        """Weighed by what the newest scan says for the known ground that the robot is in."""
+        pose = topology.robot.pose.mean
+        found = self._branching.recognized(topology.parent, pose, points, self._sequence)
+        return replace(topology, log_weight=found.log_weight)
+
+    def _children(self, topology: _Topology, newest: Sequence[int]) -> Iterator[_Topology]:
+        branches = self._branching.cut(topology.parent, newest)
+        self.asked |= any(child.notes.compared for child in branches.children)
+        for child in branches.children:
+            yield self._followed(topology, child)
+
+    def _followed(self, topology: _Topology, child: Child) -> _Topology:
+        hybrid_map = topology.hybrid_map.branch()
+        self._replica.change(hybrid_map, child.relabelled, child.arcs)
+        around = areas_around(hybrid_map, child.area, self._branching.search.nearness)
+        local = {area: belief.mean for area, belief in around.items() if area != child.area}
+        named = {child.area: len(topology.path), **topology.named}
+        robot = topology.robot.entered(child.area, child.rebase, len(child.relabelled), self._noise)
+        path = (*topology.path, named[child.area])
+        return _Topology(path, named, hybrid_map, replace(child.notes, local=local), robot, child.log_weight)
+
+    def _normalised(self, topologies: Sequence[_Topology]) -> list[_Topology]:
+        total = float(np.logaddexp.reduce([topology.log_weight for topology in topologies]))
+        kept = [topology for topology in topologies if topology.log_weight - total > math.log(NEGLIGIBLE)]
+        self.lost += NEGLIGIBLE * (len(topologies) - len(kept))
+        return [replace(topology, log_weight=topology.log_weight - total) for topology in kept]
+
+
+def plot_oracle(path: Path, distances: Mapping[str, Mapping[int, float]], bound: float) -> None:
+    """Total variation distance against the number of hypotheses.
+
+    :param distances: {under what: {number of hypotheses: mean distance}}.
+    """
+    figure = Figure(figsize=(6.0, 4.5), layout="constrained")
+    axes = figure.subplots()
+    for name, own in distances.items():
+        axes.plot(list(own), list(own.values()), "o-", label=name)
+    axes.axhline(bound, color="black", linewidth=0.8)
+    axes.set_xscale("log", base=2)
+    axes.set_xlabel("hypotheses")
+    axes.set_ylabel("mean total variation distance")
+    axes.legend(fontsize=7)
+    figure.savefig(path, dpi=_DPI)

@@ -1,4 +1,4 @@
-"""Errands of the pilot through nodes: a robot that wakes up in an institute that was explored goes to its rooms."""
+"""Errands of the pilot through nodes, in an institute that was explored."""
 
 from __future__ import annotations
 
@@ -11,17 +11,19 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
+from std_msgs.msg import String
 
 from benchmark.driven_run import DrivenRun
 from benchmark.explore import is_within
+from benchmark.institute import AT_PLACE, known_of
 from benchmark.institute_maps import LASER, PEOPLE, charted, scenario_of
-from benchmark.institute_missions import AT_PLACE, known_of
-from benchmark.pilot_nodes import Errands, Ran, Start
+from benchmark.live import PROCESSES
 from benchmark.report import Report, Requirement, table
-from benchmark.running_nodes import Listener
+from benchmark.running_nodes import Listener, Parameters
 from benchmark.runs import PARAMETERS
-from benchmark.settings import Settings
-from benchmark.simulated.measured import chosen_seeds
+from benchmark.settings import Settings, chosen_seeds
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration import Configuration, load_configuration
 from hmt_slam_ros.errors import HmtSlamError
@@ -30,6 +32,9 @@ from hmt_slam_ros.exploration.rooms import rooms
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.logs.stamps import NANOSECONDS
 from hmt_slam_ros.messages.tasks import Errand
+from hmt_slam_ros.ros import topics
+from hmt_slam_ros.ros.conversions import planar_pose, stamp_of
+from hmt_slam_ros.ros.topics import DIAGNOSTICS, ERRANDS, GROUND_TRUTH, INITIAL_POSE, OUTCOMES
 from hmt_slam_ros.simulation import open_simulated
 from hmt_slam_ros.simulation.driven_robot import DrivenRobot
 from hmt_slam_ros.simulation.scenario import START
@@ -37,8 +42,8 @@ from hmt_slam_ros.simulation.scenario import START
 SEEDS = 2
 """Buildings."""
 
-ERRANDS = 4
-"""In each of them."""
+PER_BUILDING = 4
+"""Errands in each of them."""
 
 _EXPLORATION = 2000.0  # s, of the simulation
 _SPEED = 0.31  # m/s, paper, table 2
@@ -47,12 +52,17 @@ _START = 0.1  # m, of initialpose
 
 POLICY = (
     f"Nodes as processes over DDS, {PEOPLE} people, a laser that sees all around. The map is the explorer's. At "
-    f"another visit the robot wakes up at a random place of a hallway, and is sent to {ERRANDS} rooms, one after the "
-    "other, drawn by chance. Reached: the pilot says that the robot is there, and it is within "
+    f"another visit the robot wakes up at a random place of a hallway, and is sent to {PER_BUILDING} rooms, one after "
+    "the other, drawn by chance. Reached: the pilot says that the robot is there, and it is within "
     f"{AT_PLACE:g} m of where it truly was when it took the keyframe that stands for the room. initialpose: what the "
     "pilot tells slam before doors, against the true pose then. A contact is counted where a step would bring the "
     "robot's disc into a surface or a person."
 )
+
+RATE = 2.0
+"""Times real time at most; the robot waits for slam."""
+
+_PATIENCE = 900.0  # s, for an errand, and a node that compiles
 
 
 class Explored(NamedTuple):
@@ -135,7 +145,7 @@ def errands_in(building: Explored) -> list[Scored]:
         start = Start(world, _awakening(world, draw), building.folder)
         errands = Errands(stack, stack.enter_context(Listener()), start)
         last = ""
-        for _ in range(ERRANDS):
+        for _ in range(PER_BUILDING):
             others = [name for name in building.rooms if name != last]
             last = others[int(draw.integers(len(others)))]
             scored.append(_scored(building, errands.run(last), last))
@@ -197,3 +207,103 @@ def _row(one: Scored) -> list[str]:
         str(one.ran.contacts),
         *told,
     ]
+
+
+class Start(NamedTuple):
+    """With what the nodes begin.
+
+    :ivar world: ``sim:WORLD,...``.
+    :ivar seconds: from the beginning of its scripted drive until the robot wakes up.
+    :ivar folder: of the map.
+    """
+
+    world: str
+    seconds: float
+    folder: Path
+
+
+class Ran(NamedTuple):
+    """What came of an errand.
+
+    :ivar text: how the pilot says that it ended.
+    :ivar path: shape (n, 2), where the robot truly was, m.
+    :ivar seconds: of the simulation.
+    :ivar contacts: how often the robot came upon something.
+    :ivar starts: what slam was told, ``map_T_base``, and ``world_T_base`` then, each (3,).
+    """
+
+    text: str
+    path: Float64
+    seconds: float
+    contacts: int
+    starts: list[tuple[Float64, Float64]]
+
+    @property
+    def metres(self) -> float:
+        """Way of the robot."""
+        return float(np.hypot(*np.diff(self.path, axis=0).T).sum())
+
+
+class Errands:
+    """The nodes, and what they say."""
+
+    def __init__(self, stack: ExitStack, listener: Listener, start: Start) -> None:
+        """Start them; they end with the stack."""
+        self._listener = listener
+        self._outcomes: list[str] = []
+        self._truths: dict[int, Float64] = {}
+        self._starts: list[tuple[int, Float64]] = []
+        self._contacts, self._reports = 0, 0
+        node = listener.node
+        node.create_subscription(
+            String, OUTCOMES["pilot"], lambda message: self._outcomes.append(message.data), topics.LATCHED
+        )
+        node.create_subscription(PoseStamped, GROUND_TRUTH, self._hear_truth, topics.STREAM)
+        node.create_subscription(PoseWithCovarianceStamped, INITIAL_POSE, self._hear_start, topics.STREAM)
+        node.create_subscription(DiagnosticArray, DIAGNOSTICS, self._hear_diagnostics, topics.STREAM)
+        self._errands = node.create_publisher(String, ERRANDS["pilot"], topics.STREAM)
+        shared: Parameters = {"start_from": str(start.folder), "mode": "localization"}
+        for name in (*PROCESSES, "pilot"):
+            stack.enter_context(listener.running(name, shared))
+        listener.until(lambda: self._errands.get_subscription_count() == 1, _PATIENCE)
+        robot: Parameters = {
+            "log": start.world,
+            "robot.start": start.seconds,
+            "robot.drive": "commands",
+            "robot.rate": RATE,
+            "robot.scan_listeners": 2,
+            "robot.odometry_listeners": 3,
+            "robot.patience": _PATIENCE,
+        }
+        stack.enter_context(listener.running("robot", robot))
+        listener.until(lambda: bool(self._truths), _PATIENCE)
+
+    def run(self, room: str) -> Ran:
+        """Go to a room.
+
+        :raises HmtSlamError: where the pilot does not say how that ended.
+        """
+        ended, begin, starts, contacts = len(self._outcomes), len(self._truths), len(self._starts), self._contacts
+        self._errands.publish(String(data=f"go {room}"))
+        self._listener.until(lambda: len(self._outcomes) > ended, _PATIENCE)
+        reports = self._reports
+        # What it counted up to the end is in the second report from now on.
+        self._listener.until(lambda: self._reports >= reports + 2)
+        stamps = list(self._truths)[begin:]
+        path = np.array([self._truths[stamp][:2] for stamp in stamps])
+        seconds = (stamps[-1] - stamps[0]) / NANOSECONDS
+        told = [(pose, self._truths[stamp]) for stamp, pose in self._starts[starts:] if stamp in self._truths]
+        return Ran(self._outcomes[-1], path, seconds, self._contacts - contacts, told)
+
+    def _hear_truth(self, message: PoseStamped) -> None:
+        self._truths[stamp_of(message.header.stamp)] = planar_pose(message.pose)
+
+    def _hear_start(self, message: PoseWithCovarianceStamped) -> None:
+        self._starts.append((stamp_of(message.header.stamp), planar_pose(message.pose.pose)))
+
+    def _hear_diagnostics(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            if status.name == "/robot":
+                self._reports += 1
+                # There are none before it drives.
+                self._contacts = next((int(value.value) for value in status.values if value.key == "contacts"), 0)

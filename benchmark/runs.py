@@ -52,7 +52,7 @@ class Case:
 
     def command(self, folder: Path) -> list[str]:
         """The command line that maps the log into a folder."""
-        program = ["benchmark.map_degraded", self.kind] if self.kind else ["hmt_slam_ros.cli.main", "map"]
+        program = ["benchmark.degraded_odometry", self.kind] if self.kind else ["hmt_slam_ros.cli.main", "map"]
         options = ["--out", str(folder), "--seed", str(self.seed), "--config", str(PARAMETERS)]
         given = {"--duration": self.duration, "--start": self.start, "--from": self.source}
         part = [word for name, value in given.items() if value for word in (name, str(value))]

@@ -1,25 +1,39 @@
-"""What grows with the number of areas? Cuts, scans and memory in maps of up to a hundred thousand."""
+"""Time and memory in maps of up to 100,000 areas: cuts, scans, storage."""
 
 from __future__ import annotations
 
+import math
+import time
 from collections.abc import Mapping, Sequence
-from typing import Any
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
+from matplotlib.figure import Figure
 
-from benchmark.lattice import BEAMS, PER_AREA, Lattice
-from benchmark.plots import plot_scale
+from benchmark.lattice import BEAMS, OFFSETS, PER_AREA, SPACING, Lattice, LatticeScans, scan_at, shared_scan, stops
 from benchmark.report import Report, Requirement, table
 from benchmark.runs import PARAMETERS
-from benchmark.scale_cuts import Cut, measured_cuts
-from benchmark.scale_maps import BEAMS as SAVED_BEAMS
-from benchmark.scale_maps import SCANS_PER_KEYFRAME, Lasting, lasting
-from benchmark.scale_memory import BEAMS as STORED_BEAMS
-from benchmark.scale_memory import Stored, stored
-from benchmark.scale_scans import cost_of_scans
+from benchmark.scale_maps import BEAMS as STORED_BEAMS
+from benchmark.scale_maps import SCANS_PER_KEYFRAME, Lasting, Stored, lasting, stored
+from benchmark.scripted import STEP, Script
 from benchmark.settings import Settings
+from benchmark.simulated.examinations import Examination, WatchedBranching
+from hmt_slam_ros.area_abstraction.aam import Aam
+from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration import Configuration, load_configuration
-from hmt_slam_ros.topological_inference.branching import FEWEST
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.loop_closure.tlca import Tlca
+from hmt_slam_ros.messages.messages import Message
+from hmt_slam_ros.messages.replica import FIRST_HYPOTHESIS, Replica
+from hmt_slam_ros.messages.routing import Process
+from hmt_slam_ros.metric_slam.slam import MetricSlam
+from hmt_slam_ros.offline.runtime import LockStep
+from hmt_slam_ros.real_time_localization.rtl import Rtl
+from hmt_slam_ros.sensors import Odometry
+from hmt_slam_ros.topological_inference.branching import FEWEST, Branching
+from hmt_slam_ros.topological_inference.tsbi import Tsbi
 
 SMALL = (Lattice(5, 2), Lattice(10, 10), Lattice(50, 20))
 LARGE = (Lattice(100, 100), Lattice(1000, 100))
@@ -55,10 +69,19 @@ POLICY = (
     "scan, the median of the repetitions. Memory is what Python allocates: poses and arcs in each process that keeps "
     f"the map, and the ranges of its scans, here of {STORED_BEAMS} beams; what can be computed anew from them is told, "
     "and does not count. What is saved is the whole state of a run that mapped the lattice in one pass, under one "
-    f"hypothesis, with a scan of its own of {SAVED_BEAMS} beams for every keyframe and {SCANS_PER_KEYFRAME} scans of "
+    f"hypothesis, with a scan of its own of {STORED_BEAMS} beams for every keyframe and {SCANS_PER_KEYFRAME} scans of "
     "the log to each. Saving ends when all is on the disk of the system's folder for temporary files, loading with "
     "processes that can go on; wall time."
 )
+
+_EXCURSIONS = 6
+_LONGEST = 8  # crossings along the map
+_SMALL = 1000  # maps of at most so many areas are made anew for every excursion
+_REPEATS = 5
+_STEP, _TURN = 0.1, 10  # m and degrees between scans
+_PERIOD = 200_000_000  # ns
+_LOOP = ((0, 0), (2, 0), (2, 1), (0, 1), (0, 0))
+_DPI = 110
 
 
 def measure_scale(settings: Settings) -> Report:
@@ -160,3 +183,186 @@ def _stored_table(area: Stored) -> str:
 def _lasting_table(saved: Lasting) -> str:
     head = ["areas", "files [MB]", "save [s]", "load [s]", "load the map alone [s]"]
     return table(head, [[str(saved.areas), *(f"{value:.1f}" for value in saved[1:])]])
+
+
+class Cut(NamedTuple):
+    """One cut.
+
+    :ivar ms: CPU time from the keyframe to the acceptance.
+    :ivar compared: known areas that the keyframes were compared with, under all hypotheses.
+    :ivar hypotheses: alive after it.
+    :ivar unexamined: probability of what was not looked at.
+    """
+
+    ms: float
+    compared: int
+    hypotheses: int
+    unexamined: float
+
+
+class _TimedTsbi:
+    """A TSBI in a map, of which the CPU time and the comparisons are counted until they are taken."""
+
+    def __init__(self, lattice: Lattice, configuration: Configuration) -> None:
+        self._lattice = lattice
+        self._seconds, self._compared = 0.0, 0
+        self._tsbi = Tsbi(configuration, self._branching)
+
+    def _branching(self, configuration: Configuration, replica: Replica) -> Branching:
+        replica.maps[FIRST_HYPOTHESIS] = self._lattice.hybrid_map()
+        replica.scans = LatticeScans()
+        return WatchedBranching(configuration, replica, self._count)
+
+    def _count(self, examination: Examination) -> None:
+        self._compared += len(examination.found.examined)
+
+    def handle(self, message: Message) -> list[Message]:
+        """As TSBI does."""
+        begin = time.process_time()
+        said = self._tsbi.handle(message)
+        self._seconds += time.process_time() - begin
+        return said
+
+    def take(self) -> tuple[float, int]:
+        """Milliseconds and comparisons since the last call."""
+        taken = 1e3 * self._seconds, self._compared
+        self._seconds, self._compared = 0.0, 0
+        return taken
+
+
+def measured_cuts(lattice: Lattice, configuration: Configuration, excursions: int = _EXCURSIONS) -> list[Cut]:
+    """The cuts of some ways out of the map and back in, after one that compiles kernels and is not counted."""
+    _Robot(Lattice(5, 2), configuration).excursion(0, 0)
+    cuts: list[Cut] = []
+    robot = _Robot(lattice, configuration)
+    for seed in range(excursions):
+        if lattice.areas <= _SMALL:
+            cuts += _Robot(lattice, configuration).excursion(0, seed)
+        else:
+            cuts += robot.excursion(seed * (_LONGEST + 2), seed)
+    return cuts
+
+
+class _Robot:
+    """Drives out of a lattice and back in."""
+
+    def __init__(self, lattice: Lattice, configuration: Configuration) -> None:
+        self._lattice = lattice
+        self._timed = _TimedTsbi(lattice, configuration)
+        self._script = Script(self._timed)
+        self._poses = lattice.poses()
+
+    def excursion(self, column: int, seed: int) -> list[Cut]:
+        """The cuts on the way from a crossing of row 0 along row -2 to a later crossing of row 0, and into row 1."""
+        end = min(column + _LONGEST, self._lattice.columns - 1)
+        way = [(column, 0), (column, -1), *((c, -2) for c in range(column, end + 1)), (end, -1), (end, 0), (end, 1)]
+        self._script.go_to(column, shared_scan(0.0, 0))
+        random = np.random.default_rng(seed)
+        here, cuts = np.array([SPACING * column, 0.0, 0.0]), []
+        for stop in stops(way):
+            error = se2.exp(random.multivariate_normal(np.zeros(3), STEP))
+            step, here = se2.compose(se2.between(here, stop.pose), error), stop.pose
+            self._timed.take()
+            said = self._script.keyframe(step, stop.scan, len(OFFSETS) if stop.last else 0)
+            if len(said.leaves) == 1 or stop.pose[1] > SPACING:
+                best = max(said.leaves, key=lambda leaf: leaf.probability)
+                self._script.accept(best.hypothesis, self._poses)
+            if stop.last:
+                cuts.append(Cut(*self._timed.take(), len(said.leaves), said.unexamined))
+        return cuts
+
+
+class _TimedProcess:
+    """A process whose CPU time is counted."""
+
+    def __init__(self, process: Process) -> None:
+        self._process = process
+        self.seconds = 0.0
+
+    def handle(self, message: Message) -> list[Message]:
+        """As the process does."""
+        begin = time.process_time()
+        said = self._process.handle(message)
+        self.seconds += time.process_time() - begin
+        return said
+
+
+def cost_of_scans(
+    lattices: Sequence[Lattice], configuration: Configuration, repeats: int = _REPEATS
+) -> dict[int, dict[str, float]]:
+    """{number of areas: {process: ms a scan}}, medians; the maps take turns, so that all see the same machine."""
+    _costs(lattices[0], configuration)
+    measured = [{lattice.areas: _costs(lattice, configuration) for lattice in lattices} for _ in range(repeats)]
+    return {
+        lattice.areas: {
+            process: float(np.median([costs[lattice.areas][process] for costs in measured]))
+            for process in measured[0][lattice.areas]
+        }
+        for lattice in lattices
+    }
+
+
+def _costs(lattice: Lattice, configuration: Configuration) -> dict[str, float]:
+    """{process: ms a scan} of one drive around the loop."""
+    slam, aam, tlca = MetricSlam(configuration), Aam(configuration), Tlca(configuration)
+    tsbi = Tsbi(configuration, lambda c, replica: Branching(c, _filled(replica, lattice)))
+    for process in (slam, aam, tlca):
+        _filled(process._replica, lattice)
+    processes: dict[str, Process] = {"slam": slam, "aam": aam, "tsbi": tsbi, "tlca": tlca, "rtl": Rtl(configuration)}
+    timed = {name: _TimedProcess(process) for name, process in processes.items()}
+    lock_step = LockStep(timed)
+    poses = _drive()
+    for k, pose in enumerate(poses):
+        stamp = _PERIOD * (k + 1)
+        lock_step.feed(Odometry(stamp, pose))
+        lock_step.feed(scan_at(pose, stamp, k))
+    return {name: 1e3 * process.seconds / len(poses) for name, process in timed.items()}
+
+
+def _filled(replica: Replica, lattice: Lattice) -> Replica:
+    """A replica that knows the map, as if its process had been there."""
+    replica.maps[FIRST_HYPOTHESIS] = lattice.hybrid_map()
+    replica.scans = LatticeScans()
+    return replica
+
+
+def _drive() -> Float64:
+    """Poses around the loop, turning on the spot at its corners, shape (n, 3)."""
+    poses: list[Float64] = []
+    for side, (start, end) in enumerate(pairwise(SPACING * np.array(_LOOP, dtype=np.float64))):
+        heading = 0.5 * math.pi * side
+        count = round(float(np.hypot(*(end - start))) / _STEP)
+        poses += [np.array([*(start + k / count * (end - start)), heading]) for k in range(count)]
+        poses += [np.array([*end, heading + math.radians(turn)]) for turn in range(0, 90, _TURN)]
+    return np.array(poses)
+
+
+def plot_scale(
+    path: Path,
+    cuts: Mapping[int, Sequence[float]],
+    scans: Mapping[int, Mapping[str, float]],
+    bounds: Mapping[int, float],
+) -> None:
+    """Cost against the number of areas.
+
+    :param cuts: {number of areas: ms of each cut}.
+    :param scans: {number of areas: {process: ms a scan}}.
+    :param bounds: {number of areas: ms that a cut may take}.
+    """
+    figure = Figure(figsize=(10.0, 4.0), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    for areas, own in cuts.items():
+        left.plot([areas] * len(own), own, ".", color="0.6")
+    for share, style in ((50, "o-"), (95, "^--")):
+        left.plot(list(cuts), [np.percentile(own, share) for own in cuts.values()], style, label=f"{share} %")
+    left.plot(list(bounds), list(bounds.values()), "_", color="black", markersize=20.0, label="bound")
+    left.set_ylabel("time of a cut [ms]")
+    for process in scans[min(scans)]:
+        right.plot(list(scans), [own[process] for own in scans.values()], "o-", label=process)
+    right.set_ylabel("time of a scan [ms]")
+    for axes in (left, right):
+        axes.set_xscale("log")
+        axes.set_yscale("log")
+        axes.set_xlabel("areas")
+        axes.legend(fontsize=7)
+    figure.savefig(path, dpi=_DPI)

@@ -1,17 +1,18 @@
-"""How long does it take to save and to load a map of many areas, with all that is needed to go on from it?"""
+"""Maps of many areas on disk and in memory: time to save and load, and what an area takes."""
 
 from __future__ import annotations
 
 import tempfile
 import time
-from collections.abc import Sequence
+import tracemalloc
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from benchmark.lattice import ARC, FIRST_KEYFRAME, PER_AREA, Lattice, shared_scan
+from benchmark.lattice import ARC, FIRST_KEYFRAME, PER_AREA, Lattice, scan_at, shared_scan
 from hmt_slam_ros.area_abstraction.overlap_graph import OverlapGraph
 from hmt_slam_ros.area_abstraction.partition import WatchState
 from hmt_slam_ros.configuration import Configuration
@@ -30,7 +31,7 @@ from hmt_slam_ros.saved_map.folder import put_in_place
 from hmt_slam_ros.sensors import Scan
 
 BEAMS = 181
-"""Of the scans that are saved."""
+"""Of the scans that are saved or weighed."""
 
 SCANS_PER_KEYFRAME = 10
 """Scans of the log to each keyframe, of which the trajectory has a pose."""
@@ -38,6 +39,8 @@ SCANS_PER_KEYFRAME = 10
 _PERIOD = 100_000_000  # ns
 _DRIVE, _SECONDS = "sim:office", 20.0
 _ROBOT = LocalEstimate(0, 0, 0, PoseGaussian.exactly(np.zeros(3)), np.zeros(3), 0)
+_AREAS_OF_SCANS = 100
+Made = TypeVar("Made")
 
 
 class Lasting(NamedTuple):
@@ -162,3 +165,44 @@ def _recorded(keyframes: Sequence[int]) -> dict[str, Any]:
         "estimates": EstimateTable(scans, stamps, np.zeros_like(scans), poses, poses),
         "online": poses,
     }
+
+
+class Stored(NamedTuple):
+    """Memory of a stored area, kB.
+
+    :ivar graph: poses of its keyframes and its arcs.
+    :ivar scans: the scans of its keyframes, as received.
+    :ivar points: their end points, where something asked for them.
+    """
+
+    graph: float
+    scans: float
+    points: float
+
+    @property
+    def whole(self) -> float:
+        """What cannot be built anew from the rest, kB."""
+        return self.graph + self.scans
+
+
+def stored(lattice: Lattice) -> Stored:
+    """Weigh the areas of a lattice, each with its own scans."""
+    graph = _weight(lattice.hybrid_map)[0] / lattice.areas
+    _weighed(0)
+    scans, kept = _weight(lambda: [_weighed(keyframe) for keyframe in range(_AREAS_OF_SCANS * PER_AREA)])
+    points, _ = _weight(lambda: [scan.points for scan in kept])
+    return Stored(graph, scans / _AREAS_OF_SCANS, points / _AREAS_OF_SCANS)
+
+
+def _weighed(keyframe: int) -> Scan:
+    return scan_at(np.zeros(3), keyframe, keyframe, BEAMS)
+
+
+def _weight(make: Callable[[], Made]) -> tuple[float, Made]:
+    """What something takes, kB, and the thing itself."""
+    tracemalloc.start()
+    try:
+        made = make()
+        return tracemalloc.get_traced_memory()[0] / 1e3, made
+    finally:
+        tracemalloc.stop()

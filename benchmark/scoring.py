@@ -1,4 +1,4 @@
-"""Trajectories of output folders against true relations, and means over seeds."""
+"""Scores of trajectories, against true relations or by the walls that later passes see again."""
 
 from __future__ import annotations
 
@@ -7,10 +7,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
 
 from benchmark.logs import MeasuredLog
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.evaluation import PairErrors, RelationErrors, StampedPoses, evaluate_relations, pair_errors, read_tum
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.grids.occupancy_map import FREE, OCCUPIED, occupancy_image
+from hmt_slam_ros.sensors import Scan
 
 FINAL, ONLINE = "trajectory.tum", "trajectory_online.tum"
 
@@ -19,6 +24,32 @@ POLICY = (
     "pose is carried there along the raw odometry; where that is not possible either, the relation counts as missed."
 )
 """How relations are matched, see :func:`hmt_slam_ros.evaluation.pair_errors`."""
+
+WALLS_POLICY = (
+    "Every 10 m of the path are laid over the map of all that lies more than 20 m of path before. The agreement of a "
+    "return is 1 on a wall, 0 at 0.3 m from the nearest one and -1 in free space. A stretch is torn where a shift "
+    "within 1 m and 3 degrees raises its agreement by more than 0.2, or the agreement is below 0.1."
+)
+"""How walls are judged, in short."""
+
+APART = 20.0
+"""What was seen this much path ago, m, is an earlier pass."""
+
+TORN_GAIN = 0.2
+"""A stretch is torn where another place within reach raises its agreement by this much."""
+
+TORN_AGREEMENT = 0.1
+"""A stretch that agrees less than this is torn too: the right place may be out of reach."""
+
+_STRETCH = 10.0  # m of path that are judged together
+_SPACING = 0.25  # m of path between the scans that are used
+_RANGE = 15.0  # m to which beams are used; farther away neighbouring beams leave gaps in a wall
+_CELL = 0.05  # m
+_NEAR = 0.3  # m from a wall at which agreement with it ends
+_SHARE = 0.2  # of a stretch's returns that have to fall on what is known, for it to be judged
+_SEARCHED = 600  # returns of a stretch that are used to look for a better place
+_SHIFTS = np.linspace(-1.0, 1.0, 21)  # m
+_TURNS = np.radians(np.linspace(-3.0, 3.0, 13))
 
 
 def score(folder: Path, log: MeasuredLog, file: str = FINAL) -> RelationErrors:
@@ -95,3 +126,126 @@ def over_seeds(scores: Sequence[RelationErrors]) -> SeedMeans:
 def sample_deviation(values: Sequence[float]) -> float:
     """With n - 1; 0 for a single value."""
     return float(np.std(values, ddof=1)) if len(values) > 1 else 0.0
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """A stretch of the path, compared with the map of all that lies more than 20 m of path before it.
+
+    The agreement is the mean over its returns, of those that fall on what the map knows: 1 on a wall, falling to 0 at
+    0.3 m from the nearest wall, and -1 in free space.
+
+    :ivar begin: path length at which it begins, m.
+    :ivar returns: number of returns that fall on what the map knows.
+    :ivar agreement: where the trajectory puts it.
+    :ivar gain: by which another place within 1 m and 3 degrees would agree better.
+    :ivar shift: how far that place is away, m.
+    """
+
+    begin: float
+    returns: int
+    agreement: float
+    gain: float
+    shift: float
+
+    @property
+    def torn(self) -> bool:
+        """Whether it would clearly fit elsewhere, or does not fit at all."""
+        return self.gain > TORN_GAIN or self.agreement < TORN_AGREEMENT
+
+
+@dataclass(frozen=True)
+class Walls:
+    """How the later passes of a path fit the earlier ones.
+
+    :ivar stretches: those that lead over known ground.
+    :ivar new: number of stretches that lead over new ground, though there are earlier passes.
+    """
+
+    stretches: tuple[Stretch, ...]
+    new: int
+
+    @property
+    def agreement(self) -> float:
+        """Mean over all returns; NaN where nothing was seen twice."""
+        returns = sum(stretch.returns for stretch in self.stretches)
+        return sum(s.returns * s.agreement for s in self.stretches) / returns if returns else float("nan")
+
+    @property
+    def torn(self) -> list[Stretch]:
+        """The stretches that do not fit."""
+        return [stretch for stretch in self.stretches if stretch.torn]
+
+
+def judge_walls(scans: Sequence[Scan], poses: NDArray[np.float64]) -> Walls:
+    """Compare every stretch of a path with what was seen before it.
+
+    :param scans: all scans of a log, in its order.
+    :param poses: shape (n, 3), ``map_T_base`` of each, m and rad.
+    """
+    travelled = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T))])
+    used = np.flatnonzero(np.diff(np.floor(travelled / _SPACING), prepend=-1.0))
+    number = np.floor(travelled[used] / _STRETCH)
+    judged = []
+    for k in np.unique(number):
+        begin = float(k * _STRETCH)
+        earlier, later = used[travelled[used] < begin - APART], used[number == k]
+        if earlier.size:
+            grid = _Agreement([scans[i] for i in earlier], poses[earlier])
+            points = np.concatenate([se2.transform(poses[i], _returns(scans[i])) for i in later])
+            judged.append(_judged(begin, points, poses[later[later.size // 2], :2], grid))
+    stretches = tuple(stretch for stretch in judged if stretch is not None)
+    return Walls(stretches, len(judged) - len(stretches))
+
+
+def _returns(scan: Scan) -> NDArray[np.float64]:
+    """End points (n, 2) of the beams that are used, in the robot's frame."""
+    from_laser: NDArray[np.float64] = scan.points - scan.laser_pose[:2]
+    return scan.points[np.hypot(from_laser[:, 0], from_laser[:, 1]) <= _RANGE]
+
+
+class _Agreement:
+    """What a return at some place says about the map of some scans."""
+
+    def __init__(self, scans: Sequence[Scan], poses: NDArray[np.float64]) -> None:
+        image = occupancy_image(scans, poses, _CELL, _RANGE)
+        pixels = image.pixels[::-1]
+        distance = image.resolution * distance_transform_edt(pixels != OCCUPIED)
+        elsewhere = np.where(pixels == FREE, -1.0, 0.0)
+        self._values: NDArray[np.float64] = np.where(distance < _NEAR, 1.0 - distance / _NEAR, elsewhere)
+        self._origin, self._resolution = image.origin, image.resolution
+
+    def of(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Agreement of points (..., 2); 0 where nothing is known."""
+        cells = np.floor((points - self._origin) / self._resolution).astype(np.int64)
+        size = np.array(self._values.shape[::-1])
+        inside = ((cells >= 0) & (cells < size)).all(axis=-1)
+        x, y = np.moveaxis(np.clip(cells, 0, size - 1), -1, 0)
+        return np.where(inside, self._values[y, x], 0.0)
+
+
+def _judged(begin: float, points: NDArray[np.float64], centre: NDArray[np.float64], grid: _Agreement) -> Stretch | None:
+    """The stretch, or None where it leads over new ground."""
+    here = grid.of(points)
+    known = int(np.count_nonzero(here))
+    if known < _SHARE * len(points) or not known:
+        return None
+    thinned = points[:: max(1, len(points) // _SEARCHED)]
+    kept = max(int(np.count_nonzero(grid.of(thinned))), 1)
+    best, shift = _best_place(thinned, centre, grid)
+    gain = max(0.0, best - grid.of(thinned).sum()) / kept
+    return Stretch(begin, known, float(here.sum() / known), float(gain), shift if gain else 0.0)
+
+
+def _best_place(points: NDArray[np.float64], centre: NDArray[np.float64], grid: _Agreement) -> tuple[float, float]:
+    """Largest sum of agreements over all places near by, and how far away it is, m."""
+    dx, dy = (axis.ravel() for axis in np.meshgrid(_SHIFTS, _SHIFTS, indexing="ij"))
+    shifts = np.stack([dx, dy], axis=1)
+    best, found = -np.inf, 0.0
+    for turn in _TURNS:
+        turned = se2.transform(np.array([*centre, turn]), points - centre)
+        sums = grid.of(turned + shifts[:, None]).sum(axis=1)
+        k = int(np.argmax(sums))
+        if sums[k] > best:
+            best, found = float(sums[k]), float(np.hypot(*shifts[k]))
+    return best, found

@@ -1,4 +1,4 @@
-"""The short form for CI: has accuracy become worse than it was, by more than the noise between seeds?
+"""Accuracy check for CI: fails where accuracy became worse by more than the noise between seeds.
 
 ``benchmark/expected.toml`` holds, for every figure, mean and deviation over some seeds, normally ten, of the code that
 it was written with. The mean over the few seeds of the short form may exceed the expected mean by
@@ -20,13 +20,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from benchmark.circumstances import commit
 from benchmark.logs import BUNDLED, MeasuredLog, missing, opened
-from benchmark.report import Report, Requirement, table
+from benchmark.report import Report, Requirement, commit, table
 from benchmark.runs import Case, Run, Runner
-from benchmark.scoring import FINAL, ONLINE, sample_deviation
+from benchmark.scoring import FINAL, ONLINE, judge_walls, sample_deviation
 from benchmark.settings import Settings
-from benchmark.walls import judge_walls
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.evaluation import evaluate_relations, read_tum
 

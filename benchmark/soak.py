@@ -1,4 +1,4 @@
-"""Do the nodes keep their memory, and leave nothing behind, where a robot drives for long at ten times real time?"""
+"""Memory of nodes over a long drive at ten times real time, and what they leave behind."""
 
 from __future__ import annotations
 

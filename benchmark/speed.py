@@ -1,4 +1,4 @@
-"""What a run costs: CPU time, memory, a scan in each process, and the start of the programs."""
+"""Cost of a run: CPU time, memory, a scan in each process, and the start of the programs."""
 
 from __future__ import annotations
 
@@ -143,7 +143,7 @@ def _seconds_of_help() -> float:
 
 
 def _node_starts(report: Report) -> list[list[str]]:
-    from benchmark.node_start import NODES, until_answer, until_first_pose  # noqa: PLC0415  only where there is ROS
+    from benchmark.running_nodes import NODES, until_answer, until_first_pose  # noqa: PLC0415  only where there is ROS
 
     starts = {f"node {name}, until it answers": _repeated(partial(until_answer, name)) for name in NODES}
     wall = {name: statistics.median(start.wall for start in measured) for name, measured in starts.items()}

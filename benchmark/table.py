@@ -2,22 +2,43 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
+import lzma
+import shutil
+import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import mean
+from typing import Any
 
-from benchmark.charted_run import AREAS
-from benchmark.charts import plot_growth, plot_processes
-from benchmark.logs import BUNDLED, MeasuredLog, opened
+import numpy as np
+from matplotlib.figure import Figure
+
+from benchmark import charted_run
+from benchmark.charted_run import AREAS, METRIC
+from benchmark.logs import BUNDLED, MeasuredLog, datasets, opened
 from benchmark.report import Report, Requirement, table
 from benchmark.robustness import LONG_LIMIT
-from benchmark.runs import Run, Runner
+from benchmark.runs import PARAMETERS, Case, Run, Runner
+from benchmark.scoring import FINAL
 from benchmark.settings import Settings
-from benchmark.table_runs import CAMPUS, CAMPUS_WORLD, EXTENTS, Charted, KeptRunner, compared, judged, metric_case
-from benchmark.table_runs import reference as reference_of
+from benchmark.simulated.records import code
+from benchmark.simulated.worlds import CAMPUS, CAMPUS_WORLD
 from hmt_slam_ros.errors import HmtSlamError
+from hmt_slam_ros.evaluation import (
+    RelationErrors,
+    Relations,
+    StampedPoses,
+    evaluate_relations,
+    read_tum,
+    true_relations,
+    truth_of,
+)
+from hmt_slam_ros.simulation import open_simulated
 
 COMPARED = ("edmonton", CAMPUS, "aces")
 
@@ -45,6 +66,12 @@ POLICY = (
     f"{CAMPUS_WORLD}, judged by the truth; ACES by its relations; Edmonton, which has no truth, by how far relations "
     "of the trajectory are from GMapping's, which is a metric RBPF as well."
 )
+
+EXTENTS = {"edmonton": 100.0, CAMPUS: 200.0, "aces": 80.0}
+"""Half side of the one map of a log, m, that holds all of it."""
+
+_GMAPPING = "edmonton.gmapping.txt.xz"
+_DPI = 80
 
 
 @dataclass(frozen=True)
@@ -214,3 +241,132 @@ def _process_table(processes: dict[str, dict[str, float]]) -> str:
     names = list(next(iter(processes.values())))
     rows = [[log, *(f"{own[name]:.3f}" for name in names)] for log, own in processes.items()]
     return table(["log", *(f"{name} [ms a scan]" for name in names)], rows)
+
+
+@dataclass(frozen=True)
+class Charted(Case):
+    """A run whose cost is told as it goes on.
+
+    :ivar way: "areas" or "metric", see :mod:`benchmark.charted_run`.
+    """
+
+    way: str = ""
+
+    @property
+    def name(self) -> str:
+        """Of the output folder."""
+        return f"{self.way}-{super().name}"
+
+    def command(self, folder: Path) -> list[str]:
+        """The command line that maps the log into a folder."""
+        options = ["--out", str(folder), "--seed", str(self.seed), "--config", str(PARAMETERS)]
+        changes = [word for change in self.changes for word in ("--set", change)]
+        return [sys.executable, "-m", "benchmark.charted_run", self.way, str(self.log.path), *options, *changes]
+
+
+def metric_case(log: MeasuredLog, seed: int, changes: tuple[str, ...], particles: int) -> Charted:
+    """One area for everything, with so many particles."""
+    own = (f"local_map.extent={EXTENTS[log.name]:g}", f"filter.particles={particles}")
+    return Charted(log, seed, changes=(*changes, *own), way=METRIC)
+
+
+class KeptRunner(Runner):
+    """Runs that stay in their folder, and are made anew only for another program or other parameters."""
+
+    def _run(self, case: Case) -> Run:
+        folder = self.folder.absolute() / case.name
+        kept = folder / "usage.json"
+        if kept.is_file():
+            usage: dict[str, Any] = json.loads(kept.read_text(encoding="utf-8"))
+            if usage.pop("code") == _code():
+                return Run(case, folder, **usage)
+        shutil.rmtree(folder, ignore_errors=True)
+        run = super()._run(case)
+        if not run.fault:
+            usage = {"cpu_seconds": run.cpu_seconds, "wall_seconds": run.wall_seconds, "peak_rss": run.peak_rss}
+            kept.write_text(json.dumps(usage | {"code": _code()}), encoding="utf-8")
+        return run
+
+
+def _code() -> str:
+    """What the runs of this code are known by."""
+    return code() + hashlib.sha256(Path(charted_run.__file__).read_bytes()).hexdigest()[:8]
+
+
+@contextmanager
+def compared(names: Sequence[str]) -> Iterator[list[MeasuredLog]]:
+    """The logs of some names, the campus among them.
+
+    :raises HmtSlamError: for a name that is none, or a file that is not there.
+    """
+    with opened([name for name in names if name != CAMPUS]) as logs:
+        by_name = {log.name: log for log in logs} | {CAMPUS: MeasuredLog(CAMPUS, Path(CAMPUS_WORLD))}
+        yield [by_name[name] for name in names]
+
+
+def reference_of(log: MeasuredLog, run: Run) -> tuple[Relations, str]:
+    """Relations by which the trajectories of a log are judged, and where they are from.
+
+    :param run: of the program as it is, by which the others are judged where nothing else is known.
+    """
+    if log.name == CAMPUS:
+        return true_relations(truth_of(open_simulated(CAMPUS_WORLD))), "truth"
+    if log.relations is not None:
+        return log.relations, "relations"
+    file = datasets() / _GMAPPING
+    if log.name in file.name and file.is_file():
+        with lzma.open(file, "rt", encoding="utf-8") as lines:
+            rows = np.loadtxt(lines)
+        stamps = np.round(1e9 * rows[:, 0]).astype(np.int64)
+        return true_relations(StampedPoses(stamps, rows[:, 1:4])), "GMapping"
+    return true_relations(read_tum(run.folder / FINAL)), "the other run"
+
+
+def judged(run: Run, relations: Relations) -> RelationErrors:
+    """Errors of a run's trajectory."""
+    log = run.case.log
+    odometry = None if log.name == CAMPUS else log.odometry
+    return evaluate_relations(read_tum(run.folder / FINAL), relations, odometry)
+
+
+def plot_growth(path: Path, logs: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> None:
+    """Memory above that before the first scan, and time for a scan, over the log; as Fig. 9e of the paper.
+
+    :param logs: {log: {method: report of :mod:`benchmark.charted_run`}}.
+    """
+    figure = Figure(figsize=(4.5 * len(logs), 6.0), layout="constrained")
+    panels = figure.subplots(2, len(logs), squeeze=False)
+    for column, (name, methods) in enumerate(logs.items()):
+        upper, lower = panels[0][column], panels[1][column]
+        for method, report in methods.items():
+            memory, cost = report["memory"], report["cost"]
+            minutes = [sample["s"] / 60.0 for sample in memory]
+            upper.plot(minutes, [(s["bytes"] - memory[0]["bytes"]) / 1e6 for s in memory], label=method)
+            lower.plot([sample["s"] / 60.0 for sample in cost], [sample["ms"] for sample in cost], linewidth=0.8)
+        upper.set_title(name)
+        upper.set_ylabel("memory [MB]")
+        upper.set_ylim(bottom=0.0)
+        upper.legend(fontsize=7)
+        lower.set_yscale("log")
+        lower.set_ylabel("computing time of a scan [ms]")
+        lower.set_xlabel("time of the log [min]")
+    figure.savefig(path, dpi=_DPI)
+
+
+def plot_processes(path: Path, logs: Mapping[str, Mapping[str, float]]) -> None:
+    """Mean time of every process for a scan; as Fig. 9c of the paper.
+
+    :param logs: {log: {process: ms}}.
+    """
+    figure = Figure(figsize=(6.0, 3.5), layout="constrained")
+    axes = figure.subplots()
+    processes = list(next(iter(logs.values())))
+    width = 0.8 / len(logs)
+    for k, (name, own) in enumerate(logs.items()):
+        places = np.arange(len(processes)) + (k - 0.5 * (len(logs) - 1)) * width
+        axes.bar(places, [own[process] for process in processes], width, label=name)
+    axes.set_xticks(range(len(processes)), processes)
+    axes.set_yscale("log")
+    axes.set_ylabel("mean time for a scan [ms]")
+    axes.legend(fontsize=7)
+    figure.savefig(path, dpi=_DPI)

@@ -1,4 +1,4 @@
-"""Three loops of three: institutes that are gone round twice, whose loops only the belief over places can propose.
+"""Loop closures that only the belief over places proposes, in institutes that are gone round twice.
 
 And what it proposes in other worlds, where a laser sees half a circle.
 """
@@ -16,8 +16,7 @@ import numpy as np
 from benchmark.institute_maps import LASER, PEOPLE
 from benchmark.report import Report, Requirement, table
 from benchmark.runs import PARAMETERS
-from benchmark.settings import Settings
-from benchmark.simulated.measured import chosen_seeds
+from benchmark.settings import Settings, chosen_seeds
 from benchmark.simulated.truth import NEAR, TURN
 from benchmark.simulated.watch import Watch
 from hmt_slam_ros.configuration import Configuration, load_configuration

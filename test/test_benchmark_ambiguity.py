@@ -5,11 +5,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from benchmark.ambiguity import Reentry, requirements, settling_table
-from benchmark.simulated.loops import Loop
-from benchmark.simulated.rivals import by_odometry, looks_alike, rivalries
+from benchmark.ambiguity import NEW, RIGHT, WRONG, Reentry, Verdict, requirements, settling_table, story, verdict
+from benchmark.simulated.loops import Loop, by_odometry, looks_alike, rivalries
 from benchmark.simulated.truth import Truth
-from benchmark.stories import NEW, RIGHT, WRONG, Verdict, story, verdict
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.simulation import open_simulated
 

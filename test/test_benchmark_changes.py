@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from benchmark.changes import Localized, Visit, localized, requirements, visited_twice
-from benchmark.documents import VALIDATION, marks
-from benchmark.surfaces import Surfaces, judged, unexplained
+from benchmark.changes import Localized, Surfaces, Visit, judged, localized, requirements, unexplained, visited_twice
+from benchmark.report import VALIDATION, marks
 from hmt_slam_ros.grids.occupancy_map import FREE, OCCUPIED, OccupancyImage
 
 FRAME = np.zeros(3)

@@ -1,24 +1,33 @@
-"""The measurement of missions and relocations."""
+"""Missions, relocations and charts of an institute."""
+
+import math
 
 import numpy as np
 import pytest
 
-from benchmark.belief import Estimate
-from benchmark.documents import VALIDATION, marks
-from benchmark.institute import _mission_requirements, _transitions
-from benchmark.institute_maps import InstituteMap, scenario_of
-from benchmark.institute_missions import Mission, open_doors, way_length
+from benchmark.institute import (
+    Estimate,
+    Mission,
+    _mission_requirements,
+    _transitions,
+    open_doors,
+    recovery,
+    way_length,
+)
+from benchmark.institute_maps import InstituteMap, judged, scenario_of
+from benchmark.report import VALIDATION, marks
 from hmt_slam_ros.exploration.rooms import Destination
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.landmark import Existence, Landmark
 from hmt_slam_ros.landmarks.landmarks import OPENING
-from hmt_slam_ros.places.chart import CROSSING, DOOR, Chart, ChartNode
+from hmt_slam_ros.places.chart import CROSSING, DOOR, END, Chart, ChartNode
 from hmt_slam_ros.places.floor import LeadingOff
 from hmt_slam_ros.places.observation_graph import no_landmarks
 from hmt_slam_ros.places.place_graph import EAST, NORTH, Edge
 
 EMPTY = no_landmarks()
+FRAME = np.array([3.0, -4.0, 1.0])
 
 
 def mission(rights, confident=True):
@@ -72,6 +81,51 @@ def test_the_shortest_way_between_two_nodes():
     assert way_length(charted, 0, 2) == pytest.approx(10.0)
     assert way_length(charted, 3, 0) == pytest.approx(15.0)
     assert float(se2.wrap(charted.nodes[0, 2] - charted.scenario.building.states.poses[0, 2])) == 0.0
+
+
+def estimate(arrivals, right=True, confident=True):
+    return Estimate(arrivals, 4.0 * arrivals, 0.9, confident, right)
+
+
+def test_a_recovery_is_confident_and_right_and_right_at_the_three_nodes_behind():
+    run = [estimate(0, confident=False), estimate(1), estimate(1), *(estimate(k, confident=False) for k in (2, 3, 4))]
+    assert recovery(run) == estimate(1)
+    assert recovery(run[:-1]) is None
+    spoilt = [*run[:4], estimate(2, right=False), *run[4:]]
+    assert recovery(spoilt) is None
+    assert recovery([*run[:-1], estimate(4), estimate(4, right=False)]) is None
+
+
+def chart_of_states(changed=()):
+    """The states of an institute as the nodes of a chart, some of them changed: {number: (kind, away, m)}."""
+    scenario = scenario_of(0)
+    states = scenario.building.states
+    nodes = []
+    for k, pose in enumerate(states.poses):
+        kind, away = dict(changed).get(k, (CROSSING if states.crossings[k] else DOOR, 0.1))
+        place = se2.compose(pose, np.array((away, 0.0, 0.0)))
+        nodes.append(ChartNode(0, se2.between(FRAME, place), kind, 1.0, ()))
+    return InstituteMap(scenario, None, {}, {}, Chart(tuple(nodes), (), ()), {0: FRAME})
+
+
+def test_a_chart_of_the_states_has_all_and_confuses_none():
+    found = judged(chart_of_states())
+    assert (found.states, found.detected, found.confused) == (13, 13, 0)
+    np.testing.assert_allclose(found.off, 0.1)
+
+
+@pytest.mark.parametrize(
+    ("change", "detected", "confused"),
+    [
+        pytest.param((DOOR, 0.1), 13, 1, id="a door where there is a crossing"),
+        pytest.param((CROSSING, 30.0), 12, 1, id="a crossing where there is nothing"),
+        pytest.param((END, 30.0), 12, 0, id="the end of a hallway"),
+    ],
+)
+def test_what_is_missing_and_what_is_confused(change, detected, confused):
+    found = judged(chart_of_states({0: change}.items()))
+    assert (found.detected, found.confused) == (detected, confused)
+    assert math.isclose(max(found.off), 0.1)
 
 
 def test_the_document_has_a_place_for_it():

@@ -2,8 +2,8 @@
 
 import pytest
 
-from benchmark.documents import VALIDATION, marks
 from benchmark.laps import Lap, Laps, driven, requirements
+from benchmark.report import VALIDATION, marks
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.open_log import open_log
 

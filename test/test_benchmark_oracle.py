@@ -3,9 +3,17 @@
 import pytest
 
 from benchmark import oracle
-from benchmark.documents import VALIDATION, marks
-from benchmark.enumeration import Enumeration
-from benchmark.oracle import Regime, compared, filtered, mean_distances, oracle_requirements, stops, total_variation
+from benchmark.oracle import (
+    Enumeration,
+    Regime,
+    compared,
+    filtered,
+    mean_distances,
+    oracle_requirements,
+    stops,
+    total_variation,
+)
+from benchmark.report import VALIDATION, marks
 from benchmark.runs import PARAMETERS
 from hmt_slam_ros.configuration import load_configuration
 from hmt_slam_ros.topological_inference import tsbi

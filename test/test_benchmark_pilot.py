@@ -7,9 +7,8 @@ import pytest
 
 pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
 
-from benchmark.documents import VALIDATION, marks
-from benchmark.pilot import Explored, _awakening, _row, _scored, requirements
-from benchmark.pilot_nodes import Ran
+from benchmark.pilot import Explored, Ran, _awakening, _row, _scored, requirements
+from benchmark.report import VALIDATION, marks
 from hmt_slam_ros.geometry import se2
 
 IN_MAP, IN_WORLD = np.array([1.0, 2.0, 0.3]), np.array([-4.0, 5.0, 1.0])

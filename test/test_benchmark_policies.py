@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from benchmark.policies import requirements, share
-from benchmark.simulated.doors import crossings_of, doors_of
-from benchmark.simulated.watched_run import watched
+from benchmark.simulated.truth import crossings_of, doors_of
+from benchmark.simulated.watch import watched
 from benchmark.simulated.worlds import INSTITUTE, World
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.simulation import open_simulated

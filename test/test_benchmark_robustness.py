@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from worlds import box, scan_in
 
-from benchmark.closures import closure_errors
 from benchmark.logs import BUNDLED, opened
-from benchmark.robustness import Verdict, verdict
+from benchmark.robustness import Verdict, closure_errors, verdict
 from benchmark.runs import Case, Runner
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.errors import HmtSlamError

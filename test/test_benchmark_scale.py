@@ -3,13 +3,10 @@
 import numpy as np
 import pytest
 
-from benchmark.documents import VALIDATION, marks
 from benchmark.lattice import FIRST_KEYFRAME, PER_AREA, SPACING, Lattice, LatticeScans, scan_at, stops
-from benchmark.scale import cut_requirement, growth_requirement
-from benchmark.scale_cuts import Cut, measured_cuts
-from benchmark.scale_maps import lasting, state_of
-from benchmark.scale_memory import stored
-from benchmark.scale_scans import cost_of_scans
+from benchmark.report import VALIDATION, marks
+from benchmark.scale import Cut, cost_of_scans, cut_requirement, growth_requirement, measured_cuts
+from benchmark.scale_maps import lasting, state_of, stored
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.hybrid_map.shortest_path import reachable
 

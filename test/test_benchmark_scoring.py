@@ -8,10 +8,8 @@ import pytest
 from benchmark.accuracy import BOUNDS, accuracy_requirements, accuracy_table
 from benchmark.logs import MeasuredLog
 from benchmark.report import Report
-from benchmark.runs import Case, Run
 from benchmark.scoring import FINAL, ONLINE, over_seeds, score
 from benchmark.speed import speed_requirements
-from benchmark.steps import missing_steps, score_steps, steps_table
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.evaluation import StampedPoses, write_tum
 
@@ -37,14 +35,10 @@ def log(tmp_path):
 
 def folder_with(tmp_path, name, **trajectories):
     folder = tmp_path / name
-    (folder / "stages").mkdir(parents=True)
+    folder.mkdir()
     for file, trajectory in trajectories.items():
         write_tum(folder / f"{file}.tum", trajectory)
     return folder
-
-
-def run_in(folder, log, seed=0):
-    return Run(Case(log, seed), folder, 1.0, 1.0, 1)
 
 
 def test_a_folder_is_scored_by_hand(tmp_path, log):
@@ -96,20 +90,6 @@ def test_the_bounds_are_those_that_the_project_promises():
     assert not speed_requirements("intel", [26.0, 25.0], [1])[0].met
     assert not speed_requirements("intel", [1.0], [1, 351 * 10**6])[1].met
     assert not speed_requirements("aces", [15.1], [1])[0].met
-
-
-def test_steps_that_are_there_are_scored_and_the_others_named(tmp_path, log):
-    runs = [
-        run_in(folder_with(tmp_path, "0", **{"stages/filter": line(0.02)}, trajectory=line(0.01)), log),
-        run_in(folder_with(tmp_path, "1", **{"stages/filter": line(0.04)}, trajectory=line(0.03)), log, seed=1),
-    ]
-    means = {"aces": score_steps(log, runs)}
-    assert list(means["aces"]) == ["stages/filter.tum", "trajectory.tum"]
-    assert means["aces"]["stages/filter.tum"].translation == pytest.approx(1.65)
-    (sentence,) = missing_steps(means)
-    assert "stages/arcs.tum, stages/keyframes.tum, trajectory_online.tum" in sentence
-    assert "filter only" in steps_table(means)
-    assert "optimisation of the arcs" not in steps_table(means)
 
 
 def test_a_log_without_truth_is_not_scored(tmp_path, log):

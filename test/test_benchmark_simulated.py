@@ -5,9 +5,8 @@ import csv
 import numpy as np
 import pytest
 
-from benchmark.simulated.comparisons import write_comparisons
 from benchmark.simulated.loops import Loops
-from benchmark.simulated.records import Records, code, read_record
+from benchmark.simulated.records import Records, code, read_record, write_comparisons
 from benchmark.simulated.truth import Truth, nees
 from benchmark.simulated.worlds import FAMILIES, LONG, SETTINGS, World, seeds
 from hmt_slam_ros.configuration import load_configuration

@@ -8,8 +8,7 @@ import pytest
 from benchmark.charted_run import OneArea
 from benchmark.logs import MeasuredLog
 from benchmark.runs import Run
-from benchmark.table import Comparison, Entry, comparison_table, requirements
-from benchmark.table_runs import KeptRunner, compared, metric_case
+from benchmark.table import Comparison, Entry, KeptRunner, compared, comparison_table, metric_case, requirements
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.messages.messages import AreaEvents, Hypotheses

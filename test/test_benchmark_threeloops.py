@@ -2,7 +2,7 @@
 
 import pytest
 
-from benchmark.documents import VALIDATION, marks
+from benchmark.report import VALIDATION, marks
 from benchmark.threeloops import Closed, Drive, Proposal, elsewhere_requirements, requirements
 
 RIGHT, WRONG = Proposal(220.0, (0.1, 1.0)), Proposal(50.0, (6.0, 1.0))

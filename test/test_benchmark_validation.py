@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 
 from benchmark.__main__ import main
-from benchmark.consistency import KINDS, covered, mean_nees
-from benchmark.documents import VALIDATION, marks
-from benchmark.forecasts import (
+from benchmark.calibration import (
+    KINDS,
     Forecast,
+    covered,
     forecast,
     interval,
+    mean_nees,
     new_rate,
     of_arcs,
     of_base_rate,
@@ -20,10 +21,9 @@ from benchmark.forecasts import (
     of_top,
     reliability,
 )
-from benchmark.loops import distances, missed_share
-from benchmark.report import Requirement
+from benchmark.loops import distances, faults, missed_share
+from benchmark.report import VALIDATION, Requirement, marks
 from benchmark.simulated.closures import NEW, NOT_ASKED
-from benchmark.topology import faults
 
 
 def answer(area, probability, right):
@@ -142,7 +142,7 @@ def test_a_figure_may_be_too_small():
     assert Requirement("error", 0.1, 1.0, "m").row[2:] == ["1 m", "pass"]
 
 
-@pytest.mark.parametrize("kind", ["calibration", "loops", "topology", "consistency", "evidence"])
+@pytest.mark.parametrize("kind", ["calibration", "loops", "topology", "consistency"])
 def test_the_document_has_a_place_for_every_measurement(kind):
     text = VALIDATION.read_text()
     assert all(text.count(mark) == 1 for mark in marks(kind))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from worlds import box, scan_in
 
-from benchmark.walls import judge_walls
+from benchmark.scoring import judge_walls
 from hmt_slam_ros.geometry import se2
 
 ROUND = 24  # poses of one round, a metre apart

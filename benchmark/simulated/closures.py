@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 
-from benchmark.simulated.examinations import Examination
-from benchmark.simulated.features import known_is_right, new_is_right
+from benchmark.simulated.examinations import Examination, known_is_right, new_is_right
 from benchmark.simulated.truth import Claim, Truth
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap

@@ -1,21 +1,37 @@
-"""Every comparison of keyframes with known areas that TSBI makes, handed to whoever watches."""
+"""Comparisons of keyframes with known areas, as TSBI makes them, and the truth of each: data to fit the model on."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+import math
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmark.simulated.truth import GREY, RADIUS, Pose, Truth
 from hmt_slam_ros import composition
 from hmt_slam_ros.configuration import Configuration
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
-from hmt_slam_ros.hybrid_map.surroundings import Views
+from hmt_slam_ros.hybrid_map.shortest_path import reachable
+from hmt_slam_ros.hybrid_map.surroundings import Views, entry
 from hmt_slam_ros.messages.replica import Replica
 from hmt_slam_ros.registration.likelihood_grid import AreaGrid
+from hmt_slam_ros.registration.match_modes import log_ratio_at
+from hmt_slam_ros.registration.search_bounds import Surface
 from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.topological_inference.admission import Query
 from hmt_slam_ros.topological_inference.branching import Branches, Branching, Parent
-from hmt_slam_ros.topological_inference.closure_search import ClosureSearch, Comparison, Pose
-from hmt_slam_ros.topological_inference.place_recognition import Looks
+from hmt_slam_ros.topological_inference.closure_search import ClosureSearch, Comparison, Fit
+from hmt_slam_ros.topological_inference.place_recognition import Looks, log_ratio
+
+_Asked = tuple[Query, Mapping[int, Collection[int]], frozenset[int], Comparison]
+_VIEWS = 3
+_NAN = math.nan
+_NO_MATCH = (0, _NAN, 0, 0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,9 +109,6 @@ class WatchedBranching(Branching):
         return branches
 
 
-_Asked = tuple[Query, Mapping[int, Collection[int]], frozenset[int], Comparison]
-
-
 class _WatchedSearch(ClosureSearch):
     """Remembers its last comparison."""
 
@@ -127,3 +140,230 @@ class _WatchedSearch(ClosureSearch):
         """The last comparison since it was taken."""
         last, self._last = self._last, None
         return last
+
+
+class Match(NamedTuple):
+    """How surface samples lie in a map.
+
+    :ivar samples: how many there are.
+    :ivar score: sum of their log-ratios, not tempered, nats.
+    :ivar on: samples on known surfaces.
+    :ivar free: samples in space that is known to be free.
+    """
+
+    samples: int
+    score: float
+    on: int
+    free: int
+
+
+class Row(NamedTuple):
+    """One mode in one known area, or that there is none (``mode`` -1).
+
+    :ivar event: the keyframe event.
+    :ivar kind: 0 for a cut, 1 for a re-check.
+    :ivar hypothesis: that asks; ``log_probability``, its own, the newest scan counted.
+    :ivar area: that the keyframes are in.
+    :ivar known: the area that they are compared with.
+    :ivar mode: number of the mode, the heaviest first.
+    :ivar travelled: path length since the start, m.
+    :ivar loop: path driven since the known area's newest keyframe, m.
+    :ivar asked: number of the keyframes in question, those not compared with the area before.
+    :ivar keyframes: number of the known area's own.
+    :ivar share: pi of the area by itself; ``pi``, in the transition model; ``new``, of new ground there.
+    :ivar look: log p(phi), nats, which is no part of the weight.
+    :ivar log_mass: log of the mode's part of the evidence integral, nats.
+    :ivar log_weight: of the fit, relative to new ground.
+    :ivar prior_x: deviation of the prior by the arcs along its axes, widened; likewise ``prior_y`` (m), ``prior_turn``
+        (rad).
+    :ivar log_prior: log density of the prior at the mode.
+    :ivar mahalanobis2: squared, of the mode under the prior.
+    :ivar mode_x: deviation of the mode from the match alone; likewise ``mode_y`` (m), ``mode_turn`` (rad).
+    :ivar log_volume: half the log determinant of its covariance.
+    :ivar samples: to ``free``: the keyframes' samples in the area's map at the mode, as :class:`Match`.
+    :ivar back_samples: to ``back_free``: the area's samples in the keyframes' map there.
+    :ivar true_score: to ``true_free``: as ``score``, at the true pose; NaN where the places are not the same.
+    :ivar right: 1 where the claim is true, 0 where it is false.
+    :ivar apart: to ``error_turn``: of the claim, m, m, degrees.
+    :ivar in_place: share of the keyframes that truly are in the area's place.
+    :ivar known_right: whether it is right to say that they are; ``new_right``, that they are in no known place.
+    :ivar view: share of what the middle keyframe saw that the area's nearest ones saw too.
+    """
+
+    event: int
+    kind: int
+    hypothesis: int
+    log_probability: float
+    area: int
+    known: int
+    mode: int
+    travelled: float
+    loop: float
+    asked: int
+    keyframes: int
+    share: float
+    pi: float
+    new: float
+    look: float
+    log_mass: float
+    log_weight: float
+    prior_x: float
+    prior_y: float
+    prior_turn: float
+    log_prior: float
+    mahalanobis2: float
+    mode_x: float
+    mode_y: float
+    mode_turn: float
+    log_volume: float
+    samples: int
+    score: float
+    on: int
+    free: int
+    back_samples: int
+    back_score: float
+    back_on: int
+    back_free: int
+    true_score: float
+    true_on: float
+    true_free: float
+    right: int
+    apart: float
+    error: float
+    error_turn: float
+    in_place: float
+    known_right: int
+    new_right: int
+    view: float
+
+
+def rows(
+    examination: Examination, truth: Truth, configuration: Configuration, event: int, travelled: dict[int, float]
+) -> Iterator[Row]:
+    """The rows of one examination.
+
+    :param travelled: {keyframe: path length since the start, m}.
+    """
+    new = int(new_is_right(examination, truth))
+    for known in examination.found.examined:
+        fits = [fit for fit in examination.found.fits if fit.area == known]
+        candidate = _Candidate(examination, truth, configuration, known)
+        ours = travelled[event] - max(travelled[k] for k in examination.hybrid_map.keyframes(known))
+        head = (
+            event,
+            int(examination.kind == "recheck"),
+            examination.parent.hypothesis,
+            examination.parent.log_weight,
+            examination.parent.area,
+            known,
+        )
+        middle = (travelled[event], ours, len(candidate.fresh), len(candidate.known), *candidate.transition())
+        for mode, fit in enumerate(fits) if fits else [(-1, None)]:
+            yield Row._make((*head, mode, *middle, *candidate.of(fit), *candidate.place_truth(), new, candidate.view()))
+
+
+def new_is_right(examination: Examination, truth: Truth) -> bool:
+    """Whether it is right to say that the keyframes lie in no known place: most of them do not."""
+    known = [k for area in examination.known_areas for k in examination.hybrid_map.keyframes(area)]
+    return 2.0 * truth.share_in(examination.keyframes, known, (1.0 - GREY) * RADIUS) < 1.0
+
+
+def known_is_right(examination: Examination, truth: Truth, area: int) -> bool:
+    """Whether it is right to say that the keyframes lie in a known area's place."""
+    known = list(examination.hybrid_map.keyframes(area))
+    return 2.0 * truth.share_in(examination.keyframes, known, (1.0 + GREY) * RADIUS) >= 1.0
+
+
+class _Candidate:
+    """A known area that the keyframes were compared with."""
+
+    def __init__(self, examination: Examination, truth: Truth, configuration: Configuration, area: int) -> None:
+        self._asked, self._truth, self._options, self._area = examination, truth, configuration.tsbi, area
+        self.fresh = examination.fresh(area)
+        self.known = examination.hybrid_map.keyframes(area)
+        belief = reachable(examination.hybrid_map, examination.parent.area)[area]
+        prior = belief.inverse().compose(examination.query.belief)
+        self._prior = PoseGaussian(prior.mean, self._options.prior_scale**2 * prior.covariance)
+        self._place = examination.views.place(examination.hybrid_map, area, examination.excluded)
+        self._grid = examination.views.grid(self.fresh)
+
+    def transition(self) -> tuple[float, float, float]:
+        """Share, pi and the probability of new ground."""
+        poses = np.array(list(self.fresh.values()))
+        share = entry(self._place, self._prior, poses, self._options.place_radius).share
+        model = self._asked.found.transition
+        return share, model.known[self._area], model.new
+
+    def of(self, fit: Fit | None) -> tuple[float, ...]:
+        """All that there is to say of a mode."""
+        deviations = np.sqrt(np.diag(self._prior.covariance))
+        look = self._look()
+        if fit is None:
+            nothing = [_NAN] * 2
+            shapes = [_NAN] * 6
+            return (look, *nothing, *deviations, *shapes, *_NO_MATCH, *_NO_MATCH, *self._at_truth(), 0, *[_NAN] * 3)
+        at = fit.mode.pose.mean
+        away = se2.log(se2.between(self._prior.mean, at))
+        mahalanobis2 = float(away @ np.linalg.solve(self._prior.covariance, away))
+        log_determinant = float(np.linalg.slogdet(self._prior.covariance)[1])
+        log_prior = -0.5 * (mahalanobis2 + log_determinant) - 1.5 * math.log(2.0 * math.pi)
+        measured = fit.mode.measured.covariance
+        return (
+            look,
+            fit.mode.log_mass,
+            fit.log_weight,
+            *deviations,
+            log_prior,
+            mahalanobis2,
+            *np.sqrt(np.diag(measured)),
+            0.5 * float(np.linalg.slogdet(measured)[1]),
+            *_match(self._grid.points, at, self._place.grid),
+            *_match(self._place.grid.points, se2.inverse(at), self._grid),
+            *self._at_truth(),
+            *self._claim(fit),
+        )
+
+    def _claim(self, fit: Fit) -> tuple[float, ...]:
+        asked = {k: se2.compose(fit.mode.pose.mean, pose) for k, pose in self._asked.query.poses.items()}
+        measured = fit.mode.measured
+        claim = self._truth.claim(self.known, asked, measured.covariance, measured.mean)
+        return int(claim.true), claim.apart, claim.translation, claim.rotation
+
+    def _at_truth(self) -> tuple[float, float, float]:
+        """Score, samples on surfaces and in free space at the true pose."""
+        nearest, pose = self._nearest()
+        if not self._truth.same_place(list(self.fresh), [nearest], RADIUS).any():
+            return _NAN, _NAN, _NAN
+        return _match(self._grid.points, pose, self._place.grid)[1:]
+
+    def _nearest(self) -> tuple[int, Pose]:
+        """The area's keyframe nearest to the reference, and ``area_T_reference`` as it follows from there."""
+        reference = self._truth.poses[self._asked.keyframes[0]]
+        nearest = min(self.known, key=lambda k: float(np.hypot(*(self._truth.poses[k] - reference)[:2])))
+        return nearest, se2.compose(self.known[nearest], se2.between(self._truth.poses[nearest], reference))
+
+    def place_truth(self) -> tuple[float, int]:
+        """Share of the keyframes in the area's place, and whether it is right to say that they are."""
+        share = self._truth.share_in(self._asked.keyframes, list(self.known), RADIUS)
+        return share, int(known_is_right(self._asked, self._truth, self._area))
+
+    def view(self) -> float:
+        """Of what the middle keyframe saw, the largest share that one of the area's nearest saw too."""
+        keyframes = list(self.fresh)
+        middle = keyframes[len(keyframes) // 2]
+        here = self._truth.poses[middle]
+        near = sorted(self.known, key=lambda k: float(np.hypot(*(self._truth.poses[k] - here)[:2])))[:_VIEWS]
+        return float(self._truth.shared_view(middle, near).max())
+
+    def _look(self) -> float:
+        """log p(phi), nats, relative to the other known areas."""
+        areas = [self._area, *(area for area in self._asked.known_areas if area != self._area)]
+        keyframes = [self._asked.hybrid_map.keyframes(area) for area in areas]
+        return float(log_ratio(self._asked.looks.likeness(self.fresh, keyframes)[0]))
+
+
+def _match(points: NDArray[np.float64], pose: Pose, grid: AreaGrid) -> Match:
+    """How samples that stand at ``grid_T_points`` lie in a grid."""
+    found = grid.agreement(points, pose)
+    score = log_ratio_at(Surface(grid.fine, grid.origin, 0.5 * grid.cell), points, pose)
+    return Match(found.samples, score, found.on, found.free)

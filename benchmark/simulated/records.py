@@ -1,7 +1,13 @@
-"""Watched runs of simulated worlds, each in a process of its own, kept in a folder and made once."""
+"""Watched runs of simulated worlds, each in a process of its own, kept in a folder and made once.
+
+``python -m benchmark.simulated.records FOLDER FILE.csv`` writes all comparisons of a folder as one table. The columns
+are those of ``benchmark.simulated.examinations.Row`` behind ``family`` and ``seed``; what could not be computed is
+empty.
+"""
 
 from __future__ import annotations
 
+import csv
 import gzip
 import hashlib
 import json
@@ -78,7 +84,7 @@ class Records:
             record = read_record(path)
             if (record["code"], record["world"], record["changes"]) == (code(), world.log, changes):
                 return record
-        module = "benchmark.simulated.watched_run"
+        module = "benchmark.simulated.watch"
         command = [sys.executable, "-m", module, world.family, str(world.seed), str(path), *changes]
         result = subprocess.run(
             command, cwd=ROOT, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False
@@ -89,3 +95,31 @@ class Records:
         record = read_record(path)
         print(f"{world.name}: {record['cpu_s']:.1f} CPU s", file=sys.stderr, flush=True)
         return record
+
+
+def write_comparisons(folder: Path, file: Path) -> int:
+    """Write the table; return the number of its rows."""
+    count = 0
+    with file.open("w", encoding="utf-8", newline="") as target:
+        writer = csv.writer(target)
+        for record in read_records(folder):
+            if not count:
+                writer.writerow(["family", "seed", *record["columns"]])
+            writer.writerows([record["family"], record["seed"], *row] for row in record["rows"])
+            count += len(record["rows"])
+    return count
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Write; return the exit status."""
+    folder, file = map(Path, arguments)
+    try:
+        print(f"{file}: {write_comparisons(folder, file)} comparisons")
+    except HmtSlamError as fault:
+        print(f"records: {fault}", file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

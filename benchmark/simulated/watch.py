@@ -1,20 +1,33 @@
-"""Watches the five processes on a simulated log: what they say, and what is true of it."""
+"""Watches the five processes on a simulated log: what they say, and what is true of it.
+
+``python -m benchmark.simulated.watch FAMILY SEED FILE [NAME=VALUE ...]`` maps a simulated log. FILE becomes a JSON
+document, gzipped.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import gzip
+import json
+import math
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from benchmark.runs import PARAMETERS
 from benchmark.simulated.closures import Closure, Paths, answers, by_arcs_alone
-from benchmark.simulated.examinations import Examination, WatchedBranching
-from benchmark.simulated.features import Row, rows
-from benchmark.simulated.loops import Loops
-from benchmark.simulated.truth import Pose, Truth, nees
+from benchmark.simulated.examinations import Examination, Row, WatchedBranching, rows
+from benchmark.simulated.loops import Loop, Loops, rivalries
+from benchmark.simulated.records import code
+from benchmark.simulated.truth import Pose, Truth, doors, nees
+from benchmark.simulated.worlds import World
 from hmt_slam_ros import composition
-from hmt_slam_ros.configuration import Configuration
+from hmt_slam_ros.configuration import Configuration, load_configuration
+from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
@@ -25,7 +38,7 @@ from hmt_slam_ros.messages.routing import Process
 from hmt_slam_ros.offline.runtime import LockStep
 from hmt_slam_ros.real_time_localization.rtl import Rtl
 from hmt_slam_ros.sensors import Scan
-from hmt_slam_ros.simulation import SimulatedLog
+from hmt_slam_ros.simulation import SimulatedLog, open_simulated
 from hmt_slam_ros.topological_inference.branching import Branching
 from hmt_slam_ros.topological_inference.tsbi import Tsbi
 
@@ -238,3 +251,70 @@ def _error(belief: PoseGaussian, truth: Pose) -> Entry:
         "nees": nees(belief, truth),
         "sigma": float(np.sqrt(np.trace(belief.covariance[:2, :2]))),
     }
+
+
+def watched(world: World, changes: Sequence[str] = ()) -> dict[str, Any]:
+    """All that is kept of a run."""
+    begin = time.process_time()
+    watch = Watch(open_simulated(world.log), load_configuration(PARAMETERS, list(changes), world.seed))
+    watch.run()
+    return {
+        "world": world.log,
+        "family": world.family,
+        "seed": world.seed,
+        "changes": list(changes),
+        "code": code(),
+        "keyframes": len(watch.truth.poses),
+        "columns": Row._fields,
+        "rows": watch.rows,
+        "events": watch.events,
+        "accepted": watch.accepted,
+        "pending": watch.pending(),
+        "loops": [_loop(loop) for loop in watch.loops.found],
+        "arcs": watch.arcs(),
+        "area_poses": watch.area_poses(),
+        "poses": watch.poses,
+        "pmf": watch.pmf,
+        "rivalries": [vars(found) for found in rivalries(watch.log, watch.truth, watch.loops.found, watch.travelled)],
+        "doors": doors(watch.truth, *watch.mapped(), watch.configuration),
+        "cpu_s": time.process_time() - begin,
+    }
+
+
+def _loop(loop: Loop) -> dict[str, Any]:
+    return {
+        **{name: value for name, value in vars(loop).items() if name != "partners"},
+        "can_be_closed": loop.can_be_closed,
+        "in_time": loop.in_time,
+    }
+
+
+def _plain(value: Any) -> Any:  # noqa: ANN401  whatever is in a record
+    """The same in what JSON knows, figures to seven digits."""
+    if isinstance(value, dict):
+        return {name: _plain(entry) for name, entry in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(entry) for entry in value]
+    if isinstance(value, float):
+        return float(f"{value:.7g}") if math.isfinite(value) else None
+    return value
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Run; return the exit status."""
+    family, seed, file, *changes = arguments
+    try:
+        record = watched(World(family, int(seed)), changes)
+    except HmtSlamError as fault:
+        print(f"watch: {fault}", file=sys.stderr)
+        return 2
+    # Under another name first, so that an interrupted run leaves nothing that looks like a record.
+    part = Path(f"{file}.part")
+    with gzip.open(part, "wt", encoding="utf-8") as target:
+        json.dump(_plain(record), target, allow_nan=False)
+    part.replace(file)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

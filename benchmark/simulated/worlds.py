@@ -68,3 +68,10 @@ def seeds(count: int, *, training: bool) -> tuple[int, ...]:
         raise HmtSlamError(f"there are {len(TRAINING_SEEDS)} training seeds: {count} are too many")
     first = TRAINING_SEEDS.start if training else FIRST_VALIDATION_SEED
     return tuple(range(first, first + count))
+
+
+CAMPUS = "campus"
+"""The world of ``LONG`` that is compared with a metric map."""
+
+CAMPUS_WORLD = World(LONG, FIRST_VALIDATION_SEED).log
+"""2 km of way through loops of corridors, one inside the other."""
