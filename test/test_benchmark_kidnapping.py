@@ -5,6 +5,7 @@ import math
 import pytest
 
 from benchmark.kidnapping import KINDS, SOON, Heard, drawn, judged, kidnapped, requirements
+from hmt_slam_ros.open_log import open_log
 
 LOST, RIGHT, WRONG = (False, False, False), (True, True, True), (True, True, False)
 
