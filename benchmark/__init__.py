@@ -1,5 +1,5 @@
 """Measurements of the whole system on recorded and simulated logs."""
 
-from hmt_slam_ros.process_settings import settle
+from hmt_slam_ros.process_settings import apply_process_settings
 
-settle()
+apply_process_settings()

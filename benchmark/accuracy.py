@@ -29,7 +29,7 @@ from benchmark.scoring import (
 from benchmark.settings import Settings
 from hmt_slam_ros.evaluation import PairErrors, RelationErrors, StampedPoses, read_tum
 from hmt_slam_ros.open_log import open_log
-from hmt_slam_ros.results.output_folder import EARLIER
+from hmt_slam_ros.results.output_folder import EARLIER_LOGS
 
 SEEDS = 5
 
@@ -230,7 +230,7 @@ def _halves(log: MeasuredLog, settings: Settings) -> list[Run]:
 
 def errors_of_all(folder: Path, log: MeasuredLog) -> RelationErrors:
     """Errors of the trajectories of all sessions in the final map of an output folder."""
-    parts = [read_tum(path) for path in (*sorted((folder / EARLIER).glob("*.tum")), folder / FINAL)]
+    parts = [read_tum(path) for path in (*sorted((folder / EARLIER_LOGS).glob("*.tum")), folder / FINAL)]
     stamps, poses = (np.concatenate(columns) for columns in zip(*((p.stamps, p.poses) for p in parts), strict=True))
     return scored(StampedPoses(stamps, poses), log)
 
@@ -281,8 +281,8 @@ def plot_errors_by_span(path: Path, pairs: Mapping[str, Sequence[PairErrors]]) -
     """
     figure = Figure(figsize=(5.0 * len(pairs), 4.0), layout="constrained")
     for axes, (name, own) in zip(_panels(figure, len(pairs)), pairs.items(), strict=True):
-        seconds = np.maximum(np.concatenate([errors.span[errors.found] for errors in own]) * 1e-9, _SHORTEST)
-        translation = np.concatenate([errors.translation[errors.found] for errors in own])
+        seconds = np.maximum(np.concatenate([errors.span[errors.is_matched] for errors in own]) * 1e-9, _SHORTEST)
+        translation = np.concatenate([errors.translation[errors.is_matched] for errors in own])
         axes.plot(seconds, translation, ".", markersize=1.5, color="0.7", rasterized=True)
         edges = np.geomspace(seconds.min(), seconds.max(), _BINS + 1)
         bins = np.clip(np.searchsorted(edges, seconds, side="right") - 1, 0, _BINS - 1)

@@ -346,19 +346,19 @@ def told(recorder: Recorder) -> list[dict[str, Any]]:
     entries = []
     for event, hypotheses in sorted(recorder.hypotheses.items()):
         keyframe = recorder.keyframes[event]
-        samples = {leaf.hypothesis: leaf.effective_samples for leaf in keyframe.leaves}
+        samples = {leaf.hypothesis: leaf.effective_samples for leaf in keyframe.estimates}
         leaves = [
             {
-                "hypothesis": leaf.hypothesis,
+                "hypothesis": leaf.id,
                 "parent": leaf.parent,
                 "probability": leaf.probability,
                 "samples": samples[leaf.parent],
                 "right": _count(arc.closure for arc in leaf.arcs),
                 "wrong": 0,
             }
-            for leaf in hypotheses.leaves
+            for leaf in hypotheses.hypotheses
         ]
-        where = {"event": event, "stamp": keyframe.scan.stamp, "travelled": keyframe.travelled}
+        where = {"event": event, "stamp": keyframe.scan.stamp, "travelled": keyframe.path_length}
         entries.append(where | {"unexamined": hypotheses.unexamined, "leaves": leaves})
     return entries
 

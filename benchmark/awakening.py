@@ -24,15 +24,15 @@ from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration import Configuration, load_configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.logs import LogRecord
-from hmt_slam_ros.logs.records import SIMULATED
+from hmt_slam_ros.logs.records import SIMULATION_PREFIX
 from hmt_slam_ros.messages.map_changes import AreaPose
-from hmt_slam_ros.messages.messages import Carried
+from hmt_slam_ros.messages.messages import PoseReset
 from hmt_slam_ros.messages.replica import Replica
 from hmt_slam_ros.metric_slam.slam import MetricSlam
-from hmt_slam_ros.offline.runtime import Run
+from hmt_slam_ros.offline.runtime import LockStepRun
 from hmt_slam_ros.open_log import open_log
 from hmt_slam_ros.results.hmt_map import RunState
-from hmt_slam_ros.results.recorder import placed_areas
+from hmt_slam_ros.results.recorder import complete_area_poses
 from hmt_slam_ros.sensors import Scan
 
 LOGS = ("aces", "intel")
@@ -123,7 +123,7 @@ def measure_awakening(settings: Settings) -> Report:
     names = settings.logs_or((*LOGS, *WORLDS))
     rows = []
     with opened([name for name in names if name not in WORLDS]) as logs:
-        paths: dict[str, Path | str] = {name: f"{SIMULATED}{name},laps=2" for name in names if name in WORLDS}
+        paths: dict[str, Path | str] = {name: f"{SIMULATION_PREFIX}{name},laps=2" for name in names if name in WORLDS}
         paths |= {log.name: log.path for log in logs}
         count, records = len(settings.seeds_or(STARTS)), settings.records
         for name in names:
@@ -165,10 +165,10 @@ def mapped(path: Path | str, configuration: Configuration) -> dict[str, Mapped]:
     records = list(open_log(path).records())
     scans = np.array([n for n, record in enumerate(records) if isinstance(record.measurement, Scan)])
     middle, last = len(scans) // 2, int((1.0 - _LAST) * len(scans))
-    half = _read(Run(configuration), records[: scans[middle]]).state
-    run = _read(Run(configuration, state=half), records[scans[middle] :])
+    half = _read(LockStepRun(configuration), records[: scans[middle]]).state
+    run = _read(LockStepRun(configuration, state=half), records[scans[middle] :])
     whole, result = run.state, run.finish()
-    truth = result.recorder.finish(result.log.stamps).trajectory
+    truth = result.recorder.finish(result.log_progress.stamps).trajectory
     numbers = {records[scan].measurement.stamp: n for n, scan in enumerate(scans)}
     placed = {numbers[stamp]: pose for stamp, pose in _keyframes(half).items()}
     known, poses = np.array(list(placed)), np.array(list(placed.values()))
@@ -181,17 +181,17 @@ def mapped(path: Path | str, configuration: Configuration) -> dict[str, Mapped]:
     return dict(zip(KINDS, (easy, Mapped(configuration, records, half, scans, in_half, held)), strict=True))
 
 
-def _read(run: Run, records: Sequence[LogRecord]) -> Run:
+def _read(run: LockStepRun, records: Sequence[LogRecord]) -> LockStepRun:
     for record in records:
-        run.read(record)
+        run.process_record(record)
     return run
 
 
 def _keyframes(state: RunState) -> dict[int, Float64]:
     """{stamp of a keyframe's scan: ``map_T_base`` (3,)} of the most probable map."""
-    replica = Replica.of(state.tsbi.replica)
-    hybrid_map = replica.maps[replica.best]
-    areas = placed_areas(hybrid_map, state.recorder.global_poses)
+    replica = Replica.from_state(state.tsbi.replica)
+    hybrid_map = replica.maps[replica.best_hypothesis]
+    areas = complete_area_poses(hybrid_map, state.recorder.global_poses)
     return {
         replica.scans[keyframe].stamp: se2.compose(areas[area].mean, pose)
         for area in hybrid_map.area_ids()
@@ -259,13 +259,13 @@ def _awakened(start: int) -> Awakening:
 
 def awakened(log: Mapped, start: int) -> Awakening:
     """Wake up at a scan of a drive, and go on from there."""
-    run = Run(log.configuration, state=log.state)
-    run.lock_step.feed(Carried())
+    run = LockStepRun(log.configuration, state=log.state)
+    run.lock_step.feed(PoseReset())
     found, right, wrong = math.inf, False, False
     travel, first = _travelled(log.truth[start:]), int(log.scans[start])
     counted, n = -_STEP, start
     for record in log.records[first:]:
-        run.read(record)
+        run.process_record(record)
         if not isinstance(record.measurement, Scan):
             continue
         travelled, true = next(travel), log.truth[n]
@@ -281,26 +281,26 @@ def awakened(log: Mapped, start: int) -> Awakening:
     return Awakening(start, found, right, wrong)
 
 
-def _known(run: Run) -> bool:
+def _known(run: LockStepRun) -> bool:
     """Whether the robot is sure of its place."""
     told = run.recorder.hypotheses
     if not told:
         return False
-    return sum(leaf.probability for leaf in told[max(told)].leaves if not leaf.lost) >= SURE
+    return sum(leaf.probability for leaf in told[max(told)].hypotheses if not leaf.lost) >= SURE
 
 
-def _is_right(run: Run, before: Sequence[AreaPose], true: Float64) -> bool | None:
+def _is_right(run: LockStepRun, before: Sequence[AreaPose], true: Float64) -> bool | None:
     """Whether the last estimate is near the truth; None where its area became part of another since.
 
     :param before: where the areas of the map were.
     :param true: ``map_T_base``, shape (3,).
     """
-    slam, last = run.lock_step.processes["slam"], run.recorder.last
+    slam, last = run.lock_step.processes["slam"], run.recorder.last_estimate
     assert isinstance(slam, MetricSlam)
     assert last is not None
-    told = run.recorder.accepted
+    told = run.recorder.decisions
     given = next((told[n].global_poses for n in sorted(told, reverse=True) if told[n].global_poses), before)
-    area = placed_areas(slam.replica.maps[slam.replica.best], given).get(last.area)
+    area = complete_area_poses(slam.replica.maps[slam.replica.best_hypothesis], given).get(last.area)
     if area is None:
         return None
     away = se2.between(true, se2.compose(area.mean, last.pose.mean))

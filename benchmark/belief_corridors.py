@@ -10,7 +10,13 @@ from typing import NamedTuple
 import numpy as np
 
 from hmt_slam_ros.arrays import Float64
-from hmt_slam_ros.places.observation_graph import OPENINGS, Landmarks, chosen, joined, no_landmarks
+from hmt_slam_ros.places.observation_graph import (
+    OPENINGS,
+    LandmarkSequence,
+    empty_sequence,
+    merge_sequences,
+    select_landmarks,
+)
 from hmt_slam_ros.places.place_graph import EAST, NORTH, Edge, Node
 
 ROUGH = 0.03
@@ -34,7 +40,7 @@ class Corridors(NamedTuple):
     @property
     def edges(self) -> list[Edge]:
         """In both directions."""
-        return [edge for way in self.ways for edge in (way, way.back)]
+        return [edge for way in self.ways for edge in (way, way.reverse)]
 
 
 def random_corridors(random: np.random.Generator, rows: int, columns: int, density: float) -> Corridors:
@@ -68,12 +74,12 @@ def drawn_building(random: np.random.Generator, corridors: Corridors) -> Corrido
     return Corridors(nodes, ways)
 
 
-def _stands(random: np.random.Generator, landmarks: Landmarks) -> Landmarks:
+def _stands(random: np.random.Generator, landmarks: LandmarkSequence) -> LandmarkSequence:
     there = random.random(len(landmarks.tracks)) < landmarks.probabilities
-    kept = chosen(landmarks, there)
+    kept = select_landmarks(landmarks, there)
     along, forms = (random.normal(mean, np.sqrt(kept.variances[:, k])) for k, mean in enumerate(kept[1:3]))
     certain = np.zeros_like(kept.variances)
-    return joined((Landmarks(kept.tracks, along, forms, certain, np.ones(len(along))),))
+    return merge_sequences((LandmarkSequence(kept.tracks, along, forms, certain, np.ones(len(along))),))
 
 
 def _crossings(random: np.random.Generator, count: int) -> Float64:
@@ -97,7 +103,7 @@ def _hallway(
         while at < end - _LEAST:
             stops.append((at, _added(corridors, _side(random, heading, _opening(random, _DOOR, (_LEFT, _RIGHT))))))
             at += _LEAST + random.exponential(_DOORS)
-    stops += [(at, _added(corridors, _side(random, heading, no_landmarks()))) for at in places[[0, -1]].tolist()]
+    stops += [(at, _added(corridors, _side(random, heading, empty_sequence()))) for at in places[[0, -1]].tolist()]
     stops.sort()
     for (at, start), (then, end) in pairwise(stops):
         length = then - at
@@ -111,22 +117,24 @@ def _added(corridors: Corridors, node: Node) -> int:
     return len(corridors.nodes) - 1
 
 
-def _side(random: np.random.Generator, heading: int, landmarks: Landmarks) -> Node:
+def _side(random: np.random.Generator, heading: int, landmarks: LandmarkSequence) -> Node:
     existence = float(random.uniform(*_EXISTENCE))
-    none = no_landmarks()
+    none = empty_sequence()
     return Node(existence, landmarks, none) if heading == NORTH else Node(existence, none, landmarks)
 
 
 def _crossing(random: np.random.Generator) -> Node:
-    both = [joined((_opening(random, _HALLWAY, (_LEFT,)), _opening(random, _HALLWAY, (_RIGHT,)))) for _ in range(2)]
+    both = [
+        merge_sequences((_opening(random, _HALLWAY, (_LEFT,)), _opening(random, _HALLWAY, (_RIGHT,)))) for _ in range(2)
+    ]
     return Node(float(random.uniform(*_EXISTENCE)), *both)
 
 
-def _opening(random: np.random.Generator, widths: tuple[float, float], tracks: Sequence[int]) -> Landmarks:
+def _opening(random: np.random.Generator, widths: tuple[float, float], tracks: Sequence[int]) -> LandmarkSequence:
     return _landmarks(random, random.choice(tracks, 1).tolist(), [0.0], [float(random.uniform(*widths))])
 
 
-def _corners(random: np.random.Generator, length: float, density: float) -> Landmarks:
+def _corners(random: np.random.Generator, length: float, density: float) -> LandmarkSequence:
     """Corners along a stretch of hallway, which head for one of its four diagonals."""
     tracks, along, forms = [], [], []
     for track in range(_CORNER):
@@ -141,9 +149,9 @@ def _corners(random: np.random.Generator, length: float, density: float) -> Land
 
 def _landmarks(
     random: np.random.Generator, tracks: Sequence[int], along: Sequence[float], forms: Sequence[float]
-) -> Landmarks:
+) -> LandmarkSequence:
     count = len(tracks)
     variances = np.tile((_PLACED, _FORM), (count, 1))
     existence = random.uniform(*_EXISTENCE, count)
     own = np.array(tracks, dtype=np.int64), np.array(along, dtype=np.float64), np.array(forms, dtype=np.float64)
-    return joined((Landmarks(*own, variances, existence),))
+    return merge_sequences((LandmarkSequence(*own, variances, existence),))

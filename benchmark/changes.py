@@ -20,16 +20,16 @@ from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.grids.occupancy_map import OCCUPIED, OccupancyImage, occupancy_image
 from hmt_slam_ros.logs.records import Log
-from hmt_slam_ros.messages.map_changes import Place
-from hmt_slam_ros.messages.messages import Carried
+from hmt_slam_ros.messages.map_changes import InitialPose
+from hmt_slam_ros.messages.messages import PoseReset
 from hmt_slam_ros.messages.replica import Replica
-from hmt_slam_ros.offline.runtime import Run
-from hmt_slam_ros.results.final_map import corrected_scans, final_map
+from hmt_slam_ros.offline.runtime import LockStepRun
+from hmt_slam_ros.results.final_map import deskewed_scans, final_map
 from hmt_slam_ros.results.hmt_map import RunState
 from hmt_slam_ros.results.recorder import Recording, keyframe_poses
 from hmt_slam_ros.simulation import SimulatedLog, open_simulated
-from hmt_slam_ros.simulation.building import boxes
-from hmt_slam_ros.simulation.laser import clear_between, clearance, wall_index
+from hmt_slam_ros.simulation.building import furniture_walls
+from hmt_slam_ros.simulation.laser import clearance, has_line_of_sight, wall_index
 
 WORLDS = {"quiet": "office", "people": "busy"}
 """The same buildings without and with people in the corridors."""
@@ -243,29 +243,29 @@ def mapped(visits: Sequence[SimulatedLog], mode: str, before: Mapped | None = No
     stays = visits[0].scenario.settings.people > 0
     log: Log = OneDrive(visits) if stays else visits[-1]
     configuration = replace(Configuration(), mode=mode)
-    run = Run(configuration, state=None if before is None else before.state)
-    records = run.unread(log)
+    run = LockStepRun(configuration, state=None if before is None else before.state)
+    records = run.unread_records(log)
     if before is not None and not stays:
-        run.lock_step.feed(Carried(_begin(before.recording)))
+        run.lock_step.feed(PoseReset(_begin(before.recording)))
     for record in records:
-        run.read(record)
+        run.process_record(record)
     state = run.state
     result = run.finish()
-    recording = result.recorder.finish(result.log.stamps, result.log.first_scans)
-    recording = final_map(recording, corrected_scans(log, configuration), configuration).recording
+    recording = result.recorder.finish(result.log_progress.stamps, result.log_progress.first_scans)
+    recording = final_map(recording, deskewed_scans(log, configuration), configuration).recording
     placed = keyframe_poses(recording.hybrid_map, recording.area_poses)
     scans, settings = [recording.replica.scans[k] for k in placed], configuration.local_map
     image = occupancy_image(scans, np.array(list(placed.values())), settings.cell, settings.max_range)
     return Mapped(recording, state, image)
 
 
-def _begin(recording: Recording) -> Place:
+def _begin(recording: Recording) -> InitialPose:
     """Where every visit begins, which is the origin of the map, as somebody says who points at it."""
     placed = keyframe_poses(recording.hybrid_map, recording.area_poses)
     nearest = min(placed, key=lambda keyframe: float(np.hypot(*placed[keyframe][:2])))
     area = next(a for a in recording.hybrid_map.area_ids() if nearest in recording.hybrid_map.keyframes(a))
     pose = se2.inverse(recording.area_poses[area].mean)
-    return Place(area, PoseGaussian(pose, _POINTED_AT))
+    return InitialPose(area, PoseGaussian(pose, _POINTED_AT))
 
 
 def _visit(world: str, seed: int, number: int, *, changed: float, size: float, rate: float) -> SimulatedLog:
@@ -288,8 +288,8 @@ def _frame(recording: Recording, first: SimulatedLog) -> NDArray[np.float64]:
 
 def _same(before: RunState, after: RunState) -> bool:
     """Whether the best map of a state is in another one as it was."""
-    one, other = Replica.of(before.slam.replica), Replica.of(after.slam.replica)
-    known, now = one.maps[one.best], other.maps[other.best]
+    one, other = Replica.from_state(before.slam.replica), Replica.from_state(after.slam.replica)
+    known, now = one.maps[one.best_hypothesis], other.maps[other.best_hypothesis]
     areas = known.area_ids()
     arcs = {(a, b): arc for a, b, arc in now.all_arcs()}
     return (
@@ -340,7 +340,7 @@ class Surfaces(NamedTuple):
         """Of a visit during which nothing is moved."""
         scenario = log.scenario
         poses = log.true_poses(scenario.scan_stamps[::_EVERY])
-        walls = np.concatenate((scenario.walls.walls, boxes(scenario.building.furniture)))
+        walls = np.concatenate((scenario.walls.walls, furniture_walls(scenario.building.furniture)))
         return cls(walls, se2.compose(poses, scenario.laser.pose), scenario.laser.half_field)
 
     def points(self) -> Points:
@@ -361,7 +361,7 @@ class Surfaces(NamedTuple):
             )
             away = points[near] - laser[:2]
             ends = laser[:2] + away * (1.0 - _SHORT / np.hypot(*away.T))[:, None]
-            counts[near] += clear_between(index, np.broadcast_to(laser[:2], ends.shape).copy(), ends)
+            counts[near] += has_line_of_sight(index, np.broadcast_to(laser[:2], ends.shape).copy(), ends)
         return counts >= _LOOKS
 
 

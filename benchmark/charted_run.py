@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from hmt_slam_ros.area_abstraction.aam import Aam
-from hmt_slam_ros.cli.arguments import chosen_configuration, parser
+from hmt_slam_ros.cli.arguments import build_parser, chosen_configuration
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.evaluation import StampedPoses, write_tum
@@ -28,7 +28,7 @@ from hmt_slam_ros.messages.messages import AreaEvents, Keyframe, Message
 from hmt_slam_ros.messages.routing import Process
 from hmt_slam_ros.offline.runtime import RunResult, run_log
 from hmt_slam_ros.open_log import open_log
-from hmt_slam_ros.results.final_map import FinalMap, corrected_scans, final_map
+from hmt_slam_ros.results.final_map import FinalMap, deskewed_scans, final_map
 
 SAMPLES = 200
 """Points of the curve of memory over time, at least, where the log has as many scans."""
@@ -103,15 +103,17 @@ def charted(way: str, log: TimedLog, configuration: Configuration) -> tuple[RunR
             memory.append((scans, resident_bytes()))
 
     result = run_log(log, configuration, sample, WAYS[way])
-    memory.append((len(result.log.stamps), resident_bytes()))
+    memory.append((len(result.log_progress.stamps), resident_bytes()))
     begin, log_seconds = time.process_time(), log.seconds
-    final = final_map(result.recorder.finish(result.log.stamps), corrected_scans(log, configuration), configuration)
+    final = final_map(
+        result.recorder.finish(result.log_progress.stamps), deskewed_scans(log, configuration), configuration
+    )
     hybrid_map = final.recording.hybrid_map
     refinement = time.process_time() - begin - (log.seconds - log_seconds)
     facts = {
         "particles": configuration.filter.particles,
-        "scans": len(result.log.stamps),
-        "travelled_m": final.recording.probabilities[-1].travelled,
+        "scans": len(result.log_progress.stamps),
+        "travelled_m": final.recording.probabilities[-1].path_length,
         "areas": len(hybrid_map.area_ids()),
         "loop_closures": sum(arc.closure for _, _, arc in hybrid_map.all_arcs()),
         "log_s": log.seconds,
@@ -126,7 +128,7 @@ def charted(way: str, log: TimedLog, configuration: Configuration) -> tuple[RunR
 
 def _seconds(result: RunResult, scans: int) -> float:
     """Time of the log after so many scans, s."""
-    return float(result.log.stamps[max(0, scans - 1)] - result.log.stamps[0]) / 1e9
+    return float(result.log_progress.stamps[max(0, scans - 1)] - result.log_progress.stamps[0]) / 1e9
 
 
 def _cost(result: RunResult, every: int) -> list[dict[str, float]]:
@@ -139,7 +141,7 @@ def _cost(result: RunResult, every: int) -> list[dict[str, float]]:
 def main(arguments: list[str]) -> int:
     """Run; return the exit status."""
     way, *rest = arguments
-    options = parser().parse_args(["map", *rest])
+    options = build_parser().parse_args(["map", *rest])
     try:
         configuration = chosen_configuration(options)
         result, final, facts = charted(way, TimedLog(open_log(options.log)), configuration)
@@ -147,7 +149,9 @@ def main(arguments: list[str]) -> int:
         print(f"charted_run: {fault}", file=sys.stderr)
         return 2
     options.out.mkdir(parents=True)
-    write_tum(options.out / "trajectory.tum", StampedPoses(result.log.source_stamps, final.recording.trajectory))
+    write_tum(
+        options.out / "trajectory.tum", StampedPoses(result.log_progress.source_stamps, final.recording.trajectory)
+    )
     (options.out / "report.json").write_text(json.dumps(facts), encoding="utf-8")
     return 0
 

@@ -21,8 +21,8 @@ from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.metric_slam.live_hypothesis import LiveHypothesis
 from hmt_slam_ros.sensors import Odometry, Scan
 from hmt_slam_ros.sensors.motion_model import MotionModel, increment_covariance
-from hmt_slam_ros.submap.local_mapping import LocalMapping, Sighting
-from hmt_slam_ros.submap.particle_filter import AreaFilter
+from hmt_slam_ros.submap.local_mapping import LocalMapping, PreparedScan
+from hmt_slam_ros.submap.particle_filter import ParticleFilter
 
 SEEDS = 24
 LEGS = {"a keyframe on": 1, "an arc, 20 keyframes on": 20}
@@ -92,7 +92,7 @@ def drive(seed: int, length: float = _LENGTH) -> Drive:
     """
     configuration = Configuration(seed=seed)
     mapping, motion = LocalMapping(configuration), MotionModel(configuration.motion)
-    live = LiveHypothesis(AreaFilter(mapping, 0, 0), configuration.filter)
+    live = LiveHypothesis(ParticleFilter(mapping, 0, 0), configuration.filter)
     random = np.random.default_rng(seed)
     truths = _path(length, random)
     odometry, error, odometry_errors = np.zeros(3), 0.0, np.zeros(len(truths))
@@ -106,9 +106,9 @@ def drive(seed: int, length: float = _LENGTH) -> Drive:
             odometry_errors[k] = error
         motion.odometry.add(Odometry(k * _PERIOD, odometry))
         scan = _scan(k * _PERIOD, truth, random)
-        _take(live, motion, k, Sighting(mapping, scan))
+        _take(live, motion, k, PreparedScan(mapping, scan))
     kept = live.filter.keyframes
-    covariances = np.array([live.fresh[keyframe] for keyframe in kept])
+    covariances = np.array([live.step_covariances[keyframe] for keyframe in kept])
     floor = configuration.tlca.arc_sigma_floor, configuration.tlca.arc_angle_floor
     return Drive(truths[kept], live.filter.leading_keyframe_poses(), covariances, odometry_errors[kept], floor)
 
@@ -130,15 +130,15 @@ def _scan(stamp: int, pose: NDArray[np.float64], random: np.random.Generator) ->
     return Scan(stamp, seen, _BEARINGS[0], _BEARINGS[1] - _BEARINGS[0], 0.05, _REACH + 1.0)
 
 
-def _take(live: LiveHypothesis, motion: MotionModel, number: int, sighting: Sighting) -> None:
+def _take(live: LiveHypothesis, motion: MotionModel, number: int, sighting: PreparedScan) -> None:
     """What metric SLAM does with a scan where no other process has anything to say."""
     prediction = motion.predict(sighting.scan.stamp)
     if number:
         tracked = live.filter.track(sighting, prediction)
-        motion.observe(tracked.moved, tracked.information, tracked.contradicted)
-    if not number or live.event_due(sighting):
-        live.event(number, sighting, arriving=number == 0)
-        motion.keyframe(live.moved, live.information)
+        motion.observe(tracked.increment, tracked.information, tracked.contradicts_odometry)
+    if not number or live.is_event_due(sighting):
+        live.process_keyframe(number, sighting, after_reset=number == 0)
+        motion.observe_keyframe(live.event_motion, live.match_information)
 
 
 def errors_of(drives: Sequence[Drive], stride: int) -> Errors:

@@ -28,15 +28,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from hmt_slam_ros.cli.arguments import chosen_configuration, parser
-from hmt_slam_ros.cli.map_command import measured_run
-from hmt_slam_ros.configuration.metric_slam import Motion
+from hmt_slam_ros.cli.arguments import build_parser, chosen_configuration
+from hmt_slam_ros.cli.map_command import run_measured
+from hmt_slam_ros.configuration.metric_slam import MotionParameters
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.logs.records import Log, LogRecord
 from hmt_slam_ros.logs.stamps import NANOSECONDS
 from hmt_slam_ros.open_log import open_log
-from hmt_slam_ros.results.output_folder import replacing, write_output
+from hmt_slam_ros.results.output_folder import atomic_output, write_output
 from hmt_slam_ros.sensors import Odometry
 
 KINDS = ("noise-2x", "noise-4x", "slip", "missing", "none")
@@ -124,7 +124,7 @@ def _chained(first: NDArray[np.float64], increments: NDArray[np.float64]) -> lis
 
 def _noise(increments: NDArray[np.float64], factor: float, random: np.random.Generator) -> NDArray[np.float64]:
     """Errors (n, 3), in the frame of each increment's end, that add up with the odometry's own to ``factor`` times."""
-    motion = Motion()
+    motion = MotionParameters()
     distance, angle = np.hypot(increments[:, 0], increments[:, 1]), np.abs(increments[:, 2])
     translation = np.hypot(
         motion.translation_from_translation * np.sqrt(distance),
@@ -174,14 +174,14 @@ def _middles_of_turns(seconds: NDArray[np.float64], heading: NDArray[np.float64]
 def main(arguments: list[str]) -> int:
     """Run; return the exit status."""
     kind, *rest = arguments
-    options = parser().parse_args(["map", *rest])
+    options = build_parser().parse_args(["map", *rest])
     try:
         configuration = chosen_configuration(options)
         part = configuration.robot
         recorded = open_log(options.log, start=part.start, duration=part.duration or None)
         log = degraded(recorded, kind, configuration.seed)
-        with replacing(options.out) as folder:
-            final, source_stamps, figures = measured_run(log, configuration)
+        with atomic_output(options.out) as folder:
+            final, source_stamps, figures = run_measured(log, configuration)
             write_output(folder, final, source_stamps, figures, configuration)
     except HmtSlamError as fault:
         print(f"degraded_odometry: {fault}", file=sys.stderr)

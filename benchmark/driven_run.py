@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.exploration.explorer import Explorer
-from hmt_slam_ros.exploration.pilot import Missions
+from hmt_slam_ros.exploration.pilot import PilotProcess
 from hmt_slam_ros.logs.stamps import NANOSECONDS
 from hmt_slam_ros.messages.messages import Message
-from hmt_slam_ros.messages.tasks import Errand, Outcome, Steering
-from hmt_slam_ros.offline.runtime import Run
+from hmt_slam_ros.messages.tasks import Task, TaskResult, VelocityCommand
+from hmt_slam_ros.offline.runtime import LockStepRun
 from hmt_slam_ros.results.hmt_map import RunState
 from hmt_slam_ros.results.output_folder import map_writer
 from hmt_slam_ros.results.recorder import Recording
@@ -27,18 +27,18 @@ class _Ears:
 
     def __init__(self, robot: DrivenRobot) -> None:
         self._robot = robot
-        self.outcome: Outcome | None = None
+        self.outcome: TaskResult | None = None
 
     def handle(self, message: Message) -> list[Message]:
         """Take in one message."""
-        if isinstance(message, Steering):
-            self._robot.command(message.speed, message.turn_rate)
-        elif isinstance(message, Outcome):
+        if isinstance(message, VelocityCommand):
+            self._robot.set_velocity(message.speed, message.turn_rate)
+        elif isinstance(message, TaskResult):
             self.outcome = message
         return []
 
 
-Driver = TypeVar("Driver", Explorer, Missions)
+Driver = TypeVar("Driver", Explorer, PilotProcess)
 
 
 class DrivenRun(Generic[Driver]):
@@ -56,11 +56,11 @@ class DrivenRun(Generic[Driver]):
         self.driver: Driver = driver
         self._ears = _Ears(robot)
         name = "explorer" if isinstance(driver, Explorer) else "pilot"
-        self._run = Run(configuration, state=state, others={name: driver, "robot": self._ears})
+        self._run = LockStepRun(configuration, state=state, observers={name: driver, "robot": self._ears})
         log = DrivenLog("driven", robot)
-        self._records = log.records() if state is None else self._run.unread(log)
+        self._records = log.records() if state is None else self._run.unread_records(log)
 
-    def do(self, errand: Errand, seconds: float) -> Outcome | None:
+    def do(self, errand: Task, seconds: float) -> TaskResult | None:
         """What comes of an errand, None where it takes longer.
 
         :param seconds: that it may take.
@@ -69,9 +69,9 @@ class DrivenRun(Generic[Driver]):
         self._run.lock_step.feed(errand)
         end = self.robot.stamp + round(seconds * NANOSECONDS)
         for record in self._records:
-            self._run.read(record)
+            self._run.process_record(record)
             if isinstance(record.measurement, Scan):
-                self._run.recorder.fold()
+                self._run.recorder.compact()
                 if self._ears.outcome is not None or self.robot.stamp >= end:
                     break
         return self._ears.outcome
@@ -85,15 +85,19 @@ class DrivenRun(Generic[Driver]):
         writer = map_writer(folder)
         writer.write_state(self._run.state)
         result = self._run.finish()
-        recording = result.recorder.finish(result.log.stamps, result.log.first_scans, result.log.earlier)
-        writer.write_map(recording.replica, recording.area_poses, recording.last, recording.scans)
+        recording = result.recorder.finish(
+            result.log_progress.stamps, result.log_progress.first_scans, result.log_progress.earlier_trajectory
+        )
+        writer.write_map(
+            recording.replica, recording.area_poses, recording.last_estimate, recording.relative_trajectory
+        )
         writer.finish(configuration)
         return recording
 
 
 def true_place(run: DrivenRun[Explorer], name: str) -> NDArray[np.float64]:
     """Where the robot truly was when it took the keyframe in the middle of a named place, ``world_T_base`` (3,)."""
-    atlas = run.driver.atlas
-    stamp = atlas.replica.scans[atlas.places()[name]].stamp
+    atlas = run.driver.exploration_map
+    stamp = atlas.replica.scans[atlas.named_places()[name]].stamp
     true: NDArray[np.float64] = run.robot.true_poses(np.array([stamp]))[0]
     return true

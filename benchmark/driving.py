@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hmt_slam_ros.exploration.local_motion import Limits, command_towards
+from hmt_slam_ros.exploration.local_motion import MotionLimits, command_towards
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.logs.stamps import NANOSECONDS
 from hmt_slam_ros.simulation import open_simulated
@@ -58,14 +58,14 @@ def _doors(seed: int) -> Building:
     route = [(0.5 * _ROOM, 0.0)]
     for k in range(_DOORS + 1):
         begin = k * (_ROOM + _WALL)
-        plan.free(begin, -0.5 * _ROOM, begin + _ROOM, 0.5 * _ROOM)
+        plan.cut_rectangle(begin, -0.5 * _ROOM, begin + _ROOM, 0.5 * _ROOM)
         if k:
             y = draw.uniform(-0.5, 0.5) * (_ROOM - _DOOR - 0.4)
-            plan.free(begin - _WALL - 0.01, y - 0.5 * _DOOR, begin + 0.01, y + 0.5 * _DOOR)
+            plan.cut_rectangle(begin - _WALL - 0.01, y - 0.5 * _DOOR, begin + 0.01, y + 0.5 * _DOOR)
             # The scripted way, of which only the middles of the rooms are goals.
             route += [(begin - 0.5 * _ROOM, y), (begin + 0.4 * _ROOM, y), (begin + 0.5 * _ROOM, 0.0)]
     pose = np.array([*draw.uniform(-5.0, 5.0, 2), draw.uniform(-3.0, 3.0)])
-    return Building(plan.walls(), np.array(route)).placed(pose)
+    return Building(plan.walls(), np.array(route)).transform(pose)
 
 
 def goals_of(scenario: Scenario) -> NDArray[np.float64]:
@@ -83,7 +83,7 @@ def driven(scenario: Scenario, most: int | None = None) -> Iterator[Leg]:
     :param most: of the goals, None for all.
     """
     settings = scenario.settings
-    limits = Limits(
+    limits = MotionLimits(
         settings.speed,
         math.radians(settings.turn_rate),
         ACCELERATION,
@@ -93,15 +93,15 @@ def driven(scenario: Scenario, most: int | None = None) -> Iterator[Leg]:
     )
     robot = DrivenRobot(scenario)
     for goal in goals_of(scenario)[:most]:
-        contacts, metres, begin = robot.contacts, robot.travelled, robot.stamp
+        contacts, metres, begin = robot.contacts, robot.distance_traveled, robot.stamp
         reached = _drive_to(robot, goal, limits)
         seconds = (robot.stamp - begin) / NANOSECONDS
-        yield Leg(reached, robot.contacts - contacts, robot.travelled - metres, seconds)
+        yield Leg(reached, robot.contacts - contacts, robot.distance_traveled - metres, seconds)
         if not reached:
-            robot.carry(np.array([*goal, robot.pose[2]]))
+            robot.kidnap(np.array([*goal, robot.pose[2]]))
 
 
-def _drive_to(robot: DrivenRobot, goal: NDArray[np.float64], limits: Limits) -> bool:
+def _drive_to(robot: DrivenRobot, goal: NDArray[np.float64], limits: MotionLimits) -> bool:
     """Whether it arrives in time."""
     end = robot.stamp + round(_TIME * NANOSECONDS)
     while robot.stamp < end:
@@ -111,6 +111,6 @@ def _drive_to(robot: DrivenRobot, goal: NDArray[np.float64], limits: Limits) -> 
             command = command_towards(scan, ahead, robot.velocity, limits)
             if command.arrived:
                 return True
-            robot.command(command.speed, command.turn_rate)
-        robot.drive()
+            robot.set_velocity(command.speed, command.turn_rate)
+        robot.advance()
     return False

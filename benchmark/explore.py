@@ -18,7 +18,7 @@ from hmt_slam_ros.configuration import Configuration, load_configuration
 from hmt_slam_ros.exploration.explorer import Explorer
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.logs.stamps import NANOSECONDS
-from hmt_slam_ros.messages.tasks import Errand
+from hmt_slam_ros.messages.tasks import Task
 from hmt_slam_ros.simulation.driven_robot import DrivenRobot
 from hmt_slam_ros.simulation.scenario import START
 
@@ -111,21 +111,21 @@ def measure_explore(settings: Settings) -> Report:
 def _explored(run: DrivenRun[Explorer], configuration: Configuration) -> Explored:
     """Explore, and compare with the truth."""
     robot, scenario = run.robot, run.robot.scenario
-    outcome = run.do(Errand("explore"), _TIME)
+    outcome = run.do(Task("explore"), _TIME)
     path = robot.true_poses(np.arange(START, robot.stamp, NANOSECONDS // 5))[:, :2]
     states, rooms = scenario.building.states, scenario.building.rooms
     away = [float(np.hypot(*(path - state[:2]).T).min()) for state in states.poses]
-    atlas = run.driver.atlas
+    atlas = run.driver.exploration_map
     institute = charted(scenario, atlas.hybrid_map, atlas.replica.scans, robot.true_poses, configuration)
     return Explored(
         outcome is not None,
-        robot.travelled,
+        robot.distance_traveled,
         (robot.stamp - START) / NANOSECONDS,
         robot.contacts,
         sum(distance <= _PASSED for distance in away),
         sum(is_within(room, path) for room in rooms),
         len(rooms),
-        sum(name.startswith("room ") for name in atlas.places()),
+        sum(name.startswith("room ") for name in atlas.named_places()),
         judged(institute),
     )
 
@@ -138,11 +138,13 @@ def is_within(room: Float64, path: Float64) -> bool:
 
 def _missions(run: DrivenRun[Explorer], seed: int) -> list[Mission]:
     """Go to rooms drawn by chance, never twice in a row to the same."""
-    draw, robot, begin = np.random.default_rng(seed), run.robot, run.robot.travelled
+    draw, robot, begin = np.random.default_rng(seed), run.robot, run.robot.distance_traveled
     found: list[Mission] = []
     last = ""
-    while len(found) < MISSIONS or (robot.travelled - begin < METRES and len(found) < _MOST):
-        names = [name for name in run.driver.atlas.places() if name.startswith("room ") and name != last]
+    while len(found) < MISSIONS or (robot.distance_traveled - begin < METRES and len(found) < _MOST):
+        names = [
+            name for name in run.driver.exploration_map.named_places() if name.startswith("room ") and name != last
+        ]
         if not names:
             found.append(Mission(False, math.inf, 0.0, 0.0, 0))
             continue
@@ -154,12 +156,12 @@ def _missions(run: DrivenRun[Explorer], seed: int) -> list[Mission]:
 def _mission(run: DrivenRun[Explorer], name: str) -> Mission:
     """Go to a place."""
     robot, place = run.robot, true_place(run, name)
-    metres, begin, contacts = robot.travelled, robot.stamp, robot.contacts
-    outcome = run.do(Errand("go", name), _MISSION)
+    metres, begin, contacts = robot.distance_traveled, robot.stamp, robot.contacts
+    outcome = run.do(Task("go", name), _MISSION)
     off = float(np.hypot(*(robot.pose - place)[:2]))
-    success = outcome is not None and outcome.reached and off <= _OFF
+    success = outcome is not None and outcome.succeeded and off <= _OFF
     seconds = (robot.stamp - begin) / NANOSECONDS
-    return Mission(success, off, robot.travelled - metres, seconds, robot.contacts - contacts)
+    return Mission(success, off, robot.distance_traveled - metres, seconds, robot.contacts - contacts)
 
 
 def _requirements(explorations: Sequence[Explored], missions: Sequence[Mission]) -> list[Requirement]:

@@ -12,9 +12,9 @@ from benchmark.line_truth import true_lines
 from benchmark.simulated.worlds import World
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.landmarks.heading import QUARTER, BuildingHeading
+from hmt_slam_ros.landmarks.heading import QUARTER_TURN, BuildingHeading
 from hmt_slam_ros.landmarks.line_extraction import extract_lines
-from hmt_slam_ros.sensors.motion_model import Step, increment_covariance
+from hmt_slam_ros.sensors.motion_model import RelativeMotion, increment_covariance
 from hmt_slam_ros.simulation import open_simulated
 from hmt_slam_ros.simulation.scenario import Scenario
 
@@ -33,13 +33,13 @@ def headings(world: World, laser: str, configuration: Configuration) -> NDArray[
         if number:
             before, here = scenario.odometry[(number - 1) * readings], scenario.odometry[number * readings]
             increment = se2.between(before, here)
-            heading.predict(Step(increment, increment_covariance(increment, configuration.motion)))
+            heading.predict(RelativeMotion(increment, increment_covariance(increment, configuration.motion)))
         used = heading.observe(extract_lines(scenario.scan(number), features))
         true, odometry = scenario.poses[number * readings][2] - axis, scenario.odometry[number * readings][2]
-        if heading.known and math.isnan(begin):
-            begin = QUARTER * round((true - heading.angle) / QUARTER)
+        if heading.is_known and math.isnan(begin):
+            begin = QUARTER_TURN * round((true - heading.angle) / QUARTER_TURN)
             ahead = odometry - true
-        if heading.known and number in judged:
+        if heading.is_known and number in judged:
             error = float(se2.wrap(heading.angle + begin - true))
             rows.append([error, math.sqrt(heading.variance), float(se2.wrap(odometry - true - ahead)), used])
     return np.array(rows).reshape(-1, 4)
@@ -47,6 +47,6 @@ def headings(world: World, laser: str, configuration: Configuration) -> NDArray[
 
 def _axis(scenario: Scenario) -> float:
     """Direction in which a building's walls run, up to quarters, rad; of its lines that of most."""
-    alphas = true_lines(scenario, int(scenario.scan_stamps[0]), np.zeros(3))[:, 0] % QUARTER
+    alphas = true_lines(scenario, int(scenario.scan_stamps[0]), np.zeros(3))[:, 0] % QUARTER_TURN
     apart = np.abs(alphas[:, None] - alphas[None, :])
-    return float(alphas[np.argmax((np.minimum(apart, QUARTER - apart) < _SAME).sum(axis=1))])
+    return float(alphas[np.argmax((np.minimum(apart, QUARTER_TURN - apart) < _SAME).sum(axis=1))])

@@ -30,10 +30,10 @@ from benchmark.settings import Settings
 from hmt_slam_ros.configuration import load_configuration
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.exploration.explorer import Explorer
-from hmt_slam_ros.exploration.pilot import Missions
-from hmt_slam_ros.logs.records import SIMULATED
+from hmt_slam_ros.exploration.pilot import PilotProcess
+from hmt_slam_ros.logs.records import SIMULATION_PREFIX
 from hmt_slam_ros.logs.stamps import NANOSECONDS
-from hmt_slam_ros.messages.tasks import Errand, Outcome
+from hmt_slam_ros.messages.tasks import Task, TaskResult
 from hmt_slam_ros.results.hmt_map import read_run_state
 from hmt_slam_ros.saved_map.folder import HMT_MAP
 from hmt_slam_ros.simulation import open_simulated
@@ -75,7 +75,7 @@ RUNS = {
     "busy": Fixed("sim:busy,seed=2"),
     "lines": Fixed("sim:office,laps=1,seed=4", ("local_map.kind=lines",)),
     "carried": Fixed("sim:office,seed=3,carried=0.55,to=0.72,turned=30"),
-    "institute": Fixed(f"{SIMULATED}{_INSTITUTE}"),
+    "institute": Fixed(f"{SIMULATION_PREFIX}{_INSTITUTE}"),
     "half": Fixed("sim:office,seed=5", duration=100.0),
     "gone on": Fixed("sim:office,seed=5", source="half"),
     "awakened": Fixed("sim:office,seed=5,visit=1", source="half"),
@@ -125,7 +125,7 @@ def _listed(found: Mapping[str, Digests]) -> Iterable[tuple[str, str, str]]:
 
 def _measured(settings: Settings, report: Report) -> dict[str, Digests]:
     """{run: digests} of all whose logs are there."""
-    recorded = {one.log for one in RUNS.values() if not one.log.startswith(SIMULATED)}
+    recorded = {one.log for one in RUNS.values() if not one.log.startswith(SIMULATION_PREFIX)}
     absent = {log: reason for log in recorded if (reason := missing(log))}
     report.body += [f"Skipped {log}: {reason}." for log, reason in absent.items()]
     chosen = {name: one for name, one in RUNS.items() if one.log not in absent and name in (settings.logs or RUNS)}
@@ -146,7 +146,7 @@ def _made(chosen: Mapping[str, Fixed], logs: Mapping[str, MeasuredLog], settings
 
 
 def _case(one: Fixed, logs: Mapping[str, MeasuredLog], made: Mapping[str, Run], changes: Sequence[str]) -> Case:
-    log = logs.get(one.log) or MeasuredLog(one.log.removeprefix(SIMULATED), Path(one.log))
+    log = logs.get(one.log) or MeasuredLog(one.log.removeprefix(SIMULATION_PREFIX), Path(one.log))
     source = made[one.source].folder if one.source else None
     return Case(log, 0, "", (*one.changes, *changes), one.duration, source=source)
 
@@ -184,7 +184,7 @@ def _explored(changes: Sequence[str]) -> Digests:
     """An exploration up to a time, and the robot's way."""
     configuration = load_configuration(PARAMETERS, list(changes))
     run = DrivenRun(_robot(0), configuration, Explorer(configuration))
-    outcome = run.do(Errand("explore"), _EXPLORATION)
+    outcome = run.do(Task("explore"), _EXPLORATION)
     return {"way": _way(run.robot), "outcome": _end(outcome)}
 
 
@@ -192,18 +192,18 @@ def _piloted(folder: Path, changes: Sequence[str]) -> Digests:
     """A mission to the last room of a saved map, by a robot that woke up in it, and the robot's way."""
     configuration = load_configuration(PARAMETERS, list(changes))
     state, _ = read_run_state(folder)
-    pilot = Missions(configuration, state.tsbi.replica)
+    pilot = PilotProcess(configuration, state.tsbi.replica)
     run = DrivenRun(_robot(1), configuration, pilot, state)
-    outcome = run.do(Errand("go", list(pilot.rooms)[-1]), _MISSION)
+    outcome = run.do(Task("go", list(pilot.rooms)[-1]), _MISSION)
     return {"way": _way(run.robot), "outcome": _end(outcome)}
 
 
-def _end(outcome: Outcome | None) -> str:
-    return "none yet" if outcome is None else f"{outcome.reached}: {outcome.why}"
+def _end(outcome: TaskResult | None) -> str:
+    return "none yet" if outcome is None else f"{outcome.succeeded}: {outcome.reason}"
 
 
 def _robot(visit: int) -> DrivenRobot:
-    return DrivenRobot(open_simulated(f"{SIMULATED}{_INSTITUTE},visit={visit}").scenario)
+    return DrivenRobot(open_simulated(f"{SIMULATION_PREFIX}{_INSTITUTE},visit={visit}").scenario)
 
 
 def _way(robot: DrivenRobot) -> str:

@@ -17,17 +17,17 @@ from benchmark.runs import PARAMETERS
 from benchmark.settings import Settings, chosen_seeds
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration import Configuration, load_configuration
-from hmt_slam_ros.exploration.local_motion import Limits
-from hmt_slam_ros.exploration.mission_controller import MissionPilot, Phase
+from hmt_slam_ros.exploration.local_motion import MotionLimits
+from hmt_slam_ros.exploration.mission_controller import MissionController, Phase
 from hmt_slam_ros.exploration.rooms import Destination, KnownBuilding, destinations
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.logs.stamps import NANOSECONDS
 from hmt_slam_ros.places.estimator import PlaceEstimator
 from hmt_slam_ros.places.place_graph import heading_of, node_of, state_of
-from hmt_slam_ros.places.policy import MetricStart
+from hmt_slam_ros.places.policy import MetricInitialPose
 from hmt_slam_ros.places.position_belief import certain_belief
 from hmt_slam_ros.sensors import Odometry, Scan
-from hmt_slam_ros.sensors.motion_model import Step, increment_covariance
+from hmt_slam_ros.sensors.motion_model import RelativeMotion, increment_covariance
 from hmt_slam_ros.simulation.drive import ACCELERATION, TURN_ACCELERATION
 from hmt_slam_ros.simulation.driven_robot import DrivenRobot
 from hmt_slam_ros.simulation.scenario import Scenario
@@ -287,7 +287,7 @@ class Steered:
         :param state: that the robot knows to be in, None for one that is lost.
         """
         settings = scenario.settings
-        limits = Limits(
+        limits = MotionLimits(
             settings.speed,
             math.radians(settings.turn_rate),
             ACCELERATION,
@@ -299,28 +299,28 @@ class Steered:
         self._known = known_of(institute, configuration)
         self.robot = DrivenRobot(scenario, start)
         belief = None if state is None else certain_belief(self._known.graph, configuration.places, state)
-        self.pilot = MissionPilot(self._known, configuration, limits, belief)
+        self.pilot = MissionController(self._known, configuration, limits, belief)
         self.estimates: list[Estimate] = []
         self._wheels: Float64 | None = None
 
     def mission(self, goal: Destination) -> Mission:
         """Drive to a place."""
         robot, pilot = self.robot, self.pilot
-        begin, metres, contacts = robot.stamp, robot.travelled, robot.contacts
+        begin, metres, contacts = robot.stamp, robot.distance_traveled, robot.contacts
         self.estimates, found = [], None
-        pilot.go(goal)
+        pilot.start_mission(goal)
         while robot.stamp < begin + TIME * NANOSECONDS and pilot.phase not in {Phase.THERE, Phase.LOST}:
-            before, pose = pilot.started, robot.pose
+            before, pose = pilot.initial_pose, robot.pose
             self.step()
-            if pilot.started is not before and pilot.started is not None:
-                found = pilot.started.node, self._errors(pilot.started, pose)
-        place = se2.transform(self._institute.frames[goal.opening.area], goal.place[None])[0]
+            if pilot.initial_pose is not before and pilot.initial_pose is not None:
+                found = pilot.initial_pose.node, self._errors(pilot.initial_pose, pose)
+        place = se2.transform(self._institute.frames[goal.opening.area], goal.position[None])[0]
         reached = pilot.phase is Phase.THERE and math.dist(place, robot.pose[:2]) <= AT_PLACE
         success = found is not None and found[0] == goal.node
         return Mission(
             success,
             reached,
-            robot.travelled - metres,
+            robot.distance_traveled - metres,
             (robot.stamp - begin) / NANOSECONDS,
             robot.contacts - contacts,
             self.estimates,
@@ -332,23 +332,25 @@ class Steered:
         odometry, scan = self.robot.measure()
         if scan is not None:
             self._steer(odometry, scan)
-        self.robot.drive()
+        self.robot.advance()
 
     def _steer(self, odometry: Odometry, scan: Scan) -> None:
         if self._wheels is not None:
             increment = se2.between(self._wheels, odometry.pose)
-            self.pilot.moved(Step(increment, increment_covariance(increment, self._configuration.motion)))
+            self.pilot.predict(RelativeMotion(increment, increment_covariance(increment, self._configuration.motion)))
         self._wheels = odometry.pose.copy()
         command = self.pilot.steer(scan)
-        self.robot.command(command.speed, command.turn_rate)
+        self.robot.set_velocity(command.speed, command.turn_rate)
         estimator = self.pilot.estimator
         belief = estimator.belief
-        if self.pilot.room is None and belief is not None and estimator.in_hallway and not estimator.turning:
+        if self.pilot.room is None and belief is not None and estimator.is_in_hallway and not estimator.is_turning:
             right = is_right(self._institute, estimator, self.robot.pose)
             peak = float(belief.probabilities.max())
-            self.estimates.append(Estimate(estimator.arrivals, self.robot.travelled, peak, belief.confident, right))
+            self.estimates.append(
+                Estimate(estimator.arrivals, self.robot.distance_traveled, peak, belief.is_confident, right)
+            )
 
-    def _errors(self, start: MetricStart, pose: Float64) -> tuple[float, float, float]:
+    def _errors(self, start: MetricInitialPose, pose: Float64) -> tuple[float, float, float]:
         true = se2.between(self._institute.frames[start.area], pose)
         off = se2.log(se2.between(start.pose.mean, true))
         nees = float(off @ np.linalg.solve(start.pose.covariance, off))
@@ -367,11 +369,11 @@ def is_right(institute: InstituteMap, estimator: PlaceEstimator, pose: Float64) 
     :param pose: ``world_T_base`` (3,).
     """
     belief = estimator.belief
-    state = None if belief is None else belief.most_likely
+    state = None if belief is None else belief.most_likely_state
     if state is None:
         return False
     off = se2.between(axis_of(institute, state), pose)
-    near = math.hypot(off[0] - estimator.frame.away, off[1]) <= _RIGHT
+    near = math.hypot(off[0] - estimator.frame.distance_past_node, off[1]) <= _RIGHT
     return near and abs(float(off[2])) <= _TURN
 
 
@@ -428,7 +430,7 @@ def _leaving(institute: InstituteMap, start: int, goal: int) -> int:
     """The state of a robot that leaves a node on the shortest way to another one."""
     first = networkx.shortest_path(_ways(institute), start, goal, weight="length")[1]
     edges = institute.chart.edges
-    direction = next(edge.leaving for edge in edges if (edge.start, edge.end) == (start, first))
+    direction = next(edge.start_direction for edge in edges if (edge.start, edge.end) == (start, first))
     return state_of(start, direction)
 
 
@@ -453,15 +455,15 @@ def relocations_of(institute: InstituteMap, scenario: Scenario, configuration: C
 def _relocation(
     institute: InstituteMap, scenario: Scenario, configuration: Configuration, random: np.random.Generator
 ) -> list[Estimate]:
-    edges = list({(edge.start, edge.leaving): edge for edge in institute.chart.edges}.values())
+    edges = list({(edge.start, edge.start_direction): edge for edge in institute.chart.edges}.values())
     lengths = np.array([edge.distance[0] for edge in edges])
     edge = edges[int(random.choice(len(lengths), p=lengths / lengths.sum()))]
     ahead = np.array((random.uniform(0.2, 0.8) * edge.distance[0], 0.0, 0.0))
-    start = se2.compose(axis_of(institute, state_of(edge.start, edge.leaving)), ahead)
+    start = se2.compose(axis_of(institute, state_of(edge.start, edge.start_direction)), ahead)
     steered = Steered(institute, scenario, configuration, start)
-    steered.pilot.go(None)
+    steered.pilot.start_mission(None)
     end = steered.robot.stamp + _LOST * NANOSECONDS
-    while steered.robot.travelled < FAR and steered.robot.stamp < end and recovery(steered.estimates) is None:
+    while steered.robot.distance_traveled < FAR and steered.robot.stamp < end and recovery(steered.estimates) is None:
         steered.step()
     return steered.estimates
 

@@ -11,10 +11,10 @@ from hmt_slam_ros.arrays import Float64, Int64
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
-from hmt_slam_ros.hybrid_map.surroundings import stacked
+from hmt_slam_ros.hybrid_map.surroundings import stack_poses
 from hmt_slam_ros.offline.runtime import run_log
-from hmt_slam_ros.places.area_views import AreaView, AreaViews
-from hmt_slam_ros.places.chart import CROSSING, END, Chart, chart_of
+from hmt_slam_ros.places.area_views import AreaView, AreaViewCache
+from hmt_slam_ros.places.chart import CROSSING, END, Chart, build_chart
 from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.simulation import open_simulated
 from hmt_slam_ros.simulation.scenario import Scenario
@@ -80,8 +80,10 @@ def mapped(seed: int, configuration: Configuration, visit: int = 0, people: int 
     """Map the scripted drive."""
     own = f"seed={seed},visit={visit},changed=0,laps=1,people={people},{LASER}"
     log = open_simulated(f"sim:institute,{own}")
-    result = run_log(log, configuration, lasting=True)
-    recording = result.recorder.finish(result.log.stamps, result.log.first_scans, result.log.earlier)
+    result = run_log(log, configuration, compact_record=True)
+    recording = result.recorder.finish(
+        result.log_progress.stamps, result.log_progress.first_scans, result.log_progress.earlier_trajectory
+    )
     return charted(log.scenario, recording.hybrid_map, recording.replica.scans, log.true_poses, configuration)
 
 
@@ -97,13 +99,15 @@ def charted(
     :param scans: {keyframe: scan}.
     :param true_poses: gives ``world_T_base`` (n, 3) at stamps (n,), ns.
     """
-    views = AreaViews(LocalMapping(configuration), scans).of_map(hybrid_map)
+    views = AreaViewCache(LocalMapping(configuration), scans).views_of_map(hybrid_map)
     frames = {}
     for area in hybrid_map.area_ids():
         own_poses = hybrid_map.keyframes(area)
         true = true_poses(np.array([scans[keyframe].stamp for keyframe in own_poses]))
-        frames[area] = se2.best_fit(stacked(own_poses), true)
-    return InstituteMap(scenario, hybrid_map, scans, views, chart_of(hybrid_map, views, configuration.features), frames)
+        frames[area] = se2.best_fit(stack_poses(own_poses), true)
+    return InstituteMap(
+        scenario, hybrid_map, scans, views, build_chart(hybrid_map, views, configuration.features), frames
+    )
 
 
 def judged(institute: InstituteMap) -> Judged:

@@ -141,9 +141,9 @@ def _measure_maps(keyframes: Keyframes, configuration: Configuration, figures: F
             first = odometry
         poses = se2.compose(beside, se2.between(first, odometry))
         if k % _PER_AREA:
-            _measure_matching(mapping, mapping.matching_points(scan), tables, poses, figures)
+            _measure_matching(mapping, mapping.matching_surfels(scan), tables, poses, figures)
         beams = len(scan.points) * count
-        figures.timed("insertion, a beam and a map", beams, partial(mapping.insert, tables, poses, scan))
+        figures.timed("insertion, a beam and a map", beams, partial(mapping.insert_scan, tables, poses, scan))
 
 
 def _measure_matching(
@@ -162,12 +162,12 @@ def _measure_matching(
     figures.timed(
         "things that moved, a scan",
         1,
-        lambda: dynamic_rejection.standing(points, prior.mean, prior, view, mapping.alignment),
+        lambda: dynamic_rejection.reject_dynamic(points, prior.mean, prior, view, mapping.alignment),
     )
     figures.timed(
         "likelihood, a point",
         len(points),
-        lambda: scan_to_map.log_ratio(points, *poses[0].tolist(), view, mapping.model),
+        lambda: scan_to_map.log_ratio(points, *poses[0].tolist(), view, mapping.beam_model),
     )
     figures.timed(
         "proposal, a scan and a particle",
@@ -181,7 +181,7 @@ def _measure_matching(
             tables,
             view,
             mapping.alignment,
-            mapping.model,
+            mapping.beam_model,
             settings.sharpness,
             settings.temper,
         ),

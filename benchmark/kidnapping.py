@@ -22,9 +22,9 @@ from benchmark.settings import Settings
 from hmt_slam_ros.configuration import load_configuration
 from hmt_slam_ros.evaluation import StampedPoses, evaluate_relations, true_relations
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.logs.records import SIMULATED
+from hmt_slam_ros.logs.records import SIMULATION_PREFIX
 from hmt_slam_ros.metric_slam.slam import MetricSlam
-from hmt_slam_ros.offline.runtime import Run
+from hmt_slam_ros.offline.runtime import LockStepRun
 from hmt_slam_ros.open_log import open_log
 from hmt_slam_ros.sensors import Scan
 
@@ -87,10 +87,10 @@ def drawn(world: str, kind: str, seed: int) -> str:
     """The name of a simulated drive in which the robot is carried."""
     random = np.random.Generator(np.random.Philox(key=[_DRAWS + seed, KINDS.index(kind)]))
     at, turned = random.uniform(*_AT[kind]), random.uniform(-180.0, 180.0)
-    name = f"{SIMULATED}{world},seed={seed},laps=2"
+    name = f"{SIMULATION_PREFIX}{world},seed={seed},laps=2"
     if kind == "short":
         log = open_log(name)
-        truth = np.array([record.truth for record in log.records()])
+        truth = np.array([record.true_pose for record in log.records()])
         gone = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(truth[:, :2], axis=0).T))))
         after = np.searchsorted(gone, gone[int(at * len(gone))] + _STEP)
         to = float(after) / len(gone)
@@ -124,7 +124,7 @@ class Watched:
 
     def __init__(self, changes: Sequence[str] = ()) -> None:
         """:param changes: parameters that differ from the file, as ``name=value``."""
-        self.run = Run(load_configuration(PARAMETERS, list(changes)))
+        self.run = LockStepRun(load_configuration(PARAMETERS, list(changes)))
         self.true: dict[int, NDArray[np.float64]] = {}
         self.carried = -1
 
@@ -136,21 +136,21 @@ class Watched:
     def lost(self) -> float:
         """Probability that the robot may be anywhere."""
         told = self.run.recorder.hypotheses
-        return sum(leaf.probability for leaf in told[max(told)].leaves if leaf.lost)
+        return sum(leaf.probability for leaf in told[max(told)].hypotheses if leaf.lost)
 
     def sure(self) -> bool:
         """Whether the robot is sure of its place."""
         told = self.run.recorder.hypotheses
-        return sum(leaf.probability for leaf in told[max(told)].leaves if not leaf.lost) >= SURE
+        return sum(leaf.probability for leaf in told[max(told)].hypotheses if not leaf.lost) >= SURE
 
     def right(self, true: NDArray[np.float64]) -> bool:
         """Whether the last estimate is where the map of before has the robot.
 
         :param true: ``world_T_base``, shape (3,).
         """
-        slam, last = self.run.lock_step.processes["slam"], self.run.recorder.last
+        slam, last = self.run.lock_step.processes["slam"], self.run.recorder.last_estimate
         assert isinstance(slam, MetricSlam)
-        hybrid_map, areas = slam.replica.maps[slam.replica.best], self._areas()
+        hybrid_map, areas = slam.replica.maps[slam.replica.best_hypothesis], self._areas()
         if last is None or last.area not in areas:
             return False
         placed = {
@@ -168,7 +168,7 @@ class Watched:
 
     def _areas(self) -> dict[int, NDArray[np.float64]]:
         """{area: ``map_T_area``, shape (3,)} as TLCA told last."""
-        told = self.run.recorder.accepted
+        told = self.run.recorder.decisions
         for sequence in sorted(told, reverse=True):
             if told[sequence].global_poses:
                 return {entry.area: entry.pose.mean for entry in told[sequence].global_poses}
@@ -191,21 +191,21 @@ def kidnapped(name: str, changes: Sequence[str] = ()) -> Kidnapping:
     stamps, truth, parts = list[int](), list[NDArray[np.float64]](), list[bool]()
     for record in open_log(name).records():
         before = watched.events
-        watched.run.read(record)
-        if not isinstance(record.measurement, Scan) or record.truth is None:
+        watched.run.process_record(record)
+        if not isinstance(record.measurement, Scan) or record.true_pose is None:
             continue
-        step = se2.between(truth[-1], record.truth) if truth else np.zeros(3)
+        step = se2.between(truth[-1], record.true_pose) if truth else np.zeros(3)
         if math.hypot(step[0], step[1]) > _JUMP or abs(step[2]) > _JUMP:
             watched.carried = before
         elif watched.carried >= 0:
             travelled += math.hypot(step[0], step[1])
         stamps.append(record.measurement.stamp)
-        truth.append(record.truth)
+        truth.append(record.true_pose)
         parts.append(watched.carried >= 0)
-        said = watched.hear(record.truth, travelled)
+        said = watched.hear(record.true_pose, travelled)
         heard += [] if said is None else [said]
     result = watched.run.finish()
-    recording = result.recorder.finish(result.log.stamps)
+    recording = result.recorder.finish(result.log_progress.stamps)
     own, true = StampedPoses(recording.stamps, recording.trajectory), StampedPoses(np.array(stamps), np.array(truth))
     errors = [_error(own, true, np.array(parts) == part) for part in (False, True)]
     return judged(heard, (errors[0], errors[1]), travelled)
@@ -256,9 +256,9 @@ def ordinary(path: Path | str, changes: Sequence[str] = ()) -> Alarm:
     watched, driven, doubted = Watched(changes), 0.0, 0.0
     for record in open_log(path).records():
         before = watched.events
-        watched.run.read(record)
+        watched.run.process_record(record)
         if watched.events > before:
-            travelled = watched.run.recorder.keyframes[watched.events - 1].travelled
+            travelled = watched.run.recorder.keyframes[watched.events - 1].path_length
             doubted += (travelled - driven) * (watched.lost() > DOUBT)
             driven = travelled
     return Alarm(driven, doubted)
@@ -273,7 +273,7 @@ def measure_kidnapping(settings: Settings) -> Report:
     cases = [(world, kind, seed) for world in worlds for kind in KINDS for seed in seeds]
     with opened([name for name in names if name not in WORLDS]) as logs:
         drives: list[tuple[str, Path | str]] = [(log.name, log.path) for log in logs]
-        drives += [(world, f"{SIMULATED}{world},seed={seed},laps=2") for world in worlds for seed in seeds]
+        drives += [(world, f"{SIMULATION_PREFIX}{world},seed={seed},laps=2") for world in worlds for seed in seeds]
         with ProcessPoolExecutor(settings.runner.jobs, multiprocessing.get_context("spawn")) as pool:
             changes = settings.changes
             found = list(pool.map(partial(kidnapped, changes=changes), [drawn(*case) for case in cases]))

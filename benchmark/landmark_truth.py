@@ -8,10 +8,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hmt_slam_ros.configuration.landmarks import Features
+from hmt_slam_ros.configuration.landmarks import FeatureParameters
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.simulation.building import boxes
-from hmt_slam_ros.simulation.laser import WallIndex, clear_between, wall_index
+from hmt_slam_ros.simulation.building import furniture_walls
+from hmt_slam_ros.simulation.laser import WallIndex, has_line_of_sight, wall_index
 from hmt_slam_ros.simulation.scenario import Scenario
 
 Array = NDArray[np.float64]
@@ -53,7 +53,7 @@ class World:
 
     def __init__(self, scenario: Scenario, stamp: int, pose: Array) -> None:
         building = scenario.building.walls
-        everything = np.concatenate((building, boxes(scenario.furniture(stamp))))
+        everything = np.concatenate((building, furniture_walls(scenario.furniture(stamp))))
         leaf = (building[:, None] == scenario.building.doors[None]).all(axis=2).any(axis=1)
         self.building, self._leaves = _near(building[~leaf], pose), _near(building[leaf], pose)
         self.surfaces = _near(everything, pose)
@@ -62,15 +62,15 @@ class World:
     def sees(self, points: Array) -> NDArray[np.bool_]:
         """Which points (..., 2) are in sight."""
         flat = np.ascontiguousarray(points.reshape(-1, 2))
-        seen: NDArray[np.bool_] = clear_between(self.index, np.zeros_like(flat), flat)
+        seen: NDArray[np.bool_] = has_line_of_sight(self.index, np.zeros_like(flat), flat)
         return seen.reshape(points.shape[:-1])
 
-    def corners(self, features: Features) -> Truth:
+    def corners(self, features: FeatureParameters) -> Truth:
         """All pairs of surfaces that meet at a right angle, on the sides that face the robot."""
         parts = [self._corners_of(sign_a, sign_b, features) for sign_a in (1.0, -1.0) for sign_b in (1.0, -1.0)]
         return _joined(parts)
 
-    def _corners_of(self, sign_a: float, sign_b: float, features: Features) -> Truth:
+    def _corners_of(self, sign_a: float, sign_b: float, features: FeatureParameters) -> Truth:
         walls = self.surfaces
         i, k = np.triu_indices(len(walls), 1)
         a, b = walls[i], walls[k]
@@ -103,7 +103,7 @@ class World:
         bearing = np.arctan2(points[..., 1], points[..., 0])
         return self.sees(points).all(axis=1) & (np.abs(se2.wrap(bearing[:, -1] - bearing[:, 0])) >= _WIDE)
 
-    def openings(self, features: Features) -> Truth:
+    def openings(self, features: FeatureParameters) -> Truth:
         """All deep gaps between the end of a wall and what is next on its line, on the robot's side; no furniture."""
         lengths = np.hypot(*(self.building[:, 2:] - self.building[:, :2]).T)
         walls = self.building[lengths >= features.min_length]
@@ -112,7 +112,7 @@ class World:
         gaps = [gap for end, unit in zip(ends, units, strict=True) if (gap := self._gap(end, unit, features))]
         return _without_repetitions(_joined([_NOTHING, *gaps]))
 
-    def _gap(self, end: Array, along: Array, features: Features) -> Truth | None:
+    def _gap(self, end: Array, along: Array, features: FeatureParameters) -> Truth | None:
         """The opening that begins at the end of a wall, if there is one."""
         normal = np.array([-along[1], along[0]]) * (1.0 if along[0] * end[1] - along[1] * end[0] > 0.0 else -1.0)
         width, wall = self._next_on_line(end, along, normal)

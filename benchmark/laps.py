@@ -22,14 +22,14 @@ from hmt_slam_ros.evaluation import (
     StampedPoses,
     evaluate_relations,
     read_relations,
+    read_true_poses,
     true_relations,
-    truth_of,
 )
-from hmt_slam_ros.logs.records import SIMULATED, Log, LogRecord
+from hmt_slam_ros.logs.records import SIMULATION_PREFIX, Log, LogRecord
 from hmt_slam_ros.logs.stamps import NANOSECONDS
-from hmt_slam_ros.messages.messages import Carried
+from hmt_slam_ros.messages.messages import PoseReset
 from hmt_slam_ros.metric_slam.slam import MetricSlam
-from hmt_slam_ros.offline.runtime import Run
+from hmt_slam_ros.offline.runtime import LockStepRun
 from hmt_slam_ros.open_log import open_log
 from hmt_slam_ros.results.report import scan_bytes
 from hmt_slam_ros.sensors import Scan
@@ -109,7 +109,7 @@ def measure_laps(settings: Settings) -> Report:
     names = settings.logs_or((*WORLDS, *LOGS))
     with opened([name for name in names if name not in WORLDS]) as logs:
         asked: dict[str, tuple[str, Path | None, int]] = {
-            name: (f"{SIMULATED}{name},laps={LAPS}", None, LAPS) for name in names if name in WORLDS
+            name: (f"{SIMULATION_PREFIX}{name},laps={LAPS}", None, LAPS) for name in names if name in WORLDS
         }
         asked |= {log.name: (str(log.path), log.relations_file, PASSES) for log in logs}
         # A process of its own for each: memory is what it takes.
@@ -141,17 +141,17 @@ def requirements(name: str, found: Laps) -> list[Requirement]:
 def driven(log: str, relations: Path | None, count: int, configuration: Configuration) -> Laps:
     """Drive over a log ``count`` times, or over a simulated one that has as many laps."""
     gc.freeze()
-    source, run = open_log(log), Run(configuration)
+    source, run = open_log(log), LockStepRun(configuration)
     times = 1 if relations is None else count
     ends = [round(source.scan_count * times * (lap + 1) / count) for lap in range(count)]
     laps: list[Lap] = []
     begin = time.process_time()
     for record, carried in _passes(source, times):
         if carried:
-            run.lock_step.feed(Carried())
-        run.read(record)
-        run.recorder.fold()
-        if isinstance(record.measurement, Scan) and run.scans == ends[len(laps)]:
+            run.lock_step.feed(PoseReset())
+        run.process_record(record)
+        run.recorder.compact()
+        if isinstance(record.measurement, Scan) and run.scans_read == ends[len(laps)]:
             seconds = time.process_time() - begin
             laps.append(_lap(run, seconds / (ends[len(laps)] - ([0, *ends][len(laps)]))))
             begin = time.process_time()
@@ -171,13 +171,13 @@ def _passes(log: Log, count: int) -> Iterator[tuple[LogRecord, bool]]:
             yield replace(record, measurement=replace(record.measurement, stamp=stamp)), again
 
 
-def _lap(run: Run, seconds: float) -> Lap:
+def _lap(run: LockStepRun, seconds: float) -> Lap:
     """What a run is after a lap in which a scan took so many seconds."""
     gc.collect()
     slam = run.lock_step.processes["slam"]
     assert isinstance(slam, MetricSlam)
     replica = slam.replica
-    hybrid_map, scans = replica.maps[replica.best], replica.scans
+    hybrid_map, scans = replica.maps[replica.best_hypothesis], replica.scans
     areas = hybrid_map.area_ids()
     keyframes = sum(len(hybrid_map.keyframes(area)) for area in areas)
     memory = (scan_bytes(scans.values()), _resident(), run.recorded_bytes)
@@ -190,15 +190,15 @@ def _resident() -> int:
     return pages * resource.getpagesize()
 
 
-def _errors(run: Run, log: Log, known: Relations | None, ends: Sequence[int]) -> Iterator[float]:
+def _errors(run: LockStepRun, log: Log, known: Relations | None, ends: Sequence[int]) -> Iterator[float]:
     """Mean error at the relations of each lap, m.
 
     :param known: those of a log of a real robot; None where its records tell the truth.
     :param ends: number of scans at the end of each lap.
     """
     result = run.finish()
-    recording, stamps = result.recorder.finish(result.log.stamps), result.log.source_stamps
-    truth = truth_of(log) if known is None else None
+    recording, stamps = result.recorder.finish(result.log_progress.stamps), result.log_progress.source_stamps
+    truth = read_true_poses(log) if known is None else None
     for first, end in pairwise([0, *ends]):
         rows = slice(first, end)
         lap = StampedPoses(stamps[rows], recording.trajectory[rows])

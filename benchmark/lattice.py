@@ -19,7 +19,7 @@ from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.messages.map_changes import AreaPose
 from hmt_slam_ros.sensors import Scan
-from hmt_slam_ros.simulation.laser import WallIndex, cast, wall_index
+from hmt_slam_ros.simulation.laser import WallIndex, cast_rays, wall_index
 
 SPACING = 8.0
 """From crossing to crossing, m."""
@@ -59,12 +59,12 @@ class Lattice(NamedTuple):
         places = [_at(offset, quarter) for quarter in range(2) for offset in OFFSETS]
         for area in range(self.areas):
             first = FIRST_KEYFRAME + PER_AREA * area
-            hybrid_map.areas[area] = {first + k: place.copy() for k, place in enumerate(places)}
+            hybrid_map.changed_areas[area] = {first + k: place.copy() for k, place in enumerate(places)}
             if (area + 1) % self.columns:
                 hybrid_map.set_arc(area, area + 1, _arc(SPACING, 0.0), closure=False)
             if area + self.columns < self.areas:
                 hybrid_map.set_arc(area, area + self.columns, _arc(0.0, SPACING), closure=False)
-        hybrid_map.absorb()
+        hybrid_map.commit()
         return hybrid_map
 
     def poses(self) -> tuple[AreaPose, ...]:
@@ -100,7 +100,7 @@ def scan_at(pose: Float64, stamp: int, seed: int, beams: int = BEAMS) -> Scan:
     """The scan at a pose (3,) in an endless lattice, of which a crossing lies at the origin."""
     angles = np.linspace(-0.5 * _FIELD, 0.5 * _FIELD, beams)
     at = pose[:2] - SPACING * np.round(pose[:2] / SPACING)
-    ranges = cast(_walls(), np.tile(at, (beams, 1)), angles + pose[2], np.inf)
+    ranges = cast_rays(_walls(), np.tile(at, (beams, 1)), angles + pose[2], np.inf)
     ranges = np.minimum(ranges + _NOISE * np.random.default_rng(seed).standard_normal(beams), _RANGE)
     return Scan(stamp, ranges.astype(np.float32), angles[0], angles[1] - angles[0], 0.05, _RANGE)
 

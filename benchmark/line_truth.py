@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.sensors import Scan
-from hmt_slam_ros.simulation.building import boxes
+from hmt_slam_ros.simulation.building import furniture_walls
 from hmt_slam_ros.simulation.scenario import Scenario
 
 Array = NDArray[np.float64]
@@ -72,7 +72,7 @@ def true_lines(scenario: Scenario, stamp: int, pose: Array) -> Array:
 
 def _surfaces(scenario: Scenario, stamp: int, pose: Array) -> tuple[Array, NDArray[np.int64], Array]:
     """Walls and furniture (m, 4) in a frame, the number of the line of each, (m,), and those lines, (n, 2)."""
-    world = np.concatenate((scenario.building.walls, boxes(scenario.furniture(stamp))))
+    world = np.concatenate((scenario.building.walls, furniture_walls(scenario.furniture(stamp))))
     _, numbers = np.unique(np.round(lines_of(world), _DECIMALS), axis=0, return_inverse=True)
     walls, numbers = se2.transform(se2.inverse(pose), world.reshape(-1, 2)).reshape(-1, 4), numbers.reshape(-1)
     lines = np.empty((numbers.max() + 1, 2))

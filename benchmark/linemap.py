@@ -15,8 +15,8 @@ from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.landmarks.line_extraction import extract_for_map
 from hmt_slam_ros.landmarks.stochastic_map import LineMap
-from hmt_slam_ros.random_streams import Purpose, stream
-from hmt_slam_ros.sensors.motion_model import Step, increment_covariance
+from hmt_slam_ros.random_streams import Purpose, random_stream
+from hmt_slam_ros.sensors.motion_model import RelativeMotion, increment_covariance
 from hmt_slam_ros.simulation.building import Building, FloorPlan, Point
 from hmt_slam_ros.simulation.furniture import Rectangle, furnish
 from hmt_slam_ros.simulation.scenario import Scenario
@@ -67,9 +67,9 @@ def mapped(kind: str, seed: int, laser: str, configuration: Configuration) -> Ma
         seen = seen_in(scenario, number)
         lines = extract_for_map(seen.scan, features)
         walls, observed = walls_of(lines, seen), room.observe(lines)
-        for k, line in (*observed.known, *observed.new):
+        for k, line in (*observed.matched, *observed.new):
             votes.setdefault(line, Counter())[int(walls[k])] += 1
-        for line, part in observed.joined:
+        for line, part in observed.merged:
             votes[line] += votes.pop(part)
         if number % _EVERY == _EVERY - 1:
             poses.append(_judged_pose(room, se2.between(start, scenario.poses[number * scenario.settings.readings])))
@@ -81,12 +81,12 @@ def mapped(kind: str, seed: int, laser: str, configuration: Configuration) -> Ma
     return Mapped(pose_nees, sigmas, errors, strays, sizes, floor)
 
 
-def _step(scenario: Scenario, number: int, configuration: Configuration) -> Step:
+def _step(scenario: Scenario, number: int, configuration: Configuration) -> RelativeMotion:
     """What odometry says of the motion to a scan."""
     readings = scenario.settings.readings
     before, here = scenario.odometry[(number - 1) * readings], scenario.odometry[number * readings]
     increment = se2.between(before, here)
-    return Step(increment, increment_covariance(increment, configuration.motion))
+    return RelativeMotion(increment, increment_covariance(increment, configuration.motion))
 
 
 def _judged_pose(room: LineMap, truth: NDArray[np.float64]) -> tuple[float, NDArray[np.float64], NDArray[np.float64]]:
@@ -102,7 +102,7 @@ def drive_in(kind: str, seed: int, settings: str) -> tuple[Scenario, float]:
 
     :param settings: those of the simulated robot that differ from the defaults, as ``name=value,...``.
     """
-    draw = stream(seed, Purpose.BUILDING, 1)
+    draw = random_stream(seed, Purpose.BUILDING, 1)
     first = (0.0, 0.0, draw.uniform(4.5, 7.5), draw.uniform(4.0, 6.0))
     rooms, plan = [first], FloorPlan()
     way = _around(first)
@@ -111,14 +111,14 @@ def drive_in(kind: str, seed: int, settings: str) -> tuple[Scenario, float]:
         second = (left, draw.uniform(-1.0, 0.0), left + draw.uniform(4.0, 6.0), draw.uniform(3.8, 5.5))
         rooms.append(second)
         low = max(first[1], second[1]) + _INSET - 0.5 * _DOOR
-        plan.free(first[2] - 0.05, low, left + 0.05, low + _DOOR)
+        plan.cut_rectangle(first[2] - 0.05, low, left + 0.05, low + _DOOR)
         way = _through(way, _around(second), low + 0.5 * _DOOR)
     # A door in the first room's upper wall, and what is seen of the corridor behind it.
     door = draw.uniform(0.5, first[2] - 0.5 - _DOOR)
-    plan.free(door, first[3] - 0.05, door + _DOOR, first[3] + _WALL + 0.05)
-    plan.free(-2.0, first[3] + _WALL, first[2] + 2.0, first[3] + _WALL + 2.0)
+    plan.cut_rectangle(door, first[3] - 0.05, door + _DOOR, first[3] + _WALL + 0.05)
+    plan.cut_rectangle(-2.0, first[3] + _WALL, first[2] + 2.0, first[3] + _WALL + 2.0)
     for room in rooms:
-        plan.free(*room)
+        plan.cut_rectangle(*room)
     route = np.array(way)
     building = Building(plan.walls(), route, furnish(draw, rooms, route))
     floor = sum((room[2] - room[0]) * (room[3] - room[1]) for room in rooms)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from benchmark.line_truth import Seen, difference, seen_in
 from benchmark.simulated.worlds import World
-from hmt_slam_ros.configuration.landmarks import Features
+from hmt_slam_ros.configuration.landmarks import FeatureParameters
 from hmt_slam_ros.landmarks.line_extraction import Lines, extract_lines
 from hmt_slam_ros.simulation import open_simulated
 from hmt_slam_ros.simulation.scenario import Scenario
@@ -51,7 +51,7 @@ class Scanned(NamedTuple):
     seconds: float
 
 
-def scans_of(world: World, laser: str, features: Features) -> Iterator[Scanned]:
+def scans_of(world: World, laser: str, features: FeatureParameters) -> Iterator[Scanned]:
     """What is found in scans of a drive.
 
     :param laser: settings that differ from the world's.
@@ -63,7 +63,7 @@ def scans_of(world: World, laser: str, features: Features) -> Iterator[Scanned]:
         yield _scanned(scenario, number, features)
 
 
-def _scanned(scenario: Scenario, number: int, features: Features) -> Scanned:
+def _scanned(scenario: Scenario, number: int, features: FeatureParameters) -> Scanned:
     seen = seen_in(scenario, number)
     begin = time.process_time()
     lines = extract_lines(seen.scan, features)
@@ -94,7 +94,7 @@ def _lengths(lines: Lines, walls: NDArray[np.int64], seen: Seen) -> tuple[float,
     first, second, own = seen.ends[:-1][same], seen.ends[1:][same], own[same]
     middles, lengths = 0.5 * (first + second), np.hypot(*(second - first).T)
     found = np.zeros(len(own), dtype=np.bool_)
-    for (begin, end), owner in zip(lines.pieces, lines.owners, strict=True):
+    for (begin, end), owner in zip(lines.segments, lines.owners, strict=True):
         alpha = lines.parameters[owner, 0]
         along = middles @ np.array([-math.sin(alpha), math.cos(alpha)])
         found |= (own == walls[owner]) & (along >= begin) & (along <= end)

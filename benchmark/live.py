@@ -26,7 +26,7 @@ from hmt_slam_ros.messages.documents import RobotStatus, decode
 from hmt_slam_ros.messages.messages import LocalEstimate
 from hmt_slam_ros.open_log import open_log
 from hmt_slam_ros.ros import topics
-from hmt_slam_ros.ros.conversions import stamp_of
+from hmt_slam_ros.ros.conversions import stamp_from_time
 from hmt_slam_ros.ros.topics import DOCUMENTS, ODOM, POSE, ROBOT_STATUS, SCAN
 
 PROCESSES = ("slam", "aam", "tsbi", "tlca", "rtl")
@@ -229,7 +229,7 @@ def _moments(listener: Listener, kind: type, topic: str, profile: QoSProfile) ->
     moments: Stamped = {}
 
     def hear(message: Odometry, info: dict[str, int]) -> None:
-        moments[stamp_of(message.header.stamp)] = 1e-9 * info["source_timestamp"]
+        moments[stamp_from_time(message.header.stamp)] = 1e-9 * info["source_timestamp"]
 
     listener.node.create_subscription(kind, topic, hear, profile)
     return moments

@@ -13,7 +13,7 @@ from functools import cached_property
 from pathlib import Path
 
 from hmt_slam_ros.errors import HmtSlamError
-from hmt_slam_ros.evaluation import Relations, StampedPoses, odometry_of, read_relations
+from hmt_slam_ros.evaluation import Relations, StampedPoses, read_odometry_poses, read_relations
 from hmt_slam_ros.open_log import open_log
 from hmt_slam_ros.sensors import Scan
 
@@ -53,7 +53,7 @@ class MeasuredLog:
     @cached_property
     def odometry(self) -> StampedPoses:
         """Wheel odometry with source stamps."""
-        return odometry_of(open_log(self.path))
+        return read_odometry_poses(open_log(self.path))
 
     @cached_property
     def scans(self) -> list[Scan]:

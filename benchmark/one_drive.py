@@ -39,8 +39,8 @@ class OneDrive:
         for log in self._visits:
             records = list(log.records())
             shift = stamp + _PAUSE - records[0].measurement.stamp if stamp else 0
-            assert records[0].truth is not None
-            turn = np.zeros(3) if truth is None else se2.between(truth, records[0].truth)
+            assert records[0].true_pose is not None
+            turn = np.zeros(3) if truth is None else se2.between(truth, records[0].true_pose)
             first = next(r.measurement for r in records if isinstance(r.measurement, Odometry)).pose
             begin = first if truth is None else se2.compose(odometry, turn)
             for record in records:
@@ -48,5 +48,5 @@ class OneDrive:
                 if isinstance(measurement, Odometry):
                     odometry = se2.compose(begin, se2.between(first, measurement.pose))
                     measurement = replace(measurement, pose=odometry)
-                yield LogRecord(record.source_stamp + shift, measurement, record.truth)
-            stamp, truth = records[-1].measurement.stamp + shift, records[-1].truth
+                yield LogRecord(record.source_stamp + shift, measurement, record.true_pose)
+            stamp, truth = records[-1].measurement.stamp + shift, records[-1].true_pose

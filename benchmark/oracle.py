@@ -20,17 +20,17 @@ from benchmark.settings import Settings
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration import Configuration, load_configuration
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.geometry.gaussian import gate
+from hmt_slam_ros.geometry.gaussian import chi_square_gate
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
-from hmt_slam_ros.hybrid_map.shortest_path import reachable
+from hmt_slam_ros.hybrid_map.shortest_path import shortest_path_beliefs
 from hmt_slam_ros.hybrid_map.surroundings import Transition, areas_around
 from hmt_slam_ros.messages.replica import FIRST_HYPOTHESIS, Replica
 from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.simulation import open_simulated
-from hmt_slam_ros.topological_inference.admission import Candidate, Query
+from hmt_slam_ros.topological_inference.admission import AreaCandidate, Query
 from hmt_slam_ros.topological_inference.branching import Branching, Child, Parent
-from hmt_slam_ros.topological_inference.closure_search import ClosureSearch, Comparison
-from hmt_slam_ros.topological_inference.hypothesis_tree import LeafNotes
+from hmt_slam_ros.topological_inference.closure_search import AreaComparison, ClosureSearch
+from hmt_slam_ros.topological_inference.hypothesis_tree import HypothesisState
 from hmt_slam_ros.topological_inference.tsbi import Tsbi
 
 WORLDS = {
@@ -215,7 +215,7 @@ def filtered(drive: Sequence[Stop], configuration: Configuration, noise: float) 
     paths: dict[int, tuple[Visits, dict[int, int]]] = {FIRST_HYPOTHESIS: ((0,), {0: 0})}
     found = []
     for stop in drive:
-        leaves = script.keyframe(*stop).leaves
+        leaves = script.keyframe(*stop).hypotheses
         before, paths = paths, {}
         pmf: dict[Visits, float] = defaultdict(float)
         for leaf in leaves:
@@ -223,7 +223,7 @@ def filtered(drive: Sequence[Stop], configuration: Configuration, noise: float) 
             if stop.cut:
                 named = {leaf.area: len(path), **named}
                 path = (*path, named[leaf.area])
-            paths[leaf.hypothesis] = path, named
+            paths[leaf.id] = path, named
             pmf[path] += leaf.probability
         if stop.cut:
             found.append(dict(pmf))
@@ -266,7 +266,7 @@ class _EverywhereSearch(ClosureSearch):
 
     def __init__(self, configuration: Configuration, scans: Mapping[int, Scan]) -> None:
         super().__init__(configuration, scans)
-        self._settings = replace(self._settings, gate=gate(_EVERYWHERE), margin=25.0, max_modes=1000)
+        self._settings = replace(self._settings, gate=chi_square_gate(_EVERYWHERE), margin=25.0, max_modes=1000)
 
     def compare(
         self,
@@ -277,7 +277,7 @@ class _EverywhereSearch(ClosureSearch):
         excluded: Collection[int],
         most: int,
         only: Collection[int] = (),
-    ) -> Comparison:
+    ) -> AreaComparison:
         """As in the model, over all areas, however many they are."""
         del most, only
         options = self._options
@@ -286,19 +286,19 @@ class _EverywhereSearch(ClosureSearch):
             for known in hybrid_map.area_ids()
             if known not in excluded
         }
-        beliefs = reachable(hybrid_map, area)
+        beliefs = shortest_path_beliefs(hybrid_map, area)
         asked = [known for known, own in fresh.items() if 2 * len(own) >= len(query.poses)]
-        priors = {known: self.admission.prior(beliefs[known], query) for known in asked}
-        candidates = {known: Candidate(prior, fresh[known], 1.0) for known, prior in priors.items()}
-        places = {known: self._views.place(hybrid_map, known, excluded) for known in candidates}
-        entries = {known: self._entry(place, candidates[known]) for known, place in places.items()}
-        shares = {known: found.share for known, found in entries.items() if found.share}
+        priors = {known: self.gating.prior(beliefs[known], query) for known in asked}
+        candidates = {known: AreaCandidate(prior, fresh[known], 1.0) for known, prior in priors.items()}
+        places = {known: self._grid_cache.place(hybrid_map, known, excluded) for known in candidates}
+        entries = {known: self._entry_probability(place, candidates[known]) for known, place in places.items()}
+        shares = {known: found.probability for known, found in entries.items() if found.probability}
         modes = {known: self._modes(places[known], candidates[known]) for known in shares}
         total = sum(shares.values())
         new = max(1.0 - total, options.new_probability) if total else 1.0
         if shares:
-            elsewhere = self.admission.divided(hybrid_map, area, query, excluded)[2]
-            self._count_likeness(query, [self._elsewhere(hybrid_map, other, excluded) for other in elsewhere])
+            elsewhere = self.gating.classify_areas(hybrid_map, area, query, excluded)[2]
+            self._sample_aliasing(query, [self._negative_sample(hybrid_map, other, excluded) for other in elsewhere])
         fits = [
             fit
             for known, share in shares.items()
@@ -313,7 +313,7 @@ class _EverywhereSearch(ClosureSearch):
         ]
         beside = tuple(known for known, found in modes.items() if found is None)
         examined = tuple(known for known in shares if known not in beside)
-        return Comparison(Transition({}, new), tuple(fits), examined, beside, 0.0)
+        return AreaComparison(Transition({}, new), tuple(fits), examined, beside, 0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -328,7 +328,7 @@ class _Topology:
     path: Visits
     named: dict[int, int]
     hybrid_map: HybridMap
-    notes: LeafNotes
+    notes: HypothesisState
     robot: Robot
     log_weight: float
 
@@ -351,7 +351,7 @@ class Enumeration:
         self._replica = Replica()
         self._branching = Branching(configuration, self._replica)
         self._branching.search = _EverywhereSearch(configuration, self._replica.scans)
-        self._topologies = [_Topology((0,), {0: 0}, HybridMap(), LeafNotes(), Robot(), 0.0)]
+        self._topologies = [_Topology((0,), {0: 0}, HybridMap(), HypothesisState(), Robot(), 0.0)]
         self._sequence = -1
         self.lost = 0.0
         self.asked = False
@@ -380,30 +380,32 @@ class Enumeration:
     def _noted(self, topology: _Topology, step: Float64) -> _Topology:
         """After the robot stored the newest keyframe in its area."""
         robot = topology.robot.moved(step, self._noise)
-        topology.hybrid_map.place(self._sequence, robot.area, robot.pose.mean)
-        return replace(topology, robot=robot, notes=topology.notes.stored(self._sequence, robot.pose.covariance))
+        topology.hybrid_map.set_keyframe(self._sequence, robot.area, robot.pose.mean)
+        return replace(
+            topology, robot=robot, notes=topology.notes.after_keyframe(self._sequence, robot.pose.covariance)
+        )
 
     def _recognized(self, topology: _Topology, points: Float64) -> _Topology:
         """Weighed by what the newest scan says for the known ground that the robot is in."""
         pose = topology.robot.pose.mean
-        found = self._branching.recognized(topology.parent, pose, points, self._sequence)
+        found = self._branching.reweight_by_known_ground(topology.parent, pose, points, self._sequence)
         return replace(topology, log_weight=found.log_weight)
 
     def _children(self, topology: _Topology, newest: Sequence[int]) -> Iterator[_Topology]:
         branches = self._branching.cut(topology.parent, newest)
-        self.asked |= any(child.notes.compared for child in branches.children)
+        self.asked |= any(child.state.matched_keyframes for child in branches.children)
         for child in branches.children:
             yield self._followed(topology, child)
 
     def _followed(self, topology: _Topology, child: Child) -> _Topology:
         hybrid_map = topology.hybrid_map.branch()
-        self._replica.change(hybrid_map, child.relabelled, child.arcs)
-        around = areas_around(hybrid_map, child.area, self._branching.search.nearness)
+        self._replica.apply_changes(hybrid_map, child.moved_keyframes, child.arcs)
+        around = areas_around(hybrid_map, child.area, self._branching.search.submap_radius)
         local = {area: belief.mean for area, belief in around.items() if area != child.area}
         named = {child.area: len(topology.path), **topology.named}
-        robot = topology.robot.entered(child.area, child.rebase, len(child.relabelled), self._noise)
+        robot = topology.robot.entered(child.area, child.frame_change, len(child.moved_keyframes), self._noise)
         path = (*topology.path, named[child.area])
-        return _Topology(path, named, hybrid_map, replace(child.notes, local=local), robot, child.log_weight)
+        return _Topology(path, named, hybrid_map, replace(child.state, local_area_poses=local), robot, child.log_weight)
 
     def _normalised(self, topologies: Sequence[_Topology]) -> list[_Topology]:
         total = float(np.logaddexp.reduce([topology.log_weight for topology in topologies]))

@@ -28,13 +28,13 @@ from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration import Configuration, load_configuration
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.exploration.explorer import Explorer
-from hmt_slam_ros.exploration.rooms import rooms
+from hmt_slam_ros.exploration.rooms import named_destinations
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.logs.stamps import NANOSECONDS
-from hmt_slam_ros.messages.tasks import Errand
+from hmt_slam_ros.messages.tasks import Task
 from hmt_slam_ros.ros import topics
-from hmt_slam_ros.ros.conversions import planar_pose, stamp_of
-from hmt_slam_ros.ros.topics import DIAGNOSTICS, ERRANDS, GROUND_TRUTH, INITIAL_POSE, OUTCOMES
+from hmt_slam_ros.ros.conversions import pose_from_message, stamp_from_time
+from hmt_slam_ros.ros.topics import DIAGNOSTICS, GROUND_TRUTH, INITIAL_POSE, TASK_GOALS, TASK_RESULTS
 from hmt_slam_ros.simulation import open_simulated
 from hmt_slam_ros.simulation.driven_robot import DrivenRobot
 from hmt_slam_ros.simulation.scenario import START
@@ -121,7 +121,7 @@ def explored(seed: int, configuration: Configuration, out: Path) -> Explored:
     :raises HmtSlamError: where it comes to no end.
     """
     run = DrivenRun(DrivenRobot(scenario_of(seed)), configuration, Explorer(configuration))
-    if run.do(Errand("explore"), _EXPLORATION) is None:
+    if run.do(Task("explore"), _EXPLORATION) is None:
         raise HmtSlamError(f"the explorer came to no end in {_EXPLORATION:g} s: see python -m benchmark explore")
     folder = out / f"map{seed}"
     recording = run.save(folder, configuration)
@@ -130,8 +130,8 @@ def explored(seed: int, configuration: Configuration, out: Path) -> Explored:
     )
     frames = {area: (pose.mean, institute.frames[area]) for area, pose in recording.area_poses.items()}
     places = {
-        name: (room.opening.area, se2.transform(frames[room.opening.area][1], room.place[None])[0])
-        for name, room in rooms(known_of(institute, configuration)).items()
+        name: (room.opening.area, se2.transform(frames[room.opening.area][1], room.position[None])[0])
+        for name, room in named_destinations(known_of(institute, configuration)).items()
     }
     return Explored(seed, folder, frames, places)
 
@@ -256,12 +256,12 @@ class Errands:
         self._contacts, self._reports = 0, 0
         node = listener.node
         node.create_subscription(
-            String, OUTCOMES["pilot"], lambda message: self._outcomes.append(message.data), topics.LATCHED
+            String, TASK_RESULTS["pilot"], lambda message: self._outcomes.append(message.data), topics.LATCHED
         )
         node.create_subscription(PoseStamped, GROUND_TRUTH, self._hear_truth, topics.STREAM)
         node.create_subscription(PoseWithCovarianceStamped, INITIAL_POSE, self._hear_start, topics.STREAM)
         node.create_subscription(DiagnosticArray, DIAGNOSTICS, self._hear_diagnostics, topics.STREAM)
-        self._errands = node.create_publisher(String, ERRANDS["pilot"], topics.STREAM)
+        self._errands = node.create_publisher(String, TASK_GOALS["pilot"], topics.STREAM)
         shared: Parameters = {"start_from": str(start.folder), "mode": "localization"}
         for name in (*PROCESSES, "pilot"):
             stack.enter_context(listener.running(name, shared))
@@ -296,13 +296,13 @@ class Errands:
         return Ran(self._outcomes[-1], path, seconds, self._contacts - contacts, told)
 
     def _hear_truth(self, message: PoseStamped) -> None:
-        self._truths[stamp_of(message.header.stamp)] = planar_pose(message.pose)
+        self._truths[stamp_from_time(message.header.stamp)] = pose_from_message(message.pose)
 
     def _hear_start(self, message: PoseWithCovarianceStamped) -> None:
-        self._starts.append((stamp_of(message.header.stamp), planar_pose(message.pose.pose)))
+        self._starts.append((stamp_from_time(message.header.stamp), pose_from_message(message.pose.pose)))
 
     def _hear_diagnostics(self, message: DiagnosticArray) -> None:
-        for status in message.status:
+        for status in message.robot_status:
             if status.name == "/robot":
                 self._reports += 1
                 # There are none before it drives.

@@ -139,7 +139,7 @@ def closure_errors(saved: SavedMap, truth: Mapping[int, NDArray[np.float64]]) ->
 
     :param truth: {running stamp of a scan, ns: ``map_T_base`` (3,)}, of all scans of the log, in any one frame.
     """
-    arcs = saved.replica.maps[saved.replica.best].all_arcs()
+    arcs = saved.replica.maps[saved.replica.best_hypothesis].all_arcs()
     return [_error(saved, a, b, arc, truth) for a, b, arc in arcs if arc.closure]
 
 
@@ -156,6 +156,6 @@ def _keyframes(
     saved: SavedMap, area: int, truth: Mapping[int, NDArray[np.float64]]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Poses (n, 3) of an area's keyframes in the area, and in truth."""
-    keyframes = saved.replica.maps[saved.replica.best].keyframes(area)
+    keyframes = saved.replica.maps[saved.replica.best_hypothesis].keyframes(area)
     poses = np.array(list(keyframes.values())).reshape(-1, 3)
     return poses, np.array([truth[saved.replica.scans[keyframe].stamp] for keyframe in keyframes]).reshape(-1, 3)

@@ -32,7 +32,7 @@ from hmt_slam_ros.metric_slam.slam import MetricSlam
 from hmt_slam_ros.offline.runtime import LockStep
 from hmt_slam_ros.real_time_localization.rtl import Rtl
 from hmt_slam_ros.sensors import Odometry
-from hmt_slam_ros.topological_inference.branching import FEWEST, Branching
+from hmt_slam_ros.topological_inference.branching import MIN_EXAMINED_AREAS, Branching
 from hmt_slam_ros.topological_inference.tsbi import Tsbi
 
 SMALL = (Lattice(5, 2), Lattice(10, 10), Lattice(50, 20))
@@ -150,7 +150,7 @@ def _cut_row(name: str, cuts: Sequence[Cut]) -> list[str]:
 def _bound(configuration: Configuration, cuts: Sequence[Cut]) -> str:
     """How long a cut can take."""
     options = configuration.tsbi
-    most = options.max_comparisons + FEWEST * options.max_hypotheses
+    most = options.max_comparisons + MIN_EXAMINED_AREAS * options.max_hypotheses
     each = max(cut.ms / cut.compared for cut in cuts if cut.compared)
     return (
         f"At a cut at most {most} areas are compared, under at most {options.max_hypotheses} hypotheses of "
@@ -214,7 +214,7 @@ class _TimedTsbi:
         return WatchedBranching(configuration, replica, self._count)
 
     def _count(self, examination: Examination) -> None:
-        self._compared += len(examination.found.examined)
+        self._compared += len(examination.found.examined_areas)
 
     def handle(self, message: Message) -> list[Message]:
         """As TSBI does."""
@@ -264,11 +264,11 @@ class _Robot:
             step, here = se2.compose(se2.between(here, stop.pose), error), stop.pose
             self._timed.take()
             said = self._script.keyframe(step, stop.scan, len(OFFSETS) if stop.last else 0)
-            if len(said.leaves) == 1 or stop.pose[1] > SPACING:
-                best = max(said.leaves, key=lambda leaf: leaf.probability)
-                self._script.accept(best.hypothesis, self._poses)
+            if len(said.hypotheses) == 1 or stop.pose[1] > SPACING:
+                best = max(said.hypotheses, key=lambda leaf: leaf.probability)
+                self._script.accept(best.id, self._poses)
             if stop.last:
-                cuts.append(Cut(*self._timed.take(), len(said.leaves), said.unexamined))
+                cuts.append(Cut(*self._timed.take(), len(said.hypotheses), said.unexamined))
         return cuts
 
 

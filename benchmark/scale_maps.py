@@ -14,20 +14,20 @@ import numpy as np
 
 from benchmark.lattice import ARC, FIRST_KEYFRAME, PER_AREA, Lattice, scan_at, shared_scan
 from hmt_slam_ros.area_abstraction.overlap_graph import OverlapGraph
-from hmt_slam_ros.area_abstraction.partition import WatchState
+from hmt_slam_ros.area_abstraction.partition import PartitionState
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.loop_closure.closure_history import Step
-from hmt_slam_ros.loop_closure.closure_revision import Past
-from hmt_slam_ros.messages.messages import LocalEstimate, Trail
+from hmt_slam_ros.loop_closure.closure_history import PathStep
+from hmt_slam_ros.loop_closure.closure_revision import PathHistory
+from hmt_slam_ros.messages.messages import LocalEstimate, ScanPoses
 from hmt_slam_ros.messages.replica import FIRST_HYPOTHESIS, Replica
 from hmt_slam_ros.metric_slam.live_hypothesis import KeyframeCovariances
-from hmt_slam_ros.offline.runtime import Run
+from hmt_slam_ros.offline.runtime import LockStepRun
 from hmt_slam_ros.open_log import open_log
 from hmt_slam_ros.results.hmt_map import MapWriter, RunState, read_run_state, read_saved_map
-from hmt_slam_ros.results.log_reading import LogState
-from hmt_slam_ros.results.record import EstimateTable, ProbabilityTable, TopologyProbability, TrailTable
-from hmt_slam_ros.saved_map.folder import put_in_place
+from hmt_slam_ros.results.log_reading import LogProgress
+from hmt_slam_ros.results.record import EstimateTable, ProbabilityTable, ScanPoseTable, TopologyProbability
+from hmt_slam_ros.saved_map.folder import replace_folder
 from hmt_slam_ros.sensors import Scan
 
 BEAMS = 181
@@ -38,7 +38,7 @@ SCANS_PER_KEYFRAME = 10
 
 _PERIOD = 100_000_000  # ns
 _DRIVE, _SECONDS = "sim:office", 20.0
-_ROBOT = LocalEstimate(0, 0, 0, PoseGaussian.exactly(np.zeros(3)), np.zeros(3), 0)
+_ROBOT = LocalEstimate(0, 0, 0, PoseGaussian.from_pose(np.zeros(3)), np.zeros(3), 0)
 _AREAS_OF_SCANS = 100
 Made = TypeVar("Made")
 
@@ -72,18 +72,20 @@ def lasting(lattice: Lattice, configuration: Configuration) -> Lasting:
 
 
 def _saved_and_loaded(lattice: Lattice, configuration: Configuration) -> Lasting:
-    run = Run(configuration, state=state_of(lattice, configuration))
+    run = LockStepRun(configuration, state=state_of(lattice, configuration))
     with tempfile.TemporaryDirectory() as folder:
         scratch, directory = Path(folder) / "new", Path(folder) / "hmt_map"
         begin = time.perf_counter()
         state = run.state
         writer = MapWriter(scratch)
         writer.write_state(state)
-        writer.write_map(Replica.of(state.tlca.replica), {entry.area: entry.pose for entry in lattice.poses()}, _ROBOT)
+        writer.write_map(
+            Replica.from_state(state.tlca.replica), {entry.area: entry.pose for entry in lattice.poses()}, _ROBOT
+        )
         writer.finish(configuration)
-        put_in_place(scratch, directory)
+        replace_folder(scratch, directory)
         written = time.perf_counter()
-        Run(configuration, state=read_run_state(directory)[0])
+        LockStepRun(configuration, state=read_run_state(directory)[0])
         loaded = time.perf_counter()
         read_saved_map(directory)
         looked = time.perf_counter()
@@ -102,31 +104,33 @@ def state_of(lattice: Lattice, configuration: Configuration) -> RunState:
     scans = {k: _own(shared_scan((k - FIRST_KEYFRAME) % 2 * 1.6, 0), k) for k in keyframes}
     maps, one = {FIRST_HYPOTHESIS: hybrid_map}, {FIRST_HYPOTHESIS: 1.0}
     replica = Replica(scans, maps, one, {FIRST_HYPOTHESIS: 0}).state
-    placed = KeyframeCovariances.of(dict.fromkeys(keyframes, ARC))
-    live = {hypothesis: replace(own, placed=placed) for hypothesis, own in driven.slam.live.items()}
+    placed = KeyframeCovariances.from_dict(dict.fromkeys(keyframes, ARC))
+    live = {
+        hypothesis: replace(own, keyframe_covariances=placed) for hypothesis, own in driven.slam.live_hypotheses.items()
+    }
     graph = OverlapGraph(tuple(range(PER_AREA)), np.full((PER_AREA, PER_AREA), 0.5))
     graphs = tuple(replace(graph, keyframes=tuple(hybrid_map.keyframes(a))) for a in hybrid_map.area_ids())
-    watch = WatchState(0, {area: area for area in hybrid_map.area_ids()}, frozenset(keyframes[:PER_AREA]))
+    watch = PartitionState(0, {area: area for area in hybrid_map.area_ids()}, frozenset(keyframes[:PER_AREA]))
     path = driven.tlca.paths[FIRST_HYPOTHESIS]
     arcs = [(a, b) for a, b, _ in hybrid_map.all_arcs()]
-    steps = tuple(Step(k, a, b, ((a, b),), frozenset({k})) for k, (a, b) in enumerate(arcs))
-    path = replace(path, witnesses={pair: frozenset(pair) for pair in arcs}, past=Past(steps, ()))
+    steps = tuple(PathStep(k, a, b, ((a, b),), frozenset({k})) for k, (a, b) in enumerate(arcs))
+    path = replace(path, arc_keyframes={pair: frozenset(pair) for pair in arcs}, history=PathHistory(steps, ()))
     return RunState(
         _log_state(keyframes),
-        replace(driven.slam, replica=replica, live=live, events=len(keyframes)),
-        replace(driven.aam, replica=replica, graphs=graphs, watches={FIRST_HYPOTHESIS: watch}),
+        replace(driven.slam, replica=replica, live_hypotheses=live, keyframe_events=len(keyframes)),
+        replace(driven.aam, replica=replica, graphs=graphs, partitions={FIRST_HYPOTHESIS: watch}),
         replace(driven.tsbi, replica=replica, global_poses=lattice.poses()),
         replace(driven.tlca, replica=replica, paths={FIRST_HYPOTHESIS: path}),
-        replace(driven.rtl, areas=lattice.poses()),
+        replace(driven.rtl, area_poses=lattice.poses()),
         replace(driven.recorder, replica=replica, **_recorded(keyframes)),
     )
 
 
 def _driven(configuration: Configuration) -> RunState:
     """The state after the first seconds of a simulated drive."""
-    run = Run(configuration)
+    run = LockStepRun(configuration)
     for record in open_log(_DRIVE, duration=_SECONDS).records():
-        run.read(record)
+        run.process_record(record)
     return run.state
 
 
@@ -140,10 +144,10 @@ def _stamp(keyframe: int) -> int:
     return (keyframe - FIRST_KEYFRAME) * SCANS_PER_KEYFRAME * _PERIOD
 
 
-def _log_state(keyframes: Sequence[int]) -> LogState:
+def _log_state(keyframes: Sequence[int]) -> LogProgress:
     """A log with a reading of the odometry to each scan."""
     stamps = _stamp(keyframes[0]) + _PERIOD * np.arange(len(keyframes) * SCANS_PER_KEYFRAME)
-    return LogState(2 * stamps.size, stamps, stamps)
+    return LogProgress(2 * stamps.size, stamps, stamps)
 
 
 def _recorded(keyframes: Sequence[int]) -> dict[str, Any]:
@@ -157,9 +161,9 @@ def _recorded(keyframes: Sequence[int]) -> dict[str, Any]:
     ]
     return {
         "events": len(keyframes),
-        "probabilities": ProbabilityTable.of(rows),
-        "trails": TrailTable.of(
-            Trail(FIRST_HYPOTHESIS, int(own[0]), moments, np.full(own.size, keyframe), np.zeros((own.size, 3)))
+        "probabilities": ProbabilityTable.from_rows(rows),
+        "trails": ScanPoseTable.from_messages(
+            ScanPoses(FIRST_HYPOTHESIS, int(own[0]), moments, np.full(own.size, keyframe), np.zeros((own.size, 3)))
             for own, moments, keyframe in each
         ),
         "estimates": EstimateTable(scans, stamps, np.zeros_like(scans), poses, poses),

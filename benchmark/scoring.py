@@ -118,7 +118,7 @@ def over_seeds(scores: Sequence[RelationErrors]) -> SeedMeans:
         long_max=float(np.max([score.over_60_s.translation.max for score in scores])),
         rotation=float(np.mean([score.overall.rotation.mean for score in scores])),
         matched=sum(s.overall.matched for s in scores) / sum(s.overall.count for s in scores),
-        carried=max(score.overall.carried for score in scores),
+        carried=max(score.overall.extrapolated for score in scores),
         missed=max(score.overall.missed for score in scores),
     )
 

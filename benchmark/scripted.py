@@ -16,13 +16,13 @@ from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.messages.map_changes import AreaPose
 from hmt_slam_ros.messages.messages import (
-    Accepted,
     AreaEvent,
     AreaEvents,
+    ClosureDecision,
     Hypotheses,
+    Hypothesis,
+    HypothesisEstimate,
     Keyframe,
-    Leaf,
-    LeafEstimate,
     Message,
 )
 from hmt_slam_ros.messages.replica import FIRST_AREA, FIRST_HYPOTHESIS
@@ -77,7 +77,7 @@ class Script:
         self._noise = noise
         self.sequence = -1
         self.robots = {FIRST_HYPOTHESIS: Robot()}
-        self.hypotheses = Hypotheses(self.sequence, (Leaf(FIRST_HYPOTHESIS, FIRST_HYPOTHESIS, 1.0, FIRST_AREA),))
+        self.hypotheses = Hypotheses(self.sequence, (Hypothesis(FIRST_HYPOTHESIS, FIRST_HYPOTHESIS, 1.0, FIRST_AREA),))
 
     def keyframe(self, step: Float64, scan: Scan, cut: int = 0) -> Hypotheses:
         """One keyframe event.
@@ -98,13 +98,13 @@ class Script:
 
     def accept(self, hypothesis: int, global_poses: tuple[AreaPose, ...] = ()) -> None:
         """Make a hypothesis definite."""
-        self._tell(Accepted(self.sequence, hypothesis, global_poses=global_poses))
+        self._tell(ClosureDecision(self.sequence, hypothesis, global_poses=global_poses))
         self.robots = {hypothesis: self.robots[hypothesis]}
 
     def _event(self, scan: Scan, events: Sequence[AreaEvent], *, stored: bool = True) -> Hypotheses:
         self.sequence += 1
         leaves = tuple(
-            LeafEstimate(hypothesis, robot.area, robot.pose, stored, 0.0, 0.0, Clutter(), 1.0)
+            HypothesisEstimate(hypothesis, robot.area, robot.pose, stored, 0.0, 0.0, Clutter(), 1.0)
             for hypothesis, robot in sorted(self.robots.items())
         )
         self._tell(Keyframe(self.sequence, scan, 0.0, leaves))
@@ -112,8 +112,8 @@ class Script:
         assert isinstance(answer, Hypotheses)
         before = self.robots
         self.robots = {
-            leaf.hypothesis: before[leaf.parent].entered(leaf.area, leaf.rebase, len(leaf.relabelled), self._noise)
-            for leaf in answer.leaves
+            leaf.id: before[leaf.parent].entered(leaf.area, leaf.frame_change, len(leaf.moved_keyframes), self._noise)
+            for leaf in answer.hypotheses
         }
         self.hypotheses = answer
         return answer

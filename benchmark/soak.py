@@ -21,13 +21,13 @@ from std_msgs.msg import String
 
 from benchmark.report import Report, Requirement, table
 from benchmark.settings import Settings
-from hmt_slam_ros.logs.records import SIMULATED
+from hmt_slam_ros.logs.records import SIMULATION_PREFIX
 from hmt_slam_ros.messages.documents import RobotStatus, decode
 from hmt_slam_ros.open_log import open_log
 from hmt_slam_ros.ros import topics
 from hmt_slam_ros.ros.domain import own_domain
-from hmt_slam_ros.ros.execution import await_departures
-from hmt_slam_ros.ros.replay import PROCESSES, Children
+from hmt_slam_ros.ros.execution import wait_until_alone
+from hmt_slam_ros.ros.replay import PROCESSES, NodeProcesses
 from hmt_slam_ros.ros.topics import DIAGNOSTICS, ROBOT_STATUS
 from hmt_slam_ros.ros.transforms import TFMessage
 from hmt_slam_ros.sensors import Scan
@@ -130,8 +130,8 @@ def soaked(minutes: float) -> Soak:
 
     :raises HmtSlamError: where one of them dies.
     """
-    lap = open_log(f"{SIMULATED}{WORLD},laps=1")
-    name = f"{SIMULATED}{WORLD},laps={math.ceil(60.0 * minutes * RATE / lap.duration) + 1}"
+    lap = open_log(f"{SIMULATION_PREFIX}{WORLD},laps=1")
+    name = f"{SIMULATION_PREFIX}{WORLD},laps={math.ceil(60.0 * minutes * RATE / lap.duration) + 1}"
     laser = next(r.measurement.laser_pose for r in lap.records() if isinstance(r.measurement, Scan)).tolist()
     found = Soak(resident={node: [] for node in (*PROCESSES, "robot")})
     with (
@@ -139,7 +139,7 @@ def soaked(minutes: float) -> Soak:
         own_domain() as domain,
         _listening(domain, found) as executor,
     ):
-        with Children(Path(scratch), (), print) as children:
+        with NodeProcesses(Path(scratch), (), print) as children:
             own = [] if TFMessage is not None else ["-p", f"laser_pose:={laser}"]
             environment = {**os.environ, "ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
             for node in PROCESSES:
@@ -153,12 +153,12 @@ def soaked(minutes: float) -> Soak:
     return found
 
 
-def _watch(executor: SingleThreadedExecutor, children: Children, found: Soak, seconds: float) -> None:
+def _watch(executor: SingleThreadedExecutor, children: NodeProcesses, found: Soak, seconds: float) -> None:
     """Look at the nodes until so much time is over since the first scan."""
     begin = next_look = None
     while begin is None or time.monotonic() < begin + seconds:
         executor.spin_once(timeout_sec=_SPIN)
-        children.check()
+        children.restart_killed()
         now = time.monotonic()
         if begin is None or next_look is None:
             begin = next_look = now if found.scans else None
@@ -217,7 +217,7 @@ def _listening(domain: int, found: Soak) -> Iterator[SingleThreadedExecutor]:
             found.scans, found.driven = status.acknowledged, 1e-9 * (status.stamp - begin)
 
     def hear_diagnostics(message: DiagnosticArray) -> None:
-        for status in message.status:
+        for status in message.robot_status:
             if status.level == DiagnosticStatus.ERROR:
                 found.errors[status.name] = status.message
             values = {entry.key: entry.value for entry in status.values}
@@ -231,7 +231,7 @@ def _listening(domain: int, found: Soak) -> Iterator[SingleThreadedExecutor]:
         stack.callback(context.try_shutdown)
         node = Node("soak", context=context)
         stack.callback(node.destroy_node)
-        stack.callback(await_departures, node, _DEPARTURES)
+        stack.callback(wait_until_alone, node, _DEPARTURES)
         executor = SingleThreadedExecutor(context=context)
         stack.callback(executor.shutdown)
         executor.add_node(node)

@@ -34,9 +34,9 @@ from hmt_slam_ros.evaluation import (
     Relations,
     StampedPoses,
     evaluate_relations,
+    read_true_poses,
     read_tum,
     true_relations,
-    truth_of,
 )
 from hmt_slam_ros.simulation import open_simulated
 
@@ -310,7 +310,7 @@ def reference_of(log: MeasuredLog, run: Run) -> tuple[Relations, str]:
     :param run: of the program as it is, by which the others are judged where nothing else is known.
     """
     if log.name == CAMPUS:
-        return true_relations(truth_of(open_simulated(CAMPUS_WORLD))), "truth"
+        return true_relations(read_true_poses(open_simulated(CAMPUS_WORLD))), "truth"
     if log.relations is not None:
         return log.relations, "relations"
     file = datasets() / _GMAPPING

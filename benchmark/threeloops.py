@@ -23,9 +23,9 @@ from hmt_slam_ros.configuration import Configuration, load_configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.messages.replica import Replica
-from hmt_slam_ros.places.area_views import AreaViews
+from hmt_slam_ros.places.area_views import AreaViewCache
 from hmt_slam_ros.places.landmark_evidence import PlaceEvidence
-from hmt_slam_ros.places.loop_proposals import LoopProposals, MapLoop
+from hmt_slam_ros.places.loop_proposals import AreaLoop, LoopProposer
 from hmt_slam_ros.simulation import open_simulated
 from hmt_slam_ros.topological_inference.branching import Branching
 
@@ -56,7 +56,7 @@ POLICY = (
 )
 
 
-Heard = Callable[[HybridMap, MapLoop | None, float], None]
+Heard = Callable[[HybridMap, AreaLoop | None, float], None]
 
 
 class Proposal(NamedTuple):
@@ -117,17 +117,17 @@ class Drive(NamedTuple):
         return [way for way in ways if way is not None]
 
 
-class _Listening(LoopProposals):
+class _Listening(LoopProposer):
     """Proposes loops, and tells which."""
 
-    def __init__(self, configuration: Configuration, views: AreaViews, heard: Heard) -> None:
+    def __init__(self, configuration: Configuration, views: AreaViewCache, heard: Heard) -> None:
         super().__init__(configuration, views)
         self._heard = heard
 
-    def proposed(self, hybrid_map: HybridMap) -> MapLoop | None:
+    def propose(self, hybrid_map: HybridMap) -> AreaLoop | None:
         """As always."""
         begin = time.process_time()
-        found = super().proposed(hybrid_map)
+        found = super().propose(hybrid_map)
         self._heard(hybrid_map, found, time.process_time() - begin)
         return found
 
@@ -147,10 +147,10 @@ class _Watch(Watch):
             evidence.loops = _Listening(configuration, evidence.views, self._proposed)
         return branching
 
-    def _proposed(self, hybrid_map: HybridMap, loop: MapLoop | None, seconds: float) -> None:
+    def _proposed(self, hybrid_map: HybridMap, loop: AreaLoop | None, seconds: float) -> None:
         error = None
         if loop is not None:
-            frames = (self.truth.frame(hybrid_map, area) for area in (loop.area, loop.other))
+            frames = (self.truth.frame(hybrid_map, area) for area in (loop.area, loop.other_area))
             off = se2.between(loop.pose.mean, se2.between(*frames))
             error = float(np.hypot(off[0], off[1])), float(np.degrees(abs(off[2])))
         self.proposals.append(Proposal(max(self.travelled.values()), error, seconds))

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from numba.core.caching import Cache
 
-_told: list[Callable[[str], None]] = []
+_reporters: list[Callable[[str], None]] = []
 
 
-def tell_of_compilation(say: Callable[[str], None]) -> None:
+def report_compilation(say: Callable[[str], None]) -> None:
     """See to it that ``say`` is called when the first kernel has to be compiled, as its cache has nothing of it.
 
     And when it cannot be kept, for which numba would end the program: where a disk is full, a node has to go on.
@@ -20,9 +20,9 @@ def tell_of_compilation(say: Callable[[str], None]) -> None:
     A program that has not loaded numba by then has no kernels, and will not load it for this. The first to ask is the
     only one to be told: a node asks as often as it is configured.
     """
-    if "numba" not in sys.modules or _told:
+    if "numba" not in sys.modules or _reporters:
         return
-    _told.append(say)
+    _reporters.append(say)
     from numba.core import event  # noqa: PLC0415  see above
     from numba.core.caching import Cache  # noqa: PLC0415
 
@@ -39,10 +39,10 @@ def tell_of_compilation(say: Callable[[str], None]) -> None:
 
     # Heard only where no cache helps.
     event.register("numba:compile", FirstCompilation())
-    Cache.save_overload = _kept_if_possible(Cache.save_overload, say)
+    Cache.save_overload = _tolerate_unwritable_cache(Cache.save_overload, say)
 
 
-def _kept_if_possible(keep: Callable[..., None], say: Callable[[str], None]) -> Callable[..., None]:
+def _tolerate_unwritable_cache(keep: Callable[..., None], say: Callable[[str], None]) -> Callable[..., None]:
     """How numba keeps a kernel, but that it goes on without where there is no room; said once."""
     told = False
 

@@ -8,9 +8,9 @@ import zlib
 from pathlib import Path
 
 from hmt_slam_ros.errors import HmtSlamError
-from hmt_slam_ros.logs.carmen import looks_like_carmen, open_carmen
-from hmt_slam_ros.logs.rawlog import looks_like_rawlog, open_rawlog
-from hmt_slam_ros.logs.records import SIMULATED, Log, Window
+from hmt_slam_ros.logs.carmen import is_carmen, open_carmen
+from hmt_slam_ros.logs.rawlog import is_rawlog, open_rawlog
+from hmt_slam_ros.logs.records import SIMULATION_PREFIX, Log, TimeWindow
 
 _MCAP, _SQLITE, _GZIP, _XZ = b"\x89MCAP0\r\n", b"SQLite format 3\x00", b"\x1f\x8b", b"\xfd7zXZ\x00"
 
@@ -33,7 +33,7 @@ def open_log(
     :raises HmtSlamError: one sentence where there is no such file, it is of no known format, truncated, damaged,
         or lacks what is asked for.
     """
-    window = Window(start, duration)
+    window = TimeWindow(start, duration)
     if is_simulated(path):
         # The simulation makes logs, so it imports this package; and its kernels are for those who simulate.
         from hmt_slam_ros.simulation.simulated_log import open_simulated  # noqa: PLC0415
@@ -43,10 +43,10 @@ def open_log(
     try:
         if path.is_dir():
             return _open_bag(_bag_folder(path), window, scan_topic, odom_topic)
-        head = _head(path)
+        head = _read_head(path)
         for magic, suffix in ((_MCAP, ".mcap"), (_SQLITE, ".db3")):
             if head.startswith(magic):
-                return _open_bag(_with_suffix(path, suffix), window, scan_topic, odom_topic)
+                return _open_bag(_check_suffix(path, suffix), window, scan_topic, odom_topic)
     except OSError as error:
         raise HmtSlamError(f"{path} cannot be read ({error.strerror}): give an existing log.") from error
     return _open_file(path, head, window)
@@ -54,31 +54,31 @@ def open_log(
 
 def is_simulated(path: str | Path) -> bool:
     """Whether a log is made while it is read, and no file."""
-    return str(path).startswith(SIMULATED)
+    return str(path).startswith(SIMULATION_PREFIX)
 
 
 def is_bag(path: str | Path) -> bool:
     """Whether a log that `open_log` took is a rosbag2."""
     path = Path(path)
-    return not is_simulated(path) and (path.is_dir() or _head(path).startswith((_MCAP, _SQLITE)))
+    return not is_simulated(path) and (path.is_dir() or _read_head(path).startswith((_MCAP, _SQLITE)))
 
 
-def _open_bag(path: Path, window: Window, scan_topic: str, odom_topic: str) -> Log:
+def _open_bag(path: Path, window: TimeWindow, scan_topic: str, odom_topic: str) -> Log:
     # Its library takes memory that the other formats need not pay for.
     from hmt_slam_ros.logs.bag import BagLog  # noqa: PLC0415
 
     return BagLog(path, window, scan_topic, odom_topic)
 
 
-def _open_file(path: Path, head: bytes, window: Window) -> Log:
-    content = _plain(path, head)
-    if looks_like_rawlog(content):
+def _open_file(path: Path, head: bytes, window: TimeWindow) -> Log:
+    content = _decompress(path, head)
+    if is_rawlog(content):
         return open_rawlog(path, content, window)
-    if looks_like_carmen(content):
+    if is_carmen(content):
         return open_carmen(path, content, window)
     raise HmtSlamError(
         f"{path} is of no known format: give a rosbag2 folder, a .mcap or .db3 file, a CARMEN log, an MRPT rawlog, or "
-        f"{SIMULATED}WORLD for a simulated drive."
+        f"{SIMULATION_PREFIX}WORLD for a simulated drive."
     )
 
 
@@ -88,7 +88,7 @@ def _bag_folder(path: Path) -> Path:
     return path
 
 
-def _head(path: Path) -> bytes:
+def _read_head(path: Path) -> bytes:
     with path.open("rb") as file:
         head = file.read(16)
     if not head:
@@ -96,13 +96,13 @@ def _head(path: Path) -> bytes:
     return head
 
 
-def _with_suffix(path: Path, suffix: str) -> Path:
+def _check_suffix(path: Path, suffix: str) -> Path:
     if path.suffix != suffix:
         raise HmtSlamError(f"{path} holds a bag's data under another suffix: rename it to {path.stem}{suffix}.")
     return path
 
 
-def _plain(path: Path, head: bytes) -> bytes:
+def _decompress(path: Path, head: bytes) -> bytes:
     """The file's content, decompressed."""
     content = path.read_bytes()
     try:

@@ -22,11 +22,11 @@ Reader = Callable[[object, str], object]
 """Turns parsed plain data, found at a path in a document, into a value, or refuses it."""
 
 
-ReaderOf = Callable[[str, Hashable], Reader]
+ReaderFactory = Callable[[str, Hashable], Reader]
 """Makes a reader for a field of some name and annotation."""
 
 
-def plain(value: object, forms: Mapping[type, Callable[[Any], object]]) -> Any:  # noqa: ANN401  what JSON can hold
+def to_plain(value: object, forms: Mapping[type, Callable[[Any], object]]) -> Any:  # noqa: ANN401  what JSON can hold
     """A value as plain data.
 
     :param forms: {type: what makes plain data of its values}, of types that are no dataclasses, tuples and so on, such
@@ -38,27 +38,27 @@ def plain(value: object, forms: Mapping[type, Callable[[Any], object]]) -> Any: 
     if form is not None:
         return form(value)
     if is_record(type(value)):
-        return {name: plain(getattr(value, name), forms) for name in names_in(cast(Any, type(value)))}
+        return {name: to_plain(getattr(value, name), forms) for name in field_names(cast(Any, type(value)))}
     if isinstance(value, tuple | Set):
-        return [plain(item, forms) for item in (sorted(value) if isinstance(value, Set) else value)]
+        return [to_plain(item, forms) for item in (sorted(value) if isinstance(value, Set) else value)]
     if isinstance(value, Mapping):
-        return [[plain(key, forms), plain(item, forms)] for key, item in value.items()]
+        return [[to_plain(key, forms), to_plain(item, forms)] for key, item in value.items()]
     return value.item() if isinstance(value, np.generic) else value
 
 
-class Values:
+class PlainDataReader:
     """Turns plain data back into values.
 
-    :ivar described: where the form of the documents is described, for the advice in a complaint.
+    :ivar format_reference: where the form of the documents is described, for the advice in a complaint.
     """
 
-    def __init__(self, described: str, forms: Mapping[type, ReaderOf]) -> None:
+    def __init__(self, described: str, forms: Mapping[type, ReaderFactory]) -> None:
         """:param forms: {type: what makes a reader of its values}, of types that are no dataclasses and so on."""
-        self.described = described
+        self.format_reference = described
         self._forms = forms
         self._readers: dict[tuple[str, Hashable], Reader] = {}
 
-    def value(self, content: object, kind: type[Value], path: str) -> Value:
+    def read(self, content: object, kind: type[Value], path: str) -> Value:
         """The value that plain data stands for.
 
         :param kind: its type.
@@ -84,30 +84,34 @@ class Values:
             return self._object(cast(type, kind))
         if origin in (Union, types.UnionType):
             return self._optional(self._reader(field, arguments[0]))
-        return self._word(arguments) if origin is Literal else self._collection(origin, arguments)
+        return self._literal(arguments) if origin is Literal else self._collection(origin, arguments)
 
     def _collection(self, origin: object, arguments: tuple[Any, ...]) -> Reader:
         if origin is tuple and len(arguments) == 2 and arguments[1] is Ellipsis:
             return self._list(self._reader("", arguments[0]), tuple)
         if origin is tuple:
-            return self._row([self._reader("", argument) for argument in arguments])
+            return self._fixed_tuple([self._reader("", argument) for argument in arguments])
         if origin is frozenset:
             return self._list(self._reader("", arguments[0]), frozenset)
         if isinstance(origin, type) and issubclass(origin, Mapping):
-            return self._pairs(*(self._reader("", argument) for argument in arguments))
+            return self._mapping(*(self._reader("", argument) for argument in arguments))
         raise TypeError(f"a document cannot hold a {origin}[{arguments}]")
 
     def _object(self, kind: type) -> Reader:
         hints = get_type_hints(kind)
-        readers = {name: self._reader(name, hints[name]) for name in names_in(kind)}
+        readers = {name: self._reader(name, hints[name]) for name in field_names(kind)}
 
         def read(content: object, path: str) -> object:
             if not isinstance(content, dict):
-                raise self.fault(path, content, "an object")
+                raise self.error_at(path, content, "an object")
             for name in readers.keys() - content.keys():
-                raise HmtSlamError(f"{path}.{name} is missing: see {self.described} for the form of the document")
+                raise HmtSlamError(
+                    f"{path}.{name} is missing: see {self.format_reference} for the form of the document"
+                )
             for name in content.keys() - readers.keys():
-                raise HmtSlamError(f"{path}.{name} is unknown: see {self.described} for the form of the document")
+                raise HmtSlamError(
+                    f"{path}.{name} is unknown: see {self.format_reference} for the form of the document"
+                )
             return kind(**{name: reader(content[name], f"{path}.{name}") for name, reader in readers.items()})
 
         return read
@@ -115,26 +119,26 @@ class Values:
     def _list(self, item: Reader, made: Callable[..., object]) -> Reader:
         def read(content: object, path: str) -> object:
             if not isinstance(content, list):
-                raise self.fault(path, content, "a list")
+                raise self.error_at(path, content, "a list")
             return made(item(entry, f"{path}[{k}]") for k, entry in enumerate(content))
 
         return read
 
-    def _row(self, items: list[Reader]) -> Reader:
+    def _fixed_tuple(self, items: list[Reader]) -> Reader:
         def read(content: object, path: str) -> tuple[object, ...]:
             if not isinstance(content, list) or len(content) != len(items):
-                raise self.fault(path, content, f"a list of {len(items)}")
+                raise self.error_at(path, content, f"a list of {len(items)}")
             return tuple(item(content[k], f"{path}[{k}]") for k, item in enumerate(items))
 
         return read
 
-    def _pairs(self, key: Reader, item: Reader) -> Reader:
-        pairs = self._list(self._row([key, item]), dict)
+    def _mapping(self, key: Reader, item: Reader) -> Reader:
+        pairs = self._list(self._fixed_tuple([key, item]), dict)
 
         def read(content: object, path: str) -> object:
             found = pairs(content, path)
             if len(cast(dict[Any, Any], found)) < len(cast(list[Any], content)):
-                raise self.fault(path, content, "a list of pairs with different keys")
+                raise self.error_at(path, content, "a list of pairs with different keys")
             return found
 
         return read
@@ -142,10 +146,10 @@ class Values:
     def _optional(self, some: Reader) -> Reader:
         return lambda content, path: None if content is None else some(content, path)
 
-    def _word(self, words: tuple[str, ...]) -> Reader:
+    def _literal(self, words: tuple[str, ...]) -> Reader:
         def read(content: object, path: str) -> object:
             if content not in words:
-                raise self.fault(path, content, " or ".join(words))
+                raise self.error_at(path, content, " or ".join(words))
             return content
 
         return read
@@ -153,20 +157,20 @@ class Values:
     def _scalar(self, kind: type, name: str) -> Reader:
         def read(content: object, path: str) -> object:
             if type(content) is not kind:
-                raise self.fault(path, content, name)
+                raise self.error_at(path, content, name)
             return content
 
         return read
 
     def _number(self, content: object, path: str) -> float:
         if not isinstance(content, int | float) or isinstance(content, bool) or not math.isfinite(content):
-            raise self.fault(path, content, _SCALARS[float][1])
+            raise self.error_at(path, content, _SCALARS[float][1])
         return float(content)
 
-    def fault(self, path: str, content: object, wanted: str) -> HmtSlamError:
+    def error_at(self, path: str, content: object, wanted: str) -> HmtSlamError:
         """The complaint about what was found at a path."""
         return HmtSlamError(
-            f"{path} = {str(content)[:60]} is not {wanted}: see {self.described} for the document's form"
+            f"{path} = {str(content)[:60]} is not {wanted}: see {self.format_reference} for the document's form"
         )
 
 
@@ -176,7 +180,7 @@ def is_record(kind: object) -> bool:
 
 
 @cache
-def names_in(kind: type) -> tuple[str, ...]:
+def field_names(kind: type) -> tuple[str, ...]:
     """The names of the fields of a dataclass or named tuple; one that is no argument is worked out anew."""
     return tuple(entry.name for entry in fields(kind) if entry.init) if is_dataclass(kind) else cast(Any, kind)._fields
 

@@ -7,10 +7,10 @@ import os
 import signal
 
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # <malloc.h>
-_LARGE, _SPARE = 1 << 18, 1 << 21  # bytes
+_MMAP_THRESHOLD, _TRIM_THRESHOLD = 1 << 18, 1 << 21  # bytes
 
 
-def settle() -> None:
+def apply_process_settings() -> None:
     """One thread for BLAS, and large arrays apart from small objects.
 
     The matrices here are small, so that several threads of BLAS would spend more time in waiting for each other than in
@@ -28,11 +28,11 @@ def settle() -> None:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
     if mallopt is not None:
-        mallopt(_M_MMAP_THRESHOLD, _LARGE)
-        mallopt(_M_TRIM_THRESHOLD, _SPARE)
+        mallopt(_M_MMAP_THRESHOLD, _MMAP_THRESHOLD)
+        mallopt(_M_TRIM_THRESHOLD, _TRIM_THRESHOLD)
 
 
-def end_when_told() -> None:
+def exit_on_signals() -> None:
     """Let SIGINT and SIGTERM end this process at once and as if all was well: for a node that is still being loaded."""
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: os._exit(0))

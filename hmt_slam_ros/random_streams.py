@@ -21,7 +21,7 @@ class Purpose(IntEnum):
     CHANGES = 106
 
 
-def stream(seed: int, purpose: Purpose, step: int) -> np.random.Generator:
+def random_stream(seed: int, purpose: Purpose, step: int) -> np.random.Generator:
     """The generator of one decision.
 
     All hypotheses draw the same numbers: where two have the same map and the same past they stay the same, and the

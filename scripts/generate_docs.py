@@ -7,11 +7,11 @@ from pathlib import Path
 from string import Template
 
 from hmt_slam_ros.configuration import Configuration, flat_parameters
-from hmt_slam_ros.configuration.documents import parameter_table, reference, ros_yaml
+from hmt_slam_ros.configuration.documents import parameter_reference, parameter_table, ros_yaml
 from hmt_slam_ros.results.hmt_map import PARTS, ChainState, MapDocument
-from hmt_slam_ros.results.log_reading import SHAPING
+from hmt_slam_ros.results.log_reading import FIXED_PARAMETERS
 from hmt_slam_ros.saved_map.folder import FORMAT, SCANS, VERSION
-from hmt_slam_ros.saved_map.reference import described
+from hmt_slam_ros.saved_map.reference import document_reference
 from hmt_slam_ros.saved_map.scans import ScanTable
 from hmt_slam_ros.simulation.families import FAMILIES
 from hmt_slam_ros.simulation.settings import Settings
@@ -22,7 +22,7 @@ ROOT = Path(__file__).resolve().parents[1]
 def simulation_settings(_configuration: Configuration) -> str:
     """docs/simulation_settings.md: every family of buildings, and every setting."""
     families = [
-        f"| `{name}` | {family.description} | {', '.join(f'`{key}={value}`' for key, value in family.own.items())} |"
+        f"| `{name}` | {family.description} | {', '.join(f'`{key}={value}`' for key, value in family.default_settings.items())} |"
         for name, family in FAMILIES.items()
     ]
     lines = [
@@ -47,15 +47,15 @@ def map_format(_configuration: Configuration) -> str:
         name=FORMAT,
         version=VERSION,
         parts=", ".join(PARTS),
-        shaping=", ".join(f"`{name}`" for name in SHAPING),
+        shaping=", ".join(f"`{name}`" for name in FIXED_PARAMETERS),
     )
-    return head + "\n".join(described({"map": MapDocument, SCANS: ScanTable, "chain": ChainState, **PARTS}))
+    return head + "\n".join(document_reference({"map": MapDocument, SCANS: ScanTable, "chain": ChainState, **PARTS}))
 
 
 GENERATED = {
     "config/hmt_slam.yaml": ros_yaml,
     "docs/map_format.md": map_format,
-    "docs/parameters.md": reference,
+    "docs/parameters.md": parameter_reference,
     "docs/simulation_settings.md": simulation_settings,
 }
 

@@ -99,10 +99,10 @@ class Listener:
         return future.result()
 
     def close(self):
-        from hmt_slam_ros.ros.execution import await_departures  # noqa: PLC0415  only where there is ROS
+        from hmt_slam_ros.ros.execution import wait_until_alone  # noqa: PLC0415  only where there is ROS
 
         self.executor.shutdown()
-        await_departures(self.node, 2.0)
+        wait_until_alone(self.node, 2.0)
         self.node.destroy_node()
         self.context.try_shutdown()
 

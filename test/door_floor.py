@@ -14,10 +14,10 @@ ROOM = (4.0, 3.5)
 def write_world(folder):
     """Name of the world; its scripted drive begins at the end of the hallway and ends in the room."""
     plan = FloorPlan()
-    plan.free(0.0, -1.0, 14.0, 1.0)
+    plan.cut_rectangle(0.0, -1.0, 14.0, 1.0)
     for x in (4.0, 7.5):
-        plan.free(x - 0.5, 1.0, x + 0.5, 1.3)
-        plan.free(x - 1.6, 1.2, x + 1.6, 5.0)
+        plan.cut_rectangle(x - 0.5, 1.0, x + 0.5, 1.3)
+        plan.cut_rectangle(x - 1.6, 1.2, x + 1.6, 5.0)
     path = folder / "world.yaml"
     path.write_text(
         f"walls: {plan.walls().round(3).tolist()}\nroute: [[13, 0], [4, 0], {list(ROOM)}]\n"

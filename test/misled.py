@@ -5,11 +5,11 @@ import numpy as np
 from hmt_slam_ros.area_abstraction.aam import Aam
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.hybrid_map.shortest_path import reachable
+from hmt_slam_ros.hybrid_map.shortest_path import shortest_path_beliefs
 from hmt_slam_ros.loop_closure.tlca import Tlca
 from hmt_slam_ros.messages.documents import decode, encode
 from hmt_slam_ros.messages.map_changes import Arc
-from hmt_slam_ros.messages.messages import Accepted, EndOfLog, Hypotheses
+from hmt_slam_ros.messages.messages import ClosureDecision, EndOfLog, Hypotheses
 from hmt_slam_ros.metric_slam.slam import MetricSlam
 from hmt_slam_ros.offline.runtime import LockStep
 from hmt_slam_ros.real_time_localization.rtl import Rtl
@@ -34,12 +34,14 @@ def misled(area, known, deviations):
             if self.done or parent.area != area:
                 return super().recheck(parent, only)
             Misled.done = True
-            belief = reachable(parent.hybrid_map, area, until=(known,))[known]
+            belief = shortest_path_beliefs(parent.hybrid_map, area, targets=(known,))[known]
             values, vectors = np.linalg.eigh(belief.covariance)
             wrong = se2.compose(belief.mean, se2.exp(deviations * np.sqrt(values[-1]) * vectors[:, -1]))
             arc = Arc(area, known, PoseGaussian(wrong, SIGMA), closure=True)
             notes = parent.notes.checked((), ())
-            return Branches([Child(parent.hypothesis, parent.log_weight, area, notes, arcs=(arc,), reload=True)])
+            return Branches(
+                [Child(parent.hypothesis, parent.log_weight, area, notes, arcs=(arc,), reload_local_map=True)]
+            )
 
     return Misled
 
@@ -52,7 +54,7 @@ class OverJson:
 
     def handle(self, message):
         kind = type(message)
-        return self.process.handle(decode(encode(message), kind) if kind in (Hypotheses, Accepted) else message)
+        return self.process.handle(decode(encode(message), kind) if kind in (Hypotheses, ClosureDecision) else message)
 
 
 def run(log, configuration, branching=Branching):

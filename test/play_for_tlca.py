@@ -9,8 +9,8 @@ from hmt_slam_ros.configuration import Configuration, with_changes
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.loop_closure.tlca import Tlca
-from hmt_slam_ros.messages.map_changes import Arc, Relabelled
-from hmt_slam_ros.messages.messages import Accepted, Hypotheses, Keyframe, Leaf, LeafEstimate, Notice
+from hmt_slam_ros.messages.map_changes import Arc, MovedKeyframe
+from hmt_slam_ros.messages.messages import ClosureDecision, Hypotheses, Hypothesis, HypothesisEstimate, Keyframe, Notice
 from hmt_slam_ros.registration.consistency import Clutter
 
 WORLD = worlds.two_rooms()
@@ -40,24 +40,24 @@ class Play:
         self.k += 1
         if places is None:
             replica = self.process._replica
-            places = [(h, area, np.zeros(3)) for h, area in replica.areas.items()]
+            places = [(h, area, np.zeros(3)) for h, area in replica.robot_areas.items()]
             leaves = [self._with_first_keyframe(leaf, replica) for leaf in leaves]
         estimates = tuple(
-            LeafEstimate(h, area, belief(pose), True, 0.0, 0.0, Clutter(), 12.0) for h, area, pose in places
+            HypothesisEstimate(h, area, belief(pose), True, 0.0, 0.0, Clutter(), 12.0) for h, area, pose in places
         )
         travelled = 0.5 * self.k if travelled is None else travelled
         assert self.process.handle(Keyframe(self.k, worlds.scan_at(WORLD, world), travelled, estimates)) == []
-        said = self.process.handle(Hypotheses(self.k, tuple(leaves) or (Leaf(0, 0, 1.0, 0),)))
-        verdicts = [message for message in said if isinstance(message, Accepted)]
+        said = self.process.handle(Hypotheses(self.k, tuple(leaves) or (Hypothesis(0, 0, 1.0, 0),)))
+        verdicts = [message for message in said if isinstance(message, ClosureDecision)]
         self.notices += [message for message in said if isinstance(message, Notice)]
         assert len(verdicts) == 1
         assert verdicts[0].sequence == self.k
         return verdicts[0]
 
     def _with_first_keyframe(self, leaf, replica):
-        if leaf.relabelled or leaf.area in (0, *replica.maps[leaf.parent].area_ids()):
+        if leaf.moved_keyframes or leaf.area in (0, *replica.maps[leaf.parent].area_ids()):
             return leaf
-        return replace(leaf, relabelled=(Relabelled(self.k, replica.areas[leaf.parent], leaf.area, np.zeros(3)),))
+        return replace(leaf, relabelled=(MovedKeyframe(self.k, replica.areas[leaf.parent], leaf.area, np.zeros(3)),))
 
     def start(self):
         return self.step(places=[(0, 0, np.zeros(3))])
@@ -69,7 +69,7 @@ class Play:
 def new_area(hypothesis, parent, probability, area, pose, source=0):
     """A leaf whose newest keyframe leaves ``source`` for the new ``area`` at ``source_T_area``."""
     arc = Arc(source, area, belief(pose))
-    return Leaf(hypothesis, parent, probability, area, belief(se2.inverse(pose)), (), (arc,))
+    return Hypothesis(hypothesis, parent, probability, area, belief(se2.inverse(pose)), (), (arc,))
 
 
 def poses_of(verdict):

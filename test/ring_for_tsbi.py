@@ -9,7 +9,14 @@ from worlds import box, scan_in
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.messages.messages import Accepted, AreaEvent, AreaEvents, Hypotheses, Keyframe, LeafEstimate
+from hmt_slam_ros.messages.messages import (
+    AreaEvent,
+    AreaEvents,
+    ClosureDecision,
+    Hypotheses,
+    HypothesisEstimate,
+    Keyframe,
+)
 from hmt_slam_ros.messages.replica import Replica
 from hmt_slam_ros.registration.consistency import Clutter
 from hmt_slam_ros.topological_inference.tsbi import Tsbi
@@ -77,9 +84,9 @@ class Run:
         self.true_pose = true_pose
         scan = scan_in(self.walls, true_pose, stamp=sequence, noise=0.01, seed=sequence, **self.laser)
         leaves = tuple(
-            LeafEstimate(
+            HypothesisEstimate(
                 h,
-                self.replica.areas[h],
+                self.replica.robot_areas[h],
                 PoseGaussian(self.poses[h], self.covariances[h]),
                 self.stored,
                 self.evidence.get(h, 0.0),
@@ -91,7 +98,7 @@ class Run:
         )
         message = Keyframe(sequence, scan, 0.5 * sequence, leaves, mapping=mapping)
         assert self.tsbi.handle(message) == []
-        self.replica.add(message)
+        self.replica.add_keyframe(message)
         return self._answer(sequence, self._events(sequence, cut, moved, merged))
 
     def _events(self, sequence, cut, moved, merged):
@@ -100,33 +107,33 @@ class Run:
         if moved is not None:
             return tuple(AreaEvent(h, "moved", (), moved, 0.5) for h in sorted(self.poses))
         newest = tuple(range(sequence - cut + 1, sequence + 1))
-        return tuple(AreaEvent(h, "cut", newest, self.replica.areas[h], 0.2) for h in sorted(self.poses) if cut)
+        return tuple(AreaEvent(h, "cut", newest, self.replica.robot_areas[h], 0.2) for h in sorted(self.poses) if cut)
 
     def _answer(self, sequence, events):
         *notices, answer = self.tsbi.handle(AreaEvents(sequence, events))
         self.notices += [notice.text for notice in notices]
         assert isinstance(answer, Hypotheses)
         assert answer.sequence == sequence
-        assert sum(leaf.probability for leaf in answer.leaves) + answer.unexamined == pytest.approx(1.0)
-        assert [leaf.hypothesis for leaf in answer.leaves] == sorted({leaf.hypothesis for leaf in answer.leaves})
-        self.replica.apply(answer)
+        assert sum(leaf.probability for leaf in answer.hypotheses) + answer.unexamined == pytest.approx(1.0)
+        assert [leaf.id for leaf in answer.hypotheses] == sorted({leaf.id for leaf in answer.hypotheses})
+        self.replica.apply_hypotheses(answer)
         rebased = {
-            leaf.hypothesis: self.poses[leaf.parent]
-            if leaf.rebase is None
-            else se2.compose(leaf.rebase.mean, self.poses[leaf.parent])
-            for leaf in answer.leaves
+            leaf.id: self.poses[leaf.parent]
+            if leaf.frame_change is None
+            else se2.compose(leaf.frame_change.mean, self.poses[leaf.parent])
+            for leaf in answer.hypotheses
         }
         self.covariances = {
-            leaf.hypothesis: self.covariances[leaf.parent] if leaf.rebase is None else len(leaf.relabelled) * STEP
-            for leaf in answer.leaves
+            leaf.id: self.covariances[leaf.parent] if leaf.frame_change is None else len(leaf.moved_keyframes) * STEP
+            for leaf in answer.hypotheses
         }
         self.poses = rebased
         self.answers.append(answer)
         return answer
 
     def accept(self, hypothesis, **more):
-        message = Accepted(len(self.answers) - 1, hypothesis, **more)
+        message = ClosureDecision(len(self.answers) - 1, hypothesis, **more)
         assert self.tsbi.handle(message) == []
-        self.replica.accept(message)
+        self.replica.apply_decision(message)
         self.poses = {hypothesis: self.poses[hypothesis]}
         self.covariances = {hypothesis: self.covariances[hypothesis]}

@@ -9,8 +9,8 @@ from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
-from hmt_slam_ros.places.area_views import AreaViews
-from hmt_slam_ros.places.chart import chart_of
+from hmt_slam_ros.places.area_views import AreaViewCache
+from hmt_slam_ros.places.chart import build_chart
 from hmt_slam_ros.simulation.building import FloorPlan
 from hmt_slam_ros.submap.local_mapping import LocalMapping
 
@@ -23,11 +23,11 @@ BUILDING = np.array([3.0, -2.0, 0.4])
 def walls():
     """A hallway along x from 0 to 22 m, doors to the north at 5 m, on both sides at 10 m, another hallway at 16 m."""
     plan = FloorPlan()
-    plan.free(0.0, -1.0, 22.0, 1.0)
-    plan.free(15.0, 1.0, 17.0, 12.0)
+    plan.cut_rectangle(0.0, -1.0, 22.0, 1.0)
+    plan.cut_rectangle(15.0, 1.0, 17.0, 12.0)
     for x, side in ((5.0, 1.0), (10.1, 1.0), (9.9, -1.0)):
-        plan.free(x - 0.5, min(side, 1.3 * side), x + 0.5, max(side, 1.3 * side))
-        plan.free(x - 2.0, min(1.2 * side, 5.0 * side), x + 2.0, max(1.2 * side, 5.0 * side))
+        plan.cut_rectangle(x - 0.5, min(side, 1.3 * side), x + 0.5, max(side, 1.3 * side))
+        plan.cut_rectangle(x - 2.0, min(1.2 * side, 5.0 * side), x + 2.0, max(1.2 * side, 5.0 * side))
     found = plan.walls()
     return np.concatenate([se2.transform(BUILDING, found[:, k : k + 2]) for k in (0, 2)], axis=1)
 
@@ -59,8 +59,8 @@ def charted(crossing_driven=True, again=()):
         keyframe, area, pose = len(scans), int(x > 8.0), np.array([x, 0.1, 0.0])
         hybrid_map.place(keyframe, area, se2.between(AREAS[area], pose))
         scans[keyframe] = seen_at(pose, rng, barred)
-    views = AreaViews(LocalMapping(CONFIGURATION), scans).of_map(hybrid_map)
-    return chart_of(hybrid_map, views, CONFIGURATION.features), hybrid_map, views
+    views = AreaViewCache(LocalMapping(CONFIGURATION), scans).views_of_map(hybrid_map)
+    return build_chart(hybrid_map, views, CONFIGURATION.features), hybrid_map, views
 
 
 def mapped(crossing_driven=True):
@@ -68,7 +68,7 @@ def mapped(crossing_driven=True):
     hybrid_map, scans, rng = HybridMap(), {}, np.random.default_rng(1)
     for k, pose in enumerate(keyframes(crossing_driven)):
         area = int(pose[0] > 8.0)
-        hybrid_map.place(k, area, se2.between(AREAS[area], pose))
+        hybrid_map.set_keyframe(k, area, se2.between(AREAS[area], pose))
         scans[k] = seen_at(pose, rng)
     arc = se2.between(AREAS[0], AREAS[1])
     hybrid_map.set_arc(0, 1, PoseGaussian(arc, np.diag([0.03, 0.03, 0.003]) ** 2), closure=False)

@@ -22,11 +22,11 @@ from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.landmark import Existence, Landmark
 from hmt_slam_ros.landmarks.landmarks import OPENING
 from hmt_slam_ros.places.chart import CROSSING, DOOR, END, Chart, ChartNode
-from hmt_slam_ros.places.floor import LeadingOff
-from hmt_slam_ros.places.observation_graph import no_landmarks
+from hmt_slam_ros.places.floor import SideOpening
+from hmt_slam_ros.places.observation_graph import empty_sequence
 from hmt_slam_ros.places.place_graph import EAST, NORTH, Edge
 
-EMPTY = no_landmarks()
+EMPTY = empty_sequence()
 FRAME = np.array([3.0, -4.0, 1.0])
 
 
@@ -54,7 +54,7 @@ def institute():
     kinds = [CROSSING if crossing else DOOR for crossing in states.crossings]
     nodes = tuple(ChartNode(0, pose, kind, 1.0, ()) for pose, kind in zip(states.poses, kinds, strict=True))
     ways = [Edge(k, d, k + 1, d, (5.0, 0.01), (0.0, 0.01), EMPTY) for k, d in enumerate((NORTH, NORTH, EAST))]
-    edges = tuple(edge for way in ways for edge in (way, way.back))
+    edges = tuple(edge for way in ways for edge in (way, way.reverse))
     return InstituteMap(scenario, None, {}, {}, Chart(nodes, (), edges), {0: np.zeros(3)})
 
 
@@ -73,7 +73,7 @@ def behind_door(node, pose):
     """A place behind a door that leads off where a node looks."""
     door = PoseGaussian(pose, np.eye(3))
     landmark = Landmark(OPENING, door, 0.9, 0.05, Existence(1.0))
-    return Destination(node, LeadingOff(0, 0, landmark, door, NORTH, False, pose[:2]), pose[:2])
+    return Destination(node, SideOpening(0, 0, landmark, door, NORTH, False, pose[:2]), pose[:2])
 
 
 def test_the_shortest_way_between_two_nodes():

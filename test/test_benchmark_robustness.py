@@ -28,7 +28,7 @@ def saved_map(arc, *, closure=True):
     truth = {keyframe: np.array(pose) for keyframe, pose in TRUTH.items()}
     hybrid_map = HybridMap()
     for keyframe, area, first in ((0, 0, 0), (1, 0, 0), (2, 1, 2), (3, 1, 2)):
-        hybrid_map.place(keyframe, area, se2.between(truth[first], truth[keyframe]))
+        hybrid_map.set_keyframe(keyframe, area, se2.between(truth[first], truth[keyframe]))
     hybrid_map.set_arc(0, 1, PoseGaussian(arc, 1e-4 * np.eye(3)), closure=closure)
     scans = {keyframe: scan_in(WALLS, pose, stamp=10 * keyframe, beams=11) for keyframe, pose in truth.items()}
     replica = Replica(scans, {0: hybrid_map}, {0: 1.0}, {0: 1})

@@ -8,17 +8,17 @@ from benchmark.report import VALIDATION, marks
 from benchmark.scale import Cut, cost_of_scans, cut_requirement, growth_requirement, measured_cuts
 from benchmark.scale_maps import lasting, state_of, stored
 from hmt_slam_ros.configuration import Configuration
-from hmt_slam_ros.hybrid_map.shortest_path import reachable
+from hmt_slam_ros.hybrid_map.shortest_path import shortest_path_beliefs
 
 
 def test_every_crossing_lies_where_the_arcs_place_it():
     lattice = Lattice(4, 3)
     hybrid_map = lattice.hybrid_map()
-    found = reachable(hybrid_map, 0)
+    found = shortest_path_beliefs(hybrid_map, 0)
     assert sorted(found) == list(range(12))
     for placed in lattice.poses():
         assert np.allclose(found[placed.area].mean, placed.pose.mean)
-    assert sorted(hybrid_map.neighbours(5)) == [1, 4, 6, 9]
+    assert sorted(hybrid_map.neighbors(5)) == [1, 4, 6, 9]
     assert all(len(hybrid_map.keyframes(area)) == PER_AREA for area in found)
 
 
@@ -77,7 +77,11 @@ def test_the_document_has_a_place_for_the_tables(kind):
 def test_a_map_is_saved_and_loaded_with_all_that_was_mapped():
     state = state_of(Lattice(4, 3), Configuration())
     assert len(state.slam.replica.common.areas) == len(state.aam.graphs) == 12
-    assert len(state.recorder.replica.scans) == len(state.slam.live[0].placed.keyframes) == 12 * PER_AREA
+    assert (
+        len(state.recorder.replica.scans)
+        == len(state.slam.live_hypotheses[0].keyframe_covariances.keyframes)
+        == 12 * PER_AREA
+    )
     assert len({scan.ranges.tobytes() for scan in state.tlca.replica.scans.values()}) == 12 * PER_AREA
     saved = lasting(Lattice(4, 3), Configuration())
     assert saved.areas == 12

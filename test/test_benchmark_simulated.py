@@ -66,7 +66,7 @@ def second_lap(truth, keyframes):
 def claim_with_error(truth, known, asked, error, covariance=TIGHT):
     """The claim that joins the frames of two keyframes, moved by an error."""
     pose = se2.compose(se2.between(truth.poses[known], truth.poses[asked]), np.array(error))
-    return truth.claim({known: np.zeros(3)}, {asked: pose}, covariance, pose)
+    return truth.tracked_pose({known: np.zeros(3)}, {asked: pose}, covariance, pose)
 
 
 def test_the_long_world_is_2_km_of_nested_loops_and_no_family():
@@ -105,7 +105,7 @@ def test_a_loop_is_found_where_the_second_lap_begins_and_closed_where_the_map_jo
     for keyframe in keyframes:
         area = 0 if keyframe.travelled < 28.0 else 1
         for hybrid_map in (separate, joined):
-            hybrid_map.place(keyframe.sequence, 2 * area, truth.poses[keyframe.sequence])
+            hybrid_map.set_keyframe(keyframe.sequence, 2 * area, truth.poses[keyframe.sequence])
         loops.note(keyframe.sequence, keyframe.travelled, separate, 2 * area)
         if keyframe.travelled > 60.0 and joined.arc(0, 2) is None:
             loops.definite(keyframe.sequence, separate, 2)
@@ -140,7 +140,7 @@ def record(tmp_path_factory):
 def test_watching_changes_nothing_of_a_run(record):
     _, watched = record
     result = run_log(open_simulated(WORLD.log), load_configuration(None, [], WORLD.seed))
-    recording = result.recorder.finish(result.log.stamps)
+    recording = result.recorder.finish(result.log_progress.stamps)
     arcs = list(recording.hybrid_map.all_arcs())
     assert [tuple(arc["areas"]) for arc in watched["arcs"]] == [(a, b) for a, b, _ in arcs]
     sigmas = [np.sqrt(np.trace(arc.pose.covariance[:2, :2])) for *_, arc in arcs]

@@ -79,8 +79,10 @@ def test_with_one_area_nothing_is_ever_left():
     log = open_log("sim:office,seed=1,size=0.7", duration=60.0)
     recorder = run_log(log, Configuration(), abstraction=OneArea).recorder
     assert len(recorder.keyframes) > 20
-    assert all(len(message.leaves) == 1 for message in recorder.hypotheses.values() if isinstance(message, Hypotheses))
-    assert {leaf.area for message in recorder.hypotheses.values() for leaf in message.leaves} == {0}
+    assert all(
+        len(message.hypotheses) == 1 for message in recorder.hypotheses.values() if isinstance(message, Hypotheses)
+    )
+    assert {leaf.area for message in recorder.hypotheses.values() for leaf in message.hypotheses} == {0}
 
 
 def test_one_area_answers_keyframes_alone():

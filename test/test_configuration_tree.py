@@ -18,8 +18,8 @@ from hmt_slam_ros.configuration import (
     with_changes,
 )
 from hmt_slam_ros.configuration.documents import ros_yaml, yaml_value
-from hmt_slam_ros.configuration.flat import FlatParameter, flattened, nested
-from hmt_slam_ros.configuration.tree import RULES
+from hmt_slam_ros.configuration.flat import FlatParameter, flatten, nest
+from hmt_slam_ros.configuration.tree import CONSISTENCY_RULES
 from hmt_slam_ros.errors import HmtSlamError
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -66,7 +66,7 @@ def one_sentence(fault: pytest.ExceptionInfo) -> str:
 
 @given(trees)
 def test_flattening_undoes_nesting(tree: dict) -> None:
-    assert nested(flattened(tree)) == tree
+    assert nest(flatten(tree)) == tree
 
 
 @given(some_changes())
@@ -74,7 +74,7 @@ def test_changed_values_are_read_back_and_all_others_stay(changes: dict) -> None
     changed = changed_or_none(changes)
     if changed is not None:
         assert as_flat(changed) == as_flat(Configuration()) | changes
-        assert flattened(as_nested(changed)) == as_flat(changed)
+        assert flatten(as_nested(changed)) == as_flat(changed)
 
 
 @given(some_changes())
@@ -117,7 +117,7 @@ def test_a_value_beyond_either_bound_is_refused_with_the_range(leaf: FlatParamet
 
 def test_the_defaults_obey_every_rule() -> None:
     assert with_changes(Configuration(), {}) == Configuration()
-    assert all(rule.holds(Configuration()) for rule in RULES)
+    assert all(rule.holds(Configuration()) for rule in CONSISTENCY_RULES)
 
 
 def test_values_that_contradict_each_other_are_refused_with_advice() -> None:

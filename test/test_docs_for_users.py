@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 import hmt_slam_ros
-from hmt_slam_ros.cli.arguments import parser
+from hmt_slam_ros.cli.arguments import build_parser
 from hmt_slam_ros.cli.main import main
 from hmt_slam_ros.configuration import Configuration, flat_parameters, load_configuration
 
@@ -38,7 +38,7 @@ def test_every_command_of_the_tutorial_does_what_the_tutorial_says(tmp_path, mon
     said = []
     for command in commands(TUTORIAL):
         if command.startswith("hmt_slam replay"):
-            parser().parse_args(shlex.split(command)[1:])
+            build_parser().parse_args(shlex.split(command)[1:])
             continue
         assert main([*shlex.split(command)[1:], *shortened(command)]) == 0, command
         said += capsys.readouterr().out.splitlines()

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from hmt_slam_ros.cli.main import main
-from hmt_slam_ros.doctor.examination import findings_of_log
-from hmt_slam_ros.doctor.statistics import Joint, Messages, ScanHead, scan_head
+from hmt_slam_ros.doctor.examination import log_findings
+from hmt_slam_ros.doctor.statistics import FrameTransform, MessageStatistics, ScanHeader, read_scan_header
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.logs.records import LogRecord
 from hmt_slam_ros.logs.ros_types import LASER_SCAN, typestore
@@ -54,11 +54,11 @@ def is_scan(record):
 
 def subjects(log, messages=None):
     """What is not fine, {subject: severity}."""
-    return {one.subject: one.severity for one in findings_of_log(log, messages) if one.severity != "fine"}
+    return {one.subject: one.severity for one in log_findings(log, messages) if one.severity != "fine"}
 
 
 def text_of(log, subject):
-    return next(one.text for one in findings_of_log(log) if one.subject == subject)
+    return next(one.text for one in log_findings(log) if one.subject == subject)
 
 
 def turned(scan, angle, forward=0.0):
@@ -278,11 +278,11 @@ def test_a_robot_that_stands_is_not_judged(drive):
 def joint(parent, child, *, topic="/tf_static", roll=0.0, moved=0.0):
     pose = np.eye(4)
     pose[1:3, 1:3] = [[math.cos(roll), -math.sin(roll)], [math.sin(roll), math.cos(roll)]]
-    return Joint(parent, child, topic, pose, 1, moved)
+    return FrameTransform(parent, child, topic, pose, 1, moved)
 
 
 LASER, WHEELS = joint("base_link", "laser"), joint("odom", "base_link", topic="/tf", moved=9.0)
-HEAD = ScanHead("laser", -1.0, 1.0, 0.02, 101)
+HEAD = ScanHeader("laser", -1.0, 1.0, 0.02, 101)
 
 
 @pytest.mark.parametrize(
@@ -302,7 +302,7 @@ HEAD = ScanHead("laser", -1.0, 1.0, 0.02, 101)
     ),
 )
 def test_frames_and_stated_angles_that_do_not_fit_are_found(drive, expected, changes):
-    sound = Messages({}, {}, {HEAD: 3}, ("odom", "base_link"), (LASER, WHEELS))
+    sound = MessageStatistics({}, {}, {HEAD: 3}, ("odom", "base_link"), (LASER, WHEELS))
     assert subjects(Faulty(drive[:300]), replace(sound, **changes)) == expected
 
 
@@ -322,7 +322,7 @@ def test_what_a_scan_says_of_itself_is_read_without_its_ranges(frame):
         intensities=np.zeros(0, np.float32),
     )
     content = bytes(typestore().serialize_cdr(message, LASER_SCAN))
-    assert scan_head(content) == ScanHead(frame, -1.5, 1.5, 0.5, count)
+    assert read_scan_header(content) == ScanHeader(frame, -1.5, 1.5, 0.5, count)
 
 
 def test_the_command_says_what_is_wrong_and_returns_it(drive, tmp_path, capsys):

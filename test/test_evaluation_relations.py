@@ -36,7 +36,7 @@ def test_errors_by_hand():
     trajectory = poses_at((0, 1, 1, np.pi / 2), (1, 1, 3, np.pi / 2), (2, 1, 3, -np.pi / 2))
     relations = relations_of((0, 1, 1.7, 0.4, np.deg2rad(-10)), (1, 2, 0, 0, np.pi), (0, 2, 2, 0, np.deg2rad(-170)))
     errors = evaluate_relations(trajectory, relations).overall
-    assert (errors.count, errors.matched, errors.missed, errors.carried) == (3, 3, 0, 0)
+    assert (errors.count, errors.matched, errors.missed, errors.extrapolated) == (3, 3, 0, 0)
     assert errors.translation.mean == pytest.approx(0.5 / 3)
     assert errors.translation.std == pytest.approx(np.sqrt((0.25 - 0.25 / 3) / 2))
     assert errors.translation.rms == pytest.approx(np.sqrt(0.25 / 3))
@@ -74,7 +74,7 @@ def test_of_poses_with_the_same_stamp_the_first_counts():
 def test_a_pose_at_a_tenth_of_a_second_counts_and_one_later_is_missed():
     relations = relations_of((0, 1, 1, 0, 0), (0, 2, 1, 0, 0), (3, 0, 1, 0, 0))
     errors = evaluate_relations(poses_at((0, 0, 0, 0), (1.1, 1, 0, 0), (2.100000001, 1, 0, 0)), relations).overall
-    assert (errors.matched, errors.missed, errors.carried) == (1, 2, 0)
+    assert (errors.matched, errors.missed, errors.extrapolated) == (1, 2, 0)
     assert errors.translation.max == 0.0
 
 
@@ -85,7 +85,7 @@ def test_with_odometry_a_pose_is_carried_to_the_time_asked_for():
     relations = relations_of((0, 2, 5, 1, np.pi / 2 + 0.25))
     assert evaluate_relations(trajectory, relations).overall.missed == 1
     errors = evaluate_relations(trajectory, relations, odometry).overall
-    assert (errors.matched, errors.missed, errors.carried) == (1, 0, 1)
+    assert (errors.matched, errors.missed, errors.extrapolated) == (1, 0, 1)
     assert errors.translation.max == pytest.approx(0.0, abs=1e-12)
     assert errors.rotation.max == pytest.approx(0.0, abs=1e-12)
 
@@ -122,7 +122,7 @@ def test_a_folder_is_evaluated_with_the_odometry_of_its_log(tmp_path):
     without = evaluate_folder(tmp_path, tmp_path / "truth")
     assert (without.overall.matched, without.overall.missed) == (1, 1)
     errors = evaluate_folder(tmp_path, tmp_path / "truth", log)
-    assert (errors.overall.matched, errors.overall.carried, errors.over_60_s.matched) == (2, 1, 1)
+    assert (errors.overall.matched, errors.overall.extrapolated, errors.over_60_s.matched) == (2, 1, 1)
     assert errors.over_60_s.translation.mean == pytest.approx(0.5)
     assert errors.overall.rotation.max == pytest.approx(np.rad2deg(0.1))
     table = format_table(errors).splitlines()

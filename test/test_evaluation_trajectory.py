@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hmt_slam_ros.errors import HmtSlamError
-from hmt_slam_ros.evaluation import StampedPoses, odometry_of, read_tum, write_tum
+from hmt_slam_ros.evaluation import StampedPoses, read_odometry_poses, read_tum, write_tum
 from hmt_slam_ros.open_log import open_log
 from hmt_slam_ros.sensors import Odometry
 
@@ -68,7 +68,7 @@ def test_the_nearest_pose_is_found_in_any_order_as_by_trying_all(stamps, wanted)
 
 def test_all_odometry_of_a_log_is_a_trajectory():
     log = open_log(MALAGA)
-    odometry = odometry_of(log)
+    odometry = read_odometry_poses(log)
     readings = [record for record in log.records() if isinstance(record.measurement, Odometry)]
     assert odometry.stamps.tolist() == [record.source_stamp for record in readings]
     np.testing.assert_array_equal(odometry.poses, [record.measurement.pose for record in readings])

@@ -15,17 +15,17 @@ from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.configuration.flat import with_changes
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.exploration.explorer import Explorer
-from hmt_slam_ros.exploration.frontiers import Ground
-from hmt_slam_ros.exploration.local_motion import Command, Limits, command_towards
-from hmt_slam_ros.exploration.path_follower import Pilot
-from hmt_slam_ros.exploration.roadmap import Opened, Survey, crosses, outlook_of
+from hmt_slam_ros.exploration.frontiers import NavigationGrid
+from hmt_slam_ros.exploration.local_motion import MotionCommand, MotionLimits, command_towards
+from hmt_slam_ros.exploration.path_follower import PathFollower
+from hmt_slam_ros.exploration.roadmap import Frontier, Roadmap, classify_place, crosses_doors
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
-from hmt_slam_ros.landmarks.openings import jambs_of, up_to_doors
+from hmt_slam_ros.landmarks.openings import distance_to_doors, jamb_positions
 from hmt_slam_ros.logs.stamps import NANOSECONDS
-from hmt_slam_ros.messages.messages import Accepted, Hypotheses, Keyframe, Leaf, LeafEstimate
+from hmt_slam_ros.messages.messages import ClosureDecision, Hypotheses, Hypothesis, HypothesisEstimate, Keyframe
 from hmt_slam_ros.messages.replica import Replica
-from hmt_slam_ros.messages.tasks import OF_EXPLORER, Errand, Heading, Outcome, Steering, errand_of
+from hmt_slam_ros.messages.tasks import EXPLORER_TASKS, GoalPose, Task, TaskResult, VelocityCommand, parse_task
 from hmt_slam_ros.registration.consistency import Clutter
 from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.simulation.building import Building, FloorPlan
@@ -43,11 +43,11 @@ LASER = Settings(field_of_view=360.0, beams=720)
 def small_floor() -> Building:
     """A hallway along x with an arm to the north, and two rooms to the south; the robot begins at its western end."""
     plan = FloorPlan()
-    plan.free(0.0, -1.0, 12.0, 1.0)
-    plan.free(5.0, 1.0, 7.0, 9.0)
+    plan.cut_rectangle(0.0, -1.0, 12.0, 1.0)
+    plan.cut_rectangle(5.0, 1.0, 7.0, 9.0)
     for x, y in ROOMS:
-        plan.free(x - 1.5, y - 2.0, x + 1.5, y + 2.0)
-        plan.free(x - 0.5, y + 1.9, x + 0.5, -0.9)
+        plan.cut_rectangle(x - 1.5, y - 2.0, x + 1.5, y + 2.0)
+        plan.cut_rectangle(x - 0.5, y + 1.9, x + 0.5, -0.9)
     return Building(plan.walls(), np.array([[1.0, 0.0], [11.0, 0.0]]))
 
 
@@ -61,7 +61,7 @@ def with_keyframes(poses: dict[int, tuple[float, float, float]]) -> HybridMap:
     """A map of one area that has these keyframes."""
     hybrid_map = HybridMap()
     for keyframe, pose in poses.items():
-        hybrid_map.place(keyframe, 0, np.array(pose))
+        hybrid_map.set_keyframe(keyframe, 0, np.array(pose))
     return hybrid_map
 
 
@@ -73,7 +73,7 @@ class _Explored:
         self.robot = DrivenRobot(scenario)
         configuration = with_changes(Configuration(), changes or {})
         self.run = DrivenRun(self.robot, configuration, Explorer(configuration))
-        self.outcome = self.run.do(Errand("explore"), 400.0) if explore else None
+        self.outcome = self.run.do(Task("explore"), 400.0) if explore else None
         self.length = len(path_of(self))
 
 
@@ -89,7 +89,7 @@ def path_of(own: _Explored) -> Float64:
     return own.robot.true_poses(np.arange(START, own.robot.stamp, NANOSECONDS // 5))
 
 
-def done(outcome: Outcome | None) -> Outcome:
+def done(outcome: TaskResult | None) -> TaskResult:
     """An outcome that is there."""
     assert outcome is not None
     return outcome
@@ -98,7 +98,7 @@ def done(outcome: Outcome | None) -> Outcome:
 def test_explores_all_of_a_floor_hallways_first() -> None:
     own = explored()
     path = path_of(own)[:, :2]
-    assert done(own.outcome).reached
+    assert done(own.outcome).succeeded
     assert own.robot.contacts == 0
     entered = [int(np.argmax(np.hypot(*(path - room).T) < 1.9)) for room in ROOMS]
     arm, end = (int(np.argmax(np.hypot(*(path - place).T) < 3.5)) for place in ((6.0, 8.0), (11.0, 0.0)))
@@ -107,10 +107,10 @@ def test_explores_all_of_a_floor_hallways_first() -> None:
 
 def test_rooms_have_names_and_the_robot_goes_there() -> None:
     own = explored()
-    names = [name for name in own.run.driver.atlas.places() if name.startswith("room")]
+    names = [name for name in own.run.driver.exploration_map.named_places() if name.startswith("room")]
     assert names == ["room 1", "room 2"]
     for name in names:
-        assert done(own.run.do(Errand("go", name), 120.0)).reached
+        assert done(own.run.do(Task("go", name), 120.0)).succeeded
         place = true_place(own.run, name)
         assert np.hypot(*(own.robot.pose - place)[:2]) < 0.3
         assert np.abs(ROOMS - place[:2]).max(axis=1).min() < 2.0
@@ -120,94 +120,94 @@ def test_rooms_have_names_and_the_robot_goes_there() -> None:
 def test_backtracking_goes_along_its_own_path_until_told_to_stop() -> None:
     own = explored(1)
     at = len(path_of(own))
-    assert own.run.do(Errand("backtrack"), 12.0) is None
+    assert own.run.do(Task("backtrack"), 12.0) is None
     back = path_of(own)[at:, :2]
     assert np.hypot(*(back[-1] - back[0])) > 1.0
     before = path_of(own)[:at, :2]
     assert max(np.hypot(*(before - place).T).min() for place in back) < 0.6
-    assert own.run.do(Errand("stop"), 3.0) is None
+    assert own.run.do(Task("stop"), 3.0) is None
     assert own.robot.velocity == (0.0, 0.0)
 
 
-def goes(own: _Explored, *probabilities: float) -> Heading | None:
+def goes(own: _Explored, *probabilities: float) -> GoalPose | None:
     """Where the explorer goes from now on, where so many topological paths are as probable as this; None for as before.
 
     They are all the same map.
     """
-    explorer, atlas = own.run.driver, own.run.driver.atlas
-    best, area, sequence = atlas.replica.best, atlas.pose.area, max(atlas.replica.scans)
-    leaves = tuple(Leaf(best + k, best, share, area) for k, share in enumerate(probabilities))
+    explorer, atlas = own.run.driver, own.run.driver.exploration_map
+    best, area, sequence = atlas.replica.best_hypothesis, atlas.pose.area, max(atlas.replica.scans)
+    leaves = tuple(Hypothesis(best + k, best, share, area) for k, share in enumerate(probabilities))
     explorer.handle(Hypotheses(sequence, leaves, 0.0))
-    explorer.handle(Accepted(sequence, None, (), ()))
+    explorer.handle(ClosureDecision(sequence, None, (), ()))
     said = explorer.handle(replace(scan_at((1.0, 0.0, 0.0)), stamp=atlas.pose.stamp))
-    return next((word for word in said if isinstance(word, Heading)), None)
+    return next((word for word in said if isinstance(word, GoalPose)), None)
 
 
 def test_it_turns_back_while_several_topological_paths_are_probable() -> None:
     own = _Explored(explore=False, changes={"explorer.backtracks": True})
-    assert own.run.do(Errand("explore"), 25.0) is None
+    assert own.run.do(Task("explore"), 25.0) is None
     back = goes(own, 0.6, 0.4)
     assert back is not None
     # It began there, in the frame of the first area.
     assert back.area == 0
-    np.testing.assert_allclose(back.goal[:2], (0.0, 0.0), atol=0.01)
+    np.testing.assert_allclose(back.pose[:2], (0.0, 0.0), atol=0.01)
     assert goes(own, 0.7, 0.3) is None
     on = goes(own, 0.99, 0.01)
     assert on is not None
-    assert np.hypot(*on.goal[:2]) > 1.0
+    assert np.hypot(*on.pose[:2]) > 1.0
 
 
 def test_it_explores_on_where_nobody_asks_it_to_turn_back() -> None:
     own = _Explored(explore=False)
-    assert own.run.do(Errand("explore"), 25.0) is None
-    assert own.run.driver.atlas.entropy == 0.0
+    assert own.run.do(Task("explore"), 25.0) is None
+    assert own.run.driver.exploration_map.entropy == 0.0
     on = goes(own, 0.6, 0.4)
-    assert own.run.driver.atlas.entropy == pytest.approx(0.673, abs=0.001)
-    assert on is None or np.hypot(*on.goal[:2]) > 1.0
+    assert own.run.driver.exploration_map.entropy == pytest.approx(0.673, abs=0.001)
+    assert on is None or np.hypot(*on.pose[:2]) > 1.0
 
 
 def test_scans_may_come_after_any_message_of_the_chain() -> None:
     own = _Explored(explore=False)
-    assert own.run.do(Errand("explore"), 25.0) is None
-    explorer, atlas = own.run.driver, own.run.driver.atlas
+    assert own.run.do(Task("explore"), 25.0) is None
+    explorer, atlas = own.run.driver, own.run.driver.exploration_map
     replica, pose = atlas.replica, atlas.pose
     new = max(replica.scans) + 1
     scan = replace(scan_at((1.0, 0.0, 0.0)), stamp=pose.stamp)
-    leaf = LeafEstimate(replica.best, pose.area, pose.local, True, 0.0, 0.0, Clutter(), 12.0)
+    leaf = HypothesisEstimate(replica.best_hypothesis, pose.area, pose.pose_in_area, True, 0.0, 0.0, Clutter(), 12.0)
     explorer.handle(scan)
     explorer.handle(Keyframe(new, scan, 0.0, (leaf,)))
-    explorer.handle(Errand("explore"))
+    explorer.handle(Task("explore"))
     assert explorer.handle(scan)
-    assert new in atlas.survey.roadmap
-    assert new in atlas.frames
+    assert new in atlas.roadmap.graph
+    assert new in atlas.keyframe_locator
 
 
 def test_unknown_places_are_told() -> None:
-    outcome = done(explored().run.do(Errand("go", "cellar"), 5.0))
-    assert not outcome.reached
+    outcome = done(explored().run.do(Task("go", "cellar"), 5.0))
+    assert not outcome.succeeded
     assert "choose from room 1, room 2, area 0" in outcome.text
 
 
 def test_a_known_map_is_known_from_the_start() -> None:
-    known = explored(1).run.driver.atlas
-    atlas = Explorer(Configuration(), Replica.of(known.replica.state)).atlas
-    assert set(atlas.places()) >= set(known.places())
+    known = explored(1).run.driver.exploration_map
+    atlas = Explorer(Configuration(), Replica.from_state(known.replica.state)).exploration_map
+    assert set(atlas.named_places()) >= set(known.named_places())
     for name in ("room 1", "room 2"):
-        assert any({atlas.places()[name], known.places()[name]} <= own for own in atlas.survey.chambers())
-    first = min(atlas.survey.roadmap)
-    assert set(atlas.survey.distances(first)) >= set(known.survey.distances(first))
+        assert any({atlas.named_places()[name], known.named_places()[name]} <= own for own in atlas.roadmap.segments())
+    first = min(atlas.roadmap.graph)
+    assert set(atlas.roadmap.distances(first)) >= set(known.roadmap.distances(first))
 
 
 def test_it_stands_where_nothing_tells_the_pose_any_more() -> None:
     own = _Explored(explore=False)
-    own.run.do(Errand("explore"), 5.0)
+    own.run.do(Task("explore"), 5.0)
     scan = own.robot.measure()[1] or scan_at((1.0, 0.0, 0.0))
     moving, lost = (
         own.run.driver.handle(replace(scan, stamp=own.robot.stamp + after))[-1] for after in (0, 2 * NANOSECONDS)
     )
-    assert isinstance(moving, Steering)
+    assert isinstance(moving, VelocityCommand)
     assert moving.speed > 0.0
-    assert lost == Steering(own.robot.stamp + 2 * NANOSECONDS, 0.0, 0.0)
+    assert lost == VelocityCommand(own.robot.stamp + 2 * NANOSECONDS, 0.0, 0.0)
 
 
 def test_same_seed_same_path_bit_for_bit() -> None:
@@ -220,25 +220,25 @@ def test_same_seed_same_path_bit_for_bit() -> None:
 def test_hallways_and_doors_of_a_scan() -> None:
     features = Configuration().features
     for pose, is_hallway in (((3.0, 0.0, 0.3), True), ((3.0, -3.0, 0.0), False)):
-        outlook = outlook_of(scan_at(pose), features, 1.75)
-        assert outlook.hallway == is_hallway
+        outlook = classify_place(scan_at(pose), features, 1.75)
+        assert outlook.is_hallway == is_hallway
         way = se2.transform(se2.inverse(np.array(pose)), np.array([[3.0, -0.2], [3.0, -2.0]])).reshape(1, 4)
-        assert crosses(way, outlook.doors).all()
+        assert crosses_doors(way, outlook.doors).all()
         beside = se2.transform(se2.inverse(np.array(pose)), np.array([[1.0, 0.0], [5.0, 0.0]])).reshape(1, 4)
-        assert not crosses(beside, outlook.doors).any()
+        assert not crosses_doors(beside, outlook.doors).any()
 
 
 def test_an_arm_as_wide_as_a_hallway_is_no_door() -> None:
-    doors = outlook_of(scan_at((6.0, 0.0, 0.0)), Configuration().features, 1.75).doors
-    assert not crosses(np.array([[0.0, 0.0, 0.0, 2.5]]), doors).any()
+    doors = classify_place(scan_at((6.0, 0.0, 0.0)), Configuration().features, 1.75).doors
+    assert not crosses_doors(np.array([[0.0, 0.0, 0.0, 2.5]]), doors).any()
 
 
 def test_a_room_is_as_long_as_to_its_door() -> None:
     # Through the door of the southern room one sees the hallway behind it from wall to wall.
     origins, directions = np.zeros((3, 2)), np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0]])
-    doors = jambs_of(np.array([[2.0, 0.2, 0.0], [3.0, 0.0, 0.0], [0.0, 2.0, 0.0]]), np.array([1.0, 1.0, 0.9]))
+    doors = jamb_positions(np.array([[2.0, 0.2, 0.0], [3.0, 0.0, 0.0], [0.0, 2.0, 0.0]]), np.array([1.0, 1.0, 0.9]))
     assert np.allclose(doors[0], (2.0, 0.7, 2.0, -0.3))
-    assert np.allclose(up_to_doors(origins, directions, doors), (2.0, np.inf, np.inf))
+    assert np.allclose(distance_to_doors(origins, directions, doors), (2.0, np.inf, np.inf))
 
 
 def test_a_room_that_is_seen_from_outside_as_a_whole_is_to_be_entered() -> None:
@@ -246,44 +246,44 @@ def test_a_room_that_is_seen_from_outside_as_a_whole_is_to_be_entered() -> None:
     outside = np.array([(3.0, 0.0, 0.0), (3.0, -0.7, 0.0), (2.0, 0.0, 0.0), (4.0, 0.0, 0.0)])
     inside = np.array([(3.0, -3.0, 0.0)])
     for poses, count in ((outside, 1), (np.concatenate((outside, inside)), 0)):
-        ground = Ground([scan_at(tuple(pose)) for pose in poses.tolist()], poses, 0.3)
-        ways = ground.beyond(door)
+        ground = NavigationGrid([scan_at(tuple(pose)) for pose in poses.tolist()], poses, 0.3)
+        ways = ground.paths_to_unvisited_rooms(door)
         assert len(ways) == count
         assert all(np.abs(way.points[-1] - ROOMS[0]).max() < 1.5 for way in ways)
-        assert not ground.beyond(np.empty((0, 4)))
+        assert not ground.paths_to_unvisited_rooms(np.empty((0, 4)))
 
 
 def test_what_is_open_is_not_forgotten_with_the_keyframe_beside_it() -> None:
-    survey, scans = Survey(Configuration().features, 0.3, 1.75), {k: scan_at((1.0 + k, 0.0, 0.0)) for k in range(3)}
-    survey.look(with_keyframes({0: (1.0, 0.0, 0.0), 1: (2.0, 0.0, 0.5)}), scans, 0, np.array([1.0, 0.0, 0.0]))
+    survey, scans = Roadmap(Configuration().features, 0.3, 1.75), {k: scan_at((1.0 + k, 0.0, 0.0)) for k in range(3)}
+    survey.update(with_keyframes({0: (1.0, 0.0, 0.0), 1: (2.0, 0.0, 0.5)}), scans, 0, np.array([1.0, 0.0, 0.0]))
     way = np.array([[0.0, 0.0], [20.0, 0.0]])
-    survey.frontiers = [Opened(1, way, hallway=True)]
+    survey.frontiers = [Frontier(1, way, is_in_hallway=True)]
     left = with_keyframes({0: (1.0, 0.0, 0.0), 2: (3.0, 0.0, 0.0)})
-    survey.look(left, scans, 0, np.array([1.0, 0.0, 0.0]))
+    survey.update(left, scans, 0, np.array([1.0, 0.0, 0.0]))
     (kept,) = (one for one in survey.frontiers if one.length > 19.0)
     assert kept.keyframe == 0
     there = se2.transform(np.array([2.0, 0.0, 0.5]), way[-1])
-    assert np.allclose(se2.transform(np.array([1.0, 0.0, 0.0]), kept.way[-1]), there)
+    assert np.allclose(se2.transform(np.array([1.0, 0.0, 0.0]), kept.path[-1]), there)
 
 
 def test_places_beside_each_other_are_joined_whatever_stands_about() -> None:
-    survey = Survey(Configuration().features, 0.3, 1.75)
+    survey = Roadmap(Configuration().features, 0.3, 1.75)
     # So near to a wall no cell of the ground is free.
     hybrid_map = with_keyframes({0: (2.0, 0.85, 0.0), 4: (2.2, 0.85, 0.0), 9: (2.9, 0.85, 0.0)})
-    survey.look(hybrid_map, dict.fromkeys((0, 4, 9), scan_at((2.0, 0.85, 0.0))), 0, np.array([2.0, 0.0, 0.0]))
+    survey.update(hybrid_map, dict.fromkeys((0, 4, 9), scan_at((2.0, 0.85, 0.0))), 0, np.array([2.0, 0.0, 0.0]))
     assert set(survey.distances(0)) == {0, 4}
 
 
-def surveyed(poses: list[tuple[float, float, float]], walls: Float64, person: Float64, until: int = 0) -> Survey:
+def surveyed(poses: list[tuple[float, float, float]], walls: Float64, person: Float64, until: int = 0) -> Roadmap:
     """A survey of a floor with keyframes at these poses, one after the other, somebody (1, 3) being there at first.
 
     :param until: this keyframe.
     """
-    survey, laser = Survey(Configuration().features, 0.3, 1.75), Laser(LASER)
+    survey, laser = Roadmap(Configuration().features, 0.3, 1.75), Laser(LASER)
     index, people = wall_index(walls), [person] * until + [np.empty((0, 3))] * (len(poses) - until)
     seen = [laser.distances(np.array([pose]), index, own) for pose, own in zip(poses, people, strict=True)]
     scans = {k: laser.scan(0, 0, distances) for k, distances in enumerate(seen)}
-    survey.look_everywhere(with_keyframes(dict(enumerate(poses))), scans)
+    survey.update_everywhere(with_keyframes(dict(enumerate(poses))), scans)
     return survey
 
 
@@ -294,33 +294,33 @@ def test_the_end_of_a_hallway_is_no_room() -> None:
     # From there it looked like one.
     laser = Laser(LASER)
     seen = laser.distances(np.array([hallway[0]]), wall_index(small_floor().walls), person)
-    assert not outlook_of(laser.scan(0, 0, seen), Configuration().features, 1.75).hallway
-    assert survey.room_of(0) == ()
+    assert not classify_place(laser.scan(0, 0, seen), Configuration().features, 1.75).is_hallway
+    assert survey.room_around(0) == ()
     assert survey.rooms() == []
 
 
 def test_a_room_behind_a_gap_in_a_room_is_part_of_it() -> None:
     plan = FloorPlan()
-    plan.free(0.0, -1.0, 12.0, 1.0)
-    plan.free(4.5, -1.3, 5.5, -0.9)
+    plan.cut_rectangle(0.0, -1.0, 12.0, 1.0)
+    plan.cut_rectangle(4.5, -1.3, 5.5, -0.9)
     # Two cupboards leave a gap of a metre in the middle of the room.
-    plan.free(3.0, -4.0, 7.0, -1.2)
-    plan.free(4.5, -4.4, 5.5, -3.9)
-    plan.free(3.0, -8.0, 7.0, -4.3)
+    plan.cut_rectangle(3.0, -4.0, 7.0, -1.2)
+    plan.cut_rectangle(4.5, -4.4, 5.5, -3.9)
+    plan.cut_rectangle(3.0, -8.0, 7.0, -4.3)
     poses = [(x, 0.0, 0.0) for x in np.arange(1.0, 10.0, 0.5)]
     poses += [(5.0, y, -0.5 * np.pi) for y in np.arange(-0.4, -7.0, -0.5)]
     poses += [(x, y, 0.0) for x in (4.0, 6.0) for y in (-2.5, -6.0, -6.8)]
     survey = surveyed(poses, plan.walls(), np.empty((0, 3)))
-    doors = [survey.roadmap.edges[edge]["door"] for edge in ((24, 27), (18, 21))]
+    doors = [survey.graph.edges[edge]["door"] for edge in ((24, 27), (18, 21))]
     assert doors == [True, True]
     assert len(survey.rooms()) == 1
-    assert {bool(survey.room_of(k)) for k in (24, 29, 30)} == {True}
+    assert {bool(survey.room_around(k)) for k in (24, 29, 30)} == {True}
 
 
 def test_it_does_not_aim_behind_a_wall(monkeypatch: pytest.MonkeyPatch) -> None:
     aims: list[Float64] = []
 
-    def towards(scan: Scan, goal: Float64, velocity: tuple[float, float], limits: Limits) -> Command:
+    def towards(scan: Scan, goal: Float64, velocity: tuple[float, float], limits: MotionLimits) -> MotionCommand:
         aims.append(goal)
         return command_towards(scan, goal, velocity, limits)
 
@@ -328,14 +328,14 @@ def test_it_does_not_aim_behind_a_wall(monkeypatch: pytest.MonkeyPatch) -> None:
     # From the northern arm around the eastern corner; the wall of the arm is at x = 7 up to y = 1.
     at = np.array([6.6, 1.6, 0.0])
     way = se2.transform(se2.inverse(at), np.array([(6.6, 1.6), (6.6, 0.5), (8.5, 0.5)]))
-    Pilot(Limits(0.6, 0.8, 0.5, 1.5, 0.25), 0.15).steer(scan_at((6.6, 1.6, 0.0)), way, (0.0, 0.0))
+    PathFollower(MotionLimits(0.6, 0.8, 0.5, 1.5, 0.25), 0.15).steer(scan_at((6.6, 1.6, 0.0)), way, (0.0, 0.0))
     aim = se2.transform(at, aims[0])
     assert aim[0] < 7.4
     assert np.interp(7.0, (6.6, aim[0]), (1.6, aim[1])) < 1.0 or aim[0] < 7.0
 
 
 def test_it_waits_for_who_stands_in_its_way_and_then_goes_around() -> None:
-    pilot, way = Pilot(Limits(0.6, 0.8, 0.5, 1.5, 0.25), 0.15), np.array([[0.0, 0.0], [4.0, 0.0]])
+    pilot, way = PathFollower(MotionLimits(0.6, 0.8, 0.5, 1.5, 0.25), 0.15), np.array([[0.0, 0.0], [4.0, 0.0]])
     laser, walls = Laser(LASER), wall_index(small_floor().walls)
     person = np.array([[2.7, 0.0, 0.25]])
 
@@ -351,17 +351,17 @@ def test_it_waits_for_who_stands_in_its_way_and_then_goes_around() -> None:
 
 @pytest.mark.parametrize(("seconds", "stuck"), [(4.0, False), (20.0, True)])
 def test_no_progress_for_long_is_noticed(seconds: float, stuck: bool) -> None:
-    pilot = Pilot(Limits(0.6, 0.8, 0.5, 1.5, 0.25), 0.15)
+    pilot = PathFollower(MotionLimits(0.6, 0.8, 0.5, 1.5, 0.25), 0.15)
     scan, way = scan_at((6.0, 0.0, 0.0)), np.array([[0.0, 0.0], [3.0, 0.0]])
     begin = Scan(1, scan.ranges, scan.angle_min, scan.angle_increment, scan.range_min, scan.range_max)
     assert pilot.steer(begin, way, (0.0, 0.0)).speed > 0.0
-    assert not pilot.arrived
-    assert pilot.stuck(1 + round(seconds * NANOSECONDS), 15 * NANOSECONDS) == stuck
+    assert not pilot.has_arrived
+    assert pilot.is_stuck(1 + round(seconds * NANOSECONDS), 15 * NANOSECONDS) == stuck
 
 
 def test_errands_as_they_are_written() -> None:
-    assert errand_of("explore", OF_EXPLORER) == Errand("explore")
-    assert errand_of(" go room 3", OF_EXPLORER) == Errand("go", "room 3")
+    assert parse_task("explore", EXPLORER_TASKS) == Task("explore")
+    assert parse_task(" go room 3", EXPLORER_TASKS) == Task("go", "room 3")
     for text in ("go", "dance", "explore room 3", ""):
         with pytest.raises(HmtSlamError, match=f"'{text}' is no errand: give one of explore, backtrack, stop, or go"):
-            errand_of(text, OF_EXPLORER)
+            parse_task(text, EXPLORER_TASKS)

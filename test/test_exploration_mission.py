@@ -10,15 +10,15 @@ from small_floor import AREAS, CONFIGURATION, charted, mapped, seen_at
 from worlds import blank_scan
 
 from hmt_slam_ros.exploration import mission_controller
-from hmt_slam_ros.exploration.local_motion import Limits
-from hmt_slam_ros.exploration.mission_controller import MissionPilot, Phase
+from hmt_slam_ros.exploration.local_motion import MotionLimits
+from hmt_slam_ros.exploration.mission_controller import MissionController, Phase
 from hmt_slam_ros.exploration.rooms import Destination, KnownBuilding, destinations
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.places.place_graph import opposite, state_of
+from hmt_slam_ros.places.place_graph import opposite_direction, state_of
 from hmt_slam_ros.places.position_belief import certain_belief
-from hmt_slam_ros.sensors.motion_model import Step, increment_covariance
+from hmt_slam_ros.sensors.motion_model import RelativeMotion, increment_covariance
 
-LIMITS = Limits(0.6, math.radians(45.0), 0.5, math.radians(90.0), 0.25)
+LIMITS = MotionLimits(0.6, math.radians(45.0), 0.5, math.radians(90.0), 0.25)
 STEPS = 900
 
 
@@ -35,7 +35,7 @@ def node_at(known, x):
 
 def eastwards(known):
     ends = node_at(known, 5.0), node_at(known, 10.0)
-    return next(edge.leaving for edge in known.chart.edges if (edge.start, edge.end) == ends)
+    return next(edge.start_direction for edge in known.chart.edges if (edge.start, edge.end) == ends)
 
 
 class Robot:
@@ -58,13 +58,13 @@ class Robot:
             increment = se2.exp(0.2 * np.array([command.speed, 0.0, command.turn_rate]))
             self.pose = se2.compose(self.pose, increment)
             noisy = increment * (1.0 + self.rng.normal(0.0, 0.01, 3))
-            self.pilot.moved(Step(noisy, increment_covariance(noisy, CONFIGURATION.motion)))
+            self.pilot.moved(RelativeMotion(noisy, increment_covariance(noisy, CONFIGURATION.motion)))
 
 
 def test_the_only_place_is_where_the_robot_was_in_the_room(known):
     (place,) = destinations(known).values()
     assert place.node == node_at(known, 5.0)
-    np.testing.assert_allclose(se2.transform(AREAS[place.opening.area], place.place[None])[0], (5.0, 3.0), atol=0.1)
+    np.testing.assert_allclose(se2.transform(AREAS[place.opening.area], place.position[None])[0], (5.0, 3.0), atol=0.1)
 
 
 def test_a_door_to_which_no_way_leads_is_no_place_to_go_to(known):
@@ -77,12 +77,12 @@ def test_a_door_to_which_no_way_leads_is_no_place_to_go_to(known):
 
 def test_a_robot_drives_into_a_room_and_from_there_to_another_door(known):
     goal = destinations(known)[node_at(known, 5.0)]
-    west = opposite(eastwards(known))
+    west = opposite_direction(eastwards(known))
     belief = certain_belief(known.graph, CONFIGURATION.places, state_of(node_at(known, 16.0), west))
-    robot = Robot(MissionPilot(known, CONFIGURATION, LIMITS, belief), (16.0, 0.0, math.pi))
+    robot = Robot(MissionController(known, CONFIGURATION, LIMITS, belief), (16.0, 0.0, math.pi))
     phases = list(dict.fromkeys(robot.go(goal)))
     assert phases == [Phase.HALLWAY, Phase.DOOR, Phase.ROOM, Phase.THERE]
-    assert robot.pilot.started.node == goal.node
+    assert robot.pilot.initial_pose.node == goal.node
     assert math.dist(robot.pose[:2], (5.0, 3.0)) < 0.3
     node = node_at(known, 10.0)
     opening = next(one for one in known.chart.nodes[node].openings if one.direction == goal.opening.direction)
@@ -98,20 +98,20 @@ def test_a_robot_goes_from_a_room_to_the_one_behind_the_opposite_door(known):
     south, north = (
         Destination(node, one, se2.transform(one.landmark.pose.mean, np.array([[1.2, 0.0]]))[0]) for one in doors
     )
-    west = opposite(eastwards(known))
+    west = opposite_direction(eastwards(known))
     belief = certain_belief(known.graph, CONFIGURATION.places, state_of(node_at(known, 16.0), west))
-    robot = Robot(MissionPilot(known, CONFIGURATION, LIMITS, belief), (16.0, 0.0, math.pi))
+    robot = Robot(MissionController(known, CONFIGURATION, LIMITS, belief), (16.0, 0.0, math.pi))
     assert list(robot.go(south))[-1] is Phase.THERE
     for goal, place in ((north, (10.1, 2.2)), (south, (9.9, -2.2))):
         phases = list(dict.fromkeys(robot.go(goal)))
         assert phases == [Phase.LEAVING, Phase.DOOR, Phase.ROOM, Phase.THERE]
-        assert robot.pilot.started.node == node
+        assert robot.pilot.initial_pose.node == node
         assert math.dist(robot.pose[:2], place) < 0.3
 
 
 def test_a_lost_robot_turns_at_the_end_of_the_hallway_and_is_confident_before_it_enters(known):
     goal = destinations(known)[node_at(known, 5.0)]
-    robot = Robot(MissionPilot(known, CONFIGURATION, LIMITS), (12.0, 0.1, 0.0))
+    robot = Robot(MissionController(known, CONFIGURATION, LIMITS), (12.0, 0.1, 0.0))
     phases = []
     for phase in robot.go(goal):
         phases.append(phase)
@@ -123,8 +123,8 @@ def test_a_lost_robot_turns_at_the_end_of_the_hallway_and_is_confident_before_it
 
 
 def test_a_robot_that_sees_nothing_goes_on_and_waits_for_walls(known):
-    pilot = MissionPilot(known, CONFIGURATION, LIMITS)
-    pilot.go(None)
+    pilot = MissionController(known, CONFIGURATION, LIMITS)
+    pilot.start_mission(None)
     for k in range(100):
         command = pilot.steer(replace(blank_scan(), stamp=200_000_000 * k))
         assert math.isfinite(command.speed)
@@ -136,7 +136,7 @@ def test_where_the_belief_is_wrong_there_is_no_door_and_the_robot_goes_on(known)
     goal = destinations(known)[node_at(known, 5.0)]
     # It believes to be before the door, and is 2 m off.
     belief = certain_belief(known.graph, CONFIGURATION.places, state_of(goal.node, eastwards(known)))
-    robot = Robot(MissionPilot(known, CONFIGURATION, LIMITS, belief), (7.0, 0.0, 0.0))
+    robot = Robot(MissionController(known, CONFIGURATION, LIMITS, belief), (7.0, 0.0, 0.0))
     phases = list(robot.go(goal))
     order = list(dict.fromkeys(phases))
     assert order[:3] == [Phase.DOOR, Phase.TURN, Phase.HALLWAY]
@@ -145,37 +145,37 @@ def test_where_the_belief_is_wrong_there_is_no_door_and_the_robot_goes_on(known)
 
 def test_a_robot_turns_back_where_its_way_is_closed_and_goes_there_when_it_is_open_again(known):
     goal = destinations(known)[node_at(known, 5.0)]
-    west = opposite(eastwards(known))
+    west = opposite_direction(eastwards(known))
     start = state_of(node_at(known, 16.0), west)
-    pilot = MissionPilot(known, CONFIGURATION, LIMITS, certain_belief(known.graph, CONFIGURATION.places, start))
+    pilot = MissionController(known, CONFIGURATION, LIMITS, certain_belief(known.graph, CONFIGURATION.places, start))
     robot = Robot(pilot, (16.0, 0.0, math.pi))
     closed = {state_of(node_at(known, 10.0), west), state_of(node_at(known, 5.0), eastwards(known))}
     barred = zip(range(300), robot.go(goal, barred=7.0), strict=False)
     assert Phase.TURN in [phase for _, phase in barred]
-    assert robot.pilot.ways.closed == closed
+    assert robot.pilot.edge_monitor.closed_states == closed
     assert robot.pose[0] > 7.3
     assert list(robot.go(goal))[-1] is Phase.THERE
-    assert robot.pilot.ways.closed == frozenset()
+    assert robot.pilot.edge_monitor.closed_states == frozenset()
 
 
 @pytest.mark.parametrize("sway", [0.0, 0.1])
 def test_a_robot_that_gets_nowhere_turns_back_and_where_it_cannot_goes_on_however_it_trembles_or_sways(known, sway):
-    pilot = MissionPilot(known, CONFIGURATION, LIMITS)
-    pilot.go(None)
+    pilot = MissionController(known, CONFIGURATION, LIMITS)
+    pilot.start_mission(None)
     rng, scan = np.random.default_rng(0), seen_at(np.array((3.0, 0.0, 0.0)), np.random.default_rng(1))
     phases = []
     for k in range(115):
         pilot.steer(replace(scan, stamp=200_000_000 * (k + 1)))
         phases.append(pilot.phase)
         aside = sway if k // 5 % 2 else -sway
-        pilot.moved(Step(np.array((rng.normal(0.0, 0.02), aside, 0.0)), np.diag((1e-4, 1e-4, 1e-6))))
+        pilot.predict(RelativeMotion(np.array((rng.normal(0.0, 0.02), aside, 0.0)), np.diag((1e-4, 1e-4, 1e-6))))
     assert [phase for phase, _ in itertools.groupby(phases)] == [Phase.HALLWAY, Phase.TURN, Phase.HALLWAY]
 
 
 def test_a_robot_that_left_a_room_looks_where_the_metric_filter_says(known):
     goal = destinations(known)[node_at(known, 5.0)]
     belief = certain_belief(known.graph, CONFIGURATION.places, state_of(goal.node, eastwards(known)))
-    robot = Robot(MissionPilot(known, CONFIGURATION, LIMITS, belief), (5.0, 0.0, 0.0))
+    robot = Robot(MissionController(known, CONFIGURATION, LIMITS, belief), (5.0, 0.0, 0.0))
     assert list(robot.go(goal))[-1] is Phase.THERE
     # Somebody made it turn at the end of its way out.
     out = iter(robot.go(goal._replace(node=node_at(known, 10.0))))
@@ -183,11 +183,11 @@ def test_a_robot_that_left_a_room_looks_where_the_metric_filter_says(known):
         assert next(out) is Phase.LEAVING
     increment = np.array((0.0, 0.0, -robot.pose[2]))
     robot.pose = robot.pose + increment
-    robot.pilot.moved(Step(increment, increment_covariance(increment, CONFIGURATION.motion)))
+    robot.pilot.moved(RelativeMotion(increment, increment_covariance(increment, CONFIGURATION.motion)))
     while robot.pilot.room is not None or robot.pilot.estimator.belief is None:
         next(out)
     looks = (eastwards(known) - round(float(robot.pose[2]) / (0.5 * math.pi))) % 4
-    assert looks != opposite(goal.opening.direction)
+    assert looks != opposite_direction(goal.opening.direction)
     assert robot.pilot.estimator.facing == (goal.node, looks)
 
 
@@ -196,12 +196,12 @@ def test_a_robot_that_is_out_of_a_room_where_it_went_in_has_got_on_and_turns_as_
     monkeypatch.setattr(mission_controller, "_PROGRESS", 2.0)
     monkeypatch.setattr(mission_controller, "_ELSEWHERE", np.array((2.0, 0.0, 0.0)))
     goal = destinations(known)[node_at(known, 5.0)]
-    west = state_of(node_at(known, 10.0), opposite(eastwards(known)))
+    west = state_of(node_at(known, 10.0), opposite_direction(eastwards(known)))
     belief = certain_belief(known.graph, CONFIGURATION.places, west)
-    robot = Robot(MissionPilot(known, CONFIGURATION, LIMITS, belief), (10.0, 0.0, math.pi))
+    robot = Robot(MissionController(known, CONFIGURATION, LIMITS, belief), (10.0, 0.0, math.pi))
     assert list(robot.go(goal))[-1] is Phase.THERE
     robot.stamp += 10_000_000_000
-    phases, places = robot.go(Destination(node_at(known, 10.0), goal.opening, goal.place)), []
+    phases, places = robot.go(Destination(node_at(known, 10.0), goal.opening, goal.position)), []
     while next(phases) is not Phase.DOOR:
         places.append(robot.pose[0])
     assert min(places) > 4.0

@@ -9,13 +9,13 @@ from small_floor import AREAS, CONFIGURATION, mapped, seen_at
 
 from hmt_slam_ros.configuration.flat import with_changes
 from hmt_slam_ros.errors import HmtSlamError
-from hmt_slam_ros.exploration.pilot import Missions
+from hmt_slam_ros.exploration.pilot import PilotProcess
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
-from hmt_slam_ros.messages.messages import Carried, RealTimePose
+from hmt_slam_ros.messages.messages import PoseReset, RealTimePose
 from hmt_slam_ros.messages.replica import Replica
-from hmt_slam_ros.messages.tasks import OF_PILOT, Heading, Outcome, PlaceEstimate, Steering, errand_of
+from hmt_slam_ros.messages.tasks import PILOT_TASKS, GoalPose, PlaceEstimate, TaskResult, VelocityCommand, parse_task
 from hmt_slam_ros.sensors import Odometry
 
 PERIOD = 0.2
@@ -49,9 +49,9 @@ class Robot:
         said = self.missions.handle(message)
         self.said += said
         for answer in said:
-            if isinstance(answer, Steering):
+            if isinstance(answer, VelocityCommand):
                 self.velocity = np.array([answer.speed, 0.0, answer.turn_rate])
-            if isinstance(answer, Carried) and self.rtl == "door":
+            if isinstance(answer, PoseReset) and self.rtl == "door":
                 self.rtl = "always"
         return said
 
@@ -61,7 +61,7 @@ class Robot:
         pose = se2.between(AREAS[area], self.pose)
         if self.rtl == "elsewhere":
             pose = se2.compose(pose, np.array([-3.0, 0.0, 0.0]))
-        exactly = PoseGaussian.exactly(np.zeros(3))
+        exactly = PoseGaussian.from_pose(np.zeros(3))
         return RealTimePose(
             self.stamp,
             NEW_AREA if self.rtl in {"door", "lost"} else area,
@@ -86,16 +86,16 @@ class Robot:
 
     def do(self, text, steps=600):
         """How an errand ends."""
-        said = self.hear(errand_of(text, OF_PILOT))
+        said = self.hear(parse_task(text, PILOT_TASKS))
         for _ in range(steps):
             for answer in said:
-                if isinstance(answer, Outcome):
+                if isinstance(answer, TaskResult):
                     return answer
             said = self.step()
         return None
 
     def starts(self):
-        return [message.place for message in self.said if isinstance(message, Carried)]
+        return [message.initial_pose for message in self.said if isinstance(message, PoseReset)]
 
     def estimate(self):
         return next(message for message in reversed(self.said) if isinstance(message, PlaceEstimate))
@@ -111,12 +111,12 @@ def the_room(missions):
 
 
 def test_metric_slam_that_is_lost_begins_at_the_door_where_the_robot_stands_until_it_does(saved):
-    missions = Missions(CONFIGURATION, saved)
+    missions = PilotProcess(CONFIGURATION, saved)
     robot, room = Robot(missions, (12.0, 0.0, math.pi), rtl="door"), the_room(missions)
     outcome = robot.do("go cellar")
-    assert (outcome.reached, outcome.text) == (False, f"go cellar: there is no such room: choose from {room}")
+    assert (outcome.succeeded, outcome.text) == (False, f"go cellar: there is no such room: choose from {room}")
     stood = []
-    robot.hear(errand_of(f"go {room}", OF_PILOT))
+    robot.hear(parse_task(f"go {room}", PILOT_TASKS))
     while not robot.starts():
         stood.append(robot.pose)
         robot.step()
@@ -124,40 +124,40 @@ def test_metric_slam_that_is_lost_begins_at_the_door_where_the_robot_stands_unti
     assert np.abs(off(place, stood[-1])).max() < 0.05
     np.testing.assert_allclose(stood[-1], stood[-2], atol=0.02)
     outcome = robot.do(f"go {room}")
-    assert (outcome.reached, outcome.text) == (True, f"go {room}: the robot is there")
+    assert (outcome.succeeded, outcome.text) == (True, f"go {room}: the robot is there")
     assert math.dist(robot.pose[:2], (5.0, 3.0)) < 0.3
     assert len(robot.starts()) == 1
     said = robot.estimate()
     assert (said.place, said.room, said.confident) == (room.replace("room", "door"), room, True)
     np.testing.assert_array_equal(robot.velocity, 0.0)
     assert robot.do("find").text == f"find: the robot is in {room}"
-    assert robot.do(f"go {room}").reached
+    assert robot.do(f"go {room}").succeeded
 
 
 def test_metric_slam_that_has_the_robot_at_the_door_is_told_nothing(saved):
-    missions = Missions(CONFIGURATION, saved)
+    missions = PilotProcess(CONFIGURATION, saved)
     robot = Robot(missions, (12.0, 0.0, math.pi))
-    assert robot.do(f"go {the_room(missions)}").reached
+    assert robot.do(f"go {the_room(missions)}").succeeded
     assert not robot.starts()
 
 
 @pytest.mark.parametrize("rtl", ["never", "lost"])
 def test_a_robot_that_metric_slam_does_not_find_behind_the_door_goes_by_the_map_of_the_room(saved, rtl):
-    missions = Missions(CONFIGURATION, saved)
+    missions = PilotProcess(CONFIGURATION, saved)
     robot, room = Robot(missions, (12.0, 0.0, math.pi), rtl), the_room(missions)
     robot.slip = 1.2
-    assert robot.do(f"go {room}").reached
+    assert robot.do(f"go {room}").succeeded
     assert len(robot.starts()) == 1
-    (heading,) = {message for message in robot.said if isinstance(message, Heading)}
-    place = se2.compose(AREAS[heading.area], heading.goal)
+    (heading,) = {message for message in robot.said if isinstance(message, GoalPose)}
+    place = se2.compose(AREAS[heading.area], heading.pose)
     np.testing.assert_allclose(place, (5.0, 3.0, 0.5 * math.pi), atol=0.1)
     assert math.dist(robot.pose[:2], place[:2]) < 0.2
 
 
 def test_where_metric_slam_has_the_robot_elsewhere_the_belief_begins_anew_and_no_door_is_entered(saved):
-    missions = Missions(CONFIGURATION, saved)
+    missions = PilotProcess(CONFIGURATION, saved)
     robot, room = Robot(missions, (12.0, 0.0, math.pi), rtl="elsewhere"), the_room(missions)
-    robot.hear(errand_of(f"go {room}", OF_PILOT))
+    robot.hear(parse_task(f"go {room}", PILOT_TASKS))
     confident = []
     for _ in range(250):
         robot.step()
@@ -167,13 +167,13 @@ def test_where_metric_slam_has_the_robot_elsewhere_the_belief_begins_anew_and_no
     lost = confident.index(True)
     assert not all(confident[lost:])
     robot.rtl = "always"
-    assert robot.do(f"go {room}", 900).reached
+    assert robot.do(f"go {room}", 900).succeeded
     assert math.dist(robot.pose[:2], (5.0, 3.0)) < 0.3
 
 
 def test_where_others_drive_it_says_where_the_robot_is_and_what_a_door_tells_once(saved):
     configuration = with_changes(CONFIGURATION, {"pilot.drives": False})
-    missions = Missions(configuration, saved)
+    missions = PilotProcess(configuration, saved)
     robot, room = Robot(missions, (12.0, 0.0, math.pi), rtl="never"), the_room(missions)
     assert "pilot.drives is false" in robot.do(f"go {room}").text
     robot.said.clear()
@@ -187,44 +187,46 @@ def test_where_others_drive_it_says_where_the_robot_is_and_what_a_door_tells_onc
     at = []
     while robot.pose[1] < 1.5:
         at.append(robot.pose)
-        if any(isinstance(message, Carried) for message in robot.step((0.5, 0.0, 0.0))):
+        if any(isinstance(message, PoseReset) for message in robot.step((0.5, 0.0, 0.0))):
             (place,) = robot.starts()
             assert np.abs(off(place, at[-1])).max() < 0.1
     assert len(robot.starts()) == 1
-    assert not any(isinstance(message, Steering) for message in robot.said)
+    assert not any(isinstance(message, VelocityCommand) for message in robot.said)
 
 
 def test_it_finds_out_where_it_is_and_stops_when_told_or_when_it_takes_too_long(saved):
-    missions = Missions(with_changes(CONFIGURATION, {"pilot.patience": 2.0}), saved)
+    missions = PilotProcess(with_changes(CONFIGURATION, {"pilot.patience": 2.0}), saved)
     robot = Robot(missions, (14.0, 0.0, math.pi), rtl="never")
     assert robot.do("find").text == "find: given up after 2 s"
     np.testing.assert_array_equal(robot.velocity, 0.0)
-    robot.hear(errand_of("find", OF_PILOT))
+    robot.hear(parse_task("find", PILOT_TASKS))
     robot.step()
-    robot.hear(errand_of("stop", OF_PILOT))
+    robot.hear(parse_task("stop", PILOT_TASKS))
     np.testing.assert_array_equal(robot.velocity, 0.0)
-    assert not any(isinstance(message, Steering) for message in robot.step())
-    robot = Robot(Missions(CONFIGURATION, saved), (14.0, 0.0, math.pi), rtl="never")
+    assert not any(isinstance(message, VelocityCommand) for message in robot.step())
+    robot = Robot(PilotProcess(CONFIGURATION, saved), (14.0, 0.0, math.pi), rtl="never")
     outcome = robot.do("find")
-    assert outcome.reached
+    assert outcome.succeeded
     assert outcome.text.startswith("find: the robot is at door ")
 
 
 def test_where_time_goes_back_the_robot_may_be_anywhere(saved):
-    missions = Missions(CONFIGURATION, saved)
+    missions = PilotProcess(CONFIGURATION, saved)
     robot = Robot(missions, (12.0, 0.0, math.pi), rtl="never")
-    assert robot.do("find").reached
-    robot.hear(errand_of("find", OF_PILOT))
+    assert robot.do("find").succeeded
+    robot.hear(parse_task("find", PILOT_TASKS))
     robot.stamp -= 3_000_000_000
-    assert [answer.text for answer in robot.step() if isinstance(answer, Outcome)] == ["find: given up: time went back"]
+    assert [answer.text for answer in robot.step() if isinstance(answer, TaskResult)] == [
+        "find: given up: time went back"
+    ]
     robot.step()
     assert robot.estimate().place is None
 
 
 def test_one_who_drives_the_robot_out_of_a_room_brings_it_before_the_door(saved):
-    missions = Missions(CONFIGURATION, saved)
+    missions = PilotProcess(CONFIGURATION, saved)
     robot, room = Robot(missions, (12.0, 0.0, math.pi)), the_room(missions)
-    assert robot.do(f"go {room}").reached
+    assert robot.do(f"go {room}").succeeded
     for _ in range(20):
         robot.step((0.0, 0.0, math.pi / 4.0))
     while robot.pose[1] > 0.2:
@@ -238,4 +240,4 @@ def test_one_who_drives_the_robot_out_of_a_room_brings_it_before_the_door(saved)
 
 def test_a_map_without_places_is_refused():
     with pytest.raises(HmtSlamError, match="no door or crossing along a hallway"):
-        Missions(CONFIGURATION, Replica({}, {0: HybridMap()}, {0: 1.0}, {0: 0}).state)
+        PilotProcess(CONFIGURATION, Replica({}, {0: HybridMap()}, {0: 1.0}, {0: 0}).state)

@@ -2,35 +2,37 @@
 
 import pytest
 
-from hmt_slam_ros.configuration.landmarks import Features
+from hmt_slam_ros.configuration.landmarks import FeatureParameters
 from hmt_slam_ros.hybrid_map.landmark import Existence
 
-FEATURES = Features(landmark_detected=0.9, landmark_by_chance=0.1, landmark_lasting=0.99)
+FEATURES = FeatureParameters(landmark_detected=0.9, landmark_by_chance=0.1, landmark_lasting=0.99)
 
 
 def visited(existence, times, confidence=0.9):
     for _ in range(times):
-        existence = existence.after_sight(confidence, FEATURES)
+        existence = existence.update_on_detection(confidence, FEATURES)
     return existence
 
 
 def missed(existence, times):
     for _ in range(times):
-        existence = existence.after_miss(FEATURES)
+        existence = existence.update_on_miss(FEATURES)
     return existence
 
 
 def test_one_visit_is_bayes_rule():
     """By hand: r- = 0.99 * 0.5 = 0.495; seen 0.9 * 0.495 / (0.9 * 0.495 + 0.1 * 0.505)."""
     half = Existence(0.8, presence=0.5)
-    assert half.after_sight(0.8, FEATURES).presence == pytest.approx(0.4455 / (0.4455 + 0.0505))
-    assert half.after_miss(FEATURES).presence == pytest.approx(0.0495 / (0.0495 + 0.4545))
+    assert half.update_on_detection(0.8, FEATURES).presence == pytest.approx(0.4455 / (0.4455 + 0.0505))
+    assert half.update_on_miss(FEATURES).presence == pytest.approx(0.0495 / (0.0495 + 0.4545))
     assert half.probability == pytest.approx(0.4)
 
 
 def test_that_it_is_a_landmark_is_the_mean_of_what_the_scans_say_that_show_it():
     """Eq. (4): one that is hardly believed in is no more believed in for being seen again and again."""
-    existence = Existence(0.1).after_sight(0.4, FEATURES).after_miss(FEATURES).after_sight(0.1, FEATURES)
+    existence = (
+        Existence(0.1).update_on_detection(0.4, FEATURES).update_on_miss(FEATURES).update_on_detection(0.1, FEATURES)
+    )
     assert existence.confidence == pytest.approx(0.2)
     assert visited(Existence(0.1), 100, confidence=0.1).probability < 0.1
 
@@ -57,7 +59,7 @@ def test_visits_are_counted():
 def test_one_look_suffices_for_what_is_gone_when_the_robot_comes_back():
     existence = visited(Existence(1.0), 100, confidence=1.0)
     assert missed(existence, 1).probability > 0.5
-    back = existence.after_absence().after_absence()
+    back = existence.mark_absence().mark_absence()
     assert back.probability == existence.probability
     assert missed(back, 1).probability < 0.5
     assert visited(back, 1, confidence=1.0).probability > 0.95

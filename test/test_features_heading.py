@@ -9,12 +9,12 @@ from worlds import blank_scan, box, scan_in
 from benchmark import heading as measured
 from benchmark.simulated.worlds import World
 from hmt_slam_ros.configuration import Configuration
-from hmt_slam_ros.configuration.landmarks import Features
-from hmt_slam_ros.landmarks.heading import QUARTER, BuildingHeading
+from hmt_slam_ros.configuration.landmarks import FeatureParameters
+from hmt_slam_ros.landmarks.heading import QUARTER_TURN, BuildingHeading
 from hmt_slam_ros.landmarks.line_extraction import extract_lines
-from hmt_slam_ros.sensors.motion_model import Step
+from hmt_slam_ros.sensors.motion_model import RelativeMotion
 
-FEATURES = Features(range_deviation=0.01)
+FEATURES = FeatureParameters(range_deviation=0.01)
 ROOM = box(-3.0, -2.0, 5.0, 4.0)
 ASLANT = np.array([[-1.0, 2.0, 1.5, 3.2], [3.0, -1.5, 4.5, -0.5]])
 
@@ -25,16 +25,16 @@ def lines_at(heading, walls=ROOM, seed=0):
 
 
 def turned(angle, deviation):
-    return Step(np.array([0.3, 0.0, angle]), np.diag([0.01, 0.01, deviation]) ** 2)
+    return RelativeMotion(np.array([0.3, 0.0, angle]), np.diag([0.01, 0.01, deviation]) ** 2)
 
 
 @pytest.mark.parametrize("heading", [0.1, -0.7, 1.2, 3.0, -2.3])
 def test_the_first_lines_tell_it_up_to_quarters(heading):
     robot = BuildingHeading(FEATURES)
-    assert not robot.known
+    assert not robot.is_known
     assert robot.observe(lines_at(heading)) == 4
     assert -0.25 * math.pi <= robot.angle < 0.25 * math.pi
-    assert abs((robot.angle - heading + 0.5) % QUARTER - 0.5) < 0.005
+    assert abs((robot.angle - heading + 0.5) % QUARTER_TURN - 0.5) < 0.005
     assert robot.variance < math.radians(0.5) ** 2
 
 
@@ -44,7 +44,7 @@ def test_while_nothing_is_seen_it_is_unknown():
     assert robot.observe(nothing) == 0
     robot.predict(turned(0.3, 0.1))
     assert robot.observe(nothing) == 0
-    assert not robot.known
+    assert not robot.is_known
     assert robot.observe(lines_at(0.2)) == 4
     assert robot.angle == pytest.approx(0.2, abs=0.005)
 
@@ -72,7 +72,7 @@ def test_what_stands_aslant_is_left_out():
 
 def test_walls_that_are_not_square_bound_what_is_known():
     def after(square_deviation, looks):
-        robot = BuildingHeading(Features(range_deviation=0.01, square_deviation=square_deviation))
+        robot = BuildingHeading(FeatureParameters(range_deviation=0.01, square_deviation=square_deviation))
         for k in range(looks):
             robot.observe(lines_at(0.2, seed=k))
         return robot.variance

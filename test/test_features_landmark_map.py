@@ -4,16 +4,22 @@ import numpy as np
 import pytest
 from worlds import box, scan_at
 
-from hmt_slam_ros.configuration.landmarks import Features
+from hmt_slam_ros.configuration.landmarks import FeatureParameters
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.landmarks.beam_labels import rays_of
+from hmt_slam_ros.landmarks.beam_labels import rays_from_scan
 from hmt_slam_ros.landmarks.landmark_map import LandmarkMap, scatter_ratio
-from hmt_slam_ros.landmarks.landmarks import INNER, OPENING, OUTER, due, landmarks_of
+from hmt_slam_ros.landmarks.landmarks import (
+    CONCAVE_CORNER,
+    CONVEX_CORNER,
+    OPENING,
+    extract_landmarks,
+    should_be_visible,
+)
 from hmt_slam_ros.landmarks.line_extraction import extract_lines
 
 NOISE = 0.01
-FEATURES = Features(range_deviation=NOISE)
+FEATURES = FeatureParameters(range_deviation=NOISE)
 ROOM, PILLAR = box(-3, -2, 5, 4), box(2.0, 1.0, 3.0, 2.0)
 # Below the room a hallway, and a door of 1 m to it.
 DOOR = np.array(
@@ -36,8 +42,8 @@ PLACES = [np.array([0.1 * k, 0.05 * k, 0.3 * k]) for k in range(8)]
 
 def shown(walls, pose, seed=0):
     scan = scan_at(walls, pose, NOISE, np.random.default_rng(seed), 720)
-    rays = rays_of(scan, FEATURES)
-    return landmarks_of(extract_lines(scan, FEATURES), rays, FEATURES), rays
+    rays = rays_from_scan(scan, FEATURES)
+    return extract_landmarks(extract_lines(scan, FEATURES), rays, FEATURES), rays
 
 
 def gathered(found, walls, places, first=0):
@@ -53,30 +59,30 @@ def of_kind(found, kind):
 def is_due(walls, pose, kind, landmark, width=0.0):
     rays = shown(walls, pose)[1]
     local = se2.between(np.asarray(pose, dtype=float), np.array([landmark], dtype=float))
-    return bool(due(np.array([kind]), local, np.array([width]), rays, FEATURES)[0])
+    return bool(should_be_visible(np.array([kind]), local, np.array([width]), rays, FEATURES)[0])
 
 
 def test_a_corner_should_be_seen_where_both_its_walls_are_in_sight():
     corner = (5.0, 4.0, -0.75 * np.pi)
-    assert is_due(ROOM, (2.0, 1.5, 0.0), INNER, corner)
-    assert not is_due(ROOM, (0.0, 0.0, 0.0), INNER, corner)
+    assert is_due(ROOM, (2.0, 1.5, 0.0), CONCAVE_CORNER, corner)
+    assert not is_due(ROOM, (0.0, 0.0, 0.0), CONCAVE_CORNER, corner)
     screen = np.array([[4.0, 3.9, 4.0, 1.0]])
-    assert not is_due(np.concatenate((ROOM, screen)), (2.0, 1.5, 0.0), INNER, corner)
+    assert not is_due(np.concatenate((ROOM, screen)), (2.0, 1.5, 0.0), CONCAVE_CORNER, corner)
 
 
 def test_the_corner_of_a_pillar_should_be_seen_from_before_it_alone():
     corner = (2.0, 1.0, -0.75 * np.pi)
     walls = np.concatenate((ROOM, PILLAR))
-    assert is_due(walls, (0.0, -0.5, 0.3), OUTER, corner)
-    assert not is_due(walls, (4.0, 3.0, 0.3), OUTER, corner)
+    assert is_due(walls, (0.0, -0.5, 0.3), CONVEX_CORNER, corner)
+    assert not is_due(walls, (4.0, 3.0, 0.3), CONVEX_CORNER, corner)
     # Where the pillar was, beams pass: it should be seen, and is not.
-    assert is_due(ROOM, (0.0, -0.5, 0.3), OUTER, corner)
+    assert is_due(ROOM, (0.0, -0.5, 0.3), CONVEX_CORNER, corner)
 
 
 def test_a_corner_is_gone_where_beams_pass_one_of_its_walls():
     corner, walls, beside = (2.0, 1.0, -0.75 * np.pi), np.concatenate((ROOM, PILLAR)), (0.0, 2.0, 0.3)
-    assert not is_due(walls, beside, OUTER, corner)
-    assert is_due(ROOM, beside, OUTER, corner)
+    assert not is_due(walls, beside, CONVEX_CORNER, corner)
+    assert is_due(ROOM, beside, CONVEX_CORNER, corner)
 
 
 def test_an_opening_should_be_seen_from_before_it_open_or_closed():
@@ -98,9 +104,9 @@ def test_who_stands_before_an_opening_closes_none():
 
 
 def test_what_many_scans_show_is_one_landmark_each():
-    inner = of_kind(gathered(LandmarkMap(FEATURES), ROOM, PLACES), INNER)
+    inner = of_kind(gathered(LandmarkMap(FEATURES), ROOM, PLACES), CONCAVE_CORNER)
     assert len(inner) == 4
-    outer = of_kind(gathered(LandmarkMap(FEATURES), np.concatenate((ROOM, PILLAR)), PLACES), OUTER)
+    outer = of_kind(gathered(LandmarkMap(FEATURES), np.concatenate((ROOM, PILLAR)), PLACES), CONVEX_CORNER)
     places = np.array([one.pose.mean[:2] for one in inner])
     away = np.hypot(*(places[None] - np.array([(-3, -2), (5, -2), (5, 4), (-3, 4)])[:, None]).transpose(2, 0, 1))
     assert away.min(axis=1).max() < 0.03
@@ -111,7 +117,7 @@ def test_what_many_scans_show_is_one_landmark_each():
 def test_what_scans_have_in_common_makes_no_landmark_more_certain():
     """Covariance intersection: of like observations the covariance stays that of one."""
     certain = [
-        np.trace(of_kind(gathered(LandmarkMap(FEATURES), ROOM, [PLACES[0]] * count), INNER)[0].pose.covariance)
+        np.trace(of_kind(gathered(LandmarkMap(FEATURES), ROOM, [PLACES[0]] * count), CONCAVE_CORNER)[0].pose.covariance)
         for count in (1, 10)
     ]
     assert certain[1] == pytest.approx(certain[0], rel=0.2)
@@ -125,7 +131,7 @@ def test_a_door_has_its_width_and_is_gone_when_it_was_closed():
     assert door.existence.probability > 0.9
     gathered(found, np.concatenate((DOOR, [[0.5, -2.0, 1.5, -2.0]])), PLACES, first=20)
     assert not of_kind(found, OPENING)
-    assert len(of_kind(found, INNER)) >= 4
+    assert len(of_kind(found, CONCAVE_CORNER)) >= 4
 
 
 def test_what_is_hidden_is_not_missed():

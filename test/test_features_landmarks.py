@@ -5,16 +5,16 @@ import pytest
 from worlds import box, scan_at, scan_in
 
 from benchmark.landmark_truth import World
-from hmt_slam_ros.configuration.landmarks import Features
+from hmt_slam_ros.configuration.landmarks import FeatureParameters
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.landmarks.beam_labels import rays_of
-from hmt_slam_ros.landmarks.corners import corners_of
+from hmt_slam_ros.landmarks.beam_labels import rays_from_scan
+from hmt_slam_ros.landmarks.corners import extract_corners
 from hmt_slam_ros.landmarks.line_extraction import Lines, extract_lines
-from hmt_slam_ros.landmarks.openings import openings_of
+from hmt_slam_ros.landmarks.openings import extract_openings
 from hmt_slam_ros.simulation import open_simulated
 
 NOISE = 0.01
-FEATURES = Features(range_deviation=NOISE)
+FEATURES = FeatureParameters(range_deviation=NOISE)
 ROOM = box(-3, -2, 5, 4)
 # A hallway of 2 m with a door of 1 m to a room on the left, and at its end another hallway to the right.
 HALLWAY = np.array(
@@ -39,12 +39,12 @@ HALLWAY = np.array(
 
 def corners_in(walls, pose, seed=0, beams=720):
     scan = scan_at(walls, pose, NOISE, np.random.default_rng(seed), beams)
-    return corners_of(extract_lines(scan, FEATURES), FEATURES)
+    return extract_corners(extract_lines(scan, FEATURES), FEATURES)
 
 
 def openings_in(walls, pose, seed=0, features=FEATURES):
     scan = scan_at(walls, pose, NOISE, np.random.default_rng(seed), 720)
-    return openings_of(extract_lines(scan, features), rays_of(scan, features), features)
+    return extract_openings(extract_lines(scan, features), rays_from_scan(scan, features), features)
 
 
 def by_place(poses, places):
@@ -105,7 +105,7 @@ def test_confidence_grows_with_the_size():
         # Both walls end in (2, 2): x = 2 below it and y = 2 to its left.
         parameters = np.array([[0.0, 2.0], [0.5 * np.pi, 2.0]])
         lines = Lines(parameters, covariances, pieces + np.array([[2.0], [-2.0]]), np.arange(2), np.zeros(0, np.int32))
-        return corners_of(lines, FEATURES).confidences
+        return extract_corners(lines, FEATURES).confidences
 
     small, large = corner(0.2), corner(1.0)
     assert len(small) == len(large) == 1
@@ -137,7 +137,7 @@ def test_a_niche_and_a_closed_door_are_no_openings():
     openings = openings_in(closed, (2.8, -0.2, 0.1))
     headings = openings.poses[:, 2] + 0.1
     assert not np.any(np.abs(se2.wrap(headings - 0.5 * np.pi)) < 0.3)
-    deep = openings_in(closed, (2.8, -0.2, 0.1), features=Features(range_deviation=NOISE, opening_max=1.5))
+    deep = openings_in(closed, (2.8, -0.2, 0.1), features=FeatureParameters(range_deviation=NOISE, opening_max=1.5))
     assert not len(deep.poses)
 
 
@@ -170,8 +170,8 @@ def test_nothing_is_found_in_nothing():
     scan = scan_in(ROOM, (0.0, 0.0, 0.0), beams=91)
     scan.ranges[:] = np.nan
     lines = extract_lines(scan, FEATURES)
-    assert not len(corners_of(lines, FEATURES).poses)
-    assert not len(openings_of(lines, rays_of(scan, FEATURES), FEATURES).poses)
+    assert not len(extract_corners(lines, FEATURES).poses)
+    assert not len(extract_openings(lines, rays_from_scan(scan, FEATURES), FEATURES).poses)
 
 
 def test_the_truth_of_a_drive_has_the_doors_of_its_building():

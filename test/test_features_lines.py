@@ -9,14 +9,14 @@ from worlds import box, scan_at, scan_in
 from benchmark import lines as measured
 from benchmark.line_truth import difference, lines_of, seen_in
 from benchmark.simulated.worlds import World
-from hmt_slam_ros.configuration.landmarks import Features
+from hmt_slam_ros.configuration.landmarks import FeatureParameters
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.landmarks.line_extraction import extract_for_map, extract_lines
-from hmt_slam_ros.landmarks.line_fit import Beams, distance2, fit
+from hmt_slam_ros.landmarks.line_fit import Beams, fit_line, line_distance2
 from hmt_slam_ros.simulation import open_simulated
 
 NOISE = 0.015
-FEATURES = Features(range_deviation=NOISE)
+FEATURES = FeatureParameters(range_deviation=NOISE)
 ROOM = box(-3, -2, 5, 4)
 
 
@@ -48,8 +48,8 @@ def test_all_walls_of_a_room_are_found_with_what_was_seen_of_them():
     lines = extract_lines(scan_at(ROOM, pose, beams=720), FEATURES)
     found = in_room(lines, pose)
     np.testing.assert_allclose(sorted(np.abs(found[:, 2])), [2.0, 3.0, 4.0, 5.0], atol=1e-4)
-    lengths = (lines.pieces[:, 1] - lines.pieces[:, 0])[np.argsort(np.abs(found[lines.owners, 2]))]
-    seen = np.bincount(lines.owners, lines.pieces[:, 1] - lines.pieces[:, 0])
+    lengths = (lines.segments[:, 1] - lines.segments[:, 0])[np.argsort(np.abs(found[lines.owners, 2]))]
+    seen = np.bincount(lines.owners, lines.segments[:, 1] - lines.segments[:, 0])
     np.testing.assert_allclose(np.sort(seen), [6.0, 6.0, 8.0, 8.0], atol=0.15)
     assert lengths.min() > 0.0
     assert (np.abs(np.bincount(lines.labels[lines.labels >= 0]) - 180) < 60).all()
@@ -64,7 +64,7 @@ def test_beams_without_a_return_are_no_gap_and_no_line():
     assert len(holed) == len(whole) == 4
     np.testing.assert_allclose(np.sort(holed.parameters[:, 1]), np.sort(whole.parameters[:, 1]), atol=1e-4)
     nothing = extract_lines(replace(scan, ranges=np.full_like(ranges, np.nan)), FEATURES)
-    assert len(nothing) == len(nothing.pieces) == len(nothing.labels) == 0
+    assert len(nothing) == len(nothing.segments) == len(nothing.labels) == 0
 
 
 def test_a_wall_behind_a_pillar_is_one_line_in_two_pieces_and_a_niche_another():
@@ -104,14 +104,14 @@ def test_the_covariance_is_what_the_ranges_propagate():
     labels, line = np.zeros(61, np.int32), np.empty(5)
     directions = scan.beams / np.hypot(*scan.beams.T)[:, None]
     deviations = 0.01 * (1.0 + np.arange(61) / 30.0)
-    assert fit(Beams(scan.points, directions, deviations), labels, 0, line) == 61
+    assert fit_line(Beams(scan.points, directions, deviations), labels, 0, line) == 61
     covariance = np.zeros((2, 2))
     for k in range(61):
         sides = []
         for step in (1e-5, -1e-5):
             points, moved = scan.points.copy(), np.empty(5)
             points[k] += step * directions[k]
-            fit(Beams(points, directions, deviations), labels, 0, moved)
+            fit_line(Beams(points, directions, deviations), labels, 0, moved)
             sides.append(moved[:2])
         slope = deviations[k] * (sides[0] - sides[1]) / 2e-5
         covariance += np.outer(slope, slope)
@@ -122,8 +122,8 @@ def test_a_line_near_the_origin_is_itself_on_its_other_side():
     a = np.array([0.1, 0.002, 1e-4, 1e-5, 1e-4])
     b = np.array([0.1 - np.pi, 0.003, 1e-4, -1e-5, 1e-4])
     same = np.array([0.1, -0.003, 1e-4, 1e-5, 1e-4])
-    assert distance2(a, b) == pytest.approx(distance2(a, same))
-    assert distance2(a, b) < 1.0
+    assert line_distance2(a, b) == pytest.approx(line_distance2(a, same))
+    assert line_distance2(a, b) < 1.0
 
 
 def test_lines_of_a_simulated_drive_are_measured_against_its_walls(monkeypatch):

@@ -5,15 +5,15 @@ import pytest
 
 from benchmark.linemap import mapped
 from hmt_slam_ros.configuration import Configuration
-from hmt_slam_ros.configuration.landmarks import Features
+from hmt_slam_ros.configuration.landmarks import FeatureParameters
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.landmarks.line_extraction import Lines
-from hmt_slam_ros.landmarks.line_fit import wrapped
+from hmt_slam_ros.landmarks.line_fit import wrap_angle
 from hmt_slam_ros.landmarks.stochastic_map import LineMap
-from hmt_slam_ros.sensors.motion_model import Step
+from hmt_slam_ros.sensors.motion_model import RelativeMotion
 
-FEATURES = Features()
+FEATURES = FeatureParameters()
 SIGMAS = np.array([0.004, 0.01])  # rad, m
 WALLS = np.array([[0.0, 4.0], [0.5 * np.pi, 3.0], [-np.pi, 2.0], [-0.5 * np.pi, 2.5]])
 
@@ -39,7 +39,7 @@ def nees(error, covariance):
 
 def error_of(room, line, wall):
     alpha, r = room.lines[line]
-    return np.array([float(wrapped(alpha - wall[0])), r - wall[1]])
+    return np.array([float(wrap_angle(alpha - wall[0])), r - wall[1]])
 
 
 def test_pose_and_lines_are_as_far_off_as_they_say():
@@ -51,7 +51,7 @@ def test_pose_and_lines_are_as_far_off_as_they_say():
             if k:
                 step = np.array([0.2, 0.05, 0.4])
                 true = se2.compose(se2.compose(true, step), se2.exp(deviations * draw.standard_normal(3)))
-                room.predict(Step(step, np.diag(deviations**2)))
+                room.predict(RelativeMotion(step, np.diag(deviations**2)))
             seen = draw.permutation(len(WALLS))[:3]
             room.observe(observed(true, WALLS[seen], draw))
         poses.append(nees(se2.log(se2.between(room.pose.mean, true)), room.pose.covariance))
@@ -65,7 +65,7 @@ def test_pose_and_lines_are_as_far_off_as_they_say():
 
 def test_a_motion_and_a_new_line_carry_uncertainty_as_first_order_says():
     start = PoseGaussian(np.array([0.7, -0.4, 0.6]), np.diag([0.01, 0.02, 0.005]) ** 2)
-    step = Step(np.array([0.5, 0.1, 0.3]), np.diag([0.02, 0.01, 0.01]) ** 2)
+    step = RelativeMotion(np.array([0.5, 0.1, 0.3]), np.diag([0.02, 0.01, 0.01]) ** 2)
     room = LineMap(FEATURES, start)
     room.predict(step)
     expected = start.compose(PoseGaussian(step.increment, step.covariance))
@@ -77,7 +77,7 @@ def test_a_motion_and_a_new_line_carry_uncertainty_as_first_order_says():
     slopes = np.empty((2, 3))
     for k in range(3):
         moved = room.mean[:3] + 1e-6 * np.eye(3)[k]
-        other = LineMap(FEATURES, PoseGaussian.exactly(moved))
+        other = LineMap(FEATURES, PoseGaussian.from_pose(moved))
         other.observe(lines)
         slopes[:, k] = (other.lines[0] - room.lines[0]) / 1e-6
     np.testing.assert_allclose(room.covariance[3:, :3], slopes @ before, rtol=1e-4, atol=1e-9)
@@ -89,13 +89,13 @@ def test_a_wall_has_two_faces_and_in_its_plane_noise_does_not_tell_which():
     room = LineMap(FEATURES, PoseGaussian(np.zeros(3), np.diag([0.001, 0.001, 0.001]) ** 2))
     assert room.observe(observed(np.zeros(3), wall)).new == ((0, 0),)
     # In the door the robot is in the plane of the wall, and noise has it on the other side.
-    room.predict(Step(np.array([4.0, 0.0, 0.0]), np.diag([0.02, 0.01, 0.002]) ** 2))
+    room.predict(RelativeMotion(np.array([4.0, 0.0, 0.0]), np.diag([0.02, 0.01, 0.002]) ** 2))
     behind = observed(np.array([4.005, 0.0, 0.0]), wall)
     assert abs(behind.parameters[0, 0]) > 3.0
-    assert room.observe(behind).known == ((0, 0),)
+    assert room.observe(behind).matched == ((0, 0),)
     np.testing.assert_allclose(room.lines, wall, atol=0.01)
     # From the other room its other face is seen.
-    room.predict(Step(np.array([1.0, 0.0, 0.0]), np.diag([0.01, 0.01, 0.002]) ** 2))
+    room.predict(RelativeMotion(np.array([1.0, 0.0, 0.0]), np.diag([0.01, 0.01, 0.002]) ** 2))
     assert room.observe(observed(np.array([5.0, 0.0, 0.0]), wall)).new == ((0, 1),)
     assert np.linalg.eigvalsh(room.covariance).min() > 0.0
 
@@ -105,18 +105,18 @@ def test_what_may_be_either_of_two_lines_is_told_by_the_others():
     walls = np.array([[0.0, 4.0], [0.0, 4.08], [-np.pi, 2.0]])
     room = LineMap(FEATURES)
     room.observe(observed(np.zeros(3), walls))
-    room.predict(Step(np.zeros(3), np.diag([0.05, 0.05, 0.001]) ** 2))
+    room.predict(RelativeMotion(np.zeros(3), np.diag([0.05, 0.05, 0.001]) ** 2))
     moved = np.array([0.06, 0.0, 0.0])
-    assert room.observe(observed(moved, walls)).known == ((0, 0), (1, 1), (2, 2))
-    room.predict(Step(np.zeros(3), np.diag([0.05, 0.05, 0.001]) ** 2))
+    assert room.observe(observed(moved, walls)).matched == ((0, 0), (1, 1), (2, 2))
+    room.predict(RelativeMotion(np.zeros(3), np.diag([0.05, 0.05, 0.001]) ** 2))
     found = room.observe(observed(np.array([0.13, 0.0, 0.0]), walls[[1, 2]]))
-    assert found.known == ((0, 1), (1, 2))
+    assert found.matched == ((0, 1), (1, 2))
     np.testing.assert_allclose(room.mean[:2], [0.13, 0.0], atol=0.01)
 
 
 def test_only_what_lies_beside_what_was_seen_is_compared():
     """Whether the wall behind a door goes on in the plane of this one, its line cannot tell."""
-    step = Step(np.zeros(3), np.diag([0.03, 0.03, 0.002]) ** 2)
+    step = RelativeMotion(np.zeros(3), np.diag([0.03, 0.03, 0.002]) ** 2)
     room = LineMap(FEATURES)
     for _ in range(FEATURES.min_sightings):
         room.observe(observed(np.zeros(3), WALLS[:1], extents=[(-1.0, 1.0)]))
@@ -124,7 +124,7 @@ def test_only_what_lies_beside_what_was_seen_is_compared():
     beside = np.array([[0.0, 4.06]])
     assert room.observe(observed(np.zeros(3), beside, extents=[(1.1, 2.0)])).new == ((0, 1),)
     room.predict(step)
-    assert room.observe(observed(np.zeros(3), WALLS[:1], extents=[(-0.5, 1.5)])).known == ((0, 0),)
+    assert room.observe(observed(np.zeros(3), WALLS[:1], extents=[(-0.5, 1.5)])).matched == ((0, 0),)
     np.testing.assert_allclose(room.mean[:3], 0.0, atol=1e-3)
 
 
@@ -134,9 +134,9 @@ def test_pieces_of_one_wall_are_joined_when_their_distance_is_known():
     for k in range(40):
         walls = np.repeat(WALLS[:1], 2, axis=0)
         found = room.observe(observed(np.zeros(3), walls, draw, extents))
-        assert len(found.known) + len(found.new) == 2
-        joined += [(k, *pair) for pair in found.joined]
-        room.predict(Step(np.zeros(3), np.zeros((3, 3))))
+        assert len(found.matched) + len(found.new) == 2
+        joined += [(k, *pair) for pair in found.merged]
+        room.predict(RelativeMotion(np.zeros(3), np.zeros((3, 3))))
     assert len(joined) == 1
     assert joined[0][0] > 0
     assert [wall.name for wall in room.walls] == [0]
@@ -149,10 +149,10 @@ def test_what_may_be_either_of_two_lines_and_nothing_tells_is_neither():
     room = LineMap(FEATURES)
     for _ in range(3):
         room.observe(observed(np.zeros(3), walls))
-    room.predict(Step(np.zeros(3), np.diag([0.05, 0.05, 0.001]) ** 2))
+    room.predict(RelativeMotion(np.zeros(3), np.diag([0.05, 0.05, 0.001]) ** 2))
     before = room.mean[0]
     found = room.observe(observed(np.array([0.02, 0.0, 0.0]), walls[[1, 2]]))
-    assert found.known == ((1, 2),)
+    assert found.matched == ((1, 2),)
     assert found.new == ()
     assert room.mean[0] == pytest.approx(before, abs=1e-3)
     assert room.pose.covariance[0, 0] > 0.04**2
@@ -194,35 +194,35 @@ def test_where_the_robot_was_is_corrected_by_what_is_seen_later():
     # Along a hallway whose end is hidden nothing tells how far the robot goes; it goes farther than odometry says.
     room, true, hidden = LineMap(FEATURES), np.zeros(3), WALLS[[1, 3]]
     long = ((-6.0, 6.0),)
-    room.observe(observed(true, extents=long), surely=True)
+    room.observe(observed(true, extents=long), keep_new=True)
     noise, along = np.diag([0.05, 0.02, 0.01]) ** 2, []
     for _ in range(12):
         true = se2.compose(true, np.array([0.15, 0.0, 0.0]))
-        room.predict(Step(np.array([0.12, 0.0, 0.0]), noise))
+        room.predict(RelativeMotion(np.array([0.12, 0.0, 0.0]), noise))
         room.observe(observed(true, hidden, extents=long))
-        room.mark()
+        room.clone_pose()
         along.append(true[0])
-    off = np.array(along) - room.marks.poses[:, 0]
+    off = np.array(along) - room.clones.poses[:, 0]
     assert off[-1] > 0.3
     room.observe(observed(true, extents=long))
-    assert np.abs(np.array(along) - room.marks.poses[:, 0]).max() < 0.02
+    assert np.abs(np.array(along) - room.clones.poses[:, 0]).max() < 0.02
     # A pose that is known is not corrected.
-    before = room.marks.poses.copy()
-    room.put(PoseGaussian.exactly(room.pose.mean + np.array([0.1, 0.0, 0.0])))
+    before = room.clones.poses.copy()
+    room.reset_pose(PoseGaussian.from_pose(room.pose.mean + np.array([0.1, 0.0, 0.0])))
     room.observe(observed(true, extents=long))
-    np.testing.assert_allclose(room.marks.poses, before, atol=0.02)
+    np.testing.assert_allclose(room.clones.poses, before, atol=0.02)
 
 
 def test_marks_are_as_far_off_as_the_state_says():
     # What a mark has in common with the robot is what the robot's covariance was, as long as nothing is observed.
-    room, step = LineMap(FEATURES), Step(np.array([0.2, 0.0, 0.1]), np.diag([0.05, 0.02, 0.01]) ** 2)
+    room, step = LineMap(FEATURES), RelativeMotion(np.array([0.2, 0.0, 0.1]), np.diag([0.05, 0.02, 0.01]) ** 2)
     room.predict(step)
-    room.mark()
-    np.testing.assert_array_equal(room.marks.common[0], room.covariance[:3])
+    room.clone_pose()
+    np.testing.assert_array_equal(room.clones.common[0], room.covariance[:3])
     before = room.covariance.copy()
     room.predict(step)
-    np.testing.assert_allclose(room.marks.common[0][2, 2], before[2, 2])
+    np.testing.assert_allclose(room.clones.common[0][2, 2], before[2, 2])
     # Its errors turn about where it was: theta moves the robot's x and y.
-    lever = room.mean[:2] - room.marks.poses[0, :2]
+    lever = room.mean[:2] - room.clones.poses[0, :2]
     turned = before[2, 2] * np.array([-lever[1], lever[0]])
-    np.testing.assert_allclose(room.marks.common[0][2, :2] - before[2, :2], turned)
+    np.testing.assert_allclose(room.clones.common[0][2, :2] - before[2, :2], turned)

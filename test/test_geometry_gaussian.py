@@ -10,7 +10,7 @@ from hypothesis.extra.numpy import arrays
 from scipy.stats import chi2
 
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.geometry.gaussian import PoseGaussian, fuse, gate
+from hmt_slam_ros.geometry.gaussian import PoseGaussian, chi_square_gate, fuse
 
 SAMPLES = 200_000
 
@@ -200,16 +200,16 @@ def test_fusion_never_adds_uncertainty(seed):
 
 @pytest.mark.parametrize("probability", [0.5, 0.95, 0.999])
 def test_the_gate_is_the_quantile_of_chi_square(probability):
-    assert gate(probability) == pytest.approx(chi2.ppf(probability, 3), rel=1e-12)
+    assert chi_square_gate(probability) == pytest.approx(chi2.ppf(probability, 3), rel=1e-12)
 
 
 def test_the_ellipse_holds_95_percent_of_the_positions_in_the_outer_axes():
     rng = np.random.default_rng(11)
     belief = PoseGaussian(np.array([3.0, -2.0, 0.8]), np.diag([0.2, 0.01, 0.0]) ** 2)
-    ellipse = belief.ellipse()
-    assert ellipse.longer > 10.0 * ellipse.shorter
+    ellipse = belief.position_ellipse()
+    assert ellipse.semi_major > 10.0 * ellipse.semi_minor
     assert math.sin(ellipse.angle - 0.8) == pytest.approx(0.0, abs=1e-9)
     away = draw(belief, rng)[:, :2] - belief.mean[:2]
     sin, cos = math.sin(ellipse.angle), math.cos(ellipse.angle)
-    along, across = away @ [cos, sin] / ellipse.longer, away @ [-sin, cos] / ellipse.shorter
+    along, across = away @ [cos, sin] / ellipse.semi_major, away @ [-sin, cos] / ellipse.semi_minor
     assert (along**2 + across**2 < 1.0).mean() == pytest.approx(0.95, abs=0.003)

@@ -18,25 +18,25 @@ def definite(random, rank=3):
 
 def whole(a):
     matrix = np.empty((3, 3))
-    symmetric.into_array(a, matrix)
+    symmetric.write_to_array(a, matrix)
     return matrix
 
 
 def test_sums_and_products(random):
     a, b, v, w = definite(random), definite(random), random.standard_normal(3), random.standard_normal(3)
-    one, other = symmetric.of_array(a), symmetric.of_array(b)
+    one, other = symmetric.symmetric_from_array(a), symmetric.symmetric_from_array(b)
     np.testing.assert_array_equal(whole(one), a)
-    np.testing.assert_allclose(whole(symmetric.total(one, other, -0.5)), a - 0.5 * b)
-    np.testing.assert_allclose(symmetric.times(one, tuple(v)), a @ v, rtol=1e-9)
-    np.testing.assert_allclose(whole(symmetric.sandwiched(one, other)), a @ b @ a, rtol=1e-9)
+    np.testing.assert_allclose(whole(symmetric.add_scaled(one, other, -0.5)), a - 0.5 * b)
+    np.testing.assert_allclose(symmetric.multiply(one, tuple(v)), a @ v, rtol=1e-9)
+    np.testing.assert_allclose(whole(symmetric.sandwich(one, other)), a @ b @ a, rtol=1e-9)
     assert symmetric.dot(tuple(v), tuple(w)) == pytest.approx(v @ w)
 
 
 def test_inverse_solution_and_determinant(random):
     matrix, v = definite(random) + 1e-3 * np.eye(3), random.standard_normal(3)
-    a = symmetric.of_array(matrix)
+    a = symmetric.symmetric_from_array(matrix)
     np.testing.assert_allclose(whole(symmetric.inverse(a)) @ matrix, np.eye(3), atol=1e-6)
-    np.testing.assert_allclose(matrix @ symmetric.solved(a, tuple(v)), v, atol=1e-6)
+    np.testing.assert_allclose(matrix @ symmetric.solve(a, tuple(v)), v, atol=1e-6)
     assert symmetric.determinant(a) == pytest.approx(np.linalg.det(matrix))
 
 
@@ -45,5 +45,5 @@ def test_a_solution_is_as_good_as_that_of_lapack_where_little_is_known(random, r
     matrix = definite(random, rank)
     matrix += 1e-9 * np.trace(matrix) * np.eye(3)
     v = matrix @ random.standard_normal(3)
-    off = np.abs(matrix @ symmetric.solved(symmetric.of_array(matrix), tuple(v)) - v).max()
+    off = np.abs(matrix @ symmetric.solve(symmetric.symmetric_from_array(matrix), tuple(v)) - v).max()
     assert off < 1e-12 * np.trace(matrix)

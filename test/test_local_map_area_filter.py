@@ -9,33 +9,33 @@ from worlds import blank_scan, box, scan_in
 from hmt_slam_ros.configuration import Configuration, with_changes
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.registration.scan_to_map import matched_fraction
-from hmt_slam_ros.sensors.motion_model import Prediction, Step
+from hmt_slam_ros.sensors.motion_model import Prediction, RelativeMotion
 from hmt_slam_ros.submap.local_filter import PlacedKeyframe
-from hmt_slam_ros.submap.local_mapping import LocalMapping, Sighting
-from hmt_slam_ros.submap.particle_filter import AreaFilter
+from hmt_slam_ros.submap.local_mapping import LocalMapping, PreparedScan
+from hmt_slam_ros.submap.particle_filter import ParticleFilter
 
 ROOM = np.concatenate((box(-6.02, -4.03, 6.03, 7.01), box(3.51, 1.02, 4.53, 2.52), box(-4.02, 3.03, -3.52, 7.01)))
 STEP = np.array([0.1, 0.0, 0.05])
 COVARIANCE = np.diag([0.02, 0.02, 0.01]) ** 2
 # About what the velocity tells of the next 0.2 s.
-INERTIA = Step(STEP, np.diag([0.03, 0.03, 0.04]) ** 2)
+INERTIA = RelativeMotion(STEP, np.diag([0.03, 0.03, 0.04]) ** 2)
 
 
 def predicted(increment, covariance=COVARIANCE, inertia=INERTIA):
-    odometry = Step(np.asarray(increment), covariance)
-    return Prediction(odometry, inertia, together=odometry)
+    odometry = RelativeMotion(np.asarray(increment), covariance)
+    return Prediction(odometry, inertia, fused=odometry)
 
 
 def driven(mapping, odometry_error=(0.0, 0.0, 0.0), steps=60, hypothesis=0):
     """A filter after a drive on a circle, and the true pose."""
-    area_filter = AreaFilter(mapping, hypothesis, area=0)
+    area_filter = ParticleFilter(mapping, hypothesis, area=0)
     truth = np.zeros(3)
     area_filter.add_keyframe(0, scan_in(ROOM, truth))
     events = 0
     for k in range(1, steps):
         truth = se2.compose(truth, STEP)
         scan = scan_in(ROOM, truth, noise=0.01, seed=k)
-        sighting = Sighting(mapping, scan)
+        sighting = PreparedScan(mapping, scan)
         area_filter.track(sighting, predicted(STEP + np.asarray(odometry_error)))
         if k % 5 == 0:
             events += 1
@@ -67,15 +67,15 @@ def test_a_branch_goes_its_own_way():
     child = parent.branch(1)
     before = parent.poses.copy(), parent.keyframe_poses.copy()
     scan = scan_in(ROOM, (1.0, 0.5, 0.3))
-    child.track(Sighting(mapping, scan), predicted(STEP))
-    child.update(Sighting(mapping, scan), 99)
+    child.track(PreparedScan(mapping, scan), predicted(STEP))
+    child.update(PreparedScan(mapping, scan), 99)
     child.add_keyframe(99, scan)
     np.testing.assert_array_equal(parent.poses, before[0])
     np.testing.assert_array_equal(parent.keyframe_poses, before[1])
     assert parent.keyframes[-1] != 99
     child.release()
     parent.release()
-    assert mapping.pool.used == 0
+    assert mapping.pool.patches_in_use == 0
 
 
 def test_resampling_keeps_the_leader_and_drops_what_has_no_weight():
@@ -86,9 +86,9 @@ def test_resampling_keeps_the_leader_and_drops_what_has_no_weight():
     area_filter.log_weights[count - 1] = 0.0
     leading = area_filter.keyframe_poses[count - 1].copy()
     scan = scan_in(ROOM, (0.8, 0.1, 0.35))
-    step = area_filter.update(Sighting(mapping, scan), 50)
+    step = area_filter.update(PreparedScan(mapping, scan), 50)
     assert step.effective_samples == pytest.approx(1.0, abs=0.1)
-    assert step.history_changed
+    assert step.keyframes_moved
     assert area_filter.leader == 0
     for poses in area_filter.keyframe_poses:
         np.testing.assert_array_equal(poses, leading)
@@ -103,8 +103,8 @@ def test_the_leader_stays_until_another_is_clearly_more_likely():
         area_filter.log_weights = np.full(count, -5.0)
         area_filter.log_weights[leader], area_filter.log_weights[other] = -advantage, 0.0
         # A scan without returns makes none likelier.
-        area_filter.track(Sighting(area_filter.mapping, blank_scan()), predicted(STEP))
-        area_filter.update(Sighting(area_filter.mapping, blank_scan()), 50)
+        area_filter.track(PreparedScan(area_filter.mapping, blank_scan()), predicted(STEP))
+        area_filter.update(PreparedScan(area_filter.mapping, blank_scan()), 50)
         np.testing.assert_array_equal(area_filter.pose, area_filter.poses[area_filter.leader])
         assert area_filter.leader == leads
 
@@ -116,8 +116,8 @@ def test_a_leader_that_is_less_likely_though_not_clearly_is_kept_by_resampling()
     area_filter.log_weights = np.full(count, -50.0)
     area_filter.log_weights[heaviest], area_filter.log_weights[leader] = 0.0, -2.9
     histories = area_filter.keyframe_poses[[leader, heaviest]]
-    step = area_filter.update(Sighting(area_filter.mapping, blank_scan()), 50)
-    assert not step.history_changed
+    step = area_filter.update(PreparedScan(area_filter.mapping, blank_scan()), 50)
+    assert not step.keyframes_moved
     np.testing.assert_array_equal(area_filter.log_weights, 0.0)
     np.testing.assert_array_equal(area_filter.leading_keyframe_poses(), histories[0])
     shares = [(area_filter.keyframe_poses == history).all(axis=(1, 2)).sum() for history in histories]
@@ -131,36 +131,36 @@ def test_a_particle_that_is_clearly_more_likely_takes_the_lead_and_it_is_told():
     area_filter.log_weights = np.full(count, -50.0)
     area_filter.log_weights[heaviest] = 0.0
     leading = area_filter.keyframe_poses[heaviest].copy()
-    assert area_filter.update(Sighting(area_filter.mapping, blank_scan()), 50).history_changed
+    assert area_filter.update(PreparedScan(area_filter.mapping, blank_scan()), 50).keyframes_moved
     np.testing.assert_array_equal(area_filter.leading_keyframe_poses(), leading)
 
 
 def test_the_motion_of_a_step_is_that_of_one_particle_also_where_the_lead_changes():
     area_filter, _ = driven(LocalMapping(Configuration()), steps=8)
-    area_filter.update(Sighting(area_filter.mapping, blank_scan()), 49)
+    area_filter.update(PreparedScan(area_filter.mapping, blank_scan()), 49)
     other = (area_filter.leader + 1) % len(area_filter.poses)
-    area_filter.poses[other] = area_filter._last_poses[other] = area_filter._priors[other] = (1.0, 2.0, 0.5)
+    area_filter.poses[other] = area_filter._last_poses[other] = area_filter._predicted_poses[other] = (1.0, 2.0, 0.5)
     area_filter.log_weights = np.full(len(area_filter.poses), -10.0)
     area_filter.log_weights[other] = 0.0
-    area_filter.track(Sighting(area_filter.mapping, blank_scan()), predicted(STEP))
-    step = area_filter.update(Sighting(area_filter.mapping, blank_scan()), 50)
-    assert step.history_changed
+    area_filter.track(PreparedScan(area_filter.mapping, blank_scan()), predicted(STEP))
+    step = area_filter.update(PreparedScan(area_filter.mapping, blank_scan()), 50)
+    assert step.keyframes_moved
     np.testing.assert_allclose(step.moved, STEP, atol=1e-9)
 
 
 def test_effective_samples_equal_the_particles_where_all_weigh_the_same():
     mapping = LocalMapping(Configuration())
-    area_filter = AreaFilter(mapping, 0, 0)
-    area_filter.track(Sighting(area_filter.mapping, blank_scan()), predicted(STEP))
-    step = area_filter.update(Sighting(area_filter.mapping, blank_scan()), 1)
+    area_filter = ParticleFilter(mapping, 0, 0)
+    area_filter.track(PreparedScan(area_filter.mapping, blank_scan()), predicted(STEP))
+    step = area_filter.update(PreparedScan(area_filter.mapping, blank_scan()), 1)
     assert step.effective_samples == pytest.approx(len(area_filter.poses))
 
 
 def test_without_returns_the_particles_spread_as_odometry_says():
     configuration = Configuration()
     configuration = replace(configuration, filter=replace(configuration.filter, particles=400))
-    area_filter = AreaFilter(LocalMapping(configuration), 0, 0)
-    blank = Sighting(area_filter.mapping, blank_scan())
+    area_filter = ParticleFilter(LocalMapping(configuration), 0, 0)
+    blank = PreparedScan(area_filter.mapping, blank_scan())
     area_filter.track(blank, predicted([1.0, 0.0, 0.0], np.diag([0.2, 0.1, 0.05]) ** 2))
     area_filter.update(blank, 1)
     spread = area_filter.poses[1:].std(axis=0)
@@ -171,7 +171,7 @@ def test_a_lost_robot_is_found_by_the_search():
     mapping = LocalMapping(Configuration())
     area_filter, truth = driven(mapping, steps=30)
     scan = scan_in(ROOM, se2.compose(truth, (0.3, 0.2, np.radians(12))))
-    area_filter.track(Sighting(mapping, scan), predicted(np.zeros(3), np.diag([0.1, 0.1, 0.1]) ** 2))
+    area_filter.track(PreparedScan(mapping, scan), predicted(np.zeros(3), np.diag([0.1, 0.1, 0.1]) ** 2))
     error = se2.between(se2.compose(truth, (0.3, 0.2, np.radians(12))), area_filter.pose)
     assert np.hypot(*error[:2]) < 0.05
     assert abs(error[2]) < np.radians(1.0)
@@ -187,13 +187,13 @@ def test_a_change_of_area_moves_frame_and_map_together():
     content = [PlacedKeyframe(k, 7, scan_in(ROOM, pose), se2.compose(new_T_old, pose)) for k, pose in enumerate(poses)]
     area_filter.change_area(7, new_T_old, content)
     truth = se2.compose(truth, STEP)
-    area_filter.track(Sighting(mapping, scan_in(ROOM, truth)), predicted(STEP))
+    area_filter.track(PreparedScan(mapping, scan_in(ROOM, truth)), predicted(STEP))
     error = se2.between(se2.compose(new_T_old, truth), area_filter.pose)
     assert np.hypot(*error[:2]) < 0.03
     assert area_filter.area == 7
     assert area_filter.keyframes == [0, 1, 2, 3]
     area_filter.release()
-    assert mapping.pool.used == 0
+    assert mapping.pool.patches_in_use == 0
 
 
 def test_beams_beyond_the_range_tell_free_space_up_to_it():
@@ -221,5 +221,5 @@ def test_when_keyframes_move_the_map_is_built_anew_and_the_robot_stays_where_it_
     area_filter.reload(content, 2)
     np.testing.assert_allclose(area_filter.leading_keyframe_poses(), poses)
     np.testing.assert_allclose(se2.between(poses[anchor], area_filter.poses), seen, atol=1e-9)
-    points = area_filter.mapping.matching_points(scans[2])
+    points = area_filter.mapping.matching_surfels(scans[2])
     assert matched_fraction(points, poses[anchor], area_filter._leading_view(), area_filter.mapping.near) > 0.9

@@ -7,8 +7,8 @@ import pytest
 from worlds import box, scan_at, scan_in
 
 from hmt_slam_ros.configuration.tree import Configuration
-from hmt_slam_ros.landmarks.area_landmarks import AreaLandmarks
-from hmt_slam_ros.landmarks.landmarks import INNER
+from hmt_slam_ros.landmarks.area_landmarks import AreaLandmarkExtractor
+from hmt_slam_ros.landmarks.landmarks import CONCAVE_CORNER
 from hmt_slam_ros.submap.local_mapping import LocalMapping
 
 ROOM = box(-2.02, -1.51, 2.53, 2.02)
@@ -25,26 +25,30 @@ def whole(pose, seed):
 
 @pytest.mark.parametrize("look", [half, whole])
 def test_a_room_has_its_four_corners_whatever_the_laser_sees_at_once(look):
-    landmarks = AreaLandmarks(LocalMapping(Configuration()))
+    landmarks = AreaLandmarkExtractor(LocalMapping(Configuration()))
     scans = [look(pose, k) for k, pose in enumerate(POSES)]
-    found = landmarks.of(scans, POSES)
-    corners = np.array([one.pose.mean[:2] for one in found if one.kind == INNER and one.existence.probability > 0.5])
+    found = landmarks.extract(scans, POSES)
+    corners = np.array(
+        [one.pose.mean[:2] for one in found if one.kind == CONCAVE_CORNER and one.existence.probability > 0.5]
+    )
     true = np.array([(-2.02, -1.51), (2.53, -1.51), (2.53, 2.02), (-2.02, 2.02)])
     assert corners.shape == (4, 2)
     assert np.hypot(*(corners[None] - true[:, None]).transpose(2, 0, 1)).min(axis=1).max() < 0.05
     # It keeps nothing of one area for the next.
-    again = landmarks.of(scans, POSES)
+    again = landmarks.extract(scans, POSES)
     assert [one.pose.mean.tolist() for one in again] == [one.pose.mean.tolist() for one in found]
 
 
 def test_what_is_gone_at_a_later_visit_is_not_believed_in_because_the_map_held_it():
-    landmarks = AreaLandmarks(LocalMapping(Configuration()))
+    landmarks = AreaLandmarkExtractor(LocalMapping(Configuration()))
     bigger = box(-2.02, -1.51, 4.03, 2.02)
     first = [half(pose, k) for k, pose in enumerate(POSES)]
     then = [scan_in(bigger, pose, beams=361, noise=0.01, seed=k) for k, pose in enumerate(POSES)]
     later = [replace(scan, stamp=scan.stamp + 100_000_000_000) for scan in then]
-    found = landmarks.of(first + later, np.concatenate((POSES, POSES)))
-    believed = np.array([one.pose.mean[:2] for one in found if one.kind == INNER and one.existence.probability > 0.5])
+    found = landmarks.extract(first + later, np.concatenate((POSES, POSES)))
+    believed = np.array(
+        [one.pose.mean[:2] for one in found if one.kind == CONCAVE_CORNER and one.existence.probability > 0.5]
+    )
     true = np.array([(-2.02, -1.51), (4.03, -1.51), (4.03, 2.02), (-2.02, 2.02)])
     assert believed.shape == (4, 2)
     assert np.hypot(*(believed[None] - true[:, None]).transpose(2, 0, 1)).min(axis=1).max() < 0.1
@@ -53,5 +57,5 @@ def test_what_is_gone_at_a_later_visit_is_not_believed_in_because_the_map_held_i
 @pytest.mark.parametrize("away", [10, 100])
 def test_only_a_robot_that_was_away_is_told_that_it_comes_back(away):
     scans = [replace(whole(POSES[0], k), stamp=away * k * 1_000_000_000) for k in range(3)]
-    sightings = AreaLandmarks(LocalMapping(Configuration())).sightings(scans, POSES[[0, 0, 0]])
-    assert [sighting.back for sighting in sightings] == [False, away > 60, away > 60]
+    sightings = AreaLandmarkExtractor(LocalMapping(Configuration())).observations(scans, POSES[[0, 0, 0]])
+    assert [sighting.begins_visit for sighting in sightings] == [False, away > 60, away > 60]

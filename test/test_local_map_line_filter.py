@@ -8,15 +8,15 @@ from hmt_slam_ros.configuration import Configuration, with_changes
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.landmarks.filter_selection import FilterSelector
-from hmt_slam_ros.registration.consistency import SIGHT
-from hmt_slam_ros.sensors.motion_model import Prediction, Step
+from hmt_slam_ros.registration.consistency import WALLS_OF_SUBMAP
+from hmt_slam_ros.sensors.motion_model import Prediction, RelativeMotion
 from hmt_slam_ros.submap.local_filter import PlacedKeyframe
-from hmt_slam_ros.submap.local_mapping import LocalMapping, Sighting
+from hmt_slam_ros.submap.local_mapping import LocalMapping, PreparedScan
 
 ROOM = np.concatenate((box(-6.02, -4.03, 6.03, 7.01), box(3.51, 1.02, 4.53, 2.52), box(-4.02, 3.03, -3.52, 7.01)))
 STEP = np.array([0.1, 0.0, 0.05])
 SURE = np.diag([0.03, 0.03, 0.015]) ** 2
-INERTIA = Step(STEP, np.diag([0.1, 0.1, 0.15]) ** 2)
+INERTIA = RelativeMotion(STEP, np.diag([0.1, 0.1, 0.15]) ** 2)
 CONFIGURATION = with_changes(Configuration(), {"local_map.kind": "lines"})
 
 
@@ -26,8 +26,8 @@ def mapping():
 
 
 def predicted(increment, inertia=INERTIA):
-    odometry = Step(np.asarray(increment), SURE)
-    return Prediction(odometry, inertia, together=odometry)
+    odometry = RelativeMotion(np.asarray(increment), SURE)
+    return Prediction(odometry, inertia, fused=odometry)
 
 
 def driven(mapping, odometry_error=(0.0, 0.0, 0.0), steps=60):
@@ -38,9 +38,9 @@ def driven(mapping, odometry_error=(0.0, 0.0, 0.0), steps=60):
     for k in range(1, steps):
         truth = se2.compose(truth, STEP)
         scan = scan_in(ROOM, truth, noise=0.01, seed=k)
-        own.track(Sighting(mapping, scan), predicted(STEP + np.asarray(odometry_error)))
+        own.track(PreparedScan(mapping, scan), predicted(STEP + np.asarray(odometry_error)))
         if k % 5 == 0:
-            own.update(Sighting(mapping, scan), k // 5)
+            own.update(PreparedScan(mapping, scan), k // 5)
             own.add_keyframe(k // 5, scan)
             scans.append(scan)
     return own, truth, scans
@@ -61,7 +61,7 @@ def test_the_robot_is_found_though_odometry_drifts_and_knows_how_well(mapping):
 
 def test_a_step_tells_what_the_match_determines(mapping):
     own, truth, _ = driven(mapping, steps=9)
-    scan = Sighting(mapping, scan_in(ROOM, se2.compose(truth, STEP), noise=0.01, seed=90))
+    scan = PreparedScan(mapping, scan_in(ROOM, se2.compose(truth, STEP), noise=0.01, seed=90))
     tracked = own.track(scan, predicted(STEP))
     assert not tracked.contradicted
     assert np.linalg.eigvalsh(tracked.information)[0] > 1e4
@@ -72,7 +72,7 @@ def test_a_step_tells_what_the_match_determines(mapping):
     assert np.sqrt(np.diag(step.error.matched)[:2]).max() < 0.01
     assert np.linalg.eigvalsh(step.error.lasting).min() > -1e-12
     # Without a line nothing is known but the prediction.
-    blank = Sighting(mapping, blank_scan())
+    blank = PreparedScan(mapping, blank_scan())
     own.track(blank, predicted(STEP))
     step = own.update(blank, 10)
     np.testing.assert_allclose(step.error.gain, 0.0, atol=1e-12)
@@ -85,7 +85,7 @@ def test_a_heading_slip_is_found_by_inertia_and_told(mapping, slip):
     own, truth, _ = driven(mapping, steps=21)
     truth = se2.compose(truth, STEP)
     slipped = se2.compose(STEP, (0.0, 0.0, np.radians(slip)))
-    tracked = own.track(Sighting(mapping, scan_in(ROOM, truth, noise=0.01)), predicted(slipped))
+    tracked = own.track(PreparedScan(mapping, scan_in(ROOM, truth, noise=0.01)), predicted(slipped))
     assert tracked.contradicted
     error = se2.between(truth, own.pose)
     assert np.hypot(*error[:2]) < 0.03
@@ -99,7 +99,7 @@ def test_a_change_of_area_is_one_of_the_frame_and_loads_its_lines(mapping):
     assert (own.area, own.keyframe_areas) == (7, [7] * 7)
     assert len(own.room) >= 6
     truth = se2.compose(truth, STEP)
-    tracked = own.track(Sighting(mapping, scan_in(ROOM, truth, noise=0.01, seed=77)), predicted(STEP))
+    tracked = own.track(PreparedScan(mapping, scan_in(ROOM, truth, noise=0.01, seed=77)), predicted(STEP))
     assert not tracked.contradicted
     np.testing.assert_allclose(own.pose, se2.compose(new_T_old, truth), atol=0.02)
 
@@ -117,7 +117,7 @@ def test_a_branch_goes_its_own_way_and_a_state_goes_on_to_the_bit(mapping):
     parent, truth, _ = driven(mapping, steps=20)
     before, child = parent.room.covariance.copy(), parent.branch(1)
     again = FilterSelector(mapping).restored(parent.state)
-    sighting = Sighting(mapping, scan_in(ROOM, se2.compose(truth, STEP), noise=0.01, seed=3))
+    sighting = PreparedScan(mapping, scan_in(ROOM, se2.compose(truth, STEP), noise=0.01, seed=3))
     child.track(sighting, predicted(STEP))
     child.add_keyframe(99, sighting.scan)
     np.testing.assert_array_equal(parent.room.covariance, before)
@@ -130,25 +130,25 @@ def test_a_branch_goes_its_own_way_and_a_state_goes_on_to_the_bit(mapping):
 
 def test_walls_are_met_where_the_robot_is_and_passed_where_it_is_not(mapping):
     own, truth, _ = driven(mapping)
-    found = own.compared(Sighting(mapping, scan_in(ROOM, truth, noise=0.01, seed=5)))
+    found = own.compared(PreparedScan(mapping, scan_in(ROOM, truth, noise=0.01, seed=5)))
     assert found.ends.share > 0.7
     assert found.ends.free == found.walls.free == 0
     assert found.walls.on > 30
-    elsewhere = own.compared(Sighting(mapping, scan_in(box(-9.0, -9.0, 12.0, 9.0), np.zeros(3), noise=0.01)))
+    elsewhere = own.compared(PreparedScan(mapping, scan_in(box(-9.0, -9.0, 12.0, 9.0), np.zeros(3), noise=0.01)))
     assert elsewhere.walls.free > 30
-    assert SIGHT.log_ratio(elsewhere.walls, own.experience.walls.share) < -10.0
+    assert WALLS_OF_SUBMAP.log_likelihood_ratio(elsewhere.walls, own.clutter_estimate.walls.share) < -10.0
 
 
 def test_keyframes_are_dropped_and_what_was_known_is_forgotten(mapping):
     own, _, _ = driven(mapping, steps=21)
     kept = own.leading_keyframe_poses()[[0, 2, 4]]
-    own.drop({1, 3})
+    own.drop_keyframes({1, 3})
     assert own.keyframes == [0, 2, 4]
     np.testing.assert_array_equal(own.leading_keyframe_poses(), kept)
-    own.stand(PoseGaussian.exactly(own.pose))
+    own.initialize(PoseGaussian.from_pose(own.pose))
     np.testing.assert_array_equal(own.room.pose.covariance, 0.0)
     np.testing.assert_array_equal(own.tracking_covariance, 0.0)
-    own.track(Sighting(mapping, blank_scan()), predicted(STEP))
+    own.track(PreparedScan(mapping, blank_scan()), predicted(STEP))
     np.testing.assert_allclose(own.room.pose.covariance, SURE, atol=1e-12)
 
 
@@ -160,12 +160,12 @@ def test_keyframes_of_a_drift_are_corrected_and_told(mapping):
     for k in range(1, 81):
         truth = se2.compose(truth, ahead)
         sides = hallway[np.abs(hallway[:, 0] - hallway[:, 2]) > 1.0] if 3 < k < 80 else hallway
-        sighting = Sighting(mapping, scan_in(sides, truth, noise=0.01, seed=k))
+        sighting = PreparedScan(mapping, scan_in(sides, truth, noise=0.01, seed=k))
         own.track(sighting, predicted(ahead - np.array([0.005, 0.0, 0.0])))
         if k % 5 == 0:
             step = own.update(sighting, k)
             own.add_keyframe(k, sighting.scan)
-            assert step.history_changed == (k == 80)
+            assert step.keyframes_moved == (k == 80)
     assert own.pose[0] == pytest.approx(8.0, abs=0.03)
     np.testing.assert_allclose(own.leading_keyframe_poses()[:, 0], 0.5 * np.arange(17), atol=0.05)
-    assert step.moved[0] == pytest.approx(0.5, abs=0.05)
+    assert step.increment[0] == pytest.approx(0.5, abs=0.05)

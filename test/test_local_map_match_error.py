@@ -7,10 +7,10 @@ from worlds import blank_scan, drive, scan_in, two_rooms
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.registration.match_covariance import match_error
-from hmt_slam_ros.sensors.motion_model import Prediction, Step
-from hmt_slam_ros.submap.local_mapping import LocalMapping, Sighting
-from hmt_slam_ros.submap.particle_filter import AreaFilter
+from hmt_slam_ros.registration.match_covariance import estimate_match_error
+from hmt_slam_ros.sensors.motion_model import Prediction, RelativeMotion
+from hmt_slam_ros.submap.local_mapping import LocalMapping, PreparedScan
+from hmt_slam_ros.submap.particle_filter import ParticleFilter
 
 CORRIDOR = np.array([[-200.0, -1.0, 200.0, -1.0], [-200.0, 1.0, 200.0, 1.0]])
 ODOMETRY = np.diag([0.05, 0.05, 0.025]) ** 2
@@ -21,14 +21,14 @@ ALONG = drive((0.0, 0.2), (12.0, 0.2))
 def driven(walls, truth, seed):
     """Steps of a filter along keyframes (n, 3): poses (n, 3) of the keyframes, and what was found of each step."""
     mapping, random = LocalMapping(Configuration(seed=seed)), np.random.default_rng(seed)
-    area_filter = AreaFilter(mapping, 0, area=0)
+    area_filter = ParticleFilter(mapping, 0, area=0)
     area_filter.add_keyframe(0, scan_in(walls, truth[0], noise=0.015, seed=1000 * seed))
     steps = []
     for k in range(1, len(truth)):
         noise = se2.exp(np.sqrt(np.diag(ODOMETRY)) * random.standard_normal(3))
-        step = Step(se2.compose(se2.between(truth[k - 1], truth[k]), noise), ODOMETRY)
+        step = RelativeMotion(se2.compose(se2.between(truth[k - 1], truth[k]), noise), ODOMETRY)
         scan = scan_in(walls, truth[k], noise=0.015, seed=1000 * seed + k)
-        sighting = Sighting(mapping, scan)
+        sighting = PreparedScan(mapping, scan)
         area_filter.track(sighting, Prediction(step, step, step))
         steps.append(area_filter.update(sighting, k))
         area_filter.add_keyframe(k, scan)
@@ -74,23 +74,23 @@ def test_along_a_bare_corridor_the_drift_is_that_of_odometry_and_across_it_the_m
 def error_of(points, block=0.0):
     """The error of a match in a room of which a block of beams is shifted by so much, m."""
     mapping = LocalMapping(Configuration())
-    area_filter = AreaFilter(mapping, 0, area=0)
+    area_filter = ParticleFilter(mapping, 0, area=0)
     area_filter.add_keyframe(0, scan_in(two_rooms(), (2.0, 2.0, 0.3)))
     found = points.copy()
     found[64:80, :2] += block * found[64:80, 2:]
-    return match_error(
+    return estimate_match_error(
         found,
         np.zeros(3),
         np.diag([1e4, 1e4, 1e4]),
         np.diag([400.0, 400.0, 1600.0]),
         area_filter._leading_view(),
         mapping.alignment,
-        mapping.noise,
+        mapping.match_noise,
     )
 
 
 def test_beams_that_err_together_make_a_match_less_certain():
-    points = LocalMapping(Configuration()).matching_points(scan_in(two_rooms(), (2.0, 2.0, 0.3)))
+    points = LocalMapping(Configuration()).matching_surfels(scan_in(two_rooms(), (2.0, 2.0, 0.3)))
     as_seen, misled = error_of(points), error_of(points, block=0.1)
     assert np.trace(misled.matched) > 1.5 * np.trace(as_seen.matched)
     np.testing.assert_array_equal(misled.gain, as_seen.gain)
@@ -98,11 +98,11 @@ def test_beams_that_err_together_make_a_match_less_certain():
 
 def test_without_returns_odometry_alone_tells():
     mapping = LocalMapping(Configuration())
-    nothing = Sighting(mapping, blank_scan())
-    area_filter = AreaFilter(mapping, 0, area=0)
-    step = Step(np.zeros(3), ODOMETRY)
+    nothing = PreparedScan(mapping, blank_scan())
+    area_filter = ParticleFilter(mapping, 0, area=0)
+    step = RelativeMotion(np.zeros(3), ODOMETRY)
     area_filter.track(nothing, Prediction(step, step, step))
-    error = area_filter.update(nothing, 1).error
-    np.testing.assert_allclose(error.matched, ODOMETRY, rtol=1e-6)
-    np.testing.assert_allclose(error.lasting, ODOMETRY, rtol=1e-6)
+    error = area_filter.update(nothing, 1).match_error
+    np.testing.assert_allclose(error.pose_covariance, ODOMETRY, rtol=1e-6)
+    np.testing.assert_allclose(error.drift_covariance, ODOMETRY, rtol=1e-6)
     assert not error.gain.any()

@@ -7,16 +7,24 @@ from hypothesis import strategies as st
 from worlds import box, scan_in
 
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.grids.insertion import InverseModel
-from hmt_slam_ros.grids.patch_pool import Beams, PatchPool
+from hmt_slam_ros.grids.insertion import InverseSensorModel
+from hmt_slam_ros.grids.patch_pool import MappedBeams, PatchPool
 from hmt_slam_ros.grids.patches import FAR, PATCH, field_at, odds_at
 from hmt_slam_ros.registration.correlative_search import Lattice, correlative_search
-from hmt_slam_ros.registration.scan_to_map import Alignment, Prior, agreement, align, beam_model, log_ratio, propose_all
-from hmt_slam_ros.sensors.surfels import surfels
+from hmt_slam_ros.registration.scan_to_map import (
+    AlignmentSettings,
+    Prior,
+    align,
+    count_agreement,
+    log_ratio,
+    make_beam_model,
+    propose_all,
+)
+from hmt_slam_ros.sensors.surfels import extract_surfels
 
 CELL, RADIUS = 0.05, 0.5
-MODEL = beam_model(RADIUS, 0.1, 10.0, 0.1)
-ALIGNMENT = Alignment(0.1, 0.15, 1.0, 30)
+MODEL = make_beam_model(RADIUS, 0.1, 10.0, 0.1)
+ALIGNMENT = AlignmentSettings(0.1, 0.15, 1.0, 30)
 ROOM = np.concatenate((box(-4.02, -3.03, 5.03, 4.01), box(1.01, 1.02, 2.03, 2.52), box(-3.02, 2.03, -2.52, 4.01)))
 CORRIDOR = np.array([[-100.0, -1.22, 100.0, -1.22], [-100.0, 1.22, 100.0, 1.22]])
 
@@ -27,15 +35,15 @@ def mapped(walls, poses, beams=721, field_of_view=2 * np.pi):
     for pose in poses:
         scan = scan_in(walls, pose, beams=beams, field_of_view=field_of_view)
         near = np.hypot(*scan.points.T) < 12.0
-        told = Beams(scan.points[near], np.empty((0, 2)), scan.origins[near])
-        pool.insert(table[None], np.array([pose], dtype=float), told, InverseModel(17, -8, 70))
+        told = MappedBeams(scan.points[near], np.empty((0, 2)), scan.origins[near])
+        pool.insert(table[None], np.array([pose], dtype=float), told, InverseSensorModel(17, -8, 70))
     return pool, table
 
 
 def seen(walls, pose, **settings):
     """The surfels of a scan."""
     scan = scan_in(walls, pose, **settings)
-    return surfels(scan.points, scan.origins)
+    return extract_surfels(scan.points, scan.origins)
 
 
 @pytest.fixture(scope="module")
@@ -161,4 +169,4 @@ def test_a_point_on_the_edge_of_what_beams_passed_contradicts_nothing_and_one_am
     along = np.column_stack((np.arange(2.0, 7.0, 0.2), np.zeros(25)))
     for aside, free in ((-0.02, 0), (-0.08, 0), (-0.5, 25)):
         points = along + np.array([0.0, aside])
-        assert agreement(points, np.zeros(3), pool.view(table), FAR // 3, FAR // 2) == (0, free)
+        assert count_agreement(points, np.zeros(3), pool.view(table), FAR // 3, FAR // 2) == (0, free)

@@ -9,13 +9,13 @@ from scipy.ndimage import distance_transform_edt
 from worlds import box, scan_in
 
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.grids.distance_field import lowest
-from hmt_slam_ros.grids.insertion import InverseModel
-from hmt_slam_ros.grids.patch_pool import Beams, PatchPool
+from hmt_slam_ros.grids.distance_field import lowest_bit
+from hmt_slam_ros.grids.insertion import InverseSensorModel
+from hmt_slam_ros.grids.patch_pool import MappedBeams, PatchPool
 from hmt_slam_ros.grids.patches import FAR, PATCH, field_at, odds_at
 
 CELL, RADIUS = 0.05, 0.5
-MODEL = InverseModel(17, -8, 70)
+MODEL = InverseSensorModel(17, -8, 70)
 
 
 @pytest.fixture
@@ -24,12 +24,14 @@ def pool():
 
 
 @njit
-def lowest_bit(word):
-    return lowest(word)
+def lowest(word):
+    return lowest_bit(word)
 
 
 def insert(pool, table, scan, pose=(0.0, 0.0, 0.0)):
-    pool.insert(table[None], np.array([pose], dtype=float), Beams(scan.points, np.empty((0, 2)), scan.origins), MODEL)
+    pool.insert(
+        table[None], np.array([pose], dtype=float), MappedBeams(scan.points, np.empty((0, 2)), scan.origins), MODEL
+    )
 
 
 def dense(pool, table, read):
@@ -58,12 +60,12 @@ def test_the_most_patches_ever_in_use_are_on_record(pool):
     scan = scan_in(box(-3, -4, 5, 4), (0.0, 0.0, 0.0))
     insert(pool, first, scan)
     alone = pool.peak_bytes
-    assert alone == pool.used * PATCH * (2 * PATCH + 4) > 0
+    assert alone == pool.patches_in_use * PATCH * (2 * PATCH + 4) > 0
     insert(pool, second, scan)
     pool.release(second)
     pool.release(first)
     insert(pool, pool.empty_table(), scan)
-    assert pool.used * PATCH * (2 * PATCH + 4) == alone
+    assert pool.patches_in_use * PATCH * (2 * PATCH + 4) == alone
     assert pool.peak_bytes == 2 * alone
 
 
@@ -112,7 +114,9 @@ def test_a_cell_counts_once_per_scan_however_many_beams_pass_it(pool):
 def test_each_beam_frees_the_cells_from_its_own_origin(pool):
     table = pool.empty_table()
     origins = np.array([[0.01, 0.01], [0.01, 1.01]])
-    pool.insert(table[None], np.zeros((1, 3)), Beams(origins + np.array([2.0, 0.0]), np.empty((0, 2)), origins), MODEL)
+    pool.insert(
+        table[None], np.zeros((1, 3)), MappedBeams(origins + np.array([2.0, 0.0]), np.empty((0, 2)), origins), MODEL
+    )
     odds = dense(pool, table, odds_at)
     assert sorted(set(np.nonzero(odds < 0)[0])) == [4 * PATCH, 4 * PATCH + 20]
     assert (odds < 0).sum() == 80
@@ -123,13 +127,13 @@ def test_a_shared_map_keeps_its_content_when_its_twin_is_written_to(pool):
     table = pool.empty_table()
     insert(pool, table, scan_in(box(-3, -3, 3, 3), (0, 0, 0)))
     twin = pool.share(table)
-    used = pool.used
+    used = pool.patches_in_use
     before = dense(pool, table, odds_at), dense(pool, table, field_at)
     insert(pool, twin, scan_in(box(-2, -2, 2, 2), (0, 0, 0)))
     np.testing.assert_array_equal(dense(pool, table, odds_at), before[0])
     np.testing.assert_array_equal(dense(pool, table, field_at), before[1])
     assert (dense(pool, twin, odds_at) != before[0]).any()
-    assert used < pool.used <= 2 * used
+    assert used < pool.patches_in_use <= 2 * used
 
 
 def test_released_maps_leave_no_patch_behind(pool):
@@ -138,9 +142,9 @@ def test_released_maps_leave_no_patch_behind(pool):
     twin = pool.share(table)
     insert(pool, twin, scan_in(box(-2, -2, 2, 2), (0, 0, 0)))
     pool.release(table)
-    assert pool.used > 0
+    assert pool.patches_in_use > 0
     pool.release(twin)
-    assert pool.used == 0
+    assert pool.patches_in_use == 0
 
 
 def test_a_patch_used_again_starts_empty(pool):
@@ -156,7 +160,7 @@ def test_a_patch_used_again_starts_empty(pool):
 def test_a_scan_without_a_return_changes_nothing(pool):
     table = pool.empty_table()
     insert(pool, table, scan_in(np.full((1, 4), 99.0), (0, 0, 0)))
-    assert pool.used == 0
+    assert pool.patches_in_use == 0
 
 
 def test_a_scan_that_leaves_the_map_is_cut_off_there(pool):

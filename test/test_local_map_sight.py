@@ -5,9 +5,9 @@ import pytest
 from worlds import box, scan_in
 
 from hmt_slam_ros.configuration import Configuration
-from hmt_slam_ros.registration.consistency import SIGHT
-from hmt_slam_ros.submap.local_mapping import LocalMapping, Sighting
-from hmt_slam_ros.submap.particle_filter import AreaFilter
+from hmt_slam_ros.registration.consistency import WALLS_OF_SUBMAP
+from hmt_slam_ros.submap.local_mapping import LocalMapping, PreparedScan
+from hmt_slam_ros.submap.particle_filter import ParticleFilter
 
 ROOM = box(-3.0, -2.0, 5.0, 2.0)
 HERE = np.zeros(3)
@@ -18,7 +18,7 @@ ALL_ROUND = {"beams": 361, "field_of_view": 2.0 * np.pi}
 def mapped():
     """A filter at the origin of a map of the room."""
     mapping = LocalMapping(Configuration())
-    area_filter = AreaFilter(mapping, 0, area=0)
+    area_filter = ParticleFilter(mapping, 0, area=0)
     for k, x in enumerate((0.0, 1.5, 3.0)):
         area_filter.poses[:] = (x, 0.0, 0.0)
         area_filter.add_keyframe(k, scan_in(ROOM, np.array([x, 0.0, 0.0]), noise=0.01, seed=k, **ALL_ROUND))
@@ -28,8 +28,8 @@ def mapped():
 
 def counted(area_filter, walls, pose=HERE, laser_pose=(0.0, 0.0, 0.0)):
     scan = scan_in(walls, pose, noise=0.01, seed=9, laser_pose=laser_pose, **ALL_ROUND)
-    found = area_filter.compared(Sighting(area_filter.mapping, scan)).walls
-    return found, SIGHT.log_ratio(found, area_filter.experience.walls.share)
+    found = area_filter.compared(PreparedScan(area_filter.mapping, scan)).walls
+    return found, WALLS_OF_SUBMAP.log_likelihood_ratio(found, area_filter.clutter_estimate.walls.share)
 
 
 @pytest.mark.parametrize("laser_pose", [(0.0, 0.0, 0.0), (0.4, -0.3, 1.0)], ids=["amid", "mounted aside"])
@@ -66,17 +66,17 @@ def test_a_pose_that_is_a_little_off_passes_no_wall(mapped, shift):
 
 
 def test_unknown_ground_tells_nothing():
-    area_filter = AreaFilter(LocalMapping(Configuration()), 0, area=0)
+    area_filter = ParticleFilter(LocalMapping(Configuration()), 0, area=0)
     found, log_ratio = counted(area_filter, ROOM)
     assert (found.on, found.free, log_ratio) == (0, 0, 0.0)
 
 
 def test_doubt_is_what_ends_in_free_space_and_what_is_passed_less_what_is_usual(mapped):
     scan = scan_in(box(-2.0, -5.0, 3.0, 4.0), HERE, noise=0.01, seed=9, **ALL_ROUND)
-    found = mapped.compared(Sighting(mapped.mapping, scan))
-    first = mapped.experience.judge(found)
+    found = mapped.compared(PreparedScan(mapped.mapping, scan))
+    first = mapped.clutter_estimate.judge(found)
     assert first.log_evidence < -1.0  # the short walls stand in what was free
     assert first.doubt > 10.0 - first.log_evidence
-    again = mapped.experience.after(found).judge(found)
+    again = mapped.clutter_estimate.after(found).judge(found)
     assert first.log_evidence < again.log_evidence < 0.0
     assert 0.0 < again.doubt < first.doubt

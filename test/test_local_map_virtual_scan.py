@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from worlds import box, distances, scan_in
 
-from hmt_slam_ros.configuration.landmarks import Features
+from hmt_slam_ros.configuration.landmarks import FeatureParameters
 from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.grids.virtual_scan import virtual_scan
-from hmt_slam_ros.landmarks.virtual_lines import lines_of_map, rays_of_map
+from hmt_slam_ros.grids.virtual_scan import cast_virtual_scan
+from hmt_slam_ros.landmarks.virtual_lines import extract_map_lines, rays_from_virtual_scan
 from hmt_slam_ros.submap.local_mapping import LocalMapping
 
 ROOM = box(-3.02, -2.01, 5.03, 4.02)
@@ -21,7 +21,7 @@ def view_of(poses, walls=ROOM):
     table = mapping.pool.empty_table()
     for n, pose in enumerate(poses):
         scan = scan_in(walls, pose, beams=361, noise=0.01, seed=n)
-        mapping.insert(table[None], np.array(pose, dtype=float)[None], scan)
+        mapping.insert_scan(table[None], np.array(pose, dtype=float)[None], scan)
     return mapping.pool.view(table)
 
 
@@ -33,20 +33,20 @@ def room():
 
 @pytest.mark.parametrize("beams", [360, 720])
 def test_ranges_are_those_of_a_laser_all_around(room, beams):
-    virtual = virtual_scan(room, EYE, beams, 10.0)
+    virtual = cast_virtual_scan(room, EYE, beams, 10.0)
     angles = virtual.scan.angle_min + virtual.scan.angle_increment * np.arange(beams)
     true = distances(ROOM, EYE, angles)
     assert virtual.scan.valid.mean() > 0.99
     seen = virtual.scan.valid
     # Across the surface, where a map errs.
-    across = (virtual.scan.ranges - true)[seen] * virtual.facing[seen]
+    across = (virtual.scan.ranges - true)[seen] * virtual.incidence_cosine[seen]
     assert np.abs(np.mean(across)) < 0.01
     assert np.quantile(np.abs(across), 0.95) < 0.05
-    np.testing.assert_array_equal(virtual.free[seen].astype(np.float32), virtual.scan.ranges[seen])
+    np.testing.assert_array_equal(virtual.free_range[seen].astype(np.float32), virtual.scan.ranges[seen])
 
 
 def test_beams_face_a_surface_as_it_stands(room):
-    virtual = virtual_scan(room, EYE, 720, 10.0)
+    virtual = cast_virtual_scan(room, EYE, 720, 10.0)
     angles = virtual.scan.angle_min + virtual.scan.angle_increment * np.arange(720)
     near = 2e-3
     first, second = (distances(ROOM, EYE, angles + turn) for turn in (-near, near))
@@ -58,22 +58,22 @@ def test_beams_face_a_surface_as_it_stands(room):
     along /= np.linalg.norm(along, axis=1)[:, None]
     facing = np.abs(np.cos(angles) * along[:, 1] - np.sin(angles) * along[:, 0])
     smooth = np.abs(first - second) < 0.1
-    assert np.median(np.abs(virtual.facing - facing)[smooth]) < 0.05
+    assert np.median(np.abs(virtual.incidence_cosine - facing)[smooth]) < 0.05
 
 
 def test_what_was_not_seen_is_unknown_and_what_is_out_of_reach_is_free(room):
     half = view_of([(0.0, 0.5, 0.0)])
-    virtual = virtual_scan(half, np.array([1.0, 0.5, 0.0]), 360, 10.0)
+    virtual = cast_virtual_scan(half, np.array([1.0, 0.5, 0.0]), 360, 10.0)
     angles = virtual.scan.angle_min + virtual.scan.angle_increment * np.arange(360)
     behind = np.cos(angles) < -0.5
-    assert virtual.unknown[behind].all()
+    assert virtual.ends_unknown[behind].all()
     # Far away one scan leaves holes in a wall.
-    assert virtual.unknown[np.cos(angles) > 0.5].mean() < 0.1
+    assert virtual.ends_unknown[np.cos(angles) > 0.5].mean() < 0.1
     assert np.isnan(virtual.scan.ranges[behind]).all()
-    assert virtual.free[behind].max() < 2.5
-    short = virtual_scan(room, EYE, 360, 1.0)
-    assert not short.unknown.any() and not short.scan.valid.any()
-    np.testing.assert_array_equal(short.free, 1.0)
+    assert virtual.free_range[behind].max() < 2.5
+    short = cast_virtual_scan(room, EYE, 360, 1.0)
+    assert not short.ends_unknown.any() and not short.scan.valid.any()
+    np.testing.assert_array_equal(short.free_range, 1.0)
 
 
 def test_who_walked_by_is_not_met(room):
@@ -84,15 +84,15 @@ def test_who_walked_by_is_not_met(room):
     table = mapping.pool.empty_table()
     for n, pose in enumerate(poses):
         walls = np.concatenate((ROOM, person)) if n == 0 else ROOM
-        mapping.insert(table[None], np.array(pose)[None], scan_in(walls, pose, beams=361, noise=0.01, seed=n))
-    virtual = virtual_scan(mapping.pool.view(table), np.array([0.0, 0.5, 0.0]), 360, 10.0)
+        mapping.insert_scan(table[None], np.array(pose)[None], scan_in(walls, pose, beams=361, noise=0.01, seed=n))
+    virtual = cast_virtual_scan(mapping.pool.view(table), np.array([0.0, 0.5, 0.0]), 360, 10.0)
     ahead = virtual.scan.valid & (np.abs(virtual.scan.angle_min + virtual.scan.angle_increment * np.arange(360)) < 0.5)
     assert np.nanmin(virtual.scan.ranges[ahead]) > 4.5
 
 
 def test_lines_of_a_map_are_its_walls(room):
-    features = Features()
-    lines = lines_of_map(virtual_scan(room, EYE, 720, 10.0), features)
+    features = FeatureParameters()
+    lines = extract_map_lines(cast_virtual_scan(room, EYE, 720, 10.0), features)
     normals = lines.parameters[:, 0] + EYE[2]
     r = lines.parameters[:, 1] + np.cos(normals) * EYE[0] + np.sin(normals) * EYE[1]
     found = sorted(zip(np.round(np.degrees(se2.wrap(normals)) / 90.0) % 4, r, strict=True))
@@ -103,8 +103,8 @@ def test_lines_of_a_map_are_its_walls(room):
 
 
 def test_beams_into_the_unknown_are_free_up_to_there():
-    virtual = virtual_scan(view_of([(0.0, 0.5, 0.0)]), np.array([1.0, 0.5, 0.0]), 360, 10.0)
-    rays = rays_of_map(virtual, Features())
-    assert len(rays.free) == 360
-    np.testing.assert_array_equal(rays.met, virtual.scan.valid)
+    virtual = cast_virtual_scan(view_of([(0.0, 0.5, 0.0)]), np.array([1.0, 0.5, 0.0]), 360, 10.0)
+    rays = rays_from_virtual_scan(virtual, FeatureParameters())
+    assert len(rays.free_range) == 360
+    np.testing.assert_array_equal(rays.hit, virtual.scan.valid)
     np.testing.assert_allclose(np.hypot(*rays.directions.T), 1.0)

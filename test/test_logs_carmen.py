@@ -8,7 +8,7 @@ import pytest
 
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.logs.carmen import smallest_saturated
+from hmt_slam_ros.logs.carmen import no_return_threshold
 from hmt_slam_ros.open_log import open_log
 from hmt_slam_ros.sensors import Odometry, Scan
 
@@ -116,19 +116,19 @@ def test_the_parameter_tells_the_mounting_where_the_poses_do_not(tmp_path):
 def test_the_sensors_maximum_is_no_return_whatever_it_is(maximum):
     real = np.linspace(0.5, maximum, 5000)
     ranges = np.concatenate([real, np.full(4000, maximum), np.full(20, maximum - 0.01)]).astype(np.float32)
-    limit = smallest_saturated(ranges)
+    limit = no_return_threshold(ranges)
     assert limit <= np.float32(maximum - 0.01)
     assert limit >= 0.99 * maximum - 1e-5
 
 
 def test_a_log_that_never_reaches_the_maximum_has_no_saturated_beam():
     ranges = np.round(np.random.default_rng(1).uniform(0.5, 7.5, 20000), 2).astype(np.float32)
-    assert np.all(ranges < smallest_saturated(ranges))
+    assert np.all(ranges < no_return_threshold(ranges))
 
 
 def test_a_stray_reading_beyond_the_maximum_does_not_hide_it():
     ranges = np.concatenate([np.linspace(0.5, 20.0, 1000), np.full(300, 50.0), [655.35]]).astype(np.float32)
-    assert smallest_saturated(ranges) == 50.0
+    assert no_return_threshold(ranges) == 50.0
 
 
 @pytest.mark.parametrize(("compress", "suffix"), [(gzip.compress, ".gz"), (lzma.compress, ".xz")])

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hmt_slam_ros.cli.convert_command import convert
+from hmt_slam_ros.cli.convert_command import convert_log
 from hmt_slam_ros.errors import HmtSlamError
-from hmt_slam_ros.logs.records import Entry, EntryLog, Window
+from hmt_slam_ros.logs.records import InMemoryLog, LogEntry, TimeWindow
 from hmt_slam_ros.logs.writer import write_bag
 from hmt_slam_ros.open_log import open_log
 from hmt_slam_ros.sensors import Odometry, Scan
@@ -46,11 +46,11 @@ def difficult_log():
         source = 10**18 + 10**8 * (k - 40 * (k % 50 == 49))
         pose = np.array([*rng.uniform(-100, 100, 2), rng.uniform(-np.pi, np.pi)])
         if k % 3:
-            entries.append(Entry(source, Odometry, (pose,), precedes_its_scan=k % 3 == 1))
+            entries.append(LogEntry(source, Odometry, (pose,), precedes_its_scan=k % 3 == 1))
         if k % 3 != 2:
             ranges = rng.choice([0.0, np.nan, np.inf, 1.5, 7.25, 30.0], 5 + k % 7).astype(np.float32)
-            entries.append(Entry(source, Scan, (ranges, -1.5707963, 0.0174532, 0.05, 29.9, mounts[k % 2], 1e-4)))
-    return EntryLog("difficult", entries, Window())
+            entries.append(LogEntry(source, Scan, (ranges, -1.5707963, 0.0174532, 0.05, 29.9, mounts[k % 2], 1e-4)))
+    return InMemoryLog("difficult", entries, TimeWindow())
 
 
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
@@ -62,21 +62,21 @@ def test_whatever_a_log_holds_survives(tmp_path, storage):
 
 def test_headings_at_the_seam_are_kept(tmp_path):
     headings = [-np.pi, np.nextafter(np.pi, 0.0), 0.0, 1e-12, -np.pi / 2]
-    entries = [Entry(k, Odometry, (np.array([0.0, 0.0, theta]),)) for k, theta in enumerate(headings)]
-    entries.append(Entry(9, Scan, (np.ones(3, np.float32), 0.0, 0.5, 0.0, 5.0)))
-    write_bag(EntryLog("seam", entries, Window()), tmp_path / "bag")
+    entries = [LogEntry(k, Odometry, (np.array([0.0, 0.0, theta]),)) for k, theta in enumerate(headings)]
+    entries.append(LogEntry(9, Scan, (np.ones(3, np.float32), 0.0, 0.5, 0.0, 5.0)))
+    write_bag(InMemoryLog("seam", entries, TimeWindow()), tmp_path / "bag")
     odometry = [r.measurement.pose for r in open_log(tmp_path / "bag").records() if isinstance(r.measurement, Odometry)]
     turned = np.array([pose[2] for pose in odometry]) - headings
     np.testing.assert_allclose(np.remainder(turned + 1.0, 2 * np.pi) - 1.0, 0.0, atol=1e-15)
 
 
 def test_a_bag_converted_again_is_the_same(tmp_path):
-    convert(MALAGA, tmp_path / "again", storage="sqlite3")
+    convert_log(MALAGA, tmp_path / "again", storage="sqlite3")
     assert_same_log(open_log(MALAGA), open_log(tmp_path / "again"))
 
 
 def test_a_part_of_a_log_can_be_converted(tmp_path):
-    convert(MALAGA, tmp_path / "part", start=10.0, duration=5.0)
+    convert_log(MALAGA, tmp_path / "part", start=10.0, duration=5.0)
     assert_same_log(open_log(MALAGA, start=10.0, duration=5.0), open_log(tmp_path / "part"))
 
 
@@ -99,13 +99,13 @@ def test_the_bundled_log_is_what_its_readme_says():
 @pytest.mark.parametrize("storage", ["rar", ""])
 def test_an_unknown_storage_is_refused(tmp_path, storage):
     with pytest.raises(HmtSlamError, match="choose one of mcap, sqlite3"):
-        convert(MALAGA, tmp_path / "bag", storage=storage)
+        convert_log(MALAGA, tmp_path / "bag", storage=storage)
 
 
 def test_an_existing_destination_is_left_alone(tmp_path):
     (tmp_path / "bag").mkdir()
     with pytest.raises(HmtSlamError, match="exists already"):
-        convert(MALAGA, tmp_path / "bag")
+        convert_log(MALAGA, tmp_path / "bag")
     assert list((tmp_path / "bag").iterdir()) == []
 
 
@@ -130,7 +130,7 @@ def test_a_log_that_breaks_off_leaves_nothing_behind(tmp_path):
 def test_a_destination_that_cannot_be_made_is_one_sentence(tmp_path):
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(HmtSlamError, match="cannot be written"):
-        convert(MALAGA, tmp_path / "file" / "bag")
+        convert_log(MALAGA, tmp_path / "file" / "bag")
 
 
 def dataset(name):

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hmt_slam_ros.errors import HmtSlamError
-from hmt_slam_ros.logs.records import Entry, EntryLog, Window
+from hmt_slam_ros.logs.records import InMemoryLog, LogEntry, TimeWindow
 from hmt_slam_ros.logs.stamps import running_stamps, seconds_from_stamp, stamp_from_seconds
 from hmt_slam_ros.sensors import Odometry, Scan
 
@@ -75,14 +75,14 @@ def test_the_clock_never_runs_back_and_advances_within_each_kind(readings):
 
 def _entries(seconds):
     for second in seconds:
-        yield Entry(second * 10**9, Odometry, ([0.0, 0.0, 0.0],), precedes_its_scan=True)
-        yield Entry(second * 10**9, Scan, ([1.0], 0.0, 0.1, 0.0, 5.0))
+        yield LogEntry(second * 10**9, Odometry, ([0.0, 0.0, 0.0],), precedes_its_scan=True)
+        yield LogEntry(second * 10**9, Scan, ([1.0], 0.0, 0.1, 0.0, 5.0))
 
 
 def test_a_part_of_a_log_has_the_stamps_of_the_whole():
     entries = list(_entries([10, 11, 9, 13, 14]))
-    whole = [record.measurement.stamp for record in EntryLog("log", entries, Window()).records()]
-    part = EntryLog("log", entries, Window(start=1.0, duration=2.0))
+    whole = [record.measurement.stamp for record in InMemoryLog("log", entries, TimeWindow()).records()]
+    part = InMemoryLog("log", entries, TimeWindow(start=1.0, duration=2.0))
     assert [record.measurement.stamp for record in part.records()] == whole[2:8]
     assert (part.scan_count, part.duration) == (3, 2.0)
     assert whole[4:6] == [11 * 10**9 + 1000] * 2
@@ -90,10 +90,10 @@ def test_a_part_of_a_log_has_the_stamps_of_the_whole():
 
 def test_a_part_without_scans_is_refused():
     with pytest.raises(HmtSlamError, match="chosen by start and duration"):
-        EntryLog("log", list(_entries([10, 20])), Window(start=2.0, duration=3.0))
+        InMemoryLog("log", list(_entries([10, 20])), TimeWindow(start=2.0, duration=3.0))
 
 
 @pytest.mark.parametrize("window", [{"start": -1.0}, {"start": float("nan")}, {"duration": 0.0}])
 def test_an_impossible_part_is_refused(window):
     with pytest.raises(HmtSlamError, match=r"start is|duration is"):
-        Window(**window)
+        TimeWindow(**window)

@@ -6,11 +6,17 @@ import numpy as np
 import pytest
 
 from benchmark.driving import driven, scenario_of
-from hmt_slam_ros.exploration.local_motion import _FAR, Limits, _free, command_towards, path_ahead
+from hmt_slam_ros.exploration.local_motion import (
+    _MAX_FREE_DISTANCE,
+    MotionLimits,
+    _free_distance,
+    command_towards,
+    local_goal,
+)
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.sensors import Scan
 
-LIMITS = Limits(0.6, math.radians(45.0), 0.5, math.radians(90.0), 0.25)
+LIMITS = MotionLimits(0.6, math.radians(45.0), 0.5, math.radians(90.0), 0.25)
 NOTHING = np.empty((0, 2))
 
 
@@ -74,31 +80,31 @@ def test_the_way_to_a_contact_is_that_of_a_walk_in_small_steps():
         if np.hypot(*point) <= radius:
             continue
         v, omega = draw.uniform(0.05, 0.6), draw.choice([0.0, draw.uniform(-0.8, 0.8)])
-        ways = np.arange(0.0, _FAR, step)
+        ways = np.arange(0.0, _MAX_FREE_DISTANCE, step)
         poses = se2.exp(np.stack((ways, 0.0 * ways, ways / v * omega), axis=1))
         touching = np.hypot(*(poses[:, :2] - point).T) < radius
-        walked = ways[touching.argmax()] if touching.any() else _FAR
-        assert _free(point[None], v, omega, radius) == pytest.approx(walked, abs=0.01)
+        walked = ways[touching.argmax()] if touching.any() else _MAX_FREE_DISTANCE
+        assert _free_distance(point[None], v, omega, radius) == pytest.approx(walked, abs=0.01)
 
 
 def test_what_is_too_near_keeps_it_from_nearing_but_not_from_leaving():
-    assert _free(np.array([[0.2, 0.1]]), 0.3, 0.1, 0.3) == 0.0
-    assert _free(np.array([[-0.2, 0.1]]), 0.3, 0.1, 0.3) == _FAR
-    assert _free(np.array([[0.2, 0.1]]), 0.0, 0.5, 0.3) == _FAR
+    assert _free_distance(np.array([[0.2, 0.1]]), 0.3, 0.1, 0.3) == 0.0
+    assert _free_distance(np.array([[-0.2, 0.1]]), 0.3, 0.1, 0.3) == _MAX_FREE_DISTANCE
+    assert _free_distance(np.array([[0.2, 0.1]]), 0.0, 0.5, 0.3) == _MAX_FREE_DISTANCE
 
 
 def test_the_path_goes_straight_where_nothing_is_and_around_what_is_there():
-    np.testing.assert_allclose(path_ahead(NOTHING, np.array([0.5, 0.2]), 0.3), [0.5, 0.2])
-    assert path_ahead(NOTHING, np.array([9.0, 0.0]), 0.3) == pytest.approx([4.0, 0.0], abs=0.11)
+    np.testing.assert_allclose(local_goal(NOTHING, np.array([0.5, 0.2]), 0.3), [0.5, 0.2])
+    assert local_goal(NOTHING, np.array([9.0, 0.0]), 0.3) == pytest.approx([4.0, 0.0], abs=0.11)
     # A wall with an open end on the left.
-    ahead = path_ahead(wall([0.8, -4.0], [0.8, 0.5]), np.array([2.0, 0.0]), 0.3)
+    ahead = local_goal(wall([0.8, -4.0], [0.8, 0.5]), np.array([2.0, 0.0]), 0.3)
     assert ahead[1] > 0.3
     assert np.hypot(*ahead) >= 0.6
 
 
 def test_the_path_leads_out_of_a_dead_end():
     ends = [([1.0, -1.0], [1.0, 1.0]), ([-1.0, 1.0], [1.0, 1.0]), ([-1.0, -1.0], [1.0, -1.0])]
-    ahead = path_ahead(np.concatenate([wall(*two) for two in ends]), np.array([2.5, 0.0]), 0.3)
+    ahead = local_goal(np.concatenate([wall(*two) for two in ends]), np.array([2.5, 0.0]), 0.3)
     assert ahead[0] < -0.3
 
 
@@ -109,7 +115,7 @@ def test_the_path_goes_through_the_middle_of_a_door_and_not_through_a_gap_that_i
         place, goal = np.zeros(3), np.array([2.0, 0.0])
         for _ in range(12):
             local = se2.transform(se2.inverse(place), points)
-            ahead = path_ahead(local, se2.transform(se2.inverse(place), goal[None])[0], 0.3)
+            ahead = local_goal(local, se2.transform(se2.inverse(place), goal[None])[0], 0.3)
             place[:2] += 0.3 * ahead
         assert (place[0] > 1.0) == through
         assert abs(place[1]) < 0.15 or not through

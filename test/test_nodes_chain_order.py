@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
 
-from hmt_slam_ros.messages.messages import Accepted, AreaEvents, Hypotheses, Keyframe
+from hmt_slam_ros.messages.messages import AreaEvents, ClosureDecision, Hypotheses, Keyframe
 from hmt_slam_ros.ros.inbox import CHAIN, ChainOrder
 
 
@@ -15,7 +15,7 @@ def message(kind, sequence):
         Keyframe: lambda: Keyframe(sequence, None, 0.0, ()),
         AreaEvents: lambda: AreaEvents(sequence, ()),
         Hypotheses: lambda: Hypotheses(sequence, ()),
-        Accepted: lambda: Accepted(sequence),
+        ClosureDecision: lambda: ClosureDecision(sequence),
     }[kind]()
 
 
@@ -32,32 +32,32 @@ def test_any_interleaving_of_the_topics_gives_one_order(heard, events, random):
     order, delivered = ChainOrder(heard), []
     while any(topics.values()):
         kind = random.choice([kind for kind in heard if topics[kind]])
-        delivered += order.arrive(topics[kind].pop(0))
+        delivered += order.push(topics[kind].pop(0))
     expected = [(kind, sequence) for sequence in range(events) for kind in CHAIN if kind in heard]
     assert [name(entry) for entry in delivered] == expected
-    assert order.waiting == 0
+    assert order.waiting_count == 0
     assert order.fault is None
 
 
 def test_a_keyframe_that_overtakes_the_verdict_waits():
-    order = ChainOrder((Keyframe, Accepted))
-    assert len(order.arrive(message(Keyframe, 0))) == 1
-    assert order.arrive(message(Keyframe, 1)) == []
-    assert order.waiting == 1
-    assert [name(entry) for entry in order.arrive(message(Accepted, 0))] == [(Accepted, 0), (Keyframe, 1)]
+    order = ChainOrder((Keyframe, ClosureDecision))
+    assert len(order.push(message(Keyframe, 0))) == 1
+    assert order.push(message(Keyframe, 1)) == []
+    assert order.waiting_count == 1
+    assert [name(entry) for entry in order.push(message(ClosureDecision, 0))] == [(ClosureDecision, 0), (Keyframe, 1)]
 
 
 def test_a_repeated_message_is_put_aside_and_counted():
     order = ChainOrder((Keyframe,))
-    order.arrive(message(Keyframe, 0))
-    assert order.arrive(message(Keyframe, 0)) == []
-    assert order.repeated == 1
+    order.push(message(Keyframe, 0))
+    assert order.push(message(Keyframe, 0)) == []
+    assert order.repeated_count == 1
     assert order.fault is None
 
 
 def test_a_gap_is_told_and_nothing_behind_it_is_delivered():
     order = ChainOrder((Keyframe,))
-    order.arrive(message(Keyframe, 0))
-    assert order.arrive(message(Keyframe, 3)) == []
-    assert order.arrive(message(Keyframe, 4)) == []
+    order.push(message(Keyframe, 0))
+    assert order.push(message(Keyframe, 3)) == []
+    assert order.push(message(Keyframe, 4)) == []
     assert "Keyframe 1 never came, 3 did" in order.fault

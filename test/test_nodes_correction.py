@@ -12,7 +12,7 @@ pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, 
 from diagnostic_msgs.msg import DiagnosticArray
 
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.real_time_localization.correction import Correction
+from hmt_slam_ros.real_time_localization.correction import CorrectionSmoother
 from hmt_slam_ros.ros import topics
 from hmt_slam_ros.ros.topics import DIAGNOSTICS
 
@@ -24,12 +24,12 @@ KNOWN, CORRECTED = np.array([0.0, 0.0, 0.0]), np.array([0.4, -0.2, 0.02])
 
 def driven(time, corrected=CORRECTED, steps=100):
     """Poses in the map as they are shown and known while the robot drives, corrected before the first step."""
-    correction = Correction()
-    correction.shown(0, KNOWN, FAR, time)
+    correction = CorrectionSmoother()
+    correction.smooth(0, KNOWN, FAR, time)
     shown, known = [], []
     for k in range(1, steps + 1):
         odom_T_base = se2.compose(FAR, np.array([0.006 * k, 0.0, 0.0]))
-        map_T_odom = correction.shown(k * STEP, corrected, odom_T_base, time)
+        map_T_odom = correction.smooth(k * STEP, corrected, odom_T_base, time)
         shown.append(se2.compose(map_T_odom, odom_T_base))
         known.append(se2.compose(corrected, odom_T_base))
     return np.array(shown), np.array(known)
@@ -58,10 +58,10 @@ def test_what_is_no_correction_but_another_place_is_shown_at_once():
 
 
 def test_time_that_jumps_back_begins_anew():
-    correction = Correction()
-    correction.shown(100 * STEP, KNOWN, FAR, 0.5)
+    correction = CorrectionSmoother()
+    correction.smooth(100 * STEP, KNOWN, FAR, 0.5)
     near = np.array([1e-3, 2e-3, 1e-5])
-    np.testing.assert_array_equal(correction.shown(0, near, FAR, 0.5), near)
+    np.testing.assert_array_equal(correction.smooth(0, near, FAR, 0.5), near)
 
 
 @pytest.mark.parametrize(("before", "said"), [((), "yes"), (ORDINARY, "not permitted")], ids=["permitted", "ordinary"])
@@ -70,7 +70,7 @@ def test_rtl_comes_before_what_computes_for_long_where_that_is_permitted(listene
     process = start("rtl", before=before)
 
     def answer():
-        values = [value for message in told for status in message.status for value in status.values]
+        values = [value for message in told for status in message.robot_status for value in status.values]
         return next((value.value for value in values if value.key == "real-time scheduling"), None)
 
     listener.until(answer, alive=[process])

@@ -118,7 +118,7 @@ def test_stamps_frames_and_doubled_transforms_are_told_under_a_namespace(listene
         # On today's clock, three seconds late.
         shift = time.time_ns() - 3 * 10**9 - measurement.stamp
         if isinstance(measurement, Scan):
-            message = conversions.laser_scan(measurement, "laser")
+            message = conversions.scan_message(measurement, "laser")
             message.header.stamp = conversions.time_message(measurement.stamp + shift)
             scans.publish(message)
             return

@@ -13,7 +13,7 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from hmt_slam_ros.ros import topics
-from hmt_slam_ros.ros.conversions import keyframe_frame, planar_pose
+from hmt_slam_ros.ros.conversions import keyframe_frame, pose_from_message
 from hmt_slam_ros.ros.topics import KEYFRAME_SCANS, KEYFRAMES
 
 WORLD = """
@@ -56,7 +56,7 @@ def test_it_explores_and_goes_where_it_is_sent(listener, system):
     nodes = system()
     listener.until(lambda: outcomes, alive=nodes)
     assert outcomes[0].data == "explore: all is known that can be reached; 0 places were given up"
-    path = np.array([planar_pose(message.pose)[:2] for message in truths])
+    path = np.array([pose_from_message(message.pose)[:2] for message in truths])
     assert np.hypot(*(path - (2.0, 3.0)).T).min() < 2.0
     assert goals
     assert goals[0].header.frame_id == "map"
@@ -117,4 +117,4 @@ def test_others_drive_to_its_goals(listener, system):
     truths = listener.hear(PoseStamped, "ground_truth", topics.STREAM)
     nodes = system(explorer__drive="goals")
     listener.until(lambda: goals and len(truths) > 30, alive=nodes)
-    assert np.ptp([planar_pose(message.pose) for message in truths], axis=0).max() < 1e-9
+    assert np.ptp([pose_from_message(message.pose) for message in truths], axis=0).max() < 1e-9

@@ -45,7 +45,7 @@ def restart(nodes, name, before, **parameters):
     """Start a node that was killed; wait until it has taken over."""
     said = len(nodes.diagnostics)
     nodes.alive[before] = nodes.start(name, **parameters)
-    nodes.until(lambda: any(m.status[0].name == f"/{name}" for m in nodes.diagnostics[said:]))
+    nodes.until(lambda: any(m.robot_status[0].name == f"/{name}" for m in nodes.diagnostics[said:]))
 
 
 def corridor_measurements(scans):
@@ -66,7 +66,7 @@ class Driver:
     def send(self, measurement):
         """Publish a scan or an odometry reading."""
         if isinstance(measurement, Scan):
-            self._scans.publish(conversions.laser_scan(measurement, "laser"))
+            self._scans.publish(conversions.scan_message(measurement, "laser"))
         else:
             self._odom.publish(conversions.odometry_message(measurement, "odom", "base_link"))
 
@@ -113,8 +113,8 @@ def test_rtl_that_is_killed_goes_on_with_the_pose_and_the_parameters_that_it_had
     while len(placed) < said + 1:
         drive()
         listener.spin(0.05)
-    moved = conversions.stamp_of(placed[said].header.stamp) / 20_000_000 - 1
-    assert conversions.planar_pose(placed[said].pose.pose) == pytest.approx([1.0 + 0.01 * moved, 2.0, 0.0])
+    moved = conversions.stamp_from_time(placed[said].header.stamp) / 20_000_000 - 1
+    assert conversions.pose_from_message(placed[said].pose.pose) == pytest.approx([1.0 + 0.01 * moved, 2.0, 0.0])
     # The answer of the dead one would be waited for.
     client = listener.node.create_client(GetParameters, "rtl/get_parameters")
     future = client.call_async(GetParameters.Request(names=["rtl.publish_tf"]))
@@ -148,7 +148,9 @@ def test_a_process_that_was_dead_while_the_others_began_anew_begins_anew_too(cor
     nodes.drive(log, first=31, rate=8.0)
     nodes.until(lambda: len(nodes.estimates) == 15 + 30 + SCANS - 31)
     end = 4 * (SCANS - 1) * PACE
-    nodes.until(lambda: nodes.poses and np.abs(conversions.planar_pose(nodes.poses[-1].pose.pose) - end).max() < 0.3)
+    nodes.until(
+        lambda: nodes.poses and np.abs(conversions.pose_from_message(nodes.poses[-1].pose.pose) - end).max() < 0.3
+    )
 
 
 @pytest.mark.skipif(TFMessage is None, reason="tf2_msgs is not installed: run scripts/test.sh, which builds it")
@@ -160,7 +162,7 @@ def test_all_are_killed_with_what_said_where_the_laser_is_and_go_on_without_it(d
         kill(process)
     said = len(nodes.diagnostics)
     nodes.alive = [start(name, recovery=tmp_path / "recovery") for name in NODES]
-    nodes.until(lambda: {m.status[0].name for m in nodes.diagnostics[said:]} >= {f"/{name}" for name in NODES})
+    nodes.until(lambda: {m.robot_status[0].name for m in nodes.diagnostics[said:]} >= {f"/{name}" for name in NODES})
     driver = Driver(nodes, domain)
     for one in corridor_measurements(60)[150:]:
         driver.send(one)
@@ -168,7 +170,9 @@ def test_all_are_killed_with_what_said_where_the_laser_is_and_go_on_without_it(d
     # What was under way when they were killed is said again.
     assert sorted(set(driver.answered())) == [START + k * 200_000_000 for k in range(60)]
     end = 4 * 59 * PACE
-    nodes.until(lambda: nodes.poses and np.abs(conversions.planar_pose(nodes.poses[-1].pose.pose) - end).max() < 0.1)
+    nodes.until(
+        lambda: nodes.poses and np.abs(conversions.pose_from_message(nodes.poses[-1].pose.pose) - end).max() < 0.1
+    )
     assert "no transform" not in nodes.diagnosis("slam")["last error"]
     driver.close()
     for process in nodes.alive:
@@ -211,10 +215,10 @@ def test_what_comes_late_twice_or_out_of_order_is_left_out_and_counted_and_all_e
         if number == len(arrivals) // 2:
             nodes.until(lambda: nodes.diagnosis("rtl")["received LocalEstimate"])
     nodes.until(lambda: driver.answered() == used[Scan])
-    nodes.until(lambda: nodes.poses and conversions.stamp_of(nodes.poses[-1].header.stamp) == used[Odometry][-1])
+    nodes.until(lambda: nodes.poses and conversions.stamp_from_time(nodes.poses[-1].header.stamp) == used[Odometry][-1])
     for message in nodes.poses:
         assert_true(message, START)
-    stamps = [conversions.stamp_of(message.header.stamp) for message in nodes.poses]
+    stamps = [conversions.stamp_from_time(message.header.stamp) for message in nodes.poses]
     assert in_order(stamps) == stamps
     refused = {kind: str(len(came[kind]) - len(used[kind])) for kind in kinds}
     nodes.until(lambda: nodes.diagnosis("slam")["refused on scan"] == refused[Scan])
@@ -237,7 +241,9 @@ def test_a_laser_falls_silent_a_disk_is_full_and_time_jumps_back(listener, start
     nodes.until(lambda: "no scan came for 3 s, while odometry does" in nodes.diagnosis("slam")["last error"])
     nodes.until(lambda: len(nodes.estimates) == SCANS - len(silent))
     end = 4 * (SCANS - 1) * PACE
-    nodes.until(lambda: nodes.poses and np.abs(conversions.planar_pose(nodes.poses[-1].pose.pose) - end).max() < 0.15)
+    nodes.until(
+        lambda: nodes.poses and np.abs(conversions.pose_from_message(nodes.poses[-1].pose.pose) - end).max() < 0.15
+    )
 
     def save():
         return listener.call(Trigger, "slam/save", Trigger.Request())
@@ -286,12 +292,12 @@ def test_a_missing_transform_and_clocks_that_are_apart_are_told_with_the_remedy(
         if isinstance(one, Scan):
             late = Scan(one.stamp + hour, one.ranges, one.angle_min, one.angle_increment, one.range_min, one.range_max)
             assert late.ranges.size == BEAMS
-            scans.publish(conversions.laser_scan(late, "laser"))
+            scans.publish(conversions.scan_message(late, "laser"))
         else:
             odom.publish(conversions.odometry_message(one, "odom", "base_link"))
 
     def said():
-        return next((m.status[0].message for m in reversed(told) if m.status[0].name == "/slam"), "")
+        return next((m.robot_status[0].message for m in reversed(told) if m.robot_status[0].name == "/slam"), "")
 
     listener.until(lambda: "no transform" in said(), alive=[process])
     assert said() == (
@@ -334,7 +340,9 @@ def test_two_robots_that_drive_at_once_under_namespaces_share_nothing_but_a_tf_t
         nodes.until(lambda nodes=nodes, scans=scans: len(nodes.estimates) == scans)
         end = START + (scans - 1) * SECOND // 5
         nodes.until(
-            lambda nodes=nodes, end=end: nodes.poses and conversions.stamp_of(nodes.poses[-1].header.stamp) == end
+            lambda nodes=nodes, end=end: (
+                nodes.poses and conversions.stamp_from_time(nodes.poses[-1].header.stamp) == end
+            )
         )
         assert_true(nodes.poses[-1], START)
         nodes.until(lambda nodes=nodes, scans=scans: nodes.diagnosis("slam")["received Scan"] == str(scans))

@@ -19,7 +19,7 @@ from std_msgs.msg import Float64MultiArray, String
 
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.messages.documents import encode
-from hmt_slam_ros.messages.messages import Accepted, AreaEvents, Hypotheses, Leaf, LocalEstimate
+from hmt_slam_ros.messages.messages import AreaEvents, ClosureDecision, Hypotheses, Hypothesis, LocalEstimate
 from hmt_slam_ros.ros import conversions, topics
 from hmt_slam_ros.ros.topics import DIAGNOSTICS, DOCUMENTS, HMT_POSE, KEYFRAMES, POSE
 from hmt_slam_ros.sensors import Odometry
@@ -86,13 +86,13 @@ def test_two_signals_in_a_row_do_no_harm(listener, start):
 
 
 def level(told, name):
-    levels = [status for message in told for status in message.status if status.name == f"/{name}"]
+    levels = [status for message in told for status in message.robot_status if status.name == f"/{name}"]
     return levels[-1] if levels else None
 
 
 def test_a_malformed_document_is_told_and_survived(listener, start):
     told = listener.hear(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
-    events = listener.node.create_publisher(String, DOCUMENTS[Accepted], topics.CHAIN)
+    events = listener.node.create_publisher(String, DOCUMENTS[ClosureDecision], topics.CHAIN)
     process = start("rtl")
     events.publish(String(data='{"document":"accepted","version":99}'))
     listener.until(lambda: (status := level(told, "rtl")) and status.level == DiagnosticStatus.ERROR, alive=[process])
@@ -101,10 +101,10 @@ def test_a_malformed_document_is_told_and_survived(listener, start):
 
 def test_a_lost_message_of_the_chain_is_told(listener, start):
     told = listener.hear(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
-    accepted = listener.node.create_publisher(String, DOCUMENTS[Accepted], topics.CHAIN)
+    accepted = listener.node.create_publisher(String, DOCUMENTS[ClosureDecision], topics.CHAIN)
     process = start("rtl")
-    accepted.publish(String(data=encode(Accepted(0))))
-    accepted.publish(String(data=encode(Accepted(2))))
+    accepted.publish(String(data=encode(ClosureDecision(0))))
+    accepted.publish(String(data=encode(ClosureDecision(2))))
     listener.until(lambda: (status := level(told, "rtl")) and status.level == DiagnosticStatus.ERROR, alive=[process])
     assert "Accepted 1 never came, 2 did" in level(told, "rtl").message
 
@@ -113,12 +113,12 @@ def test_a_node_that_starts_late_catches_up(listener, start):
     """What was said before a node started is latched, and reaches it in the order of the chain."""
     keyframes = listener.node.create_publisher(String, KEYFRAMES, topics.CHAIN)
     hypotheses = listener.node.create_publisher(String, DOCUMENTS[Hypotheses], topics.CHAIN)
-    accepted = listener.node.create_publisher(String, DOCUMENTS[Accepted], topics.CHAIN)
+    accepted = listener.node.create_publisher(String, DOCUMENTS[ClosureDecision], topics.CHAIN)
     told = listener.hear(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
     assert keyframes
     for sequence in range(3):
-        hypotheses.publish(String(data=encode(Hypotheses(sequence, (Leaf(0, 0, 1.0, 0),)))))
-        accepted.publish(String(data=encode(Accepted(sequence))))
+        hypotheses.publish(String(data=encode(Hypotheses(sequence, (Hypothesis(0, 0, 1.0, 0),)))))
+        accepted.publish(String(data=encode(ClosureDecision(sequence))))
     process = start("rtl")
 
     def received():
@@ -153,7 +153,7 @@ def test_rtl_answers_every_odometry_reading(listener, start):
     listener.until(lambda: len(placed) == len(local) == before + 50)
     assert local[-1].header.frame_id == "area_0"
     assert placed[-1].header.frame_id == "map"
-    assert conversions.planar_pose(placed[-1].pose.pose) == pytest.approx([1.5, 2.0, 0.0])
+    assert conversions.pose_from_message(placed[-1].pose.pose) == pytest.approx([1.5, 2.0, 0.0])
     assert placed[-1].pose.covariance[0] > placed[before].pose.covariance[0]
 
 

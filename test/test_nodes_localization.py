@@ -20,7 +20,7 @@ from std_srvs.srv import Trigger
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.messages.messages import LocalEstimate, Notice
 from hmt_slam_ros.ros import topics
-from hmt_slam_ros.ros.conversions import planar_pose, pose_with_covariance, stamp_of
+from hmt_slam_ros.ros.conversions import pose_from_message, pose_with_covariance_message, stamp_from_time
 from hmt_slam_ros.ros.topics import DIAGNOSTICS, DOCUMENTS, ENTROPY, IS_LOCALIZED, POSE
 
 NODES = ("slam", "aam", "tsbi", "tlca", "rtl")
@@ -80,7 +80,11 @@ class Nodes:
 
     def diagnosis(self, node):
         """What a node said of itself last, {name: value}; values are empty while it said nothing."""
-        said = (m.status[0] for m in reversed(self.diagnostics) if m.status[0].name == f"{self.namespace}/{node}")
+        said = (
+            m.robot_status[0]
+            for m in reversed(self.diagnostics)
+            if m.robot_status[0].name == f"{self.namespace}/{node}"
+        )
         return defaultdict(str, {value.key: value.value for status in islice(said, 1) for value in status.values})
 
 
@@ -89,8 +93,8 @@ def assert_true(message, begin):
 
     :param begin: stamp of the log's first scan, ns.
     """
-    k = (stamp_of(message.header.stamp) - begin) / 50e6
-    assert np.abs(planar_pose(message.pose.pose) - k * PACE).max() < 0.15
+    k = (stamp_from_time(message.header.stamp) - begin) / 50e6
+    assert np.abs(pose_from_message(message.pose.pose) - k * PACE).max() < 0.15
 
 
 def test_a_robot_that_wakes_up_in_a_saved_map_says_so_until_it_is_recognized_where_it_is(corridor, listener, start):
@@ -105,7 +109,7 @@ def test_a_robot_that_wakes_up_in_a_saved_map_says_so_until_it_is_recognized_whe
     nodes.until(nodes.is_localized)
     nodes.until(lambda: len(nodes.estimates) == SCANS - 20)
     listener.spin(1.5)
-    begin = stamp_of(nodes.poses[-1].header.stamp) - (SCANS - 1) * 200_000_000
+    begin = stamp_from_time(nodes.poses[-1].header.stamp) - (SCANS - 1) * 200_000_000
     assert_true(nodes.poses[-1], begin)
     # Odometry, which is elsewhere than when the map was saved, was not taken for a jump.
     assert not nodes.notices
@@ -142,7 +146,7 @@ def test_a_robot_that_is_carried_while_the_nodes_run_is_recognized_elsewhere(cor
     nodes.until(lambda: len(nodes.estimates) == SCANS - 40 + SCANS)
     listener.spin(1.5)
     assert len(nodes.poses) > said
-    begin = stamp_of(nodes.poses[-1].header.stamp) - (SCANS - 1) * 200_000_000
+    begin = stamp_from_time(nodes.poses[-1].header.stamp) - (SCANS - 1) * 200_000_000
     assert_true(nodes.poses[-1], begin)
 
 
@@ -157,7 +161,7 @@ def test_a_robot_that_is_carried_while_it_drives_notices_and_is_recognized(liste
 
 def initial_pose(at, frame="map", deviations=(0.5, 0.5, 0.26)):
     """As RViz sends it, for a robot at a pose (3,) in the map."""
-    return pose_with_covariance(0, frame, PoseGaussian(at, np.diag(deviations) ** 2))
+    return pose_with_covariance_message(0, frame, PoseGaussian(at, np.diag(deviations) ** 2))
 
 
 def test_a_person_says_where_the_robot_is_and_where_it_cannot_be(corridor, listener, start):
@@ -165,7 +169,7 @@ def test_a_person_says_where_the_robot_is_and_where_it_cannot_be(corridor, liste
     nodes = Nodes(start, listener, start_from=out)
     publisher = listener.node.create_publisher(PoseWithCovarianceStamped, "initialpose", topics.STREAM)
     listener.until(lambda: publisher.get_subscription_count() == 1)
-    nodes.until(lambda: nodes.localized and any(m.status[0].name == "/slam" for m in nodes.diagnostics))
+    nodes.until(lambda: nodes.localized and any(m.robot_status[0].name == "/slam" for m in nodes.diagnostics))
     publisher.publish(initial_pose(np.array([100.0, 50.0, 0.0])))
     nodes.until(lambda: "outside of the map" in nodes.diagnosis("slam")["last error"])
     complaint = nodes.diagnosis("slam")["last error"]
@@ -190,7 +194,9 @@ def test_a_person_says_where_the_robot_is_and_where_it_cannot_be(corridor, liste
     nodes.drive(log, first=80, rate=2.0, robot__duration=6.0)
     nodes.until(nodes.is_localized)
     nodes.until(lambda: len(nodes.estimates) == 13 + 10 + 30)
-    nodes.until(lambda: nodes.poses and np.abs(planar_pose(nodes.poses[-1].pose.pose) - 4 * 109 * PACE).max() < 0.2)
+    nodes.until(
+        lambda: nodes.poses and np.abs(pose_from_message(nodes.poses[-1].pose.pose) - 4 * 109 * PACE).max() < 0.2
+    )
 
 
 def test_an_initial_pose_that_is_given_as_a_parameter_is_where_the_robot_is_looked_for(corridor, listener, start):

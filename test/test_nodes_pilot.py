@@ -20,8 +20,8 @@ from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.messages.documents import decode
 from hmt_slam_ros.messages.tasks import PlaceEstimate
 from hmt_slam_ros.ros import topics
-from hmt_slam_ros.ros.conversions import planar_pose
-from hmt_slam_ros.ros.topics import DIAGNOSTICS, GOALS, INITIAL_POSE, IS_LOCALIZED, PLACE
+from hmt_slam_ros.ros.conversions import pose_from_message
+from hmt_slam_ros.ros.topics import DIAGNOSTICS, GOAL_POSE, INITIAL_POSE, IS_LOCALIZED, PLACE
 
 PROCESSES = ("slam", "aam", "tsbi", "tlca", "rtl")
 
@@ -43,7 +43,7 @@ def test_it_goes_to_a_room_and_has_slam_begin_at_the_door(mapped, listener, star
     outcomes = listener.hear(String, "pilot/outcome", topics.LATCHED)
     places = listener.hear(String, PLACE, topics.LATCHED)
     starts = listener.hear(PoseWithCovarianceStamped, INITIAL_POSE, topics.STREAM)
-    goals = listener.hear(PoseStamped, GOALS, topics.STREAM)
+    goals = listener.hear(PoseStamped, GOAL_POSE, topics.STREAM)
     truths = listener.hear(PoseStamped, "ground_truth", topics.STREAM)
     localized = listener.hear(Bool, IS_LOCALIZED, topics.LATCHED)
     diagnostics = listener.hear(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
@@ -73,18 +73,20 @@ def test_it_goes_to_a_room_and_has_slam_begin_at_the_door(mapped, listener, star
     origin = scripted(world)[1][0]
     (goal,) = goals
     assert goal.header.frame_id == "map"
-    place = se2.compose(origin, planar_pose(goal.pose))
+    place = se2.compose(origin, pose_from_message(goal.pose))
     # The last keyframe in the room is up to half a metre before the drive's end.
     np.testing.assert_allclose(place, (ROOM[0], ROOM[1] - 0.25, 0.5 * math.pi), atol=0.25)
-    assert math.dist(planar_pose(truths[-1].pose)[:2], place[:2]) < 0.2
-    said = [value.value for m in diagnostics if m.status[0].name == "/pilot" for value in m.status[0].values]
+    assert math.dist(pose_from_message(truths[-1].pose)[:2], place[:2]) < 0.2
+    said = [
+        value.value for m in diagnostics if m.robot_status[0].name == "/pilot" for value in m.robot_status[0].values
+    ]
     assert "'dance' is no errand: give one of find, stop, or go and the name of a place" in said
     last = decode(places[-1].data, PlaceEstimate)
     assert (last.place, last.room, last.confident) == (room.replace("room", "door"), room, True)
     (begun,) = starts
     assert begun.header.frame_id == "map"
-    true = next(planar_pose(m.pose) for m in truths if m.header.stamp == begun.header.stamp)
-    off = se2.between(se2.between(origin, true), planar_pose(begun.pose.pose))
+    true = next(pose_from_message(m.pose) for m in truths if m.header.stamp == begun.header.stamp)
+    off = se2.between(se2.between(origin, true), pose_from_message(begun.pose.pose))
     assert np.abs(off).max() < 0.05, off
     listener.until(lambda: localized[-1].data, alive=others)
 
@@ -96,7 +98,7 @@ def test_it_goes_to_a_room_and_has_slam_begin_at_the_door(mapped, listener, star
     listener.spin(0.5)
     anew = decode(places[-1].data, PlaceEstimate)
     assert (anew.place, anew.room, anew.confident) == (None, None, False)
-    assert np.abs(planar_pose(truths[-1].pose) - planar_pose(truths[-20].pose)).max() < 1e-9
+    assert np.abs(pose_from_message(truths[-1].pose) - pose_from_message(truths[-20].pose)).max() < 1e-9
 
 
 def test_without_a_map_it_ends_with_a_sentence(start):

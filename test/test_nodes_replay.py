@@ -17,7 +17,7 @@ from logs_for_nodes import corridor_bag, is_alive
 
 from hmt_slam_ros.configuration import Configuration, load_configuration
 from hmt_slam_ros.evaluation import read_tum
-from hmt_slam_ros.offline.runtime import Run
+from hmt_slam_ros.offline.runtime import LockStepRun
 from hmt_slam_ros.open_log import open_log
 from hmt_slam_ros.results.hmt_map import read_saved_map
 
@@ -118,10 +118,10 @@ def test_the_nodes_have_two_areas_become_one_as_the_lock_step_run_does(tmp_path)
 
 def test_the_nodes_forget_the_keyframes_that_the_lock_step_run_forgets(tmp_path):
     name = "sim:office,size=0.7,rate=1.5,laps=2"
-    log, run = open_log(name), Run(Configuration())
+    log, run = open_log(name), LockStepRun(Configuration())
     for record in log.records():
-        run.read(record)
-    gone = {one.keyframe for answer in run.recorder.hypotheses.values() for one in answer.forgotten}
+        run.process_record(record)
+    gone = {one.keyframe for answer in run.recorder.hypotheses.values() for one in answer.pruned_keyframes}
     assert len(gone) > 3
     nodes, lock_step = mapped_twice(name, tmp_path)
     assert not gone & read_saved_map(nodes / "hmt_map").replica.scans.keys()

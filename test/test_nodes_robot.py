@@ -60,16 +60,18 @@ def ended(heard):
 def test_every_scan_and_odometry_reading_arrives_as_it_is_in_the_log(tmp_path, listener, start, heard):
     robot = start("robot", log=corridor_bag(tmp_path), robot__rate=0.0, robot__paced=False)
     listener.until(lambda: ended(heard)() and len(heard["odom"]) == 45, alive=[robot])
-    assert [conversions.stamp_of(message.header.stamp) for message in heard["scan"]] == [scan.stamp for scan in SCANS]
+    assert [conversions.stamp_from_time(message.header.stamp) for message in heard["scan"]] == [
+        scan.stamp for scan in SCANS
+    ]
     for message, scan in zip(heard["scan"], SCANS, strict=True):
-        assert np.array_equal(conversions.ranges_of(message), scan.ranges)
+        assert np.array_equal(conversions.ranges_from_message(message), scan.ranges)
         assert message.header.frame_id == "laser"
-    readings = [conversions.odometry_from(message) for message in heard["odom"]]
+    readings = [conversions.odometry_from_message(message) for message in heard["odom"]]
     assert np.allclose([reading.pose[0] for reading in readings], 0.025 * np.arange(45))
     assert heard["odom"][0].header.frame_id == "odom"
     status = last_status(heard)
     assert (status["scans"], status["scans_in_log"], status["odometry"]) == (12, 12, 45)
-    listener.until(lambda: heard["clock"] and conversions.stamp_of(heard["clock"][-1].clock) == SCANS[-1].stamp)
+    listener.until(lambda: heard["clock"] and conversions.stamp_from_time(heard["clock"][-1].clock) == SCANS[-1].stamp)
 
 
 @pytest.mark.skipif(TFMessage is None, reason="tf2_msgs is not installed: run scripts/test.sh, which builds it")
@@ -121,7 +123,7 @@ def test_a_paced_robot_waits_for_the_acknowledgement(tmp_path, listener, start, 
     while answered < 12:
         listener.until(lambda: len(heard["scan"]) > answered)  # noqa: B023  called before the next turn
         belief = PoseGaussian(np.zeros(3), np.eye(3))
-        stamp = conversions.stamp_of(heard["scan"][answered].header.stamp)
+        stamp = conversions.stamp_from_time(heard["scan"][answered].header.stamp)
         estimates.publish(String(data=encode(LocalEstimate(stamp, answered, 0, belief, np.zeros(3), 0))))
         answered += 1
         assert len(heard["scan"]) <= answered + 4
@@ -143,9 +145,9 @@ def test_the_robot_waits_for_those_who_have_to_hear_it_and_answer(tmp_path, list
 def test_a_log_that_loops_goes_on_from_the_start_with_later_stamps(tmp_path, listener, start, heard):
     start("robot", log=corridor_bag(tmp_path, 3), robot__rate=0.0, robot__paced=False, robot__loop=True)
     listener.until(lambda: len(heard["scan"]) > 10)
-    stamps = [conversions.stamp_of(message.header.stamp) for message in heard["scan"]]
+    stamps = [conversions.stamp_from_time(message.header.stamp) for message in heard["scan"]]
     assert all(a < b for a, b in pairwise(stamps))
-    assert np.array_equal(conversions.ranges_of(heard["scan"][3]), SCANS[0].ranges)
+    assert np.array_equal(conversions.ranges_from_message(heard["scan"][3]), SCANS[0].ranges)
 
 
 def test_start_and_duration_play_a_part(tmp_path, listener, start, heard):
@@ -153,7 +155,7 @@ def test_start_and_duration_play_a_part(tmp_path, listener, start, heard):
         "robot", log=corridor_bag(tmp_path), robot__rate=0.0, robot__paced=False, robot__start=0.5, robot__duration=1.0
     )
     listener.until(ended(heard))
-    stamps = [(conversions.stamp_of(message.header.stamp) - START) / 1e9 for message in heard["scan"]]
+    stamps = [(conversions.stamp_from_time(message.header.stamp) - START) / 1e9 for message in heard["scan"]]
     assert stamps == pytest.approx([0.6, 0.8, 1.0, 1.2, 1.4])
 
 
@@ -163,7 +165,7 @@ def test_everything_but_the_clock_moves_into_a_namespace(tmp_path, listener, sta
     times = listener.hear(Clock, "/clock", topics.STREAM)
     start("robot", "-r", "__ns:=/tower", log=corridor_bag(tmp_path, 3), robot__rate=0.0, robot__paced=False)
     listener.until(lambda: len(scans) == 3)
-    listener.until(lambda: times and conversions.stamp_of(times[-1].clock) == SCANS[2].stamp)
+    listener.until(lambda: times and conversions.stamp_from_time(times[-1].clock) == SCANS[2].stamp)
 
 
 @pytest.mark.parametrize(
@@ -186,8 +188,8 @@ def test_a_simulated_robot_drives_live(listener, start, heard):
     listener.until(lambda: len(heard["odom"]) == len(records) - len(scans))
     assert len(scans) == len(heard["scan"]) == 16
     for message, scan in zip(heard["scan"], scans, strict=True):
-        assert conversions.stamp_of(message.header.stamp) == scan.stamp
-        assert np.array_equal(conversions.ranges_of(message), scan.ranges)
+        assert conversions.stamp_from_time(message.header.stamp) == scan.stamp
+        assert np.array_equal(conversions.ranges_from_message(message), scan.ranges)
 
 
 class Driver:
@@ -200,7 +202,7 @@ class Driver:
 
     @property
     def poses(self):
-        return np.array([conversions.planar_pose(message.pose) for message in self.truths])
+        return np.array([conversions.pose_from_message(message.pose) for message in self.truths])
 
     def until(self, condition, speed, turn_rate=0.0, **options):
         """Command velocities until a condition holds."""
@@ -240,10 +242,10 @@ def test_commands_drive_the_robot_and_silence_stops_it(listener, start, heard, d
     # Half a second after the last command it begins to brake.
     moved = se2.between(begin, driver.poses[-1])
     assert moved[0] < 1.5
-    readings = [conversions.odometry_from(message) for message in heard["odom"]]
+    readings = [conversions.odometry_from_message(message) for message in heard["odom"]]
     assert all(a < b for a, b in pairwise([reading.stamp for reading in readings]))
     wheels = {reading.stamp: reading.pose for reading in readings}
-    stamps = [conversions.stamp_of(message.header.stamp) for message in driver.truths]
+    stamps = [conversions.stamp_from_time(message.header.stamp) for message in driver.truths]
     shared = [(wheels[stamp], pose) for stamp, pose in zip(stamps, driver.poses, strict=True) if stamp in wheels]
     assert len(shared) > 20
     errors = se2.between(se2.between(shared[0][0], shared[-1][0]), se2.between(shared[0][1], shared[-1][1]))
@@ -255,7 +257,7 @@ def test_commands_drive_the_robot_and_silence_stops_it(listener, start, heard, d
 def test_the_driven_robot_does_not_pass_a_wall(listener, start, driver):
     # It begins a metre before the end of a hallway, with its back to it.
     reports = listener.hear(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
-    contacts = lambda: [v.value for r in reports[-1:] for v in r.status[0].values if v.key == "contacts"]  # noqa: E731
+    contacts = lambda: [v.value for r in reports[-1:] for v in r.robot_status[0].values if v.key == "contacts"]  # noqa: E731
     robot = start_driven(start)
     listener.until(driver.stands, alive=[robot])
     begin = driver.poses[-1]

@@ -18,7 +18,7 @@ from std_srvs.srv import SetBool, Trigger
 from hmt_slam_ros.area_abstraction.partition import AamState
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.loop_closure.tlca import TlcaState
-from hmt_slam_ros.messages.documents import KeyframeHead, decode
+from hmt_slam_ros.messages.documents import KeyframeHeader, decode
 from hmt_slam_ros.messages.messages import LocalEstimate
 from hmt_slam_ros.metric_slam.slam import SlamState
 from hmt_slam_ros.results.hmt_map import ChainState, read_saved_map
@@ -102,16 +102,16 @@ def test_a_map_is_saved_while_the_robot_drives_and_others_go_on_from_it_when_all
     first.kill()
 
     # At the first scan that is not in the map.
-    begin = (stopped["slam"].queue.last_stamp - START) / 1e9 + 0.001
+    begin = (stopped["slam"].scan_queue.last_stamp - START) / 1e9 + 0.001
     stayed = start_with(start, start_from=folder, start_carried=False)
     second = Nodes(stayed, listener, log, folder, 0.0, robot__start=begin)
     second.until(lambda: second.estimates and second.last.scan_index == 79)
-    heads = [decode(message.data, KeyframeHead).sequence for message in second.keyframes]
+    heads = [decode(message.data, KeyframeHeader).sequence for message in second.keyframes]
     assert heads == list(range(events, events + len(heads)))
     known = read_saved_map(folder)
     assert second.save().success
     grown = read_saved_map(folder)
-    best, before = grown.replica.maps[grown.replica.best], known.replica.maps[known.replica.best]
+    best, before = grown.replica.maps[grown.replica.best_hypothesis], known.replica.maps[known.replica.best_hypothesis]
     assert set(before.area_ids()) <= set(best.area_ids())
     # The robot is where it truly is, in the map of before.
     at = se2.compose(grown.area_poses[second.last.area].mean, second.last.pose.mean)
@@ -152,7 +152,7 @@ def test_nodes_show_a_map_of_the_command_line_at_once_and_go_on_from_it(tmp_path
     known = (np.frombuffer(grids[0].data, dtype=np.int8) == 100).sum()
     assert known > 100
     events = FolderReader(out / "hmt_map", FORMAT, VERSION).read("chain", ChainState).events
-    assert decode(nodes.keyframes[0].data, KeyframeHead).sequence == events > 3
+    assert decode(nodes.keyframes[0].data, KeyframeHeader).sequence == events > 3
 
 
 def start_with(start, **parameters):

@@ -17,11 +17,11 @@ from recording import Recording
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
-from hmt_slam_ros.messages.documents import KeyframeHead, decode
+from hmt_slam_ros.messages.documents import KeyframeHeader, decode
 from hmt_slam_ros.messages.messages import LocalEstimate
 from hmt_slam_ros.open_log import open_log
 from hmt_slam_ros.ros import topics
-from hmt_slam_ros.ros.conversions import planar_pose
+from hmt_slam_ros.ros.conversions import pose_from_message
 from hmt_slam_ros.ros.topics import KEYFRAMES, MAP
 from hmt_slam_ros.ros.transforms import TFMessage
 
@@ -80,7 +80,7 @@ def test_a_map_is_loaded_while_the_nodes_run_and_the_robot_recognized_in_it(corr
     nodes.until(nodes.is_localized)
     nodes.until(lambda: last(nodes).scan_index == SCANS + (SCANS - 20) - 1)
     end = 4 * (SCANS - 1) * PACE
-    nodes.until(lambda: nodes.poses and np.abs(planar_pose(nodes.poses[-1].pose.pose) - end).max() < 0.15)
+    nodes.until(lambda: nodes.poses and np.abs(pose_from_message(nodes.poses[-1].pose.pose) - end).max() < 0.15)
 
 
 def test_after_a_reset_a_new_map_begins_where_the_robot_is_and_all_that_is_said_can_be_recorded(
@@ -90,17 +90,17 @@ def test_after_a_reset_a_new_map_begins_where_the_robot_is_and_all_that_is_said_
     recording = Recording(listener, tmp_path / "bag")
     nodes = Nodes(start, listener, start_from=out, start_carried=False, save_to=tmp_path / "saved")
     keyframes = listener.hear(String, KEYFRAMES, topics.CHAIN)
-    nodes.until(lambda: {m.status[0].name for m in nodes.diagnostics} == {f"/{name}" for name in NODES})
+    nodes.until(lambda: {m.robot_status[0].name for m in nodes.diagnostics} == {f"/{name}" for name in NODES})
     answer = listener.call(Trigger, "slam/reset", Trigger.Request())
     assert (answer.success, answer.message) == (True, "the map is forgotten, a new one begins")
     assert listener.call(GetMap, "tlca/get_map", GetMap.Request()).map.info.width == 0
     # Slam, rtl, and the recording.
     nodes.drive(log, first=40, rate=8.0, robot__duration=8.0, robot__odometry_listeners=3)
     nodes.until(lambda: len(nodes.estimates) == 40)
-    assert decode(keyframes[0].data, KeyframeHead).sequence == 0
+    assert decode(keyframes[0].data, KeyframeHeader).sequence == 0
     nodes.until(nodes.is_localized)
     # In the frame of the first scan after it.
-    nodes.until(lambda: nodes.poses and abs(planar_pose(nodes.poses[-1].pose.pose)[0] - 4 * 39 * PACE[0]) < 0.3)
+    nodes.until(lambda: nodes.poses and abs(pose_from_message(nodes.poses[-1].pose.pose)[0] - 4 * 39 * PACE[0]) < 0.3)
     assert occupied(listener.call(GetMap, "tlca/get_map", GetMap.Request()).map) > 20
     assert listener.call(Trigger, "slam/save", Trigger.Request()).success
     nodes.until(lambda: set(recording.counts) >= SAID)

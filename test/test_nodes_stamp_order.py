@@ -5,13 +5,13 @@ from types import SimpleNamespace
 
 import pytest
 
-from hmt_slam_ros.ros.sensor_input import BACK, StampOrder
+from hmt_slam_ros.ros.sensor_input import MIN_BACKWARD_JUMP, StampOrder
 
 
 def let_through(stamps, newest=None):
     """The stamps that are let through, and how many are refused."""
     order = StampOrder(newest)
-    return [one for stamp in stamps for one in order.arrive(stamp, stamp)], order.refused
+    return [one for stamp in stamps for one in order.push(stamp, stamp)], order.rejected_count
 
 
 @pytest.mark.parametrize(
@@ -20,11 +20,36 @@ def let_through(stamps, newest=None):
         pytest.param([1, 2, 3], [1, 2, 3], 0, id="in order"),
         pytest.param([1, 3, 2, 4], [1, 3, 4], 1, id="swapped"),
         pytest.param([1, 1, 2, 2, 2, 3], [1, 2, 3], 3, id="repeated"),
-        pytest.param([9 * BACK, BACK, 10 * BACK], [9 * BACK, 10 * BACK], 1, id="one very late"),
-        pytest.param([9 * BACK, 3, BACK, 10 * BACK], [9 * BACK, 3, BACK, 10 * BACK], 0, id="time goes back"),
-        pytest.param([9 * BACK, 3, 3, 4], [9 * BACK, 3, 4], 1, id="time goes back, and the first comes twice"),
-        pytest.param([9 * BACK, 5 * BACK, 3, 4], [9 * BACK, 3, 4], 1, id="time goes back twice"),
-        pytest.param([-1, 9 * BACK, BACK, 8 * BACK], [-1, 9 * BACK, BACK, 8 * BACK], 0, id="it goes back for long"),
+        pytest.param(
+            [9 * MIN_BACKWARD_JUMP, MIN_BACKWARD_JUMP, 10 * MIN_BACKWARD_JUMP],
+            [9 * MIN_BACKWARD_JUMP, 10 * MIN_BACKWARD_JUMP],
+            1,
+            id="one very late",
+        ),
+        pytest.param(
+            [9 * MIN_BACKWARD_JUMP, 3, MIN_BACKWARD_JUMP, 10 * MIN_BACKWARD_JUMP],
+            [9 * MIN_BACKWARD_JUMP, 3, MIN_BACKWARD_JUMP, 10 * MIN_BACKWARD_JUMP],
+            0,
+            id="time goes back",
+        ),
+        pytest.param(
+            [9 * MIN_BACKWARD_JUMP, 3, 3, 4],
+            [9 * MIN_BACKWARD_JUMP, 3, 4],
+            1,
+            id="time goes back, and the first comes twice",
+        ),
+        pytest.param(
+            [9 * MIN_BACKWARD_JUMP, 5 * MIN_BACKWARD_JUMP, 3, 4],
+            [9 * MIN_BACKWARD_JUMP, 3, 4],
+            1,
+            id="time goes back twice",
+        ),
+        pytest.param(
+            [-1, 9 * MIN_BACKWARD_JUMP, MIN_BACKWARD_JUMP, 8 * MIN_BACKWARD_JUMP],
+            [-1, 9 * MIN_BACKWARD_JUMP, MIN_BACKWARD_JUMP, 8 * MIN_BACKWARD_JUMP],
+            0,
+            id="it goes back for long",
+        ),
     ],
 )
 def test_what_comes_late_or_twice_is_refused_and_time_that_goes_back_is_told_from_it(stamps, expected, refused):
@@ -34,10 +59,10 @@ def test_what_comes_late_or_twice_is_refused_and_time_that_goes_back_is_told_fro
 def test_the_order_goes_on_after_what_was_heard_before_and_what_comes_next_may_be_of_any_time_when_that_is_said():
     assert let_through([4, 5, 6], newest=5) == ([6], 2)
     order = StampOrder(5)
-    assert order.arrive(2, "late") == []
-    assert order.last_refused == 2
-    order.forget()
-    assert order.arrive(1, "of another time") == ["of another time"]
+    assert order.push(2, "late") == []
+    assert order.last_rejected_stamp == 2
+    order.reset()
+    assert order.push(1, "of another time") == ["of another time"]
 
 
 @pytest.mark.parametrize(
@@ -50,12 +75,12 @@ def test_the_order_goes_on_after_what_was_heard_before_and_what_comes_next_may_b
 )
 def test_a_laser_is_silent_only_where_the_node_could_hear_it(monkeypatch, looks, silent):
     pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
-    from hmt_slam_ros.ros.sensor_input import SensorWatch  # noqa: PLC0415  only where there is ROS
+    from hmt_slam_ros.ros.sensor_input import SensorMonitor  # noqa: PLC0415  only where there is ROS
 
     said = []
     monkeypatch.setattr(time, "monotonic", lambda: 0.0)
-    watch = SensorWatch(SimpleNamespace(warn=said.append))
+    watch = SensorMonitor(SimpleNamespace(warn=said.append))
     for readings, moment in enumerate(looks, 1):
         monkeypatch.setattr(time, "monotonic", lambda moment=moment: moment)
-        watch.look(readings)
+        watch.check_silence(readings)
     assert bool(said) == silent

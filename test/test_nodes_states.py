@@ -17,7 +17,7 @@ from lifecycle_msgs.srv import ChangeState, GetState
 from std_srvs.srv import Trigger
 
 from hmt_slam_ros.ros import topics
-from hmt_slam_ros.ros.conversions import planar_pose, stamp_of
+from hmt_slam_ros.ros.conversions import pose_from_message, stamp_from_time
 from hmt_slam_ros.ros.topics import DIAGNOSTICS, KEYFRAMES, ODOM, POSE, SCAN
 from hmt_slam_ros.saved_map.folder import FORMAT, VERSION, FolderReader
 
@@ -111,9 +111,9 @@ def test_nodes_that_are_halted_and_taken_down_amid_a_drive_come_to_the_same_as_o
     manager.lead(["slam"], "activate", "active")
     nodes.until(lambda: len(nodes.estimates) == SCANS)
     nodes.park()
-    assert np.diff([stamp_of(pose.header.stamp) for pose in nodes.poses]).max() > 2 * SECOND
+    assert np.diff([stamp_from_time(pose.header.stamp) for pose in nodes.poses]).max() > 2 * SECOND
     end = 4 * (SCANS - 1) * PACE
-    nodes.until(lambda: nodes.poses and np.abs(planar_pose(nodes.poses[-1].pose.pose) - end).max() < 0.15)
+    nodes.until(lambda: nodes.poses and np.abs(pose_from_message(nodes.poses[-1].pose.pose) - end).max() < 0.15)
 
     manager.lead(DOWN, "deactivate", "inactive")
     assert listener.call(Trigger, "slam/save", Trigger.Request()).success
@@ -166,7 +166,7 @@ def stands(nodes):
 def begun_anew(manager, nodes, log):
     """Slam alone does not begin anew, all five do."""
     manager.lead(["slam"], "cleanup", "unconfigured")
-    assert not manager.change("slam", "configure")
+    assert not manager.apply_changes("slam", "configure")
     assert manager.state("slam") == "unconfigured"
     nodes.until(lambda: "still have the map that slam gave up" in nodes.diagnosis("slam")["last error"])
     assert nodes.diagnosis("slam")["last error"].startswith("aam, rtl, tlca, tsbi still")
@@ -201,4 +201,4 @@ def test_a_node_that_is_killed_comes_back_in_the_state_in_which_it_was(listener,
     heard = len(told)
     node = start("rtl", recovery=tmp_path)
     listener.until(lambda: len(told) > heard, alive=[node])
-    assert told[-1].status[0].message == "inactive"
+    assert told[-1].robot_status[0].message == "inactive"

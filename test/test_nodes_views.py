@@ -25,12 +25,12 @@ from visualization_msgs.msg import MarkerArray
 
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.hybrid_map.shortest_path import unknown
+from hmt_slam_ros.hybrid_map.shortest_path import uninformative_belief
 from hmt_slam_ros.messages.map_changes import Arc, AreaPose
-from hmt_slam_ros.messages.messages import Accepted, Hypotheses, Keyframe, Leaf, LeafEstimate
+from hmt_slam_ros.messages.messages import ClosureDecision, Hypotheses, Hypothesis, HypothesisEstimate, Keyframe
 from hmt_slam_ros.registration.consistency import Clutter
 from hmt_slam_ros.ros import topics
-from hmt_slam_ros.ros.map_view import MapView, Seen
+from hmt_slam_ros.ros.map_view import MapRenderer, MapRendererState
 from hmt_slam_ros.ros.topics import DIAGNOSTICS, FINISHED, GRAPH, HMT_POSE, MAP, PARTICLES, PMF, POSE
 from hmt_slam_ros.ros.transforms import TFMessage
 from hmt_slam_ros.sensors import Scan
@@ -149,12 +149,14 @@ def assert_graph(graph):
 
 
 def assert_health(health):
-    told = {status.name.strip("/"): {v.key: v.value for v in status.values} for a in health for status in a.status}
+    told = {
+        status.name.strip("/"): {v.key: v.value for v in status.values} for a in health for status in a.robot_status
+    }
     assert set(told) == {*PROCESSES, "robot", "view"}
     assert {"memory", "peak memory", "busy", "last error"} <= set.intersection(*map(set, told.values()))
     assert float(told["slam"]["effective samples"].removesuffix(" of 12")) >= 1.0
     assert float(told["slam"]["memory"].removesuffix(" MB")) > 20.0
-    values = [value for array in health for status in array.status for value in status.values]
+    values = [value for array in health for status in array.robot_status for value in status.values]
     assert max(float(value.value) for value in values if value.key == "sent Scan a second") > 1.0
 
 
@@ -219,16 +221,18 @@ def spread(spots):
 
 
 def test_an_arc_that_could_be_any_has_no_ellipse():
-    view = MapView(Configuration(), "map", Seen())
+    view = MapRenderer(Configuration(), "map", MapRendererState())
     scan = Scan(5, np.ones(3, dtype=np.float32), -1.0, 1.0, 0.05, 30.0, np.zeros(3))
     known = PoseGaussian(np.array([1.0, 2.0, 0.1]), 0.01 * np.eye(3))
     for keyframe, area in enumerate((0, 1, 2)):
-        view.hear(Keyframe(keyframe, scan, 0.0, (LeafEstimate(0, area, known, True, 0.0, 0.0, Clutter(), 12.0),)))
-    arcs = (Arc(0, 1, known), Arc(1, 2, unknown(np.array([3.0, 0.0, 0.0]))))
-    view.hear(Hypotheses(2, (Leaf(0, 0, 1.0, 2, arcs=arcs, lost=True),)))
-    beliefs = (known, known.compose(known), unknown(np.array([5.0, 2.0, 0.0])))
-    view.hear(Accepted(2, global_poses=tuple(AreaPose(area, belief) for area, belief in enumerate(beliefs))))
-    groups = groups_of(view.graph())
+        view.update(
+            Keyframe(keyframe, scan, 0.0, (HypothesisEstimate(0, area, known, True, 0.0, 0.0, Clutter(), 12.0),))
+        )
+    arcs = (Arc(0, 1, known), Arc(1, 2, uninformative_belief(np.array([3.0, 0.0, 0.0]))))
+    view.update(Hypotheses(2, (Hypothesis(0, 0, 1.0, 2, arcs=arcs, lost=True),)))
+    beliefs = (known, known.compose(known), uninformative_belief(np.array([5.0, 2.0, 0.0])))
+    view.update(ClosureDecision(2, global_poses=tuple(AreaPose(area, belief) for area, belief in enumerate(beliefs))))
+    groups = groups_of(view.graph_markers())
     assert (groups["areas"], groups["arcs"]) == (3, 2)
     assert (groups["area_uncertainty"], groups["arc_uncertainty"]) == (2, 1)
 

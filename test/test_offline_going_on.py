@@ -11,13 +11,13 @@ import pytest
 from misled import misled
 
 from hmt_slam_ros.cli import map_command
-from hmt_slam_ros.cli.arguments import parser
+from hmt_slam_ros.cli.arguments import build_parser
 from hmt_slam_ros.configuration import Configuration, load_configuration, with_changes
 from hmt_slam_ros.errors import HmtSlamError
-from hmt_slam_ros.offline.runtime import Run, run_log
+from hmt_slam_ros.offline.runtime import LockStepRun, run_log
 from hmt_slam_ros.open_log import open_log
 from hmt_slam_ros.results.hmt_map import PARTS, RunState, read_run_state
-from hmt_slam_ros.results.log_reading import differences, map_folder
+from hmt_slam_ros.results.log_reading import describe_parameter_changes, map_folder
 from hmt_slam_ros.saved_map.folder import FolderReader, FolderWriter
 from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.topological_inference.branching import Branching
@@ -54,7 +54,7 @@ def same_outcome(one, other):
 
 def beginning(configuration, branching):
     """A run whose TSBI makes the children of hypotheses in some way."""
-    run = Run(configuration)
+    run = LockStepRun(configuration)
     run.lock_step.processes["tsbi"] = run._tsbi = Tsbi(configuration, branching)
     return run
 
@@ -75,7 +75,7 @@ def compared(log, folder, stops, branching=lambda: Branching, configuration=None
         if stops(number, run._tsbi.state):
             state = run.state
             stopped.append(state.tsbi)
-            run = Run(configuration, state=read(written(folder / str(number), state)))
+            run = LockStepRun(configuration, state=read(written(folder / str(number), state)))
     assert contents(written(folder / "stopped", run.state)) == contents(written(folder / "whole", whole.state))
     same_outcome(*(end.recorder.finish(end.log.stamps) for end in (run.finish(), whole.finish())))
     return stopped
@@ -126,8 +126,8 @@ def test_a_run_in_which_closures_were_accepted_and_areas_became_one_can_stop(tmp
 
 def test_a_run_in_which_a_closure_is_doubted_can_stop_before_the_question_is_answered(tmp_path):
     log = open_log("sim:ring,seed=3,size=1.5", duration=165.0)
-    (stopped,) = compared(log, tmp_path, once(lambda state: state.reopened), lambda: misled(2, 0, 3.8))
-    assert [ends.source for ends in stopped.reopened[0].withdrawn] == [0]
+    (stopped,) = compared(log, tmp_path, once(lambda state: state.revised_hypotheses), lambda: misled(2, 0, 3.8))
+    assert [ends.source for ends in stopped.revised_hypotheses[0].withdrawn] == [0]
 
 
 @pytest.mark.parametrize("kind", ["lines", "by_class"])
@@ -152,17 +152,17 @@ def test_before_the_first_scan_and_after_the_last_a_run_can_stop_as_well(tmp_pat
 def test_scans_without_odometry_wait_in_the_saved_map_as_well(tmp_path):
     """A log without odometry: scans wait, until patience ends."""
     scans = [record for record in open_log(LOG, duration=8.0).records() if isinstance(record.measurement, Scan)]
-    whole, run = Run(Configuration()), Run(Configuration())
+    whole, run = LockStepRun(Configuration()), LockStepRun(Configuration())
     for record in scans[:3]:
-        whole.read(record)
-        run.read(record)
+        whole.process_record(record)
+        run.process_record(record)
     state = run.state
-    assert len(state.slam.queue.scans) == 3
-    run = Run(Configuration(), state=read(written(tmp_path / "waiting", state)))
+    assert len(state.slam.scan_queue.scans) == 3
+    run = LockStepRun(Configuration(), state=read(written(tmp_path / "waiting", state)))
     for record in scans[3:]:
-        whole.read(record)
-        run.read(record)
-    same_outcome(*(end.recorder.finish(end.log.stamps) for end in (run.finish(), whole.finish())))
+        whole.process_record(record)
+        run.process_record(record)
+    same_outcome(*(end.recorder.finish(end.log_progress.stamps) for end in (run.finish(), whole.finish())))
 
 
 def test_a_run_whose_areas_end_at_doors_goes_on_with_the_openings_that_it_saw(tmp_path):
@@ -210,7 +210,7 @@ def test_the_command_goes_on_with_the_parameters_of_the_map_which_it_may_replace
 def test_what_cannot_go_on_is_refused_and_nothing_is_left(first, tmp_path, options, sentence):
     arguments = ["map", str(LOG), "--out", str(tmp_path / "out"), "--from", str(first), *options]
     with pytest.raises(HmtSlamError, match=sentence):
-        map_command.run(parser().parse_args(arguments))
+        map_command.run(build_parser().parse_args(arguments))
     assert list(tmp_path.iterdir()) == []
 
 
@@ -226,15 +226,15 @@ def test_a_log_that_begins_alike_and_is_another_is_refused(first):
 def test_a_log_that_goes_on_begins_where_it_began_and_a_further_one_anywhere():
     saved = Configuration()
     asked = with_changes(saved, {"robot.start": 2.0})
-    assert differences(saved, asked, further=True) is None
+    assert describe_parameter_changes(saved, asked, further=True) is None
     with pytest.raises(HmtSlamError, match=r"made with robot\.start = 0\.0, not with robot\.start = 2\.0"):
-        differences(saved, asked)
+        describe_parameter_changes(saved, asked)
 
 
 def test_parameters_that_may_change_are_told_with_both_values():
     saved = with_changes(Configuration(), {"tlca.accept_probability": 0.9, "robot.duration": 60.0})
-    assert differences(saved, with_changes(saved, {"robot.duration": 0.0})) is None
-    told = differences(saved, with_changes(saved, {"tlca.accept_probability": 0.95, "seed": 4}))
+    assert describe_parameter_changes(saved, with_changes(saved, {"robot.duration": 0.0})) is None
+    told = describe_parameter_changes(saved, with_changes(saved, {"tlca.accept_probability": 0.95, "seed": 4}))
     assert told == (
         "goes on with seed = 4 and tlca.accept_probability = 0.95; the map was made with seed = 0 and "
         "tlca.accept_probability = 0.9"

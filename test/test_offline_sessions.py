@@ -11,10 +11,10 @@ import pytest
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.evaluation import read_tum
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.offline.runtime import Run, run_log
+from hmt_slam_ros.offline.runtime import LockStepRun, run_log
 from hmt_slam_ros.open_log import open_log
-from hmt_slam_ros.results.final_map import corrected_scans, final_map
-from hmt_slam_ros.results.log_reading import LogState, Reading, goes_on
+from hmt_slam_ros.results.final_map import deskewed_scans, final_map
+from hmt_slam_ros.results.log_reading import LogProgress, LogReader, is_newest_log
 from hmt_slam_ros.sensors import Scan
 
 WORLD = "sim:office,seed=3,size=0.7"
@@ -43,9 +43,9 @@ def scans_of(log):
 @pytest.fixture(scope="module")
 def first():
     """The state after the first part of a drive."""
-    run = Run(Configuration())
+    run = LockStepRun(Configuration())
     for record in open_log(WORLD, duration=FIRST).records():
-        run.read(record)
+        run.process_record(record)
     return run.state
 
 
@@ -57,8 +57,8 @@ def second_log():
 def extended(state, log):
     """The final map of a map and a further log, and how the logs were read."""
     result = run_log(log, Configuration(), state=state)
-    recording = result.recorder.finish(result.log.stamps, result.log.first_scans)
-    return final_map(recording, corrected_scans(log, Configuration()), Configuration()).recording, result.log
+    recording = result.recorder.finish(result.log_progress.stamps, result.log_progress.first_scans)
+    return final_map(recording, deskewed_scans(log, Configuration()), Configuration()).recording, result.log_progress
 
 
 @pytest.fixture(scope="module")
@@ -69,7 +69,7 @@ def both(first, second_log):
 def test_the_poses_of_both_logs_are_in_one_frame(both, first):
     recording, log = both
     assert log.first_scans == (0, first.log.stamps.size)
-    truth = np.array([record.truth for record in scans_of(open_log(WORLD, duration=BEGIN + SECOND))])
+    truth = np.array([record.true_pose for record in scans_of(open_log(WORLD, duration=BEGIN + SECOND))])
     assert len(truth) == len(recording.trajectory)
     away = se2.between(se2.between(truth[0], truth), se2.between(recording.trajectory[0], recording.trajectory))
     assert np.hypot(away[:, 0], away[:, 1]).max() < NEAR
@@ -77,12 +77,12 @@ def test_the_poses_of_both_logs_are_in_one_frame(both, first):
 
 
 def test_the_robot_was_lost_at_first_and_then_joined(first, second_log):
-    run, lost = Run(Configuration(), state=first), []
-    for record in run.unread(second_log):
-        run.read(record)
+    run, lost = LockStepRun(Configuration(), state=first), []
+    for record in run.unread_records(second_log):
+        run.process_record(record)
         events = max(run.recorder.hypotheses, default=-1)
         if events >= first.slam.events:
-            lost.append(all(leaf.lost for leaf in run.recorder.hypotheses[events].leaves))
+            lost.append(all(leaf.lost for leaf in run.recorder.hypotheses[events].hypotheses))
     assert lost[0]
     assert not lost[-1]
     joined = lost.index(False)
@@ -99,9 +99,9 @@ def test_stamps_before_and_among_those_of_the_map_make_no_difference(both, first
 
 
 def test_a_run_can_stop_in_the_second_log_as_well(both, first, second_log):
-    run = Run(Configuration(), state=first)
-    for number, record in enumerate(run.unread(second_log)):
-        run.read(record)
+    run = LockStepRun(Configuration(), state=first)
+    for number, record in enumerate(run.unread_records(second_log)):
+        run.process_record(record)
         if number == 1500:
             break
     recording, log = extended(run.state, second_log)
@@ -119,17 +119,17 @@ def test_a_log_that_the_map_does_not_know_is_an_island_in_it(first):
 
 
 def test_a_log_is_known_by_the_stamp_and_the_ranges_of_its_first_scan(first):
-    assert goes_on(first.log, open_log(WORLD))
-    assert not goes_on(first.log, Restamped(open_log(WORLD), 1))
-    assert not goes_on(first.log, open_log("sim:office,seed=4,size=0.7"))
-    assert goes_on(LogState(), open_log(BUNDLED))
+    assert is_newest_log(first.log, open_log(WORLD))
+    assert not is_newest_log(first.log, Restamped(open_log(WORLD), 1))
+    assert not is_newest_log(first.log, open_log("sim:office,seed=4,size=0.7"))
+    assert is_newest_log(LogProgress(), open_log(BUNDLED))
 
 
 def test_the_clock_of_a_map_goes_on_in_a_log_that_is_older(first, second_log):
-    reading = Reading(first.log)
+    reading = LogReader(first.log)
     log = Restamped(second_log, -(10**12))
-    reading.begin(log)
-    record = next(iter(reading.unread(log)))
+    reading.begin_log(log)
+    record = next(iter(reading.unread_records(log)))
     assert record.measurement.stamp > first.log.stamps[-1]
     assert record.source_stamp < first.log.source_stamps[0]
 

@@ -12,25 +12,25 @@ from hmt_slam_ros.evaluation import read_tum
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.grids.occupancy_map import read_map
-from hmt_slam_ros.messages.map_changes import Arc, ArcEnds, AreaPose, LocalArea, Relabelled
+from hmt_slam_ros.messages.map_changes import Arc, ArcEnds, AreaPose, LocalArea, MovedKeyframe
 from hmt_slam_ros.messages.messages import (
-    Accepted,
-    Finished,
+    ClosureDecision,
+    EndOfRun,
     Hypotheses,
+    Hypothesis,
+    HypothesisEstimate,
     Keyframe,
-    Leaf,
-    LeafEstimate,
     LocalEstimate,
     Notice,
-    Trail,
+    ScanPoses,
 )
 from hmt_slam_ros.registration.consistency import Clutter
 from hmt_slam_ros.results import plots
 from hmt_slam_ros.results.final_map import FinalMap, final_map
 from hmt_slam_ros.results.hmt_map import MapWriter, read_run_state, read_saved_map
-from hmt_slam_ros.results.output_folder import replacing, write_output
+from hmt_slam_ros.results.output_folder import atomic_output, write_output
 from hmt_slam_ros.results.recorder import Recorder
-from hmt_slam_ros.results.report import RunFigures, read_table
+from hmt_slam_ros.results.report import RunMetrics, read_table
 from hmt_slam_ros.sensors import Scan
 
 SCANS, EVERY, CUT, VERDICT = 24, 4, 3, 4
@@ -58,7 +58,9 @@ def keyframe(sequence: int, leaves: dict[int, int]) -> Keyframe:
     """Keyframe event with {hypothesis: area}; poses are exact in each hypothesis."""
     index = EVERY * sequence
     estimates = tuple(
-        LeafEstimate(hypothesis, area, belief(se2.between(frame(area), TRUTH[index])), True, 0.0, 0.0, Clutter(), 12.0)
+        HypothesisEstimate(
+            hypothesis, area, belief(se2.between(frame(area), TRUTH[index])), True, 0.0, 0.0, Clutter(), 12.0
+        )
         for hypothesis, area in leaves.items()
     )
     return Keyframe(sequence, scan(index), 6.0 * index / (SCANS - 1), estimates)
@@ -72,7 +74,7 @@ def verdict_poses(*areas: int) -> tuple[AreaPose, ...]:
     return tuple(AreaPose(area, belief(frame(area))) for area in areas)
 
 
-def trails() -> list[Trail]:
+def trails() -> list[ScanPoses]:
     """Hypothesis 0 up to the cut, 1 and 2 after it; 2 is wrong by a metre and must not be used."""
     rows = []
     for first in range(0, SCANS, EVERY):
@@ -82,7 +84,7 @@ def trails() -> list[Trail]:
         after = first > EVERY * CUT
         for hypothesis in ([1] if first > EVERY * VERDICT else [1, 2]) if after else [0]:
             shift = np.array([1.0, 0.0, 0.0]) * (hypothesis == 2)
-            rows.append(Trail(hypothesis, first, STAMPS[index], anchors, poses + shift))
+            rows.append(ScanPoses(hypothesis, first, STAMPS[index], anchors, poses + shift))
     return rows
 
 
@@ -96,39 +98,39 @@ def messages() -> list:
         said.append(keyframe(k, {0: 0} if k <= CUT else {1: 1, 2: 0} if k <= VERDICT else {1: 1}))
         said.append(hypotheses(k))
         said.append(accepted(k))
-    return [*said, Notice("slam", "two scans had no beam: clean the laser"), Finished(SCANS, SCANS, 0)]
+    return [*said, Notice("slam", "two scans had no beam: clean the laser"), EndOfRun(SCANS, SCANS, 0)]
 
 
 def hypotheses(k: int) -> Hypotheses:
     if k < CUT:
-        return Hypotheses(k, (Leaf(0, 0, 1.0, 0),))
+        return Hypotheses(k, (Hypothesis(0, 0, 1.0, 0),))
     if k > VERDICT:
-        return Hypotheses(k, (Leaf(1, 1, 1.0, 1),))
+        return Hypotheses(k, (Hypothesis(1, 1, 1.0, 1),))
     if k == VERDICT:
-        return Hypotheses(k, (Leaf(1, 1, 0.95, 1), Leaf(2, 2, 0.04, 0)), unexamined=0.01)
+        return Hypotheses(k, (Hypothesis(1, 1, 0.95, 1), Hypothesis(2, 2, 0.04, 0)), unexamined=0.01)
     to_1 = se2.between(MAP_T_AREA_1, TRUTH[EVERY * k])
-    new = Leaf(
+    new = Hypothesis(
         1,
         0,
         0.7,
         1,
         belief(se2.inverse(MAP_T_AREA_1)),
-        (Relabelled(k, 0, 1, to_1),),
+        (MovedKeyframe(k, 0, 1, to_1),),
         (Arc(0, 1, belief(MAP_T_AREA_1), closure=True),),
         (LocalArea(1, np.zeros(3)), LocalArea(0, se2.inverse(MAP_T_AREA_1))),
     )
-    return Hypotheses(k, (new, Leaf(2, 0, 0.3, 0)))
+    return Hypotheses(k, (new, Hypothesis(2, 0, 0.3, 0)))
 
 
-def accepted(k: int) -> Accepted:
+def accepted(k: int) -> ClosureDecision:
     if k == 0:
-        return Accepted(k, global_poses=verdict_poses(0))
+        return ClosureDecision(k, global_poses=verdict_poses(0))
     if k == CUT:
-        return Accepted(k, global_poses=verdict_poses(0, 1))
-    return Accepted(k, hypothesis=1) if k == VERDICT else Accepted(k)
+        return ClosureDecision(k, global_poses=verdict_poses(0, 1))
+    return ClosureDecision(k, hypothesis=1) if k == VERDICT else ClosureDecision(k)
 
 
-FIGURES = RunFigures(
+FIGURES = RunMetrics(
     "by hand",
     "lock-step",
     {"slam": np.arange(SCANS) * 1e-3, "aam": np.zeros(SCANS)},
@@ -192,9 +194,9 @@ def test_a_message_that_comes_twice_counts_once(folder: Path, tmp_path: Path) ->
 
 
 def test_the_recorder_is_complete_only_when_everything_has_been_heard() -> None:
-    assert recorded().complete
-    for kind in (Finished, Accepted, Hypotheses, LocalEstimate):
-        assert not recorded(without=kind).complete
+    assert recorded().is_complete
+    for kind in (EndOfRun, ClosureDecision, Hypotheses, LocalEstimate):
+        assert not recorded(without=kind).is_complete
 
 
 def test_a_lost_message_is_named() -> None:
@@ -206,7 +208,7 @@ def test_a_lost_message_is_named() -> None:
 
 def test_a_lost_last_message_is_named() -> None:
     recorder = recorded()
-    del recorder.accepted[SCANS // EVERY - 1]
+    del recorder.decisions[SCANS // EVERY - 1]
     with pytest.raises(HmtSlamError, match="was lost"):
         recorder.finish(STAMPS)
 
@@ -223,19 +225,19 @@ def test_a_scan_that_is_not_in_the_log_is_named() -> None:
 
 def test_a_scan_without_a_pose_gets_one_between_its_neighbours() -> None:
     recorder = recorded()
-    trail = recorder.trails.pop((1, 16))
+    trail = recorder.scan_poses.pop((1, 16))
     keep = np.array([True, False, True, True])
-    recorder.handle(Trail(1, 16, trail.stamps[keep], trail.anchors[keep], trail.poses[keep]))
+    recorder.handle(ScanPoses(1, 16, trail.stamps[keep], trail.keyframes[keep], trail.poses[keep]))
     np.testing.assert_allclose(recorder.finish(STAMPS).trajectory, TRUTH, atol=5e-3)
 
 
 def test_an_area_that_no_verdict_placed_is_placed_along_the_arcs() -> None:
     recorder = recorded()
-    recorder.accepted[CUT] = Accepted(CUT)
+    recorder.decisions[CUT] = ClosureDecision(CUT)
     recording = recorder.finish(STAMPS)
     np.testing.assert_allclose(recording.area_poses[1].mean, MAP_T_AREA_1)
     np.testing.assert_allclose(recording.trajectory, TRUTH, atol=1e-9)
-    np.testing.assert_allclose(recording.online, TRUTH, atol=1e-9)
+    np.testing.assert_allclose(recording.online_trajectory, TRUTH, atol=1e-9)
 
 
 def test_the_probabilities_are_those_of_tsbi(folder: Path) -> None:
@@ -284,7 +286,7 @@ def test_the_saved_map_reads_back_complete(folder: Path) -> None:
     saved = read_saved_map(folder / "hmt_map")
     recording = finished(recorded()).recording
     hybrid_map = saved.replica.maps[1]
-    assert saved.replica.best == recording.replica.best == 1
+    assert saved.replica.best_hypothesis == recording.replica.best_hypothesis == 1
     assert saved.configuration.seed == 7
     assert hybrid_map.area_ids() == recording.hybrid_map.area_ids()
     for area in hybrid_map.area_ids():
@@ -302,27 +304,29 @@ def test_the_saved_map_reads_back_complete(folder: Path) -> None:
 def test_the_saved_map_keeps_every_live_hypothesis(tmp_path: Path) -> None:
     recorder = recorded()
     for k in range(VERDICT, SCANS // EVERY):
-        recorder.hypotheses[k] = Hypotheses(k, (Leaf(1, 1, 0.6, 1), Leaf(2, 2, 0.4, 0)))
-        recorder.accepted[k] = Accepted(k)
+        recorder.hypotheses[k] = Hypotheses(k, (Hypothesis(1, 1, 0.6, 1), Hypothesis(2, 2, 0.4, 0)))
+        recorder.decisions[k] = ClosureDecision(k)
     write(tmp_path, recorder)
     saved = read_saved_map(tmp_path / "hmt_map")
     assert saved.replica.probabilities == {1: 0.6, 2: 0.4}
     assert {h: m.area_ids() for h, m in saved.replica.maps.items()} == {1: [0, 1], 2: [0]}
-    assert saved.replica.areas == {1: 1, 2: 0}
+    assert saved.replica.robot_areas == {1: 1, 2: 0}
 
 
 def test_the_saved_map_keeps_that_a_hypothesis_lacks_an_arc(tmp_path: Path) -> None:
     recorder = recorded()
     for k in range(VERDICT, SCANS // EVERY):
         withdrawn = (ArcEnds(0, 1),) if k == VERDICT else ()
-        recorder.hypotheses[k] = Hypotheses(k, (Leaf(1, 1, 0.6, 1, withdrawn=withdrawn), Leaf(2, 2, 0.4, 0)))
-        recorder.accepted[k] = Accepted(k)
+        recorder.hypotheses[k] = Hypotheses(
+            k, (Hypothesis(1, 1, 0.6, 1, removed_arcs=withdrawn), Hypothesis(2, 2, 0.4, 0))
+        )
+        recorder.decisions[k] = ClosureDecision(k)
     recording = recorder.finish(STAMPS)
     writer = MapWriter(tmp_path / "hmt_map")
-    writer.write_map(recording.replica, recording.area_poses, recording.last)
+    writer.write_map(recording.replica, recording.area_poses, recording.last_estimate)
     writer.finish(recorder.configuration)
     saved = read_saved_map(tmp_path / "hmt_map")
-    assert list(saved.replica.maps[1].arcs) == [(0, 1)]
+    assert list(saved.replica.maps[1].changed_arcs) == [(0, 1)]
     assert saved.replica.maps[1].arc(0, 1) is None
 
 
@@ -344,7 +348,7 @@ def test_plots_of_something_else_are_refused(tmp_path: Path) -> None:
 
 def test_a_failed_run_leaves_nothing_behind(tmp_path: Path) -> None:
     def run() -> None:
-        with replacing(tmp_path / "deep" / "out") as scratch:
+        with atomic_output(tmp_path / "deep" / "out") as scratch:
             (scratch / "map.pgm").write_text("half")
             raise HmtSlamError("stop")
 
@@ -354,7 +358,7 @@ def test_a_failed_run_leaves_nothing_behind(tmp_path: Path) -> None:
 
 
 def test_a_successful_run_makes_missing_folders_and_leaves_no_scratch(tmp_path: Path) -> None:
-    with replacing(tmp_path / "deep" / "out") as scratch:
+    with atomic_output(tmp_path / "deep" / "out") as scratch:
         (scratch / "map.pgm").write_text("whole")
     assert [entry.name for entry in tmp_path.iterdir()] == ["deep"]
     assert (tmp_path / "deep" / "out" / "map.pgm").read_text() == "whole"
@@ -362,7 +366,7 @@ def test_a_successful_run_makes_missing_folders_and_leaves_no_scratch(tmp_path: 
 
 def test_an_old_output_folder_is_replaced_whole(tmp_path: Path) -> None:
     for content in ("old", "new"):
-        with replacing(tmp_path / "out") as scratch:
+        with atomic_output(tmp_path / "out") as scratch:
             (scratch / "hmt_map").mkdir()
             (scratch / "hmt_map" / "manifest.json").write_text(content)
             if content == "old":
@@ -376,7 +380,7 @@ def test_a_folder_with_anything_else_is_refused_and_kept(tmp_path: Path, name: s
         (tmp_path / "out" / part).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / "out" / part).write_text("precious")
     before = contents(tmp_path)
-    with pytest.raises(HmtSlamError, match="is not an output folder"), replacing(tmp_path / "out"):
+    with pytest.raises(HmtSlamError, match="is not an output folder"), atomic_output(tmp_path / "out"):
         pass
     assert contents(tmp_path) == before
 
@@ -384,6 +388,6 @@ def test_a_folder_with_anything_else_is_refused_and_kept(tmp_path: Path, name: s
 def test_a_file_in_the_way_is_refused(tmp_path: Path) -> None:
     (tmp_path / "out").write_text("precious")
     for path in (tmp_path / "out", tmp_path / "out" / "below"):
-        with pytest.raises(HmtSlamError, match="choose another --out"), replacing(path):
+        with pytest.raises(HmtSlamError, match="choose another --out"), atomic_output(path):
             pass
     assert (tmp_path / "out").read_text() == "precious"

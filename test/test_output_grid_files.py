@@ -77,7 +77,7 @@ def test_map_server_sees_the_walls_where_they_are_at_any_resolution(out: Path, t
 
 def test_one_area_stands_in_its_own_frame(out: Path, tmp_path: Path) -> None:
     saved = read_saved_map(out / "hmt_map")
-    (area,) = saved.replica.maps[saved.replica.best].area_ids()
+    (area,) = saved.replica.maps[saved.replica.best_hypothesis].area_ids()
     export_grid(out, tmp_path / "whole")
     files = export_grid(out / "hmt_map", tmp_path / "one", area=area)
     assert files == (tmp_path / "one" / "map.pgm", tmp_path / "one" / "map.yaml")

@@ -17,7 +17,7 @@ BACK = {"north": "south", "south": "north", "east": "west", "west": "east"}
 @pytest.fixture(scope="module")
 def document(tmp_path_factory: pytest.TempPathFactory) -> dict:
     chart, _, _ = charted()
-    poses = {area: PoseGaussian.exactly(pose) for area, pose in AREAS.items()}
+    poses = {area: PoseGaussian.from_pose(pose) for area, pose in AREAS.items()}
     path: Path = write_places(tmp_path_factory.mktemp("places"), poses, chart)
     assert path.name == "places.json"
     return json.loads(path.read_text())

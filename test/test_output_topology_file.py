@@ -12,9 +12,9 @@ from test_output_folder import COVARIANCE, MAP_T_AREA_1, recorded, write
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.landmark import Existence, Landmark
-from hmt_slam_ros.landmarks.area_classes import AreaKinds
+from hmt_slam_ros.landmarks.area_classes import AreaClassifier
 from hmt_slam_ros.landmarks.landmark_map import LandmarkMap
-from hmt_slam_ros.landmarks.landmarks import INNER, OPENING
+from hmt_slam_ros.landmarks.landmarks import CONCAVE_CORNER, OPENING
 from hmt_slam_ros.landmarks.portals import Portal
 from hmt_slam_ros.results import export
 from hmt_slam_ros.results.export import export_topology
@@ -43,8 +43,8 @@ def of(belief) -> list[float]:
 def test_areas_and_arcs_read_back_as_the_map_has_them(folder: Path) -> None:
     graph = nx.read_graphml(export_topology(folder)[0], node_type=int)
     saved = read_saved_map(folder / "hmt_map")
-    hybrid_map = saved.replica.maps[saved.replica.best]
-    kinds = AreaKinds(LocalMapping(saved.configuration))
+    hybrid_map = saved.replica.maps[saved.replica.best_hypothesis]
+    kinds = AreaClassifier(LocalMapping(saved.configuration))
     assert graph.is_directed()
     assert sorted(graph) == hybrid_map.area_ids() == [0, 1]
     for area, attributes in graph.nodes.items():
@@ -52,7 +52,7 @@ def test_areas_and_arcs_read_back_as_the_map_has_them(folder: Path) -> None:
         assert attributes["keyframes"] == len(hybrid_map.keyframes(area))
         assert attributes["robot"] is (area == 1)
         keyframes = hybrid_map.keyframes(area)
-        kind = kinds.of([saved.replica.scans[k] for k in keyframes], np.array(list(keyframes.values())))
+        kind = kinds.classify([saved.replica.scans[k] for k in keyframes], np.array(list(keyframes.values())))
         assert attributes.get("hallway") == (None if kind is None else kind.probability)
     arcs = {(a, b): arc for a, b, arc in hybrid_map.all_arcs()}
     assert set(graph.edges) == set(arcs) == {(0, 1)}
@@ -69,8 +69,8 @@ def test_portals_stand_at_their_arcs_and_landmarks_in_a_file_of_their_own(
 ) -> None:
     belief = PoseGaussian(np.array([1.0, 2.0, 0.5]), np.diag([0.01, 0.02, 0.03]))
     portal = Portal((0, 1), belief, belief.inverse(), 0.9, 0.05, 0.8, 2)
-    door = Landmark(OPENING, belief, 0.9, 0.05, Existence(0.8, seen=4, missed=1))
-    corner = Landmark(INNER, belief, 0.0, 0.0, Existence(0.7))
+    door = Landmark(OPENING, belief, 0.9, 0.05, Existence(0.8, detections=4, misses=1))
+    corner = Landmark(CONCAVE_CORNER, belief, 0.0, 0.0, Existence(0.7))
     monkeypatch.setattr(LandmarkMap, "observe", lambda found, *_, **__: setattr(found, "landmarks", [door, corner]))
     monkeypatch.setattr(export, "portals_of", lambda *_: (portal,))
     graph_file, landmarks_file, _ = export_topology(folder)

@@ -15,8 +15,8 @@ import pytest
 
 from hmt_slam_ros.arrays import Bool, Float32, Float64
 from hmt_slam_ros.errors import HmtSlamError
-from hmt_slam_ros.saved_map.folder import FolderReader, FolderWriter, put_in_place
-from hmt_slam_ros.saved_map.reference import described
+from hmt_slam_ros.saved_map.folder import FolderReader, FolderWriter, replace_folder
+from hmt_slam_ros.saved_map.reference import document_reference
 from hmt_slam_ros.sensors import Scan
 
 
@@ -201,7 +201,7 @@ def test_an_array_beyond_its_file_and_a_key_that_comes_twice_are_refused(tmp_pat
 
 
 def test_the_description_tells_every_field_of_every_object():
-    lines = described({"notes": Notebook})
+    lines = document_reference({"notes": Notebook})
     assert "### Document `notes`" in lines
     assert "| `places` | list of [text, `Place`] | `a_T_b` by name. |" in lines
     assert (
@@ -217,10 +217,10 @@ def test_one_folder_takes_the_place_of_another(tmp_path):
     for name in ("old", "new"):
         (tmp_path / name).mkdir()
         (tmp_path / name / "content").write_text(name)
-    put_in_place(tmp_path / "new", tmp_path / "old")
+    replace_folder(tmp_path / "new", tmp_path / "old")
     assert (tmp_path / "old" / "content").read_text() == "new"
     assert (tmp_path / "new" / "content").read_text() == "old"
-    put_in_place(tmp_path / "new", tmp_path / "third")
+    replace_folder(tmp_path / "new", tmp_path / "third")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["old", "third"]
 
 

@@ -8,8 +8,8 @@ import pytest
 from small_floor import CONFIGURATION, mapped
 
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.landmarks.area_landmarks import Growing
-from hmt_slam_ros.places.area_views import AreaViews
+from hmt_slam_ros.landmarks.area_landmarks import GrowingArea
+from hmt_slam_ros.places.area_views import AreaViewCache
 from hmt_slam_ros.submap.local_mapping import LocalMapping
 
 
@@ -29,18 +29,18 @@ def area():
 @pytest.fixture
 def looked_up(monkeypatch):
     """The scans that were looked up."""
-    scans, sighting = [], Growing.sighting
+    scans, sighting = [], GrowingArea.observe_keyframe
 
     def noted(own, scan, pose):
         scans.append(scan)
         return sighting(own, scan, pose)
 
-    monkeypatch.setattr(Growing, "sighting", noted)
+    monkeypatch.setattr(GrowingArea, "sighting", noted)
     return scans
 
 
 def views(scans):
-    return AreaViews(LocalMapping(CONFIGURATION), scans)
+    return AreaViewCache(LocalMapping(CONFIGURATION), scans)
 
 
 def assert_same(one, other):
@@ -72,7 +72,7 @@ def test_areas_are_looked_at_ahead_so_many_keyframes_at_a_time(looked_up):
         own.look_ahead(areas, 7)
         counts.append(len(looked_up))
     assert counts == [*range(7, every, 7), every, every]
-    found = own.of_map(hybrid_map)
+    found = own.views_of_map(hybrid_map)
     assert len(looked_up) == every
     for area, keyframes in areas:
         assert_same(found[area], views(scans).of(area, keyframes))

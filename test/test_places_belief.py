@@ -9,20 +9,20 @@ import pytest
 
 from benchmark.belief_corridors import random_corridors
 from benchmark.belief_world import drawn_anywhere, drawn_observation
-from hmt_slam_ros.configuration.landmarks import Features, Places
-from hmt_slam_ros.places.observation import log_observation, log_unknown_ground, observation_model
-from hmt_slam_ros.places.observation_graph import Landmarks, joined, no_landmarks
-from hmt_slam_ros.places.place_graph import EAST, NORTH, SOUTH, WEST, Edge, Node, place_graph, state_of
-from hmt_slam_ros.places.position_belief import Travel, certain_belief, flat_belief
+from hmt_slam_ros.configuration.landmarks import FeatureParameters, PlaceParameters
+from hmt_slam_ros.places.observation import log_observation_ratios, log_unknown_ground_ratio, observation_model
+from hmt_slam_ros.places.observation_graph import LandmarkSequence, empty_sequence, merge_sequences
+from hmt_slam_ros.places.place_graph import EAST, NORTH, SOUTH, WEST, Edge, Node, build_place_graph, state_of
+from hmt_slam_ros.places.position_belief import Travel, certain_belief, uniform_belief
 
-PLACES = Places()
-MODEL = observation_model(PLACES, Features())
-EMPTY = no_landmarks()
+PLACES = PlaceParameters()
+MODEL = observation_model(PLACES, FeatureParameters())
+EMPTY = empty_sequence()
 QUARTER = 0.5 * math.pi
 
 
 def corner(along, track=0, heading=0.5):
-    return Landmarks(
+    return LandmarkSequence(
         np.array([track]), np.array([along]), np.array([heading]), np.array([[0.01, 0.01]]), np.array([0.9])
     )
 
@@ -35,12 +35,12 @@ def chain(lengths, existence=0.5, places=PLACES):
     """A hallway from west to east."""
     ways = [straight(k, k + 1, length, corner(1.0 + 0.1 * k)) for k, length in enumerate(lengths)]
     edges = [edge for way in ways for edge in (way, way.back)]
-    return place_graph([Node(existence, EMPTY, EMPTY)] * (len(lengths) + 1), edges, places)
+    return build_place_graph([Node(existence, EMPTY, EMPTY)] * (len(lengths) + 1), edges, places)
 
 
 def random_graph(seed, rows=1, columns=1, density=0.1):
     corridors = random_corridors(np.random.default_rng(seed), rows, columns, density)
-    return place_graph(corridors.nodes, corridors.edges, PLACES)
+    return build_place_graph(corridors.nodes, corridors.edges, PLACES)
 
 
 def test_the_next_opening_is_at_the_end_of_the_edge_or_behind_those_that_are_missed():
@@ -73,15 +73,17 @@ def test_a_state_sees_ahead_and_back_what_the_map_has_there():
 
 def test_behind_a_bend_nothing_is_in_sight():
     bend = Edge(0, EAST, 1, SOUTH, (3.0, 0.04), (-QUARTER, 0.01), corner(1.0))
-    graph = place_graph([Node(1.0, EMPTY, EMPTY)] * 3, [bend, straight(1, 2, 2.0, corner(0.5), SOUTH)], PLACES)
-    starts = graph.expected.starts
-    np.testing.assert_allclose(graph.expected.landmarks.along[starts[EAST] : starts[EAST + 1]], [1.0])
-    np.testing.assert_allclose(graph.arcs.means[graph.arcs.sources == EAST], [(3, -QUARTER), (5, -QUARTER)])
+    graph = build_place_graph([Node(1.0, EMPTY, EMPTY)] * 3, [bend, straight(1, 2, 2.0, corner(0.5), SOUTH)], PLACES)
+    starts = graph.expected_landmarks.starts
+    np.testing.assert_allclose(graph.expected_landmarks.landmarks.positions[starts[EAST] : starts[EAST + 1]], [1.0])
+    np.testing.assert_allclose(
+        graph.transitions.means[graph.transitions.sources == EAST], [(3, -QUARTER), (5, -QUARTER)]
+    )
 
 
 def test_two_ways_in_one_direction_are_refused():
     with pytest.raises(ValueError, match="same direction"):
-        place_graph([Node(1.0, EMPTY, EMPTY)] * 3, [straight(0, 1, 2.0), straight(0, 2, 3.0)], PLACES)
+        build_place_graph([Node(1.0, EMPTY, EMPTY)] * 3, [straight(0, 1, 2.0), straight(0, 2, 3.0)], PLACES)
 
 
 def transition(graph, places, action):
@@ -118,8 +120,8 @@ def test_the_belief_is_that_of_an_enumeration_of_all_paths(seed):
     lengths = random.uniform(2.0, 4.0, 2)
     edges = [straight(0, 1, lengths[0], corner(1.0)), straight(1, 2, lengths[1], corner(0.7, 1))]
     edges += [edges[0].back] + ([edges[1].back] if seed % 2 else [])
-    graph = place_graph([Node(0.7, EMPTY, corner(0.0, 5, 1.0))] * 3, edges, places)
-    belief, factors = flat_belief(graph, places), []
+    graph = build_place_graph([Node(0.7, EMPTY, corner(0.0, 5, 1.0))] * 3, edges, places)
+    belief, factors = uniform_belief(graph, places), []
     for _ in range(3):
         action = random.choice(4)
         action = Travel(*random.normal((3.0, 0.0), (0.5, 0.1)), (0.01, 0.01)) if action in (0, 1) else int(action - 2)
@@ -128,17 +130,18 @@ def test_the_belief_is_that_of_an_enumeration_of_all_paths(seed):
         if isinstance(action, Travel):
             belief = belief.arrived(action)
         elif action:
-            belief = belief.turned(action)
+            belief = belief.predict_turn(action)
         else:
-            belief = belief.gone_on(places.spacing)
-        belief = belief.observed(graph_seen, MODEL, away, variance)
+            belief = belief.predict_travel(places.spacing)
+        belief = belief.update(graph_seen, MODEL, away, variance)
         told = np.append(
-            log_observation(graph_seen, graph.expected, away, variance, MODEL), log_unknown_ground(graph_seen, MODEL)
+            log_observation_ratios(graph_seen, graph.expected_landmarks, away, variance, MODEL),
+            log_unknown_ground_ratio(graph_seen, MODEL),
         )
         factors.append(transition(graph, places, action) * np.exp(told))
-    start = np.exp(flat_belief(graph, places).logs)
-    ends = np.zeros(graph.states + 1)
-    for path in itertools.product(range(graph.states + 1), repeat=3):
+    start = np.exp(uniform_belief(graph, places).log_probabilities)
+    ends = np.zeros(graph.state_count + 1)
+    for path in itertools.product(range(graph.state_count + 1), repeat=3):
         steps = factors[1][path[0], path[1]] * factors[2][path[1], path[2]]
         ends[path[2]] += float(start @ factors[0][:, path[0]]) * steps
     np.testing.assert_allclose(belief.probabilities, ends / ends.sum(), rtol=1e-12, atol=1e-300)
@@ -151,8 +154,12 @@ def test_every_transition_is_a_probability():
     for source in (0, 5, graph.states):
         logs = np.full(graph.states + 1, -np.inf)
         logs[source] = 0.0
-        belief = dataclasses.replace(flat_belief(graph, PLACES), logs=logs)
-        for after in (belief.gone_on(2.0), belief.turned(1), belief.arrived(Travel(4.0, 0.0, (0.1, 0.1)))):
+        belief = dataclasses.replace(uniform_belief(graph, PLACES), log_probabilities=logs)
+        for after in (
+            belief.predict_travel(2.0),
+            belief.predict_turn(1),
+            belief.predict_arrival(Travel(4.0, 0.0, (0.1, 0.1))),
+        ):
             assert after.probabilities.sum() == pytest.approx(1.0, abs=1e-12)
 
 
@@ -160,30 +167,30 @@ def test_entropy_says_whether_the_belief_is_confident():
     graph = random_graph(1)
     certain = certain_belief(graph, PLACES, 7)
     assert certain.entropy == 0.0
-    assert certain.confident
-    assert certain.most_likely == 7
+    assert certain.is_confident
+    assert certain.most_likely_state == 7
     states = int(graph.travelled.sum())
-    flat = flat_belief(graph, dataclasses.replace(PLACES, unmapped=1.0 / (states + 1)))
+    flat = uniform_belief(graph, dataclasses.replace(PLACES, unmapped=1.0 / (states + 1)))
     assert flat.entropy == pytest.approx(math.log(states + 1))
-    assert not flat.confident
-    lost = dataclasses.replace(flat, logs=np.log(np.append(np.full(graph.states, 1e-9), 1.0)))
-    assert lost.most_likely is None
+    assert not flat.is_confident
+    lost = dataclasses.replace(flat, log_probabilities=np.log(np.append(np.full(graph.states, 1e-9), 1.0)))
+    assert lost.most_likely_state is None
 
 
 def test_a_lost_robot_is_where_a_hallway_leads_on_or_back():
-    flat = flat_belief(chain([3.0, 4.0]), PLACES).probabilities[:-1].reshape(-1, 4)
+    flat = uniform_belief(chain([3.0, 4.0]), PLACES).probabilities[:-1].reshape(-1, 4)
     np.testing.assert_allclose(flat[:, [EAST, WEST]], (1.0 - PLACES.unmapped) / 6)
     assert not flat[:, [NORTH, SOUTH]].any()
     with pytest.raises(ValueError, match="no place"):
-        flat_belief(place_graph([Node(1.0, EMPTY, EMPTY)], [], PLACES), PLACES)
+        uniform_belief(build_place_graph([Node(1.0, EMPTY, EMPTY)], [], PLACES), PLACES)
 
 
 def test_to_look_often_on_the_way_leaks_no_more_than_to_look_once():
     start = certain_belief(chain([30.0]), PLACES, state_of(0, EAST))
     often = start
     for _ in range(50):
-        often = often.gone_on(0.1)
-    once = start.gone_on(5.0)
+        often = often.predict_travel(0.1)
+    once = start.predict_travel(5.0)
     assert once.probabilities[state_of(0, EAST)] == pytest.approx(1.0 - PLACES.slip)
     np.testing.assert_allclose(often.probabilities, once.probabilities, atol=1e-4)
 
@@ -191,41 +198,41 @@ def test_to_look_often_on_the_way_leaks_no_more_than_to_look_once():
 def test_an_opening_far_from_where_the_map_has_one_is_none_of_it():
     graph, noise = chain([3.0, 4.0]), (0.01, 0.01)
     sure = certain_belief(graph, PLACES, state_of(0, EAST))
-    assert [sure.is_listed(Travel(d, 0.0, noise)) for d in (1.5, 2.9, 4.5, 7.1)] == [False, True, False, True]
+    assert [sure.is_mapped_opening(Travel(d, 0.0, noise)) for d in (1.5, 2.9, 4.5, 7.1)] == [False, True, False, True]
     # One that passed two closed doors knows the next one, and what is in between is none of the map.
     beyond = certain_belief(chain([3.0, 4.0, 5.0, 6.0], existence=1.0), PLACES, state_of(0, EAST))
-    assert [beyond.is_listed(Travel(d, 0.0, noise)) for d in (9.5, 12.1)] == [False, True]
+    assert [beyond.is_mapped_opening(Travel(d, 0.0, noise)) for d in (9.5, 12.1)] == [False, True]
     # A robot that may be anywhere takes it for one of the map.
-    assert flat_belief(graph, PLACES).is_listed(Travel(3.5, 0.0, noise))
-    assert certain_belief(graph, PLACES, graph.states).is_listed(Travel(1.5, 0.0, noise))
+    assert uniform_belief(graph, PLACES).is_mapped_opening(Travel(3.5, 0.0, noise))
+    assert certain_belief(graph, PLACES, graph.states).is_mapped_opening(Travel(1.5, 0.0, noise))
 
 
 def test_where_the_map_ends_unknown_ground_begins():
     graph = chain([3.0, 4.0])
-    there = certain_belief(graph, PLACES, state_of(2, EAST)).arrived(Travel(4.0, 0.0, (0.01, 0.01)))
-    assert there.most_likely is None
+    there = certain_belief(graph, PLACES, state_of(2, EAST)).predict_arrival(Travel(4.0, 0.0, (0.01, 0.01)))
+    assert there.most_likely_state is None
     assert there.probabilities[-1] > 0.98
 
 
 def test_the_travelled_distance_tells_openings_apart():
     graph = chain([3.0, 4.0])
     start = certain_belief(graph, PLACES, state_of(0, EAST))
-    assert start.arrived(Travel(3.1, 0.0, (0.01, 0.01))).most_likely == state_of(1, EAST)
-    assert start.arrived(Travel(6.9, 0.0, (0.01, 0.01))).most_likely == state_of(2, EAST)
+    assert start.predict_arrival(Travel(3.1, 0.0, (0.01, 0.01))).most_likely_state == state_of(1, EAST)
+    assert start.predict_arrival(Travel(6.9, 0.0, (0.01, 0.01))).most_likely_state == state_of(2, EAST)
 
 
 def simulated(seed, places, steps=6):
     """Beliefs and true states of a robot that moves and sees exactly as the model says."""
     random = np.random.default_rng(seed)
     graph = random_graph(seed % 7, density=0.02)
-    belief = flat_belief(graph, places)
+    belief = uniform_belief(graph, places)
     state = int(random.choice(graph.states + 1, p=belief.probabilities))
     for _ in range(steps):
         action = int(random.choice(4, p=(0.1, 0.1, 0.1, 0.7)))
         state, travel = drawn_transition(random, graph, places, state, action)
-        belief = belief.turned(action) if travel is None else belief.arrived(travel)
+        belief = belief.predict_turn(action) if travel is None else belief.predict_arrival(travel)
         yield belief, state
-        belief = belief.observed(drawn_seen(random, graph, state), MODEL, 0.0, 0.01)
+        belief = belief.update(drawn_seen(random, graph, state), MODEL, 0.0, 0.01)
         yield belief, state
 
 
@@ -252,9 +259,9 @@ def drawn_transition(random, graph, places, state, action):
 
 def drawn_seen(random, graph, state):
     if state == graph.states:
-        return drawn_anywhere(random, MODEL.usual, MODEL.false, MODEL)
+        return drawn_anywhere(random, MODEL.usual_density, MODEL.false_density, MODEL)
     own = slice(*graph.expected.starts[state : state + 2])
-    return drawn_observation(random, Landmarks(*(f[own] for f in graph.expected.landmarks)), 0.0, 0.01, MODEL)
+    return drawn_observation(random, LandmarkSequence(*(f[own] for f in graph.expected.landmarks)), 0.0, 0.01, MODEL)
 
 
 def test_beliefs_about_robots_of_the_model_are_calibrated():
@@ -263,7 +270,7 @@ def test_beliefs_about_robots_of_the_model_are_calibrated():
     for seed in range(250):
         for belief, state in simulated(seed, places):
             peaks.append(belief.probabilities.max())
-            right.append(int(np.argmax(belief.logs)) == state)
+            right.append(int(np.argmax(belief.log_probabilities)) == state)
     peaks, right = np.array(peaks), np.array(right)
     bins = np.minimum(9, (10 * peaks).astype(int))
     error = np.abs(np.bincount(bins, peaks - right)).sum() / len(peaks)
@@ -272,7 +279,7 @@ def test_beliefs_about_robots_of_the_model_are_calibrated():
 
 
 def test_a_hallway_may_be_joined_from_lists_of_both_directions():
-    there = joined((corner(1.0), corner(2.0, 3)))
+    there = merge_sequences((corner(1.0), corner(2.0, 3)))
     way = straight(0, 1, 3.0, there)
     np.testing.assert_allclose(way.back.landmarks.along, [2.0, 1.0])
     assert list(way.back.landmarks.tracks) == [1, 2]

@@ -14,9 +14,9 @@ from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.hybrid_map.landmark import Existence, Landmark
 from hmt_slam_ros.landmarks.landmarks import OPENING
-from hmt_slam_ros.places.area_views import AreaViews
-from hmt_slam_ros.places.chart import CROSSING, DOOR, END, _place_of, chart_of
-from hmt_slam_ros.places.floor import LeadingOff, floors
+from hmt_slam_ros.places.area_views import AreaViewCache
+from hmt_slam_ros.places.chart import CROSSING, DOOR, END, _node_draft, build_chart
+from hmt_slam_ros.places.floor import SideOpening, aligned_neighborhoods
 from hmt_slam_ros.places.observation_graph import OPENINGS
 from hmt_slam_ros.places.place_graph import EAST, WEST
 from hmt_slam_ros.simulation.building import FloorPlan
@@ -95,7 +95,9 @@ def test_a_node_shows_its_openings_to_the_side_on_which_they_are(charts):
 def test_a_hallway_that_leads_on_is_an_opening_of_its_crossing_to_both_sides(charts):
     chart = charts[0]
     number = at(chart, 16.0)
-    (mouth,) = {edge.leaving for edge in chart.edges if (edge.start, edge.end) == (number, at(chart, 16.0, 11.0))}
+    (mouth,) = {
+        edge.start_direction for edge in chart.edges if (edge.start, edge.end) == (number, at(chart, 16.0, 11.0))
+    }
     seen = chart.seen[number].east if mouth in {EAST, WEST} else chart.seen[number].north
     for track in (OPENINGS + 1, OPENINGS + 3):
         own = (seen.tracks == track) & (np.abs(seen.along) < 0.1)
@@ -118,7 +120,7 @@ def test_a_wide_opening_behind_which_one_sees_far_is_a_crossing_before_anyone_dr
     assert crossing.kind == CROSSING
     assert len(crossing.openings) == 1
     # The way into it is not known.
-    leaving = {edge.leaving for edge in chart.edges if edge.start == at(chart, 16.0)}
+    leaving = {edge.start_direction for edge in chart.edges if edge.start == at(chart, 16.0)}
     assert len(leaving) == 2
     assert crossing.openings[0].direction not in leaving
 
@@ -135,7 +137,7 @@ def test_areas_that_lie_anywhere_to_each_other_share_no_node(charts):
     _, hybrid_map, views = charts
     parted = hybrid_map.branch()
     parted.remove_arc(0, 1)
-    apart = chart_of(parted, views, CONFIGURATION.features)
+    apart = build_chart(parted, views, CONFIGURATION.features)
     places = {0: 0, 1: 0}
     for node in apart.nodes:
         places[node.area] += node.kind != END
@@ -158,7 +160,7 @@ def test_openings_that_are_hardly_believed_in_are_no_nodes(charts):
         for area, view in views.items()
     }
     assert chart.nodes
-    assert chart_of(hybrid_map, doubted, CONFIGURATION.features).nodes == ()
+    assert build_chart(hybrid_map, doubted, CONFIGURATION.features).nodes == ()
 
 
 def test_north_is_one_direction_in_all_areas(charts):
@@ -167,7 +169,7 @@ def test_north_is_one_direction_in_all_areas(charts):
     for edge in chart.edges:
         away = se2.between(true_places(chart)[edge.start], true_places(chart)[edge.end])
         # From a pose that looks north, east is to the right.
-        off = math.atan2(away[1], away[0]) + 0.5 * math.pi * edge.leaving
+        off = math.atan2(away[1], away[0]) + 0.5 * math.pi * edge.start_direction
         assert abs(float(se2.wrap(off))) < 0.05
 
 
@@ -175,16 +177,18 @@ def turning(walls, places):
     """The floor of an area with keyframes at these poses."""
     hybrid_map, rng = HybridMap(), np.random.default_rng(3)
     for k, pose in enumerate(places):
-        hybrid_map.place(k, 0, np.array(pose))
+        hybrid_map.set_keyframe(k, 0, np.array(pose))
     scans = {k: scan_at(walls, np.array(pose), 0.01, rng, 720) for k, pose in enumerate(places)}
-    return floors(hybrid_map, AreaViews(LocalMapping(CONFIGURATION), scans).of_map(hybrid_map))[0]
+    return aligned_neighborhoods(
+        hybrid_map, AreaViewCache(LocalMapping(CONFIGURATION), scans).views_of_map(hybrid_map)
+    )[0]
 
 
 def test_the_end_of_a_hallway_is_in_the_hallway_where_a_room_behind_a_door_is_not():
     plan = FloorPlan()
-    plan.free(0.0, -1.0, 12.0, 1.0)
-    plan.free(9.5, 0.9, 10.5, 1.3)
-    plan.free(8.0, 1.2, 12.0, 5.0)
+    plan.cut_rectangle(0.0, -1.0, 12.0, 1.0)
+    plan.cut_rectangle(9.5, 0.9, 10.5, 1.3)
+    plan.cut_rectangle(8.0, 1.2, 12.0, 5.0)
     person = box(8.8, -0.2, 9.2, 0.2)
     along = [(x, 0.0, 0.0) for x in np.arange(5.0, 8.1, 0.5)]
     end = [(11.0, 0.0, heading) for heading in np.arange(0.0, 6.0, 0.5)]
@@ -218,10 +222,10 @@ def test_a_way_that_was_closed_is_none_until_it_is_seen_free_again(charts, again
 def test_of_a_door_in_several_areas_that_counts_which_was_seen_most_often():
     def known(area, y, confidence, seen):
         pose = PoseGaussian(np.array([0.0, y, 0.0]), np.eye(3))
-        landmark = Landmark(OPENING, pose, 0.9, 0.05, Existence(confidence, seen=seen))
-        return LeadingOff(area, 0, landmark, pose, EAST, False, pose.mean[:2])
+        landmark = Landmark(OPENING, pose, 0.9, 0.05, Existence(confidence, detections=seen))
+        return SideOpening(area, 0, landmark, pose, EAST, False, pose.mean[:2])
 
     often, once = known(0, 0.0, 0.97, 20), known(1, 0.1, 0.99, 1)
-    place = _place_of([once, often], np.zeros((2, 2)))
+    place = _node_draft([once, often], np.zeros((2, 2)))
     assert place.openings == (often,)
     assert place.area == 0

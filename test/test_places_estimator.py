@@ -8,14 +8,14 @@ from small_floor import AREAS, BUILDING, CONFIGURATION, charted, seen_at, walls
 from worlds import scan_at
 
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.landmarks.openings import Openings, openings_of
+from hmt_slam_ros.landmarks.openings import Openings, extract_openings
 from hmt_slam_ros.places.chart import DOOR
 from hmt_slam_ros.places.estimator import PlaceEstimator
-from hmt_slam_ros.places.observation_graph import QUARTERS, chosen, turned_back
-from hmt_slam_ros.places.place_graph import heading_of, node_of, opposite, state_of
-from hmt_slam_ros.places.policy import metric_start
+from hmt_slam_ros.places.observation_graph import QUARTERS, reverse_direction, select_landmarks
+from hmt_slam_ros.places.place_graph import heading_of, node_of, opposite_direction, state_of
+from hmt_slam_ros.places.policy import metric_initial_pose
 from hmt_slam_ros.places.position_belief import PositionBelief, certain_belief
-from hmt_slam_ros.sensors.motion_model import Step, increment_covariance
+from hmt_slam_ros.sensors.motion_model import RelativeMotion, increment_covariance
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +36,7 @@ def node_at(chart, x, y=0.0):
 def eastwards(chart):
     """The direction of the chart in which x grows."""
     first, second = node_at(chart, 5.0), node_at(chart, 10.0)
-    return next(edge.leaving for edge in chart.edges if (edge.start, edge.end) == (first, second))
+    return next(edge.start_direction for edge in chart.edges if (edge.start, edge.end) == (first, second))
 
 
 def line(start, end, heading=None):
@@ -57,7 +57,7 @@ def drive(estimator, poses, seed=0):
     for before, after in zip([poses[0], *poses[:-1]], poses, strict=True):
         increment = se2.between(np.array(before), np.array(after))
         noisy = increment * (1.0 + rng.normal(0.0, 0.01, 3))
-        estimator.moved(Step(noisy, increment_covariance(noisy, CONFIGURATION.motion)))
+        estimator.moved(RelativeMotion(noisy, increment_covariance(noisy, CONFIGURATION.motion)))
         yield estimator.observe(seen_at(np.array(after), rng))
 
 
@@ -67,19 +67,19 @@ def test_a_lost_robot_knows_its_place_after_some_nodes_and_how_far_it_is_beyond_
     beliefs = list(drive(estimator, poses))
     assert beliefs[0] is None
     assert estimator.arrivals == 3
-    assert estimator.belief.confident
-    state = estimator.belief.most_likely
+    assert estimator.belief.is_confident
+    state = estimator.belief.most_likely_state
     assert (node_of(state), heading_of(state)) == (node_at(chart, 16.0), eastwards(chart))
-    assert estimator.frame.away == pytest.approx(3.0, abs=0.1)
-    assert estimator.in_hallway
+    assert estimator.frame.distance_past_node == pytest.approx(3.0, abs=0.1)
+    assert estimator.is_in_hallway
 
 
 def test_the_wall_at_the_end_is_a_node_and_after_the_turn_the_way_leads_back(chart, graph):
     start = state_of(node_at(chart, 16.0), eastwards(chart))
     estimator = PlaceEstimator(graph, CONFIGURATION, certain_belief(graph, CONFIGURATION.places, start))
     poses = line((16.0, 0.0), (21.0, 0.0)) + turn((21.0, 0.0), 0.0, math.pi) + line((21.0, 0.0), (12.0, 0.0))
-    seen = [belief.most_likely for belief in drive(estimator, poses)]
-    end, back = node_at(chart, 21.0), opposite(eastwards(chart))
+    seen = [belief.most_likely_state for belief in drive(estimator, poses)]
+    end, back = node_at(chart, 21.0), opposite_direction(eastwards(chart))
     ways = [start, state_of(end, eastwards(chart)), state_of(end, back), state_of(node_at(chart, 16.0), back)]
     assert [state for k, state in enumerate(seen) if not k or state != seen[k - 1]] == ways
 
@@ -92,13 +92,13 @@ def test_in_a_room_the_belief_pauses_and_goes_on_at_the_door(chart, graph):
     up = 0.5 * math.pi
     into = line((1.0, 0.0), (5.1, 0.0)) + turn((5.1, 0.0), 0.0, up) + line((5.1, 0.0), (5.1, 3.0))
     inside = list(drive(estimator, into))[-1]
-    assert not estimator.in_hallway
+    assert not estimator.is_in_hallway
     about = [(5.1, 3.0, up + 0.2 * k) for k in range(16)]
     assert list(drive(estimator, about))[-1] is inside
     out = line((5.1, 3.0), (5.1, 0.0)) + turn((5.1, 0.0), 1.5 * math.pi, 2.0 * math.pi) + line((5.1, 0.0), (12.0, 0.0))
     list(drive(estimator, [about[-1], *out]))
-    assert estimator.belief.confident
-    state = estimator.belief.most_likely
+    assert estimator.belief.is_confident
+    state = estimator.belief.most_likely_state
     assert (node_of(state), heading_of(state)) == (node_at(chart, 10.0), eastwards(chart))
 
 
@@ -109,7 +109,7 @@ def test_before_a_door_a_confident_robot_knows_its_pose_in_the_area_of_the_door(
     up = 0.5 * math.pi
     poses = line((1.0, 0.0), (4.9, 0.0)) + turn((4.9, 0.0), 0.0, up) + line((4.9, 0.0), (4.9, 0.5))
     list(drive(estimator, poses))
-    found = metric_start(estimator, chart)
+    found = metric_initial_pose(estimator, chart)
     assert found.node == node_at(chart, 5.0)
     true = se2.between(AREAS[found.area], np.array(poses[-1]))
     off = se2.log(se2.between(found.pose.mean, true))
@@ -118,19 +118,19 @@ def test_before_a_door_a_confident_robot_knows_its_pose_in_the_area_of_the_door(
     # One that is not confident does not switch, and neither does one that looks along the hallway.
     lost = PlaceEstimator(graph, CONFIGURATION)
     list(drive(lost, poses))
-    assert lost.belief is None or not lost.belief.confident
-    assert metric_start(lost, chart) is None
+    assert lost.belief is None or not lost.belief.is_confident
+    assert metric_initial_pose(lost, chart) is None
     list(drive(estimator, line((4.9, 0.5), (4.9, 0.0), up) + turn((4.9, 0.0), up, 0.0)))
-    assert metric_start(estimator, chart) is None
+    assert metric_initial_pose(estimator, chart) is None
 
 
 def test_a_door_of_whose_wall_too_little_is_seen_tells_no_pose(chart, graph, monkeypatch):
     estimator = PlaceEstimator(graph, CONFIGURATION, certain_belief(graph, CONFIGURATION.places, 0))
     list(drive(estimator, [(4.9, 0.3, 0.5 * math.pi)] * 2))
     assert estimator.openings.door_ahead() is not None
-    hidden = estimator.openings.seen.covariances.copy()
+    hidden = estimator.openings.last_openings.covariances.copy()
     hidden[:, 2, 2] = math.radians(0.4) ** 2
-    monkeypatch.setattr(estimator.openings, "seen", estimator.openings.seen._replace(covariances=hidden))
+    monkeypatch.setattr(estimator.openings, "seen", estimator.openings.last_openings._replace(covariances=hidden))
     assert estimator.openings.door_ahead() is None
 
 
@@ -139,11 +139,11 @@ def test_a_door_that_someone_hid_is_noticed_by_the_turn_into_it(chart, graph, mo
     estimator = PlaceEstimator(graph, CONFIGURATION, certain_belief(graph, CONFIGURATION.places, start))
     up = 0.5 * math.pi
     poses = line((1.0, 0.0), (5.0, 0.0)) + turn((5.0, 0.0), 0.0, up)
-    hidden = openings_of
+    hidden = extract_openings
     monkeypatch.setattr("hmt_slam_ros.places.estimator.openings_of", lambda *args: without_sides(hidden(*args)))
     list(drive(estimator, poses))
     assert estimator.arrivals == 1
-    assert estimator.facing == (node_at(chart, 5.0), chart.nodes[node_at(chart, 5.0)].openings[0].direction)
+    assert estimator.node_and_direction == (node_at(chart, 5.0), chart.nodes[node_at(chart, 5.0)].openings[0].direction)
 
 
 def without_sides(openings):
@@ -160,14 +160,14 @@ def test_where_the_robot_turns_into_another_hallway_there_is_a_node_though_its_o
     up = 0.5 * math.pi
     list(drive(estimator, line((10.0, 0.0), (16.0, 0.0)) + turn((16.0, 0.0), 0.0, up) + line((16.0, 0.0), (16.0, 4.0))))
     north = (eastwards(chart) - 1) % QUARTERS
-    assert estimator.facing == (node_at(chart, 16.0), north)
-    assert estimator.belief.confident
+    assert estimator.node_and_direction == (node_at(chart, 16.0), north)
+    assert estimator.belief.is_confident
 
 
 def test_an_opening_that_is_none_of_the_map_hides_no_end_of_a_hallway(chart, graph, monkeypatch):
     start = state_of(node_at(chart, 16.0), eastwards(chart))
     estimator = PlaceEstimator(graph, CONFIGURATION, certain_belief(graph, CONFIGURATION.places, start))
-    seen, ahead = openings_of, iter(np.linspace(4.6, -0.3, 41).tolist())
+    seen, ahead = extract_openings, iter(np.linspace(4.6, -0.3, 41).tolist())
 
     def and_a_new_one(*args):
         """Beside where the robot turns at the end."""
@@ -183,7 +183,7 @@ def test_an_opening_that_is_none_of_the_map_hides_no_end_of_a_hallway(chart, gra
 
     monkeypatch.setattr("hmt_slam_ros.places.estimator.openings_of", and_a_new_one)
     list(drive(estimator, line((16.0, 0.0), (20.9, 0.0))))
-    assert estimator.facing == (node_at(chart, 21.0), eastwards(chart))
+    assert estimator.node_and_direction == (node_at(chart, 21.0), eastwards(chart))
 
 
 def test_who_stands_beside_the_robot_does_not_move_the_middle_of_the_hallway(graph):
@@ -193,7 +193,7 @@ def test_who_stands_beside_the_robot_does_not_move_the_middle_of_the_hallway(gra
     person = np.concatenate([se2.transform(BUILDING, beside[:, k : k + 2]) for k in (0, 2)], axis=1)
     for _ in range(2):
         estimator.observe(scan_at(np.concatenate((walls(), person)), se2.compose(BUILDING, pose), 0.01, rng, 720))
-    np.testing.assert_allclose(estimator.frame.ahead(2.0), (2.0, -0.1), atol=0.05)
+    np.testing.assert_allclose(estimator.frame.center_point_ahead_in_base(2.0), (2.0, -0.1), atol=0.05)
 
 
 def test_a_robot_that_stands_learns_nothing_however_its_wheels_tremble(chart, graph):
@@ -202,15 +202,18 @@ def test_a_robot_that_stands_learns_nothing_however_its_wheels_tremble(chart, gr
     rng = np.random.default_rng(0)
     (first,) = drive(estimator, [(10.0, 0.0, 0.0)])
     for _ in range(300):
-        estimator.moved(Step(np.array((rng.normal(0.0, 0.03), 0.0, 0.0)), np.diag((1e-4, 1e-4, 1e-6))))
+        estimator.predict(RelativeMotion(np.array((rng.normal(0.0, 0.03), 0.0, 0.0)), np.diag((1e-4, 1e-4, 1e-6))))
     assert estimator.observe(seen_at(np.array((10.0, 0.0, 0.0)), rng)) is first
 
 
 def test_a_robot_that_turned_back_on_its_way_sees_what_it_saw_before(chart, graph):
-    ways = (state_of(node_at(chart, 10.0), heading) for heading in (eastwards(chart), opposite(eastwards(chart))))
-    there, back = (
-        chosen(graph.expected.landmarks, slice(*graph.expected.starts[state : state + 2].tolist())) for state in ways
+    ways = (
+        state_of(node_at(chart, 10.0), heading) for heading in (eastwards(chart), opposite_direction(eastwards(chart)))
     )
-    assert np.abs(there.along).max() > 5.0
-    for one, other in zip(there, turned_back(back), strict=True):
+    there, back = (
+        select_landmarks(graph.expected.landmarks, slice(*graph.expected.starts[state : state + 2].tolist()))
+        for state in ways
+    )
+    assert np.abs(there.positions).max() > 5.0
+    for one, other in zip(there, reverse_direction(back), strict=True):
         np.testing.assert_allclose(one, other, atol=1e-9)

@@ -10,10 +10,10 @@ from worlds import scan_at
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
-from hmt_slam_ros.places.area_views import AreaViews
-from hmt_slam_ros.places.chart import chart_of
-from hmt_slam_ros.places.loop_detector import ways
-from hmt_slam_ros.places.loop_proposals import LoopProposals, MapLoops
+from hmt_slam_ros.places.area_views import AreaViewCache
+from hmt_slam_ros.places.chart import build_chart
+from hmt_slam_ros.places.loop_detector import traversed_paths
+from hmt_slam_ros.places.loop_proposals import AreaLoopDetector, LoopProposer
 from hmt_slam_ros.simulation.building import FloorPlan
 from hmt_slam_ros.submap.local_mapping import LocalMapping
 
@@ -25,10 +25,10 @@ VAGUE = np.diag([20.0, 20.0, 1.0]) ** 2
 def other_hallway():
     """Walls of a hallway as long, with doors elsewhere and on other sides."""
     plan = FloorPlan()
-    plan.free(0.0, -1.0, 22.0, 1.0)
+    plan.cut_rectangle(0.0, -1.0, 22.0, 1.0)
     for x, side in ((4.0, -1.0), (8.2, 1.0), (12.9, 1.0), (18.1, -1.0)):
-        plan.free(x - 0.6, min(side, 1.3 * side), x + 0.6, max(side, 1.3 * side))
-        plan.free(x - 2.0, min(1.2 * side, 5.0 * side), x + 2.0, max(1.2 * side, 5.0 * side))
+        plan.cut_rectangle(x - 0.6, min(side, 1.3 * side), x + 0.6, max(side, 1.3 * side))
+        plan.cut_rectangle(x - 2.0, min(1.2 * side, 5.0 * side), x + 2.0, max(1.2 * side, 5.0 * side))
     found = plan.walls()
     return np.concatenate([se2.transform(BUILDING, found[:, k : k + 2]) for k in (0, 2)], axis=1)
 
@@ -42,10 +42,10 @@ def driven_twice(again, walls=None):
     hybrid_map, scans, rng = HybridMap(), {}, np.random.default_rng(2)
     for k, pose in enumerate(keyframes()):
         area = int(pose[0] > 8.0)
-        hybrid_map.place(k, area, se2.between(AREAS[area], pose))
+        hybrid_map.set_keyframe(k, area, se2.between(AREAS[area], pose))
         scans[k] = seen_at(pose, rng)
     for k, pose in enumerate(again, len(scans)):
-        hybrid_map.place(k, 2 + int(k > len(keyframes())), se2.between(THIRD, pose))
+        hybrid_map.set_keyframe(k, 2 + int(k > len(keyframes())), se2.between(THIRD, pose))
         at = se2.compose(BUILDING, pose)
         scans[k] = seen_at(pose, rng) if walls is None else scan_at(walls, at, 0.01, rng, 720)
     arc = PoseGaussian(se2.between(AREAS[0], AREAS[1]), np.diag([0.03, 0.03, 0.003]) ** 2)
@@ -62,7 +62,7 @@ def along(turned):
 
 
 def map_loops(scans):
-    return MapLoops(CONFIGURATION, AreaViews(LocalMapping(CONFIGURATION), scans))
+    return AreaLoopDetector(CONFIGURATION, AreaViewCache(LocalMapping(CONFIGURATION), scans))
 
 
 @pytest.fixture(scope="module", params=[False, True])
@@ -97,8 +97,10 @@ def test_a_robot_that_was_in_all_areas_of_late_has_no_map_of_before():
 def test_the_way_leads_from_node_to_node_as_the_robot_went(twice):
     hybrid_map, scans = twice
     part = hybrid_map.part([3])
-    chart = chart_of(part, AreaViews(LocalMapping(CONFIGURATION), scans).of_map(part), CONFIGURATION.features)
-    (way,) = ways(part, chart)
+    chart = build_chart(
+        part, AreaViewCache(LocalMapping(CONFIGURATION), scans).views_of_map(part), CONFIGURATION.features
+    )
+    (way,) = traversed_paths(part, chart)
     assert len(way) == 4
     places = np.array([chart.nodes[k].pose for k in (way[0].start, *(edge.end for edge in way))])
     there = se2.compose(THIRD, places)[:, 0]
@@ -110,13 +112,13 @@ def test_the_way_leads_from_node_to_node_as_the_robot_went(twice):
 
 def test_what_is_proposed_is_supposed_and_told_once_and_stays_no_arc(twice):
     hybrid_map, scans = twice
-    proposals = LoopProposals(CONFIGURATION, AreaViews(LocalMapping(CONFIGURATION), scans))
-    supposed = proposals.supposed(hybrid_map, 3)
+    proposals = LoopProposer(CONFIGURATION, AreaViewCache(LocalMapping(CONFIGURATION), scans))
+    supposed = proposals.with_proposed_arc(hybrid_map, 3)
     (notice,) = proposals.notices()
-    (other,) = set(supposed.neighbours(3)) - {2}
+    (other,) = set(supposed.neighbors(3)) - {2}
     assert f"from area 3 to area 3 are those up to area {other}" in notice.text
-    assert hybrid_map.neighbours(3) == [2]
-    proposals.supposed(hybrid_map, 3)
+    assert hybrid_map.neighbors(3) == [2]
+    proposals.with_proposed_arc(hybrid_map, 3)
     assert not proposals.notices()
 
 
@@ -125,6 +127,6 @@ def test_where_an_arc_joins_the_two_nothing_is_proposed(twice):
     closed = hybrid_map.branch()
     for known in (0, 1):
         closed.set_arc(3, known, PoseGaussian(se2.between(THIRD, AREAS[known]), 0.01 * np.eye(3)), closure=True)
-    proposals = LoopProposals(CONFIGURATION, AreaViews(LocalMapping(CONFIGURATION), scans))
-    assert proposals.supposed(closed, 3) is closed
+    proposals = LoopProposer(CONFIGURATION, AreaViewCache(LocalMapping(CONFIGURATION), scans))
+    assert proposals.with_proposed_arc(closed, 3) is closed
     assert not proposals.notices()

@@ -9,31 +9,31 @@ import pytest
 from worlds import scan_at
 
 from benchmark.belief_world import drawn_anywhere, drawn_observation
-from hmt_slam_ros.configuration.landmarks import Features, Places
-from hmt_slam_ros.landmarks.beam_labels import rays_of
-from hmt_slam_ros.landmarks.corners import Corners, corners_of
+from hmt_slam_ros.configuration.landmarks import FeatureParameters, PlaceParameters
+from hmt_slam_ros.landmarks.beam_labels import rays_from_scan
+from hmt_slam_ros.landmarks.corners import Corners, extract_corners
 from hmt_slam_ros.landmarks.line_extraction import extract_lines
-from hmt_slam_ros.landmarks.openings import Openings, openings_of
+from hmt_slam_ros.landmarks.openings import Openings, extract_openings
 from hmt_slam_ros.places.observation import (
-    Expected,
-    log_observation,
-    log_unknown_ground,
+    ExpectedLandmarks,
+    estimate_distance_past_node,
+    log_observation_ratios,
+    log_unknown_ground_ratio,
     observation_model,
-    place_along,
 )
 from hmt_slam_ros.places.observation_graph import (
     OPENINGS,
     TRACKS,
-    Landmarks,
-    joined,
-    moved,
-    no_landmarks,
+    LandmarkSequence,
+    empty_sequence,
+    merge_sequences,
     observation_graph,
-    turned_back,
+    reverse_direction,
+    shift_ahead,
 )
 
-FEATURES = Features(range_deviation=0.01)
-PLACES = Places()
+FEATURES = FeatureParameters(range_deviation=0.01)
+PLACES = PlaceParameters()
 MODEL = observation_model(PLACES, FEATURES)
 WHOLE = dataclasses.replace(PLACES, reach=6.0, aside=4.0)
 # A hallway of 2 m with a door of 1 m to a room on the left, and at its end another hallway to the right.
@@ -60,8 +60,8 @@ HALLWAY = np.array(
 def graph_at(pose, axis):
     scan = scan_at(HALLWAY, pose, 0.01, np.random.default_rng(0), 720)
     lines = extract_lines(scan, FEATURES)
-    openings = openings_of(lines, rays_of(scan, FEATURES), FEATURES)
-    return observation_graph(corners_of(lines, FEATURES), openings, axis, WHOLE)
+    openings = extract_openings(lines, rays_from_scan(scan, FEATURES), FEATURES)
+    return observation_graph(extract_corners(lines, FEATURES), openings, axis, WHOLE)
 
 
 def is_in(few, more):
@@ -74,7 +74,9 @@ def is_in(few, more):
 def landmarks(*rows):
     """Rows of track, along, form, its two variances and the probability."""
     table = np.array(rows, dtype=float).reshape(-1, 6)
-    return joined((Landmarks(table[:, 0].astype(np.int64), table[:, 1], table[:, 2], table[:, 3:5], table[:, 5]),))
+    return merge_sequences(
+        (LandmarkSequence(table[:, 0].astype(np.int64), table[:, 1], table[:, 2], table[:, 3:5], table[:, 5]),)
+    )
 
 
 def random_landmarks(random, count, tracks=(0, 2, 5), spread=1.0):
@@ -82,11 +84,11 @@ def random_landmarks(random, count, tracks=(0, 2, 5), spread=1.0):
     forms = np.where(chosen < OPENINGS, random.uniform(-np.pi, np.pi, count), random.uniform(0.7, 2.5, count))
     variances = random.uniform(0.0, 0.2, (count, 2))
     along = random.uniform(-spread, spread, count)
-    return joined((Landmarks(chosen, along, forms, variances, random.uniform(0.1, 1.0, count)),))
+    return merge_sequences((LandmarkSequence(chosen, along, forms, variances, random.uniform(0.1, 1.0, count)),))
 
 
 def one_state(found):
-    return Expected(np.array([0, len(found.tracks)]), found)
+    return ExpectedLandmarks(np.array([0, len(found.tracks)]), found)
 
 
 def test_a_hallway_is_seen_in_order_along_the_axis_whatever_the_robot_heads_for():
@@ -115,20 +117,22 @@ def test_only_landmarks_within_reach_count_and_variances_are_those_along_the_axi
 
 def test_to_turn_back_is_to_see_the_hallway_from_its_other_end():
     there, back = graph_at((-1.0, 0.0, 0.0), 0.0), graph_at((-1.0, 0.0, np.pi), 0.0)
-    mirrored = turned_back(there)
+    mirrored = reverse_direction(there)
     assert is_in(back, mirrored) or is_in(mirrored, back)
-    for one, other in zip(turned_back(mirrored), there, strict=True):
+    for one, other in zip(reverse_direction(mirrored), there, strict=True):
         np.testing.assert_allclose(one, other, atol=1e-12)
 
 
 def test_what_is_seen_tells_how_far_the_robot_is_beyond_the_node():
-    expected = Expected(np.array([0, 0, 2]), landmarks((0, 1.0, 0.5, 0.0, 0.0, 0.9), (5, 2.0, 1.0, 0.0, 0.0, 0.9)))
+    expected = ExpectedLandmarks(
+        np.array([0, 0, 2]), landmarks((0, 1.0, 0.5, 0.0, 0.0, 0.9), (5, 2.0, 1.0, 0.0, 0.0, 0.9))
+    )
     seen = landmarks((0, 0.8, 0.5, 0.0, 0.0, 0.9), (5, 1.8, 1.0, 0.0, 0.0, 0.9))
-    mean, variance = place_along(seen, expected, 1, 0.0, 0.25, MODEL)
+    mean, variance = estimate_distance_past_node(seen, expected, 1, 0.0, 0.25, MODEL)
     assert mean == pytest.approx(0.2, abs=0.02)
-    assert variance == pytest.approx(1.0 / (2.0 / MODEL.along + 4.0), rel=0.1)
+    assert variance == pytest.approx(1.0 / (2.0 / MODEL.position_variance + 4.0), rel=0.1)
     # Where nothing is seen that is known, nothing is learnt.
-    mean, variance = place_along(no_landmarks(), expected, 0, 0.1, 0.25, MODEL)
+    mean, variance = estimate_distance_past_node(empty_sequence(), expected, 0, 0.1, 0.25, MODEL)
     assert (mean, variance) == pytest.approx((0.1, 0.25), rel=0.01)
 
 
@@ -177,22 +181,22 @@ def density(off, variance):
 @pytest.mark.parametrize("seed", range(40))
 def test_the_forward_algorithm_is_the_sum_over_all_pairings_that_do_not_cross(seed):
     random = np.random.default_rng(seed)
-    model = MODEL._replace(along=0.3, heading=0.5, width=0.5, reach=1.5)
+    model = MODEL._replace(position_variance=0.3, heading_variance=0.5, width_variance=0.5, reach=1.5)
     states = [random_landmarks(random, int(random.integers(0, 6))) for _ in range(3)]
     observed = random_landmarks(random, int(random.integers(0, 6)))
     starts = np.concatenate(([0], np.cumsum([len(state.tracks) for state in states])))
-    every = Landmarks(*(np.concatenate(fields) for fields in zip(*states, strict=True)))
-    found = log_observation(observed, Expected(starts, every), 0.2, 0.0, model)
+    every = LandmarkSequence(*(np.concatenate(fields) for fields in zip(*states, strict=True)))
+    found = log_observation_ratios(observed, ExpectedLandmarks(starts, every), 0.2, 0.0, model)
     np.testing.assert_allclose(found, [math.log(brute_force(observed, s, 0.2, model)) for s in states], rtol=1e-12)
 
 
 def test_where_the_robot_is_along_the_axis_is_integrated_out():
     random = np.random.default_rng(5)
     expected, observed = random_landmarks(random, 4), random_landmarks(random, 4)
-    found = math.exp(log_observation(observed, one_state(expected), 0.1, 0.09, MODEL)[0])
+    found = math.exp(log_observation_ratios(observed, one_state(expected), 0.1, 0.09, MODEL)[0])
     points = np.linspace(-1.5, 1.5, 3001)
     weights = np.exp(-0.5 * points**2 / 0.09)
-    values = [math.exp(log_observation(observed, one_state(expected), 0.1 + x, 0.0, MODEL)[0]) for x in points]
+    values = [math.exp(log_observation_ratios(observed, one_state(expected), 0.1 + x, 0.0, MODEL)[0]) for x in points]
     assert found == pytest.approx(float(weights @ values / weights.sum()), rel=1e-3)
 
 
@@ -202,7 +206,9 @@ def mean_ratio(expected, model, draws=12000, variance=0.0, seed=1):
     state = one_state(expected)
     ratios = np.exp(
         [
-            log_observation(drawn_anywhere(random, model.new, model.false, model), state, 0.0, variance, model)[0]
+            log_observation_ratios(drawn_anywhere(random, model.new, model.false, model), state, 0.0, variance, model)[
+                0
+            ]
             for _ in range(draws)
         ]
     )
@@ -210,7 +216,15 @@ def mean_ratio(expected, model, draws=12000, variance=0.0, seed=1):
 
 
 # Much that is extra and little that is certain, so that the mean over what is extra is one of many terms.
-DENSE = MODEL._replace(reach=3.0, along=0.4, heading=0.6, width=0.06, new=0.15, false=0.05, detection=0.6)
+DENSE = MODEL._replace(
+    reach=3.0,
+    position_variance=0.4,
+    heading_variance=0.6,
+    width_variance=0.06,
+    new_density=0.15,
+    false_density=0.05,
+    detection=0.6,
+)
 APART = landmarks(
     (0, -2.3, 0.5, 0, 0, 0.7), (0, 2.3, -2.0, 0, 0, 0.6), (5, 0.5, 1.8, 0, 0, 0.8), (1, 2.9, 0.0, 0, 0, 0.7)
 )
@@ -225,9 +239,12 @@ def test_the_observation_function_is_a_density(variance):
 
 def test_unknown_ground_is_a_density_too():
     random = np.random.default_rng(2)
-    model = DENSE._replace(usual=0.25)
+    model = DENSE._replace(usual_density=0.25)
     ratios = np.exp(
-        [log_unknown_ground(drawn_anywhere(random, model.new, model.false, model), model) for _ in range(8000)]
+        [
+            log_unknown_ground_ratio(drawn_anywhere(random, model.new_density, model.false_density, model), model)
+            for _ in range(8000)
+        ]
     )
     error = ratios.std() / math.sqrt(len(ratios))
     assert error < 0.05
@@ -245,24 +262,28 @@ def test_of_two_landmarks_in_one_place_what_is_missing_is_the_probability_of_the
 def test_what_is_seen_of_a_state_speaks_for_it_on_average_as_much_as_information_theory_says():
     random = np.random.default_rng(3)
     right = landmarks((0, 1.0, 0.5, 0, 0, 0.9), (5, -1.0, 1.0, 0, 0, 0.9))
-    wrong = moved(right, 0.6)
-    both = Expected(np.array([0, 2, 4]), Landmarks(*(np.concatenate(f) for f in zip(right, wrong, strict=True))))
+    wrong = shift_ahead(right, 0.6)
+    both = ExpectedLandmarks(
+        np.array([0, 2, 4]), LandmarkSequence(*(np.concatenate(f) for f in zip(right, wrong, strict=True)))
+    )
     ratios = []
     for _ in range(8000):
-        seen = log_observation(drawn_observation(random, right, 0.0, 0.0, DENSE), both, 0.0, 0.0, DENSE)
+        seen = log_observation_ratios(drawn_observation(random, right, 0.0, 0.0, DENSE), both, 0.0, 0.0, DENSE)
         ratios.append(math.exp(seen[1] - seen[0]))
     assert np.mean(ratios) == pytest.approx(1.0, abs=4.0 * np.std(ratios) / math.sqrt(len(ratios)))
 
 
 def test_without_landmarks_nothing_is_told_and_what_is_certain_and_missed_excludes():
-    assert log_observation(no_landmarks(), one_state(no_landmarks()), 0.0, 0.0, MODEL)[0] == 0.0
+    assert log_observation_ratios(empty_sequence(), one_state(empty_sequence()), 0.0, 0.0, MODEL)[0] == 0.0
     certain = landmarks((0, 0.0, 0.5, 0, 0, 1.0))
-    found = log_observation(no_landmarks(), one_state(certain), 0.0, 0.0, MODEL._replace(detection=1.0))
+    found = log_observation_ratios(empty_sequence(), one_state(certain), 0.0, 0.0, MODEL._replace(detection=1.0))
     assert found[0] == -np.inf
     less = observation_model(dataclasses.replace(PLACES, detection=0.5), FEATURES)
-    assert log_observation(no_landmarks(), one_state(certain), 0.0, 0.0, less)[0] == pytest.approx(math.log(0.5))
+    assert log_observation_ratios(empty_sequence(), one_state(certain), 0.0, 0.0, less)[0] == pytest.approx(
+        math.log(0.5)
+    )
 
 
 def test_every_track_has_a_mirrored_one():
     table = [(track, 0.5, 1.0, 0, 0, 1) for track in range(TRACKS)]
-    assert sorted(turned_back(landmarks(*table)).tracks) == list(range(TRACKS))
+    assert sorted(reverse_direction(landmarks(*table)).tracks) == list(range(TRACKS))

@@ -6,21 +6,23 @@ import math
 import numpy as np
 import pytest
 
-from hmt_slam_ros.configuration.landmarks import Features, Places
+from hmt_slam_ros.configuration.landmarks import FeatureParameters, PlaceParameters
 from hmt_slam_ros.places.observation import observation_model
-from hmt_slam_ros.places.observation_graph import Landmarks, joined, no_landmarks
-from hmt_slam_ros.places.place_graph import EAST, NORTH, SOUTH, WEST, Edge, Node, place_graph, state_of
+from hmt_slam_ros.places.observation_graph import LandmarkSequence, empty_sequence, merge_sequences
+from hmt_slam_ros.places.place_graph import EAST, NORTH, SOUTH, WEST, Edge, Node, build_place_graph, state_of
 from hmt_slam_ros.places.policy import most_informative_turn, next_turn, turn_towards
 from hmt_slam_ros.places.position_belief import PositionBelief, certain_belief
 
-PLACES = Places()
-MODEL = observation_model(PLACES, Features())
-EMPTY = no_landmarks()
+PLACES = PlaceParameters()
+MODEL = observation_model(PLACES, FeatureParameters())
+EMPTY = empty_sequence()
 
 
 def graph_of(ways, nodes):
     edges = [Edge(a, heading, b, heading, (length, 0.1), (0.0, 0.01), seen) for a, heading, b, length, seen in ways]
-    return place_graph([Node(1.0, EMPTY, EMPTY)] * nodes, [e for edge in edges for e in (edge, edge.back)], PLACES)
+    return build_place_graph(
+        [Node(1.0, EMPTY, EMPTY)] * nodes, [e for edge in edges for e in (edge, edge.reverse)], PLACES
+    )
 
 
 @pytest.fixture
@@ -55,9 +57,9 @@ def test_a_robot_that_is_sure_heads_for_its_goal_and_one_in_unknown_ground_for_n
 def corners(along):
     count = len(along)
     headings = np.full(count, 0.25 * math.pi)
-    return joined(
+    return merge_sequences(
         (
-            Landmarks(
+            LandmarkSequence(
                 np.zeros(count, np.int64), np.array(along), headings, np.full((count, 2), 1e-3), np.full(count, 0.9)
             ),
         )
@@ -72,7 +74,7 @@ def test_a_robot_that_is_not_sure_goes_where_places_differ():
         logs = np.full(graph.states + 1, -50.0)
         logs[[state_of(1, heading), state_of(4, heading)]] = math.log(0.5)
         belief = PositionBelief(graph, PLACES, logs)
-        assert not belief.confident
+        assert not belief.is_confident
         assert most_informative_turn(belief, MODEL) == expected
         assert next_turn(belief, 0, MODEL, ahead=False) == expected
         # It follows a hallway that leads on.
@@ -81,7 +83,7 @@ def test_a_robot_that_is_not_sure_goes_where_places_differ():
 
 
 def test_without_a_way_there_is_no_turn():
-    graph = place_graph([Node(1.0, EMPTY, EMPTY)], [], PLACES)
+    graph = build_place_graph([Node(1.0, EMPTY, EMPTY)], [], PLACES)
     assert most_informative_turn(certain_belief(graph, PLACES, 0), MODEL) is None
-    lost = dataclasses.replace(certain_belief(graph, PLACES, 0), logs=np.log([0.05] * 4 + [0.8]))
+    lost = dataclasses.replace(certain_belief(graph, PLACES, 0), log_probabilities=np.log([0.05] * 4 + [0.8]))
     assert most_informative_turn(lost, MODEL) is None

@@ -7,22 +7,22 @@ import pytest
 
 from benchmark.belief_corridors import Corridors, drawn_building, random_corridors
 from benchmark.belief_world import drawn_of_present
-from hmt_slam_ros.configuration.landmarks import Features, Places
-from hmt_slam_ros.places.loop_detector import TwinPeaks, belief_of_twins
+from hmt_slam_ros.configuration.landmarks import FeatureParameters, PlaceParameters
+from hmt_slam_ros.places.loop_detector import TwoPeakTracker, initial_loop_belief
 from hmt_slam_ros.places.observation import observation_model
-from hmt_slam_ros.places.observation_graph import Landmarks, chosen, no_landmarks
-from hmt_slam_ros.places.place_graph import EAST, Edge, Node, heading_of, place_graph, state_of
-from hmt_slam_ros.places.position_belief import PositionBelief, Travel, certain_belief, flat_belief
+from hmt_slam_ros.places.observation_graph import LandmarkSequence, empty_sequence, select_landmarks
+from hmt_slam_ros.places.place_graph import EAST, Edge, Node, build_place_graph, heading_of, state_of
+from hmt_slam_ros.places.position_belief import PositionBelief, Travel, certain_belief, uniform_belief
 
-PLACES = Places()
-MODEL = observation_model(PLACES, Features())
+PLACES = PlaceParameters()
+MODEL = observation_model(PLACES, FeatureParameters())
 NOISE = (0.01, 0.001)
 ROUND = 6  # nodes of the loop
 
 
 def lap(random):
     """The edges of a straight hallway with many landmarks, all of which are extracted in every lap."""
-    ways = [way for way in random_corridors(random, 1, 3, 0.2).ways if way.leaving == EAST][:ROUND]
+    ways = [way for way in random_corridors(random, 1, 3, 0.2).ways if way.start_direction == EAST][:ROUND]
     return [way._replace(landmarks=sure(way.landmarks)) for way in ways]
 
 
@@ -35,7 +35,7 @@ def mapped_twice(random, edges, turned=0, missed=0.0):
 
     :param missed: share of the landmarks that only the first lap showed.
     """
-    nodes = [Node(1.0, no_landmarks(), no_landmarks())] * (2 * ROUND + 1)
+    nodes = [Node(1.0, empty_sequence(), empty_sequence())] * (2 * ROUND + 1)
     twice = []
     for k in range(2 * ROUND):
         there = drawn_building(random, Corridors([], [edges[k % ROUND]])).ways[0]
@@ -45,14 +45,14 @@ def mapped_twice(random, edges, turned=0, missed=0.0):
             probabilities=np.full(len(there.landmarks.tracks), 0.9),
         )
         if k >= ROUND:
-            listed = chosen(listed, random.random(len(listed.tracks)) >= missed)
+            listed = select_landmarks(listed, random.random(len(listed.tracks)) >= missed)
         heading = EAST if k < ROUND else EAST + turned
         length = edges[k % ROUND].distance[0]
         twice.append(Edge(k, heading, k + 1, heading, (length, (0.03 * length) ** 2), (0.0, 1e-4), listed))
     if turned:
         last = twice[ROUND - 1]
-        twice[ROUND - 1] = last._replace(arriving=EAST + turned, turn=(-0.5 * math.pi * turned, 1e-4))
-    return place_graph(nodes, twice, PLACES)
+        twice[ROUND - 1] = last._replace(end_direction=EAST + turned, turn=(-0.5 * math.pi * turned, 1e-4))
+    return build_place_graph(nodes, twice, PLACES)
 
 
 def driven(random, belief, detector, edges, start, count):
@@ -64,11 +64,11 @@ def driven(random, belief, detector, edges, start, count):
         ahead = edges[(k + 1) % ROUND].landmarks
         seen = drawn_of_present(random, ahead, np.ones(len(ahead.tracks), bool), 0.0, MODEL)
         belief = belief.observed(ahead_only(seen), MODEL, 0.0, 0.01)
-        yield detector.after_transition(belief), belief
+        yield detector.update(belief), belief
 
 
 def ahead_only(seen):
-    return Landmarks(*(field[seen.along > 0.0] for field in seen))
+    return LandmarkSequence(*(field[seen.along > 0.0] for field in seen))
 
 
 @pytest.mark.parametrize(("turned", "missed"), [(0, 0.0), (1, 0.0), (0, 0.2)])
@@ -78,8 +78,8 @@ def test_a_loop_that_was_mapped_twice_is_proposed_with_the_places_that_are_one(t
         random = np.random.default_rng(seed)
         edges = lap(random)
         graph = mapped_twice(random, edges, turned, missed)
-        belief = belief_of_twins(graph, PLACES)
-        for loop, _ in driven(random, belief, TwinPeaks(), edges, 0, ROUND - 1):
+        belief = initial_loop_belief(graph, PLACES)
+        for loop, _ in driven(random, belief, TwoPeakTracker(), edges, 0, ROUND - 1):
             if loop is not None:
                 found += 1
                 assert abs(loop.node - loop.other) == ROUND
@@ -92,19 +92,19 @@ def test_no_loop_is_proposed_where_there_is_none():
     for seed in range(40):
         random = np.random.default_rng(seed)
         corridors = random_corridors(random, 1, 2, 0.1)
-        graph = place_graph(corridors.nodes, corridors.edges, PLACES)
+        graph = build_place_graph(corridors.nodes, corridors.edges, PLACES)
         building = drawn_building(random, corridors)
-        truth = place_graph(building.nodes, building.edges, PLACES)
-        state = int(random.choice(np.flatnonzero(graph.following >= 0)))
-        belief, detector = belief_of_twins(graph, PLACES), TwinPeaks()
-        while graph.following[state] >= 0:
+        truth = build_place_graph(building.nodes, building.edges, PLACES)
+        state = int(random.choice(np.flatnonzero(graph.successors >= 0)))
+        belief, detector = initial_loop_belief(graph, PLACES), TwoPeakTracker()
+        while graph.successors[state] >= 0:
             travel = Travel(random.normal(truth.lengths[state], 0.05), random.normal(0.0, 0.02), NOISE)
-            state = int(graph.following[state])
-            own = slice(*truth.expected.starts[state : state + 2])
-            there = Landmarks(*(field[own] for field in truth.expected.landmarks))
+            state = int(graph.successors[state])
+            own = slice(*truth.expected_landmarks.starts[state : state + 2])
+            there = LandmarkSequence(*(field[own] for field in truth.expected_landmarks.landmarks))
             seen = drawn_of_present(random, there, np.ones(len(there.tracks), bool), 0.0, MODEL)
-            belief = belief.arrived(travel).observed(seen, MODEL, 0.0, 0.01)
-            assert detector.after_transition(belief) is None
+            belief = belief.predict_arrival(travel).update(seen, MODEL, 0.0, 0.01)
+            assert detector.update(belief) is None
 
 
 def two_peaks(graph, first, second, shares=(0.6, 0.4)):
@@ -115,14 +115,14 @@ def two_peaks(graph, first, second, shares=(0.6, 0.4)):
 
 @pytest.fixture
 def hallway():
-    edges = [Edge(k, EAST, k + 1, EAST, (4.0, 0.1), (0.0, 0.01), no_landmarks()) for k in range(11)]
-    back = [edge.back for edge in edges]
-    return place_graph([Node(1.0, no_landmarks(), no_landmarks())] * 12, edges + back, PLACES)
+    edges = [Edge(k, EAST, k + 1, EAST, (4.0, 0.1), (0.0, 0.01), empty_sequence()) for k in range(11)]
+    back = [edge.reverse for edge in edges]
+    return build_place_graph([Node(1.0, empty_sequence(), empty_sequence())] * 12, edges + back, PLACES)
 
 
 def proposals(graph, places):
-    detector = TwinPeaks()
-    return [detector.after_transition(two_peaks(graph, *states)) for states in places]
+    detector = TwoPeakTracker()
+    return [detector.update(two_peaks(graph, *states)) for states in places]
 
 
 def test_three_transitions_in_the_same_way_make_a_loop_whichever_peak_is_higher(hallway):
@@ -146,13 +146,13 @@ def test_peaks_may_head_for_different_sides_but_have_to_move_alike_and_apart(hal
 
 def test_a_belief_that_is_certain_and_one_of_many_peaks_begin_anew(hallway):
     pairs = [(state_of(k, EAST), state_of(k + 6, EAST)) for k in range(5)]
-    detector = TwinPeaks()
+    detector = TwoPeakTracker()
     for k, pair in enumerate(pairs):
         belief = two_peaks(hallway, *pair)
         if k == 2:
             belief = certain_belief(hallway, PLACES, pair[0])
-        assert detector.after_transition(belief) is None
-    detector = TwinPeaks()
+        assert detector.update(belief) is None
+    detector = TwoPeakTracker()
     for k, pair in enumerate(pairs):
-        belief = flat_belief(hallway, PLACES) if k == 2 else two_peaks(hallway, *pair)
-        assert detector.after_transition(belief) is None
+        belief = uniform_belief(hallway, PLACES) if k == 2 else two_peaks(hallway, *pair)
+        assert detector.update(belief) is None

@@ -9,8 +9,16 @@ from hmt_slam_ros.area_abstraction.aam import Aam
 from hmt_slam_ros.configuration import Configuration, with_changes
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.messages.map_changes import Arc, Merged, Relabelled
-from hmt_slam_ros.messages.messages import Accepted, AreaEvents, Hypotheses, Keyframe, Leaf, LeafEstimate, LocalEstimate
+from hmt_slam_ros.messages.map_changes import Arc, AreaMerge, MovedKeyframe
+from hmt_slam_ros.messages.messages import (
+    AreaEvents,
+    ClosureDecision,
+    Hypotheses,
+    Hypothesis,
+    HypothesisEstimate,
+    Keyframe,
+    LocalEstimate,
+)
 from hmt_slam_ros.registration.consistency import Clutter
 
 WORLD = worlds.two_rooms()
@@ -27,7 +35,7 @@ def exact(pose):
 
 
 def estimate(hypothesis, area, pose, stored=True):
-    return LeafEstimate(hypothesis, area, exact(pose), stored, 0.0, 0.0, Clutter(), 12.0)
+    return HypothesisEstimate(hypothesis, area, exact(pose), stored, 0.0, 0.0, Clutter(), 12.0)
 
 
 def keyframe(k, world_pose, *leaves):
@@ -35,7 +43,7 @@ def keyframe(k, world_pose, *leaves):
 
 
 def stay(k, *hypotheses, area=0):
-    return Hypotheses(k, tuple(Leaf(h, h, 1.0 / len(hypotheses), area) for h in hypotheses))
+    return Hypotheses(k, tuple(Hypothesis(h, h, 1.0 / len(hypotheses), area) for h in hypotheses))
 
 
 def drive_until_cut(process, poses=THERE, origin=None):
@@ -55,13 +63,13 @@ def into(area, event, k, hypothesis=0, parent=0, probability=1.0, new_T_old=None
     """TSBI's answer that the keyframes of a cut belong to ``area``."""
     new_T_old = np.zeros(3) if new_T_old is None else new_T_old
     poses = {i: se2.compose(new_T_old, se2.between(THERE[0], THERE[i])) for i in event.keyframes}
-    return Leaf(
+    return Hypothesis(
         hypothesis,
         parent,
         probability,
         area,
         exact(new_T_old),
-        tuple(Relabelled(i, event.area, area, pose) for i, pose in poses.items()),
+        tuple(MovedKeyframe(i, event.area, area, pose) for i, pose in poses.items()),
         (Arc(event.area, area, exact(se2.inverse(new_T_old))),),
     )
 
@@ -112,7 +120,7 @@ def test_every_keyframe_is_answered_once_and_nothing_else_is():
     process = aam()
     assert len(process.handle(keyframe(0, THERE[0], estimate(0, 0, np.zeros(3))))) == 1
     assert process.handle(stay(0, 0)) == []
-    assert process.handle(Accepted(0)) == []
+    assert process.handle(ClosureDecision(0)) == []
     assert process.handle(LocalEstimate(0, 0, 0, exact(np.zeros(3)), np.zeros(3), 0)) == []
     assert process.handle(worlds.scan_at(WORLD, THERE[0])) == []
 
@@ -164,7 +172,7 @@ def answered_in_first_room(process):
     """Rooms 0 and 1 known, the robot in room 1; returns the next keyframe's number."""
     event, k = drive_until_cut(process)
     process.handle(Hypotheses(k, (into(1, event, k),)))
-    process.handle(Accepted(k, 0))
+    process.handle(ClosureDecision(k, 0))
     for later in range(k + 1, len(THERE)):
         area_pose = se2.between(THERE[0], THERE[later])
         assert process.handle(keyframe(later, THERE[later], estimate(0, 1, area_pose)))[0].events == ()
@@ -234,8 +242,8 @@ def test_a_closure_puts_the_keyframes_beside_the_known_ones_and_compares_only_ac
     process.handle(Hypotheses(k, (into(7, event, k, 1, 0, 0.5), into(8, event, k, 2, 0, 0.5))))
     measured.clear()
     back = {i: se2.between(THERE[0], THERE[i]) for i in event.keyframes}
-    relabelled = tuple(Relabelled(i, 7, 0, pose) for i, pose in back.items())
-    process.handle(Hypotheses(k + 1, (Leaf(1, 1, 1.0, 0, exact(np.zeros(3)), relabelled),)))
+    relabelled = tuple(MovedKeyframe(i, 7, 0, pose) for i, pose in back.items())
+    process.handle(Hypotheses(k + 1, (Hypothesis(1, 1, 1.0, 0, exact(np.zeros(3)), relabelled),)))
     known = k + 1 - len(event.keyframes)
     assert sum(measured) == known * len(event.keyframes)
 
@@ -252,7 +260,7 @@ def test_a_hypothesis_that_does_not_store_the_keyframe_is_not_cut():
 def test_hypotheses_are_judged_each_by_its_own_map():
     process = aam()
     event, k = drive_until_cut(process)
-    process.handle(Hypotheses(k, (into(1, event, k, 1, 0, 0.6), Leaf(2, 0, 0.4, 0))))
+    process.handle(Hypotheses(k, (into(1, event, k, 1, 0, 0.6), Hypothesis(2, 0, 0.4, 0))))
     pose = se2.between(THERE[0], THERE[k + 1])
     (answer,) = process.handle(keyframe(k + 1, THERE[k + 1], estimate(1, 1, pose), estimate(2, 0, pose)))
     assert [(event.hypothesis, event.kind) for event in answer.events] == [(2, "cut")]
@@ -261,8 +269,8 @@ def test_hypotheses_are_judged_each_by_its_own_map():
 def test_acceptance_drops_the_other_hypotheses():
     process = aam()
     event, k = drive_until_cut(process)
-    process.handle(Hypotheses(k, (into(1, event, k, 1, 0, 0.9), Leaf(2, 0, 0.1, 0))))
-    process.handle(Accepted(k, 1))
+    process.handle(Hypotheses(k, (into(1, event, k, 1, 0, 0.9), Hypothesis(2, 0, 0.1, 0))))
+    process.handle(ClosureDecision(k, 1))
     pose = se2.between(THERE[0], THERE[k + 1])
     (answer,) = process.handle(keyframe(k + 1, THERE[k + 1], estimate(1, 1, pose), estimate(2, 0, pose)))
     assert answer.events == ()
@@ -274,12 +282,12 @@ def closed(process, around, error=(0.0, 0.0, 0.0)):
     Returns the answer to the next keyframe, and that keyframe's number.
     """
     first = answered_in_first_room(process)
-    moved = Relabelled(first, 1, 2, np.zeros(3))
+    moved = MovedKeyframe(first, 1, 2, np.zeros(3))
     one_T_two = se2.between(THERE[0], around[0])
-    begun = Leaf(0, 0, 1.0, 2, exact(se2.inverse(one_T_two)), (moved,), (Arc(1, 2, exact(one_T_two)),))
+    begun = Hypothesis(0, 0, 1.0, 2, exact(se2.inverse(one_T_two)), (moved,), (Arc(1, 2, exact(one_T_two)),))
     process.handle(keyframe(first, around[0], estimate(0, 1, one_T_two)))
     process.handle(Hypotheses(first, (begun,)))
-    process.handle(Accepted(first, 0, begun.arcs))
+    process.handle(ClosureDecision(first, 0, begun.arcs))
     for k, pose in enumerate(around[1:-1], start=first + 1):
         (answer,) = process.handle(keyframe(k, pose, estimate(0, 2, se2.between(around[0], pose))))
         assert answer.events == ()
@@ -287,8 +295,8 @@ def closed(process, around, error=(0.0, 0.0, 0.0)):
     last = first + len(around) - 1
     arc = Arc(2, 0, exact(se2.compose(se2.inverse(one_T_two), np.array(error))), closure=True)
     process.handle(keyframe(last, around[-1], estimate(0, 2, se2.between(around[0], around[-1]))))
-    process.handle(Hypotheses(last, (Leaf(0, 0, 1.0, 2, None, (), (arc,)),)))
-    process.handle(Accepted(last, 0, (arc,)))
+    process.handle(Hypotheses(last, (Hypothesis(0, 0, 1.0, 2, None, (), (arc,)),)))
+    process.handle(ClosureDecision(last, 0, (arc,)))
     pose = se2.between(around[0], around[-1])
     (answer,) = process.handle(keyframe(last + 1, around[-1], estimate(0, 2, pose, stored=False)))
     return answer, last + 1
@@ -303,10 +311,12 @@ def test_a_room_that_was_taken_for_a_new_one_is_the_same_area_when_the_loop_is_c
     (event,) = answer.events
     assert (event.hypothesis, event.kind, event.area, event.into) == (0, "merged", 2, 0)
     assert 0.8 < event.score <= 2.0
-    process.handle(Hypotheses(k, (Leaf(0, 0, 1.0, 0, merged=Merged(2, 0, exact(se2.between(THERE[0], AGAIN[0])))),)))
-    process.handle(Accepted(k, 0))
+    process.handle(
+        Hypotheses(k, (Hypothesis(0, 0, 1.0, 0, area_merge=AreaMerge(2, 0, exact(se2.between(THERE[0], AGAIN[0])))),))
+    )
+    process.handle(ClosureDecision(k, 0))
     # Its keyframes are the robot's own, and one graph holds them and the known ones.
-    watch = process._watches[0]
+    watch = process._partitions[0]
     assert watch.area == 0
     assert watch.own >= {*range(k - len(AGAIN) + 1, k)}
     assert watch.graphs.keys() == {0, 1}
@@ -329,11 +339,11 @@ def test_the_question_comes_again_when_the_robot_leaves_one_of_the_two_and_waits
     # TSBI finds that they contradict each other.
     process.handle(stay(k, 0, area=2))
     assert process.handle(keyframe(k + 1, AGAIN[-1], estimate(0, 2, in_two, stored=False)))[0].events == ()
-    gone_over = Leaf(1, 0, 0.6, 0, exact(se2.between(THERE[0], AGAIN[0])))
-    process.handle(Hypotheses(k + 1, (gone_over, Leaf(2, 0, 0.4, 2))))
+    gone_over = Hypothesis(1, 0, 0.6, 0, exact(se2.between(THERE[0], AGAIN[0])))
+    process.handle(Hypotheses(k + 1, (gone_over, Hypothesis(2, 0, 0.4, 2))))
     both = estimate(1, 0, in_zero, stored=False), estimate(2, 2, in_two, stored=False)
     assert process.handle(keyframe(k + 2, AGAIN[-1], *both))[0].events == ()
-    process.handle(Hypotheses(k + 2, (Leaf(1, 1, 1.0, 0),)))
+    process.handle(Hypotheses(k + 2, (Hypothesis(1, 1, 1.0, 0),)))
     (event,) = process.handle(keyframe(k + 3, AGAIN[-1], both[0]))[0].events
     assert (event.kind, event.area, event.into) == ("merged", 2, 0)
 
@@ -345,7 +355,7 @@ def test_two_areas_are_measured_again_only_where_the_arc_between_them_moved(meas
     for later, error in enumerate((0.0, 0.001, 0.1), start=k):
         two_T_zero = se2.compose(se2.between(AGAIN[0], THERE[0]), (error, 0.0, 0.0))
         process.handle(stay(later, 0, area=2))
-        process.handle(Accepted(later, 0, (Arc(2, 0, exact(two_T_zero), closure=True),)))
+        process.handle(ClosureDecision(later, 0, (Arc(2, 0, exact(two_T_zero), closure=True),)))
         measured.clear()
         (answer,) = process.handle(keyframe(later + 1, AGAIN[-1], estimate(0, 2, pose, stored=False)))
         moved = error == 0.1

@@ -11,8 +11,8 @@ from hmt_slam_ros.composition import area_abstraction
 from hmt_slam_ros.configuration import Configuration, with_changes
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.messages.map_changes import Arc, Relabelled
-from hmt_slam_ros.messages.messages import Accepted, Hypotheses, Keyframe, Leaf
+from hmt_slam_ros.messages.map_changes import Arc, MovedKeyframe
+from hmt_slam_ros.messages.messages import ClosureDecision, Hypotheses, Hypothesis, Keyframe
 from hmt_slam_ros.saved_map.folder import FolderReader, FolderWriter
 
 # Straight on through the door, in the first room and behind it.
@@ -80,10 +80,10 @@ def test_areas_with_an_opening_between_them_are_not_one(policy, merged):
     process = by_policy("both", ncut_threshold=0.5, portal_factor=0.01)
     event, k = drive_until_cut(process, THROUGH)
     poses = {i: se2.between(THROUGH[0], THROUGH[i]) for i in event.keyframes}
-    begun = tuple(Relabelled(i, 0, 1, pose) for i, pose in poses.items())
+    begun = tuple(MovedKeyframe(i, 0, 1, pose) for i, pose in poses.items())
     arc = Arc(0, 1, exact(np.zeros(3)), closure=True)
-    process.handle(Hypotheses(k, (Leaf(0, 0, 1.0, 1, exact(np.zeros(3)), begun, (arc,)),)))
-    process.handle(Accepted(k, 0, (arc,)))
+    process.handle(Hypotheses(k, (Hypothesis(0, 0, 1.0, 1, exact(np.zeros(3)), begun, (arc,)),)))
+    process.handle(ClosureDecision(k, 0, (arc,)))
     changed = {"ncut_threshold": 0.3, "overlap_radius": 2.0, "min_cluster": 5, "portal_factor": 0.01}
     process = area_abstraction(configured(policy, **changed), process.state)
     leaf = estimate(0, 1, poses[k], stored=False)

@@ -7,7 +7,7 @@ from play_for_tlca import Play, belief
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.messages.map_changes import Arc
-from hmt_slam_ros.messages.messages import Leaf, RealTimePose
+from hmt_slam_ros.messages.messages import Hypothesis, RealTimePose
 
 THERE = np.array([4.0, 1.0, 0.5])
 ELSEWHERE = np.array([4.5, 4.0, 0.7])
@@ -18,7 +18,7 @@ def verdict_of(probability):
     play = Play()
     play.start()
     leaves = [
-        Leaf(h, 0, p, 2, belief(se2.inverse(THERE)), (), (Arc(0, 2, belief(arc)),))
+        Hypothesis(h, 0, p, 2, belief(se2.inverse(THERE)), (), (Arc(0, 2, belief(arc)),))
         for h, p, arc in ((1, probability, THERE), (2, 1.0 - probability, ELSEWHERE))
     ]
     return play.step(*leaves)
@@ -37,7 +37,7 @@ def test_it_is_what_the_others_are_away_by_their_probability(probability):
 
 
 def test_the_pose_in_the_map_is_as_uncertain_as_the_hypotheses_are_apart_whatever_the_heading():
-    exact = PoseGaussian.exactly
+    exact = PoseGaussian.from_pose
     apart = np.diag([4.0, 0.0, 0.0])
     said = [
         RealTimePose(
@@ -47,4 +47,4 @@ def test_the_pose_in_the_map_is_as_uncertain_as_the_hypotheses_are_apart_whateve
     ]
     np.testing.assert_allclose(said[0].map_pose.covariance, np.diag([4.0, 0.0, 0.0]), atol=1e-12)
     np.testing.assert_allclose(said[1].map_pose.covariance, np.diag([0.0, 4.0, 0.0]), atol=1e-12)
-    np.testing.assert_allclose(said[1].local.covariance, 0.0, atol=1e-12)
+    np.testing.assert_allclose(said[1].pose_in_area.covariance, 0.0, atol=1e-12)

@@ -10,11 +10,11 @@ from benchmark.kidnapping import SOON, kidnapped
 from hmt_slam_ros.configuration import Configuration, with_changes
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.hybrid_map.shortest_path import tells_nothing, unknown
-from hmt_slam_ros.messages.map_changes import Place
-from hmt_slam_ros.messages.messages import Carried
+from hmt_slam_ros.hybrid_map.shortest_path import is_uninformative, uninformative_belief
+from hmt_slam_ros.messages.map_changes import InitialPose
+from hmt_slam_ros.messages.messages import PoseReset
 from hmt_slam_ros.messages.replica import Replica
-from hmt_slam_ros.offline.runtime import Run
+from hmt_slam_ros.offline.runtime import LockStepRun
 from hmt_slam_ros.open_log import open_log
 from hmt_slam_ros.sensors import Odometry, Scan
 from hmt_slam_ros.simulation.scenario import START
@@ -38,16 +38,16 @@ def office(maps):
 @pytest.fixture(scope="module")
 def begin(office):
     """The record of a keyframe's scan."""
-    known = {scan.stamp for scan in Replica.of(office.state.tsbi.replica).scans.values()}
+    known = {scan.stamp for scan in Replica.from_state(office.state.tsbi.replica).scans.values()}
     return [scan for scan in office.scans if office.records[scan].measurement.stamp in known][60]
 
 
 def carried(office, records, scans):
     """A run that woke up in a map and read so many scans."""
-    run = Run(Configuration(), state=office.state)
-    run.lock_step.feed(Carried())
+    run = LockStepRun(Configuration(), state=office.state)
+    run.lock_step.feed(PoseReset())
     for record in records:
-        run.read(record)
+        run.process_record(record)
         scans -= isinstance(record.measurement, Scan)
         if not scans:
             break
@@ -55,17 +55,17 @@ def carried(office, records, scans):
 
 
 def test_it_begins_a_new_area_to_which_an_arc_leads_that_tells_nothing(office, begin):
-    before = Replica.of(office.state.tsbi.replica)
+    before = Replica.from_state(office.state.tsbi.replica)
     run = carried(office, office.records[begin:], 10)
-    replica = Replica.of(run.state.tsbi.replica)
+    replica = Replica.from_state(run.state.tsbi.replica)
     (leaf,) = run.recorder.hypotheses[max(run.recorder.hypotheses)].leaves
     assert leaf.lost
-    assert leaf.area not in before.maps[before.best].area_ids()
+    assert leaf.area not in before.maps[before.best_hypothesis].area_ids()
     hybrid_map = replica.maps[leaf.hypothesis]
-    (beside,) = hybrid_map.neighbours(leaf.area)
-    assert tells_nothing(hybrid_map.arc(beside, leaf.area))
-    for area in before.maps[before.best].area_ids():
-        assert hybrid_map.keyframes(area).keys() == before.maps[before.best].keyframes(area).keys()
+    (beside,) = hybrid_map.neighbors(leaf.area)
+    assert is_uninformative(hybrid_map.arc(beside, leaf.area))
+    for area in before.maps[before.best_hypothesis].area_ids():
+        assert hybrid_map.keyframes(area).keys() == before.maps[before.best_hypothesis].keyframes(area).keys()
 
 
 @pytest.mark.parametrize(("kind", "share"), [("whole", 0.15), ("whole", 0.7), ("first half", 0.5)])
@@ -89,17 +89,17 @@ def test_without_landmarks_as_prior_it_is_recognized_too(maps, share):
 
 def test_in_the_map_of_the_first_half_it_wakes_up_in_the_second_near_keyframes_of_the_first(maps):
     log, whole = maps["first half"], maps["whole"]
-    scans = Replica.of(log.state.tsbi.replica).scans.values()
+    scans = Replica.from_state(log.state.tsbi.replica).scans.values()
     stamps = {log.records[scan].measurement.stamp: n for n, scan in enumerate(log.scans)}
-    known = np.array([log.truth[stamps[scan.stamp], :2] for scan in scans])
+    known = np.array([log.true_pose[stamps[scan.stamp], :2] for scan in scans])
     assert max(stamps[scan.stamp] for scan in scans) < min(log.starts)
-    assert all(np.hypot(*(known - log.truth[start, :2]).T).min() < 2.1 for start in log.starts)
-    assert np.hypot(*(log.truth - whole.truth)[:, :2].T).max() < 0.5
+    assert all(np.hypot(*(known - log.true_pose[start, :2]).T).min() < 2.1 for start in log.starts)
+    assert np.hypot(*(log.true_pose - whole.true_pose)[:, :2].T).max() < 0.5
 
 
 def test_it_is_not_believed_to_be_where_one_look_alone_finds_it(office, begin, monkeypatch):
     """Every other look finds it 5 m off."""
-    looks, found = [], ClosureSearch.everywhere
+    looks, found = [], ClosureSearch.localize_globally
 
     def off_at_times(search, *asked):
         looks.append(found(search, *asked))
@@ -107,9 +107,9 @@ def test_it_is_not_believed_to_be_where_one_look_alone_finds_it(office, begin, m
             return looks[-1]
         moved = [
             fit._replace(mode=fit.mode._replace(pose=PoseGaussian(fit.mode.pose.mean + OFF, np.eye(3))))
-            for fit in looks[-1].found
+            for fit in looks[-1].candidates
         ]
-        return looks[-1]._replace(found=tuple(moved))
+        return looks[-1]._replace(candidates=tuple(moved))
 
     monkeypatch.setattr(ClosureSearch, "everywhere", off_at_times)
     run = carried(office, office.records[begin:], 150)
@@ -126,8 +126,8 @@ def test_in_a_building_that_it_does_not_know_it_stays_lost(office, seed):
 
 def test_a_robot_that_stands_still_is_recognized_where_somebody_says_that_it_is(office, begin):
     """In the place of a keyframe; what is said is 0.4 m and 6 degrees off."""
-    replica = Replica.of(office.state.tsbi.replica)
-    hybrid_map = replica.maps[replica.best]
+    replica = Replica.from_state(office.state.tsbi.replica)
+    hybrid_map = replica.maps[replica.best_hypothesis]
     scan = office.records[begin].measurement
     (at,) = [
         (area, pose)
@@ -136,14 +136,14 @@ def test_a_robot_that_stands_still_is_recognized_where_somebody_says_that_it_is(
         if replica.scans[keyframe].stamp == scan.stamp
     ]
     said = PoseGaussian(se2.compose(at[1], np.array([0.3, -0.25, 0.1])), np.diag([0.5, 0.5, 0.26]) ** 2)
-    run = Run(Configuration(), state=office.state)
-    run.lock_step.feed(Carried(Place(at[0], said)))
+    run = LockStepRun(Configuration(), state=office.state)
+    run.lock_step.feed(PoseReset(InitialPose(at[0], said)))
     for k in range(3):
         stamp = scan.stamp + k * 200_000_000
         run.lock_step.feed(Odometry(stamp, np.zeros(3)))
         run.lock_step.feed(replace(scan, stamp=stamp))
     run.lock_step.feed(Odometry(stamp + 200_000_000, np.zeros(3)))
-    leaves = run.recorder.hypotheses[max(run.recorder.hypotheses)].leaves
+    leaves = run.recorder.hypotheses[max(run.recorder.hypotheses)].hypotheses
     assert sum(leaf.probability for leaf in leaves if not leaf.lost) > 0.9
 
 
@@ -162,8 +162,8 @@ def test_one_that_is_carried_while_it_maps_notices_and_is_recognized():
 
 
 def test_one_that_is_carried_while_it_stores_nothing_notices_and_is_recognized(office):
-    run = Run(Configuration(mode="localization"), state=office.state)
-    run.lock_step.feed(Carried())
+    run = LockStepRun(Configuration(mode="localization"), state=office.state)
+    run.lock_step.feed(PoseReset())
     log = open_log(CARRIED)
     jump = START + int(0.6e9 * log.scenario.drive.duration)
     heard = []
@@ -172,16 +172,16 @@ def test_one_that_is_carried_while_it_stores_nothing_notices_and_is_recognized(o
         if since > 40.0:
             break
         if since > -30.0:
-            run.read(record)
+            run.process_record(record)
         if run.recorder.hypotheses:
-            lost = all(leaf.lost for leaf in run.recorder.hypotheses[max(run.recorder.hypotheses)].leaves)
+            lost = all(leaf.lost for leaf in run.recorder.hypotheses[max(run.recorder.hypotheses)].hypotheses)
             heard.append((since, lost))
     assert not any(lost for since, lost in heard if -1.0 < since < 0.0)
     assert any(lost for since, lost in heard if 0.0 < since < SOON)  # at 0.6 m/s at most
     assert not heard[-1][1]
-    assert run.state.slam.dropped == 0
+    assert run.state.slam.dropped_scans == 0
 
 
 def test_an_arc_that_tells_nothing_is_told_from_the_least_certain_one_between_areas():
-    assert tells_nothing(unknown(np.array([3.0, 4.0, 1.0])))
-    assert not tells_nothing(PoseGaussian(np.zeros(3), np.diag([100.0, 100.0, 1.0]) ** 2))
+    assert is_uninformative(uninformative_belief(np.array([3.0, 4.0, 1.0])))
+    assert not is_uninformative(PoseGaussian(np.zeros(3), np.diag([100.0, 100.0, 1.0]) ** 2))

@@ -15,45 +15,45 @@ from hypothesis import strategies as st
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.messages.documents import (
-    BeginRequest,
-    BegunPart,
-    Closing,
-    KeyframeHead,
+    FinalCounts,
+    KeyframeHeader,
+    ResetRequest,
+    ResetResponse,
     RobotStatus,
-    SavedPart,
     SaveRequest,
+    SaveResponse,
     decode,
     encode,
 )
 from hmt_slam_ros.messages.messages import (
-    Accepted,
     AreaEvents,
-    Arriving,
+    ClosureDecision,
     Hypotheses,
+    HypothesisEstimate,
     Keyframe,
-    LeafEstimate,
     LocalEstimate,
     Notice,
+    TrackingReset,
 )
 from hmt_slam_ros.messages.tasks import PlaceEstimate
-from hmt_slam_ros.plain_data import is_record, names_in
+from hmt_slam_ros.plain_data import field_names, is_record
 from hmt_slam_ros.registration.consistency import Clutter
 from hmt_slam_ros.sensors import Scan
 
 KINDS = (
-    KeyframeHead,
+    KeyframeHeader,
     AreaEvents,
     Hypotheses,
-    Accepted,
+    ClosureDecision,
     LocalEstimate,
-    Arriving,
+    TrackingReset,
     Notice,
-    Closing,
+    FinalCounts,
     RobotStatus,
     SaveRequest,
-    SavedPart,
-    BeginRequest,
-    BegunPart,
+    SaveResponse,
+    ResetRequest,
+    ResetResponse,
     PlaceEstimate,
 )
 NUMBERS = st.floats(allow_nan=False, allow_infinity=False)
@@ -74,7 +74,7 @@ def values(kind, name=""):
         return st.none() | values(arguments[0])
     if is_record(kind):
         hints = get_type_hints(kind)
-        return st.builds(kind, **{name: values(hints[name], name) for name in names_in(kind)})
+        return st.builds(kind, **{name: values(hints[name], name) for name in field_names(kind)})
     return {bool: st.booleans(), int: st.integers(-(2**63), 2**63 - 1), float: NUMBERS, str: st.text()}[kind]
 
 
@@ -117,9 +117,9 @@ def test_a_keyframe_is_whole_again_with_its_ranges():
     ranges = np.array([1.0, np.nan, np.inf, 0.1], dtype=np.float32)
     scan = Scan(5, ranges, -1.1, 0.1, 0.05, 30.0, np.array([0.1, 0.2, 0.3]), 1e-5)
     pose = PoseGaussian(np.array([1.0, 2.0, 0.1]), np.eye(3))
-    leaf = LeafEstimate(3, 4, pose, True, -0.3, 0.2, Clutter(0.01, 0.002), 11.5)
+    leaf = HypothesisEstimate(3, 4, pose, True, -0.3, 0.2, Clutter(0.01, 0.002), 11.5)
     keyframe = Keyframe(2, scan, 1.25, (leaf,))
-    assert_same(decode(encode(KeyframeHead.of(keyframe)), KeyframeHead).with_ranges(ranges), keyframe)
+    assert_same(decode(encode(KeyframeHeader.from_keyframe(keyframe)), KeyframeHeader).to_keyframe(ranges), keyframe)
 
 
 STATUS = RobotStatus("playing", "aces", 12, 3, 7374, 3, 1)

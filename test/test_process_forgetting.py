@@ -6,7 +6,7 @@ import pytest
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.messages.messages import Hypotheses
-from hmt_slam_ros.offline.runtime import Run
+from hmt_slam_ros.offline.runtime import LockStepRun
 from hmt_slam_ros.open_log import open_log
 from hmt_slam_ros.results.recorder import Recorder
 from hmt_slam_ros.sensors import Scan
@@ -22,7 +22,7 @@ class Ears:
 
     def handle(self, message):
         if isinstance(message, Hypotheses):
-            self.forgotten += message.forgotten
+            self.forgotten += message.pruned_keyframes
         return [answer for recorder in self.recorders for answer in recorder.handle(message)]
 
 
@@ -34,20 +34,20 @@ class Rounds:
 
     def __init__(self):
         self.log = open_log(f"sim:office,size=0.7,rate=2.5,laps={LAPS}")
-        self.run, self.folding = Run(Configuration()), Recorder(Configuration())
+        self.run, self.folding = LockStepRun(Configuration()), Recorder(Configuration())
         self.ears = Ears(self.run.recorder, self.folding)
         self.run.lock_step.processes["recorder"] = self.ears
         self.keyframes, self.kept = [], 0
         for record in self.log.records():
-            self.run.read(record)
-            self.folding.fold()
+            self.run.process_record(record)
+            self.folding.compact()
             self.kept = max(self.kept, len(self.folding.keyframes))
-            if isinstance(record.measurement, Scan) and self.run.scans * LAPS >= self.log.scan_count * (
+            if isinstance(record.measurement, Scan) and self.run.scans_read * LAPS >= self.log.scan_count * (
                 len(self.keyframes) + 1
             ):
                 self.keyframes.append(len(self.placed))
         self.result = self.run.finish()
-        self.log_state = self.result.log
+        self.log_state = self.result.log_progress
         self.recording = self.run.recorder.finish(self.log_state.stamps)
 
     @property
@@ -83,7 +83,7 @@ def test_what_is_forgotten_was_stored_before_and_is_gone_in_every_process(rounds
         assert replica.scans.keys() == state.slam.replica.scans.keys()
     assert not gone & rounds.placed
     for live in state.slam.live.values():
-        assert not gone & {*live.grid.keyframes, *live.placed.by_keyframe(), *live.fresh.by_keyframe(), live.anchor}
+        assert not gone & {*live.grid.keyframes, *live.placed.to_dict(), *live.fresh.to_dict(), live.anchor}
     assert not gone & {keyframe for graph in state.aam.graphs for keyframe in graph.keyframes}
 
 
@@ -101,7 +101,7 @@ def test_every_scan_keeps_its_pose_relative_to_a_keyframe_that_is_there(rounds):
 
 
 def test_a_record_instead_of_messages_tells_the_same(rounds):
-    assert rounds.kept < 100 < len(rounds.run.recorder.keyframes)
+    assert rounds.indices < 100 < len(rounds.run.recorder.keyframes)
     folded = rounds.folding.finish(rounds.log_state.stamps)
     for name in ("trajectory", "online", "odometry"):
         np.testing.assert_array_equal(getattr(folded, name), getattr(rounds.recording, name))

@@ -11,7 +11,7 @@ from hmt_slam_ros.configuration.flat import with_changes
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.places.landmark_evidence import PlaceEvidence
-from hmt_slam_ros.places.loop_proposals import LoopProposals, MapLoop
+from hmt_slam_ros.places.loop_proposals import AreaLoop, LoopProposer
 
 SPREAD = np.diag([0.15, 0.15, math.radians(1.5)]) ** 2
 # Areas whose position is less certain than this are not looked at, m: none behind the ring.
@@ -19,14 +19,14 @@ GATED = with_changes(Configuration(), {"tsbi.prior_limit": 0.5})
 LAP, LAST = 96, 120  # keyframes
 
 
-class Told(LoopProposals):
+class Told(LoopProposer):
     """Proposes what it is told."""
 
     def __init__(self, loop, configuration, views):
         super().__init__(configuration, views)
         self.loop, self.asked = loop, 0
 
-    def proposed(self, _hybrid_map):
+    def propose(self, _hybrid_map):
         self.asked += 1
         return self.loop
 
@@ -46,16 +46,16 @@ def twice_into_the_first_corridor(shift, proposing=GATED):
     run, poses = Run(RING, configuration=GATED, field_of_view=2 * np.pi, beams=241), ring_drive(LAST)
     for k, pose in enumerate(poses):
         if k == LAP + 4 and shift is not None:
-            own = run.replica.areas[run.replica.best]
+            own = run.replica.robot_areas[run.replica.best_hypothesis]
             true = se2.between(frame(run, poses, own), frame(run, poses, 0))
-            loop = MapLoop(own, 0, PoseGaussian(se2.compose(np.array((*shift, 0.0)), true), SPREAD), own)
+            loop = AreaLoop(own, 0, PoseGaussian(se2.compose(np.array((*shift, 0.0)), true), SPREAD), own)
             branching = run.tsbi._branching
             branching.landmarks = PlaceEvidence(GATED, run.tsbi._replica.scans)
             branching.landmarks.loops = Told(loop, proposing, branching.landmarks.views)
         run.keyframe(pose, cut=7 if k and k % 14 == 0 else 0)
         if len(run.answers[-1].leaves) > 1:
-            run.accept(run.replica.best)
-    best = run.replica.maps[run.replica.best]
+            run.accept(run.replica.best_hypothesis)
+    best = run.replica.maps[run.replica.best_hypothesis]
     return run, poses, [(a, b, arc) for a, b, arc in best.all_arcs() if arc.closure]
 
 

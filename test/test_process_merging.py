@@ -60,7 +60,7 @@ def test_the_published_pose_does_not_jump_when_areas_become_one(drive, merged):
     stamps = {row.keyframe: row.stamp for row in recording.probabilities}
     for k in merged:
         row = int(np.searchsorted(recording.stamps, stamps[k]))
-        step = se2.between(*recording.online[row : row + 2])
+        step = se2.between(*recording.online_trajectory[row : row + 2])
         driven = se2.between(*recording.odometry[row : row + 2])
         assert np.hypot(*(step - driven)[:2]) < 0.1
         assert np.degrees(abs(step[2] - driven[2])) < 2.0
@@ -108,6 +108,6 @@ def test_the_saved_map_has_the_areas_that_are_left(drive, tmp_path):
     writer.write_map(recording.replica, recording.area_poses, recording.last)
     writer.finish(Configuration())
     saved = read_saved_map(tmp_path / "hmt_map")
-    best = saved.replica.maps[saved.replica.best]
+    best = saved.replica.maps[saved.replica.best_hypothesis]
     assert best.area_ids() == recording.hybrid_map.area_ids() == sorted(saved.area_poses)
-    assert saved.replica.areas == recording.replica.areas
+    assert saved.replica.robot_areas == recording.replica.areas

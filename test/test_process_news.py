@@ -8,14 +8,14 @@ from worlds import box, scan_in
 
 from benchmark.one_drive import OneDrive
 from hmt_slam_ros.configuration import Configuration
-from hmt_slam_ros.lifelong.change_detection import Look, looked, news_of, outdated
-from hmt_slam_ros.messages.documents import KeyframeHead, encode
-from hmt_slam_ros.messages.map_changes import Outdated
-from hmt_slam_ros.offline.runtime import Run
+from hmt_slam_ros.lifelong.change_detection import RecentScan, append_recent_scan, combine_stale_beams, detect_changes
+from hmt_slam_ros.messages.documents import KeyframeHeader, encode
+from hmt_slam_ros.messages.map_changes import StaleBeams
+from hmt_slam_ros.offline.runtime import LockStepRun
 from hmt_slam_ros.results.hmt_map import MapWriter, read_run_state
 from hmt_slam_ros.sensors import Scan
-from hmt_slam_ros.sensors.polar_scan import FREE, SURFACE, UNSEEN, behind, seen, view_of
-from hmt_slam_ros.sensors.scan import Revision
+from hmt_slam_ros.sensors.polar_scan import FREE, SURFACE, UNKNOWN, classify_points, occlusion_starts, to_polar_scan
+from hmt_slam_ros.sensors.scan import BeamRevision
 from hmt_slam_ros.simulation import open_simulated
 from hmt_slam_ros.submap.local_filter import PlacedKeyframe
 
@@ -33,7 +33,7 @@ def room(*things):
 def looks_in(*worlds, apart=SECOND):
     """A look from each place of the way, in the world as it is at that time."""
     pairs = enumerate(zip(worlds, WAY, strict=False))
-    return tuple(Look(scan_in(walls, pose, stamp=n * apart, beams=361), pose) for n, (walls, pose) in pairs)
+    return tuple(RecentScan(scan_in(walls, pose, stamp=n * apart, beams=361), pose) for n, (walls, pose) in pairs)
 
 
 def keyframes(walls):
@@ -42,8 +42,8 @@ def keyframes(walls):
 
 def news(before, now, looks=None):
     """What a scan now says of a map of before."""
-    scan = Look(scan_in(now, NOW, stamp=10 * SECOND, beams=361), NOW)
-    return news_of(scan, looks_in(now, now, now) if looks is None else looks, keyframes(before))
+    scan = RecentScan(scan_in(now, NOW, stamp=10 * SECOND, beams=361), NOW)
+    return detect_changes(scan, looks_in(now, now, now) if looks is None else looks, keyframes(before))
 
 
 def ends(keyframe, beams):
@@ -53,13 +53,13 @@ def ends(keyframe, beams):
 
 
 def test_a_view_tells_surface_from_free_space_and_from_what_is_hidden():
-    view = view_of(scan_in(room(CUPBOARD), NOW, beams=361))
+    view = to_polar_scan(scan_in(room(CUPBOARD), NOW, beams=361))
     places = np.array([[2.0, 1.0], [1.0, 0.5], [4.0, 2.0], [5.0, -2.0], [-1.0, 0.0], [4.8, -1.0], [2.0, 0.45]])
-    assert seen(view, places).tolist() == [SURFACE, FREE, UNSEEN, SURFACE, UNSEEN, UNSEEN, SURFACE]
-    starts = behind(view, np.array([[1.0, 0.5], [2.0, 0.45]]))
+    assert classify_points(view, places).tolist() == [SURFACE, FREE, UNKNOWN, SURFACE, UNKNOWN, UNKNOWN, SURFACE]
+    starts = occlusion_starts(view, np.array([[1.0, 0.5], [2.0, 0.45]]))
     assert (np.abs(starts - np.hypot(1.0, 0.5) - 1.0) < 1e-9).sum() > 5
     assert (starts[starts > 0.0] < view.ranges[starts > 0.0]).all()
-    assert not behind(view, np.array([[4.0, 2.0]])).any()
+    assert not occlusion_starts(view, np.array([[4.0, 2.0]])).any()
 
 
 @pytest.mark.parametrize("increment", [1, -1])
@@ -68,20 +68,20 @@ def test_a_view_of_a_laser_that_hangs_upside_down_or_moves_in_the_sweep_is_the_s
     swept = scan_in(room(CUPBOARD), poses, beams=361, field_of_view=increment * np.pi)
     moving = dataclasses.replace(swept, motion=np.array([0.1, 0.0, 0.0]))
     places = np.array([[2.0, 1.0], [1.0, 0.5], [4.0, 2.0]])
-    assert seen(view_of(moving), places).tolist() == [SURFACE, FREE, UNSEEN]
+    assert classify_points(to_polar_scan(moving), places).tolist() == [SURFACE, FREE, UNKNOWN]
 
 
 def test_an_unchanged_room_is_no_news():
     found = news(room(CUPBOARD), room(CUPBOARD))
     assert (found.new, found.changed) == (False, False)
-    assert not any(late.gone.any() or late.starts.any() for late in found.outdated.values())
+    assert not any(late.gone.any() or late.starts.any() for late in found.stale_beams.values())
 
 
 def test_furniture_that_came_is_stored_and_beams_that_pass_it_are_out_of_date():
     found = news(room(), room(CUPBOARD))
     assert found.changed
     for keyframe in keyframes(room()):
-        late = found.outdated[keyframe.keyframe]
+        late = found.stale_beams[keyframe.keyframe]
         passed = ends(keyframe, late.starts > 0.0)
         assert len(passed) > 5
         assert (passed[:, 0] > 2.3).all()
@@ -91,7 +91,7 @@ def test_furniture_that_came_is_stored_and_beams_that_pass_it_are_out_of_date():
 def test_of_furniture_that_is_gone_every_beam_is_out_of_date():
     found = news(room(CUPBOARD), room())
     for keyframe in keyframes(room(CUPBOARD)):
-        gone = found.outdated[keyframe.keyframe].gone
+        gone = found.stale_beams[keyframe.keyframe].gone
         on = np.zeros(361, dtype=bool)
         on[keyframe.scan.valid] = np.abs(keyframe.scan.points + keyframe.pose[:2] - [2.3, 1.1]).max(axis=1) < 0.61
         assert on.sum() > 10
@@ -103,36 +103,36 @@ def test_who_walks_through_is_no_news():
     at = [box(x, -1.0, x + 0.4, -0.6) for x in (1.0, 1.6, 2.2)]
     found = news(room(), room(box(2.8, -1.0, 3.2, -0.6)), looks_in(*(room(person) for person in at)))
     assert (found.new, found.changed) == (False, False)
-    assert not any(late.gone.any() or late.starts.any() for late in found.outdated.values())
+    assert not any(late.gone.any() or late.starts.any() for late in found.stale_beams.values())
 
 
 def test_a_robot_that_is_elsewhere_takes_nothing_for_out_of_date():
     found = news(room(), room() * [0.6, 0.4, 0.6, 0.4])
     assert not found.changed
-    assert not found.outdated
+    assert not found.stale_beams
 
 
 def test_looks_are_a_second_apart_and_few():
     looks = ()
     for look in looks_in(*[room()] * 4, apart=SECOND // 2):
-        looks = looked(looks, look)
+        looks = append_recent_scan(looks, look)
     assert [look.scan.stamp for look in looks] == [0, SECOND]
     for n in range(5):
-        looks = looked(looks, Look(scan_in(room(), NOW, stamp=(2 + n) * SECOND), NOW))
+        looks = append_recent_scan(looks, RecentScan(scan_in(room(), NOW, stamp=(2 + n) * SECOND), NOW))
     assert len(looks) == 3
 
 
 def test_hypotheses_have_to_agree_on_what_is_out_of_date():
     one, other = news(room(CUPBOARD), room()), news(room(), room())
-    assert outdated([(one, 0.97), (other, 0.03)])
-    assert outdated([(one, 0.6), (other, 0.4)]) == ()
-    assert outdated([]) == ()
+    assert combine_stale_beams([(one, 0.97), (other, 0.03)])
+    assert combine_stale_beams([(one, 0.6), (other, 0.4)]) == ()
+    assert combine_stale_beams([]) == ()
 
 
 def test_beams_are_left_out_of_a_scan_once_for_all_who_hold_it():
     scan = scan_in(room(), NOW, beams=361)
-    less = scan.revised(Revision((3, 4), (180,), (1.5,)))
-    assert less is scan.revised(Revision((3, 4), (180,), (1.5,)))
+    less = scan.revised(BeamRevision((3, 4), (180,), (1.5,)))
+    assert less is scan.revised(BeamRevision((3, 4), (180,), (1.5,)))
     assert np.flatnonzero(scan.valid & ~less.valid).tolist() == [3, 4]
     assert len(less.points) == len(scan.points) - 2
 
@@ -142,13 +142,13 @@ def test_what_is_behind_a_thing_that_came_stays_in_the_map_and_what_is_before_it
     poses = np.stack((np.linspace(0.0, motion, 361), np.zeros(361), np.zeros(361)), axis=1)
     scan = dataclasses.replace(scan_in(room(), poses, beams=361), motion=np.array([motion, 0.0, 0.0]))
     thing = np.array([[2.0, 0.0], [2.0, 0.1]])
-    starts = behind(view_of(scan), thing)
+    starts = occlusion_starts(to_polar_scan(scan), thing)
     cut = np.flatnonzero(starts)
-    less = scan.revised(Revision((), tuple(cut.tolist()), tuple(starts[cut].tolist())))
+    less = scan.revised(BeamRevision((), tuple(cut.tolist()), tuple(starts[cut].tolist())))
     assert (less.points == scan.points).all()
     places = np.array([[5.0, 0.0], [2.0, 0.05], [4.0, 0.1], [1.0, -1.0]])
-    assert seen(view_of(scan), places).tolist() == [SURFACE, FREE, FREE, FREE]
-    assert seen(view_of(less), places).tolist() == [SURFACE, UNSEEN, FREE, FREE]
+    assert classify_points(to_polar_scan(scan), places).tolist() == [SURFACE, FREE, FREE, FREE]
+    assert classify_points(to_polar_scan(less), places).tolist() == [SURFACE, UNKNOWN, FREE, FREE]
     away = less.origins[np.isin(np.flatnonzero(less.valid), cut)]
     assert (away[:, 0] > 2.9).all()
     assert (away[:, 0] < 3.1).all()
@@ -174,8 +174,8 @@ def visits(tmp_path_factory):
     records, first = list(log.records()), log.scan_count // 2
     scans = np.cumsum([isinstance(record.measurement, Scan) for record in records])
     ends = [int(np.searchsorted(scans, count, side="right")) for count in (first, first + MIDDLE, first + END)]
-    _, before = read(Run(Configuration()), records[: ends[0]])
-    run = Run(LIFELONG, state=before)
+    _, before = read(LockStepRun(Configuration()), records[: ends[0]])
+    run = LockStepRun(LIFELONG, state=before)
     _, middle = read(run, records[ends[0] : ends[1]])
     folder = tmp_path_factory.mktemp("middle") / "hmt_map"
     writer = MapWriter(folder)
@@ -195,8 +195,8 @@ def test_every_process_leaves_the_same_beams_out_and_little_is_stored(visits):
     for replica in (after.aam.replica, after.tsbi.replica, after.tlca.replica, after.recorder.replica):
         assert replica.scans.keys() == scans.keys()
         assert all(scan is scans[keyframe] for keyframe, scan in replica.scans.items())
-    told = [one for message in said for one in message.outdated]
-    assert all(isinstance(one, Outdated) for one in told)
+    told = [one for message in said for one in message.stale_beams]
+    assert all(isinstance(one, StaleBeams) for one in told)
     old = [one for one in told if one.keyframe in before.slam.replica.scans and one.keyframe in scans]
     assert len(old) > 10
     for one in old:
@@ -211,8 +211,10 @@ def test_every_process_leaves_the_same_beams_out_and_little_is_stored(visits):
 def test_a_run_that_goes_on_from_its_state_says_the_same(visits):
     _, folder, rest, said, _ = visits
     middle, _ = read_run_state(folder)
-    assert any(live.looks for live in middle.slam.live.values())
-    again, _ = read(Run(LIFELONG, state=middle), rest)
+    assert any(live.recent_scans for live in middle.slam.live_hypotheses.values())
+    again, _ = read(LockStepRun(LIFELONG, state=middle), rest)
     same = said[-len(again) :]
-    assert [encode(KeyframeHead.of(one)) for one in again] == [encode(KeyframeHead.of(one)) for one in same]
-    assert any(one.outdated for one in again)
+    assert [encode(KeyframeHeader.from_keyframe(one)) for one in again] == [
+        encode(KeyframeHeader.from_keyframe(one)) for one in same
+    ]
+    assert any(one.stale_beams for one in again)

@@ -10,26 +10,26 @@ from hmt_slam_ros.configuration import Configuration, with_changes
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
-from hmt_slam_ros.landmarks.area_landmarks import Growing
-from hmt_slam_ros.places.area_views import AreaViews
-from hmt_slam_ros.places.relocalization_prior import PlacePrior
-from hmt_slam_ros.registration.area_to_area import Mode
+from hmt_slam_ros.landmarks.area_landmarks import GrowingArea
+from hmt_slam_ros.places.area_views import AreaViewCache
+from hmt_slam_ros.places.relocalization_prior import RelocalizationPrior
+from hmt_slam_ros.registration.area_to_area import MatchMode
 from hmt_slam_ros.registration.consistency import Agreement
 from hmt_slam_ros.simulation import open_simulated
 from hmt_slam_ros.submap.local_mapping import LocalMapping
-from hmt_slam_ros.topological_inference.global_localization import UNMAPPED, Whereabouts
-from hmt_slam_ros.topological_inference.global_scan_matching import Located
+from hmt_slam_ros.topological_inference.global_localization import UNMAPPED_PRIOR, PoseDistribution
+from hmt_slam_ros.topological_inference.global_scan_matching import PoseCandidate
 
 CONFIGURATION = with_changes(Configuration(), {"places.prior_temper": 0.5})
 
 
 def place_prior(scans):
-    return PlacePrior(CONFIGURATION, AreaViews(LocalMapping(CONFIGURATION), scans))
+    return RelocalizationPrior(CONFIGURATION, AreaViewCache(LocalMapping(CONFIGURATION), scans))
 
 
 def located(pose, area=0):
     belief = PoseGaussian(np.asarray(pose, dtype=float), np.eye(3) * 1e-4)
-    return Located(area, Mode(belief, belief, 0.0), Agreement(0, 0, 0))
+    return PoseCandidate(area, MatchMode(belief, belief, 0.0), Agreement(0, 0, 0))
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +43,7 @@ def drive():
     scans, hybrid_map = {}, HybridMap()
     for k, n in enumerate(first):
         scans[k] = scenario.scan(n)
-        hybrid_map.place(k, 0, se2.between(poses[first[0]], poses[n]))
+        hybrid_map.set_keyframe(k, 0, se2.between(poses[first[0]], poses[n]))
     before = len(first)
     for k, n in enumerate(second, start=before):
         scans[k] = scenario.scan(n)
@@ -71,12 +71,12 @@ def test_what_speaks_against_places_weighs_them_with_an_exponent(drive):
     hybrid_map, scans, seen, before, true = drive
     prior = place_prior(scans)
     found = (located(true), located(se2.compose(true, np.array([2.0, 0.0, 0.0]))), located(true))
-    where = Whereabouts(found, np.array([0.4, 0.4, 5e-4]))
+    where = PoseDistribution(found, np.array([0.4, 0.4, 5e-4]))
     ratios = prior.log_ratios(hybrid_map, seen, before, found)
     expected = np.array([0.4, 0.4, 5e-4]) * np.exp([0.0, 0.5 * ratios[1], 0.0])
     # That landmarks agree in a place says no more than its surfaces.
     assert ratios[0] > 0.0 > ratios[1]
-    weighed = prior.weighed(where, hybrid_map, seen, before)
+    weighed = prior.reweight(where, hybrid_map, seen, before)
     np.testing.assert_allclose(weighed.probabilities, expected / (expected.sum() + 1.0 - 0.8005), rtol=1e-9)
     assert weighed.found is found
 
@@ -84,9 +84,9 @@ def test_what_speaks_against_places_weighs_them_with_an_exponent(drive):
 def test_a_look_finds_the_landmarks_gathered_at_the_events_before(drive, monkeypatch):
     hybrid_map, scans, seen, before, true = drive
     prior, found = place_prior(scans), (located(se2.compose(true, np.array([2.0, 0.0, 0.0]))),)
-    where, sighting = Whereabouts(found, np.array([0.8])), Growing.sighting
+    where, sighting = PoseDistribution(found, np.array([0.8])), GrowingArea.observe_keyframe
     looked_at = []
-    monkeypatch.setattr(Growing, "sighting", lambda *asked: looked_at.append(asked) or sighting(*asked))
+    monkeypatch.setattr(GrowingArea, "sighting", lambda *asked: looked_at.append(asked) or sighting(*asked))
     steps = CONFIGURATION.tsbi.recheck_keyframes - 1
     for _ in range(steps):
         known = len(looked_at)
@@ -94,7 +94,7 @@ def test_a_look_finds_the_landmarks_gathered_at_the_events_before(drive, monkeyp
         prior.look_ahead([(hybrid_map, before), (hybrid_map.branch(), before)])
         assert len(looked_at) - known <= math.ceil(before / steps)
     assert len(looked_at) == before
-    assert prior.weighed(where, hybrid_map, seen, before).probabilities[0] < 0.8
+    assert prior.reweight(where, hybrid_map, seen, before).probabilities[0] < 0.8
     assert len(looked_at) == before + len(seen)
 
 
@@ -116,7 +116,7 @@ def test_new_ground_looks_like_the_places_of_the_map(drive):
     hybrid_map, scans, seen, before, _ = drive
     only = HybridMap()
     for k in (0, 1):
-        only.place(k, 0, hybrid_map.keyframes(0)[k])
+        only.set_keyframe(k, 0, hybrid_map.keyframes(0)[k])
     newest = seen[max(seen)]
     same = [located(se2.compose(pose, se2.inverse(newest))) for pose in only.keyframes(0).values()]
     ratios = place_prior(scans).log_ratios(only, seen, before, same)
@@ -128,14 +128,14 @@ def test_without_a_landmark_or_a_place_nothing_changes(drive):
     hybrid_map, scans, seen, before, _ = drive
     prior = place_prior(scans)
     assert prior.log_ratios(hybrid_map, seen, before, []) is None
-    nowhere = Whereabouts((), np.zeros(0))
-    assert prior.weighed(nowhere, hybrid_map, seen, before).probabilities.size == 0
+    nowhere = PoseDistribution((), np.zeros(0))
+    assert prior.reweight(nowhere, hybrid_map, seen, before).probabilities.size == 0
 
 
 def test_weights_follow_bayes_and_stay_finite():
-    where = Whereabouts((located(np.zeros(3)), located(np.ones(3))), np.array([0.3, 1.0 - UNMAPPED - 0.3]))
-    np.testing.assert_allclose(where.weighed([0.0, 0.0]).probabilities, where.probabilities)
-    weighed = where.weighed([math.log(4.0), 0.0]).probabilities
+    where = PoseDistribution((located(np.zeros(3)), located(np.ones(3))), np.array([0.3, 1.0 - UNMAPPED_PRIOR - 0.3]))
+    np.testing.assert_allclose(where.reweight([0.0, 0.0]).probabilities, where.probabilities)
+    weighed = where.reweight([math.log(4.0), 0.0]).probabilities
     np.testing.assert_allclose(weighed, np.array([1.2, 0.5]) / 1.9)
-    np.testing.assert_allclose(where.weighed([5000.0, 0.0]).probabilities, [1.0, 0.0], atol=1e-12)
-    np.testing.assert_allclose(where.weighed([-5000.0, -5000.0]).probabilities, [0.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(where.reweight([5000.0, 0.0]).probabilities, [1.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(where.reweight([-5000.0, -5000.0]).probabilities, [0.0, 0.0], atol=1e-12)

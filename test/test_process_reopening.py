@@ -10,18 +10,26 @@ from ring_for_tsbi import RING, Run, ring_drive
 
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.geometry.gaussian import PoseGaussian, gate
+from hmt_slam_ros.geometry.gaussian import PoseGaussian, chi_square_gate
 from hmt_slam_ros.hybrid_map.common_map import ArcValue
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
-from hmt_slam_ros.loop_closure.closure_history import Account, Closure, Step, Undo, merged, unrefined, without
-from hmt_slam_ros.loop_closure.closure_revision import Doubts
-from hmt_slam_ros.messages.map_changes import Arc, ArcEnds, Merged, Relabelled
-from hmt_slam_ros.messages.messages import Leaf
+from hmt_slam_ros.loop_closure.closure_history import (
+    AcceptedPath,
+    Closure,
+    MapSnapshot,
+    PathStep,
+    apply_area_merge,
+    undo_refinements,
+    withdraw_closure,
+)
+from hmt_slam_ros.loop_closure.closure_revision import ClosureConsistencyCheck
+from hmt_slam_ros.messages.map_changes import Arc, ArcEnds, AreaMerge, MovedKeyframe
+from hmt_slam_ros.messages.messages import Hypothesis
 from hmt_slam_ros.open_log import open_log
 from hmt_slam_ros.results.final_map import final_map
 from hmt_slam_ros.sensors import Scan
 
-BOUND = gate(Configuration().tlca.contradiction_probability)
+BOUND = chi_square_gate(Configuration().tlca.contradiction_probability)
 ODOMETRY, MATCH = np.diag([0.3, 0.3, 0.02]) ** 2, np.diag([0.05, 0.05, 0.01]) ** 2
 NEXT = np.array([4.0, 0.0, 0.0])  # from the frame of an area to that of the next
 
@@ -35,23 +43,23 @@ def corridor(areas):
     """Areas 0, 1, ... along a corridor, each with keyframes 10 a and 10 a + 1, joined by odometry; its history."""
     hybrid_map, history = HybridMap(), None
     for area in range(areas):
-        hybrid_map.place(10 * area, area, np.zeros(3))
-        hybrid_map.place(10 * area + 1, area, np.array([1.0, 0.0, 0.0]))
+        hybrid_map.set_keyframe(10 * area, area, np.zeros(3))
+        hybrid_map.set_keyframe(10 * area + 1, area, np.array([1.0, 0.0, 0.0]))
         if area:
             hybrid_map.set_arc(area - 1, area, PoseGaussian(NEXT, ODOMETRY), closure=False)
-            history = history, Step(10 * area, area - 1, area, ((area - 1, area),), frozenset({10 * area}))
+            history = history, PathStep(10 * area, area - 1, area, ((area - 1, area),), frozenset({10 * area}))
     return hybrid_map, history
 
 
 def closed(hybrid_map, event, near, far, error=(0.0, 0.0, 0.0), log_odds=4.6):
     belief = PoseGaussian(se2.compose(around(near, far), np.array(error)), MATCH)
     hybrid_map.set_arc(near, far, belief, closure=True)
-    return Closure((event, (min(near, far), max(near, far))), near, far, belief, log_odds, Undo({}, {}))
+    return Closure((event, (min(near, far), max(near, far))), near, far, belief, log_odds, MapSnapshot({}, {}))
 
 
 def account_of(hybrid_map, history, closures, area):
-    hybrid_map.absorb()
-    return Account(hybrid_map, history, tuple(closures), area, np.zeros(3))
+    hybrid_map.commit()
+    return AcceptedPath(hybrid_map, history, tuple(closures), area, np.zeros(3))
 
 
 TRUE, FALSE = (0.0, 0.0, 0.0), (2.2, 0.0, 0.0)
@@ -63,12 +71,14 @@ def drive_with(*found, areas=8, area=7):
     closures = []
     for event, near, far, error in found:
         closures.append(closed(hybrid_map, event, near, far, error))
-        history = history, Step(event, near, near, (closures[-1].pair,))
+        history = history, PathStep(event, near, near, (closures[-1].pair,))
     return account_of(hybrid_map, history, closures, area)
 
 
 def doubt_of(account, event):
-    return Doubts(account, BOUND, 100).raised([c.name for c in account.closures if c.name[0] == event], 0.01)
+    return ClosureConsistencyCheck(account, BOUND, 100).find_inconsistency(
+        [c.name for c in account.closures if c.name[0] == event], 0.01
+    )
 
 
 def test_closures_that_agree_raise_no_doubt():
@@ -83,7 +93,7 @@ def test_a_false_closure_is_found_when_true_ones_contradict_it():
     account = drive_with((80, 6, 0, FALSE), (81, 7, 1, TRUE))
     doubt = doubt_of(account, 81)
     assert doubt.closure.name[0] == 81
-    assert doubt.excess > BOUND
+    assert doubt.excess_chi2 > BOUND
     assert [c.name[0] for c in doubt.explanations[0].false] == [80]
     assert doubt.explanations[0].probability > 0.9
 
@@ -109,7 +119,7 @@ def test_closures_that_were_accepted_because_of_a_false_one_go_with_it_and_true_
     best = doubt.explanations[0]
     assert [c.name[0] for c in best.false] == [80, 81, 82]
     assert best.probability > 0.99
-    assert [c.name[0] for c in best.account.closures] == [79, 90, 91]
+    assert [c.name[0] for c in best.path.closures] == [79, 90, 91]
 
 
 def joined():
@@ -124,9 +134,9 @@ def joined():
     hybrid_map.place(50, 4, np.zeros(3))
     hybrid_map.set_arc(1, 4, PoseGaussian(np.array([0.0, 3.0, 1.5]), ODOMETRY), closure=False)
     for step in (
-        Step(40, 3, 0, ((0, 3),), frozenset({39})),
-        Step(43, 0, 1, ()),
-        Step(50, 1, 4, ((1, 4),), frozenset({50})),
+        PathStep(40, 3, 0, ((0, 3),), frozenset({39})),
+        PathStep(43, 0, 1, ()),
+        PathStep(50, 1, 4, ((1, 4),), frozenset({50})),
     ):
         history = history, step
     return account_of(hybrid_map, history, [closure], 4)
@@ -142,7 +152,7 @@ def in_frame_of(hybrid_map, *areas):
 
 def test_what_was_stored_in_areas_that_were_entered_falsely_becomes_an_area_of_its_own():
     before = joined()
-    found = without(before, before.closures[0].name, 9)
+    found = withdraw_closure(before, before.closures[0].name, 9)
     hybrid_map = found.hybrid_map
     assert {a: sorted(hybrid_map.keyframes(a)) for a in hybrid_map.area_ids()} == {
         0: [0, 1],
@@ -165,7 +175,7 @@ def test_what_was_stored_in_areas_that_were_entered_falsely_becomes_an_area_of_i
     np.testing.assert_allclose(in_frame_of(hybrid_map, 3, 9, 4), was, atol=1e-12)
     at = se2.compose(in_frame_of(before.hybrid_map, 3, 0, 1), before.hybrid_map.keyframes(1)[45])
     np.testing.assert_allclose(se2.compose(hybrid_map.arc(3, 9).mean, hybrid_map.keyframes(9)[45]), at, atol=1e-12)
-    assert (found.area, found.rebase) == (4, None)
+    assert (found.area, found.frame_change) == (4, None)
     np.testing.assert_array_equal(list(before.hybrid_map.keyframes(0)), [0, 1, 39, 41, 42])
 
 
@@ -174,18 +184,20 @@ def test_a_robot_that_is_in_an_area_falsely_is_then_in_the_new_one():
     earlier, _ = before.history
     hybrid_map = before.hybrid_map.branch()
     hybrid_map.remove_arc(1, 4)
-    found = without(replace(before, hybrid_map=hybrid_map, history=earlier, area=1), before.closures[0].name, 9)
+    found = withdraw_closure(
+        replace(before, hybrid_map=hybrid_map, history=earlier, area=1), before.closures[0].name, 9
+    )
     assert found.area == 9
-    np.testing.assert_allclose(found.rebase, NEXT, atol=1e-12)
-    assert found.history[1].after == 9
+    np.testing.assert_allclose(found.frame_change, NEXT, atol=1e-12)
+    assert found.history[1].area_after == 9
 
 
 def test_a_link_that_the_robot_never_crossed_is_only_taken_out():
     before = drive_with((80, 6, 0, FALSE))
-    found = without(before, before.closures[0].name, 100)
+    found = withdraw_closure(before, before.closures[0].name, 100)
     assert 100 not in found.hybrid_map.area_ids()
     assert found.hybrid_map.arc(0, 6) is None
-    assert (found.area, found.rebase) == (7, None)
+    assert (found.area, found.frame_change) == (7, None)
     assert before.hybrid_map.arc(0, 6) is not None
 
 
@@ -194,7 +206,7 @@ def test_what_a_refinement_moved_goes_back_and_what_was_stored_since_goes_with_i
     bent = np.array([0.3, 0.2, 0.05])
     closure = closed(hybrid_map, 40, 3, 0)
     former = {k: (3, hybrid_map.keyframes(3)[k].copy()) for k in (30, 31)}
-    undo = Undo(former, {(2, 3): ArcValue(PoseGaussian(NEXT, ODOMETRY), closure=False)})
+    undo = MapSnapshot(former, {(2, 3): ArcValue(PoseGaussian(NEXT, ODOMETRY), closure=False)})
     for k in (30, 31):
         hybrid_map.place(k, 3, se2.compose(bent, former[k][1]))
     hybrid_map.set_arc(2, 3, PoseGaussian(NEXT + 0.1, ODOMETRY), closure=False)
@@ -202,32 +214,32 @@ def test_what_a_refinement_moved_goes_back_and_what_was_stored_since_goes_with_i
     hybrid_map.place(41, 3, se2.compose(bent, stored))
     hybrid_map.place(45, 4, np.zeros(3))
     hybrid_map.set_arc(3, 4, PoseGaussian(se2.compose(bent, reached), ODOMETRY), closure=False)
-    history = history, Step(40, 3, 3, ((0, 3),))
-    history = history, Step(45, 3, 4, ((3, 4),), frozenset({45}))
+    history = history, PathStep(40, 3, 3, ((0, 3),))
+    history = history, PathStep(45, 3, 4, ((3, 4),), frozenset({45}))
     account = account_of(hybrid_map, history, [replace(closure, undo=undo)], 4)
-    found = unrefined(account, closure.name)
+    found = undo_refinements(account, closure.name)
     placed = found.hybrid_map.keyframes(3)
     for k in (30, 31):
         np.testing.assert_array_equal(placed[k], former[k][1])
     np.testing.assert_allclose(placed[41], stored, atol=1e-12)
     np.testing.assert_allclose(found.hybrid_map.arc(3, 4).mean, reached, atol=1e-12)
     np.testing.assert_array_equal(found.hybrid_map.arc(2, 3).mean, NEXT)
-    assert found.closures[0].undo is None
-    at_home = unrefined(replace(account, area=3, pose=se2.compose(bent, stored)), closure.name)
+    assert found.closures[0].snapshot is None
+    at_home = undo_refinements(replace(account, area=3, pose=se2.compose(bent, stored)), closure.name)
     np.testing.assert_allclose(at_home.pose, stored, atol=1e-12)
-    np.testing.assert_allclose(at_home.rebase, se2.inverse(bent), atol=1e-12)
+    np.testing.assert_allclose(at_home.frame_change, se2.inverse(bent), atol=1e-12)
 
 
 def test_an_area_that_became_part_of_another_is_that_one_in_the_account():
     """Areas 3 and 6 are one; the false closure of areas 7 and 1 can be withdrawn as before, that of 3 and 6 cannot."""
     account = drive_with((80, 6, 3, TRUE), (81, 7, 1, FALSE), (82, 6, 0, TRUE))
-    history, closures = merged(account, Merged(6, 3, account.hybrid_map.arc(3, 6)))
-    assert [(c.name[0], c.near, c.far) for c in closures] == [(81, 7, 1), (82, 3, 0)]
+    history, closures = apply_area_merge(account, AreaMerge(6, 3, account.hybrid_map.arc(3, 6)))
+    assert [(c.closure_id[0], c.near, c.far) for c in closures] == [(81, 7, 1), (82, 3, 0)]
     np.testing.assert_allclose(closures[1].pose.mean, around(3, 0), atol=1e-9)
     steps = []
     while history is not None:
         history, step = history
-        steps.insert(0, (step.event, step.before, step.after, step.arcs))
+        steps.insert(0, (step.event, step.area_before, step.area_after, step.new_arcs))
     assert steps[4:] == [
         (50, 4, 5, ((4, 5),)),
         (60, 5, 3, ((3, 5),)),
@@ -236,19 +248,19 @@ def test_an_area_that_became_part_of_another_is_that_one_in_the_account():
         (81, 7, 7, ((1, 7),)),
         (82, 3, 3, ((0, 3),)),
     ]
-    history, closures = merged(account, Merged(6, 3, account.hybrid_map.arc(3, 6)))
+    history, closures = apply_area_merge(account, AreaMerge(6, 3, account.hybrid_map.arc(3, 6)))
     hybrid_map = account.hybrid_map.branch()
     hybrid_map.merge(6, 3, hybrid_map.arc(3, 6))
-    found = without(Account(hybrid_map, history, closures, 7, np.zeros(3)), closures[0].name, 100)
+    found = withdraw_closure(AcceptedPath(hybrid_map, history, closures, 7, np.zeros(3)), closures[0].closure_id, 100)
     assert found.hybrid_map.arc(1, 7) is None
     assert found.hybrid_map.arc(3, 7) is not None
-    assert [c.name[0] for c in found.closures] == [82]
+    assert [c.closure_id[0] for c in found.closures] == [82]
 
 
 def test_a_closure_beside_which_another_observation_of_its_arc_is_fused_is_not_withdrawn():
     """Both 5 and 6 were found beside 0, and are then found to be one."""
     account = drive_with((80, 6, 0, TRUE), (81, 5, 0, TRUE), (82, 6, 5, TRUE))
-    _, closures = merged(account, Merged(6, 5, account.hybrid_map.arc(5, 6)))
+    _, closures = apply_area_merge(account, AreaMerge(6, 5, account.hybrid_map.arc(5, 6)))
     assert closures == ()
 
 
@@ -259,13 +271,15 @@ def test_what_a_refinement_moved_goes_back_after_an_area_became_part_of_another(
     for k, (area, pose) in former.items():
         hybrid_map.place(k, area, se2.compose(bent, pose))
     arcs = {pair: hybrid_map.arc_value(*pair) for pair in ((1, 2), (2, 3))}
-    closure = replace(closed(hybrid_map, 40, 2, 0), undo=Undo(former, arcs))
+    closure = replace(closed(hybrid_map, 40, 2, 0), undo=MapSnapshot(former, arcs))
     account = account_of(hybrid_map, history, [closure], 2)
-    history, closures = merged(account, Merged(3, 2, account.hybrid_map.arc(2, 3)))
-    assert set(closures[0].undo.keyframes) == {20, 21}
-    assert set(closures[0].undo.arcs) == {(1, 2)}
+    history, closures = apply_area_merge(account, AreaMerge(3, 2, account.hybrid_map.arc(2, 3)))
+    assert set(closures[0].snapshot.keyframes) == {20, 21}
+    assert set(closures[0].snapshot.arcs) == {(1, 2)}
     hybrid_map.merge(3, 2, hybrid_map.arc(2, 3))
-    found = unrefined(Account(hybrid_map, history, closures, 2, np.zeros(3)), closure.name).hybrid_map.keyframes(2)
+    found = undo_refinements(
+        AcceptedPath(hybrid_map, history, closures, 2, np.zeros(3)), closure.name
+    ).hybrid_map.keyframes(2)
     for k in (20, 21):
         np.testing.assert_array_equal(found[k], former[k][1])
     was = hybrid_map.keyframes(2)
@@ -280,10 +294,10 @@ def test_tsbi_goes_on_with_the_explanations_as_live_hypotheses():
     link = PoseGaussian(np.array([2.5, 0.0, 0.0]), MATCH)
     back = PoseGaussian(np.array([2.5, 0.0, 0.0]), np.zeros((3, 3)))
     keyframes = run.replica.maps[0].keyframes(1)
-    moved = tuple(Relabelled(k, 1, 0, se2.compose(back.mean, pose)) for k, pose in keyframes.items())
+    moved = tuple(MovedKeyframe(k, 1, 0, se2.compose(back.mean, pose)) for k, pose in keyframes.items())
     explanations = (
-        Leaf(0, 0, 0.7, 0, back, moved, (), withdrawn=(ArcEnds(0, 1),)),
-        Leaf(0, 0, 0.3, 1, None, (), (Arc(0, 1, link, closure=True),)),
+        Hypothesis(0, 0, 0.7, 0, back, moved, (), removed_arcs=(ArcEnds(0, 1),)),
+        Hypothesis(0, 0, 0.3, 1, None, (), (Arc(0, 1, link, closure=True),)),
     )
     run.accept(0, reopened=explanations)
     one, two = run.keyframe(ring_drive(9)[8]).leaves
@@ -292,7 +306,7 @@ def test_tsbi_goes_on_with_the_explanations_as_live_hypotheses():
     assert run.replica.maps[one.hypothesis].arc(0, 1) is None
     np.testing.assert_array_equal(run.replica.maps[two.hypothesis].arc(0, 1).mean, link.mean)
     # The keyframe that came since goes with the robot.
-    assert sorted(r.keyframe for r in one.relabelled) == [5, 6, 7, 8]
+    assert sorted(r.keyframe for r in one.moved_keyframes) == [5, 6, 7, 8]
     assert sorted(run.replica.maps[one.hypothesis].keyframes(0)) == list(range(9))
     assert one.local[0].area == 0
     assert [leaf.withdrawn for leaf in run.keyframe(ring_drive(10)[9]).leaves] == [(), ()]

@@ -11,7 +11,7 @@ from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.messages.map_changes import AreaPose
-from hmt_slam_ros.messages.messages import Accepted, LocalEstimate, Notice
+from hmt_slam_ros.messages.messages import ClosureDecision, LocalEstimate, Notice
 from hmt_slam_ros.real_time_localization.rtl import Rtl
 from hmt_slam_ros.sensors import Odometry
 
@@ -32,7 +32,7 @@ def accepted(**areas):
         AreaPose(int(name[1:]), PoseGaussian(np.array(pose, dtype=np.float64), np.eye(3) * 0.01))
         for name, pose in areas.items()
     )
-    return Accepted(0, global_poses=poses)
+    return ClosureDecision(0, global_poses=poses)
 
 
 @pytest.fixture
@@ -178,6 +178,6 @@ def test_when_an_estimate_arrives_does_not_matter_only_which_scan_it_is_of(steps
         said = [rtl.handle(Odometry(k * SECOND, pose)) for rtl in (at_once, delayed)]
         if k == late:
             delayed.handle(belief)
-    assert np.allclose(said[0][0].local.mean, said[1][0].local.mean)
-    assert np.allclose(said[0][0].local.covariance, said[1][0].local.covariance)
-    assert np.allclose(said[0][0].local.mean, se2.compose((1, 2, 3), se2.between(poses[0], poses[-1])))
+    assert np.allclose(said[0][0].pose_in_area.mean, said[1][0].pose_in_area.mean)
+    assert np.allclose(said[0][0].pose_in_area.covariance, said[1][0].pose_in_area.covariance)
+    assert np.allclose(said[0][0].pose_in_area.mean, se2.compose((1, 2, 3), se2.between(poses[0], poses[-1])))

@@ -10,17 +10,17 @@ from worlds import box, scan_in
 from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.messages.map_changes import Arc, LocalArea, Merged, Relabelled
+from hmt_slam_ros.messages.map_changes import Arc, AreaMerge, LocalArea, MovedKeyframe
 from hmt_slam_ros.messages.messages import (
-    Accepted,
+    ClosureDecision,
     EndOfLog,
-    Finished,
+    EndOfRun,
     Hypotheses,
+    Hypothesis,
     Keyframe,
-    Leaf,
     LocalEstimate,
     Notice,
-    Trail,
+    ScanPoses,
 )
 from hmt_slam_ros.metric_slam.slam import MetricSlam
 from hmt_slam_ros.sensors import Odometry
@@ -41,9 +41,9 @@ def drive(count, start=0):
 def agree(keyframe):
     """The answer that changes nothing."""
     leaves = tuple(
-        Leaf(leaf.hypothesis, leaf.hypothesis, 1.0 / len(keyframe.leaves), leaf.area) for leaf in keyframe.leaves
+        Hypothesis(leaf.hypothesis, leaf.hypothesis, 1.0 / len(keyframe.leaves), leaf.area) for leaf in keyframe.leaves
     )
-    return [Hypotheses(keyframe.sequence, leaves), Accepted(keyframe.sequence)]
+    return [Hypotheses(keyframe.sequence, leaves), ClosureDecision(keyframe.sequence)]
 
 
 class Dialogue:
@@ -108,7 +108,7 @@ def test_scans_wait_while_a_keyframe_event_is_open_and_none_is_lost():
     for odometry, scan, _ in drive(20):
         dialogue.tell(odometry, scan)
     assert len(dialogue.of(LocalEstimate)) == 1
-    assert dialogue.slam.waiting_scans == 19
+    assert dialogue.slam.queued_scans == 19
     dialogue.answer = agree
     dialogue.tell(*agree(dialogue.of(Keyframe)[0]))
     assert len(dialogue.of(LocalEstimate)) == 20
@@ -125,7 +125,7 @@ def test_a_scan_waits_for_its_odometry():
 
 def test_without_odometry_scans_are_matched_after_a_while_and_it_is_said_once():
     configuration = Configuration()
-    configuration = replace(configuration, filter=replace(configuration.filter, patience=5))
+    configuration = replace(configuration, filter=replace(configuration.filter, max_scans_waiting_for_odometry=5))
     dialogue = Dialogue(configuration)
     for _, scan, _ in drive(30):
         dialogue.tell(scan)
@@ -156,7 +156,7 @@ def test_faulty_ranges_and_differing_beam_counts_lose_no_scan(spoil):
         ranges[k % 7 :: 7] = spoil
         dialogue.tell(odometry, replace(scan, ranges=ranges[: len(ranges) - k % 3]))
     dialogue.tell(EndOfLog())
-    assert dialogue.of(Finished)[0].processed == 30
+    assert dialogue.of(EndOfRun)[0].processed == 30
     assert np.abs(dialogue.of(LocalEstimate)[-1].pose.mean - (2.9, 0, 0)).max() < 0.05
 
 
@@ -183,14 +183,14 @@ def test_the_trails_hold_every_scan_once_and_lead_to_its_pose():
         poses |= {r.keyframe: r.pose for r in keyframe.leaves[0].revised}
     rows = [
         (trail.first_scan + k, se2.compose(poses[int(anchor)], pose))
-        for trail in dialogue.of(Trail)
-        for k, (anchor, pose) in enumerate(zip(trail.anchors, trail.poses, strict=True))
+        for trail in dialogue.of(ScanPoses)
+        for k, (anchor, pose) in enumerate(zip(trail.keyframes, trail.poses, strict=True))
     ]
     assert [scan for scan, _ in rows] == list(range(60))
     errors = np.array([se2.between(t, p) for t, (_, p) in zip(truths, rows, strict=True)])
     assert np.hypot(*errors[:, :2].T).max() < 0.05
-    (finished,) = dialogue.of(Finished)
-    assert (finished.scans_in, finished.processed, finished.dropped) == (60, 60, 0)
+    (finished,) = dialogue.of(EndOfRun)
+    assert (finished.received, finished.processed, finished.dropped) == (60, 60, 0)
 
 
 def split_at(event):
@@ -201,8 +201,8 @@ def split_at(event):
             return agree(keyframe)
         (leaf,) = keyframe.leaves
         reference = PoseGaussian(np.array([3.0, 0.0, 0.0]), np.diag([1e-4, 1e-4, 1e-5]))
-        moved = tuple(Relabelled(k, 0, 1, np.array([0.5 * (k - 6), 0.0, 0.0])) for k in range(6, event + 1))
-        change = Leaf(
+        moved = tuple(MovedKeyframe(k, 0, 1, np.array([0.5 * (k - 6), 0.0, 0.0])) for k in range(6, event + 1))
+        change = Hypothesis(
             1,
             leaf.hypothesis,
             1.0,
@@ -212,7 +212,7 @@ def split_at(event):
             (Arc(0, 1, reference),),
             (LocalArea(1, np.zeros(3)), LocalArea(0, np.array([-3.0, 0.0, 0.0]))),
         )
-        return [Hypotheses(keyframe.sequence, (change,)), Accepted(keyframe.sequence, 1)]
+        return [Hypotheses(keyframe.sequence, (change,)), ClosureDecision(keyframe.sequence, 1)]
 
     return answer
 
@@ -240,8 +240,10 @@ def test_a_robot_whose_area_becomes_part_of_another_goes_on_there():
     def answer(keyframe):
         if keyframe.sequence == 0 or keyframe.leaves[0].hypothesis == 0 or keyframe.sequence != 13:
             return split(keyframe)
-        leaf = Leaf(1, 1, 1.0, 0, back, local=(LocalArea(0, np.zeros(3)),), merged=Merged(1, 0, back))
-        return [Hypotheses(13, (leaf,)), Accepted(13, 1)]
+        leaf = Hypothesis(
+            1, 1, 1.0, 0, back, local_areas=(LocalArea(0, np.zeros(3)),), area_merge=AreaMerge(1, 0, back)
+        )
+        return [Hypotheses(13, (leaf,)), ClosureDecision(13, 1)]
 
     dialogue = Dialogue(answer=answer)
     truths = []
@@ -256,7 +258,7 @@ def test_a_robot_whose_area_becomes_part_of_another_goes_on_there():
     hybrid_map = dialogue.slam._replica.maps[1]
     assert hybrid_map.area_ids() == [0]
     assert sorted(hybrid_map.keyframes(0)) == [keyframe.sequence for keyframe in dialogue.of(Keyframe)]
-    assert set(dialogue.slam._best.filter.keyframe_areas) == {0}
+    assert set(dialogue.slam._best_hypothesis.filter.keyframe_areas) == {0}
     # The drift goes on from what it was, with what is not known of how the two lie to each other.
     before, after = (dialogue.of(Keyframe)[k].leaves[0].pose.covariance for k in (13, 14))
     assert np.trace(after[:2, :2]) > np.trace(before[:2, :2]) + 1e-4
@@ -275,16 +277,16 @@ def test_two_hypotheses_are_tracked_side_by_side():
     def fork(keyframe):
         if keyframe.sequence != 3:
             return agree(keyframe)
-        leaves = (Leaf(1, 0, 0.5, 0), Leaf(2, 0, 0.5, 0))
-        return [Hypotheses(3, leaves), Accepted(3)]
+        leaves = (Hypothesis(1, 0, 0.5, 0), Hypothesis(2, 0, 0.5, 0))
+        return [Hypotheses(3, leaves), ClosureDecision(3)]
 
     dialogue = Dialogue(answer=fork)
     for odometry, scan, _ in drive(40):
         dialogue.tell(odometry, scan)
     keyframes = dialogue.of(Keyframe)
     assert [leaf.hypothesis for leaf in keyframes[-1].leaves] == [1, 2]
-    assert sorted({trail.hypothesis for trail in dialogue.of(Trail)}) == [0, 1, 2]
-    dialogue.tell(Accepted(keyframes[-1].sequence, 2))
+    assert sorted({trail.hypothesis for trail in dialogue.of(ScanPoses)}) == [0, 1, 2]
+    dialogue.tell(ClosureDecision(keyframes[-1].sequence, 2))
     for odometry, scan, _ in drive(10, start=40):
         dialogue.tell(odometry, scan)
     assert [leaf.hypothesis for leaf in dialogue.of(Keyframe)[-1].leaves] == [2]

@@ -7,13 +7,13 @@ from worlds import drive, scan_in
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.messages.map_changes import Relabelled
-from hmt_slam_ros.messages.messages import Leaf
+from hmt_slam_ros.messages.map_changes import MovedKeyframe
+from hmt_slam_ros.messages.messages import Hypothesis
 from hmt_slam_ros.metric_slam.live_hypothesis import LiveHypothesis
-from hmt_slam_ros.sensors.motion_model import Prediction, Step
+from hmt_slam_ros.sensors.motion_model import Prediction, RelativeMotion
 from hmt_slam_ros.submap.local_filter import PlacedKeyframe
-from hmt_slam_ros.submap.local_mapping import LocalMapping, Sighting
-from hmt_slam_ros.submap.particle_filter import AreaFilter, ParticleFilters
+from hmt_slam_ros.submap.local_mapping import LocalMapping, PreparedScan
+from hmt_slam_ros.submap.particle_filter import ParticleFilter, ParticleFilters
 
 CORRIDOR = np.array([[-200.0, -1.0, 200.0, -1.0], [-200.0, 1.0, 200.0, 1.0]])
 ODOMETRY = np.diag([0.05, 0.05, 0.025]) ** 2
@@ -27,19 +27,19 @@ class Drive:
     def __init__(self):
         configuration = Configuration()
         self.mapping = LocalMapping(configuration)
-        self.live = LiveHypothesis(AreaFilter(self.mapping, 0, 0), configuration.filter)
+        self.live = LiveHypothesis(ParticleFilter(self.mapping, 0, 0), configuration.filter)
         self.truth, self.scans = THERE[0], {}
         self.to(THERE[0])
 
     def to(self, pose):
         """Drive to a pose and take a keyframe there; what it says."""
-        step = Step(se2.between(self.truth, pose), ODOMETRY)
+        step = RelativeMotion(se2.between(self.truth, pose), ODOMETRY)
         sequence, self.truth = len(self.scans), pose
         scan = self.scans[sequence] = scan_in(CORRIDOR, pose, noise=0.01, seed=sequence)
-        sighting = Sighting(self.mapping, scan)
+        sighting = PreparedScan(self.mapping, scan)
         if sequence:
             self.live.filter.track(sighting, Prediction(step, step, step))
-        return self.live.event(sequence, sighting, arriving=sequence == 0)
+        return self.live.process_keyframe(sequence, sighting, after_reset=sequence == 0)
 
     def along(self, poses):
         return [self.to(pose) for pose in poses]
@@ -76,8 +76,8 @@ def test_where_the_map_is_as_far_off_as_its_keyframes_so_is_a_pose_in_it(driven)
 def entered(live, moved, rebase):
     """After TSBI sent the robot into area 1, with some keyframes."""
     poses = dict(zip(live.filter.keyframes, live.filter.leading_keyframe_poses(), strict=True))
-    relabelled = tuple(Relabelled(k, 0, 1, se2.compose(rebase.mean, poses[k])) for k in moved)
-    return Leaf(0, 0, 1.0, 1, rebase, relabelled), poses
+    relabelled = tuple(MovedKeyframe(k, 0, 1, se2.compose(rebase.mean, poses[k])) for k in moved)
+    return Hypothesis(0, 0, 1.0, 1, rebase, relabelled), poses
 
 
 @pytest.mark.parametrize("sigma", [0.1, 0.3])
@@ -93,17 +93,17 @@ def test_a_robot_that_enters_an_area_is_as_uncertain_in_it_as_the_newest_keyfram
     content = [PlacedKeyframe(k, 1, driven.scans[k], se2.compose(rebase.mean, poses[k])) for k in range(16)]
     live.change_area(leaf, content, ParticleFilters(live.filter.mapping))
     np.testing.assert_allclose(live.filter.pose, entry.mean, atol=1e-9)
-    np.testing.assert_allclose(live.drift, entry.covariance, atol=1e-6)
-    assert live.belief().covariance[0, 0] >= 0.9 * sigma**2
+    np.testing.assert_allclose(live.pose_covariance, entry.covariance, atol=1e-6)
+    assert live.pose_belief().covariance[0, 0] >= 0.9 * sigma**2
 
 
 def test_a_robot_that_goes_back_into_an_area_is_as_far_off_as_the_map_there_and_along_it_as_the_arc():
     drive_ = Drive()
     drive_.along(THERE[1:])
     live, rebase = drive_.live, PoseGaussian(np.array([-1.0, 0.0, 0.0]), np.diag([0.4, 0.4, 0.0]) ** 2)
-    before = live.drift
+    before = live.pose_covariance
     leaf, poses = entered(live, (), rebase)
     content = [PlacedKeyframe(k, 1, drive_.scans[k], se2.compose(rebase.mean, poses[k])) for k in range(16)]
     live.change_area(leaf, content, ParticleFilters(live.filter.mapping))
-    assert live.drift[0, 0] == pytest.approx(before[0, 0] + 0.16, rel=0.2)
-    assert live.drift[1, 1] < 0.05
+    assert live.pose_covariance[0, 0] == pytest.approx(before[0, 0] + 0.16, rel=0.2)
+    assert live.pose_covariance[1, 1] < 0.05

@@ -75,7 +75,7 @@ def test_without_odometry_no_scan_waits_once_patience_is_lost():
     dialogue = Dialogue()
     for k, (_, _, scan) in enumerate(turning_drive(5.0)):
         dialogue.tell(scan)
-        waited = dialogue.slam.waiting_scans
+        waited = dialogue.slam.queued_scans
         assert waited == (k + 1 if k < 15 else 0)
 
 

@@ -5,7 +5,7 @@ import pytest
 import worlds
 from play_for_tlca import HOME, SPREAD, WORLD, Play, new_area, poses_of
 
-from hmt_slam_ros.messages.messages import AreaEvents, Leaf
+from hmt_slam_ros.messages.messages import AreaEvents, Hypothesis
 
 
 def test_the_first_area_lies_at_the_origin_of_the_map_with_hardly_any_uncertainty():
@@ -21,7 +21,7 @@ def test_nothing_is_said_where_nothing_changed():
     play.start()
     verdict = play.step(places=[(0, 0, [0.5, 0.0, 0.0])])
     assert verdict.hypothesis is None
-    assert verdict.arcs == verdict.relabelled == verdict.global_poses == ()
+    assert verdict.arcs == verdict.moved_keyframes == verdict.global_poses == ()
 
 
 def test_the_one_hypothesis_left_is_accepted_at_once_and_its_new_area_is_placed():
@@ -39,7 +39,7 @@ def parted(play, dominant=0.95):
 
 
 def both(dominant=0.95):
-    return Leaf(1, 1, dominant, 1), Leaf(2, 2, 1.0 - dominant, 1)
+    return Hypothesis(1, 1, dominant, 1), Hypothesis(2, 2, 1.0 - dominant, 1)
 
 
 def test_a_dominant_path_is_accepted_after_enough_keyframes_since_the_paths_parted():
@@ -74,9 +74,9 @@ def test_branching_again_starts_the_count_anew():
     again = (
         new_area(3, 1, 0.92, 2, [3.0, 0.0, 0.0], source=1),
         new_area(4, 1, 0.06, 2, [3.0, 1.0, 0.0], source=1),
-        Leaf(2, 2, 0.02, 1),
+        Hypothesis(2, 2, 0.02, 1),
     )
-    rest = (Leaf(3, 3, 0.92, 2), Leaf(4, 4, 0.06, 2), Leaf(2, 2, 0.02, 1))
+    rest = (Hypothesis(3, 3, 0.92, 2), Hypothesis(4, 4, 0.06, 2), Hypothesis(2, 2, 0.02, 1))
     assert [play.step(*leaves).hypothesis for leaves in (again, rest, rest)] == [None, None, 3]
 
 
@@ -85,7 +85,7 @@ def test_after_acceptance_only_the_accepted_hypothesis_goes_on():
     parted(play)
     while play.step(*both()).hypothesis is None:
         pass
-    verdict = play.step(Leaf(1, 1, 1.0, 1))
+    verdict = play.step(Hypothesis(1, 1, 1.0, 1))
     assert verdict.hypothesis is None
     assert list(play.process._replica.maps) == [1]
 

@@ -5,13 +5,13 @@ from play_for_tlca import SPREAD, Play, belief, new_area, poses_of
 
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import fuse
-from hmt_slam_ros.messages.map_changes import Arc, Merged, Relabelled
-from hmt_slam_ros.messages.messages import Leaf
+from hmt_slam_ros.messages.map_changes import Arc, AreaMerge, MovedKeyframe
+from hmt_slam_ros.messages.messages import Hypothesis
 
 
 def revisit(pose, area=1, source=0, closure=False):
     """The only hypothesis goes over the arc again and observes it at ``pose``."""
-    return Leaf(0, 0, 1.0, area, belief(se2.inverse(pose)), (), (Arc(source, area, belief(pose), closure),))
+    return Hypothesis(0, 0, 1.0, area, belief(se2.inverse(pose)), (), (Arc(source, area, belief(pose), closure),))
 
 
 def test_an_arc_that_is_travelled_again_becomes_the_product_of_both_observations():
@@ -19,7 +19,7 @@ def test_an_arc_that_is_travelled_again_becomes_the_product_of_both_observations
     play.start()
     first, second = [4.0, 0.0, 0.5], [4.1, 0.05, 0.49]
     play.step(new_area(0, 0, 1.0, 1, first))
-    play.step(Leaf(0, 0, 1.0, 0, belief(first)))
+    play.step(Hypothesis(0, 0, 1.0, 0, belief(first)))
     verdict = play.step(revisit(second))
     product = fuse([belief(first), belief(second)])
     (arc,) = verdict.arcs
@@ -36,7 +36,7 @@ def test_an_arc_travelled_the_other_way_is_the_same_arc():
     first, second = [4.0, 0.0, 0.5], [4.1, 0.05, 0.49]
     play.step(new_area(0, 0, 1.0, 1, first))
     back = belief(second).inverse()
-    play.step(Leaf(0, 0, 1.0, 0, belief(second), (), (Arc(1, 0, back),)))
+    play.step(Hypothesis(0, 0, 1.0, 0, belief(second), (), (Arc(1, 0, back),)))
     product = fuse([belief(first), belief(second)])
     np.testing.assert_allclose(play.arc(0, 1).mean, product.mean, atol=1e-6)
     np.testing.assert_allclose(play.arc(0, 1).covariance, product.covariance, atol=1e-6)
@@ -46,10 +46,10 @@ def test_an_arc_seen_twice_before_acceptance_counts_both_times():
     play = Play(accept_distance=0.0)
     first, second = [4.0, 0.0, 0.5], [4.1, 0.05, 0.49]
     play.start()
-    play.step(new_area(1, 0, 0.95, 1, first), Leaf(2, 0, 0.05, 0))
-    again = Leaf(1, 1, 0.95, 1, None, (), (Arc(0, 1, belief(second)),))
-    play.step(again, Leaf(2, 2, 0.05, 0))
-    verdict = play.step(Leaf(1, 1, 0.95, 1), Leaf(2, 2, 0.05, 0))
+    play.step(new_area(1, 0, 0.95, 1, first), Hypothesis(2, 0, 0.05, 0))
+    again = Hypothesis(1, 1, 0.95, 1, None, (), (Arc(0, 1, belief(second)),))
+    play.step(again, Hypothesis(2, 2, 0.05, 0))
+    verdict = play.step(Hypothesis(1, 1, 0.95, 1), Hypothesis(2, 2, 0.05, 0))
     assert verdict.hypothesis == 1
     product = fuse([belief(first), belief(second)])
     np.testing.assert_allclose(play.arc(0, 1, 1).mean, product.mean, atol=1e-9)
@@ -61,9 +61,9 @@ def test_an_arc_is_fused_only_on_acceptance():
     play.start()
     first, second = [4.0, 0.0, 0.5], [4.1, 0.05, 0.49]
     play.step(new_area(0, 0, 1.0, 1, first))
-    play.step(Leaf(0, 0, 1.0, 0, belief(first)))
+    play.step(Hypothesis(0, 0, 1.0, 0, belief(first)))
     arcs = (Arc(0, 1, belief(second), True),)
-    verdict = play.step(Leaf(1, 0, 0.6, 1, None, (), arcs), new_area(2, 0, 0.4, 2, [1.0, 5.0, 0.0]))
+    verdict = play.step(Hypothesis(1, 0, 0.6, 1, None, (), arcs), new_area(2, 0, 0.4, 2, [1.0, 5.0, 0.0]))
     assert verdict.hypothesis is None
     assert verdict.arcs == ()
     np.testing.assert_allclose(play.arc(0, 1, 1).mean, second, atol=1e-12)
@@ -75,11 +75,11 @@ def test_the_same_keyframes_do_not_make_an_arc_more_certain_twice():
     play.start()
     pose = [4.0, 0.0, 0.0]
     play.step(places=[(0, 0, [4.5, 0.0, 0.0])])
-    there = Relabelled(1, 0, 1, np.array([0.5, 0.0, 0.0]))
-    leaf = Leaf(0, 0, 1.0, 1, belief(se2.inverse(pose)), (there,), (Arc(0, 1, belief(pose)),))
+    there = MovedKeyframe(1, 0, 1, np.array([0.5, 0.0, 0.0]))
+    leaf = Hypothesis(0, 0, 1.0, 1, belief(se2.inverse(pose)), (there,), (Arc(0, 1, belief(pose)),))
     play.step(leaf)
-    again = Relabelled(1, 1, 1, np.array([0.5, 0.0, 0.0]))
-    play.step(Leaf(0, 0, 1.0, 1, None, (again,), (Arc(0, 1, belief(pose)),)))
+    again = MovedKeyframe(1, 1, 1, np.array([0.5, 0.0, 0.0]))
+    play.step(Hypothesis(0, 0, 1.0, 1, None, (again,), (Arc(0, 1, belief(pose)),)))
     np.testing.assert_allclose(play.arc(0, 1).covariance, SPREAD, rtol=1e-6, atol=1e-12)
 
 
@@ -101,21 +101,21 @@ def test_two_areas_that_are_one_are_definite_at_once_and_the_loop_stays_closed()
         play.step(new_area(0, 0, 1.0, area, [2.0, 0.0, np.pi / 2], source=area - 1))
     play.step(new_area(0, 0, 1.0, 4, [2.0, 0.0, np.pi / 2], source=3))
     home = Arc(4, 0, belief(np.zeros(3), 0.01 * SPREAD), True)
-    before = play.step(Leaf(0, 0, 1.0, 4, None, (), (home,)))
+    before = play.step(Hypothesis(0, 0, 1.0, 4, None, (), (home,)))
     assert sorted(poses_of(before)) == [0, 1, 2, 3, 4]
     into = play.arc(0, 4)
-    verdict = play.step(Leaf(0, 0, 1.0, 0, into, merged=Merged(4, 0, into)))
+    verdict = play.step(Hypothesis(0, 0, 1.0, 0, into, area_merge=AreaMerge(4, 0, into)))
     assert verdict.hypothesis == 0
-    assert (verdict.arcs, verdict.relabelled, verdict.reopened) == ((), (), ())
+    assert (verdict.arcs, verdict.moved_keyframes, verdict.revised_hypotheses) == ((), (), ())
     poses = poses_of(verdict)
     assert sorted(poses) == [0, 1, 2, 3]
     for area in poses:
         apart = se2.between(poses_of(before)[area].mean, poses[area].mean)
         assert np.hypot(*apart[:2]) < 0.01
         assert np.degrees(abs(apart[2])) < 0.1
-    assert play.process._replica.areas == {0: 0}
+    assert play.process._replica.robot_areas == {0: 0}
     # What is found again of the arc that is left is fused with it, as always.
     sharp = play.arc(0, 3).covariance
     play.step(new_area(0, 0, 1.0, 5, [1.0, 0.0, 0.0]))
-    play.step(Leaf(0, 0, 1.0, 3, belief([2.0, 0.0, np.pi / 2]), (), (Arc(0, 3, play.arc(0, 3), True),)))
+    play.step(Hypothesis(0, 0, 1.0, 3, belief([2.0, 0.0, np.pi / 2]), (), (Arc(0, 3, play.arc(0, 3), True),)))
     assert np.trace(play.arc(0, 3).covariance) < np.trace(sharp)

@@ -12,7 +12,7 @@ from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.messages.map_changes import Arc, AreaPose
-from hmt_slam_ros.messages.messages import AreaEvents, Hypotheses, Leaf
+from hmt_slam_ros.messages.messages import AreaEvents, Hypotheses, Hypothesis
 
 
 def test_without_an_event_the_hypothesis_stays():
@@ -30,13 +30,13 @@ def test_a_cut_in_unknown_ground_makes_a_new_area():
         run.keyframe(pose)
     (leaf,) = run.keyframe(poses[-1], cut=3).leaves
     assert (leaf.hypothesis, leaf.area, leaf.probability) == (0, 1, 1.0)
-    assert [r.keyframe for r in leaf.relabelled] == [5, 6, 7]
-    assert np.allclose(leaf.relabelled[0].pose, 0.0)
-    assert np.allclose(leaf.relabelled[2].pose, se2.between(poses[5], poses[7]))
+    assert [r.keyframe for r in leaf.moved_keyframes] == [5, 6, 7]
+    assert np.allclose(leaf.moved_keyframes[0].pose, 0.0)
+    assert np.allclose(leaf.moved_keyframes[2].pose, se2.between(poses[5], poses[7]))
     (arc,) = leaf.arcs
     assert (arc.source, arc.target, arc.closure) == (0, 1, False)
     assert np.allclose(arc.pose.mean, se2.between(poses[0], poses[5]))
-    assert np.allclose(leaf.rebase.mean, se2.between(poses[5], poses[0]))
+    assert np.allclose(leaf.frame_change.mean, se2.between(poses[5], poses[0]))
 
 
 def test_the_new_arc_has_the_uncertainty_of_the_reference_keyframe_and_the_floor():
@@ -58,7 +58,7 @@ def test_the_local_map_holds_the_area_and_those_that_are_surely_near():
     (leaf,) = run.keyframe(ring_drive(8)[7], cut=3).leaves
     assert [local.area for local in leaf.local] == [1, 0]
     assert np.allclose(leaf.local[0].pose, 0.0)
-    assert np.allclose(leaf.local[1].pose, leaf.rebase.mean)
+    assert np.allclose(leaf.local[1].pose, leaf.frame_change.mean)
 
 
 @pytest.mark.parametrize("mapping", [True, False])
@@ -70,9 +70,9 @@ def test_a_move_goes_to_the_known_area_and_no_keyframe_changes(mapping):
     run.keyframe(poses[-1], cut=3)
     before = run.poses[0]
     (leaf,) = run.keyframe(poses[-1], moved=0, mapping=mapping).leaves
-    assert (leaf.hypothesis, leaf.area, leaf.relabelled, leaf.arcs) == (0, 0, (), ())
+    assert (leaf.hypothesis, leaf.area, leaf.moved_keyframes, leaf.arcs) == (0, 0, (), ())
     assert [local.area for local in leaf.local] == [0, 1]
-    assert np.allclose(se2.compose(leaf.rebase.mean, before), se2.between(poses[0], poses[-1]))
+    assert np.allclose(se2.compose(leaf.frame_change.mean, before), se2.between(poses[0], poses[-1]))
 
 
 def two_areas(**changed):
@@ -89,11 +89,11 @@ def test_an_area_becomes_part_of_another_and_the_robot_goes_on_there():
     into = run.replica.maps[0].arc(0, 1)
     before = {k: se2.compose(into.mean, at) for k, at in run.replica.maps[0].keyframes(1).items()}
     (leaf,) = run.keyframe(pose, merged=(1, 0)).leaves
-    assert (leaf.hypothesis, leaf.probability, leaf.area, leaf.relabelled, leaf.arcs) == (0, 1.0, 0, (), ())
-    assert (leaf.merged.area, leaf.merged.into) == (1, 0)
+    assert (leaf.hypothesis, leaf.probability, leaf.area, leaf.moved_keyframes, leaf.arcs) == (0, 1.0, 0, (), ())
+    assert (leaf.area_merge.area, leaf.area_merge.into) == (1, 0)
     assert [local.area for local in leaf.local] == [0]
-    np.testing.assert_allclose(leaf.rebase.mean, into.mean, atol=1e-12)
-    np.testing.assert_allclose(leaf.merged.pose.covariance, into.covariance, atol=1e-12)
+    np.testing.assert_allclose(leaf.frame_change.mean, into.mean, atol=1e-12)
+    np.testing.assert_allclose(leaf.area_merge.pose.covariance, into.covariance, atol=1e-12)
     hybrid_map = run.replica.maps[0]
     assert hybrid_map.area_ids() == [0]
     assert list(hybrid_map.all_arcs()) == []
@@ -112,17 +112,17 @@ def test_a_robot_that_is_in_neither_of_two_areas_stays_where_it_is():
         run.keyframe(further)
     run.keyframe(ring_drive(21)[20], cut=3)
     (leaf,) = run.keyframe(ring_drive(22)[21], merged=(1, 0)).leaves
-    assert (leaf.area, leaf.rebase, leaf.merged.into) == (2, None, 0)
+    assert (leaf.area, leaf.frame_change, leaf.area_merge.into) == (2, None, 0)
     assert leaf.local[0].area == 2
     assert 1 not in [local.area for local in leaf.local]
-    assert run.replica.maps[0].neighbours(2) == [0]
+    assert run.replica.maps[0].neighbors(2) == [0]
 
 
 def test_areas_whose_surfaces_contradict_each_other_stay_two():
     wrong = PoseGaussian(se2.compose(se2.between(*ring_drive(7)[[0, 6]]), [0.0, 0.6, 0.0]), STEP)
     run, pose = two_areas(arcs=(Arc(0, 1, wrong, closure=True),))
     (leaf,) = run.keyframe(pose, merged=(1, 0)).leaves
-    assert (leaf.area, leaf.rebase, leaf.merged, leaf.local) == (1, None, None, ())
+    assert (leaf.area, leaf.frame_change, leaf.area_merge, leaf.local) == (1, None, None, ())
 
 
 def test_turning_back_into_tracked_ground_is_no_new_area():
@@ -136,7 +136,7 @@ def test_turning_back_into_tracked_ground_is_no_new_area():
         run.keyframe(turned)
     (leaf,) = run.keyframe(np.array([*poses[1][:2], math.pi]), cut=5).leaves
     assert (leaf.area, leaf.probability, leaf.arcs) == (0, 1.0, ())
-    assert {r.area for r in leaf.relabelled} == {0}
+    assert {r.area for r in leaf.moved_keyframes} == {0}
 
 
 def test_ground_tracked_by_way_of_another_area_is_joined_by_a_measured_arc():
@@ -168,10 +168,10 @@ def ring_with_two_leaves(apart=1.0):
 
 def split_in_two(run, apart):
     """Leaf 1 where the robot is, leaf 2 at the pose ``apart`` from there."""
-    split = Hypotheses(len(run.answers) - 1, (Leaf(1, 0, 0.6, 0), Leaf(2, 0, 0.4, 0)))
+    split = Hypotheses(len(run.histories) - 1, (Hypothesis(1, 0, 0.6, 0), Hypothesis(2, 0, 0.4, 0)))
     for replica in (run.replica, run.tsbi._replica):
-        replica.apply(split)
-    run.tsbi._notes = dict.fromkeys((1, 2), run.tsbi._notes[0])
+        replica.apply_hypotheses(split)
+    run.tsbi._hypothesis_states = dict.fromkeys((1, 2), run.tsbi._hypothesis_states[0])
     run.poses = {1: run.poses[0], 2: se2.compose(run.poses[0], apart)}
     run.covariances = {1: STEP, 2: STEP}
 
@@ -219,7 +219,7 @@ def test_what_was_seen_just_before_is_no_known_ground():
 
 def test_acceptance_leaves_one_hypothesis():
     run = ring_with_two_leaves()
-    run.accept(2)
+    run.apply_decision(2)
     (leaf,) = run.keyframe(run.true_pose).leaves
     assert (leaf.hypothesis, leaf.parent, leaf.probability) == (2, 2, 1.0)
 

@@ -11,7 +11,7 @@ from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.messages.replica import Replica
 from hmt_slam_ros.topological_inference.branching import Branching, Parent
-from hmt_slam_ros.topological_inference.hypothesis_tree import LeafNotes
+from hmt_slam_ros.topological_inference.hypothesis_tree import HypothesisState
 
 PATH = np.array([[1.2 + 0.5 * k, 2.2, 0.1 * math.sin(k)] for k in range(6)])
 ROOM = np.concatenate((box(0.0, 0.0, 5.0, 5.0), box(1.0, 3.0, 2.0, 3.5)))
@@ -34,12 +34,12 @@ def rooms_apart(rooms, offsets, sigma, configuration=None, last=PATH):
             replica.scans[keyframe] = scan_in(
                 walls, pose, noise=0.01, seed=keyframe, field_of_view=2 * np.pi, beams=361
             )
-            hybrid_map.place(keyframe, area, se2.between(PATH[0], pose))
+            hybrid_map.set_keyframe(keyframe, area, se2.between(PATH[0], pose))
     for area, offset in enumerate(offsets):
         spread = np.diag([sigma, sigma, math.radians(5.0)]) ** 2
         hybrid_map.set_arc(here, area, PoseGaussian(np.array([*offset, 0.0]), spread), closure=False)
     newest = range(6 * here, 6 * here + 6)
-    notes = LeafNotes({k: 1e-3 * np.eye(3) for k in newest}, unchecked=tuple(newest))
+    notes = HypothesisState({k: 1e-3 * np.eye(3) for k in newest}, unmatched_keyframes=tuple(newest))
     parent = Parent(0, here, hybrid_map, notes, 0.0)
     return parent, Branching(configuration or Configuration(), replica), list(newest)
 
@@ -91,9 +91,9 @@ def test_a_recognised_area_is_entered_at_the_pose_of_the_match():
     child = max(branching.cut(parent, newest[1:]).children, key=lambda child: child.log_weight)
     assert child.area == 0
     truth = se2.between(PATH[0], PATH[1])
-    entered = {r.keyframe: r.pose for r in child.relabelled}
+    entered = {r.keyframe: r.pose for r in child.moved_keyframes}
     assert np.allclose(entered[newest[1]], truth, atol=0.03)
-    assert np.allclose(child.rebase.mean, 0.0, atol=0.04)
+    assert np.allclose(child.frame_change.mean, 0.0, atol=0.04)
     (arc,) = child.arcs
     assert (arc.source, arc.target) == (1, 0)
     assert np.allclose(arc.pose.mean, 0.0, atol=0.04)
@@ -109,9 +109,9 @@ def test_the_robot_is_told_to_be_as_uncertain_in_the_area_as_its_newest_keyframe
     children = branching.cut(parent, newest[1:]).children
     assert {child.area for child in children} == {0, 2}
     for child in children:
-        carried = child.rebase.compose(exact)
+        carried = child.frame_change.compose(exact)
         np.testing.assert_allclose(carried.covariance, child.notes.covariances[newest[-1]], atol=1e-12)
-        (moved,) = [r.pose for r in child.relabelled if r.keyframe == newest[-1]]
+        (moved,) = [r.pose for r in child.moved_keyframes if r.keyframe == newest[-1]]
         np.testing.assert_allclose(carried.mean, moved, atol=1e-9)
 
 
@@ -121,7 +121,7 @@ def test_candidates_beyond_the_number_that_is_examined_keep_their_prior_mass():
     parent, branching, newest = rooms_apart((ROOM, ROOM, ROOM), ((0.6, 0.4), (-0.5, 0.3)), 1.0, settings)
     branches = branching.cut(parent, newest[1:])
     assert len({child.area for child in branches.children}) == 2  # new, and one of the two
-    assert 0.05 < math.exp(branches.log_skipped) < 0.6
+    assert 0.05 < math.exp(branches.log_skipped_weight) < 0.6
 
 
 def test_a_re_check_joins_areas_by_an_arc_and_moves_nothing():
@@ -130,10 +130,10 @@ def test_a_re_check_joins_areas_by_an_arc_and_moves_nothing():
     children = branching.recheck(parent).children
     stay, *joined = children
     assert (stay.area, stay.arcs, stay.reload) == (2, (), False)
-    assert stay.notes.unchecked == ()
+    assert stay.notes.unmatched_keyframes == ()
     assert joined
     for child in joined:
-        assert (child.area, child.relabelled, child.rebase) == (2, (), None)
+        assert (child.area, child.moved_keyframes, child.frame_change) == (2, (), None)
         (arc,) = child.arcs
         assert (arc.source, arc.target, arc.closure) == (2, 0, True)
 
@@ -171,7 +171,7 @@ def test_whether_the_robot_is_in_known_ground_now_is_asked_of_the_newest_keyfram
     parent = replace(parent, notes=replace(parent.notes, unchecked=tuple(newest[-3:]), beside=(0,)))
     (stay,) = branching.recheck(parent, (0,)).children
     assert stay.log_weight == parent.log_weight
-    assert (stay.notes.unchecked, stay.notes.beside) == (tuple(newest[-3:]), (0,))
+    assert (stay.notes.unmatched_keyframes, stay.notes.beside) == (tuple(newest[-3:]), (0,))
 
 
 def test_keyframes_most_of_which_are_in_its_place_are_recognized():
@@ -190,7 +190,7 @@ def test_further_ways_to_fit_into_an_area_count_as_not_examined():
         parent, branching, newest = rooms_apart((hall, hall), ((0.3, 0.1),), 0.8, settings)
         branches = branching.cut(parent, newest[1:])
         weights[most] = [math.exp(child.log_weight) for child in branches.children if child.area == 0]
-        skipped[most] = math.exp(branches.log_skipped)
+        skipped[most] = math.exp(branches.log_skipped_weight)
     assert (len(weights[1]), len(weights[6])) == (1, 5)
     assert weights[1][0] == max(weights[6])
     assert 0.0 < skipped[1] <= sum(weights[6]) - max(weights[6]) + 1e-9
@@ -204,5 +204,5 @@ def test_an_improbable_hypothesis_examines_few_areas_and_counts_the_others():
     for share in (1.0, 1e-3):
         branches = branching.cut(replace(parent, share=share), newest[1:])
         examined[share] = {area for child in branches.children for area in child.notes.compared}
-        assert (branches.log_skipped > -math.inf) == (share < 1.0)
+        assert (branches.log_skipped_weight > -math.inf) == (share < 1.0)
     assert (len(examined[1.0]), len(examined[1e-3])) == (6, 4)

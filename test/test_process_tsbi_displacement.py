@@ -12,14 +12,14 @@ from worlds import box, scan_in
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.hybrid_map.shortest_path import tells_nothing
-from hmt_slam_ros.messages.map_changes import Place
-from hmt_slam_ros.messages.messages import AreaEvents, Forgotten, Keyframe
+from hmt_slam_ros.hybrid_map.shortest_path import is_uninformative
+from hmt_slam_ros.messages.map_changes import InitialPose
+from hmt_slam_ros.messages.messages import AreaEvents, Keyframe, PrunedKeyframe
 from hmt_slam_ros.topological_inference import relocalization
-from hmt_slam_ros.topological_inference.global_localization import Whereabouts
-from hmt_slam_ros.topological_inference.hypothesis_tree import LeafNotes, Spot, Stay
-from hmt_slam_ros.topological_inference.kidnapping import displaced_or_not, with_displaced
-from hmt_slam_ros.topological_inference.relocalization import UNKNOWN
+from hmt_slam_ros.topological_inference.global_localization import PoseDistribution
+from hmt_slam_ros.topological_inference.hypothesis_tree import FalseAlarm, HypothesisState, PoseInArea
+from hmt_slam_ros.topological_inference.kidnapping import decide_without_mapping, spawn_kidnapped_hypothesis
+from hmt_slam_ros.topological_inference.relocalization import KIDNAPPED_UNMAPPED_PRIOR
 from hmt_slam_ros.topological_inference.tsbi import Tsbi
 
 FAR, HERE = (30.0, 20.0), (0.0, 0.0)
@@ -44,42 +44,42 @@ def asked(rooms, doubts, first=FAR, hall=2):
             HALL, PATH[k], noise=0.01, seed=keyframe, field_of_view=2 * np.pi, beams=361
         )
     notes = replace(parent.notes, doubts={newest[n]: nats for n, nats in doubts.items()})
-    return with_displaced(branching, replace(parent, notes=notes))
+    return spawn_kidnapped_hypothesis(branching, replace(parent, notes=notes))
 
 
 def test_the_keyframes_since_then_begin_an_area_of_which_nothing_tells_where_it_is():
     stays, lost = asked((ROOM, OTHER, ROOM), {2: 8.0}).children
-    assert (stays.area, stays.log_weight, stays.relabelled) == (2, 0.0, ())
+    assert (stays.area, stays.log_weight, stays.moved_keyframes) == (2, 0.0, ())
     assert lost.area == 3
     assert lost.notes.lost == 14
     (arc,) = lost.arcs
     assert (arc.source, arc.target) == (2, 3)
-    assert tells_nothing(arc.pose)
-    poses = {r.keyframe: r.pose for r in lost.relabelled}
+    assert is_uninformative(arc.pose)
+    poses = {r.keyframe: r.pose for r in lost.moved_keyframes}
     assert sorted(poses) == [14, 15, 16, 17]  # what was stored before the displacement stays
     for keyframe, pose in poses.items():
         np.testing.assert_allclose(pose, se2.between(PATH[2], PATH[keyframe - 12]), atol=1e-9)
-    assert not stays.notes.doubts
-    assert not lost.notes.doubts
+    assert not stays.notes.kidnapping_evidence
+    assert not lost.notes.kidnapping_evidence
 
 
 def test_that_the_place_is_known_elsewhere_speaks_for_it_and_one_look_has_found_it():
     _, lost = asked((ROOM, OTHER, ROOM), {2: 8.0}).children
     assert lost.log_weight > PRIOR + 8.0 + 1.0
-    assert lost.notes.credit == pytest.approx(lost.log_weight - PRIOR - 8.0)
-    assert lost.notes.sighted.area == 0
-    np.testing.assert_allclose(lost.notes.sighted.pose, se2.between(PATH[0], PATH[5]), atol=0.05)
+    assert lost.notes.counted_evidence == pytest.approx(lost.log_weight - PRIOR - 8.0)
+    assert lost.notes.relocalization_candidate.area == 0
+    np.testing.assert_allclose(lost.notes.relocalization_candidate.pose, se2.between(PATH[0], PATH[5]), atol=0.05)
 
 
 def test_it_is_believed_to_be_where_two_looks_find_it():
     parent, branching, newest = rooms_apart((ROOM, OTHER, ROOM), [FAR, FAR], 0.1)
-    notes = replace(parent.notes, lost=newest[0], claim=Spot(2, newest[0], np.zeros(3)), credit=None)
-    (still,) = relocalization.looked_for(branching, replace(parent, notes=notes)).children
-    assert still.notes.sighted.area == 0
-    looked = relocalization.looked_for(branching, replace(parent, notes=still.notes))
+    notes = replace(parent.notes, lost=newest[0], claim=PoseInArea(2, newest[0], np.zeros(3)), credit=None)
+    (still,) = relocalization.update_relocalization(branching, replace(parent, notes=notes)).children
+    assert still.state.relocalization_candidate.area == 0
+    looked = relocalization.update_relocalization(branching, replace(parent, notes=still.state))
     _, found = looked.children
-    assert relocalization.surely_found(looked).children == [found]
-    assert (found.notes.lost, found.notes.claim, found.notes.found) == (None, None, 0)
+    assert relocalization.accept_relocalization(looked).children == [found]
+    assert (found.state.lost_since, found.state.tracked_pose, found.state.relocalized_area) == (None, None, 0)
     assert (found.arcs[0].source, found.arcs[0].target) == (2, 0)
 
 
@@ -90,16 +90,16 @@ def test_where_nothing_is_stored_it_goes_over_into_the_area_where_it_was_recogni
     for pose in poses[:-1]:
         run.keyframe(pose)
     run.keyframe(poses[-1], cut=3)
-    run.tsbi._notes[0] = replace(run.tsbi._notes[0], found=0)
+    run.tsbi._hypothesis_states[0] = replace(run.tsbi._hypothesis_states[0], relocalized_area=0)
     (leaf,) = run.keyframe(poses[-1], mapping=mapping).leaves
     assert leaf.area == area
-    assert run.tsbi._notes[0].found is None
+    assert run.tsbi._hypothesis_states[0].relocalized_area is None
 
 
 def test_on_ground_that_nobody_knows_the_doubts_alone_speak_for_it():
     _, lost = asked((OTHER, OTHER, ROOM), {2: 8.0}).children
-    assert lost.log_weight == pytest.approx(PRIOR + 8.0 + math.log(UNKNOWN), abs=0.5)
-    assert lost.notes.sighted is None
+    assert lost.log_weight == pytest.approx(PRIOR + 8.0 + math.log(KIDNAPPED_UNMAPPED_PRIOR), abs=0.5)
+    assert lost.notes.relocalization_candidate is None
 
 
 def test_that_the_place_is_known_where_the_robot_would_be_anyway_speaks_against_it():
@@ -118,21 +118,21 @@ def test_a_robot_that_is_hardly_displaced_is_not_asked_about(doubts):
 
 def test_an_area_is_not_left_without_keyframes():
     _, lost = asked((ROOM, OTHER, ROOM), {0: 8.0}).children
-    assert [r.keyframe for r in lost.relabelled] == [13, 14, 15, 16, 17]
+    assert [r.keyframe for r in lost.moved_keyframes] == [13, 14, 15, 16, 17]
 
 
 @pytest.mark.parametrize(("nats", "lost"), [(11.0, None), (12.0, 18)])
 def test_where_nothing_is_stored_it_is_lost_from_the_next_keyframe_on_if_that_is_more_probable(nats, lost):
     parent, branching, _ = rooms_apart((ROOM,), [], 0.1)
-    spot = Spot(0, 17, PATH[3])
+    spot = PoseInArea(0, 17, PATH[3])
     doubtful = replace(parent, notes=replace(parent.notes, doubts={17: nats}, spots={17: spot}))
     branching.remember(17, scan_in(OTHER, PATH[3], field_of_view=2 * np.pi, beams=361), {17})
-    child = displaced_or_not(branching, doubtful, 17)
-    assert child.notes.lost == lost
-    assert bool(child.notes.doubts) == (lost is None)
+    child = decide_without_mapping(branching, doubtful, 17)
+    assert child.state.lost_since == lost
+    assert bool(child.state.kidnapping_evidence) == (lost is None)
     if lost is not None:
-        assert child.notes.stay.spot is spot
-        assert child.notes.stay.probability == pytest.approx(1.0 / (1.0 + math.exp(PRIOR + nats)))
+        assert child.state.false_alarm.tracked_pose is spot
+        assert child.state.false_alarm.probability == pytest.approx(1.0 / (1.0 + math.exp(PRIOR + nats)))
 
 
 @pytest.mark.parametrize(
@@ -146,27 +146,31 @@ def test_where_nothing_is_stored_it_is_lost_if_it_is_rather_in_another_place(wor
     for event, pose in enumerate(PATH[:4], start=12):
         scan = scan_in(world, pose, noise=0.01, seed=event, field_of_view=2 * np.pi, beams=361)
         claimed = se2.between(PATH[0], pose) + np.array([off, 0.0, 0.0])
-        notes = notes.heard(event, 6.0, Spot(1, event, claimed))
-        branching.remember(event, scan, notes.spots)
-    child = displaced_or_not(branching, replace(parent, notes=notes), 15)
-    assert child.notes.lost == lost
-    assert not child.notes.doubts
-    assert not child.notes.spots
+        notes = notes.heard(event, 6.0, PoseInArea(1, event, claimed))
+        branching.remember(event, scan, notes.unstored_poses)
+    child = decide_without_mapping(branching, replace(parent, notes=notes), 15)
+    assert child.state.lost_since == lost
+    assert not child.state.kidnapping_evidence
+    assert not child.state.unstored_poses
 
 
 @pytest.mark.parametrize(("lost", "stays"), [(11, True), (9, False)], ids=["takes itself for lost", "was carried"])
 def test_where_it_would_be_if_it_had_not_been_displaced_is_where_odometry_has_it_when_it_is_lost(lost, stays):
     parent, branching, _ = rooms_apart((ROOM, OTHER), [FAR], 0.1)
-    notes = replace(parent.notes, lost=lost, stay=Stay(Spot(1, 10, PATH[2]), 0.4))
+    notes = replace(parent.notes, lost=lost, stay=FalseAlarm(PoseInArea(1, 10, PATH[2]), 0.4))
     scan = scan_in(ROOM, PATH[3], field_of_view=2 * np.pi, beams=361)
-    keyframe = Keyframe(11, scan, 1.0, (), carried=True, mapping=False)
-    (child,) = relocalization.arrived(branching, replace(parent, notes=notes), keyframe, PATH[3]).children
-    assert child.notes.lost == 11
+    keyframe = Keyframe(11, scan, 1.0, (), motion_unknown=True, mapping=False)
+    (child,) = relocalization.begin_relocalization(branching, replace(parent, notes=notes), keyframe, PATH[3]).children
+    assert child.state.lost_since == 11
     if not stays:
-        assert child.notes.stay is None
+        assert child.state.false_alarm is None
         return
-    assert (child.notes.stay.spot.area, child.notes.stay.spot.keyframe, child.notes.stay.probability) == (1, 11, 0.4)
-    np.testing.assert_array_equal(child.notes.stay.spot.pose, PATH[3])
+    assert (
+        child.state.false_alarm.tracked_pose.area,
+        child.state.false_alarm.tracked_pose.keyframe,
+        child.state.false_alarm.probability,
+    ) == (1, 11, 0.4)
+    np.testing.assert_array_equal(child.state.false_alarm.tracked_pose.pose, PATH[3])
 
 
 @pytest.mark.parametrize(("at", "found"), [(0.0, True), (3.0, False)], ids=["there", "elsewhere"])
@@ -174,31 +178,33 @@ def test_a_place_is_believed_sooner_where_it_would_be_if_it_had_not_been_displac
     parent, branching, newest = rooms_apart((ROOM, OTHER, ROOM), [FAR, FAR], 0.1)
     looked = {}
     for probability in (0.0, 0.4):
-        stay = Stay(Spot(0, newest[0], np.array([at, 0.0, 0.0])), probability)
+        stay = FalseAlarm(PoseInArea(0, newest[0], np.array([at, 0.0, 0.0])), probability)
         notes = replace(parent.notes, lost=newest[0], stay=stay)
-        where = relocalization.looked_for(branching, replace(parent, notes=notes)).where
-        looked[probability] = max(p for p, fit in zip(where.probabilities, where.found, strict=True) if fit.area == 0)
+        where = relocalization.update_relocalization(branching, replace(parent, notes=notes)).pose_distribution
+        looked[probability] = max(
+            p for p, fit in zip(where.probabilities, where.candidates, strict=True) if fit.area == 0
+        )
     assert (looked[0.4] > looked[0.0]) == found
 
 
 def test_who_says_where_it_is_knows_better_than_where_it_would_be_if_it_had_not_been_displaced():
     parent, branching, newest = rooms_apart((ROOM, OTHER, ROOM), [FAR, FAR], 0.1)
-    notes = replace(parent.notes, lost=newest[0], stay=Stay(Spot(1, newest[0], np.zeros(3)), 0.4))
-    told = Place(0, PoseGaussian(se2.between(PATH[0], PATH[5]), np.diag([0.3, 0.3, 0.2]) ** 2))
+    notes = replace(parent.notes, lost=newest[0], stay=FalseAlarm(PoseInArea(1, newest[0], np.zeros(3)), 0.4))
+    told = InitialPose(0, PoseGaussian(se2.between(PATH[0], PATH[5]), np.diag([0.3, 0.3, 0.2]) ** 2))
     pose = parent.hybrid_map.keyframes(2)[newest[-1]]
-    keyframe = Keyframe(newest[-1], branching._replica.scans[newest[-1]], 1.0, (), place=told, mapping=False)
-    looked = relocalization.arrived(branching, replace(parent, notes=notes), keyframe, pose)
-    assert all(child.notes.stay is None for child in looked.children)
+    keyframe = Keyframe(newest[-1], branching._replica.scans[newest[-1]], 1.0, (), initial_pose=told, mapping=False)
+    looked = relocalization.begin_relocalization(branching, replace(parent, notes=notes), keyframe, pose)
+    assert all(child.state.false_alarm is None for child in looked.children)
 
 
 def test_a_robot_that_may_have_stayed_where_much_was_moved_is_nowhere_rather_than_in_a_like_place():
-    where = Whereabouts((None, None), np.array([0.0, 0.9]))
-    stayed = where.or_stayed(np.array([True, False]), 0.5, 4)
+    where = PoseDistribution((None, None), np.array([0.0, 0.9]))
+    stayed = where.with_false_alarm(np.array([True, False]), 0.5, 4)
     # Of the displaced half, 0.2 on ground that nobody knows weighs 0.1 of it; the other half weighs as new ground.
     np.testing.assert_allclose(stayed.probabilities, [0.0, 0.9 / (0.9 + 0.1 + 0.1 / 0.2)], atol=1e-12)
-    assert where.or_stayed(np.array([True, False]), 0.0, 4).probabilities == pytest.approx(where.probabilities)
-    known = Whereabouts((None, None), np.array([0.6, 0.3]))
-    assert known.or_stayed(np.array([True, False]), 0.5, 4).probabilities[0] > 0.8
+    assert where.with_false_alarm(np.array([True, False]), 0.0, 4).probabilities == pytest.approx(where.probabilities)
+    known = PoseDistribution((None, None), np.array([0.6, 0.3]))
+    assert known.with_false_alarm(np.array([True, False]), 0.5, 4).probabilities[0] > 0.8
 
 
 def test_scans_that_the_map_does_not_hold_are_remembered_as_long_as_they_are_doubtful():
@@ -209,40 +215,40 @@ def test_scans_that_the_map_does_not_hold_are_remembered_as_long_as_they_are_dou
     for pose in poses[6:]:
         run.keyframe(pose, mapping=False)
     state = run.tsbi.state
-    assert [*state.notes[0].spots] == [*state.branching.recent] == [6, 7]
-    assert [*Tsbi(Configuration(), state=state).state.branching.recent] == [6, 7]
-    np.testing.assert_array_equal(state.notes[0].spots[7].pose, run.poses[0])
+    assert [*state.hypothesis_states[0].unstored_poses] == [*state.branching.unstored_scans] == [6, 7]
+    assert [*Tsbi(Configuration(), state=state).state.branching.unstored_scans] == [6, 7]
+    np.testing.assert_array_equal(state.hypothesis_states[0].unstored_poses[7].pose, run.poses[0])
     run.evidence[0] = 9.0
     run.keyframe(poses[7], mapping=False)
-    assert not run.tsbi.state.notes[0].spots
-    assert not run.tsbi.state.branching.recent
+    assert not run.tsbi.state.hypothesis_states[0].unstored_poses
+    assert not run.tsbi.state.branching.unstored_scans
 
 
 def test_scans_that_contradict_add_up_and_are_remembered_in_the_next_area():
-    notes = LeafNotes().heard(5, -0.3).heard(6, 8.0).heard(7, 5.0).heard(8, 1.2)
-    odds, since = notes.displaced
+    notes = HypothesisState().after_scan(5, -0.3).after_scan(6, 8.0).after_scan(7, 5.0).after_scan(8, 1.2)
+    odds, since = notes.kidnapping_test
     assert since == 6
     assert odds == pytest.approx(PRIOR + 7.0 + 4.0 + 0.2)
-    assert notes.entered({}).displaced == (odds, since)
+    assert notes.after_area_change({}).kidnapping_test == (odds, since)
 
 
 def test_what_contradicts_at_every_keyframe_is_clutter():
-    notes = LeafNotes()
+    notes = HypothesisState()
     for event in range(20):
-        notes = notes.heard(event, 0.9)
-    assert not notes.doubts
-    assert notes.displaced == (-math.inf, 0)
+        notes = notes.after_scan(event, 0.9)
+    assert not notes.kidnapping_evidence
+    assert notes.kidnapping_test == (-math.inf, 0)
 
 
 def test_a_doubt_passes_with_scans_that_fit():
-    notes = LeafNotes().heard(5, 4.0)
+    notes = HypothesisState().after_scan(5, 4.0)
     for event in range(6, 9):
-        notes = notes.heard(event, -0.3)
-    assert not notes.doubts
+        notes = notes.after_scan(event, -0.3)
+    assert not notes.kidnapping_evidence
 
 
 def test_what_contradicted_a_little_before_is_another_matter():
-    assert LeafNotes().heard(5, 2.0).heard(6, 9.0).heard(7, 6.0).displaced[1] == 6
+    assert HypothesisState().after_scan(5, 2.0).after_scan(6, 9.0).after_scan(7, 6.0).kidnapping_test[1] == 6
 
 
 def test_what_a_displaced_robot_saw_is_not_forgotten_at_the_same_event():
@@ -253,7 +259,7 @@ def test_what_a_displaced_robot_saw_is_not_forgotten_at_the_same_event():
     run.evidence[0] = -6.0
     for pose in poses[12:14]:
         assert len(run.keyframe(pose).leaves) == 1
-    run._answer = lambda sequence, _events: run.tsbi.handle(AreaEvents(sequence, (), (Forgotten(sequence, 0),)))
+    run._answer = lambda sequence, _events: run.tsbi.handle(AreaEvents(sequence, (), (PrunedKeyframe(sequence, 0),)))
     (answer,) = run.keyframe(poses[14])
     assert [leaf.lost for leaf in answer.leaves] == [False, True]
     assert not answer.forgotten

@@ -6,23 +6,23 @@ import numpy as np
 import pytest
 from worlds import drive, scan_in, two_rooms
 
-from hmt_slam_ros.configuration.topology import Refinement
+from hmt_slam_ros.configuration.topology import RefinementParameters
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.hybrid_map.pose_graph import Edges
 from hmt_slam_ros.loop_closure.joint_refinement import (
+    add_distant_pairs,
     certain_areas,
     linked_areas,
-    neighbours,
-    pairs_of,
+    nearest_keyframes,
     refine_jointly,
-    with_other_ways,
+    scan_pairs,
 )
-from hmt_slam_ros.registration.scan_to_scan import normal_equations, surfaces_of, weighting
-from hmt_slam_ros.results.final_map import place
+from hmt_slam_ros.registration.scan_to_scan import extract_surfaces, normal_equations, weighting_from_options
+from hmt_slam_ros.results.final_map import register_scans
 
-OPTIONS = Refinement()
+OPTIONS = RefinementParameters()
 CORRIDOR = np.array([[-200.0, -1.0, 200.0, -1.0], [-200.0, 1.0, 200.0, 1.0]])
 # Through the door and back, every half metre.
 TRUTH = np.concatenate((drive((2.0, 2.0), (5.0, 3.0), (9.0, 3.0)), drive((9.0, 3.2), (5.0, 3.2), (2.0, 2.5))))
@@ -33,7 +33,7 @@ def scans_at(poses: np.ndarray, walls: np.ndarray, noise: float = 0.01, **laser:
 
 
 def surfaces(scans: list):
-    return surfaces_of(scans, 30.0, OPTIONS.max_points)
+    return extract_surfaces(scans, 30.0, OPTIONS.max_points)
 
 
 def equations(
@@ -42,7 +42,7 @@ def equations(
     seen = surfaces(scans_at(truth, walls, noise))
     one, other = np.array([0]), np.array([1])
     information, gradient, share = normal_equations(
-        seen, one, seen, other, relative[None], gate, weighting(OPTIONS), every
+        seen, one, seen, other, relative[None], gate, weighting_from_options(OPTIONS), every
     )
     return information[0], gradient[0], share[0]
 
@@ -67,9 +67,9 @@ def test_normals_stand_upright_on_the_walls_and_point_to_the_laser() -> None:
     pose = np.array([3.0, 2.0, 0.3])
     seen = surfaces([scan_in(two_rooms(), pose)])
     points, normals = se2.transform(pose, seen.points), se2.transform([0.0, 0.0, pose[2]], seen.normals)
-    assert seen.flat.mean() > 0.8
-    assert np.all(np.sum((points - pose[:2]) * normals, axis=1)[seen.flat] < 0.0)
-    south = seen.flat & (points[:, 1] < 1e-3) & (np.abs(points[:, 0] - 3.0) < 2.0)
+    assert seen.is_flat.mean() > 0.8
+    assert np.all(np.sum((points - pose[:2]) * normals, axis=1)[seen.is_flat] < 0.0)
+    south = seen.is_flat & (points[:, 1] < 1e-3) & (np.abs(points[:, 0] - 3.0) < 2.0)
     assert south.sum() > 10
     np.testing.assert_allclose(normals[south], np.tile([0.0, 1.0], (south.sum(), 1)), atol=1e-3)
 
@@ -120,7 +120,7 @@ def test_noise_does_not_shorten_a_bare_corridor() -> None:
         near = [replace(s, ranges=np.where(s.ranges < 10.0, s.ranges, s.range_max)) for s in scans]
         seen, back = surfaces(near), np.array([[-3.0, 0.0, 0.0]])
         information, gradient, _ = normal_equations(
-            seen, np.array([0]), seen, np.array([1]), back, 0.4, weighting(OPTIONS), 1
+            seen, np.array([0]), seen, np.array([1]), back, 0.4, weighting_from_options(OPTIONS), 1
         )
         pulls.append(-gradient[0, 0])
         informations.append(information[0, 0, 0])
@@ -143,7 +143,7 @@ def test_scans_of_other_resolution_and_mounting_register_with_each_other() -> No
     seen = surfaces([one, other])
     start = se2.compose(se2.between(truth[1], truth[0]), se2.exp([0.03, -0.03, 0.01]))
     pair = np.array([0]), seen, np.array([1])
-    information, gradient, share = normal_equations(seen, *pair, start[None], 0.3, weighting(OPTIONS), 1)
+    information, gradient, share = normal_equations(seen, *pair, start[None], 0.3, weighting_from_options(OPTIONS), 1)
     assert share[0] > 0.2
     np.testing.assert_allclose(-np.linalg.solve(information[0], gradient[0]), [-0.03, 0.03, -0.01], atol=0.008)
 
@@ -155,8 +155,8 @@ def test_joint_refinement_takes_the_drift_of_odometry_away() -> None:
         drifted.append(se2.compose(drifted[-1], increment))
     start = np.array(drifted)
     everything = np.zeros(len(TRUTH), dtype=np.int64)
-    around = neighbours(start, everything, start, everything, {0: frozenset({0})}, OPTIONS.reach, 16)
-    pairs = pairs_of(around, OPTIONS.min_share)
+    around = nearest_keyframes(start, everything, start, everything, {0: frozenset({0})}, OPTIONS.reach, 16)
+    pairs = scan_pairs(around, OPTIONS.min_share)
     refined = refine_jointly(surfaces(scans_at(TRUTH, two_rooms())), start, pairs, motion, OPTIONS)
     before, after = errors(start, TRUTH), errors(refined, TRUTH)
     # 0.1 degrees of noise in the first scan alone are 15 mm at the far end.
@@ -171,8 +171,8 @@ def test_a_scan_is_placed_among_keyframes_that_stay() -> None:
     off = np.array([[0.05, 0.03, 0.02], [-0.06, 0.02, -0.02], [0.0, -0.06, 0.03]])
     start = se2.compose(between, se2.exp(off))
     rows = np.zeros(len(TRUTH), dtype=np.int64)
-    around = neighbours(TRUTH, rows, start, np.zeros(3, np.int64), {0: frozenset({0})}, OPTIONS.reach, 4)
-    placed = place(
+    around = nearest_keyframes(TRUTH, rows, start, np.zeros(3, np.int64), {0: frozenset({0})}, OPTIONS.reach, 4)
+    placed = register_scans(
         surfaces(scans_at(TRUTH, two_rooms())),
         TRUTH,
         surfaces(scans_at(between, two_rooms())),
@@ -190,34 +190,36 @@ def test_a_scan_that_shows_nothing_stays_where_it_is() -> None:
     blind = scan_in(np.array([[500.0, 0.0, 500.0, 1.0]]), start[0])
     keyframes = surfaces(scans_at(TRUTH, two_rooms()))
     around = [np.array([0, 1], dtype=np.int64)]
-    np.testing.assert_allclose(place(keyframes, TRUTH, surfaces([blind]), start, around, OPTIONS), start, atol=1e-12)
+    np.testing.assert_allclose(
+        register_scans(keyframes, TRUTH, surfaces([blind]), start, around, OPTIONS), start, atol=1e-12
+    )
 
 
 def test_keyframes_in_areas_that_no_arcs_link_are_not_paired() -> None:
     hybrid_map = HybridMap()
     for area in range(5):
-        hybrid_map.place(area, area, np.zeros(3))
+        hybrid_map.set_keyframe(area, area, np.zeros(3))
     for area in range(4):
         hybrid_map.set_arc(area, area + 1, PoseGaussian(np.zeros(3), np.eye(3)), closure=False)
     linked = linked_areas(hybrid_map)
     assert linked[0] == {0, 1, 2}
     assert linked[2] == {0, 1, 2, 3, 4}
     poses, areas = np.zeros((5, 3)), np.arange(5)
-    pairs = pairs_of(neighbours(poses, areas, poses, areas, linked, 4.0, 10), 0.1)
+    pairs = scan_pairs(nearest_keyframes(poses, areas, poses, areas, linked, 4.0, 10), 0.1)
     assert pairs.rows.tolist() == [[0, 1], [0, 2], [1, 2], [1, 3], [2, 3], [2, 4], [3, 4]]
 
 
 def test_the_nearest_in_place_and_heading_come_first() -> None:
     poses = np.array([[0.0, 0.0, 0.0], [0.5, 0.0, 3.0], [1.0, 0.0, 0.1], [9.0, 0.0, 0.0]])
     areas = np.zeros(4, dtype=np.int64)
-    found = neighbours(poses, areas, poses[:1], areas[:1], {0: frozenset({0})}, 4.0, 2)
+    found = nearest_keyframes(poses, areas, poses[:1], areas[:1], {0: frozenset({0})}, 4.0, 2)
     assert found[0].tolist() == [0, 2]
 
 
 def test_areas_are_certain_of_each_other_where_a_short_way_joins_them() -> None:
     hybrid_map = HybridMap()
     for area in range(4):
-        hybrid_map.place(area, area, np.zeros(3))
+        hybrid_map.set_keyframe(area, area, np.zeros(3))
     for area, deviation in enumerate((0.1, 0.1, 1.0)):
         arc = PoseGaussian(np.zeros(3), np.diag([deviation**2, 1e-6, 1e-6]))
         hybrid_map.set_arc(area, area + 1, arc, closure=False)
@@ -238,8 +240,8 @@ def ways_paired(areas: np.ndarray, certain: dict[int, set[int]], start: np.ndarr
     """The pairs near each other, and those with the other way too."""
     seen = surfaces(scans_at(WAYS, HALL))
     everything = {area: set(areas.tolist()) for area in areas.tolist()}
-    near = pairs_of(neighbours(start, areas, start, areas, everything, OPTIONS.reach, 9), OPTIONS.min_share)
-    return seen, near, with_other_ways(near, seen, start, areas, certain, OPTIONS)
+    near = scan_pairs(nearest_keyframes(start, areas, start, areas, everything, OPTIONS.reach, 9), OPTIONS.min_share)
+    return seen, near, add_distant_pairs(near, seen, start, areas, certain, OPTIONS)
 
 
 def test_where_ways_keep_apart_keyframes_are_paired_with_those_of_the_other_that_see_most_of_the_same() -> None:
@@ -248,7 +250,7 @@ def test_where_ways_keep_apart_keyframes_are_paired_with_those_of_the_other_that
     far = pairs.rows[len(near.rows) :]
     np.testing.assert_array_equal(pairs.rows[: len(near.rows)], near.rows)
     assert np.all(far[:, 1] - far[:, 0] > 20)
-    assert np.all(pairs.least_share[len(near.rows) :] < OPTIONS.min_share)
+    assert np.all(pairs.min_share[len(near.rows) :] < OPTIONS.min_share)
     met = near.rows[near.rows[:, 1] - near.rows[:, 0] > 20]
     apart = set(range(60)) - set(met.ravel().tolist())
     assert set(range(15, 30)) | set(range(45, 60)) <= apart <= set(far.ravel().tolist())
@@ -280,7 +282,7 @@ def test_of_many_keyframes_the_nearest_are_found_also_where_headings_lie_on_both
     # Equals come in their order.
     poses[40:50] = poses[30:40]
     areas, linked = np.arange(80) % 3, {0: {0, 1}, 1: {0, 1, 2}, 2: {1, 2}}
-    found = neighbours(poses, areas, poses[:30], areas[:30], linked, 4.0, 9)
+    found = nearest_keyframes(poses, areas, poses[:30], areas[:30], linked, 4.0, 9)
     for pose, area, rows in zip(poses, areas, found, strict=False):
         distance, turn = np.hypot(*(poses[:, :2] - pose[:2]).T), np.abs(se2.wrap(poses[:, 2] - pose[2]))
         near = [k for k in range(80) if distance[k] <= 4.0 and areas[k] in linked[area]]

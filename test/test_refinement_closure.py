@@ -28,7 +28,7 @@ def visited(bend=0.0, seed=0):
     for area, poses in VISITS.items():
         for i, pose in enumerate(poses):
             turned = se2.compose([0.0, 0.0, bend * i * (area == 2)], se2.between(poses[0], pose))
-            hybrid_map.place(k, area, turned)
+            hybrid_map.set_keyframe(k, area, turned)
             scans[k], truth[k] = worlds.scan_in(ROOMS, pose, noise=0.01, seed=100 * seed + k), pose
             k += 1
     first = {area: poses[0] for area, poses in VISITS.items()}
@@ -39,7 +39,7 @@ def visited(bend=0.0, seed=0):
 
 
 def refined(hybrid_map, scans, closed=(0, 2), **changes):
-    return ClosureRefinement(with_changes(Configuration(), changes)).refined(hybrid_map, scans, set(closed))
+    return ClosureRefinement(with_changes(Configuration(), changes)).refine(hybrid_map, scans, set(closed))
 
 
 @pytest.mark.parametrize("bend", [0.0, 0.004])
@@ -92,7 +92,7 @@ def test_along_a_bare_corridor_the_closing_arc_stays_uncertain():
     for area, start in ((0, 0.0), (1, 1.3)):
         for i in range(6):
             k = 6 * area + i
-            hybrid_map.place(k, area, np.array([0.5 * i, 0.0, 0.0]))
+            hybrid_map.set_keyframe(k, area, np.array([0.5 * i, 0.0, 0.0]))
             scans[k] = worlds.scan_in(walls, np.array([start + 0.5 * i, 0.0, 0.0]), noise=0.01, seed=k)
     hybrid_map.set_arc(0, 1, PoseGaussian(np.array([1.3, 0.0, 0.0]), CLOSURE), closure=True)
     deviations = np.sqrt(np.diag(refined(hybrid_map, scans, (0, 1)).arcs[0, 1].covariance))
@@ -105,15 +105,15 @@ def test_closures_far_from_each_other_are_refined_each_for_itself():
     far, first = HybridMap(), len(scans)
     for area in hybrid_map.area_ids():
         for k, pose in hybrid_map.keyframes(area).items():
-            far.place(k, area, pose)
-            far.place(first + k, 10 + area, pose)
+            far.set_keyframe(k, area, pose)
+            far.set_keyframe(first + k, 10 + area, pose)
             scans[first + k] = scans[k]
     for a, b, arc in hybrid_map.all_arcs():
         far.set_arc(a, b, arc.pose, closure=arc.closure)
         far.set_arc(10 + a, 10 + b, arc.pose, closure=arc.closure)
     # The way from one to the other leads through areas that lie beside neither.
-    far.place(2 * first, 5, np.zeros(3))
-    far.place(2 * first + 1, 6, np.zeros(3))
+    far.set_keyframe(2 * first, 5, np.zeros(3))
+    far.set_keyframe(2 * first + 1, 6, np.zeros(3))
     for a, b in ((1, 5), (5, 6), (6, 11)):
         far.set_arc(a, b, PoseGaussian(np.array([30.0, 0.0, 0.0]), TRAVELLED), closure=False)
     alone, both = refined(hybrid_map, scans), refined(far, scans, (0, 2, 10, 12))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from worlds import box, scan_in
 
-from hmt_slam_ros.configuration.metric_slam import Motion
+from hmt_slam_ros.configuration.metric_slam import MotionParameters
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.sensors.motion_model import increment_covariance
@@ -30,7 +30,7 @@ def test_a_laser_mounted_upside_down_turns_the_other_way():
 
 
 def test_the_covariance_of_an_increment_grows_with_the_way_and_has_a_floor():
-    motion = Motion()
+    motion = MotionParameters()
     still = increment_covariance(np.zeros(3), motion)
     near = increment_covariance(np.array([0.5, 0.0, 0.0]), motion)
     turned = increment_covariance(np.array([0.5, 0.0, 1.0]), motion)

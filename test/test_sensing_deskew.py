@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 from worlds import box, scan_in
 
-from hmt_slam_ros.configuration.robot import RealTimeLocalization
+from hmt_slam_ros.configuration.robot import RealTimeParameters
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.sensors import Odometry, Scan
-from hmt_slam_ros.sensors.deskew import SweepCheck, deskewed
+from hmt_slam_ros.sensors.deskew import SweepCheck, deskew_scan
 from hmt_slam_ros.sensors.odometry import OdometryBuffer
 
 ROOM = box(-3, -4, 5, 4)
 START = np.array([0.5, -0.3, 0.4])
-LIMITS = RealTimeLocalization()
+LIMITS = RealTimeParameters()
 MS = 1_000_000
 SWEEP = 0.1
 MOUNTINGS = {
@@ -43,7 +43,7 @@ def off_the_walls(points):
 def test_the_points_of_a_scan_on_the_move_lie_on_the_walls(mounting):
     scan, buffer = sweeping((1.0, 0.1, np.pi / 2), **MOUNTINGS[mounting])
     assert np.sign(scan.angle_increment) == (1.0 if mounting == "upright" else -1.0)
-    corrected = deskewed(scan, buffer, LIMITS)
+    corrected = deskew_scan(scan, buffer, LIMITS)
     assert off_the_walls(se2.transform(START, scan.points)).max() > 0.3
     assert off_the_walls(se2.transform(START, corrected.points)).max() < 1e-5
 
@@ -51,7 +51,7 @@ def test_the_points_of_a_scan_on_the_move_lie_on_the_walls(mounting):
 @pytest.mark.parametrize("mounting", MOUNTINGS)
 def test_every_beam_starts_where_the_laser_was(mounting):
     scan, buffer = sweeping((1.0, 0.1, np.pi / 2), **MOUNTINGS[mounting])
-    corrected = deskewed(scan, buffer, LIMITS)
+    corrected = deskew_scan(scan, buffer, LIMITS)
     np.testing.assert_array_equal(corrected.origins[0], scan.laser_pose[:2])
     end = se2.compose(se2.exp(SWEEP * np.array([1.0, 0.1, np.pi / 2])), scan.laser_pose)
     np.testing.assert_allclose(corrected.origins[-1], end[:2], atol=1e-9)
@@ -63,14 +63,14 @@ def test_beams_without_a_return_take_their_time_too():
     ranges = scan.ranges.copy()
     ranges[::3] = np.nan
     seen = np.isfinite(ranges)
-    corrected = deskewed(replace(scan, ranges=ranges), buffer, LIMITS)
-    np.testing.assert_array_equal(corrected.points, deskewed(scan, buffer, LIMITS).points[seen])
+    corrected = deskew_scan(replace(scan, ranges=ranges), buffer, LIMITS)
+    np.testing.assert_array_equal(corrected.points, deskew_scan(scan, buffer, LIMITS).points[seen])
 
 
 @pytest.mark.parametrize("increment", [0.0, SWEEP / 180])
 def test_a_scan_without_motion_is_unchanged_to_the_last_bit(increment):
     scan, buffer = sweeping((0.0, 0.0, 0.0), laser_pose=(0.2, -0.1, 0.3))
-    corrected = deskewed(replace(scan, time_increment=increment), buffer, LIMITS)
+    corrected = deskew_scan(replace(scan, time_increment=increment), buffer, LIMITS)
     assert corrected.points.tobytes() == scan.points.tobytes()
     assert corrected.beams.tobytes() == (scan.points - scan.laser_pose[:2]).tobytes()
 
@@ -78,12 +78,12 @@ def test_a_scan_without_motion_is_unchanged_to_the_last_bit(increment):
 def test_motion_without_time_changes_nothing():
     scan, buffer = sweeping((1.0, 0.1, np.pi / 2))
     instant = replace(scan, time_increment=0.0)
-    assert deskewed(instant, buffer, LIMITS) is instant
+    assert deskew_scan(instant, buffer, LIMITS) is instant
 
 
 def test_without_odometry_a_scan_stays_as_it_is():
     scan, _ = sweeping((1.0, 0.1, np.pi / 2))
-    np.testing.assert_array_equal(deskewed(scan, OdometryBuffer(), LIMITS).motion, 0.0)
+    np.testing.assert_array_equal(deskew_scan(scan, OdometryBuffer(), LIMITS).motion, 0.0)
 
 
 def test_a_reset_of_the_odometry_is_no_motion():
@@ -91,7 +91,7 @@ def test_a_reset_of_the_odometry_is_no_motion():
     buffer.add(Odometry(160 * MS, np.zeros(3)))
     buffer.add(Odometry(180 * MS, np.array([30.0, 0.0, 0.0])))
     late = replace(scan, stamp=100 * MS)
-    assert deskewed(late, buffer, LIMITS) is late
+    assert deskew_scan(late, buffer, LIMITS) is late
 
 
 def steady(*stamps):
@@ -135,15 +135,15 @@ def blank(stamp, increment, beams=101):
     ],
 )
 def test_an_impossible_time_increment_is_told_and_left_out(increment, sentence):
-    scan, fault = SweepCheck().checked(blank(7, increment))
+    scan, fault = SweepCheck().check(blank(7, increment))
     assert scan.time_increment == 0.0
-    assert scan.end == 7
+    assert scan.end_stamp == 7
     assert sentence in fault
 
 
 def test_a_sweep_longer_than_the_time_between_scans_is_told_once_that_time_is_known():
     check = SweepCheck()
-    verdicts = [check.checked(blank(50 * k * MS, 0.001)) for k in range(10)]
+    verdicts = [check.check(blank(50 * k * MS, 0.001)) for k in range(10)]
     assert [fault is None for _, fault in verdicts] == [True] * 5 + [False] * 5
     assert [scan.time_increment > 0.0 for scan, _ in verdicts] == [True] * 5 + [False] * 5
     assert "101 beams would take 0.100 s, longer than the 0.050 s from one scan to the next" in verdicts[-1][1]
@@ -152,4 +152,4 @@ def test_a_sweep_longer_than_the_time_between_scans_is_told_once_that_time_is_kn
 def test_a_stamp_that_jitters_makes_no_sweep_too_long():
     check, random = SweepCheck(), np.random.default_rng(0)
     stamps = [round((100 * k + random.uniform(-20, 20)) * MS) for k in range(200)]
-    assert [fault for stamp in stamps if (fault := check.checked(blank(stamp, 0.00099))[1])] == []
+    assert [fault for stamp in stamps if (fault := check.check(blank(stamp, 0.00099))[1])] == []

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from hmt_slam_ros.configuration.metric_slam import Motion
+from hmt_slam_ros.configuration.metric_slam import MotionParameters
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.sensors import Odometry
-from hmt_slam_ros.sensors.motion_model import Inertia, MotionModel, OdometryNoise, Step, increment_covariance
+from hmt_slam_ros.sensors.motion_model import Inertia, MotionModel, OdometryNoise, RelativeMotion, increment_covariance
 from hmt_slam_ros.sensors.odometry import OdometryBuffer
 
 SECOND = 10**9
@@ -18,7 +18,7 @@ def test_odometry_is_interpolated_along_the_arc():
     buffer = OdometryBuffer()
     buffer.add(Odometry(0, np.zeros(3)))
     buffer.add(Odometry(SECOND, np.array([1.0, 1.0, np.pi / 2])))
-    pose, gap = buffer.at(SECOND // 2)
+    pose, gap = buffer.pose_at(SECOND // 2)
     np.testing.assert_allclose(pose, [np.sin(np.pi / 4), 1 - np.cos(np.pi / 4), np.pi / 4], atol=1e-12)
     # Speeding up and braking with 1 m/s^2 for half a second each, the robot would be off by this much half way.
     assert gap == pytest.approx(0.125)
@@ -26,12 +26,12 @@ def test_odometry_is_interpolated_along_the_arc():
 
 def test_odometry_is_unknown_before_the_first_reading_and_after_the_last():
     buffer = OdometryBuffer()
-    assert buffer.at(5) is None
+    assert buffer.pose_at(5) is None
     assert not buffer.covers(5)
     buffer.add(Odometry(10, np.array([1.0, 0.0, 0.0])))
-    assert buffer.at(5) is None
-    assert buffer.at(15) is None
-    pose, gap = buffer.at(10)
+    assert buffer.pose_at(5) is None
+    assert buffer.pose_at(15) is None
+    pose, gap = buffer.pose_at(10)
     np.testing.assert_array_equal(pose, [1.0, 0.0, 0.0])
     assert gap == 0.0
     assert buffer.covers(10)
@@ -43,7 +43,7 @@ def test_odometry_whose_stamps_jump_back_starts_anew():
     buffer.add(Odometry(1000, np.array([5.0, 0.0, 0.0])))
     buffer.add(Odometry(10, np.zeros(3)))
     buffer.add(Odometry(20, np.array([1.0, 0.0, 0.0])))
-    np.testing.assert_allclose(buffer.at(15)[0], [0.5, 0.0, 0.0])
+    np.testing.assert_allclose(buffer.pose_at(15)[0], [0.5, 0.0, 0.0])
 
 
 def driven(inertia, velocity, times):
@@ -62,7 +62,7 @@ def deviations(step, truth):
 
 
 def test_a_steady_velocity_is_learnt():
-    prediction, truth = driven(Inertia(Motion()), TURNING, 0.2 * np.arange(20))
+    prediction, truth = driven(Inertia(MotionParameters()), TURNING, 0.2 * np.arange(20))
     np.testing.assert_allclose(prediction.increment, truth, atol=0.01)
     assert deviations(prediction, truth) < 0.3
     assert np.sqrt(np.diag(prediction.covariance))[0] < 0.05
@@ -71,7 +71,7 @@ def test_a_steady_velocity_is_learnt():
 def test_scans_whose_stamps_come_in_bursts_are_predicted_as_evenly_taken_within_the_deviation():
     times = 0.2 * np.arange(60)
     bursts = 0.8 * np.ceil(times / 0.8) + 1e-5 * np.arange(60)
-    inertia = Inertia(Motion(acceleration=0.5))
+    inertia = Inertia(MotionParameters(acceleration=0.5))
     for k in range(1, 60):
         step = inertia.predict(bursts[k] - bursts[k - 1])
         truth = se2.exp(0.2 * TURNING)
@@ -82,7 +82,7 @@ def test_scans_whose_stamps_come_in_bursts_are_predicted_as_evenly_taken_within_
 
 
 def test_where_scans_do_not_show_the_motion_the_velocity_becomes_uncertain():
-    inertia = Inertia(Motion())
+    inertia = Inertia(MotionParameters())
     driven(inertia, np.array([0.5, 0.0, 0.0]), 0.2 * np.arange(20))
     spreads = []
     for _ in range(10):
@@ -96,7 +96,7 @@ def test_where_scans_do_not_show_the_motion_the_velocity_becomes_uncertain():
 
 
 def test_a_jump_says_nothing_of_the_velocity_and_a_velocity_that_lasts_is_learnt_at_once():
-    inertia = Inertia(Motion())
+    inertia = Inertia(MotionParameters())
     driven(inertia, np.array([0.3, 0.0, 0.0]), 0.2 * np.arange(20))
     inertia.predict(0.2)
     inertia.observe(se2.exp([0.3, -0.9, -1.0]), SHARP)
@@ -109,7 +109,7 @@ def test_a_jump_says_nothing_of_the_velocity_and_a_velocity_that_lasts_is_learnt
 
 
 def test_after_a_long_pause_the_robot_is_not_believed_to_have_turned_on_and_on():
-    inertia = Inertia(Motion())
+    inertia = Inertia(MotionParameters())
     driven(inertia, np.array([0.0, 0.0, np.radians(-60.0)]), 0.2 * np.arange(20))
     step = inertia.predict(6.0)
     assert np.degrees(step.increment[2]) > -65.0
@@ -119,13 +119,13 @@ def test_after_a_long_pause_the_robot_is_not_believed_to_have_turned_on_and_on()
 def learnt(factor, steps=400, slips=()):
     """The noise learnt from odometry with ``factor`` times the model's noise; at ``slips`` 20 degrees on top."""
     random = np.random.default_rng(0)
-    noise, motion = OdometryNoise(), Motion()
+    noise, motion = OdometryNoise(), MotionParameters()
     increment = np.array([0.5, 0.0, 0.1])
     covariance = increment_covariance(increment, motion)
     for k in range(steps):
         error = factor * np.sqrt(np.diag(covariance)) * random.standard_normal(3)
         error[2] += np.radians(20.0) * (k in slips)
-        noise.learn(Step(se2.compose(increment, se2.exp(error)), covariance), increment, SHARP)
+        noise.learn(RelativeMotion(se2.compose(increment, se2.exp(error)), covariance), increment, SHARP)
     return noise
 
 
@@ -136,14 +136,17 @@ def test_the_noise_of_odometry_is_learnt(factor):
 
 def test_odometry_better_than_its_model_is_taken_as_the_model_says():
     np.testing.assert_array_equal(learnt(0.3).factors, 1.0)
-    step, inertia = Step(TURNING, np.diag([1.0, 2.0, 3.0])), Step(np.zeros(3), 1e-6 * np.eye(3))
-    for said in (learnt(0.3).scaled(step), learnt(0.3).together(step, inertia)):
+    step, inertia = RelativeMotion(TURNING, np.diag([1.0, 2.0, 3.0])), RelativeMotion(np.zeros(3), 1e-6 * np.eye(3))
+    for said in (learnt(0.3).scale(step), learnt(0.3).together(step, inertia)):
         np.testing.assert_array_equal(said.increment, step.increment)
         np.testing.assert_array_equal(said.covariance, step.covariance)
 
 
 def test_inertia_reduces_noise_beyond_twice_the_models_and_no_more():
-    step, inertia = Step(np.array([0.1, 0.0, 0.0]), 1e-4 * np.eye(3)), Step(np.zeros(3), 1e-12 * np.eye(3))
+    step, inertia = (
+        RelativeMotion(np.array([0.1, 0.0, 0.0]), 1e-4 * np.eye(3)),
+        RelativeMotion(np.zeros(3), 1e-12 * np.eye(3)),
+    )
     both = learnt(4.0).together(step, inertia)
     np.testing.assert_allclose(both.increment, 0.0, atol=1e-3)
     np.testing.assert_allclose(both.covariance, 4.0 * step.covariance, rtol=1e-3, atol=1e-9)
@@ -159,13 +162,13 @@ def test_what_scans_do_not_show_says_nothing_of_the_noise():
     covariance = np.diag([0.01, 0.01, 0.001])
     for _ in range(100):
         # Matched where odometry predicts, along the corridor; twice the deviation off, across.
-        odometry = Step(np.array([0.5, 0.0, 0.0]), covariance)
+        odometry = RelativeMotion(np.array([0.5, 0.0, 0.0]), covariance)
         noise.learn(odometry, np.array([0.5, 0.2, 0.0]), np.diag([0.0, 1e6, 1e6]))
     assert noise.factors[0] == pytest.approx(2.0, rel=0.05)
 
 
 def test_odometry_predicts_where_readings_enclose_both_scans_and_inertia_elsewhere():
-    model = MotionModel(Motion())
+    model = MotionModel(MotionParameters())
     for k in (0, 1, 2, 6, 7):
         model.odometry.add(Odometry(k * SECOND // 10, np.array([0.05 * k, 0.0, 0.0])))
     said = [model.predict(k * SECOND // 10).odometry for k in range(10)]
@@ -178,7 +181,7 @@ def test_odometry_predicts_where_readings_enclose_both_scans_and_inertia_elsewhe
 
 
 def test_where_odometry_is_silent_its_pose_is_carried_on_by_the_match():
-    model = MotionModel(Motion())
+    model = MotionModel(MotionParameters())
     model.odometry.add(Odometry(0, np.array([3.0, 0.0, 0.0])))
     for k in range(4):
         model.predict(k * SECOND // 10)
@@ -188,24 +191,24 @@ def test_where_odometry_is_silent_its_pose_is_carried_on_by_the_match():
 
 def test_noisy_odometry_and_inertia_together_tell_the_motion_better_where_no_scan_does():
     random = np.random.default_rng(0)
-    model, truth, noise = MotionModel(Motion()), se2.exp(0.1 * TURNING), np.array([0.06, 0.06, 0.06])
+    model, truth, noise = MotionModel(MotionParameters()), se2.exp(0.1 * TURNING), np.array([0.06, 0.06, 0.06])
     readings = [np.zeros(3)]
     for _ in range(400):
         readings.append(se2.compose(readings[-1], se2.compose(truth, se2.exp(noise * random.standard_normal(3)))))
     off = []
     for k, reading in enumerate(readings):
         model.odometry.add(Odometry(k * SECOND // 10, reading))
-        step = model.predict(k * SECOND // 10).together
+        step = model.predict(k * SECOND // 10).fused
         model.observe(step.increment, np.zeros((3, 3)))
         # Scans show as much at keyframes, so that the noise is known.
-        model.keyframe(truth, SHARP)
+        model.observe_keyframe(truth, SHARP)
         off.append(se2.log(se2.between(truth, step.increment)))
     late = np.array(off[200:])
     assert (np.sqrt((late**2).mean(axis=0)) < 0.6 * noise).all()
 
 
 def test_odometry_that_the_scans_contradict_says_nothing_of_the_velocity():
-    models = [MotionModel(Motion()), MotionModel(Motion())]
+    models = [MotionModel(MotionParameters()), MotionModel(MotionParameters())]
     for k in range(20):
         for model in models:
             model.odometry.add(Odometry(k * SECOND // 10, np.array([0.1 * k, 0.0, 0.0])))
@@ -217,7 +220,10 @@ def test_odometry_that_the_scans_contradict_says_nothing_of_the_velocity():
 
 
 def test_two_sources_tell_of_one_motion():
-    narrow, wide = Step(np.array([0.1, 0.0, 0.1]), 1e-4 * np.eye(3)), Step(np.zeros(3), 3e-4 * np.eye(3))
-    for both in (narrow.and_also(wide), wide.and_also(narrow)):
+    narrow, wide = (
+        RelativeMotion(np.array([0.1, 0.0, 0.1]), 1e-4 * np.eye(3)),
+        RelativeMotion(np.zeros(3), 3e-4 * np.eye(3)),
+    )
+    for both in (narrow.fuse(wide), wide.fuse(narrow)):
         np.testing.assert_allclose(both.increment, [0.075, 0.0, 0.075], atol=2e-3)
         np.testing.assert_allclose(both.covariance, 0.75e-4 * np.eye(3), atol=1e-12)

@@ -5,7 +5,7 @@ import pytest
 from worlds import box, scan_in
 
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.sensors.surfels import moved, surfels
+from hmt_slam_ros.sensors.surfels import extract_surfels, transform_surfels
 
 REACH = 8.0
 CORRIDOR = np.array([[-100.0, -1.1, 100.0, -1.1], [-100.0, 1.1, 100.0, 1.1]])
@@ -16,7 +16,9 @@ def seen(walls, pose, stride=1, **settings):
     """Surfels in the world, of beams up to the reach."""
     scan = scan_in(walls, pose, **settings)
     near = np.hypot(*scan.points.T) < REACH
-    return moved(np.asarray(pose, dtype=float), surfels(scan.points[near], scan.origins[near], stride))
+    return transform_surfels(
+        np.asarray(pose, dtype=float), extract_surfels(scan.points[near], scan.origins[near], stride)
+    )
 
 
 def flat(found):
@@ -45,9 +47,9 @@ def test_the_error_of_a_point_is_not_that_of_its_normal():
     scan = scan_in(CORRIDOR, (0.0, 0.2, 0.05), beams=361, noise=0.01)
     near = np.hypot(*scan.points.T) < REACH
     points, origins = scan.points[near], scan.origins[near]
-    before = surfels(points, origins)
+    before = extract_surfels(points, origins)
     points[100] *= 1.0001
-    after = surfels(points, origins)
+    after = extract_surfels(points, origins)
     np.testing.assert_array_equal(after[100, 2:], before[100, 2:])
     assert (after[:, 2:] != before[:, 2:]).any()
 
@@ -93,13 +95,13 @@ def test_thinning_leaves_the_normals_as_they_are():
 @pytest.mark.parametrize("count", [0, 1, 2])
 def test_few_points_have_no_normals(count):
     points = np.array([[1.0, 0.0], [1.0, 0.01]])[:count]
-    found = surfels(points, np.zeros((count, 2)))
+    found = extract_surfels(points, np.zeros((count, 2)))
     assert found.shape == (count, 4)
     np.testing.assert_array_equal(found[:, 2:], 0.0)
 
 
 def test_moved_surfels_turn_with_the_frame():
     found = seen(ROOM, (0.0, 0.0, 0.0))
-    there = moved(np.array([1.0, 2.0, np.pi / 2]), found)
+    there = transform_surfels(np.array([1.0, 2.0, np.pi / 2]), found)
     np.testing.assert_allclose(there[:, :2], se2.transform((1.0, 2.0, np.pi / 2), found[:, :2]))
     np.testing.assert_allclose(there[:, 2:], np.stack((-found[:, 3], found[:, 2]), axis=1), atol=1e-12)

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from hmt_slam_ros.configuration.metric_slam import Motion
+from hmt_slam_ros.configuration.metric_slam import MotionParameters
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.sensors.motion_model import NO_STEP, Step, increment_covariance
+from hmt_slam_ros.sensors.motion_model import NO_MOTION, RelativeMotion, increment_covariance
 from hmt_slam_ros.simulation import FAMILIES, open_simulated
-from hmt_slam_ros.simulation.building import Building, boxes, outline_of_rectangles
-from hmt_slam_ros.simulation.laser import cast, clear_between, clearance
+from hmt_slam_ros.simulation.building import Building, furniture_walls, outline_of_rectangles
+from hmt_slam_ros.simulation.laser import cast_rays, clearance, has_line_of_sight
 from hmt_slam_ros.simulation.scenario import Scenario
 from hmt_slam_ros.simulation.settings import Settings
 
@@ -25,7 +25,7 @@ def scenario_of(family, seed=0, **settings):
 def view(scenario, pose, reach):
     """What a laser that sees all round would see of the walls from a pose, shape (720,), m."""
     origins = np.tile(np.asarray(pose)[:2], (ALL_AROUND.size, 1))
-    return cast(scenario.walls, origins, ALL_AROUND + pose[2], reach)
+    return cast_rays(scenario.walls, origins, ALL_AROUND + pose[2], reach)
 
 
 def closed_corners(walls):
@@ -41,11 +41,11 @@ def test_the_robot_keeps_its_radius_from_everything_and_never_crosses_a_wall(fam
     scenario = scenario_of(family, seed)
     points = scenario.drive.poses(np.arange(0.0, scenario.drive.duration, 0.02))[:, :2].copy()
     assert clearance(scenario.building.walls, points).min() > scenario.settings.radius
-    assert clear_between(scenario.walls, points[:-1], points[1:]).all()
+    assert has_line_of_sight(scenario.walls, points[:-1], points[1:]).all()
     for stamp in scenario.scan_stamps[::50]:
         now = scenario.true_poses(np.array([stamp]))[:, :2]
         if len(scenario.building.furniture):
-            assert clearance(boxes(scenario.furniture(stamp)), now).min() > scenario.settings.radius
+            assert clearance(furniture_walls(scenario.furniture(stamp)), now).min() > scenario.settings.radius
 
 
 @pytest.mark.parametrize("family", FAMILIES)
@@ -107,7 +107,7 @@ def se2_frame(origin, heading, scenario):
     for turn in (0.0, 0.5 * np.pi, np.pi, -0.5 * np.pi):
         frame = np.array([*origin, heading + turn])
         ahead = se2.transform(frame, np.array([[4.0, 0.0], [0.0, 4.0]]))
-        if clear_between(scenario.walls, np.tile(origin, (2, 1)), ahead).all():
+        if has_line_of_sight(scenario.walls, np.tile(origin, (2, 1)), ahead).all():
             return frame
     raise AssertionError("no crossing there")
 
@@ -162,9 +162,9 @@ def test_after_the_tour_of_the_hall_odometry_cannot_tell_the_twins_apart(seed):
     edges = np.flatnonzero(np.diff(np.pad(blind.astype(int), 1)))
     begin, end = max(edges.reshape(-1, 2).tolist(), key=lambda stretch: stretch[1] - stretch[0])
     odometry = scenario.odometry[:: scenario.settings.readings][begin - 1 : end + 1]
-    total = NO_STEP
+    total = NO_MOTION
     for motion in se2.between(odometry[:-1], odometry[1:]):
-        total = total.then(Step(motion, increment_covariance(motion, Motion())))
+        total = total.compose(RelativeMotion(motion, increment_covariance(motion, MotionParameters())))
     pose = scenario.true_poses(scenario.scan_stamps[end : end + 1])[0]
     apart = se2.transform(se2.inverse([0.0, 0.0, pose[2]]), (second - first)[None, :2])[0]
     assert np.hypot(*apart) == pytest.approx(9.0)

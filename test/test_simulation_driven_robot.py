@@ -7,17 +7,17 @@ import pytest
 
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.random_streams import Purpose, stream
+from hmt_slam_ros.random_streams import Purpose, random_stream
 from hmt_slam_ros.simulation import open_simulated
-from hmt_slam_ros.simulation.building import Building, boxes
+from hmt_slam_ros.simulation.building import Building, furniture_walls
 from hmt_slam_ros.simulation.driven_robot import DrivenLog, DrivenRobot
 from hmt_slam_ros.simulation.laser import clearance
-from hmt_slam_ros.simulation.people import People, Walkers
+from hmt_slam_ros.simulation.people import People, ReactivePeople
 from hmt_slam_ros.simulation.scenario import START, Scenario
 from hmt_slam_ros.simulation.settings import Settings
-from hmt_slam_ros.simulation.wheels import chained, noisy_increments
+from hmt_slam_ros.simulation.wheels import integrate_increments, noisy_increments
 
-ROOM = boxes(np.array([[0.0, 0.0, 0.0, 12.0, 8.0]]))
+ROOM = furniture_walls(np.array([[0.0, 0.0, 0.0, 12.0, 8.0]]))
 ROUTE = np.array([[-4.0, 0.0], [4.0, 0.0]])
 
 
@@ -27,7 +27,7 @@ def robot_in(building=None, start=None, **settings):
 
 def drive(robot, speed, turn_rate, readings):
     for _ in range(readings):
-        robot.command(speed, turn_rate)
+        robot.set_velocity(speed, turn_rate)
         robot.drive()
 
 
@@ -53,7 +53,7 @@ def test_it_follows_an_exact_arc_once_it_is_as_fast_as_told():
 
 def test_accelerations_and_speeds_are_limited():
     robot = robot_in(speed=0.5, turn_rate=30.0)
-    robot.command(3.0, -9.0)
+    robot.set_velocity(3.0, -9.0)
     robot.drive()
     assert robot.velocity == pytest.approx((0.05, -math.radians(9.0)))
     drive(robot, 3.0, -9.0, 30)
@@ -66,7 +66,7 @@ def test_without_a_command_it_stands_still():
     robot = robot_in()
     robot.drive()
     assert robot.travelled == 0.0
-    robot.command(0.2, 0.0)
+    robot.set_velocity(0.2, 0.0)
     for _ in range(5):
         robot.drive()
     assert robot.velocity[0] == pytest.approx(0.2)
@@ -124,7 +124,7 @@ def test_people_walk_wait_before_the_robot_and_turn_back_and_are_not_passed_thro
     nearest, walked = math.inf, np.zeros(8)
     for _ in range(300):
         before = robot.people
-        robot.command(0.6 if robot.contacts % 2 == 0 else -0.6, 0.0)
+        robot.set_velocity(0.6 if robot.contacts % 2 == 0 else -0.6, 0.0)
         robot.drive()
         steps = np.hypot(*(robot.people - before)[:, :2].T)
         # Where the robot's route turns back, its left side is another.
@@ -143,11 +143,11 @@ def test_who_cannot_turn_back_for_long_squeezes_past_a_robot_that_stands():
     # A walk of 2 m to and fro, and in its middle 0.8 m from the end a robot that wants nothing but to stand there.
     drive_ = robot_in(people=1, seed=2).scenario.people.drive
     people = People(drive_, *np.array([[0.0], [2.0], [1.0], [0.0], [0.0]]))
-    robot = np.append(people.places(np.array([1.2]))[0], 0.0)
-    walkers, passed = Walkers(people), []
+    robot = np.append(people.positions(np.array([1.2]))[0], 0.0)
+    walkers, passed = ReactivePeople(people), []
     for _ in range(1000):
         walkers.walk(0.05, robot)
-        passed.append(np.hypot(*(walkers.discs[0, :2] - people.places(np.array([2.0]))[0])))
+        passed.append(np.hypot(*(walkers.discs[0, :2] - people.positions(np.array([2.0]))[0])))
     assert min(passed) < 0.3
     assert max(passed) > 1.7
 
@@ -173,10 +173,10 @@ def test_odometry_at_scans_is_the_scripted_drives_model_of_the_same_draws(readin
             wheels.append(reading.pose)
         if k % 7 == 0:
             turn = turns.uniform(-0.7, 0.7)
-        robot.command(0.4, turn)
+        robot.set_velocity(0.4, turn)
         robot.drive()
     true = se2.between(np.array(poses[:-1]), np.array(poses[1:]))
-    expected = chained(noisy_increments(true, 1.0, stream(4, Purpose.WHEELS, 0)))
+    expected = integrate_increments(noisy_increments(true, 1.0, random_stream(4, Purpose.WHEELS, 0)))
     np.testing.assert_allclose(np.array(wheels), expected, atol=1e-12)
 
 
@@ -185,7 +185,7 @@ def test_odometry_between_scans_grows_evenly_on_an_even_way():
     drive(robot, 0.5, 0.0, 40)
     start, wheels, errors = robot.pose, robot.measure()[0].pose, []
     for _ in range(4):
-        robot.command(0.5, 0.0)
+        robot.set_velocity(0.5, 0.0)
         robot.drive()
         measured = se2.between(wheels, robot.measure()[0].pose)
         errors.append(se2.log(se2.between(se2.between(start, robot.pose), measured)))
@@ -235,11 +235,11 @@ def test_as_a_log_it_goes_on_until_its_end():
     records = []
     for record in log.records():
         records.append(record)
-        robot.command(0.3, 0.0)
+        robot.set_velocity(0.3, 0.0)
     assert log.scan_count == 11 == sum(hasattr(record.measurement, "ranges") for record in records)
     assert len(records) == 11 + 21
     assert records[-1].measurement.stamp == START + 2_000_000_000
-    np.testing.assert_array_equal(records[-1].truth, robot.pose)
+    np.testing.assert_array_equal(records[-1].true_pose, robot.pose)
     assert robot.pose[0] > -4.0 + 0.3
     assert DrivenLog("room", robot).scan_count == 0
 

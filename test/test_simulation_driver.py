@@ -21,13 +21,13 @@ def test_the_way_begins_and_ends_at_its_way_points_and_goes_on_without_a_jump():
     path = path_through(CORNERS, 0.5)
     assert path.starts[0] == pytest.approx([0.0, 0.0, 0.0])
     assert end_of(path) == pytest.approx([2.0, 5.2, 0.5 * np.pi])
-    ends = path.pose(np.arange(len(path.lengths)), path.sizes)
+    ends = path.poses_at(np.arange(len(path.lengths)), path.sizes)
     np.testing.assert_allclose(se2.between(ends[:-1], path.starts[1:]), 0.0, atol=1e-12)
 
 
 def test_corners_are_rounded_by_arcs_of_the_radius_asked_for_or_smaller_where_there_is_no_room():
     path = path_through(CORNERS, 0.5)
-    arcs = ~path.on_the_spot & (path.turns != 0.0)
+    arcs = ~path.is_turn_in_place & (path.turns != 0.0)
     radii = path.lengths[arcs] / np.abs(path.turns[arcs])
     assert radii[0] == pytest.approx(0.5)
     assert (radii <= 0.5 + 1e-12).all()
@@ -36,7 +36,7 @@ def test_corners_are_rounded_by_arcs_of_the_radius_asked_for_or_smaller_where_th
 
 def test_where_the_way_turns_back_the_robot_turns_on_the_spot():
     path = path_through(CORNERS, 0.5)
-    (spot,) = np.flatnonzero(path.on_the_spot)
+    (spot,) = np.flatnonzero(path.is_turn_in_place)
     assert path.starts[spot, :2] == pytest.approx([9.0, 8.0])
     assert abs(path.turns[spot]) == pytest.approx(np.pi)
 

@@ -6,7 +6,7 @@ import pytest
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.simulation import open_simulated
 from hmt_slam_ros.simulation.building import Building
-from hmt_slam_ros.simulation.laser import cast, clear_between
+from hmt_slam_ros.simulation.laser import cast_rays, has_line_of_sight
 
 SEEDS = range(6)
 
@@ -18,7 +18,7 @@ def scenario_of(seed=0, **settings):
 
 def ahead(scenario, poses, reach=30.0):
     """How far it is to the next wall ahead of poses (n, 3), m."""
-    return cast(scenario.walls, np.ascontiguousarray(poses[:, :2]), np.ascontiguousarray(poses[:, 2]), reach)
+    return cast_rays(scenario.walls, np.ascontiguousarray(poses[:, :2]), np.ascontiguousarray(poses[:, 2]), reach)
 
 
 def open_doors(scenario):
@@ -119,7 +119,7 @@ def test_states_move_with_their_building():
     states = scenario_of(1).building.states
     walls = np.array([[0.0, 0.0, 1.0, 0.0]])
     pose = np.array([3.0, -2.0, 0.7])
-    placed = Building(walls, np.zeros((2, 2)), states=states).placed(pose).states
+    placed = Building(walls, np.zeros((2, 2)), states=states).transform(pose).states
     np.testing.assert_allclose(placed.openings, se2.compose(pose, states.openings))
     assert len(Building(walls, np.zeros((2, 2))).states.poses) == 0
 
@@ -129,4 +129,4 @@ def test_doors_of_rooms_are_free_to_walk_through():
     states = scenario.building.states
     doors = ~states.crossings
     inside = se2.compose(states.openings[doors], np.array([1.0, 0.0, 0.0]))
-    assert clear_between(scenario.walls, states.poses[doors, :2].copy(), inside[:, :2].copy()).all()
+    assert has_line_of_sight(scenario.walls, states.poses[doors, :2].copy(), inside[:, :2].copy()).all()

@@ -12,7 +12,7 @@ from rosbags.rosbag2 import Reader
 from test_logs_convert import assert_same_log
 
 from hmt_slam_ros.errors import HmtSlamError
-from hmt_slam_ros.evaluation import odometry_of, read_tum, true_relations, truth_of
+from hmt_slam_ros.evaluation import read_odometry_poses, read_true_poses, read_tum, true_relations
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.logs.ros_types import deserialize
 from hmt_slam_ros.logs.writer import write_bag
@@ -31,7 +31,7 @@ def content(log, count=400):
     for _, record in zip(range(count), log.records(), strict=False):
         measurement = record.measurement
         values = measurement.ranges if isinstance(measurement, Scan) else measurement.pose
-        parts.append((record.source_stamp, measurement.stamp, values.tobytes(), record.truth.tobytes()))
+        parts.append((record.source_stamp, measurement.stamp, values.tobytes(), record.true_pose.tobytes()))
     return parts
 
 
@@ -97,20 +97,20 @@ def test_a_bag_of_a_simulated_log_is_the_same_log_and_knows_the_truth(tmp_path, 
     bag = open_log(tmp_path / "bag")
     assert_same_log(log, bag)
     for one, other in zip(log.records(), bag.records(), strict=True):
-        np.testing.assert_allclose(one.truth, other.truth, rtol=0.0, atol=1e-14)
+        np.testing.assert_allclose(one.true_pose, other.true_pose, rtol=0.0, atol=1e-14)
 
 
 def test_a_bag_of_a_real_robot_knows_no_truth():
     log = open_log(MALAGA)
-    assert all(record.truth is None for record in log.records())
+    assert all(record.true_pose is None for record in log.records())
     with pytest.raises(HmtSlamError, match="does not tell the truth"):
-        truth_of(log)
+        read_true_poses(log)
 
 
 def test_truth_is_told_of_any_time_and_of_places():
     log = open_log("sim:ring,odometry=0,seed=2")
     assert isinstance(log, SimulatedLog)
-    truth, odometry = truth_of(log), odometry_of(log)
+    truth, odometry = read_true_poses(log), read_odometry_poses(log)
     np.testing.assert_allclose(log.true_poses(truth.stamps), truth.poses, atol=1e-12)
     moved = se2.between(truth.poses[0], truth.poses)
     np.testing.assert_allclose(moved, odometry.poses[:: log.scenario.settings.readings], atol=1e-9)
@@ -125,7 +125,7 @@ def test_truth_is_told_of_any_time_and_of_places():
 
 
 def test_true_relations_reach_to_the_next_metre_the_tenth_and_the_lap_before():
-    truth = truth_of(open_log("sim:ring,seed=1"))
+    truth = read_true_poses(open_log("sim:ring,seed=1"))
     relations = true_relations(truth)
     long = np.abs(relations.ends - relations.starts) > 60_000_000_000
     # Two laps of 55 m: all of the second is near the first.
@@ -234,8 +234,8 @@ def test_simulate_writes_bag_and_truth_and_evaluate_takes_either(tmp_path):
     assert "sim:ring,laps=1,seed=3" in said
     log = open_log("sim:ring,laps=1,seed=3", duration=20.0)
     truth = read_tum(tmp_path / "bag" / "ground_truth.tum")
-    assert np.array_equal(truth.stamps, truth_of(log).stamps)
-    np.testing.assert_allclose(truth.poses, truth_of(open_log(tmp_path / "bag")).poses, atol=1e-8)
+    assert np.array_equal(truth.stamps, read_true_poses(log).stamps)
+    np.testing.assert_allclose(truth.poses, read_true_poses(open_log(tmp_path / "bag")).poses, atol=1e-8)
     (tmp_path / "trajectory.tum").write_text((tmp_path / "bag" / "ground_truth.tum").read_text())
     for source in (tmp_path / "bag", "sim:ring,laps=1,seed=3"):
         table = subprocess.run(

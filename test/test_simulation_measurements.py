@@ -7,12 +7,12 @@ import pytest
 
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.simulation import open_simulated
-from hmt_slam_ros.simulation.building import Building, boxes
-from hmt_slam_ros.simulation.laser import clear_between
+from hmt_slam_ros.simulation.building import Building, furniture_walls
+from hmt_slam_ros.simulation.laser import has_line_of_sight
 from hmt_slam_ros.simulation.scenario import Scenario
 from hmt_slam_ros.simulation.settings import Settings
 
-ROOM = boxes(np.array([[0.0, 0.0, 0.0, 12.0, 8.0]]))
+ROOM = furniture_walls(np.array([[0.0, 0.0, 0.0, 12.0, 8.0]]))
 ROUTE = np.array([[-4.0, 0.0], [4.0, 0.0]])
 
 
@@ -108,7 +108,7 @@ def test_furniture_is_moved_only_while_the_robot_does_not_see_it_and_is_seen_els
         eye = scenario.true_poses(stamps[k : k + 1])[0, :2]
         for middle in np.concatenate((standing[k - 1][pieces, :2], standing[k][pieces, :2])):
             near = np.hypot(*(middle - eye)) < scenario.settings.range
-            assert not (near and clear_between(scenario.walls, eye[None], middle[None])[0])
+            assert not (near and has_line_of_sight(scenario.walls, eye[None], middle[None])[0])
 
 
 def test_where_nothing_is_moved_the_furniture_stays():

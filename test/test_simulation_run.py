@@ -6,8 +6,8 @@ import sys
 import numpy as np
 import pytest
 
-from hmt_slam_ros.configuration.metric_slam import Motion
-from hmt_slam_ros.evaluation import evaluate_relations, read_tum, true_relations, truth_of
+from hmt_slam_ros.configuration.metric_slam import MotionParameters
+from hmt_slam_ros.evaluation import evaluate_relations, read_true_poses, read_tum, true_relations
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.open_log import open_log
 from hmt_slam_ros.sensors import Odometry, Scan
@@ -33,7 +33,7 @@ def test_a_small_loop_is_closed_and_mapped_to_two_centimetres(mapped):
     folder, said = mapped
     assert "0 dropped" in said
     assert "loop closures: 0" not in said
-    errors = evaluate_relations(read_tum(folder / "trajectory.tum"), true_relations(truth_of(open_log(LOG))))
+    errors = evaluate_relations(read_tum(folder / "trajectory.tum"), true_relations(read_true_poses(open_log(LOG))))
     assert errors.overall.missed == 0
     assert errors.over_60_s.count > 30
     for score in (errors.overall, errors.over_60_s):
@@ -50,7 +50,7 @@ def test_its_bag_makes_the_same_map_as_far_as_quaternions_are_exact(mapped, tmp_
 
 
 def test_a_motion_model_that_is_told_the_truth_finds_nothing_wrong_with_the_odometry():
-    model, last, factors = MotionModel(Motion()), None, []
+    model, last, factors = MotionModel(MotionParameters()), None, []
     certain = 1e8 * np.eye(3)
     for record in open_log("sim:nested,seed=1", duration=600.0).records():
         if isinstance(record.measurement, Odometry):
@@ -58,10 +58,10 @@ def test_a_motion_model_that_is_told_the_truth_finds_nothing_wrong_with_the_odom
             continue
         assert isinstance(record.measurement, Scan)
         model.predict(record.measurement.stamp)
-        moved = np.zeros(3) if last is None else se2.between(last, record.truth)
+        moved = np.zeros(3) if last is None else se2.between(last, record.true_pose)
         if last is None or np.hypot(*moved[:2]) > 0.5:
-            model.keyframe(moved, certain)
-            last = record.truth
+            model.observe_keyframe(moved, certain)
+            last = record.true_pose
             factors.append(model.noise.factors)
     # The factors are 1 at least, and their memory is of 20 keyframes.
     assert np.mean(factors, axis=0).max() < 1.15

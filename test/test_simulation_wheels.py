@@ -5,11 +5,11 @@ import math
 import numpy as np
 import pytest
 
-from hmt_slam_ros.configuration.metric_slam import Motion
+from hmt_slam_ros.configuration.metric_slam import MotionParameters
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.sensors.motion_model import NO_STEP, Step, increment_covariance
+from hmt_slam_ros.sensors.motion_model import NO_MOTION, RelativeMotion, increment_covariance
 from hmt_slam_ros.simulation import open_simulated
-from hmt_slam_ros.simulation.wheels import chained, noisy_increments, slips
+from hmt_slam_ros.simulation.wheels import draw_slips, integrate_increments, noisy_increments
 
 RUNS = 100
 # 95 % band of the mean over 100 runs of a chi-square with 3 degrees of freedom.
@@ -22,7 +22,7 @@ def nees(step, truth):
 
 
 def model_of(measured, factor=1.0):
-    return Step(measured, factor**2 * increment_covariance(measured, Motion()))
+    return RelativeMotion(measured, factor**2 * increment_covariance(measured, MotionParameters()))
 
 
 @pytest.mark.parametrize(
@@ -45,10 +45,10 @@ def test_dead_reckoning_over_many_seeds_is_as_wrong_as_the_filters_expect():
     true = np.tile([0.1, 0.0, 0.02], (30, 1))
     values = []
     for seed in range(RUNS):
-        total = NO_STEP
+        total = NO_MOTION
         for measured in noisy_increments(true, 1.0, np.random.default_rng(seed)):
-            total = total.then(model_of(measured))
-        values.append(nees(total, chained(true)[-1]))
+            total = total.compose(model_of(measured))
+        values.append(nees(total, integrate_increments(true)[-1]))
     assert LOW < np.mean(values) < HIGH
 
 
@@ -73,14 +73,14 @@ def test_without_noise_odometry_is_the_truth():
 
 def test_slips_come_as_often_and_are_as_large_as_asked_for():
     distances = np.full(100_000, 0.1)
-    errors = slips(distances, 0.2, 2.0, np.random.default_rng(0))
+    errors = draw_slips(distances, 0.2, 2.0, np.random.default_rng(0))
     moving = np.any(errors != 0.0, axis=1)
     # 200 slips of five scans each on 10 km; their number has a deviation of 14.
     assert moving.sum() == pytest.approx(1000, abs=200)
     assert errors[:, 1].max() == 0.0
     assert 5 * errors[moving].std(axis=0)[2] == pytest.approx(math.radians(15.0), rel=0.2)
     assert 5 * errors[moving].std(axis=0)[0] == pytest.approx(0.3, rel=0.2)
-    assert not slips(distances, 0.2, 0.0, np.random.default_rng(0)).any()
+    assert not draw_slips(distances, 0.2, 0.0, np.random.default_rng(0)).any()
 
 
 def test_a_log_with_slips_goes_astray_by_more_than_the_model_says():

@@ -44,7 +44,7 @@ def test_what_was_seen_since_decides_along_a_wall():
     alignment = AreaAlignment(with_changes(Configuration(), {"local_map.max_range": 5.0}))
     known, later = worlds.drive((0.0, 1.0), (12.0, 1.0)), worlds.drive((2.0, 1.2), (11.0, 1.2))
     loose = np.diag([1.5**2, 0.1**2, 0.02**2])
-    found = alignment.measured(placed(walls, known), placed(walls, later), claimed([1.3, 0.0, 0.0], loose)).mean
+    found = alignment.align(placed(walls, known), placed(walls, later), claimed([1.3, 0.0, 0.0], loose)).mean
     np.testing.assert_allclose(found[:2], 0.0, atol=0.05)
 
 
@@ -59,7 +59,7 @@ def test_along_a_corridor_the_closure_decides_and_across_it_the_walls():
     alignment = AreaAlignment(with_changes(Configuration(), {"local_map.max_range": 5.0}))
     known = worlds.drive((0.0, 1.0), (6.0, 1.0))
     joined = np.add(known[3:8], [0.23, 0.1, 0.1])
-    found = alignment.measured(placed(CORRIDOR, known, 720), placed(CORRIDOR, joined, 720), claimed([0.15, 0.1, 0.0]))
+    found = alignment.align(placed(CORRIDOR, known, 720), placed(CORRIDOR, joined, 720), claimed([0.15, 0.1, 0.0]))
     assert found.mean[1] == pytest.approx(0.0, abs=0.03)
     assert found.mean[0] == pytest.approx(0.15, abs=0.05)
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from worlds import box, scan_in
 
-from hmt_slam_ros.registration.likelihood_grid import GridModel, build_area_grid, thinned
+from hmt_slam_ros.registration.likelihood_grid import GridModel, build_area_grid, thin_points
 
 ROOM = box(0.0, 0.0, 6.0, 4.0)
 MODEL = GridModel()
@@ -12,7 +12,7 @@ MODEL = GridModel()
 
 def log_ratio_at(grid, x, y):
     column, row = np.floor((np.array([x, y]) - grid.origin) / (0.5 * grid.cell)).astype(int)
-    return grid.fine[row, column]
+    return grid.fine_log_ratio[row, column]
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +39,7 @@ def test_the_two_flanks_of_a_wall_are_alike_close_to_it(room):
 
 def test_the_coarse_grid_is_the_mean_of_the_fine_one(room):
     rows, columns = room.log_ratio.shape
-    assert np.allclose(room.log_ratio, room.fine.reshape(rows, 2, columns, 2).mean(axis=(1, 3)))
+    assert np.allclose(room.log_ratio, room.fine_log_ratio.reshape(rows, 2, columns, 2).mean(axis=(1, 3)))
 
 
 def test_points_beyond_the_range_are_not_used():
@@ -65,7 +65,7 @@ def test_poses_place_the_scans():
 
 def test_thinning_leaves_one_point_a_voxel():
     points = np.random.default_rng(1).uniform(-1.0, 1.0, (5000, 2))
-    few = thinned(points, 0.25)
+    few = thin_points(points, 0.25)
     assert len(few) == 64
     assert len({tuple(voxel) for voxel in np.floor(few / 0.25).astype(int)}) == 64
 
@@ -88,4 +88,4 @@ def test_a_surface_on_the_edge_of_what_beams_passed_contradicts_nothing_and_one_
     grid = build_area_grid([ahead], np.array([[0.0, 0.0, -np.pi / 4]]), GridModel())
     along = np.column_stack((np.arange(2.0, 7.0, 0.2), np.zeros(25)))
     for aside, free in ((-0.02, 0), (-0.08, 0), (-0.5, 25)):
-        assert grid.agreement(along + np.array([0.0, aside]), np.zeros(3)) == (25, 0, free)
+        assert grid.compare(along + np.array([0.0, aside]), np.zeros(3)) == (25, 0, free)

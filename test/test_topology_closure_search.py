@@ -25,7 +25,7 @@ def query(hybrid_map):
 
 
 def places_tried(search, hybrid_map, excluded):
-    return search.admission.divided(hybrid_map, HERE, query(hybrid_map), excluded)[2]
+    return search.gating.classify_areas(hybrid_map, HERE, query(hybrid_map), excluded)[2]
 
 
 def test_the_places_tried_are_spread_over_the_map_and_most_stay_the_same(lattice):

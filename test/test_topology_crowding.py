@@ -5,11 +5,11 @@ import math
 import numpy as np
 import pytest
 
-from hmt_slam_ros.configuration.metric_slam import Filter
+from hmt_slam_ros.configuration.metric_slam import FilterParameters
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.hybrid_map.keyframe_pruning import crowded, in_place, successor
+from hmt_slam_ros.hybrid_map.keyframe_pruning import is_same_viewpoint, nearest_replacement, redundant_keyframes
 
-SETTINGS = Filter(keyframe_distance=0.5, keyframe_angle=20.0)
+SETTINGS = FilterParameters(keyframe_distance=0.5, keyframe_angle=20.0)
 
 
 @pytest.mark.parametrize(
@@ -23,13 +23,13 @@ SETTINGS = Filter(keyframe_distance=0.5, keyframe_angle=20.0)
     ],
 )
 def test_a_place_is_what_metric_slam_takes_for_one(relative, same):
-    assert in_place(np.array(relative), SETTINGS) == same
+    assert is_same_viewpoint(np.array(relative), SETTINGS) == same
 
 
 def test_the_nearest_keyframe_stands_for_one_that_is_forgotten():
     gone = np.array([2.0, 1.0, 0.5])
     others = {7: np.array([2.1, 1.0, 1.5]), 4: np.array([2.0, 1.6, 0.5]), 9: np.array([9.0, 9.0, 0.5])}
-    held = successor(gone, others)
+    held = nearest_replacement(gone, others)
     assert held.keyframe == 4
     np.testing.assert_allclose(se2.compose(others[4], held.pose), gone, atol=1e-12)
 
@@ -41,26 +41,26 @@ def passes(count, spacing=0.5):
 
 def test_of_many_passes_as_many_keyframes_stay_as_a_place_may_hold():
     placed = passes(6)
-    gone = crowded(placed, [], 2, SETTINGS)
+    gone = redundant_keyframes(placed, [], 2, SETTINGS)
     left = sorted(placed.keys() - set(gone))
     assert left == [*range(20, 30)]
 
 
 def test_what_is_to_stay_does_and_others_go_instead():
-    gone = crowded(passes(3), [0, 1], 2, SETTINGS)
+    gone = redundant_keyframes(passes(3), [0, 1], 2, SETTINGS)
     assert sorted(gone) == [2, 3, 4, 5, 6]
 
 
 def test_where_no_place_is_too_full_nothing_goes():
-    assert crowded(passes(2), [], 2, SETTINGS) == []
-    assert crowded({}, [], 2, SETTINGS) == []
+    assert redundant_keyframes(passes(2), [], 2, SETTINGS) == []
+    assert redundant_keyframes({}, [], 2, SETTINGS) == []
 
 
 def test_the_one_that_is_in_one_place_with_most_others_goes_first():
     placed = {k: np.array([x, 0.0, 0.0]) for k, x in enumerate([0.0, 0.35, 0.7, 1.05])}
-    assert crowded(placed, [], 2, SETTINGS) == [1]
+    assert redundant_keyframes(placed, [], 2, SETTINGS) == [1]
 
 
 def test_other_headings_are_other_places():
     placed = {k: np.array([0.0, 0.0, math.radians(angle)]) for k, angle in enumerate(range(0, 360, 20))}
-    assert crowded(placed, [], 1, SETTINGS) == []
+    assert redundant_keyframes(placed, [], 1, SETTINGS) == []

@@ -8,14 +8,18 @@ import pytest
 
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.random_streams import Purpose, stream
-from hmt_slam_ros.topological_inference.hypothesis_tree import LeafNotes, relative_covariance, settle
+from hmt_slam_ros.random_streams import Purpose, random_stream
+from hmt_slam_ros.topological_inference.hypothesis_tree import (
+    HypothesisState,
+    normalize_and_reduce,
+    relative_covariance,
+)
 
 
 def settled(weights, skipped=0.0, unexamined=0.0, most=16, least=1e-6):
     with np.errstate(divide="ignore"):
         logs, log_skipped = np.log(np.array(weights)), float(np.log(skipped))
-    return settle(logs, log_skipped, unexamined, most, least, stream(0, Purpose.HYPOTHESES, 0))
+    return normalize_and_reduce(logs, log_skipped, unexamined, most, least, random_stream(0, Purpose.HYPOTHESES, 0))
 
 
 def test_weights_are_normalised():
@@ -23,7 +27,9 @@ def test_weights_are_normalised():
 
 
 def test_hopelessly_small_weights_do_not_underflow():
-    found = settle(np.array([-5000.0, -5001.0]), -math.inf, 0.0, 4, 1e-6, stream(0, Purpose.HYPOTHESES, 0))
+    found = normalize_and_reduce(
+        np.array([-5000.0, -5001.0]), -math.inf, 0.0, 4, 1e-6, random_stream(0, Purpose.HYPOTHESES, 0)
+    )
     assert found.probabilities.tolist() == pytest.approx([1.0 / (1.0 + math.exp(-1.0)), 1.0 / (1.0 + math.e)])
 
 
@@ -41,17 +47,17 @@ def test_what_was_not_examined_earlier_keeps_its_share():
 
 def test_what_is_dropped_is_counted_as_unexamined():
     found = settled([1.0, 1e-3], least=0.01)
-    assert found.kept.tolist() == [0]
+    assert found.indices.tolist() == [0]
     assert found.unexamined == pytest.approx(1e-3, rel=0.01)
 
 
 def test_the_best_is_never_dropped():
-    assert settled([1.0, 1.0, 1.0], least=0.5).kept.tolist() == [0, 1, 2]
+    assert settled([1.0, 1.0, 1.0], least=0.5).indices.tolist() == [0, 1, 2]
 
 
 def test_the_reduction_keeps_the_total():
     found = settled(np.linspace(0.5, 1.5, 40), most=5)
-    assert found.kept.size == 5
+    assert found.indices.size == 5
     assert found.probabilities.sum() == pytest.approx(1.0)
 
 
@@ -70,27 +76,27 @@ def test_a_keyframe_that_is_better_known_than_the_reference_leaves_the_floor():
 
 
 def test_entering_an_area_keeps_the_notes_of_the_keyframes_that_came_along():
-    notes = LeafNotes().stored(4, np.eye(3)).stored(5, np.eye(3)).checked([9], [4, 5])
-    entered = notes.entered({5: 2.0 * np.eye(3)})
-    assert entered.compared == {9: {5}}
+    notes = HypothesisState().after_keyframe(4, np.eye(3)).after_keyframe(5, np.eye(3)).after_matching([9], [4, 5])
+    entered = notes.after_area_change({5: 2.0 * np.eye(3)})
+    assert entered.matched_keyframes == {9: {5}}
     assert entered.covariances.keys() == {5}
-    assert entered.unchecked == ()
+    assert entered.unmatched_keyframes == ()
 
 
 def test_areas_beside_which_keyframes_fitted_are_remembered_until_the_next_comparison():
-    notes = LeafNotes(unchecked=(3, 4, 5, 6, 7)).checked([1], [3, 4, 5, 6, 7], (2,))
-    assert (notes.unchecked, notes.beside) == ((), (2,))
-    assert notes.compared == {1: {3, 4, 5, 6, 7}}
-    soon = replace(notes, unchecked=(8, 9)).checked([2], [5, 6, 7, 8, 9], all_areas=False)
-    assert (soon.unchecked, soon.beside) == ((8, 9), ())
+    notes = HypothesisState(unmatched_keyframes=(3, 4, 5, 6, 7)).after_matching([1], [3, 4, 5, 6, 7], (2,))
+    assert (notes.unmatched_keyframes, notes.pending_candidates) == ((), (2,))
+    assert notes.matched_keyframes == {1: {3, 4, 5, 6, 7}}
+    soon = replace(notes, unmatched_keyframes=(8, 9)).after_matching([2], [5, 6, 7, 8, 9], all_areas=False)
+    assert (soon.unmatched_keyframes, soon.pending_candidates) == ((8, 9), ())
 
 
 def test_notes_are_values():
-    before = LeafNotes().stored(1, np.eye(3))
-    before.stored(2, np.eye(3))
-    before.checked([3], [1])
-    assert before.unchecked == (1,)
-    assert not before.compared
+    before = HypothesisState().after_keyframe(1, np.eye(3))
+    before.after_keyframe(2, np.eye(3))
+    before.after_matching([3], [1])
+    assert before.unmatched_keyframes == (1,)
+    assert not before.matched_keyframes
 
 
 def test_the_pose_of_the_reference_does_not_enter_the_relative_covariance():

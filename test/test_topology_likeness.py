@@ -9,7 +9,7 @@ from worlds import box, drive, scan_in
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.registration.area_to_area import MatchSettings
 from hmt_slam_ros.registration.likelihood_grid import GridModel, build_area_grid
-from hmt_slam_ros.topological_inference.place_recognition import Elsewhere, Likeness, best_shares
+from hmt_slam_ros.topological_inference.place_recognition import NegativeSample, PerceptualAliasing, best_shares
 
 MODEL, SETTINGS = GridModel(), MatchSettings(temper=0.3)
 PATH = drive((-4.0, 0.0), (4.0, 0.0))
@@ -35,7 +35,7 @@ def seen(walls, poses, seed):
 
 
 def elsewhere(walls, seed):
-    return Elsewhere(seen(walls, PATH, seed), se2.between(PATH[0], PATH[len(PATH) // 2]))
+    return NegativeSample(seen(walls, PATH, seed), se2.between(PATH[0], PATH[len(PATH) // 2]))
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -61,30 +61,32 @@ def test_where_nothing_is_seen_nothing_fits():
 
 
 def test_a_fit_tells_the_more_the_rarer_it_is():
-    likeness = Likeness(0.25)
-    assert likeness.log_rarity(0.9, foretold=False) == pytest.approx(math.log(4.0))
-    likeness.count([0.2] * 38)
-    assert likeness.log_rarity(0.9, foretold=False) == pytest.approx(math.log(40.0 / 0.5))
-    assert likeness.log_rarity(0.2, foretold=False) == pytest.approx(math.log(40.0 / 38.5))
-    likeness.count([0.95] * 20)
-    assert likeness.log_rarity(0.9, foretold=False) == pytest.approx(math.log(60.0 / 20.5))
+    likeness = PerceptualAliasing(0.25)
+    assert likeness.log_distinctiveness(0.9, already_expected=False) == pytest.approx(math.log(4.0))
+    likeness.add_negatives([0.2] * 38)
+    assert likeness.log_distinctiveness(0.9, already_expected=False) == pytest.approx(math.log(40.0 / 0.5))
+    assert likeness.log_distinctiveness(0.2, already_expected=False) == pytest.approx(math.log(40.0 / 38.5))
+    likeness.add_negatives([0.95] * 20)
+    assert likeness.log_distinctiveness(0.9, already_expected=False) == pytest.approx(math.log(60.0 / 20.5))
 
 
 def test_a_fit_that_is_hardly_better_is_not_better():
-    likeness = Likeness(0.25)
-    likeness.count([0.96] * 8)
-    assert likeness.log_rarity(0.97, foretold=False) == pytest.approx(math.log(10.0 / 8.5))
-    assert likeness.log_rarity(0.99, foretold=False) == pytest.approx(math.log(10.0 / 0.5))
+    likeness = PerceptualAliasing(0.25)
+    likeness.add_negatives([0.96] * 8)
+    assert likeness.log_distinctiveness(0.97, already_expected=False) == pytest.approx(math.log(10.0 / 8.5))
+    assert likeness.log_distinctiveness(0.99, already_expected=False) == pytest.approx(math.log(10.0 / 0.5))
 
 
 def test_a_fit_that_was_to_be_expected_tells_little():
-    likeness = Likeness(0.25)
-    likeness.count([0.2] * 38)
-    assert likeness.log_rarity(0.9, foretold=True) == pytest.approx(math.log(2.5))
-    assert likeness.log_rarity(0.2, foretold=True) == likeness.log_rarity(0.2, foretold=False)
+    likeness = PerceptualAliasing(0.25)
+    likeness.add_negatives([0.2] * 38)
+    assert likeness.log_distinctiveness(0.9, already_expected=True) == pytest.approx(math.log(2.5))
+    assert likeness.log_distinctiveness(0.2, already_expected=True) == likeness.log_distinctiveness(
+        0.2, already_expected=False
+    )
 
 
 def test_that_a_building_looks_alike_everywhere_is_learnt():
-    likeness = Likeness(0.25)
-    likeness.count([1.0] * 64)
-    assert 0.0 < likeness.log_rarity(1.0, foretold=False) < 0.03
+    likeness = PerceptualAliasing(0.25)
+    likeness.add_negatives([1.0] * 64)
+    assert 0.0 < likeness.log_distinctiveness(1.0, already_expected=False) < 0.03

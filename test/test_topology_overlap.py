@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from hmt_slam_ros.area_abstraction.overlap import Sensed, overlaps, sensed_overlaps, sensed_points
+from hmt_slam_ros.area_abstraction.overlap import SensedSpace, overlaps, sensed_overlaps, sensed_points
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.sensors import Scan
 
@@ -87,7 +87,7 @@ def test_a_scan_without_returns_overlaps_nothing():
 
 
 def test_scans_that_saw_free_space_only_overlap_the_less_the_farther_apart_they_were_taken():
-    blank, seen = Sensed(np.empty((0, 2)), 8.0), Sensed(wall(0, 5), 8.0)
+    blank, seen = SensedSpace(np.empty((0, 2)), 8.0), SensedSpace(wall(0, 5), 8.0)
     poses = np.array([[0.0, 0.0, 1.0], [8.0, 0.0, 0.0], [0.0, 20.0, 0.0], [0.0, 0.0, 0.0]])
     found = sensed_overlaps(blank, HERE, [blank, blank, blank, seen], poses, 0.2)
     np.testing.assert_allclose(found, [1.0, 0.5, 0.0, 0.0])

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from hmt_slam_ros.area_abstraction.doors import Way
-from hmt_slam_ros.configuration.landmarks import Features
+from hmt_slam_ros.configuration.landmarks import FeatureParameters
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.landmarks.beam_labels import Rays
-from hmt_slam_ros.landmarks.landmarks import INNER, OPENING, Landmarks
+from hmt_slam_ros.landmarks.landmarks import CONCAVE_CORNER, OPENING, ScanLandmarks
 
-FEATURES = Features()
+FEATURES = FeatureParameters()
 # Beams that tell nothing: so no landmark is missed.
 BLIND = Rays(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), np.zeros(0), np.zeros(0, np.bool_))
 DOOR, OTHER = (3.2, 0.0, 0.0), (6.2, 0.0, 0.0)
@@ -21,7 +21,7 @@ def shown(pose, openings, confidence=0.9, kind=OPENING):
     count = len(poses)
     covariances = np.tile(np.diag([0.02, 0.02, 0.01]) ** 2, (count, 1, 1))
     sizes = np.ones(count)
-    return Landmarks(np.full(count, kind), poses, covariances, confidence * sizes, sizes, 0.05 * sizes)
+    return ScanLandmarks(np.full(count, kind), poses, covariances, confidence * sizes, sizes, 0.05 * sizes)
 
 
 def go(way, xs, openings, first=0, y=0.0, **how):
@@ -41,7 +41,7 @@ def test_the_path_passes_an_opening_that_only_keyframes_before_it_saw():
     assert way.chambers(range(10)) == {k: int(k >= 7) for k in range(10)}
 
 
-@pytest.mark.parametrize("how", [{"confidence": 0.3}, {"kind": INNER}, {"y": 0.8}])
+@pytest.mark.parametrize("how", [{"confidence": 0.3}, {"kind": CONCAVE_CORNER}, {"y": 0.8}])
 def test_nothing_else_is_a_passage(how):
     way = go(Way(), 0.5 * np.arange(10), [DOOR], **how)
     assert way.passages == ()

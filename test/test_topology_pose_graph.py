@@ -8,7 +8,7 @@ from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian, fuse
 from hmt_slam_ros.hybrid_map.global_map import consistent_map, shortest_path_map
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
-from hmt_slam_ros.hybrid_map.pose_graph import Edges, optimise, relative_covariances
+from hmt_slam_ros.hybrid_map.pose_graph import Edges, optimize, relative_covariances
 
 SPREAD = np.diag([0.05**2, 0.03**2, 0.01**2])
 
@@ -72,7 +72,7 @@ def dense_solution(initial, graph):
 
 def test_one_edge_puts_the_second_node_where_it_was_measured():
     graph = edges((0, 1, [1.0, 2.0, 0.5], SPREAD))
-    found = optimise(np.zeros((2, 3)), graph)
+    found = optimize(np.zeros((2, 3)), graph)
     np.testing.assert_allclose(found.poses, [[0, 0, 0], [1.0, 2.0, 0.5]], atol=1e-9)
     np.testing.assert_allclose(found.covariances[1], SPREAD, atol=1e-12)
     np.testing.assert_array_equal(found.covariances[0], np.zeros((3, 3)))
@@ -81,7 +81,7 @@ def test_one_edge_puts_the_second_node_where_it_was_measured():
 
 def test_an_edge_read_backwards_is_the_inverse_belief():
     measured = PoseGaussian(np.array([1.0, 2.0, 0.5]), SPREAD)
-    found = optimise(np.zeros((2, 3)), edges((1, 0, measured.mean, measured.covariance)))
+    found = optimize(np.zeros((2, 3)), edges((1, 0, measured.mean, measured.covariance)))
     np.testing.assert_allclose(found.poses[1], measured.inverse().mean, atol=1e-9)
     np.testing.assert_allclose(found.covariances[1], measured.inverse().covariance, atol=1e-12)
 
@@ -89,7 +89,7 @@ def test_an_edge_read_backwards_is_the_inverse_belief():
 def test_two_edges_between_two_nodes_are_the_product_of_gaussians():
     one = PoseGaussian(np.array([1.0, 2.0, 0.5]), np.diag([0.04, 0.01, 0.001]))
     two = PoseGaussian(np.array([1.1, 1.9, 0.48]), np.diag([0.01, 0.02, 0.002]))
-    found = optimise(one.mean * [[0], [1]], edges((0, 1, one.mean, one.covariance), (0, 1, two.mean, two.covariance)))
+    found = optimize(one.mean * [[0], [1]], edges((0, 1, one.mean, one.covariance), (0, 1, two.mean, two.covariance)))
     product = fuse([one, two])
     np.testing.assert_allclose(found.poses[1], product.mean, atol=1e-8)
     np.testing.assert_allclose(found.covariances[1], product.covariance, atol=1e-8)
@@ -98,7 +98,7 @@ def test_two_edges_between_two_nodes_are_the_product_of_gaussians():
 def test_a_chain_composes_its_beliefs():
     steps = [PoseGaussian(np.array([1.0, 0.1 * i, 0.3]), SPREAD * (1 + i)) for i in range(4)]
     graph = edges(*[(i, i + 1, step.mean, step.covariance) for i, step in enumerate(steps)])
-    found = optimise(chain_of(graph, 5), graph)
+    found = optimize(chain_of(graph, 5), graph)
     belief = steps[0].compose(steps[1]).compose(steps[2]).compose(steps[3])
     np.testing.assert_allclose(found.poses[4], belief.mean, atol=1e-9)
     np.testing.assert_allclose(found.covariances[4], belief.covariance, rtol=1e-9, atol=1e-14)
@@ -114,7 +114,7 @@ def test_the_error_of_a_ring_of_translations_is_shared_by_variance():
         (2, 3, [-2.0, 0.0, 0.0], tight),
         (3, 0, [0.4, -2.0, 0.0], loose),
     )
-    found = optimise(chain_of(graph, 4), graph)
+    found = optimize(chain_of(graph, 4), graph)
     share = 0.4 / 7.0  # variances 1, 1, 1 and 4
     expected = [[0, 0, 0], [2 - share, 0, 0], [2 - 2 * share, 2, 0], [-3 * share, 2, 0]]
     np.testing.assert_allclose(found.poses, expected, atol=1e-6)
@@ -127,7 +127,7 @@ def test_the_error_of_a_ring_of_translations_is_shared_by_variance():
 def test_a_square_that_turns_too_little_closes():
     quarter = np.radians(88.0)
     graph = edges(*[(i, (i + 1) % 4, [2.0, 0.0, quarter], SPREAD) for i in range(4)])
-    found = optimise(chain_of(graph, 4), graph)
+    found = optimize(chain_of(graph, 4), graph)
     relative = se2.between(found.poses, np.roll(found.poses, -1, axis=0))
     np.testing.assert_allclose(np.degrees(relative[:, 2]), 90.0, atol=1e-6)
     np.testing.assert_allclose(relative, np.broadcast_to(relative[0], (4, 3)), atol=1e-6)
@@ -137,7 +137,7 @@ def test_a_square_that_turns_too_little_closes():
 def test_poses_marginals_and_chi2_are_those_of_a_dense_solution(seed):
     _, graph = simulated(14, 12, seed)
     initial = chain_of(graph, 14)
-    found = optimise(initial, graph)
+    found = optimize(initial, graph)
     poses, covariance, cost = dense_solution(initial, graph)
     np.testing.assert_allclose(se2.log(se2.between(poses, found.poses)), 0.0, atol=1e-7)
     blocks = covariance.reshape(13, 3, 13, 3)[np.arange(13), :, np.arange(13)]
@@ -148,7 +148,7 @@ def test_poses_marginals_and_chi2_are_those_of_a_dense_solution(seed):
 def test_the_fixed_node_may_be_any_and_keeps_its_pose():
     _, graph = simulated(8, 6, 3)
     initial = chain_of(graph, 8)
-    one, other = optimise(initial, graph), optimise(initial, graph, fixed=5)
+    one, other = optimize(initial, graph), optimize(initial, graph, fixed=5)
     np.testing.assert_array_equal(other.poses[5], initial[5])
     np.testing.assert_array_equal(other.covariances[5], np.zeros((3, 3)))
     np.testing.assert_allclose(se2.between(other.poses[0], other.poses), one.poses, atol=1e-7)
@@ -159,18 +159,18 @@ def test_the_frame_of_the_start_does_not_matter():
     _, graph = simulated(10, 8, 4)
     initial = chain_of(graph, 10)
     there = np.array([100.0, -50.0, 2.0])
-    one, other = optimise(initial, graph), optimise(se2.compose(there, initial), graph)
+    one, other = optimize(initial, graph), optimize(se2.compose(there, initial), graph)
     np.testing.assert_allclose(se2.between(there, other.poses), one.poses, atol=1e-6)
     np.testing.assert_allclose(other.covariances, one.covariances, atol=1e-10)
 
 
 def test_a_bad_start_is_damped_to_the_same_solution():
     truth, graph = simulated(20, 15, 5)
-    good = optimise(chain_of(graph, 20), graph)
+    good = optimize(chain_of(graph, 20), graph)
     rng = np.random.default_rng(6)
     bad = se2.compose(truth, rng.normal(size=(20, 3)) * [1.5, 1.5, 0.5])
     bad[0] = 0.0
-    np.testing.assert_allclose(optimise(bad, graph).poses, good.poses, atol=1e-6)
+    np.testing.assert_allclose(optimize(bad, graph).poses, good.poses, atol=1e-6)
 
 
 def test_errors_of_simulated_graphs_are_as_large_as_the_marginals_say():
@@ -178,7 +178,7 @@ def test_errors_of_simulated_graphs_are_as_large_as_the_marginals_say():
     nees = []
     for seed in range(60):
         truth, graph = simulated(8, 5, 100 + seed)
-        found = optimise(chain_of(graph, 8), graph)
+        found = optimize(chain_of(graph, 8), graph)
         error = se2.log(se2.between(found.poses[5], truth[5]))
         nees.append(error @ np.linalg.solve(found.covariances[5], error))
     assert chi2.ppf(0.005, 180) < np.sum(nees) < chi2.ppf(0.995, 180)
@@ -186,19 +186,19 @@ def test_errors_of_simulated_graphs_are_as_large_as_the_marginals_say():
 
 def test_chi2_of_simulated_graphs_has_the_degrees_of_freedom_of_their_loops():
     values = [
-        optimise(chain_of(g, 8), g, marginals=False).chi2 for _, g in (simulated(8, 5, 200 + s) for s in range(60))
+        optimize(chain_of(g, 8), g, marginals=False).chi2 for _, g in (simulated(8, 5, 200 + s) for s in range(60))
     ]
     assert chi2.ppf(0.005, 15 * 60) < np.sum(values) < chi2.ppf(0.995, 15 * 60)
 
 
 def test_a_node_without_edges_is_refused():
     with pytest.raises(ValueError, match="node 2"):
-        optimise(np.zeros((3, 3)), edges((0, 1, [1.0, 0.0, 0.0], SPREAD)))
+        optimize(np.zeros((3, 3)), edges((0, 1, [1.0, 0.0, 0.0], SPREAD)))
 
 
 def test_a_graph_of_one_node_is_solved_already():
     nothing = Edges(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3)))
-    found = optimise(np.array([[1.0, 2.0, 3.0]]), nothing)
+    found = optimize(np.array([[1.0, 2.0, 3.0]]), nothing)
     np.testing.assert_array_equal(found.poses, [[1.0, 2.0, 3.0]])
     np.testing.assert_array_equal(found.covariances, np.zeros((1, 3, 3)))
 
@@ -206,7 +206,7 @@ def test_a_graph_of_one_node_is_solved_already():
 def test_a_chain_longer_than_the_columns_solved_at_once_composes_its_beliefs_too():
     step = PoseGaussian(np.array([0.5, 0.0, 0.1]), SPREAD)
     graph = edges(*[(i, i + 1, step.mean, step.covariance) for i in range(149)])
-    found = optimise(chain_of(graph, 150), graph)
+    found = optimize(chain_of(graph, 150), graph)
     belief = step
     for i in range(2, 150):
         belief = belief.compose(step)
@@ -216,7 +216,7 @@ def test_a_chain_longer_than_the_columns_solved_at_once_composes_its_beliefs_too
 def ring_of_areas():
     hybrid_map = HybridMap()
     for area in (3, 5, 8, 9):
-        hybrid_map.place(10 * area, area, np.zeros(3))
+        hybrid_map.set_keyframe(10 * area, area, np.zeros(3))
     quarter = np.radians(88.0)
     step = PoseGaussian(np.array([2.0, 0.0, quarter]), SPREAD)
     for a, b in ((3, 5), (5, 8), (8, 9), (9, 3)):
@@ -249,7 +249,7 @@ def test_closing_the_ring_makes_the_areas_more_certain():
 
 def test_one_area_without_arcs_lies_at_the_origin():
     hybrid_map = HybridMap()
-    hybrid_map.place(0, 0, np.zeros(3))
+    hybrid_map.set_keyframe(0, 0, np.zeros(3))
     for found in (consistent_map(hybrid_map), shortest_path_map(hybrid_map)):
         assert list(found.poses) == [0]
         np.testing.assert_array_equal(found.poses[0].mean, np.zeros(3))
@@ -258,7 +258,7 @@ def test_one_area_without_arcs_lies_at_the_origin():
 
 def test_covariances_of_nodes_relative_to_each_other_are_those_of_the_whole_system():
     graph = simulated(12, 6, seed=3)[1]
-    poses = optimise(chain_of(graph, 12), graph).poses
+    poses = optimize(chain_of(graph, 12), graph).poses
     whole = dense_solution(poses, graph)[1]
     between = np.array([[2, 7], [7, 2], [0, 5], [9, 9]])
     found = relative_covariances(poses, graph, between)

@@ -6,7 +6,7 @@ import pytest
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
-from hmt_slam_ros.topological_inference.hypothesis_merging import Claim, merged
+from hmt_slam_ros.topological_inference.hypothesis_merging import LocalizedHypothesis, merge_equivalent
 
 SHARP, VAGUE = np.diag([0.05, 0.05, 0.01]) ** 2, np.diag([2.0, 2.0, 0.2]) ** 2
 STEP = np.array([10.0, 0.0, 0.0])
@@ -17,10 +17,10 @@ def chain(covariance=SHARP):
     """Areas 0 to 3, definite, 10 m apart along x."""
     hybrid_map = HybridMap()
     for area in range(4):
-        hybrid_map.place(area, area, np.zeros(3))
+        hybrid_map.set_keyframe(area, area, np.zeros(3))
     for area in range(3):
         hybrid_map.set_arc(area, area + 1, PoseGaussian(STEP, covariance), closure=False)
-    hybrid_map.absorb()
+    hybrid_map.commit()
     return hybrid_map
 
 
@@ -28,7 +28,7 @@ def entered(area, pose, covariance=SHARP):
     """From area 3 the robot came into a known one, where it is at ``area_T_base``."""
     hybrid_map = chain(VAGUE)
     hybrid_map.set_arc(3, area, PoseGaussian(area * STEP - np.array([5.0, 0.0, 0.0]), covariance), closure=True)
-    return Claim(hybrid_map, area, pose, {area})
+    return LocalizedHypothesis(hybrid_map, area, pose, {area})
 
 
 def in_next_area(pose):
@@ -43,22 +43,22 @@ def with_sharp_arc(claim):
 
 def test_the_same_place_entered_by_one_area_or_by_the_next_is_one_claim():
     one, other = with_sharp_arc(entered(0, POSE)), with_sharp_arc(entered(1, in_next_area(POSE)))
-    assert one.equals(other)
-    assert other.equals(one)
+    assert one.is_equivalent(other)
+    assert other.is_equivalent(one)
 
 
 @pytest.mark.parametrize(
     ("offset", "same"), [([0.3, 0.2, 0.05], True), ([0.7, 0.0, 0.0], False), ([0.0, 0.0, 0.2], False)]
 )
 def test_modes_that_part_by_less_than_is_mended_are_one_claim(offset, same):
-    assert entered(0, POSE).equals(entered(0, se2.compose(POSE, np.array(offset)))) == same
+    assert entered(0, POSE).is_equivalent(entered(0, se2.compose(POSE, np.array(offset)))) == same
 
 
 def test_known_ground_is_a_claim_of_its_own():
-    tracked = Claim(chain(), 0, POSE, {0})
+    tracked = LocalizedHypothesis(chain(), 0, POSE, {0})
     recognised = entered(0, POSE)
-    assert not tracked.equals(recognised)
-    assert not recognised.equals(tracked)
+    assert not tracked.is_equivalent(recognised)
+    assert not recognised.is_equivalent(tracked)
 
 
 def with_another_loop(claim, covariance=SHARP):
@@ -70,8 +70,8 @@ def with_another_loop(claim, covariance=SHARP):
 @pytest.mark.parametrize("covariance", [SHARP, 100.0 * SHARP])
 def test_a_further_loop_is_a_claim_of_its_own(covariance):
     open_still, closed = entered(0, POSE), with_another_loop(entered(0, POSE), covariance)
-    assert not open_still.equals(closed)
-    assert not closed.equals(open_still)
+    assert not open_still.is_equivalent(closed)
+    assert not closed.is_equivalent(open_still)
 
 
 def test_a_loop_that_one_hypothesis_closes_by_two_arcs_and_one_by_the_second_is_one_claim():
@@ -79,17 +79,17 @@ def test_a_loop_that_one_hypothesis_closes_by_two_arcs_and_one_by_the_second_is_
     for claim in (direct, around):
         claim.hybrid_map.set_arc(0, 1, PoseGaussian(STEP, SHARP), closure=False)
         claim.hybrid_map.set_arc(1, 2, PoseGaussian(STEP, SHARP), closure=False)
-    assert direct.equals(around)
-    assert around.equals(direct)
+    assert direct.is_equivalent(around)
+    assert around.is_equivalent(direct)
 
 
 def test_what_a_hypothesis_is_uncertain_of_it_does_not_claim():
-    assert not entered(0, POSE).equals(entered(1, in_next_area(POSE)))
+    assert not entered(0, POSE).is_equivalent(entered(1, in_next_area(POSE)))
 
 
 def test_the_heaviest_stands_for_all_that_say_the_same():
     claims = [entered(0, POSE), entered(1, POSE), entered(0, POSE + 0.01)]
     weights = np.log([0.2, 0.3, 0.5])
-    found = merged(claims, weights)
+    found = merge_equivalent(claims, weights)
     assert list(found) == [2, 1]
     np.testing.assert_allclose(np.exp(list(found.values())), [0.7, 0.3])

@@ -6,7 +6,7 @@ import pytest
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
-from hmt_slam_ros.hybrid_map.shortest_path import reachable
+from hmt_slam_ros.hybrid_map.shortest_path import shortest_path_beliefs
 
 
 def arc(x, y, theta, sigma_xy=0.1, sigma_theta=0.0):
@@ -21,35 +21,35 @@ def chain(*beliefs):
 
 
 def test_the_start_comes_first_at_the_origin_with_no_uncertainty():
-    found = reachable(chain(arc(1.0, 0.0, 0.0)), 1)
+    found = shortest_path_beliefs(chain(arc(1.0, 0.0, 0.0)), 1)
     assert next(iter(found)) == 1
     np.testing.assert_array_equal(found[1].mean, np.zeros(3))
     np.testing.assert_array_equal(found[1].covariance, np.zeros((3, 3)))
 
 
 def test_an_area_that_the_map_does_not_hold_reaches_only_itself():
-    assert list(reachable(HybridMap(), 7)) == [7]
+    assert list(shortest_path_beliefs(HybridMap(), 7)) == [7]
 
 
 def test_poses_are_composed_along_a_chain():
     quarter = np.pi / 2.0
-    found = reachable(chain(arc(2.0, 0.0, quarter), arc(3.0, 0.0, quarter), arc(2.0, 0.0, 0.0)), 0)
+    found = shortest_path_beliefs(chain(arc(2.0, 0.0, quarter), arc(3.0, 0.0, quarter), arc(2.0, 0.0, 0.0)), 0)
     np.testing.assert_allclose(found[2].mean, [2.0, 3.0, -np.pi], atol=1e-12)
     np.testing.assert_allclose(found[3].mean, [0.0, 3.0, -np.pi], atol=1e-12)
 
 
 def test_an_arc_is_followed_against_its_direction():
-    found = reachable(chain(arc(2.0, 0.0, np.pi / 2.0)), 1)
+    found = shortest_path_beliefs(chain(arc(2.0, 0.0, np.pi / 2.0)), 1)
     np.testing.assert_allclose(found[0].mean, [0.0, 2.0, -np.pi / 2.0], atol=1e-12)
 
 
 def test_variances_of_pure_translations_add():
-    found = reachable(chain(arc(2.0, 0.0, 0.0, 0.3), arc(0.0, 1.0, 0.0, 0.4)), 0)
+    found = shortest_path_beliefs(chain(arc(2.0, 0.0, 0.0, 0.3), arc(0.0, 1.0, 0.0, 0.4)), 0)
     np.testing.assert_allclose(found[2].covariance[:2, :2], np.eye(2) * 0.25, atol=1e-10)
 
 
 def test_heading_error_moves_a_distant_area_by_its_lever_arm():
-    found = reachable(chain(arc(0.0, 0.0, 0.0, 0.0, 0.02), arc(10.0, 0.0, 0.0, 0.0)), 0)
+    found = shortest_path_beliefs(chain(arc(0.0, 0.0, 0.0, 0.0, 0.02), arc(10.0, 0.0, 0.0, 0.0)), 0)
     # 10 m ahead, a heading deviation of 0.02 rad is 0.2 m sideways.
     np.testing.assert_allclose(found[2].covariance[1, 1], 0.2**2, rtol=1e-6)
 
@@ -57,32 +57,32 @@ def test_heading_error_moves_a_distant_area_by_its_lever_arm():
 def test_the_less_uncertain_of_two_paths_is_taken_though_it_has_more_arcs():
     hybrid_map = chain(arc(1.0, 0.0, 0.0, 0.1), arc(1.0, 0.0, 0.0, 0.1), arc(1.0, 0.0, 0.0, 0.1))
     hybrid_map.set_arc(0, 3, arc(9.0, 0.0, 0.0, 0.2), closure=True)
-    assert reachable(hybrid_map, 0)[3].mean[0] == pytest.approx(3.0)
+    assert shortest_path_beliefs(hybrid_map, 0)[3].mean[0] == pytest.approx(3.0)
     hybrid_map.set_arc(0, 3, arc(9.0, 0.0, 0.0, 0.15), closure=True)
-    assert reachable(hybrid_map, 0)[3].mean[0] == pytest.approx(9.0)
+    assert shortest_path_beliefs(hybrid_map, 0)[3].mean[0] == pytest.approx(9.0)
 
 
 def test_areas_come_in_order_of_their_uncertainty():
     hybrid_map = HybridMap()
     for area, sigma in ((1, 0.5), (2, 0.1), (3, 0.3)):
         hybrid_map.set_arc(0, area, arc(1.0, 0.0, 0.0, sigma), closure=False)
-    assert list(reachable(hybrid_map, 0)) == [0, 2, 3, 1]
+    assert list(shortest_path_beliefs(hybrid_map, 0)) == [0, 2, 3, 1]
 
 
 def test_areas_beyond_the_cost_limit_are_left_out():
     hybrid_map = chain(*[arc(1.0, 0.0, 0.0, 0.1)] * 5)
-    assert list(reachable(hybrid_map, 0, cost_limit=3 * 2 * 0.1**2 + 1e-6)) == [0, 1, 2, 3]
+    assert list(shortest_path_beliefs(hybrid_map, 0, cost_limit=3 * 2 * 0.1**2 + 1e-6)) == [0, 1, 2, 3]
 
 
 def test_no_more_areas_than_asked_for_are_returned():
-    found = reachable(chain(*[arc(1.0, 0.0, 0.0, sigma) for sigma in (0.1, 0.2, 0.3, 0.4)]), 2, max_areas=3)
+    found = shortest_path_beliefs(chain(*[arc(1.0, 0.0, 0.0, sigma) for sigma in (0.1, 0.2, 0.3, 0.4)]), 2, max_areas=3)
     assert list(found) == [2, 1, 0]
 
 
 def test_costs_never_fall_where_the_path_turns_back_to_its_start():
     # A heading error is a large lever arm out there and none back at the start.
     hybrid_map = chain(arc(0.0, 0.0, 0.0, 0.0, 0.05), arc(10.0, 0.0, 0.0, 0.0), arc(-10.0, 0.0, 0.0, 0.0))
-    assert list(reachable(hybrid_map, 0, cost_limit=0.1)) == [0, 1]
+    assert list(shortest_path_beliefs(hybrid_map, 0, cost_limit=0.1)) == [0, 1]
 
 
 def test_the_tree_costs_what_the_best_of_all_paths_costs_in_a_random_graph():
@@ -98,7 +98,7 @@ def test_the_tree_costs_what_the_best_of_all_paths_costs_in_a_random_graph():
         for (a, b), sigma in edges.items():
             for u, v in ((a, b), (b, a)):
                 best[v] = min(best.get(v, np.inf), best.get(u, np.inf) + sigma**2)
-    found = reachable(hybrid_map, 0)
+    found = shortest_path_beliefs(hybrid_map, 0)
     assert set(found) == set(best)
     for area, variance in best.items():
         assert found[area].covariance[0, 0] == pytest.approx(variance, rel=1e-4)
@@ -106,8 +106,8 @@ def test_the_tree_costs_what_the_best_of_all_paths_costs_in_a_random_graph():
 
 def test_the_search_ends_where_all_that_is_wanted_is_found():
     hybrid_map = chain(*[arc(1.0, 0.0, 0.0)] * 6)
-    assert set(reachable(hybrid_map, 1, until=(0, 3))) == {0, 1, 2, 3}
-    assert set(reachable(hybrid_map, 1, until=(77,))) == set(range(7))
+    assert set(shortest_path_beliefs(hybrid_map, 1, targets=(0, 3))) == {0, 1, 2, 3}
+    assert set(shortest_path_beliefs(hybrid_map, 1, targets=(77,))) == set(range(7))
 
 
 def test_own_arcs_replace_common_ones_and_beliefs_are_those_of_composition():
@@ -118,14 +118,14 @@ def test_own_arcs_replace_common_ones_and_beliefs_are_those_of_composition():
         loose = 2.0 if n % 5 == 0 else 0.2
         hybrid_map.set_arc(a, b, arc(*rng.normal(size=3), rng.uniform(0.1, loose), 0.05), closure=False)
         if n == len(pairs) // 2:
-            hybrid_map.absorb()
+            hybrid_map.commit()
     for a, b in pairs[: len(pairs) // 4]:
         hybrid_map.set_arc(a, b, arc(*rng.normal(size=3), rng.uniform(0.1, 0.3), 0.05), closure=False)
-    found = reachable(hybrid_map, 20)
+    found = shortest_path_beliefs(hybrid_map, 20)
     assert len(found) == 40
     for area, belief in list(found.items())[1:]:
         # Every belief is that of a neighbour that was found before, carried on by the arc that counts.
-        before = [b for b in hybrid_map.neighbours(area) if list(found).index(b) < list(found).index(area)]
+        before = [b for b in hybrid_map.neighbors(area) if list(found).index(b) < list(found).index(area)]
         ways = [found[b].compose(hybrid_map.arc(b, area)) for b in before]
         assert any(
             np.allclose(way.mean, belief.mean) and np.allclose(way.covariance, belief.covariance) for way in ways
@@ -134,12 +134,12 @@ def test_own_arcs_replace_common_ones_and_beliefs_are_those_of_composition():
 
 def test_a_hypothesis_sees_its_own_arcs_and_the_common_ones():
     hybrid_map = chain(arc(1.0, 0.0, 0.0))
-    hybrid_map.absorb()
+    hybrid_map.commit()
     child = hybrid_map.branch()
     child.set_arc(1, 2, arc(1.0, 0.0, 0.0), closure=True)
-    assert list(reachable(child, 0)) == [0, 1, 2]
-    assert list(reachable(hybrid_map, 0)) == [0, 1]
-    np.testing.assert_allclose(reachable(child, 2)[0].mean, se2.inverse([2.0, 0.0, 0.0]), atol=1e-12)
+    assert list(shortest_path_beliefs(child, 0)) == [0, 1, 2]
+    assert list(shortest_path_beliefs(hybrid_map, 0)) == [0, 1]
+    np.testing.assert_allclose(shortest_path_beliefs(child, 2)[0].mean, se2.inverse([2.0, 0.0, 0.0]), atol=1e-12)
 
 
 def test_an_arc_that_a_hypothesis_lacks_is_not_followed():
@@ -150,14 +150,14 @@ def test_an_arc_that_a_hypothesis_lacks_is_not_followed():
     for a, b, value in hybrid_map.all_arcs():
         if (a, b) not in ((0, 4), (2, 3)):
             alone.set_arc(a, b, value.pose, closure=value.closure)
-    hybrid_map.absorb()
+    hybrid_map.commit()
     hypothesis = hybrid_map.branch()
     hypothesis.remove_arc(0, 4)
     hypothesis.remove_arc(3, 2)
     for start in range(7):
-        found, wanted = reachable(hypothesis, start), reachable(alone, start)
+        found, wanted = shortest_path_beliefs(hypothesis, start), shortest_path_beliefs(alone, start)
         assert list(found) == list(wanted)
         for area, belief in wanted.items():
             np.testing.assert_array_equal(found[area].covariance, belief.covariance)
-    hypothesis.absorb()
-    assert list(reachable(hypothesis, 0)) == [0, 1, 2]
+    hypothesis.commit()
+    assert list(shortest_path_beliefs(hypothesis, 0)) == [0, 1, 2]

@@ -7,11 +7,18 @@ from worlds import box, scan_in
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
-from hmt_slam_ros.hybrid_map.shortest_path import Reached
-from hmt_slam_ros.hybrid_map.surroundings import Nearness, Views, agreeing, areas_around, entry_bound, entry_bounds
+from hmt_slam_ros.hybrid_map.shortest_path import ShortestPaths
+from hmt_slam_ros.hybrid_map.surroundings import (
+    GridCache,
+    Neighborhood,
+    areas_around,
+    consistent_pose,
+    quick_entry_bounds,
+    sampled_entry_bound,
+)
 from hmt_slam_ros.registration.likelihood_grid import GridModel
 
-NEAR = Nearness(sigma=0.3, reach=6.0)
+NEAR = Neighborhood(max_sigma=0.3, max_distance=6.0)
 
 
 def belief(x, sigma):
@@ -26,7 +33,7 @@ def chain(*sigmas, spacing=4.0):
     """Areas 0, 1, ... in a row, each with one keyframe at its origin, joined by arcs of the given deviations."""
     hybrid_map = HybridMap()
     for area in range(len(sigmas) + 1):
-        hybrid_map.place(area, area, np.zeros(3))
+        hybrid_map.set_keyframe(area, area, np.zeros(3))
     for area, sigma in enumerate(sigmas):
         hybrid_map.set_arc(area, area + 1, belief(spacing, sigma), closure=False)
     return hybrid_map
@@ -48,17 +55,17 @@ def test_an_area_beyond_reach_does_not_hide_one_behind_it():
 
 
 def test_excluded_areas_are_left_out():
-    assert list(areas_around(chain(0.05), 0, NEAR, without={1})) == [0]
+    assert list(areas_around(chain(0.05), 0, NEAR, excluded={1})) == [0]
 
 
 @pytest.mark.parametrize(("asked", "keyframe"), [((0.0, 0.0), (0.0, 0.0)), ((2.0, 0.5), (1.5, 0.0))])
 def test_the_quick_bound_lets_all_pass_that_are_near_and_few_others(asked, keyframe):
     rng = np.random.default_rng(2)
     square = rng.normal(size=(200, 3, 3)) * np.array([0.3, 0.3, 0.05])[:, None]
-    found = Reached(np.arange(200), rng.uniform(-9.0, 9.0, size=(200, 3)), square @ square.transpose(0, 2, 1))
+    found = ShortestPaths(np.arange(200), rng.uniform(-9.0, 9.0, size=(200, 3)), square @ square.transpose(0, 2, 1))
     query = PoseGaussian(np.array([1.0, 2.0, 0.3]), np.diag([0.1, 0.2, 0.05]) ** 2)
     lever, extent = np.hypot(*asked), np.hypot(*keyframe)
-    bounds = entry_bounds(found, query, lever, np.full(200, extent + lever + 2.0), 2.0, 2.0)
+    bounds = quick_entry_bounds(found, query, lever, np.full(200, extent + lever + 2.0), 2.0, 2.0)
     passed = bounds > 0.0
     near = []
     for mean, covariance in zip(found.means, found.covariances, strict=True):
@@ -74,24 +81,24 @@ def test_the_quick_bound_lets_all_pass_that_are_near_and_few_others(asked, keyfr
 @pytest.mark.parametrize("away", [0.0, 6.0, 15.0, 30.0])
 def test_the_quick_bound_is_one_on_the_probability_of_an_area_far_from_certain(away):
     spread = np.diag([6.0, 4.0, 0.1]) ** 2
-    found = Reached(np.array([3]), np.array([[away, 1.0, 0.5]]), spread[None])
+    found = ShortestPaths(np.array([3]), np.array([[away, 1.0, 0.5]]), spread[None])
     query = PoseGaussian(np.array([0.0, 0.0, 1.0]), 0.01 * np.eye(3))
-    (bound,) = entry_bounds(found, query, 1.0, np.array([3.0]), 1.5, 4.0)
+    (bound,) = quick_entry_bounds(found, query, 1.0, np.array([3.0]), 1.5, 4.0)
     prior = PoseGaussian(found.means[0], spread).inverse().compose(query)
     poses = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
-    exact = entry_bound(np.zeros((1, 2)), PoseGaussian(prior.mean, 1.5**2 * prior.covariance), poses, 2.0)
+    exact = sampled_entry_bound(np.zeros((1, 2)), PoseGaussian(prior.mean, 1.5**2 * prior.covariance), poses, 2.0)
     assert exact <= bound <= max(10.0 * exact, 0.01)
 
 
 def test_a_global_pose_that_agrees_with_the_arcs_is_taken():
     poses = placed(np.array([1.0, 1.0, 0.5]), se2.compose([1.0, 1.0, 0.5], [4.05, 0.0, 0.0]))
-    assert np.allclose(agreeing(belief(4.0, 0.1), 0, 1, poses, 16.0), [4.05, 0.0, 0.0])
+    assert np.allclose(consistent_pose(belief(4.0, 0.1), 0, 1, poses, 16.0), [4.05, 0.0, 0.0])
 
 
 def test_a_global_pose_that_contradicts_the_arcs_is_not():
     poses = placed(np.zeros(3), np.array([6.0, 0.0, 0.0]))
-    assert np.allclose(agreeing(belief(4.0, 0.1), 0, 1, poses, 16.0), [4.0, 0.0, 0.0])
-    assert np.allclose(agreeing(belief(4.0, 0.1), 0, 7, poses, 16.0), [4.0, 0.0, 0.0])
+    assert np.allclose(consistent_pose(belief(4.0, 0.1), 0, 1, poses, 16.0), [4.0, 0.0, 0.0])
+    assert np.allclose(consistent_pose(belief(4.0, 0.1), 0, 7, poses, 16.0), [4.0, 0.0, 0.0])
 
 
 KEPT = 1_500_000
@@ -101,7 +108,7 @@ KEPT = 1_500_000
 def views():
     room = box(-2.0, -2.0, 10.0, 2.0)
     scans = {area: scan_in(room, np.array([4.0 * area, 0.0, 0.0])) for area in range(3)}
-    return Views(scans, GridModel(), NEAR, KEPT)
+    return GridCache(scans, GridModel(), NEAR, KEPT)
 
 
 def test_a_place_has_the_keyframes_of_the_areas_around_in_its_frame(views):

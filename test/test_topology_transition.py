@@ -7,7 +7,13 @@ import pytest
 from worlds import box, scan_in
 
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.hybrid_map.surroundings import Place, entry, entry_bound, owner_at, transition
+from hmt_slam_ros.hybrid_map.surroundings import (
+    AreaPlace,
+    containing_area,
+    entry_prior,
+    sampled_entry_bound,
+    transition_model,
+)
 from hmt_slam_ros.registration.likelihood_grid import GridModel, build_area_grid
 
 RADIUS = 2.0
@@ -20,7 +26,7 @@ def place(first=0.0, last=8.0, border=5.0):
     x = np.arange(first, last + 0.1)
     poses = np.stack((x, np.zeros_like(x), np.zeros_like(x)), axis=1)
     scans = [scan_in(CORRIDORS, pose, field_of_view=2 * np.pi, beams=361) for pose in poses]
-    return Place(3, np.where(x > border, 7, 3), poses[:, :2], build_area_grid(scans, poses, GridModel()))
+    return AreaPlace(3, np.where(x > border, 7, 3), poses[:, :2], build_area_grid(scans, poses, GridModel()))
 
 
 def keyframes(x, y=0.0, count=4):
@@ -38,59 +44,59 @@ def corridor():
 
 
 def test_keyframes_among_those_of_an_area_lie_in_its_place(corridor):
-    assert owner_at(corridor, keyframes(1.0, 0.4), RADIUS) == 3
+    assert containing_area(corridor, keyframes(1.0, 0.4), RADIUS) == 3
 
 
 def test_keyframes_nearer_to_the_next_area_lie_in_the_place_of_that(corridor):
-    assert owner_at(corridor, keyframes(6.0), RADIUS) == 7
+    assert containing_area(corridor, keyframes(6.0), RADIUS) == 7
 
 
 def test_keyframes_far_away_lie_in_no_place(corridor):
-    assert owner_at(corridor, keyframes(12.0), RADIUS) is None
+    assert containing_area(corridor, keyframes(12.0), RADIUS) is None
 
 
 def test_a_parallel_corridor_behind_a_wall_is_another_place(corridor):
-    assert owner_at(corridor, keyframes(1.0, 1.6), RADIUS) is None
+    assert containing_area(corridor, keyframes(1.0, 1.6), RADIUS) is None
 
 
 def test_where_most_keyframes_lie_decides(corridor):
-    assert owner_at(corridor, keyframes(9.0, count=5), RADIUS) == 7  # up to 11 m, place up to 10 m
-    assert owner_at(corridor, keyframes(9.6, count=5), RADIUS) is None
+    assert containing_area(corridor, keyframes(9.0, count=5), RADIUS) == 7  # up to 11 m, place up to 10 m
+    assert containing_area(corridor, keyframes(9.6, count=5), RADIUS) is None
 
 
 def test_a_robot_tracked_within_a_place_is_there_for_sure(corridor):
-    assert entry(corridor, belief(0.05), keyframes(1.0), RADIUS).share == 1.0
+    assert entry_prior(corridor, belief(0.05), keyframes(1.0), RADIUS).probability == 1.0
 
 
 def test_without_overlap_the_probability_is_exactly_zero(corridor):
-    assert entry(corridor, belief(0.3), keyframes(14.0), RADIUS).share == 0.0
+    assert entry_prior(corridor, belief(0.3), keyframes(14.0), RADIUS).probability == 0.0
 
 
 @pytest.mark.parametrize("x", [1.0, 4.0, 5.6, 9.0, 14.0, 18.0])
 @pytest.mark.parametrize("sigma", [0.05, 1.0, 4.0])
 def test_the_bound_from_positions_alone_is_a_bound_and_zero_where_nothing_is_near(corridor, x, sigma):
     own = corridor.positions[corridor.owners == 3]
-    bound = entry_bound(own, belief(sigma), keyframes(x), RADIUS)
-    assert entry(corridor, belief(sigma), keyframes(x), RADIUS).share <= bound
+    bound = sampled_entry_bound(own, belief(sigma), keyframes(x), RADIUS)
+    assert entry_prior(corridor, belief(sigma), keyframes(x), RADIUS).probability <= bound
     assert bound == 0.0 or x < 9.0 or sigma > 0.05
 
 
 def test_a_loose_prior_spreads_over_the_place_and_what_lies_around(corridor):
-    share = entry(corridor, belief(3.0, 10.0), keyframes(1.0), RADIUS).share
+    share = entry_prior(corridor, belief(3.0, 10.0), keyframes(1.0), RADIUS).probability
     assert 0.02 < share < 0.6
 
 
 def test_the_probability_is_that_of_the_gaussian():
     """Lengthwise uncertainty alone: in the place up to 2 m beyond its last keyframe, normal cumulative distribution."""
     prior = PoseGaussian(np.array([9.0, 0.0, 0.0]), np.diag([0.8, 1e-3, 1e-4]) ** 2)
-    share = entry(place(border=50.0), prior, np.zeros((1, 3)), RADIUS).share
+    share = entry_prior(place(border=50.0), prior, np.zeros((1, 3)), RADIUS).probability
     assert share == pytest.approx(0.5 * (1.0 + math.erf((10.0 - 9.0) / 0.8 / math.sqrt(2.0))), abs=0.02)
 
 
 def test_neighbouring_areas_share_the_probability(corridor):
-    other = Place(7, corridor.owners, corridor.positions, corridor.grid)
+    other = AreaPlace(7, corridor.owners, corridor.positions, corridor.grid)
     prior = PoseGaussian(np.array([4.0, 0.0, 0.0]), np.diag([0.5, 0.1, 0.003]) ** 2)
-    shares = [entry(p, prior, keyframes(0.5), RADIUS).share for p in (corridor, other)]
+    shares = [entry_prior(p, prior, keyframes(0.5), RADIUS).probability for p in (corridor, other)]
     assert min(shares) > 0.1
     assert sum(shares) <= 1.0
     assert sum(shares) == pytest.approx(1.0, abs=0.02)
@@ -98,30 +104,32 @@ def test_neighbouring_areas_share_the_probability(corridor):
 
 def test_known_and_new_sum_to_one():
     for shares in ({1: 0.2, 4: 0.3}, {1: 0.7, 2: 0.6}, {1: 1.0}, {}):
-        model = transition(shares, 0.05)
+        model = transition_model(shares, 0.05)
         assert sum(model.known.values()) + model.new == pytest.approx(1.0)
 
 
 def test_new_ground_has_what_the_known_places_leave():
-    model = transition({1: 0.2, 4: 0.3}, 0.05)
+    model = transition_model({1: 0.2, 4: 0.3}, 0.05)
     assert model.new == pytest.approx(0.5)
     assert model.known == pytest.approx({1: 0.2, 4: 0.3})
 
 
 def test_new_ground_keeps_its_floor():
-    assert transition({1: 0.9, 2: 0.9}, 0.05).new == 0.05
+    assert transition_model({1: 0.9, 2: 0.9}, 0.05).new == 0.05
 
 
 def test_without_a_candidate_all_is_new():
-    assert transition({}, 0.05) == ({}, 1.0)
+    assert transition_model({}, 0.05) == ({}, 1.0)
 
 
 def test_a_place_that_the_belief_is_all_in_is_made_of_poses_as_near_as_the_belief_is_wide(corridor):
-    found = entry(corridor, belief(0.05), keyframes(1.0), RADIUS)
-    assert found.typical == pytest.approx(2.37, abs=0.1)  # the median of chi-square with 3 degrees of freedom
+    found = entry_prior(corridor, belief(0.05), keyframes(1.0), RADIUS)
+    assert found.median_mahalanobis2 == pytest.approx(
+        2.37, abs=0.1
+    )  # the median of chi-square with 3 degrees of freedom
 
 
 def test_a_place_at_the_edge_of_the_belief_is_made_of_poses_that_are_far_off(corridor):
-    near, far = (entry(corridor, belief(1.0), keyframes(x), RADIUS) for x in (1.0, -3.5))
-    assert near.share > 5.0 * far.share > 0.0
-    assert far.typical > near.typical + 1.0
+    near, far = (entry_prior(corridor, belief(1.0), keyframes(x), RADIUS) for x in (1.0, -3.5))
+    assert near.probability > 5.0 * far.probability > 0.0
+    assert far.median_mahalanobis2 > near.median_mahalanobis2 + 1.0

@@ -5,8 +5,8 @@ import pytest
 from worlds import box, scan_in
 
 from hmt_slam_ros.configuration import Configuration
-from hmt_slam_ros.registration.consistency import WALLS, WALLS_USUAL
-from hmt_slam_ros.topological_inference.global_scan_matching import Walls
+from hmt_slam_ros.registration.consistency import WALLS_OF_MAP, WALLS_OUTLIER_RATE
+from hmt_slam_ros.topological_inference.global_scan_matching import FreeSpaceCheck
 
 OUTER, SHELF = box(-3.0, -2.0, 5.0, 2.0), box(1.0, 1.0, 2.5, 1.3)
 OPEN = np.array([[-3.0, 2.0, 0.0, 2.0], [1.2, 2.0, 5.0, 2.0], *OUTER[[0, 1, 3]], *box(-1.0, 2.1, 2.5, 6.0)[1:]])
@@ -21,7 +21,7 @@ def between(there, here, known=KNOWN, seen=SEEN):
         for walls, poses in ((there, KNOWN), (here, SEEN))
         for k, pose in poses.items()
     }
-    return Walls(scans, Configuration()).between(known, seen)
+    return FreeSpaceCheck(scans, Configuration()).compare(known, seen)
 
 
 def test_in_the_same_room_no_wall_is_seen_through():
@@ -30,7 +30,7 @@ def test_in_the_same_room_no_wall_is_seen_through():
     assert found.on > 600
     assert found.free == 0
     assert found.samples == found.on
-    assert WALLS.log_ratio(found, WALLS_USUAL) > 0.0
+    assert WALLS_OF_MAP.log_likelihood_ratio(found, WALLS_OUTLIER_RATE) > 0.0
 
 
 @pytest.mark.parametrize("turned", [False, True], ids=["in the map", "in the scans"])
@@ -38,7 +38,7 @@ def test_a_door_is_found_open_whichever_side_knows_it_closed(turned):
     rooms = (OUTER, OPEN)
     found = between(*rooms[::-1] if turned else rooms)
     assert found.free >= 10  # five samples across, in scans that see it at all
-    assert WALLS.log_ratio(found, WALLS_USUAL) < -1.0
+    assert WALLS_OF_MAP.log_likelihood_ratio(found, WALLS_OUTLIER_RATE) < -1.0
 
 
 def test_a_shelf_speaks_against_the_room_and_people_do_little():
@@ -46,8 +46,10 @@ def test_a_shelf_speaks_against_the_room_and_people_do_little():
     shelf = between(np.concatenate((OUTER, SHELF)), OUTER)
     people = between(OUTER, np.concatenate([OUTER, *(box(x, 0.5, x + 0.3, 0.8) for x in (-1.0, 2.0))]))
     assert shelf.free > 2 * people.free
-    assert -1.0 < WALLS.log_ratio(people, WALLS_USUAL) < 0.0
-    assert WALLS.log_ratio(people, 0.003) > WALLS.log_ratio(people, WALLS_USUAL)  # where walls are passed usually
+    assert -1.0 < WALLS_OF_MAP.log_likelihood_ratio(people, WALLS_OUTLIER_RATE) < 0.0
+    assert WALLS_OF_MAP.log_likelihood_ratio(people, 0.003) > WALLS_OF_MAP.log_likelihood_ratio(
+        people, WALLS_OUTLIER_RATE
+    )  # where walls are passed usually
 
 
 def test_keyframes_that_are_far_off_see_nothing_of_each_other():

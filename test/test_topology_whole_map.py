@@ -9,10 +9,10 @@ from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
-from hmt_slam_ros.hybrid_map.surroundings import Nearness, Views
+from hmt_slam_ros.hybrid_map.surroundings import GridCache, Neighborhood
 from hmt_slam_ros.registration.area_to_area import MatchSettings
 from hmt_slam_ros.registration.likelihood_grid import GridModel
-from hmt_slam_ros.topological_inference.global_scan_matching import Walls, WholeMap, regions
+from hmt_slam_ros.topological_inference.global_scan_matching import FreeSpaceCheck, GlobalScanMatcher, regions
 
 REACH = 6.0
 ASKED = se2.compose(np.array([3.6, 2.6, 2.5]), np.array([[0.3 * k, 0.0, 0.05 * k] for k in range(4)]))
@@ -29,15 +29,15 @@ def asked():
     for area, walls in enumerate((ROOM, OTHER)):
         for k, pose in enumerate(PATH):
             scans[6 * area + k] = seen(walls, pose, 6 * area + k)
-            hybrid_map.place(6 * area + k, area, se2.between(PATH[0], pose))
+            hybrid_map.set_keyframe(6 * area + k, area, se2.between(PATH[0], pose))
     scans |= {12 + k: seen(ROOM, pose, 12 + k) for k, pose in enumerate(ASKED)}
     poses = {12 + k: se2.between(ASKED[0], pose) for k, pose in enumerate(ASKED)}
     return hybrid_map, poses, scans
 
 
 def whole_map(scans):
-    views = Views(scans, GridModel(), Nearness(0.3, REACH))
-    return WholeMap(views, Walls(scans, Configuration()), MatchSettings(temper=0.3), 2.0, REACH)
+    views = GridCache(scans, GridModel(), Neighborhood(0.3, REACH))
+    return GlobalScanMatcher(views, FreeSpaceCheck(scans, Configuration()), MatchSettings(temper=0.3), 2.0, REACH)
 
 
 @pytest.fixture
@@ -138,13 +138,13 @@ def test_areas_are_searched_together_where_they_lie_for_certain_beside_each_othe
     """Six areas in a row, 5 m apart: each belongs to one region, whose map reaches beyond it."""
     hybrid_map = HybridMap()
     for area in range(6):
-        hybrid_map.place(area, area, np.zeros(3))
+        hybrid_map.set_keyframe(area, area, np.zeros(3))
         if area:
             arc = PoseGaussian(np.array([5.0, 0.0, 0.0]), np.diag([deviation, deviation, 0.01]) ** 2)
             hybrid_map.set_arc(area - 1, area, arc, closure=False)
     found = regions(hybrid_map, range(6), 10.0)
-    assert sorted(area for part in found for area in part.own) == list(range(6))
+    assert sorted(area for part in found for area in part.own_areas) == list(range(6))
     assert len(found) == count
-    assert all(part.own <= part.poses.keys() for part in found)
+    assert all(part.own_areas <= part.poses.keys() for part in found)
     if count == 2:
         assert found[0].poses.keys() == {0, 1, 2, 3, 4}

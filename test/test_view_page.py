@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from hmt_slam_ros.cli.arguments import parser
+from hmt_slam_ros.cli.arguments import build_parser
 from hmt_slam_ros.errors import HmtSlamError
-from hmt_slam_ros.messages.documents import KeyframeHead
-from hmt_slam_ros.messages.messages import Hypotheses, Keyframe, Leaf
+from hmt_slam_ros.messages.documents import KeyframeHeader
+from hmt_slam_ros.messages.messages import Hypotheses, Hypothesis, Keyframe
 from hmt_slam_ros.sensors import Scan
-from hmt_slam_ros.view.board import HISTORY, Board, History, Seen
-from hmt_slam_ros.view.health import Health
+from hmt_slam_ros.view.board import HISTORY_LENGTH, Board, ClientState, KeyframeHistory
+from hmt_slam_ros.view.health import SystemHealth
 from hmt_slam_ros.view.server import PORT, PageServer, grid_png
 
 NODES = ("slam", "rtl")
@@ -53,59 +53,59 @@ def test_the_picture_of_a_grid_has_the_smallest_y_at_the_bottom_and_three_levels
 
 
 def test_a_browser_hears_of_what_changed_alone(board):
-    seen = Seen()
+    seen = ClientState()
     board.put("area", "3")
     board.put("localized", True)
-    assert board.news(seen) == {"area": "3", "localized": True, "history": {"anew": True, "events": []}}
+    assert board.wait_for_changes(seen) == {"area": "3", "localized": True, "history": {"anew": True, "events": []}}
     board.put("area", "3")
-    assert board.news(seen) == {}
+    assert board.wait_for_changes(seen) == {}
     board.put("area", "4")
-    assert board.news(seen) == {"area": "4"}
+    assert board.wait_for_changes(seen) == {"area": "4"}
 
 
 def test_the_history_comes_once_and_whole_where_it_began_anew(board):
-    one, other = Seen(), Seen()
+    one, other = ClientState(), ClientState()
     for event in range(3):
         board.append(event)
-    assert board.news(one)["history"] == {"anew": True, "events": [0, 1, 2]}
+    assert board.wait_for_changes(one)["history"] == {"anew": True, "events": [0, 1, 2]}
     board.append(3)
-    assert board.news(one)["history"] == {"anew": False, "events": [3]}
-    assert board.news(other)["history"] == {"anew": True, "events": [0, 1, 2, 3]}
-    board.forget_history()
+    assert board.wait_for_changes(one)["history"] == {"anew": False, "events": [3]}
+    assert board.wait_for_changes(other)["history"] == {"anew": True, "events": [0, 1, 2, 3]}
+    board.clear_history()
     board.append(7)
-    assert board.news(one)["history"] == {"anew": True, "events": [7]}
+    assert board.wait_for_changes(one)["history"] == {"anew": True, "events": [7]}
 
 
 def test_a_browser_that_missed_more_than_is_kept_gets_what_is_left(board):
-    seen = Seen()
-    board.news(seen)
-    for event in range(HISTORY + 5):
+    seen = ClientState()
+    board.wait_for_changes(seen)
+    for event in range(HISTORY_LENGTH + 5):
         board.append(event)
-    assert board.news(seen)["history"]["events"] == list(range(5, HISTORY + 5))
+    assert board.wait_for_changes(seen)["history"]["events"] == list(range(5, HISTORY_LENGTH + 5))
 
 
 def head(sequence, stamp):
     scan = Scan(stamp, np.ones(3, dtype=np.float32), -1.0, 0.1, 0.05, 30.0, np.zeros(3))
-    return KeyframeHead.of(Keyframe(sequence, scan, 0.5 * sequence, ()))
+    return KeyframeHeader.from_keyframe(Keyframe(sequence, scan, 0.5 * sequence, ()))
 
 
 def test_events_are_told_once_in_order_when_both_halves_are_there_and_a_new_run_begins_anew(board):
-    history, seen = History(board), Seen()
+    history, seen = KeyframeHistory(board), ClientState()
 
     def told(*messages):
         for message in messages:
-            history.hear(message)
-        history.tell()
-        news = board.news(seen).get("history", {"anew": False, "events": []})
+            history.add(message)
+        history.publish_complete()
+        news = board.wait_for_changes(seen).get("history", {"anew": False, "events": []})
         return news["anew"], [event["event"] for event in news["events"]]
 
-    answers = [Hypotheses(k, (Leaf(3, 0, 0.25, 5), Leaf(1, 0, 0.75, 4, lost=True))) for k in range(3)]
+    answers = [Hypotheses(k, (Hypothesis(3, 0, 0.25, 5), Hypothesis(1, 0, 0.75, 4, lost=True))) for k in range(3)]
     assert told(answers[1], answers[0]) == (True, [])
     assert told(head(1, 7_000_000_000), head(0, 5_500_000_000)) == (False, [0, 1])
     assert told(head(2, 9_000_000_000), answers[0], answers[1], head(0, 5_500_000_000)) == (False, [])
     assert told(answers[2]) == (False, [2])
     assert told(head(0, 20_000_000_000), answers[0]) == (True, [0])
-    (event,) = board.news(Seen())["history"]["events"]
+    (event,) = board.wait_for_changes(ClientState())["history"]["events"]
     assert event == {
         "event": 0,
         "time": 20.0,
@@ -134,24 +134,24 @@ def test_the_page_its_style_and_its_scripts_are_served_and_ask_for_nothing_from_
 
 def test_the_map_is_sent_to_those_who_do_not_have_it(board, server):
     assert status_of(server.url + "map.png") == 404
-    tag = board.put_picture(grid_png(np.zeros((5, 5), dtype=np.int8)))
+    tag = board.put_map_image(grid_png(np.zeros((5, 5), dtype=np.int8)))
     with urlopen(server.url + "map.png", timeout=10) as answer:
         assert answer.headers["ETag"] == f'"{tag}"'
         assert answer.read().startswith(b"\x89PNG")
     assert status_of(Request(server.url + "map.png", headers={"If-None-Match": f'"{tag}"'})) == 304
-    board.put_picture(grid_png(np.full((5, 5), 100, dtype=np.int8)))
+    board.put_map_image(grid_png(np.full((5, 5), 100, dtype=np.int8)))
     with urlopen(Request(server.url + "map.png", headers={"If-None-Match": f'"{tag}"'}), timeout=10) as answer:
-        assert answer.status == 200
+        assert answer.robot_status == 200
 
 
 def test_news_stream_and_somebody_who_looks_is_noticed(board, server):
-    assert not board.watched
+    assert not board.is_watched
     with urlopen(server.url + "news", timeout=10) as stream:
         assert json.loads(stream.readline().decode().removeprefix("data: "))["history"]["anew"]
         assert stream.readline() == b"\n"
         board.put("area", "5")
         assert json.loads(stream.readline().decode().removeprefix("data: ")) == {"area": "5"}
-        assert board.watched
+        assert board.is_watched
 
 
 def test_a_page_of_another_site_gets_nothing(server):
@@ -162,9 +162,9 @@ def test_a_page_of_another_site_gets_nothing(server):
 
 
 def test_the_command_line_names_the_port_of_the_node():
-    options = parser().parse_args(["replay", "log", "--out", "out", "--view"])
+    options = build_parser().parse_args(["replay", "log", "--out", "out", "--view"])
     assert options.view == PORT
-    assert parser().parse_args(["replay", "log", "--out", "out"]).view is None
+    assert build_parser().parse_args(["replay", "log", "--out", "out"]).view is None
 
 
 def test_a_port_in_use_and_an_address_that_is_none_are_told_in_a_sentence(board):
@@ -192,17 +192,17 @@ def well(health, now, **messages):
 
 
 def test_where_no_node_runs_the_page_says_what_to_start():
-    verdict = Health(NODES).verdict(5.0)
+    verdict = SystemHealth(NODES).verdict(5.0)
     assert verdict["level"] == "waiting"
     assert "ros2 launch hmt_slam_ros mapping.launch.py" in verdict["advice"]
 
 
 def test_a_node_that_is_missing_or_fell_silent_is_named():
-    health = Health(NODES)
-    health.hear("slam", 0, "running", {}, 0.0)
+    health = SystemHealth(NODES)
+    health.update("slam", 0, "running", {}, 0.0)
     assert health.verdict(1.0)["text"] == "rtl is not running."
     well(health, 2.0)
-    health.hear("slam", 0, "running", {}, 20.0)
+    health.update("slam", 0, "running", {}, 20.0)
     assert health.verdict(20.5) | {"advice": ""} == {
         "level": "fault",
         "text": "rtl says nothing, for 18 s.",
@@ -212,10 +212,10 @@ def test_a_node_that_is_missing_or_fell_silent_is_named():
 
 
 def test_no_pose_is_a_fault_but_not_after_the_end_of_a_log():
-    health = Health(NODES)
+    health = SystemHealth(NODES)
     well(health, 0.0)
     assert health.verdict(1.0)["level"] == "waiting"
-    health.pose_heard = 0.5
+    health.last_pose_at = 0.5
     assert health.verdict(1.0) == {"level": "good", "text": "All is well.", "advice": ""}
     assert health.verdict(5.0)["text"] == "No pose for 4 s."
     health.robot_state = "ended"
@@ -223,18 +223,18 @@ def test_no_pose_is_a_fault_but_not_after_the_end_of_a_log():
 
 
 def test_a_node_that_is_halted_is_named_rather_than_the_pose_that_does_not_come():
-    health = Health(NODES)
+    health = SystemHealth(NODES)
     well(health, 0.0)
-    health.hear("rtl", 0, "inactive", {"state": "inactive"}, 0.0)
+    health.update("rtl", 0, "inactive", {"state": "inactive"}, 0.0)
     told = {"level": "waiting", "text": "rtl is inactive.", "advice": "ros2 lifecycle set /rtl activate"}
     assert health.verdict(1.0) == told
     assert health.rows(1.0)[1]["level"] == "waiting"
-    health.hear("rtl", 0, "running", {"state": "active"}, 1.0)
+    health.update("rtl", 0, "running", {"state": "active"}, 1.0)
     assert "no pose came yet" in health.verdict(2.0)["text"]
 
 
 def test_errors_come_before_warnings_and_warnings_grow_old():
-    health = Health(NODES, pose_heard=100.0, localized=False)
+    health = SystemHealth(NODES, last_pose_at=100.0, is_localized=False)
     well(health, 0.0, slam=(1, "the wheels slip"))
     assert health.verdict(1.0) == {"level": "attention", "text": "slam warns.", "advice": "the wheels slip"}
     well(health, 99.0, slam=(1, "the wheels slip"))

@@ -9,7 +9,7 @@ import numpy as np
 
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.sensors import Scan
-from hmt_slam_ros.simulation.laser import cast, wall_index
+from hmt_slam_ros.simulation.laser import cast_rays, wall_index
 
 RANGE_MAX = 30.0
 
@@ -32,7 +32,7 @@ def distances(walls, sensor, angles):
     The laser has one pose (3,), or one for each angle (n, 3).
     """
     sensor = np.broadcast_to(sensor, (angles.size, 3))
-    return cast(wall_index(walls), sensor[:, :2].copy(), angles + sensor[:, 2], np.inf)
+    return cast_rays(wall_index(walls), sensor[:, :2].copy(), angles + sensor[:, 2], np.inf)
 
 
 def scan_in(

@@ -10,7 +10,7 @@ from benchmark.simulated.truth import Claim, Truth
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.messages.map_changes import Arc
-from hmt_slam_ros.messages.messages import Hypotheses, Leaf
+from hmt_slam_ros.messages.messages import Hypotheses, Hypothesis
 from hmt_slam_ros.messages.replica import FIRST_HYPOTHESIS, Replica
 
 # Keyframes of the robot's area by which it is judged that this area joins another.
@@ -66,11 +66,11 @@ class Paths:
         :param asked: {parent: what it asked at this event}.
         """
         self.paths = {
-            leaf.hypothesis: self._followed(leaf, hypotheses.sequence, replica.maps[leaf.parent], asked)
-            for leaf in hypotheses.leaves
+            leaf.id: self._followed(leaf, hypotheses.sequence, replica.maps[leaf.parent], asked)
+            for leaf in hypotheses.hypotheses
         }
 
-    def _followed(self, leaf: Leaf, event: int, before: HybridMap, asked: Mapping[int, Examination]) -> Path:
+    def _followed(self, leaf: Hypothesis, event: int, before: HybridMap, asked: Mapping[int, Examination]) -> Path:
         path = self.paths[leaf.parent]
         examination = asked.get(leaf.parent)
         found = [self._closure(leaf, arc, event, before, examination) for arc in closing(leaf, before, examination)]
@@ -80,10 +80,14 @@ class Paths:
             return path
         return replace(path, missing=not found and not new_is_right(examination, self._truth))
 
-    def _closure(self, leaf: Leaf, arc: Arc, event: int, before: HybridMap, examination: Examination | None) -> Closure:
+    def _closure(
+        self, leaf: Hypothesis, arc: Arc, event: int, before: HybridMap, examination: Examination | None
+    ) -> Closure:
         known_area = known_end(leaf, arc)
         other, pose = (arc.source, arc.pose.inverse()) if arc.target == known_area else (arc.target, arc.pose)
-        joined = {r.keyframe: r.pose for r in leaf.relabelled if r.area == known_area and r.source != r.area}
+        joined = {
+            r.keyframe: r.pose for r in leaf.moved_keyframes if r.area == known_area and r.previous_area != r.area
+        }
         recent = examination.keyframes if examination else list(before.keyframes(other))[-_RECENT:]
         staying = {k: se2.compose(pose.mean, at) for k, at in before.keyframes(other).items() if k in recent}
         known, asked = before.keyframes(known_area), joined or staying
@@ -110,23 +114,23 @@ class Paths:
         return replace(closure, claim=claim)
 
 
-def closing(leaf: Leaf, before: HybridMap, examination: Examination | None) -> Iterator[Arc]:
+def closing(leaf: Hypothesis, before: HybridMap, examination: Examination | None) -> Iterator[Arc]:
     """The arcs by which a leaf says where in a known area the robot is.
 
     They close a loop that its parent had not closed, or are measured anew by keyframes that TSBI found in the area.
     """
-    if leaf.withdrawn:
+    if leaf.removed_arcs:
         return  # a question that TLCA opened again: nothing was observed
-    found = examination is not None and bool(leaf.relabelled) and leaf.area in before.area_ids()
+    found = examination is not None and bool(leaf.moved_keyframes) and leaf.area in before.area_ids()
     for arc in leaf.arcs:
         value = before.arc_value(arc.source, arc.target)
         if found or (arc.closure and (value is None or not value.closure)):
             yield arc
 
 
-def known_end(leaf: Leaf, arc: Arc) -> int:
+def known_end(leaf: Hypothesis, arc: Arc) -> int:
     """The known one of the two areas of an arc: that which keyframes moved to, else that in which the robot is not."""
-    if leaf.relabelled:
+    if leaf.moved_keyframes:
         return leaf.area
     return arc.target if arc.source == leaf.area else arc.source
 
@@ -156,11 +160,11 @@ def answers(
     :param paths: after the event.
     """
     found = []
-    for leaf in hypotheses.leaves:
+    for leaf in hypotheses.hypotheses:
         examination = asked.get(leaf.parent)
         arcs = list(closing(leaf, before.maps[leaf.parent], examination))
         area = NOT_ASKED if examination is None else known_end(leaf, arcs[0]) if arcs else NEW
-        found.append(Answer(area, leaf.probability, paths[leaf.hypothesis].right))
+        found.append(Answer(area, leaf.probability, paths[leaf.id].right))
     return found
 
 

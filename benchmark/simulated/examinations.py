@@ -16,19 +16,19 @@ from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
-from hmt_slam_ros.hybrid_map.shortest_path import reachable
-from hmt_slam_ros.hybrid_map.surroundings import Views, entry
+from hmt_slam_ros.hybrid_map.shortest_path import shortest_path_beliefs
+from hmt_slam_ros.hybrid_map.surroundings import GridCache, entry_prior
 from hmt_slam_ros.messages.replica import Replica
 from hmt_slam_ros.registration.likelihood_grid import AreaGrid
 from hmt_slam_ros.registration.match_modes import log_ratio_at
-from hmt_slam_ros.registration.search_bounds import Surface
+from hmt_slam_ros.registration.search_bounds import LogRatioGrid
 from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.topological_inference.admission import Query
 from hmt_slam_ros.topological_inference.branching import Branches, Branching, Parent
-from hmt_slam_ros.topological_inference.closure_search import ClosureSearch, Comparison, Fit
-from hmt_slam_ros.topological_inference.place_recognition import Looks, log_ratio
+from hmt_slam_ros.topological_inference.closure_search import AreaComparison, ClosureSearch, Fit
+from hmt_slam_ros.topological_inference.place_recognition import ScanDescriptors, descriptor_log_ratio
 
-_Asked = tuple[Query, Mapping[int, Collection[int]], frozenset[int], Comparison]
+_Asked = tuple[Query, Mapping[int, Collection[int]], frozenset[int], AreaComparison]
 _VIEWS = 3
 _NAN = math.nan
 _NO_MATCH = (0, _NAN, 0, 0)
@@ -53,9 +53,9 @@ class Examination:
     query: Query
     compared: Mapping[int, Collection[int]]
     excluded: frozenset[int]
-    found: Comparison
-    views: Views
-    looks: Looks
+    found: AreaComparison
+    views: GridCache
+    looks: ScanDescriptors
 
     @property
     def hybrid_map(self) -> HybridMap:
@@ -90,7 +90,7 @@ class WatchedBranching(Branching):
     def __init__(self, configuration: Configuration, replica: Replica, heard: Heard) -> None:
         super().__init__(configuration, replica, composition.landmark_evidence)
         self.search = self._watched = _WatchedSearch(configuration, replica.scans)
-        self._looks = Looks(replica.scans)
+        self._looks = ScanDescriptors(replica.scans)
         self._heard = heard
 
     def cut(self, parent: Parent, keyframes: Sequence[int]) -> Branches:
@@ -117,9 +117,9 @@ class _WatchedSearch(ClosureSearch):
         self._last: _Asked | None = None
 
     @property
-    def views(self) -> Views:
+    def views(self) -> GridCache:
         """Grids that were built and are kept."""
-        return self._views
+        return self._grid_cache
 
     def compare(
         self,
@@ -130,7 +130,7 @@ class _WatchedSearch(ClosureSearch):
         excluded: Collection[int],
         most: int,
         only: Collection[int] = (),
-    ) -> Comparison:
+    ) -> AreaComparison:
         """As always."""
         found = super().compare(hybrid_map, area, query, compared, excluded, most, only)
         self._last = query, compared, frozenset(excluded), found
@@ -245,7 +245,7 @@ def rows(
     :param travelled: {keyframe: path length since the start, m}.
     """
     new = int(new_is_right(examination, truth))
-    for known in examination.found.examined:
+    for known in examination.found.examined_areas:
         fits = [fit for fit in examination.found.fits if fit.area == known]
         candidate = _Candidate(examination, truth, configuration, known)
         ours = travelled[event] - max(travelled[k] for k in examination.hybrid_map.keyframes(known))
@@ -281,7 +281,7 @@ class _Candidate:
         self._asked, self._truth, self._options, self._area = examination, truth, configuration.tsbi, area
         self.fresh = examination.fresh(area)
         self.known = examination.hybrid_map.keyframes(area)
-        belief = reachable(examination.hybrid_map, examination.parent.area)[area]
+        belief = shortest_path_beliefs(examination.hybrid_map, examination.parent.area)[area]
         prior = belief.inverse().compose(examination.query.belief)
         self._prior = PoseGaussian(prior.mean, self._options.prior_scale**2 * prior.covariance)
         self._place = examination.views.place(examination.hybrid_map, area, examination.excluded)
@@ -290,7 +290,7 @@ class _Candidate:
     def transition(self) -> tuple[float, float, float]:
         """Share, pi and the probability of new ground."""
         poses = np.array(list(self.fresh.values()))
-        share = entry(self._place, self._prior, poses, self._options.place_radius).share
+        share = entry_prior(self._place, self._prior, poses, self._options.place_radius).probability
         model = self._asked.found.transition
         return share, model.known[self._area], model.new
 
@@ -359,11 +359,11 @@ class _Candidate:
         """log p(phi), nats, relative to the other known areas."""
         areas = [self._area, *(area for area in self._asked.known_areas if area != self._area)]
         keyframes = [self._asked.hybrid_map.keyframes(area) for area in areas]
-        return float(log_ratio(self._asked.looks.likeness(self.fresh, keyframes)[0]))
+        return float(descriptor_log_ratio(self._asked.looks.similarity(self.fresh, keyframes)[0]))
 
 
 def _match(points: NDArray[np.float64], pose: Pose, grid: AreaGrid) -> Match:
     """How samples that stand at ``grid_T_points`` lie in a grid."""
-    found = grid.agreement(points, pose)
-    score = log_ratio_at(Surface(grid.fine, grid.origin, 0.5 * grid.cell), points, pose)
-    return Match(found.samples, score, found.on, found.free)
+    found = grid.compare(points, pose)
+    score = log_ratio_at(LogRatioGrid(grid.fine_log_ratio, grid.origin, 0.5 * grid.cell), points, pose)
+    return Match(found.samples, score, found.on_surface, found.in_free_space)

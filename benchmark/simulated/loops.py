@@ -18,7 +18,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from benchmark.simulated.truth import Pose, Truth
-from hmt_slam_ros.configuration.metric_slam import Motion
+from hmt_slam_ros.configuration.metric_slam import MotionParameters
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
@@ -154,7 +154,7 @@ def _areas(hybrid_map: HybridMap) -> dict[int, int]:
 
 def _linked(hybrid_map: HybridMap, areas: Mapping[int, int], area: int, keyframes: tuple[int, ...]) -> bool:
     """Whether one of the keyframes is in an area or in one beside it."""
-    near = {area, *hybrid_map.neighbours(area)}
+    near = {area, *hybrid_map.neighbors(area)}
     return any(areas.get(keyframe) in near for keyframe in keyframes)
 
 
@@ -181,7 +181,7 @@ def rivalries(log: SimulatedLog, truth: Truth, loops: list[Loop], travelled: Map
     :param loops: the places that the robot entered again.
     :param travelled: {keyframe event: path length since the start, m}.
     """
-    moves = _moves(log.scenario.building.places)
+    moves = _moves(log.scenario.building.twin_frames)
     found = [_rivalry(log, truth, loop, moves, travelled) for loop in loops if moves]
     return [rivalry for rivalry in found if rivalry is not None]
 
@@ -250,7 +250,7 @@ def by_odometry(log: SimulatedLog, truth: Truth, since: int, event: int, poses: 
     readings = scenario.odometry[:: scenario.settings.readings][first : last + 1]
     belief = PoseGaussian(truth.poses[since], np.zeros((3, 3)))
     for increment in se2.between(readings[:-1], readings[1:]):
-        covariance = scenario.settings.odometry**2 * increment_covariance(increment, Motion())
+        covariance = scenario.settings.odometry**2 * increment_covariance(increment, MotionParameters())
         belief = belief.compose(PoseGaussian(increment, covariance))
     errors = [se2.log(se2.between(belief.mean, pose)) for pose in poses]
     logs = np.array([-0.5 * error @ np.linalg.solve(belief.covariance, error) for error in errors])

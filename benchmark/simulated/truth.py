@@ -16,13 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmark.landmark_truth import World
-from hmt_slam_ros.area_abstraction.doors import STEP, crossings
+from hmt_slam_ros.area_abstraction.doors import MAX_STEP, find_crossings
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
-from hmt_slam_ros.landmarks.area_landmarks import AreaLandmarks
-from hmt_slam_ros.landmarks.portals import portals_of
+from hmt_slam_ros.landmarks.area_landmarks import AreaLandmarkExtractor
+from hmt_slam_ros.landmarks.portals import find_portals
 from hmt_slam_ros.messages.messages import Keyframe
 from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.simulation import SimulatedLog
@@ -183,7 +183,7 @@ class Doors(NamedTuple):
     def passed(self, path: Array) -> Doors:
         """Those that a path (n, 2) passes."""
         each = zip(self.poses, self.widths, strict=True)
-        chosen = np.array([any(crossings(path, *one)) for one in each], dtype=np.bool_)
+        chosen = np.array([any(find_crossings(path, *one)) for one in each], dtype=np.bool_)
         return Doors(*(column[chosen] for column in self))
 
     def apart(self, places: Array) -> Array:
@@ -236,16 +236,16 @@ def _changes(truth: Truth, hybrid_map: HybridMap) -> Array:
     """True places (n, 2) where the path goes from one area into another, each between two keyframes."""
     path = sorted((k, area) for area in hybrid_map.area_ids() for k in hybrid_map.keyframes(area))
     ends = [(truth.poses[a][:2], truth.poses[b][:2]) for (a, left), (b, entered) in pairwise(path) if left != entered]
-    return np.array([0.5 * (a + b) for a, b in ends if np.hypot(*(a - b)) <= STEP]).reshape(-1, 2)
+    return np.array([0.5 * (a + b) for a, b in ends if np.hypot(*(a - b)) <= MAX_STEP]).reshape(-1, 2)
 
 
 def _portals(truth: Truth, hybrid_map: HybridMap, scans: Mapping[int, Scan], configuration: Configuration) -> Array:
     """Places (n, 2) of the portals in the world, by the true frame of the area that they are told in."""
-    known, landmarks = AreaLandmarks(LocalMapping(configuration)), {}
+    known, landmarks = AreaLandmarkExtractor(LocalMapping(configuration)), {}
     for area in hybrid_map.area_ids():
         placed = hybrid_map.keyframes(area)
-        landmarks[area] = known.of([scans[k] for k in placed], np.array(list(placed.values())).reshape(-1, 3))
-    portals = portals_of(hybrid_map, landmarks, configuration.features)
+        landmarks[area] = known.extract([scans[k] for k in placed], np.array(list(placed.values())).reshape(-1, 3))
+    portals = find_portals(hybrid_map, landmarks, configuration.features)
     frames = [truth.frame(hybrid_map, portal.areas[0]) for portal in portals]
     poses = [se2.compose(frame, one.pose_in_a.mean) for frame, one in zip(frames, portals, strict=True)]
     return np.array(poses).reshape(-1, 3)[:, :2]

@@ -32,7 +32,7 @@ from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.loop_closure.tlca import Tlca
-from hmt_slam_ros.messages.messages import Accepted, EndOfLog, Hypotheses, Keyframe, Message, RealTimePose
+from hmt_slam_ros.messages.messages import ClosureDecision, EndOfLog, Hypotheses, Keyframe, Message, RealTimePose
 from hmt_slam_ros.messages.replica import FIRST_AREA, Replica
 from hmt_slam_ros.messages.routing import Process
 from hmt_slam_ros.offline.runtime import LockStep
@@ -121,7 +121,7 @@ class Watch:
                 self._note(message)
             case Hypotheses():
                 self._follow(message)
-            case Accepted():
+            case ClosureDecision():
                 self._accept(message)
             case RealTimePose() if message.stamp >= self._next_pose:
                 self._next_pose = message.stamp + _POSE_PERIOD
@@ -129,11 +129,13 @@ class Watch:
 
     def _note(self, keyframe: Keyframe) -> None:
         self.truth.note(keyframe)
-        self.travelled[keyframe.sequence] = keyframe.travelled
-        self._samples = {leaf.hypothesis: leaf.effective_samples for leaf in keyframe.leaves}
-        self._replica.add(keyframe)
-        best = self._replica.best
-        self.loops.note(keyframe.sequence, keyframe.travelled, self._replica.maps[best], self._replica.areas[best])
+        self.travelled[keyframe.sequence] = keyframe.path_length
+        self._samples = {leaf.hypothesis: leaf.effective_samples for leaf in keyframe.estimates}
+        self._replica.add_keyframe(keyframe)
+        best = self._replica.best_hypothesis
+        self.loops.note(
+            keyframe.sequence, keyframe.path_length, self._replica.maps[best], self._replica.robot_areas[best]
+        )
         self._asked = {}
 
     def _examined(self, examination: Examination) -> None:
@@ -157,23 +159,23 @@ class Watch:
                     "arcs_alone": [asdict(answer) | {"among": among} for answer, among in arcs],
                 }
             )
-        self._replica.apply(hypotheses)
+        self._replica.apply_hypotheses(hypotheses)
 
     def _tell(self, hypotheses: Hypotheses) -> None:
         """Keep the PMF, and the loops that every hypothesis closes now: those that there are, and those that not."""
         leaves = []
-        for leaf in hypotheses.leaves:
-            closures = self._paths.paths[leaf.hypothesis].closures
+        for leaf in hypotheses.hypotheses:
+            closures = self._paths.paths[leaf.id].closures
             now = [closure.claim.true for closure in closures if closure.event == hypotheses.sequence]
-            told = {"hypothesis": leaf.hypothesis, "parent": leaf.parent, "probability": leaf.probability}
+            told = {"hypothesis": leaf.id, "parent": leaf.parent, "probability": leaf.probability}
             leaves.append(told | {"samples": self._samples[leaf.parent], "right": sum(now), "wrong": now.count(False)})
         event = hypotheses.sequence
         where = {"event": event, "stamp": self.truth.stamps[event], "travelled": self.travelled[event]}
         self.pmf.append(where | {"unexamined": hypotheses.unexamined, "leaves": leaves})
 
-    def _accept(self, accepted: Accepted) -> None:
+    def _accept(self, accepted: ClosureDecision) -> None:
         probabilities = dict(self._replica.probabilities)
-        self._replica.accept(accepted)
+        self._replica.apply_decision(accepted)
         if accepted.global_poses:
             self._area_poses = {area.area: area.pose for area in accepted.global_poses}
         if accepted.hypothesis is None:
@@ -181,15 +183,15 @@ class Watch:
         chosen = self._replica.maps[accepted.hypothesis]
         for closure in self._paths.accepted(accepted.hypothesis, chosen):
             self.accepted.append(self._entry(closure, accepted.sequence, probabilities[accepted.hypothesis]))
-        self.loops.definite(accepted.sequence, chosen, self._replica.areas[accepted.hypothesis])
+        self.loops.definite(accepted.sequence, chosen, self._replica.robot_areas[accepted.hypothesis])
 
     def mapped(self) -> tuple[HybridMap, Mapping[int, Scan]]:
         """The most probable map, and the scans of its keyframes."""
-        return self._replica.maps[self._replica.best], self._replica.scans
+        return self._replica.maps[self._replica.best_hypothesis], self._replica.scans
 
     def pending(self) -> list[Entry]:
         """The closures of the most probable path that are not definite."""
-        best = self._replica.best
+        best = self._replica.best_hypothesis
         event, probability = max(self.travelled), self._replica.probabilities[best]
         return [self._entry(closure, event, probability) for closure in self._paths.paths[best].closures]
 
@@ -207,7 +209,7 @@ class Watch:
 
     def _judge_pose(self, pose: RealTimePose) -> None:
         """Errors of the pose in the map and of that in the robot's area."""
-        best = self._replica.maps[self._replica.best]
+        best = self._replica.maps[self._replica.best_hypothesis]
         if pose.area not in best.area_ids():
             return
         truth = self.log.true_poses(np.array([pose.stamp]))[0]
@@ -218,13 +220,13 @@ class Watch:
                 "stamp": pose.stamp,
                 "area": pose.area,
                 "map": _error(pose.map_pose, in_map),
-                "local": _error(pose.local, in_area),
+                "local": _error(pose.pose_in_area, in_area),
             }
         )
 
     def arcs(self) -> list[Entry]:
         """Errors of the arcs of the most probable map as it is now."""
-        best = self._replica.maps[self._replica.best]
+        best = self._replica.maps[self._replica.best_hypothesis]
         frames = {area: self.truth.frame(best, area) for area in best.area_ids()}
         return [
             {"areas": (a, b), "closure": arc.closure, **_error(arc.pose, se2.between(frames[a], frames[b]))}
@@ -233,7 +235,7 @@ class Watch:
 
     def area_poses(self) -> list[Entry]:
         """Errors of the areas' poses in the map as TLCA last gave them."""
-        best = self._replica.maps[self._replica.best]
+        best = self._replica.maps[self._replica.best_hypothesis]
         origin = self.truth.frame(best, FIRST_AREA)
         return [
             {"area": area, **_error(pose, se2.between(origin, self.truth.frame(best, area)))}

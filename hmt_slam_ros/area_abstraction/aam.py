@@ -11,24 +11,31 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmt_slam_ros.area_abstraction.doors import OpeningDetector, Way
-from hmt_slam_ros.area_abstraction.overlap import Sensed, overlaps, sensed_overlaps
-from hmt_slam_ros.area_abstraction.overlap_graph import OverlapGraph, Separation, least_cut, synchronised
-from hmt_slam_ros.area_abstraction.partition import AamState, AreaPolicy, Joint, Watch, numbered, watch_of
+from hmt_slam_ros.area_abstraction.overlap import SensedSpace, overlaps, sensed_overlaps
+from hmt_slam_ros.area_abstraction.overlap_graph import OverlapGraph, Separation, min_ncut, synchronize_graph
+from hmt_slam_ros.area_abstraction.partition import (
+    AamState,
+    AreaPolicy,
+    JoinedGraph,
+    Partition,
+    partition_from_state,
+    partition_to_state,
+)
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.hybrid_map.common_map import Keyframes, Pair
+from hmt_slam_ros.hybrid_map.common_map import AreaPair, KeyframePoses
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
-from hmt_slam_ros.hybrid_map.keyframe_pruning import crowded, in_place
-from hmt_slam_ros.hybrid_map.shortest_path import telling_arc
-from hmt_slam_ros.messages.map_changes import Forgotten, Merged
+from hmt_slam_ros.hybrid_map.keyframe_pruning import is_same_viewpoint, redundant_keyframes
+from hmt_slam_ros.hybrid_map.shortest_path import informative_arc
+from hmt_slam_ros.messages.map_changes import AreaMerge, PrunedKeyframe
 from hmt_slam_ros.messages.messages import (
-    Accepted,
     AreaEvent,
     AreaEvents,
+    ClosureDecision,
     Hypotheses,
+    Hypothesis,
+    HypothesisEstimate,
     Keyframe,
-    Leaf,
-    LeafEstimate,
     Message,
 )
 from hmt_slam_ros.messages.replica import Replica
@@ -37,9 +44,9 @@ from hmt_slam_ros.sensors import Scan
 # An area's overlap with a scan is that of the best few keyframes among those taken nearest to it.
 _NEAREST, _BEST = 8, 3
 # Keyframes that one place of an area may hold, and keyframe events for which all that is new stays.
-_MOST_IN_PLACE, _RECENT = 2, 30
+_MAX_IN_PLACE, _RECENT = 2, 30
 # Where an arc moved keyframes by less than this share of the radius of overlap, overlaps are not measured again.
-_UNMOVED = 0.1
+_REMEASURE_SHARE = 0.1
 
 
 class Aam:
@@ -73,21 +80,23 @@ class Aam:
         self._filter = configuration.filter
         self._max_range = configuration.local_map.max_range
         self._policy = AreaPolicy(configuration, detector)
-        self._replica = Replica.of(state.replica)
-        self._seen: dict[int, Sensed] = {}
-        self._watches = {hypothesis: watch_of(own, state.graphs) for hypothesis, own in state.watches.items()}
-        self._asked = set(state.asked)
-        self._left = set(state.left)
+        self._replica = Replica.from_state(state.replica)
+        self._sensed_spaces: dict[int, SensedSpace] = {}
+        self._partitions = {
+            hypothesis: partition_from_state(own, state.graphs) for hypothesis, own in state.partitions.items()
+        }
+        self._merge_queue = set(state.merge_queue)
+        self._prune_queue = set(state.prune_queue)
 
     @property
     def state(self) -> AamState:
         """All that the AAM knows, as a value."""
-        known = self._watches.values()
+        known = self._partitions.values()
         graphs = {id(graph): graph for watch in known for graph in watch.graphs.values()}
-        graphs |= {id(joint.graph): joint.graph for watch in known for joint in watch.joints.values()}
+        graphs |= {id(joint.graph): joint.graph for watch in known for joint in watch.joined_graphs.values()}
         numbers = {name: number for number, name in enumerate(graphs)}
-        watches = {hypothesis: numbered(watch, numbers) for hypothesis, watch in self._watches.items()}
-        asked, left = frozenset(self._asked), frozenset(self._left)
+        watches = {hypothesis: partition_to_state(watch, numbers) for hypothesis, watch in self._partitions.items()}
+        asked, left = frozenset(self._merge_queue), frozenset(self._prune_queue)
         return AamState(self._replica.state, tuple(graphs.values()), watches, asked, left)
 
     def handle(self, message: Message) -> list[Message]:
@@ -95,171 +104,188 @@ class Aam:
         if isinstance(message, Keyframe):
             return [self._examine(message)]
         if isinstance(message, Hypotheses):
-            self._replica.apply(message)
-            self._watches = {leaf.hypothesis: self._follow(leaf) for leaf in message.leaves}
-            self._forget({one.keyframe for one in message.forgotten})
-            for late in message.outdated:
-                self._seen.pop(late.keyframe, None)
-        elif isinstance(message, Accepted) and message.hypothesis is not None:
-            self._replica.accept(message)
-            self._watches = {message.hypothesis: self._watches[message.hypothesis]}
-            if message.relabelled:
-                self._interrupt(message.hypothesis)
-            self._asked |= {(min(arc.source, arc.target), max(arc.source, arc.target)) for arc in message.arcs}
-            if message.reopened:
-                self._asked = set()
-                self._watches = {one: replace(watch, joints={}) for one, watch in self._watches.items()}
+            self._replica.apply_hypotheses(message)
+            self._partitions = {leaf.id: self._update_partition(leaf) for leaf in message.hypotheses}
+            self._remove_keyframes({one.keyframe for one in message.pruned_keyframes})
+            for late in message.stale_beams:
+                self._sensed_spaces.pop(late.keyframe, None)
+        elif isinstance(message, ClosureDecision) and message.hypothesis is not None:
+            self._replica.apply_decision(message)
+            self._partitions = {message.hypothesis: self._partitions[message.hypothesis]}
+            if message.moved_keyframes:
+                self._interrupt_door_tracker(message.hypothesis)
+            self._merge_queue |= {(min(arc.source, arc.target), max(arc.source, arc.target)) for arc in message.arcs}
+            if message.revised_hypotheses:
+                self._merge_queue = set()
+                self._partitions = {one: replace(watch, joined_graphs={}) for one, watch in self._partitions.items()}
         return []
 
     def _examine(self, keyframe: Keyframe) -> AreaEvents:
-        self._replica.add(keyframe)
-        self._seen[keyframe.sequence] = self._sensed(keyframe.scan)
-        known = [leaf for leaf in keyframe.leaves if leaf.hypothesis in self._watches]
-        self._watches |= self._policy.seen(keyframe, known, self._replica, self._watches)
+        self._replica.add_keyframe(keyframe)
+        self._sensed_spaces[keyframe.sequence] = self._sense(keyframe.scan)
+        known = [leaf for leaf in keyframe.estimates if leaf.hypothesis in self._partitions]
+        self._partitions |= self._policy.track_doors(keyframe, known, self._replica, self._partitions)
         events = [
-            self._cut(leaf, keyframe.sequence)
-            or (self._merged(leaf.hypothesis) if keyframe.mapping else None)
-            or self._moved(leaf, keyframe.sequence)
+            self._find_cut(leaf, keyframe.sequence)
+            or (self._find_merge(leaf.hypothesis) if keyframe.mapping else None)
+            or self._find_move(leaf, keyframe.sequence)
             for leaf in known
         ]
         if not any(leaf.stored for leaf in known):
-            del self._seen[keyframe.sequence]
-        may_forget = keyframe.mapping and len(self._watches) == 1
-        forgotten = self._superfluous(known[0], events[0], keyframe.sequence) if may_forget else ()
+            del self._sensed_spaces[keyframe.sequence]
+        may_forget = keyframe.mapping and len(self._partitions) == 1
+        forgotten = self._keyframes_to_prune(known[0], events[0], keyframe.sequence) if may_forget else ()
         return AreaEvents(keyframe.sequence, tuple(event for event in events if event is not None), forgotten)
 
-    def _superfluous(self, leaf: LeafEstimate, event: AreaEvent | None, newest: int) -> tuple[Forgotten, ...]:
+    def _keyframes_to_prune(
+        self, leaf: HypothesisEstimate, event: AreaEvent | None, newest: int
+    ) -> tuple[PrunedKeyframe, ...]:
         """The keyframes of the one hypothesis that may be forgotten now."""
         if event is None:
-            return self._crowded(leaf.hypothesis, newest)
-        return self._passed_again(leaf.hypothesis, event.area) if event.kind == "moved" else ()
+            return self._redundant_after_leaving(leaf.hypothesis, newest)
+        return self._redundant_after_move(leaf.hypothesis, event.area) if event.kind == "moved" else ()
 
-    def _passed_again(self, hypothesis: int, entered: int) -> tuple[Forgotten, ...]:
+    def _redundant_after_move(self, hypothesis: int, entered: int) -> tuple[PrunedKeyframe, ...]:
         """The robot's own keyframes of the area that it leaves which the one that it is in would not have stored.
 
         Metric SLAM did, as it does not hold areas whose place is uncertain. Without that an area grew into the next one
         with every pass, by as many keyframes as it takes to notice the move.
         """
-        watch, hybrid_map = self._watches[hypothesis], self._replica.maps[hypothesis]
+        watch, hybrid_map = self._partitions[hypothesis], self._replica.maps[hypothesis]
         arc, known = hybrid_map.arc(entered, watch.area), np.array(list(self._keyframes(hypothesis, entered).values()))
         placed = self._keyframes(hypothesis, watch.area)
         if arc is None or not known.size:
             return ()
         first = next(iter(placed))
         return tuple(
-            Forgotten(keyframe, watch.area)
-            for keyframe in sorted(watch.own & placed.keys() - {first})
-            if in_place(se2.between(known, se2.compose(arc.mean, placed[keyframe])), self._filter).any()
+            PrunedKeyframe(keyframe, watch.area)
+            for keyframe in sorted(watch.new_keyframes & placed.keys() - {first})
+            if is_same_viewpoint(se2.between(known, se2.compose(arc.mean, placed[keyframe])), self._filter).any()
         )
 
-    def _crowded(self, hypothesis: int, newest: int) -> tuple[Forgotten, ...]:
+    def _redundant_after_leaving(self, hypothesis: int, newest: int) -> tuple[PrunedKeyframe, ...]:
         """The superfluous keyframes of an area that the robot left."""
-        if not self._left:
+        if not self._prune_queue:
             return ()
-        area = min(self._left)
-        self._left.discard(area)
+        area = min(self._prune_queue)
+        self._prune_queue.discard(area)
         if not self._replica.maps[hypothesis].has_area(area):
             return ()
         placed = self._keyframes(hypothesis, area)
-        kept = {*list(placed)[:1], *(k for k in placed if k > newest - _RECENT), *self._watches[hypothesis].own}
-        return tuple(Forgotten(k, area) for k in crowded(placed, kept, _MOST_IN_PLACE, self._filter))
+        kept = {
+            *list(placed)[:1],
+            *(k for k in placed if k > newest - _RECENT),
+            *self._partitions[hypothesis].new_keyframes,
+        }
+        return tuple(PrunedKeyframe(k, area) for k in redundant_keyframes(placed, kept, _MAX_IN_PLACE, self._filter))
 
-    def _forget(self, keyframes: set[int]) -> None:
+    def _remove_keyframes(self, keyframes: set[int]) -> None:
         """Go on without what the maps do not hold any more."""
         if not keyframes:
             return
         for keyframe in keyframes:
-            self._seen.pop(keyframe, None)
-        for hypothesis, watch in self._watches.items():
-            held = {area: graph.without(keyframes) for area, graph in watch.graphs.items()}
-            self._watches[hypothesis] = replace(watch, graphs=held, own=watch.own - keyframes)
+            self._sensed_spaces.pop(keyframe, None)
+        for hypothesis, watch in self._partitions.items():
+            held = {area: graph.without_keyframes(keyframes) for area, graph in watch.graphs.items()}
+            self._partitions[hypothesis] = replace(watch, graphs=held, new_keyframes=watch.new_keyframes - keyframes)
 
-    def _sensed(self, scan: Scan) -> Sensed:
-        return Sensed.of(scan, self._max_range, self._options.overlap_points)
+    def _sense(self, scan: Scan) -> SensedSpace:
+        return SensedSpace.from_scan(scan, self._max_range, self._options.overlap_points)
 
-    def _seen_by(self, keyframe: int) -> Sensed:
+    def _sensed_space(self, keyframe: int) -> SensedSpace:
         """What is compared of a keyframe's scan, worked out once."""
-        if keyframe not in self._seen:
-            self._seen[keyframe] = self._sensed(self._replica.scans[keyframe])
-        return self._seen[keyframe]
+        if keyframe not in self._sensed_spaces:
+            self._sensed_spaces[keyframe] = self._sense(self._replica.scans[keyframe])
+        return self._sensed_spaces[keyframe]
 
-    def _cut(self, leaf: LeafEstimate, newest: int) -> AreaEvent | None:
+    def _find_cut(self, leaf: HypothesisEstimate, newest: int) -> AreaEvent | None:
         """The event that the newest keyframes leave the robot's area, when that has lasted."""
         if not leaf.stored:
             return None
-        watch = self._watches[leaf.hypothesis]
+        watch = self._partitions[leaf.hypothesis]
         graph = self._graph(watch, leaf.hypothesis, watch.area)
-        own = watch.own | {newest}
-        found = self._policy.separation(graph, own, newest, watch.way)
+        own = watch.new_keyframes | {newest}
+        found = self._policy.find_separation(graph, own, newest, watch.door_tracker)
         watch = replace(
-            watch, graphs=watch.graphs | {watch.area: graph}, own=own, separate=watch.separate + 1 if found else 0
+            watch,
+            graphs=watch.graphs | {watch.area: graph},
+            new_keyframes=own,
+            separation_count=watch.separation_count + 1 if found else 0,
         )
-        self._watches[leaf.hypothesis] = watch
+        self._partitions[leaf.hypothesis] = watch
         return self._cut_event(leaf.hypothesis, watch, found)
 
-    def _cut_event(self, hypothesis: int, watch: Watch, found: Separation | None) -> AreaEvent | None:
-        if found is None or watch.separate < self._options.persistence:
+    def _cut_event(self, hypothesis: int, partition: Partition, found: Separation | None) -> AreaEvent | None:
+        if found is None or partition.separation_count < self._options.confirmations:
             return None
-        return AreaEvent(hypothesis, "cut", found.keyframes, watch.area, found.ncut)
+        return AreaEvent(hypothesis, "cut", found.keyframes, partition.area, found.ncut)
 
-    def _merged(self, hypothesis: int) -> AreaEvent | None:
+    def _find_merge(self, hypothesis: int) -> AreaEvent | None:
         """The event that two areas are one, where there is no other hypothesis."""
         hybrid_map = self._replica.maps[hypothesis]
-        while self._asked and len(self._watches) == 1:
-            into, area = pair = min(self._asked)
-            self._asked.discard(pair)
+        while self._merge_queue and len(self._partitions) == 1:
+            into, area = pair = min(self._merge_queue)
+            self._merge_queue.discard(pair)
             arc = hybrid_map.arc_value(into, area)
             if arc is None or not arc.closure:
                 continue
-            joint = self._joint(hypothesis, pair, arc.pose.mean)
-            least = self._policy.least_cut(joint) if pair in self._watches[hypothesis].parted else joint.least
+            joint = self._joined_graph(hypothesis, pair, arc.pose.mean)
+            least = (
+                self._policy.min_ncut(joint)
+                if pair in self._partitions[hypothesis].pairs_split_by_door
+                else joint.min_ncut
+            )
             if least > self._options.ncut_threshold:
                 return AreaEvent(hypothesis, "merged", (), area, least, into)
         return None
 
-    def _joint(self, hypothesis: int, pair: Pair, arc: NDArray[np.float64]) -> Joint:
+    def _joined_graph(self, hypothesis: int, pair: AreaPair, arc: NDArray[np.float64]) -> JoinedGraph:
         """Two areas as one, whose arc is ``arc``; from what was found before, measuring only what is new."""
-        watch, (into, area) = self._watches[hypothesis], pair
-        other, before = self._keyframes(hypothesis, area), watch.joints.get(pair)
+        watch, (into, area) = self._partitions[hypothesis], pair
+        other, before = self._keyframes(hypothesis, area), watch.joined_graphs.get(pair)
         placed = dict(self._keyframes(hypothesis, into))
         placed |= {keyframe: se2.compose(arc, pose) for keyframe, pose in other.items()}
         known = [watch.graphs.get(one, OverlapGraph()) for one in pair]
-        if before is not None and before.moved(arc, other) < _UNMOVED * self._options.overlap_radius:
-            if before.part == other.keys() and set(before.graph.keyframes) == placed.keys():
+        if before is not None and before.max_displacement(arc, other) < _REMEASURE_SHARE * self._options.overlap_radius:
+            if before.second_keyframes == other.keys() and set(before.graph.keyframes) == placed.keys():
                 return before
             arc, known = before.arc, [before.graph, *known]
-        graph = self._synchronised(placed, *known)
-        joint = Joint(arc, graph, frozenset(other), least_cut(graph, other, self._options.min_cluster))
-        self._watches[hypothesis] = replace(watch, joints=watch.joints | {pair: joint})
+        graph = self._synchronize_graph(placed, *known)
+        joint = JoinedGraph(arc, graph, frozenset(other), min_ncut(graph, other, self._options.min_cluster))
+        self._partitions[hypothesis] = replace(watch, joined_graphs=watch.joined_graphs | {pair: joint})
         return joint
 
-    def _moved(self, leaf: LeafEstimate, newest: int) -> AreaEvent | None:
+    def _find_move(self, leaf: HypothesisEstimate, newest: int) -> AreaEvent | None:
         """The event that the robot went into a known area one arc away, when that has lasted.
 
         The margin by which the other area has to overlap more keeps the robot from going back and forth at a border.
         Keyframes that the robot stored in the area it leaves stay there.
         """
-        watch = self._watches[leaf.hypothesis]
-        shares = self._shares(leaf, newest)
+        watch = self._partitions[leaf.hypothesis]
+        shares = self._area_overlaps(leaf, newest)
         best = max(shares, key=lambda area: (shares[area], -area))
         inside = best == watch.area or shares[best] < shares[watch.area] + self._options.move_margin
-        times = 1 if watch.beyond is None or watch.beyond[0] != best else watch.beyond[1] + 1
-        self._watches[leaf.hypothesis] = replace(watch, beyond=None if inside else (best, times))
-        if inside or times < self._options.persistence:
+        times = (
+            1
+            if watch.overlap_candidate is None or watch.overlap_candidate[0] != best
+            else watch.overlap_candidate[1] + 1
+        )
+        self._partitions[leaf.hypothesis] = replace(watch, overlap_candidate=None if inside else (best, times))
+        if inside or times < self._options.confirmations:
             return None
         return AreaEvent(leaf.hypothesis, "moved", (), best, shares[best])
 
-    def _shares(self, leaf: LeafEstimate, newest: int) -> dict[int, float]:
+    def _area_overlaps(self, leaf: HypothesisEstimate, newest: int) -> dict[int, float]:
         """Overlap of the newest scan with the robot's area and with those one arc away."""
         hybrid_map, here = self._replica.maps[leaf.hypothesis], leaf.area
-        shares = {here: self._share(hybrid_map, here, leaf.pose.mean, newest)}
-        for area in hybrid_map.neighbours(here):
-            arc = telling_arc(hybrid_map, area, here)
+        shares = {here: self._area_overlap(hybrid_map, here, leaf.pose.mean, newest)}
+        for area in hybrid_map.neighbors(here):
+            arc = informative_arc(hybrid_map, area, here)
             if arc is not None:
-                shares[area] = self._share(hybrid_map, area, se2.compose(arc.mean, leaf.pose.mean), newest)
+                shares[area] = self._area_overlap(hybrid_map, area, se2.compose(arc.mean, leaf.pose.mean), newest)
         return shares
 
-    def _share(self, hybrid_map: HybridMap, area: int, pose: NDArray[np.float64], newest: int) -> float:
+    def _area_overlap(self, hybrid_map: HybridMap, area: int, pose: NDArray[np.float64], newest: int) -> float:
         """Overlap of the newest scan, taken at ``pose`` = ``area_T_base``, with an area."""
         placed = hybrid_map.keyframes(area)
         others = [keyframe for keyframe in placed if keyframe != newest]
@@ -268,65 +294,84 @@ class Aam:
         poses = np.array([placed[keyframe] for keyframe in others])
         nearest = np.argsort(np.hypot(*(poses[:, :2] - pose[:2]).T), kind="stable")[:_NEAREST]
         found = sensed_overlaps(
-            self._seen_by(newest),
+            self._sensed_space(newest),
             pose,
-            [self._seen_by(others[i]) for i in nearest],
+            [self._sensed_space(others[i]) for i in nearest],
             poses[nearest],
             self._options.overlap_radius,
         )
         return float(np.sort(found)[-_BEST:].mean())
 
-    def _follow(self, leaf: Leaf) -> Watch:
+    def _update_partition(self, leaf: Hypothesis) -> Partition:
         """The watch over a hypothesis after TSBI's answer."""
-        watch = self._watches[leaf.parent]
-        if leaf.merged is not None:
-            return self._follow_merged(watch, leaf, leaf.merged)
+        watch = self._partitions[leaf.parent]
+        if leaf.area_merge is not None:
+            return self._merge_in_partition(watch, leaf, leaf.area_merge)
         if leaf.area == watch.area:
-            return replace(watch, way=watch.way.interrupted()) if leaf.withdrawn else watch
-        moved = frozenset(r.keyframe for r in leaf.relabelled if r.area == leaf.area)
-        entered = self._graph(watch, leaf.hypothesis, leaf.area)
-        left = watch.graphs.get(watch.area, OverlapGraph()).only(self._keyframes(leaf.hypothesis, watch.area))
-        beside = self._replica.maps[leaf.hypothesis].neighbours(watch.area)
-        self._asked |= {(min(watch.area, other), max(watch.area, other)) for other in beside}
-        self._left.add(watch.area)
+            return replace(watch, door_tracker=watch.door_tracker.interrupted()) if leaf.removed_arcs else watch
+        moved = frozenset(r.keyframe for r in leaf.moved_keyframes if r.area == leaf.area)
+        entered = self._graph(watch, leaf.id, leaf.area)
+        left = watch.graphs.get(watch.area, OverlapGraph()).subgraph(self._keyframes(leaf.id, watch.area))
+        beside = self._replica.maps[leaf.id].neighbors(watch.area)
+        self._merge_queue |= {(min(watch.area, other), max(watch.area, other)) for other in beside}
+        self._prune_queue.add(watch.area)
         graphs = watch.graphs | {watch.area: left, leaf.area: entered}
-        way, parted = Way() if leaf.rebase is None else watch.way.in_frame(leaf.rebase.mean), watch.parted
-        if moved and watch.way.chambers(moved)[max(moved)] != 0:
+        way, parted = (
+            Way() if leaf.frame_change is None else watch.door_tracker.in_frame(leaf.frame_change.mean),
+            watch.pairs_split_by_door,
+        )
+        if moved and watch.door_tracker.chambers(moved)[max(moved)] != 0:
             parted |= {(min(watch.area, leaf.area), max(watch.area, leaf.area))}
         way = way.since(min(moved, default=None))
-        return Watch(leaf.area, graphs, moved, joints=watch.joints, way=way, parted=parted)
+        return Partition(
+            leaf.area, graphs, moved, joined_graphs=watch.joined_graphs, door_tracker=way, pairs_split_by_door=parted
+        )
 
-    def _follow_merged(self, watch: Watch, leaf: Leaf, merged: Merged) -> Watch:
+    def _merge_in_partition(self, partition: Partition, leaf: Hypothesis, merged: AreaMerge) -> Partition:
         """The watch with one area for two; what was the robot's own in one of them still is."""
-        self._asked = {pair for pair in self._asked if merged.area not in pair}
-        graphs = {area: graph for area, graph in watch.graphs.items() if area != merged.area}
-        one, other = (watch.graphs.get(area, OverlapGraph()) for area in (merged.into, merged.area))
-        graphs[merged.into] = self._synchronised(self._keyframes(leaf.hypothesis, merged.into), one, other)
-        joints = {pair: joint for pair, joint in watch.joints.items() if merged.area not in pair}
-        way = watch.way if leaf.area == watch.area else watch.way.in_frame(merged.pose.mean)
-        named = ({merged.into if area == merged.area else area for area in pair} for pair in watch.parted)
+        self._merge_queue = {pair for pair in self._merge_queue if merged.area not in pair}
+        graphs = {area: graph for area, graph in partition.graphs.items() if area != merged.area}
+        one, other = (partition.graphs.get(area, OverlapGraph()) for area in (merged.into, merged.area))
+        graphs[merged.into] = self._synchronize_graph(self._keyframes(leaf.id, merged.into), one, other)
+        joints = {pair: joint for pair, joint in partition.joined_graphs.items() if merged.area not in pair}
+        way = (
+            partition.door_tracker if leaf.area == partition.area else partition.door_tracker.in_frame(merged.pose.mean)
+        )
+        named = (
+            {merged.into if area == merged.area else area for area in pair} for pair in partition.pairs_split_by_door
+        )
         parted = frozenset((min(pair), max(pair)) for pair in named if len(pair) == 2)
-        return replace(watch, area=leaf.area, graphs=graphs, beyond=None, joints=joints, way=way, parted=parted)
+        return replace(
+            partition,
+            area=leaf.area,
+            graphs=graphs,
+            overlap_candidate=None,
+            joined_graphs=joints,
+            door_tracker=way,
+            pairs_split_by_door=parted,
+        )
 
-    def _interrupt(self, hypothesis: int) -> None:
+    def _interrupt_door_tracker(self, hypothesis: int) -> None:
         """Keyframes of a hypothesis moved, and the robot with them."""
-        watch = self._watches[hypothesis]
-        self._watches[hypothesis] = replace(watch, way=watch.way.interrupted())
+        watch = self._partitions[hypothesis]
+        self._partitions[hypothesis] = replace(watch, door_tracker=watch.door_tracker.interrupted())
 
-    def _graph(self, watch: Watch, hypothesis: int, area: int) -> OverlapGraph:
+    def _graph(self, partition: Partition, hypothesis: int, area: int) -> OverlapGraph:
         """The overlap graph of an area as it is now, from what the watch knows."""
-        known = [watch.graphs.get(one, OverlapGraph()) for one in (area, watch.area)]
-        return self._synchronised(self._keyframes(hypothesis, area), *known)
+        known = [partition.graphs.get(one, OverlapGraph()) for one in (area, partition.area)]
+        return self._synchronize_graph(self._keyframes(hypothesis, area), *known)
 
-    def _keyframes(self, hypothesis: int, area: int) -> Keyframes:
+    def _keyframes(self, hypothesis: int, area: int) -> KeyframePoses:
         return self._replica.maps[hypothesis].keyframes(area)
 
-    def _synchronised(self, placed: Keyframes, graph: OverlapGraph, *others: OverlapGraph) -> OverlapGraph:
+    def _synchronize_graph(self, placed: KeyframePoses, graph: OverlapGraph, *others: OverlapGraph) -> OverlapGraph:
         """The overlap graph of keyframes, {keyframe: pose}, measuring only what none of the graphs holds."""
 
         def measure(keyframe: int, others: tuple[int, ...]) -> NDArray[np.float64]:
             poses = np.array([placed[other] for other in others]).reshape(-1, 3)
-            seen = [self._seen_by(other).points for other in others]
-            return overlaps(self._seen_by(keyframe).points, placed[keyframe], seen, poses, self._options.overlap_radius)
+            seen = [self._sensed_space(other).points for other in others]
+            return overlaps(
+                self._sensed_space(keyframe).points, placed[keyframe], seen, poses, self._options.overlap_radius
+            )
 
-        return synchronised(graph, placed, measure, *others)
+        return synchronize_graph(graph, placed, measure, *others)

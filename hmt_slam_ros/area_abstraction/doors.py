@@ -20,13 +20,13 @@ from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.landmark import Landmark
 from hmt_slam_ros.sensors import Scan
 
-STEP = 1.5
+MAX_STEP = 1.5
 """Keyframes that are farther apart than this, m, are no step of a path."""
 
-SAME = 0.6
+SAME_OPENING_DISTANCE = 0.6
 """Openings that are nearer to each other than this, m, are one."""
 
-LEAST = 0.5
+MIN_PROBABILITY = 0.5
 """An opening that is less probable is none that one passes."""
 
 
@@ -72,7 +72,7 @@ _LATE = 6
 
 
 @dataclass(frozen=True, eq=False)
-class Passage:
+class DoorCrossing:
     """Where the path went through an opening.
 
     :ivar event: the first keyframe event behind it.
@@ -106,7 +106,7 @@ class Way:
 
     openings: tuple[Landmark, ...] = ()
     steps: tuple[Step, ...] = ()
-    passages: tuple[Passage, ...] = ()
+    passages: tuple[DoorCrossing, ...] = ()
 
     def seen(self, event: int, pose: PoseGaussian, around: OpeningView) -> Way:
         """After a keyframe event.
@@ -118,7 +118,7 @@ class Way:
         steps = (*self.steps, Step(event, pose.mean))[-_LATE - 1 :]
         passages = list(self.passages)
         for passage in _passed(steps, openings):
-            before = _last_at(passages, passage.pose)
+            before = _last_crossing_at(passages, passage.pose)
             if before is None or not _alike(passages[before].pose, passage.pose):
                 passages.append(passage)
         return Way(openings, steps, tuple(sorted(passages, key=lambda passage: passage.event)))
@@ -128,7 +128,7 @@ class Way:
 
         :param frame: shape (3,), ``other_T_area``.
         """
-        by = PoseGaussian.exactly(frame)
+        by = PoseGaussian.from_pose(frame)
         return Way(
             tuple(replace(one, pose=by.compose(one.pose)) for one in self.openings),
             tuple(replace(step, pose=se2.compose(frame, step.pose)) for step in self.steps),
@@ -147,30 +147,30 @@ class Way:
         """{keyframe: number of its chamber}, of keyframes since the robot entered its area, in chamber 0."""
         numbers, begins = [0], [0]
         for k, passage in enumerate(self.passages):
-            back = _last_at(self.passages[:k], passage.pose)
+            back = _last_crossing_at(self.passages[:k], passage.pose)
             numbers.append(max(numbers) + 1 if back is None else numbers[back])
             begins.append(passage.event)
         return {k: numbers[int(np.searchsorted(begins, k, side="right")) - 1] for k in keyframes}
 
 
-def _passed(steps: Sequence[Step], openings: Sequence[Landmark]) -> list[Passage]:
+def _passed(steps: Sequence[Step], openings: Sequence[Landmark]) -> list[DoorCrossing]:
     """All passages of openings that are there, in the order of events."""
     path = np.array([step.pose[:2] for step in steps])
     found = []
     for opening in openings:
-        if opening.existence.probability < LEAST:
+        if opening.existence.probability < MIN_PROBABILITY:
             continue
-        for at, forwards in crossings(path, opening.pose.mean, opening.width):
+        for at, forwards in find_crossings(path, opening.pose.mean, opening.width):
             k = int(at)
-            if np.hypot(*(path[k + 1] - path[k])) <= STEP:
+            if np.hypot(*(path[k + 1] - path[k])) <= MAX_STEP:
                 turned = se2.compose(opening.pose.mean, (0.0, 0.0, 0.0 if forwards else np.pi))
-                found.append(Passage(steps[k + 1].event, turned))
+                found.append(DoorCrossing(steps[k + 1].event, turned))
     return sorted(found, key=lambda passage: passage.event)
 
 
-def _last_at(passages: Sequence[Passage], pose: Float64) -> int | None:
+def _last_crossing_at(passages: Sequence[DoorCrossing], pose: Float64) -> int | None:
     """Number of the last passage of the opening at a pose."""
-    near = [k for k, one in enumerate(passages) if np.hypot(*(one.pose[:2] - pose[:2])) < SAME]
+    near = [k for k, one in enumerate(passages) if np.hypot(*(one.pose[:2] - pose[:2])) < SAME_OPENING_DISTANCE]
     return near[-1] if near else None
 
 
@@ -179,7 +179,7 @@ def _alike(one: Float64, other: Float64) -> bool:
     return bool(np.cos(one[2] - other[2]) > 0.0)
 
 
-def crossings(path: Float64, opening: Float64, width: float) -> Iterator[tuple[float, bool]]:
+def find_crossings(path: Float64, opening: Float64, width: float) -> Iterator[tuple[float, bool]]:
     """Where a path (n, 2) passes an opening (3,), in steps from its begin; and whether it goes ahead there.
 
     :param width: of the opening, m.

@@ -33,24 +33,28 @@ def sensed_points(scan: Scan, max_range: float, count: int = 180) -> NDArray[np.
     return near[np.linspace(0.0, len(near) - 1.0, count).round().astype(np.int64)]
 
 
-class Sensed(NamedTuple):
+class SensedSpace(NamedTuple):
     """What is compared of a scan.
 
     :ivar points: of :func:`sensed_points`, shape (k, 2), m.
-    :ivar reach: up to which the scan would have had others, m.
+    :ivar max_range: up to which the scan would have had others, m.
     """
 
     points: NDArray[np.float64]
-    reach: float
+    max_range: float
 
     @classmethod
-    def of(cls, scan: Scan, max_range: float, count: int = 180) -> Sensed:
+    def from_scan(cls, scan: Scan, max_range: float, count: int = 180) -> SensedSpace:
         """Of a scan, as :func:`sensed_points`."""
         return cls(sensed_points(scan, max_range, count), min(max_range, scan.range_max))
 
 
 def sensed_overlaps(
-    one: Sensed, pose: NDArray[np.float64], others: Sequence[Sensed], other_poses: NDArray[np.float64], radius: float
+    one: SensedSpace,
+    pose: NDArray[np.float64],
+    others: Sequence[SensedSpace],
+    other_poses: NDArray[np.float64],
+    radius: float,
 ) -> NDArray[np.float64]:
     """Overlap of one scan with each of several others as :func:`overlaps`, where neither has points that of free space.
 
@@ -63,7 +67,7 @@ def sensed_overlaps(
     free = [j for j, other in enumerate(others) if not len(other.points)]
     if free and not len(one.points):
         apart = np.hypot(*(other_poses[free, :2] - pose[:2]).T)
-        found[free] = np.maximum(0.0, 1.0 - apart / (one.reach + np.array([others[j].reach for j in free])))
+        found[free] = np.maximum(0.0, 1.0 - apart / (one.max_range + np.array([others[j].max_range for j in free])))
     return found
 
 
@@ -102,19 +106,19 @@ def _overlaps(
     result = np.zeros(ends.size)
     if not len(points):
         return result
-    grid = _filed(points, radius)
+    grid = _fill_grid(points, radius)
     # For each of the points the last other scan that met it, so that there is nothing to clear in between.
     met_by, start = np.full(len(points), -1), 0
     for j in range(ends.size):
         if ends[j] > start:
-            moved = _moved(stacked[start : ends[j]], pose, other_poses[j])
+            moved = _transform_points(stacked[start : ends[j]], pose, other_poses[j])
             result[j] = _overlap(points, grid, moved, radius, met_by, j)
         start = ends[j]
     return result
 
 
 @njit(cache=True)
-def _moved(
+def _transform_points(
     points: NDArray[np.float64], pose: NDArray[np.float64], other_pose: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Points of the base at ``other_pose`` as seen from the base at ``pose``."""
@@ -129,24 +133,24 @@ def _moved(
     return moved
 
 
-class _Grid(NamedTuple):
+class _PointGrid(NamedTuple):
     """Points in square cells.
 
     :ivar low_x: lower edges, m, and ``low_y``.
     :ivar edge: of a cell, m.
-    :ivar newest: shape (rows, columns), the newest point of each cell, -1 for none.
-    :ivar before: shape (n,), for each point the one before it in its cell, -1 for none.
+    :ivar last_point: shape (rows, columns), the newest point of each cell, -1 for none.
+    :ivar previous_point: shape (n,), for each point the one before it in its cell, -1 for none.
     """
 
     low_x: float
     low_y: float
     edge: float
-    newest: NDArray[np.int32]
-    before: NDArray[np.int32]
+    last_point: NDArray[np.int32]
+    previous_point: NDArray[np.int32]
 
 
 @njit(cache=True)
-def _filed(points: NDArray[np.float64], radius: float) -> _Grid:
+def _fill_grid(points: NDArray[np.float64], radius: float) -> _PointGrid:
     low_x, low_y = points[:, 0].min(), points[:, 1].min()
     extent = max(points[:, 0].max() - low_x, points[:, 1].max() - low_y)
     edge = max(2.0 * radius, extent / _CELLS)
@@ -156,13 +160,13 @@ def _filed(points: NDArray[np.float64], radius: float) -> _Grid:
         column, row = int((points[k, 0] - low_x) / edge), int((points[k, 1] - low_y) / edge)
         before[k] = newest[row, column]
         newest[row, column] = k
-    return _Grid(low_x, low_y, edge, newest, before)
+    return _PointGrid(low_x, low_y, edge, newest, before)
 
 
 @njit(cache=True)
 def _overlap(
     points: NDArray[np.float64],
-    grid: _Grid,
+    grid: _PointGrid,
     others: NDArray[np.float64],
     radius: float,
     met_by: NDArray[np.int64],
@@ -173,7 +177,7 @@ def _overlap(
     :param met_by: for each of the points the number of the last scan that met it, changed in place.
     :param number: of this one.
     """
-    size = len(grid.newest)
+    size = len(grid.last_point)
     # Rounding must not hide a point at just this distance.
     reach = radius * (1.0 + 1e-9)
     met = met_others = 0
@@ -184,7 +188,7 @@ def _overlap(
         near = False
         for r in range(max(0, bottom), min(size, top + 1)):
             for c in range(max(0, left), min(size, right + 1)):
-                k = grid.newest[r, c]
+                k = grid.last_point[r, c]
                 while k >= 0:
                     dx, dy = points[k, 0] - others[i, 0], points[k, 1] - others[i, 1]
                     if dx * dx + dy * dy <= radius * radius:
@@ -192,6 +196,6 @@ def _overlap(
                         if met_by[k] != number:
                             met_by[k] = number
                             met += 1
-                    k = grid.before[k]
+                    k = grid.previous_point[k]
         met_others += near
     return 0.5 * (met / len(points) + met_others / len(others))

@@ -23,26 +23,26 @@ class OverlapGraph:
     keyframes: tuple[int, ...] = ()
     similarity: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0)))
 
-    def only(self, keep: Collection[int]) -> OverlapGraph:
+    def subgraph(self, keep: Collection[int]) -> OverlapGraph:
         """The graph of those of its keyframes that are in ``keep``."""
         rows = [i for i, keyframe in enumerate(self.keyframes) if keyframe in keep]
         if len(rows) == len(self.keyframes):
             return self
         return OverlapGraph(tuple(self.keyframes[i] for i in rows), self.similarity[np.ix_(rows, rows)])
 
-    def without(self, gone: Collection[int]) -> OverlapGraph:
+    def without_keyframes(self, gone: Collection[int]) -> OverlapGraph:
         """The graph without those of its keyframes that are in ``gone``."""
-        return self.only(set(self.keyframes).difference(gone))
+        return self.subgraph(set(self.keyframes).difference(gone))
 
-    def weakened(self, chambers: Mapping[int, int], factor: float) -> OverlapGraph:
+    def weaken_across_doors(self, segment_labels: Mapping[int, int], factor: float) -> OverlapGraph:
         """The graph with the similarities of keyframes in different chambers multiplied by a factor.
 
-        :param chambers: {keyframe: number of its chamber}, 0 of those that are not in it.
+        :param segment_labels: {keyframe: number of its chamber}, 0 of those that are not in it.
         """
-        own = np.array([chambers.get(keyframe, 0) for keyframe in self.keyframes])
+        own = np.array([segment_labels.get(keyframe, 0) for keyframe in self.keyframes])
         return OverlapGraph(self.keyframes, np.where(own[:, None] == own, 1.0, factor) * self.similarity)
 
-    def between(self, keyframe: int, others: Sequence[int]) -> NDArray[np.float64]:
+    def overlaps_with(self, keyframe: int, others: Sequence[int]) -> NDArray[np.float64]:
         """Overlaps of a keyframe with others, NaN where either is not in this graph."""
         if keyframe not in self.keyframes:
             return np.full(len(others), np.nan)
@@ -51,11 +51,11 @@ class OverlapGraph:
         return np.where(known[at] == wanted, self.similarity[self.keyframes.index(keyframe), at], np.nan)
 
 
-Measure = Callable[[int, tuple[int, ...]], NDArray[np.float64]]
+MeasureOverlaps = Callable[[int, tuple[int, ...]], NDArray[np.float64]]
 
 
-def synchronised(
-    graph: OverlapGraph, keyframes: Collection[int], measure: Measure, *others: OverlapGraph
+def synchronize_graph(
+    graph: OverlapGraph, keyframes: Collection[int], measure: MeasureOverlaps, *others: OverlapGraph
 ) -> OverlapGraph:
     """The graph of exactly ``keyframes``, measuring only overlaps that neither ``graph`` nor one of ``others`` holds.
 
@@ -64,7 +64,7 @@ def synchronised(
     :param measure: (keyframe, others) -> overlaps, shape (number of others,).
     :param others: the graphs of areas from which keyframes came over.
     """
-    graph = graph.only(keyframes)
+    graph = graph.subgraph(keyframes)
     held, new = graph.keyframes, sorted(set(keyframes) - set(graph.keyframes))
     if not new:
         return graph
@@ -74,7 +74,7 @@ def synchronised(
     for k, keyframe in enumerate(new, start=len(held)):
         row = np.full(k, np.nan)
         for other in others:
-            row = np.where(np.isnan(row), other.between(keyframe, ids[:k]), row)
+            row = np.where(np.isnan(row), other.overlaps_with(keyframe, ids[:k]), row)
         unknown = np.flatnonzero(np.isnan(row))
         row[unknown] = measure(keyframe, tuple(ids[i] for i in unknown))
         similarity[k, :k] = similarity[:k, k] = row
@@ -89,8 +89,8 @@ class Separation(NamedTuple):
     ncut: float
 
 
-def separation(
-    graph: OverlapGraph, own: Collection[int], newest: int, threshold: float, min_size: int
+def find_separation(
+    graph: OverlapGraph, new_keyframes: Collection[int], newest: int, threshold: float, min_size: int
 ) -> Separation | None:
     """The part of the robot's own keyframes, the newest among them, that separates from its area.
 
@@ -100,13 +100,13 @@ def separation(
     ground, since they were passed before and nothing says that they form a place of their own. Where the part so found
     does not separate well from all the rest, the first bipartition stands.
 
-    :param own: the keyframes stored since the robot entered the area.
-    :param newest: the newest keyframe, one of ``own``.
+    :param new_keyframes: the keyframes stored since the robot entered the area.
+    :param newest: the newest keyframe, one of ``new_keyframes``.
     :param threshold: largest NCut at which keyframes separate.
     :param min_size: keyframes on each side at least.
     :returns: None where nothing separates, or the newest keyframe is on the side of the old ground.
     """
-    similarity, sizes, nodes = _contracted(graph, own)
+    similarity, sizes, nodes = _contract(graph, new_keyframes)
     at = nodes.index(newest)
     first = normalized_cut(similarity, min_size, sizes)
     if first is None or first.value > threshold:
@@ -119,7 +119,7 @@ def separation(
     return None
 
 
-def least_cut(graph: OverlapGraph, part: Collection[int], min_size: int) -> float:
+def min_ncut(graph: OverlapGraph, part: Collection[int], min_size: int) -> float:
     """The least NCut at which a graph falls into two: that which sets ``part`` apart, or a better one.
 
     :param part: some of its keyframes.
@@ -133,10 +133,12 @@ def least_cut(graph: OverlapGraph, part: Collection[int], min_size: int) -> floa
 _OLD_GROUND = -1
 
 
-def _contracted(graph: OverlapGraph, own: Collection[int]) -> tuple[NDArray[np.float64], NDArray[np.int64], list[int]]:
+def _contract(
+    graph: OverlapGraph, new_keyframes: Collection[int]
+) -> tuple[NDArray[np.float64], NDArray[np.int64], list[int]]:
     """Similarities, shape (m, m), and sizes, shape (m,), of the old ground (where there is any) and own keyframes."""
-    nodes = [keyframe for keyframe in graph.keyframes if keyframe in own]
-    is_own = np.array([keyframe in own for keyframe in graph.keyframes])
+    nodes = [keyframe for keyframe in graph.keyframes if keyframe in new_keyframes]
+    is_own = np.array([keyframe in new_keyframes for keyframe in graph.keyframes])
     if not is_own.all():
         nodes.insert(0, _OLD_GROUND)
     membership = np.zeros((len(is_own), len(nodes)))

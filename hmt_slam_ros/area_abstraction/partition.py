@@ -14,100 +14,100 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmt_slam_ros.area_abstraction.doors import OpeningDetector, OpeningView, Way
-from hmt_slam_ros.area_abstraction.overlap_graph import OverlapGraph, Separation, least_cut, separation
+from hmt_slam_ros.area_abstraction.overlap_graph import OverlapGraph, Separation, find_separation, min_ncut
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.hybrid_map.common_map import Keyframes, Pair
-from hmt_slam_ros.hybrid_map.shortest_path import beside
-from hmt_slam_ros.messages.messages import Keyframe, LeafEstimate
+from hmt_slam_ros.hybrid_map.common_map import AreaPair, KeyframePoses
+from hmt_slam_ros.hybrid_map.shortest_path import connected_neighbors
+from hmt_slam_ros.messages.messages import HypothesisEstimate, Keyframe
 from hmt_slam_ros.messages.replica import FIRST_AREA, FIRST_HYPOTHESIS, Replica, ReplicaState
 
 
-class Joint(NamedTuple):
+class JoinedGraph(NamedTuple):
     """Two areas that a closure joins, as one.
 
     :ivar arc: ``a_T_b``, shape (3,), by which overlaps between the two were measured.
     :ivar graph: of the keyframes of both.
-    :ivar part: keyframes of area b.
-    :ivar least: least normalised cut of the graph.
+    :ivar second_keyframes: keyframes of area b.
+    :ivar min_ncut: least normalised cut of the graph.
     """
 
     arc: NDArray[np.float64]
     graph: OverlapGraph
-    part: frozenset[int]
-    least: float
+    second_keyframes: frozenset[int]
+    min_ncut: float
 
-    def moved(self, arc: NDArray[np.float64], placed: Keyframes) -> float:
+    def max_displacement(self, arc: NDArray[np.float64], placed: KeyframePoses) -> float:
         """How far at most another arc has the keyframes of area b, {keyframe: pose in b}, from where they were, m."""
         points = np.array([pose[:2] for pose in placed.values()]).reshape(-1, 2)
         return float(np.hypot(*(se2.transform(arc, points) - se2.transform(self.arc, points)).T).max(initial=0.0))
 
 
 @dataclass(frozen=True)
-class Watch:
+class Partition:
     """What the AAM remembers of one hypothesis; a value, so that the children of a hypothesis inherit it.
 
     :ivar area: the robot's area.
     :ivar graphs: {area: overlap graph of its keyframes} of the areas that the robot was in.
-    :ivar own: keyframes stored since the robot entered ``area``, and those that came over with it.
-    :ivar separate: at how many of the latest evaluations in a row the newest keyframes separated.
-    :ivar beyond: the known area that the robot seems to be in, and for how many keyframes in a row.
-    :ivar joints: {pair of areas: what was found when it was last asked whether they are one}.
-    :ivar way: the openings that the robot passes, where the policy asks for them.
-    :ivar parted: areas, the smaller first, between which the path went through an opening, likewise.
+    :ivar new_keyframes: keyframes stored since the robot entered ``area``, and those that came over with it.
+    :ivar separation_count: at how many of the latest evaluations in a row the newest keyframes separated.
+    :ivar overlap_candidate: the known area that the robot seems to be in, and for how many keyframes in a row.
+    :ivar joined_graphs: {pair of areas: what was found when it was last asked whether they are one}.
+    :ivar door_tracker: the openings that the robot passes, where the policy asks for them.
+    :ivar pairs_split_by_door: areas, the smaller first, between which the path went through an opening, likewise.
     """
 
     area: int
     graphs: dict[int, OverlapGraph] = field(default_factory=dict)
-    own: frozenset[int] = frozenset()
-    separate: int = 0
-    beyond: tuple[int, int] | None = None
-    joints: dict[Pair, Joint] = field(default_factory=dict)
-    way: Way = field(default_factory=Way)
-    parted: frozenset[Pair] = frozenset()
+    new_keyframes: frozenset[int] = frozenset()
+    separation_count: int = 0
+    overlap_candidate: tuple[int, int] | None = None
+    joined_graphs: dict[AreaPair, JoinedGraph] = field(default_factory=dict)
+    door_tracker: Way = field(default_factory=Way)
+    pairs_split_by_door: frozenset[AreaPair] = frozenset()
 
 
 @dataclass(frozen=True, eq=False)
-class JointState:
+class JoinedGraphState:
     """Two areas a and b that a closure joins, as one.
 
     :ivar arc: ``a_T_b``, shape (3,), by which overlaps between the two were measured, m and rad.
     :ivar graph: number of the overlap graph of the keyframes of both in ``AamState.graphs``.
-    :ivar part: keyframes of area b.
-    :ivar least: least normalised cut of the graph.
+    :ivar second_keyframes: keyframes of area b.
+    :ivar min_ncut: least normalised cut of the graph.
     """
 
     arc: NDArray[np.float64]
     graph: int
-    part: frozenset[int]
-    least: float
+    second_keyframes: frozenset[int]
+    min_ncut: float
 
 
 @dataclass(frozen=True, eq=False)
-class WatchState:
+class PartitionState:
     """What the AAM remembers of one hypothesis.
 
     :ivar area: the robot's area.
     :ivar graphs: {area: number of the overlap graph of its keyframes in ``AamState.graphs``}.
-    :ivar own: keyframes stored since the robot entered ``area``, and those that came over with it.
-    :ivar separate: at how many of the latest evaluations in a row the newest keyframes separated.
-    :ivar beyond: the known area that the robot seems to be in, and for how many keyframes in a row.
-    :ivar joints: {pair of areas: what was found when it was last asked whether they are one}.
-    :ivar way: the openings that the robot passes, where the policy asks for them.
-    :ivar parted: areas, the smaller first, between which the path went through an opening, likewise.
+    :ivar new_keyframes: keyframes stored since the robot entered ``area``, and those that came over with it.
+    :ivar separation_count: at how many of the latest evaluations in a row the newest keyframes separated.
+    :ivar overlap_candidate: the known area that the robot seems to be in, and for how many keyframes in a row.
+    :ivar joined_graphs: {pair of areas: what was found when it was last asked whether they are one}.
+    :ivar door_tracker: the openings that the robot passes, where the policy asks for them.
+    :ivar pairs_split_by_door: areas, the smaller first, between which the path went through an opening, likewise.
     """
 
     area: int
     graphs: Mapping[int, int] = field(default_factory=dict)
-    own: frozenset[int] = frozenset()
-    separate: int = 0
-    beyond: tuple[int, int] | None = None
-    joints: Mapping[Pair, JointState] = field(default_factory=dict)
-    way: Way = field(default_factory=Way)
-    parted: frozenset[Pair] = frozenset()
+    new_keyframes: frozenset[int] = frozenset()
+    separation_count: int = 0
+    overlap_candidate: tuple[int, int] | None = None
+    joined_graphs: Mapping[AreaPair, JoinedGraphState] = field(default_factory=dict)
+    door_tracker: Way = field(default_factory=Way)
+    pairs_split_by_door: frozenset[AreaPair] = frozenset()
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,35 +116,56 @@ class AamState:
 
     :ivar replica: the maps of the live hypotheses.
     :ivar graphs: overlap graphs; hypotheses share them.
-    :ivar watches: {hypothesis: what is remembered of it}.
-    :ivar asked: areas, the smaller first, of which is still to be asked whether they are one.
-    :ivar left: areas that the robot left, of which is still to be asked whether they hold too much.
+    :ivar partitions: {hypothesis: what is remembered of it}.
+    :ivar merge_queue: areas, the smaller first, of which is still to be asked whether they are one.
+    :ivar prune_queue: areas that the robot left, of which is still to be asked whether they hold too much.
     """
 
     replica: ReplicaState = field(default_factory=ReplicaState)
     graphs: tuple[OverlapGraph, ...] = ()
-    watches: Mapping[int, WatchState] = field(default_factory=lambda: {FIRST_HYPOTHESIS: WatchState(FIRST_AREA)})
-    asked: frozenset[Pair] = frozenset()
-    left: frozenset[int] = frozenset()
+    partitions: Mapping[int, PartitionState] = field(
+        default_factory=lambda: {FIRST_HYPOTHESIS: PartitionState(FIRST_AREA)}
+    )
+    merge_queue: frozenset[AreaPair] = frozenset()
+    prune_queue: frozenset[int] = frozenset()
 
 
-def numbered(watch: Watch, numbers: Mapping[int, int]) -> WatchState:
+def partition_to_state(partition: Partition, numbers: Mapping[int, int]) -> PartitionState:
     """A watch as a value, where its graphs have numbers by their identities."""
     joints = {
-        pair: JointState(joint.arc, numbers[id(joint.graph)], joint.part, joint.least)
-        for pair, joint in watch.joints.items()
+        pair: JoinedGraphState(joint.arc, numbers[id(joint.graph)], joint.second_keyframes, joint.min_ncut)
+        for pair, joint in partition.joined_graphs.items()
     }
-    graphs = {area: numbers[id(graph)] for area, graph in watch.graphs.items()}
-    return WatchState(watch.area, graphs, watch.own, watch.separate, watch.beyond, joints, watch.way, watch.parted)
+    graphs = {area: numbers[id(graph)] for area, graph in partition.graphs.items()}
+    return PartitionState(
+        partition.area,
+        graphs,
+        partition.new_keyframes,
+        partition.separation_count,
+        partition.overlap_candidate,
+        joints,
+        partition.door_tracker,
+        partition.pairs_split_by_door,
+    )
 
 
-def watch_of(state: WatchState, graphs: Sequence[OverlapGraph]) -> Watch:
+def partition_from_state(state: PartitionState, graphs: Sequence[OverlapGraph]) -> Partition:
     """The watch of a value, whose graphs have numbers in ``graphs``."""
     joints = {
-        pair: Joint(joint.arc, graphs[joint.graph], joint.part, joint.least) for pair, joint in state.joints.items()
+        pair: JoinedGraph(joint.arc, graphs[joint.graph], joint.second_keyframes, joint.min_ncut)
+        for pair, joint in state.joined_graphs.items()
     }
     own = {area: graphs[number] for area, number in state.graphs.items()}
-    return Watch(state.area, own, state.own, state.separate, state.beyond, joints, state.way, state.parted)
+    return Partition(
+        state.area,
+        own,
+        state.new_keyframes,
+        state.separation_count,
+        state.overlap_candidate,
+        joints,
+        state.door_tracker,
+        state.pairs_split_by_door,
+    )
 
 
 # Keyframes in whose map an opening around the robot is looked for.
@@ -162,11 +183,15 @@ class AreaPolicy:
         self._options, self._detector = configuration.aam, detector
         if configuration.aam.area_policy == "both" and detector is None:
             raise HmtSlamError("aam.area_policy = both needs landmarks, which see openings: give the AAM a detector")
-        self._factor = self._options.portal_factor if self._options.area_policy == "both" else 1.0
+        self._door_factor = self._options.portal_factor if self._options.area_policy == "both" else 1.0
 
-    def seen(
-        self, keyframe: Keyframe, leaves: Sequence[LeafEstimate], replica: Replica, watches: Mapping[int, Watch]
-    ) -> dict[int, Watch]:
+    def track_doors(
+        self,
+        keyframe: Keyframe,
+        leaves: Sequence[HypothesisEstimate],
+        replica: Replica,
+        partitions: Mapping[int, Partition],
+    ) -> dict[int, Partition]:
         """The watches over hypotheses after what a keyframe shows of openings; none by a policy that asks for none.
 
         All hypotheses see what the most probable one does: what is around the robot they have in common.
@@ -174,23 +199,23 @@ class AreaPolicy:
         if self._detector is None or not keyframe.mapping or not leaves:
             return {}
         best = max(leaves, key=lambda leaf: (replica.probabilities[leaf.hypothesis], -leaf.hypothesis))
-        around = self._around(self._detector, keyframe, best, replica)
+        around = self._observe_surroundings(self._detector, keyframe, best, replica)
         found = {}
         for leaf in leaves:
-            watch = watches[leaf.hypothesis]
-            way = watch.way.interrupted() if keyframe.carried else watch.way
+            watch = partitions[leaf.hypothesis]
+            way = watch.door_tracker.interrupted() if keyframe.motion_unknown else watch.door_tracker
             pose = PoseGaussian(leaf.pose.mean, around.pose.covariance)
             way = way.seen(keyframe.sequence, pose, around)
-            found[leaf.hypothesis] = replace(watch, way=way)
+            found[leaf.hypothesis] = replace(watch, door_tracker=way)
         return found
 
-    def _around(
-        self, detector: OpeningDetector, keyframe: Keyframe, leaf: LeafEstimate, replica: Replica
+    def _observe_surroundings(
+        self, detector: OpeningDetector, keyframe: Keyframe, leaf: HypothesisEstimate, replica: Replica
     ) -> OpeningView:
         """What is around a keyframe, by the keyframes of its area and those beside it that were taken nearest."""
         hybrid_map, here = replica.maps[leaf.hypothesis], leaf.area
         placed: list[tuple[int, Float64]] = []
-        for area in () if detector.sees_around(keyframe.scan) else (here, *beside(hybrid_map, here)):
+        for area in () if detector.sees_around(keyframe.scan) else (here, *connected_neighbors(hybrid_map, here)):
             arc = hybrid_map.arc(here, area) if area != here else None
             frame = np.zeros(3) if arc is None else arc.mean
             placed += [(k, se2.compose(frame, at)) for k, at in hybrid_map.keyframes(area).items()]
@@ -201,19 +226,21 @@ class AreaPolicy:
         poses = np.array([placed[i][1] for i in nearest]).reshape(-1, 3)
         return detector.view(keyframe.scan, leaf.pose.mean, scans, poses)
 
-    def separation(self, graph: OverlapGraph, own: Collection[int], newest: int, way: Way) -> Separation | None:
+    def find_separation(
+        self, graph: OverlapGraph, new_keyframes: Collection[int], newest: int, door_tracker: Way
+    ) -> Separation | None:
         """The part of the robot's own keyframes, the newest among them, that separates from its area.
 
         :param graph: of the area.
-        :param own: the keyframes stored since the robot entered the area.
-        :param newest: the newest keyframe, one of ``own``.
-        :param way: of the robot.
+        :param new_keyframes: the keyframes stored since the robot entered the area.
+        :param newest: the newest keyframe, one of ``new_keyframes``.
+        :param door_tracker: of the robot.
         """
         if self._options.area_policy == "both":
-            graph = graph.weakened(way.chambers(own), self._factor)
-        return separation(graph, own, newest, self._options.ncut_threshold, self._options.min_cluster)
+            graph = graph.weaken_across_doors(door_tracker.chambers(new_keyframes), self._door_factor)
+        return find_separation(graph, new_keyframes, newest, self._options.ncut_threshold, self._options.min_cluster)
 
-    def least_cut(self, joint: Joint) -> float:
+    def min_ncut(self, joined: JoinedGraph) -> float:
         """The least NCut of two areas as one between which the path went through an opening."""
-        graph = joint.graph.weakened(dict.fromkeys(joint.part, 1), self._factor)
-        return least_cut(graph, joint.part, self._options.min_cluster)
+        graph = joined.graph.weaken_across_doors(dict.fromkeys(joined.second_keyframes, 1), self._door_factor)
+        return min_ncut(graph, joined.second_keyframes, self._options.min_cluster)

@@ -22,20 +22,22 @@ class OneSentenceParser(argparse.ArgumentParser):
         self.exit(2, f"{self.prog}: {message}: see {self.prog} --help\n")
 
 
-def parser() -> argparse.ArgumentParser:
+def build_parser() -> argparse.ArgumentParser:
     """The parser of ``hmt_slam``; the name of the subcommand ends up in ``command``."""
     top = OneSentenceParser(prog="hmt_slam", description="Hybrid metric-topological SLAM.")
     top.add_argument("--version", action="version", version=f"hmt_slam_ros {__version__}")
     commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    _map(commands.add_parser("map", help="map a log, all in one process, the same for one seed"))
-    _replay(commands.add_parser("replay", help="map a log by a simulated robot and the ROS nodes"))
-    _convert(commands.add_parser("convert", help="write a log as a rosbag2"))
-    _simulate(commands.add_parser("simulate", help="write a drive through a simulated world as a rosbag2"))
-    _evaluate(commands.add_parser("evaluate", help="errors of an output folder against true relations"))
-    _plot(commands.add_parser("plot", help="draw map, probabilities and cost of an output folder"))
-    _export(commands.add_parser("export", help="write a map's topology as GraphML, or its grid for nav2"))
-    _doctor(commands.add_parser("doctor", help="say what is wrong with a log or with the running system"))
-    _parameters(commands.add_parser("parameters", help="print every parameter as a YAML file"))
+    _add_map_arguments(commands.add_parser("map", help="map a log, all in one process, the same for one seed"))
+    _add_replay_arguments(commands.add_parser("replay", help="map a log by a simulated robot and the ROS nodes"))
+    _add_convert_arguments(commands.add_parser("convert", help="write a log as a rosbag2"))
+    _add_simulate_arguments(
+        commands.add_parser("simulate", help="write a drive through a simulated world as a rosbag2")
+    )
+    _add_evaluate_arguments(commands.add_parser("evaluate", help="errors of an output folder against true relations"))
+    _add_plot_arguments(commands.add_parser("plot", help="draw map, probabilities and cost of an output folder"))
+    _add_export_arguments(commands.add_parser("export", help="write a map's topology as GraphML, or its grid for nav2"))
+    _add_doctor_arguments(commands.add_parser("doctor", help="say what is wrong with a log or with the running system"))
+    _add_parameters_arguments(commands.add_parser("parameters", help="print every parameter as a YAML file"))
     return top
 
 
@@ -53,8 +55,8 @@ def chosen_configuration(options: argparse.Namespace, base: Configuration | None
     return load_configuration(options.config, settings, options.seed, base)
 
 
-def _map(command: argparse.ArgumentParser) -> None:
-    _log_to_folder(command)
+def _add_map_arguments(command: argparse.ArgumentParser) -> None:
+    _add_log_and_output(command)
     command.add_argument(
         "--from",
         type=Path,
@@ -69,8 +71,8 @@ def _map(command: argparse.ArgumentParser) -> None:
     )
 
 
-def _replay(command: argparse.ArgumentParser) -> None:
-    _log_to_folder(command)
+def _add_replay_arguments(command: argparse.ArgumentParser) -> None:
+    _add_log_and_output(command)
     command.add_argument("--rate", type=float, help="speed relative to real time; also --set robot.rate=F")
     command.add_argument(
         "--view",
@@ -82,14 +84,14 @@ def _replay(command: argparse.ArgumentParser) -> None:
     )
 
 
-def _log_to_folder(command: argparse.ArgumentParser) -> None:
+def _add_log_and_output(command: argparse.ArgumentParser) -> None:
     command.add_argument("log", type=Path, metavar="LOG", help=_LOG)
     command.add_argument("--out", type=Path, required=True, metavar="DIR", help="output folder; an old one is replaced")
-    _configuration(command)
-    _part(command)
+    _add_configuration(command)
+    _add_time_window(command)
 
 
-def _configuration(command: argparse.ArgumentParser) -> None:
+def _add_configuration(command: argparse.ArgumentParser) -> None:
     command.add_argument("--seed", type=int, metavar="N", help="seed of all random numbers")
     command.add_argument("--config", type=Path, metavar="FILE", help="YAML file with parameters")
     command.add_argument(
@@ -97,34 +99,34 @@ def _configuration(command: argparse.ArgumentParser) -> None:
     )
 
 
-def _part(command: argparse.ArgumentParser) -> None:
+def _add_time_window(command: argparse.ArgumentParser) -> None:
     command.add_argument("--start", type=float, metavar="S", help="seconds of the log to skip")
     command.add_argument("--duration", type=float, metavar="S", help="seconds of the log to use; 0 for all")
 
 
-def _convert(command: argparse.ArgumentParser) -> None:
+def _add_convert_arguments(command: argparse.ArgumentParser) -> None:
     command.add_argument("source", type=Path, metavar="SRC", help=_LOG)
     command.add_argument("destination", type=Path, metavar="DST", help="rosbag2 folder to make")
-    _storage(command)
-    _part(command)
+    _add_storage(command)
+    _add_time_window(command)
 
 
-def _storage(command: argparse.ArgumentParser) -> None:
+def _add_storage(command: argparse.ArgumentParser) -> None:
     command.add_argument("--storage", choices=("mcap", "sqlite3"), default="mcap", help="format of the bag's file")
 
 
-def _simulate(command: argparse.ArgumentParser) -> None:
+def _add_simulate_arguments(command: argparse.ArgumentParser) -> None:
     command.add_argument("world", metavar="WORLD", help="family of buildings or .yaml file, see docs/simulation.md")
     command.add_argument("--out", type=Path, required=True, metavar="BAG", help="rosbag2 folder to make")
     command.add_argument("--seed", type=int, metavar="N", help="seed of building, noise, people and furniture")
     command.add_argument(
         "--set", action="append", default=[], dest="settings", metavar="NAME=VALUE", help="set one setting of the world"
     )
-    _storage(command)
-    _part(command)
+    _add_storage(command)
+    _add_time_window(command)
 
 
-def _evaluate(command: argparse.ArgumentParser) -> None:
+def _add_evaluate_arguments(command: argparse.ArgumentParser) -> None:
     command.add_argument("directory", type=Path, metavar="DIR", help="output folder")
     true = command.add_mutually_exclusive_group(required=True)
     true.add_argument("--relations", type=Path, metavar="FILE", help="lines t1 t2 x y z r p yaw")
@@ -134,11 +136,11 @@ def _evaluate(command: argparse.ArgumentParser) -> None:
     )
 
 
-def _plot(command: argparse.ArgumentParser) -> None:
+def _add_plot_arguments(command: argparse.ArgumentParser) -> None:
     command.add_argument("directory", type=Path, metavar="DIR", help="output folder, in which the pictures are put")
 
 
-def _export(command: argparse.ArgumentParser) -> None:
+def _add_export_arguments(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "directory", type=Path, metavar="DIR", help="output folder, in which the file is put; for --grid also a hmt_map"
     )
@@ -149,12 +151,12 @@ def _export(command: argparse.ArgumentParser) -> None:
     command.add_argument("--area", type=int, metavar="N", help="the grid of one area alone, in that area's frame")
 
 
-def _doctor(command: argparse.ArgumentParser) -> None:
+def _add_doctor_arguments(command: argparse.ArgumentParser) -> None:
     command.add_argument("log", type=Path, nargs="?", metavar="LOG", help=_LOG)
     command.add_argument("--live", action="store_true", help="listen to the running system instead")
     command.add_argument("--seconds", type=float, default=10.0, metavar="S", help="how long to listen to it")
     command.add_argument("--json", action="store_true", help="print the findings as JSON")
-    _part(command)
+    _add_time_window(command)
     command.add_argument(
         "--ros-args",
         nargs=argparse.REMAINDER,
@@ -165,5 +167,5 @@ def _doctor(command: argparse.ArgumentParser) -> None:
     )
 
 
-def _parameters(command: argparse.ArgumentParser) -> None:
-    _configuration(command)
+def _add_parameters_arguments(command: argparse.ArgumentParser) -> None:
+    _add_configuration(command)

@@ -12,7 +12,7 @@ from hmt_slam_ros.open_log import open_log
 
 def run(options: argparse.Namespace) -> None:
     """Write the bag and say what is in it."""
-    log = convert(
+    log = convert_log(
         options.source,
         options.destination,
         storage=options.storage,
@@ -22,7 +22,7 @@ def run(options: argparse.Namespace) -> None:
     print(f"{options.destination}: {log.scan_count} scans, {log.duration:.1f} s")
 
 
-def convert(
+def convert_log(
     source: Path,
     destination: Path,
     *,

@@ -15,19 +15,19 @@ def run(options: argparse.Namespace) -> int:
     """Examine, and say what was found; 1 where something is wrong, else 0."""
     if options.live == (options.log is not None):
         raise HmtSlamError("doctor examines a log or the running system: give either LOG or --live")
-    found = _live(options) if options.live else _log(options)
+    found = _examine_running_system(options) if options.live else _examine_log(options)
     print(_as_json(found) if options.json else _as_text(found))
     return _WRONG if any(finding.severity == "wrong" for finding in found) else 0
 
 
-def _log(options: argparse.Namespace) -> list[Finding]:
+def _examine_log(options: argparse.Namespace) -> list[Finding]:
     # It loads compiled kernels, for which an error in the arguments need not wait.
     from hmt_slam_ros.doctor.examination import examine  # noqa: PLC0415
 
     return examine(options.log, start=options.start or 0.0, duration=options.duration or None)
 
 
-def _live(options: argparse.Namespace) -> list[Finding]:
+def _examine_running_system(options: argparse.Namespace) -> list[Finding]:
     try:
         from hmt_slam_ros.ros.doctor_node import examine_running  # noqa: PLC0415  it needs ROS
     except ImportError as fault:

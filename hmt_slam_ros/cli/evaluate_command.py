@@ -8,9 +8,9 @@ from hmt_slam_ros.evaluation import (
     evaluate_folder,
     evaluate_relations,
     format_table,
+    read_true_poses,
     read_tum,
     true_relations,
-    truth_of,
 )
 from hmt_slam_ros.open_log import open_log
 
@@ -20,6 +20,6 @@ def run(options: argparse.Namespace) -> None:
     if options.truth is None:
         errors = evaluate_folder(options.directory, options.relations, options.odometry)
     else:
-        relations = true_relations(truth_of(open_log(options.truth)))
+        relations = true_relations(read_true_poses(open_log(options.truth)))
         errors = evaluate_relations(read_tum(options.directory / "trajectory.tum"), relations)
     print(format_table(errors))

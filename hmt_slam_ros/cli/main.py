@@ -7,9 +7,9 @@ import sys
 from collections.abc import Sequence
 from importlib import import_module
 
-from hmt_slam_ros.cli.arguments import parser
-from hmt_slam_ros.cli.terminal import heed_signals
-from hmt_slam_ros.compilation import tell_of_compilation
+from hmt_slam_ros.cli.arguments import build_parser
+from hmt_slam_ros.cli.terminal import install_signal_handlers
+from hmt_slam_ros.compilation import report_compilation
 from hmt_slam_ros.errors import HmtSlamError
 
 FAULT, INTERRUPTED = 2, 130
@@ -22,12 +22,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     :returns: exit status: 0 for a complete result, 1 where ``doctor`` found something wrong, 2 where the input is at
         fault, 130 where the user stopped it.
     """
-    heed_signals()
-    options = parser().parse_args(arguments)
+    install_signal_handlers()
+    options = build_parser().parse_args(arguments)
     try:
         # Each subcommand loads what it needs itself, so that --help does not wait for numba and matplotlib.
         command = import_module(f"hmt_slam_ros.cli.{options.command}_command")
-        tell_of_compilation(lambda text: print(f"hmt_slam {options.command}: {text}", file=sys.stderr))
+        report_compilation(lambda text: print(f"hmt_slam {options.command}: {text}", file=sys.stderr))
         return command.run(options) or 0
     except HmtSlamError as fault:
         print(f"hmt_slam {options.command}: {fault}", file=sys.stderr)

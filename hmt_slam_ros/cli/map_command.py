@@ -22,21 +22,21 @@ from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.logs import Log
 from hmt_slam_ros.offline.runtime import run_log
 from hmt_slam_ros.open_log import open_log
-from hmt_slam_ros.results.final_map import FinalMap, corrected_scans, final_map
+from hmt_slam_ros.results.final_map import FinalMap, deskewed_scans, final_map
 from hmt_slam_ros.results.hmt_map import RunState, read_run_state, read_saved_map
-from hmt_slam_ros.results.log_reading import differences, goes_on, map_folder, which_log
-from hmt_slam_ros.results.output_folder import map_writer, replacing, write_output
-from hmt_slam_ros.results.report import RunFigures, code_bytes
+from hmt_slam_ros.results.log_reading import describe_log, describe_parameter_changes, is_newest_log, map_folder
+from hmt_slam_ros.results.output_folder import atomic_output, map_writer, write_output
+from hmt_slam_ros.results.report import RunMetrics, code_bytes
 from hmt_slam_ros.saved_map.folder import HMT_MAP
 
 
 def run(options: argparse.Namespace) -> None:
     """Map the log and say what came of it."""
-    configuration, state, log = _beginning(options)
+    configuration, state, log = _initial_state(options)
     log_seconds = log.duration
-    with replacing(options.out) as folder:
+    with atomic_output(options.out) as folder:
         writer = map_writer(folder)
-        final, source_stamps, figures = measured_run(log, configuration, state, writer.write_state)
+        final, source_stamps, figures = run_measured(log, configuration, state, writer.write_state)
         del log, state  # they may be large
         write_output(folder, final, source_stamps, figures, configuration, writer)
         if configuration.mode == "localization":
@@ -45,30 +45,30 @@ def run(options: argparse.Namespace) -> None:
     print(summary(options.out, final.recording, log_seconds, figures.wall_seconds))
 
 
-def _beginning(options: argparse.Namespace) -> tuple[Configuration, RunState, Log]:
+def _initial_state(options: argparse.Namespace) -> tuple[Configuration, RunState, Log]:
     """What the run begins with, which is nothing or the map that it goes on from, and the log."""
     if options.source is None:
         configuration = chosen_configuration(options)
         if configuration.mode == "localization":
             raise HmtSlamError("mode = localization wants a map to find the robot in: give --from, or map first")
-        return configuration, RunState(), _opened(options.log, configuration)
+        return configuration, RunState(), _open_time_window(options.log, configuration)
     folder = map_folder(options.source)
     state, saved = read_run_state(folder)
     whole = with_changes(saved, {"robot.duration": 0.0})
     configuration = chosen_configuration(options, whole)
-    log = _opened(options.log, configuration)
-    further = not goes_on(state.log, log)
+    log = _open_time_window(options.log, configuration)
+    further = not is_newest_log(state.log, log)
     if further:
-        state = replace(state, log=replace(state.log, earlier=read_saved_map(folder).scans))
+        state = replace(state, log=replace(state.log, earlier_trajectory=read_saved_map(folder).relative_trajectory))
         configuration = chosen_configuration(options, with_changes(whole, {"robot.start": 0.0}))
-        log = _opened(options.log, configuration)
-    changes = differences(saved, configuration, further=further)
-    for told in filter(None, (which_log(state.log, log.name, further=further), changes)):
+        log = _open_time_window(options.log, configuration)
+    changes = describe_parameter_changes(saved, configuration, further=further)
+    for told in filter(None, (describe_log(state.log, log.name, further=further), changes)):
         print(f"hmt_slam map: {told}", file=sys.stderr)
     return configuration, state, log
 
 
-def _opened(path: Path, configuration: Configuration) -> Log:
+def _open_time_window(path: Path, configuration: Configuration) -> Log:
     """The part of the log that was asked for."""
     log = open_log(path, start=configuration.robot.start, duration=configuration.robot.duration or None)
     if not log.scan_count:
@@ -76,27 +76,29 @@ def _opened(path: Path, configuration: Configuration) -> Log:
     return log
 
 
-def measured_run(
+def run_measured(
     log: Log,
     configuration: Configuration,
     state: RunState | None = None,
-    keep: Callable[[RunState], None] | None = None,
-) -> tuple[FinalMap, NDArray[np.int64], RunFigures]:
+    on_state: Callable[[RunState], None] | None = None,
+) -> tuple[FinalMap, NDArray[np.int64], RunMetrics]:
     """Map a log, and measure what that costs.
 
     :param state: to go on from.
-    :param keep: called with the state at the end of the log, before that is told.
+    :param on_state: called with the state at the end of the log, before that is told.
     :returns: the map, the log's own stamps of all scans (n,), ns, and the figures.
     """
     wall, cpu = time.monotonic(), time.process_time()
     # Libraries and the log stay to the end: the garbage collector need not look through them again and again.
     gc.freeze()
     with Progress(log.scan_count, log.duration) as progress:
-        result = run_log(log, configuration, progress, state=state, keep=keep, lasting=True)
+        result = run_log(log, configuration, progress, state=state, on_state=on_state, compact_record=True)
     begin = time.process_time()
-    recording = result.recorder.finish(result.log.stamps, result.log.first_scans, result.log.earlier)
-    final = final_map(recording, corrected_scans(log, configuration), configuration)
-    figures = RunFigures(
+    recording = result.recorder.finish(
+        result.log_progress.stamps, result.log_progress.first_scans, result.log_progress.earlier_trajectory
+    )
+    final = final_map(recording, deskewed_scans(log, configuration), configuration)
+    figures = RunMetrics(
         log=log.name,
         runtime="lock-step",
         seconds_per_scan=result.seconds_per_scan,
@@ -107,4 +109,4 @@ def measured_run(
         refinement_seconds=time.process_time() - begin,
         memory={"particle_maps": result.map_bytes} | code_bytes(),
     )
-    return final, result.log.source_stamps, figures
+    return final, result.log_progress.source_stamps, figures

@@ -26,5 +26,5 @@ def run(options: argparse.Namespace) -> None:
         check_port(options.view)
         print(f"the live page is at http://{LOCAL}:{options.view}/", file=sys.stderr)
     with Progress(log.scan_count, log.duration) as progress:
-        replayed = replay(options.log, options.out, configuration, progress, view=options.view)
+        replayed = replay(options.log, options.out, configuration, progress, view_port=options.view)
     print(summary(options.out, replayed.recording, log.duration, replayed.wall_seconds))

@@ -12,7 +12,7 @@ from dataclasses import dataclass, fields, is_dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, cast
 
-from hmt_slam_ros.configuration.tree import RULES, Configuration
+from hmt_slam_ros.configuration.tree import CONSISTENCY_RULES, Configuration
 from hmt_slam_ros.errors import HmtSlamError
 
 if TYPE_CHECKING:
@@ -53,14 +53,14 @@ class FlatParameter:
 
 def flat_parameters(tree: DataclassInstance) -> list[FlatParameter]:
     """Every parameter of a tree, in the order of declaration."""
-    return list(_leaves(tree, ""))
+    return list(_parameters_below(tree, ""))
 
 
-def _leaves(node: DataclassInstance, prefix: str) -> Iterator[FlatParameter]:
+def _parameters_below(node: DataclassInstance, prefix: str) -> Iterator[FlatParameter]:
     for entry in fields(node):
         name, value = prefix + entry.name, getattr(node, entry.name)
         if is_dataclass(value) and not isinstance(value, type):
-            yield from _leaves(value, f"{name}.")
+            yield from _parameters_below(value, f"{name}.")
         else:
             yield FlatParameter(name, value, cast(Value, entry.default), **entry.metadata)
 
@@ -72,10 +72,10 @@ def as_flat(configuration: Configuration) -> dict[str, Value]:
 
 def as_nested(configuration: Configuration) -> dict[str, Any]:
     """Nested dictionaries of plain values, for JSON and YAML."""
-    return nested(as_flat(configuration))
+    return nest(as_flat(configuration))
 
 
-def nested(flat: Mapping[str, Any]) -> dict[str, Any]:
+def nest(flat: Mapping[str, Any]) -> dict[str, Any]:
     """Dictionaries nested at the dots of the names."""
     tree: dict[str, Any] = {}
     for name, value in flat.items():
@@ -87,12 +87,12 @@ def nested(flat: Mapping[str, Any]) -> dict[str, Any]:
     return tree
 
 
-def flattened(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+def flatten(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     """The inverse of :func:`nested`; an empty dictionary vanishes."""
     flat: dict[str, Any] = {}
     for name, value in tree.items():
         if isinstance(value, Mapping):
-            flat.update(flattened(value, f"{prefix}{name}."))
+            flat.update(flatten(value, f"{prefix}{name}."))
         else:
             flat[f"{prefix}{name}"] = value
     return flat
@@ -105,14 +105,14 @@ def with_changes(configuration: Configuration, changes: Mapping[str, Any]) -> Co
     :raises HmtSlamError: for an unknown name, a value of the wrong type or out of range, or values that do not fit
         together.
     """
-    changed = changed_one_by_one(configuration, changes, "docs/parameters.md")
-    for rule in RULES:
+    changed = apply_changes(configuration, changes, "docs/parameters.md")
+    for rule in CONSISTENCY_RULES:
         if not rule.holds(changed):
             raise HmtSlamError(f"the configuration contradicts itself: {rule.advice}")
     return changed
 
 
-def changed_one_by_one(tree: Node, changes: Mapping[str, Any], document: str) -> Node:
+def apply_changes(tree: Node, changes: Mapping[str, Any], document: str) -> Node:
     """A tree of parameters with some values changed, each checked by itself.
 
     :param changes: dotted name -> value; an int serves where a float is expected.
@@ -120,19 +120,19 @@ def changed_one_by_one(tree: Node, changes: Mapping[str, Any], document: str) ->
     :raises HmtSlamError: for an unknown name, a value of the wrong type or out of range.
     """
     known = {leaf.name: leaf for leaf in flat_parameters(tree)}
-    checked = {name: _checked(_named(name, known, document), value) for name, value in changes.items()}
-    return _replaced(tree, nested(checked))
+    checked = {name: _check_value(_find_parameter(name, known, document), value) for name, value in changes.items()}
+    return _replace_values(tree, nest(checked))
 
 
-def _replaced(node: Node, changes: Mapping[str, Any]) -> Node:
+def _replace_values(node: Node, changes: Mapping[str, Any]) -> Node:
     values = {
-        name: _replaced(getattr(node, name), value) if isinstance(value, dict) else value
+        name: _replace_values(getattr(node, name), value) if isinstance(value, dict) else value
         for name, value in changes.items()
     }
     return replace(node, **values)
 
 
-def _named(name: str, known: Mapping[str, FlatParameter], document: str) -> FlatParameter:
+def _find_parameter(name: str, known: Mapping[str, FlatParameter], document: str) -> FlatParameter:
     if name in known:
         return known[name]
     near = nearest_names(name, known)
@@ -146,26 +146,26 @@ def nearest_names(name: str, known: Mapping[str, FlatParameter]) -> list[str]:
     return (same_ending + [near for near in difflib.get_close_matches(name, known) if near not in same_ending])[:3]
 
 
-def _checked(leaf: FlatParameter, value: object) -> Value:
-    typed = _typed(leaf, value)
+def _check_value(leaf: FlatParameter, value: object) -> Value:
+    typed = _convert_type(leaf, value)
     if leaf.choices and typed not in leaf.choices:
         raise HmtSlamError(f"{leaf.name} = {value} is not a choice: use {' or '.join(leaf.choices)}")
-    if not isinstance(typed, str) and not _within(leaf, typed):
+    if not isinstance(typed, str) and not _is_in_range(leaf, typed):
         raise HmtSlamError(
-            f"{leaf.name} = {value} is out of range: use {allowed(leaf)} (the default is {leaf.default})"
+            f"{leaf.name} = {value} is out of range: use {allowed_values(leaf)} (the default is {leaf.default})"
         )
     return typed
 
 
-def _typed(leaf: FlatParameter, value: object) -> Value:
+def _convert_type(leaf: FlatParameter, value: object) -> Value:
     if leaf.kind is float and type(value) is int:
         return float(value)
     if type(value) is leaf.kind:
         return cast(Value, value)
-    raise HmtSlamError(f"{leaf.name} = {value!r} is not {_KIND_NAMES[leaf.kind]}: use {allowed(leaf)}")
+    raise HmtSlamError(f"{leaf.name} = {value!r} is not {_KIND_NAMES[leaf.kind]}: use {allowed_values(leaf)}")
 
 
-def _within(leaf: FlatParameter, value: float) -> bool:
+def _is_in_range(leaf: FlatParameter, value: float) -> bool:
     if not math.isfinite(value):
         return False
     return (leaf.low is None or value >= leaf.low) and (leaf.high is None or value <= leaf.high)
@@ -174,7 +174,7 @@ def _within(leaf: FlatParameter, value: float) -> bool:
 _KIND_NAMES = {bool: "true or false", int: "a whole number", float: "a number", str: "a word"}
 
 
-def allowed(leaf: FlatParameter) -> str:
+def allowed_values(leaf: FlatParameter) -> str:
     """The values that the parameter admits, in words."""
     if leaf.choices:
         return " or ".join(leaf.choices)
@@ -185,10 +185,10 @@ def allowed(leaf: FlatParameter) -> str:
         return f"{_KIND_NAMES[leaf.kind]}, {leaf.low:g}{unit} or more"
     if leaf.low is None:
         return f"{_KIND_NAMES[leaf.kind]}, {leaf.high:g}{unit} or less"
-    return f"{_KIND_NAMES[leaf.kind]} from {number(leaf.low)} to {number(leaf.high)}{unit}"
+    return f"{_KIND_NAMES[leaf.kind]} from {format_number(leaf.low)} to {format_number(leaf.high)}{unit}"
 
 
-def number(value: float) -> str:
+def format_number(value: float) -> str:
     """A bound as a person would write it: whole numbers in full, others short."""
     return str(int(value)) if float(value).is_integer() else f"{value:.6g}"
 
@@ -213,30 +213,30 @@ def load_configuration(
     """
     configuration = base or Configuration()
     if file is not None:
-        configuration = with_changes(configuration, read_file(file))
+        configuration = with_changes(configuration, read_parameter_file(file))
     changes = dict(parse_setting(setting) for setting in settings)
     if seed is not None:
         changes["seed"] = seed
     return with_changes(configuration, changes)
 
 
-def read_file(file: Path) -> dict[str, Any]:
+def read_parameter_file(file: Path) -> dict[str, Any]:
     """Dotted name -> value as written in a YAML file, unchecked but for its form.
 
     :raises HmtSlamError: where the file cannot be read or is no mapping.
     """
-    tree = _parsed(file)
+    tree = _parse_yaml(file)
     if not isinstance(tree, Mapping):
         raise HmtSlamError(f"{file} holds no parameters: write lines such as 'filter: {{particles: 12}}'")
     sections = [section["ros__parameters"] for section in tree.values() if _is_ros_section(section)]
     if not sections:
-        return flattened(_text_keys(tree))
+        return flatten(_text_keys(tree))
     if len(sections) < len(tree):
         raise HmtSlamError(f"{file} mixes ROS sections (ros__parameters) with plain parameters: use one form only")
-    return _merged(file, [_own(flattened(_text_keys(section or {}))) for section in sections])
+    return _merge_sections(file, [_without_foreign(flatten(_text_keys(section or {}))) for section in sections])
 
 
-def _parsed(file: Path) -> object:
+def _parse_yaml(file: Path) -> object:
     import yaml  # noqa: PLC0415  the commands that read no file start faster without it
 
     try:
@@ -261,11 +261,11 @@ def _text_keys(tree: Mapping[Any, Any]) -> dict[str, Any]:
     return {str(key): _text_keys(value) if isinstance(value, Mapping) else value for key, value in tree.items()}
 
 
-def _own(flat: Mapping[str, Any]) -> dict[str, Any]:
+def _without_foreign(flat: Mapping[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in flat.items() if not name.startswith(_FOREIGN)}
 
 
-def _merged(file: Path, sections: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
+def _merge_sections(file: Path, sections: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
     merged: dict[str, Any] = {}
     for section in sections:
         for name, value in section.items():
@@ -296,10 +296,10 @@ def parse_setting(setting: str, tree: DataclassInstance | None = None) -> tuple[
         return name, text
 
 
-def _truth(text: str) -> bool:
+def _parse_bool(text: str) -> bool:
     if text.lower() not in ("true", "false"):
         raise ValueError(text)
     return text.lower() == "true"
 
 
-_READERS: dict[type, Callable[[str], Value]] = {bool: _truth, int: int, float: float, str: str}
+_READERS: dict[type, Callable[[str], Value]] = {bool: _parse_bool, int: int, float: float, str: str}

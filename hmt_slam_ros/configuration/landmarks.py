@@ -8,7 +8,7 @@ from hmt_slam_ros.configuration.parameter import parameter
 
 
 @dataclass(frozen=True)
-class Features:
+class FeatureParameters:
     """Lines: what a scan shows of walls, and what a room's map makes of it."""
 
     range_deviation: float = parameter(
@@ -154,7 +154,7 @@ class Features:
 
 
 @dataclass(frozen=True)
-class Places:
+class PlaceParameters:
     """Places: landmarks along hallways, and the robot's belief over where among them it is."""
 
     reach: float = parameter(

@@ -8,7 +8,7 @@ from hmt_slam_ros.configuration.parameter import parameter
 
 
 @dataclass(frozen=True)
-class Motion:
+class MotionParameters:
     """Odometry motion model: noise of the increment between two readings."""
 
     translation_from_translation: float = parameter(
@@ -46,7 +46,7 @@ class Motion:
 
 
 @dataclass(frozen=True)
-class LocalMap:
+class LocalMapParameters:
     """Metric map of one area: occupancy grid and distance field, or lines, built from the keyframes' scans."""
 
     kind: str = parameter(
@@ -79,7 +79,7 @@ class LocalMap:
 
 
 @dataclass(frozen=True)
-class Matching:
+class MatchingParameters:
     """Scan matching: correlative search for the start, Gauss-Newton on the distance field for precision."""
 
     max_points: int = parameter(200, "Beams of a scan that are matched; evenly thinned.", low=10, high=5000)
@@ -154,7 +154,7 @@ class Matching:
 
 
 @dataclass(frozen=True)
-class Filter:
+class FilterParameters:
     """Metric SLAM: the Rao-Blackwellized particle filter of each hypothesis and the keyframe rule."""
 
     particles: int = parameter(12, "Metric particles M of every hypothesis.", low=1, high=1000)
@@ -174,7 +174,7 @@ class Filter:
         low=0.1,
         high=100.0,
     )
-    patience: int = parameter(
+    max_scans_waiting_for_odometry: int = parameter(
         15,
         "Scans that wait for the first odometry at most, before they are placed by the velocity and their match; four "
         "times as many where odometry has come before.",

@@ -8,7 +8,7 @@ from hmt_slam_ros.configuration.parameter import parameter
 
 
 @dataclass(frozen=True)
-class RealTimeLocalization:
+class RealTimeParameters:
     """RTL: the pose at the rate of the odometry."""
 
     publish_tf: bool = parameter(True, "Publish map -> odom on /tf.")
@@ -19,7 +19,7 @@ class RealTimeLocalization:
         low=0.0,
         high=60.0,
     )
-    precedence: bool = parameter(
+    realtime_priority: bool = parameter(
         True, "Let the node come before all that computes for long (SCHED_RR), where the system permits it."
     )
     max_speed: float = parameter(
@@ -31,7 +31,7 @@ class RealTimeLocalization:
 
 
 @dataclass(frozen=True)
-class Robot:
+class RobotParameters:
     """The simulated robot that replays a log, or drives."""
 
     drive: str = parameter(
@@ -46,8 +46,10 @@ class Robot:
     start: float = parameter(0.0, "Seconds of the log to skip.", unit="s", low=0.0, high=1e6)
     duration: float = parameter(0.0, "Seconds of the log to play; 0 plays all of it.", unit="s", low=0.0, high=1e6)
     loop: bool = parameter(False, "Start again at the end of the log; the stamps go on increasing.")
-    paced: bool = parameter(True, "Wait for the acknowledgement of earlier scans, so that none is lost.")
-    window: int = parameter(20, "Scans under way without an acknowledgement, when paced.", low=1, high=10000)
+    flow_control: bool = parameter(True, "Wait for the acknowledgement of earlier scans, so that none is lost.")
+    max_unacknowledged_scans: int = parameter(
+        20, "Scans under way without an acknowledgement, when paced.", low=1, high=10000
+    )
     scan_listeners: int = parameter(
         1,
         "Start when this many subscribers of the scans are there, when paced also slam; 0 waits for none.",
@@ -57,11 +59,11 @@ class Robot:
     odometry_listeners: int = parameter(
         1, "Start when this many subscribers of the odometry are there; 0 waits for none.", low=0, high=100
     )
-    patience: float = parameter(10.0, "Wait this long for the subscribers.", unit="s", low=0.0, high=3600.0)
+    discovery_timeout: float = parameter(10.0, "Wait this long for the subscribers.", unit="s", low=0.0, high=3600.0)
 
 
 @dataclass(frozen=True)
-class Exploration:
+class ExplorerParameters:
     """The explorer: the robot, which the pilot drives as well, and when it gives something up."""
 
     drive: str = parameter(
@@ -85,14 +87,14 @@ class Exploration:
     door: float = parameter(
         1.75, "An opening up to so wide is a door, a wider one a hallway.", unit="m", low=0.5, high=5.0
     )
-    patience: float = parameter(
+    stuck_timeout: float = parameter(
         15.0, "A goal is given up to which the robot has not come nearer for so long.", unit="s", low=1.0, high=600.0
     )
 
 
 @dataclass(frozen=True)
-class Piloting:
+class PilotParameters:
     """The pilot, who goes by the belief over places: whether it drives the robot, and when it gives up."""
 
     drives: bool = parameter(True, "Take errands and drive; otherwise only say where the robot is that others drive.")
-    patience: float = parameter(300.0, "An errand is given up that takes longer.", unit="s", low=1.0, high=1e5)
+    task_timeout: float = parameter(300.0, "An errand is given up that takes longer.", unit="s", low=1.0, high=1e5)

@@ -8,7 +8,7 @@ from hmt_slam_ros.configuration.parameter import parameter
 
 
 @dataclass(frozen=True)
-class AreaAbstraction:
+class AreaAbstractionParameters:
     """AAM: partition of the keyframes into areas by normalized cut, with doors or without."""
 
     area_policy: str = parameter(
@@ -32,7 +32,7 @@ class AreaAbstraction:
         0.2, "Two scan points this close count as the same sensed space.", unit="m", low=0.01, high=2.0
     )
     overlap_points: int = parameter(180, "Points of a scan that are compared; evenly thinned.", low=10, high=5000)
-    persistence: int = parameter(
+    confirmations: int = parameter(
         2, "Keyframes in a row at which a cut, or a move into a known area, has to be found.", low=1, high=100
     )
     move_margin: float = parameter(
@@ -44,7 +44,7 @@ class AreaAbstraction:
 
 
 @dataclass(frozen=True)
-class TopologicalInference:
+class InferenceParameters:
     """TSBI: the distribution over topological paths."""
 
     max_hypotheses: int = parameter(16, "Topological hypotheses N kept after a reduction.", low=1, high=1000)
@@ -79,7 +79,7 @@ class TopologicalInference:
     new_probability: float = parameter(
         0.05, "Probability of new ground at least, where the arcs point into known areas.", low=0.0, high=1.0
     )
-    alike_probability: float = parameter(
+    aliasing_prior: float = parameter(
         0.25,
         "Probability that keyframes fit into a place of the building where they do not lie, before any was tried; what "
         "is found where they surely do not lie is counted from then on.",
@@ -134,7 +134,7 @@ class TopologicalInference:
 
 
 @dataclass(frozen=True)
-class LoopClosureAcceptance:
+class LoopClosureParameters:
     """TLCA: acceptance of the dominant topological path and the globally consistent map."""
 
     accept_probability: float = parameter(
@@ -169,12 +169,12 @@ class LoopClosureAcceptance:
 
 
 @dataclass(frozen=True)
-class Refinement:
+class RefinementParameters:
     """Refinement of the poses by registering the scans with each other, when a path is accepted and at the end."""
 
     iterations: int = parameter(4, "Linearisations of all pairs of keyframes.", low=0, high=100)
-    neighbours: int = parameter(15, "Keyframes that a keyframe is registered with at most.", low=1, high=1000)
-    scan_neighbours: int = parameter(
+    neighbors: int = parameter(15, "Keyframes that a keyframe is registered with at most.", low=1, high=1000)
+    scan_neighbors: int = parameter(
         4, "Keyframes that a scan between keyframes is registered with at most.", low=1, high=100
     )
     reach: float = parameter(

@@ -13,11 +13,21 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-from hmt_slam_ros.configuration.landmarks import Features, Places
-from hmt_slam_ros.configuration.metric_slam import Filter, LocalMap, Matching, Motion
+from hmt_slam_ros.configuration.landmarks import FeatureParameters, PlaceParameters
+from hmt_slam_ros.configuration.metric_slam import (
+    FilterParameters,
+    LocalMapParameters,
+    MatchingParameters,
+    MotionParameters,
+)
 from hmt_slam_ros.configuration.parameter import parameter
-from hmt_slam_ros.configuration.robot import Exploration, Piloting, RealTimeLocalization, Robot
-from hmt_slam_ros.configuration.topology import AreaAbstraction, LoopClosureAcceptance, Refinement, TopologicalInference
+from hmt_slam_ros.configuration.robot import ExplorerParameters, PilotParameters, RealTimeParameters, RobotParameters
+from hmt_slam_ros.configuration.topology import (
+    AreaAbstractionParameters,
+    InferenceParameters,
+    LoopClosureParameters,
+    RefinementParameters,
+)
 
 
 @dataclass(frozen=True)
@@ -35,23 +45,23 @@ class Configuration:
         "follows a world that changes: it is added to only where something is new, and what is no more is left out.",
         choices=("mapping", "localization", "lifelong"),
     )
-    motion: Motion = field(default_factory=Motion)
-    local_map: LocalMap = field(default_factory=LocalMap)
-    matching: Matching = field(default_factory=Matching)
-    filter: Filter = field(default_factory=Filter)
-    aam: AreaAbstraction = field(default_factory=AreaAbstraction)
-    tsbi: TopologicalInference = field(default_factory=TopologicalInference)
-    tlca: LoopClosureAcceptance = field(default_factory=LoopClosureAcceptance)
-    refinement: Refinement = field(default_factory=Refinement)
-    features: Features = field(default_factory=Features)
-    places: Places = field(default_factory=Places)
-    rtl: RealTimeLocalization = field(default_factory=RealTimeLocalization)
-    robot: Robot = field(default_factory=Robot)
-    explorer: Exploration = field(default_factory=Exploration)
-    pilot: Piloting = field(default_factory=Piloting)
+    motion: MotionParameters = field(default_factory=MotionParameters)
+    local_map: LocalMapParameters = field(default_factory=LocalMapParameters)
+    matching: MatchingParameters = field(default_factory=MatchingParameters)
+    filter: FilterParameters = field(default_factory=FilterParameters)
+    aam: AreaAbstractionParameters = field(default_factory=AreaAbstractionParameters)
+    tsbi: InferenceParameters = field(default_factory=InferenceParameters)
+    tlca: LoopClosureParameters = field(default_factory=LoopClosureParameters)
+    refinement: RefinementParameters = field(default_factory=RefinementParameters)
+    features: FeatureParameters = field(default_factory=FeatureParameters)
+    places: PlaceParameters = field(default_factory=PlaceParameters)
+    rtl: RealTimeParameters = field(default_factory=RealTimeParameters)
+    robot: RobotParameters = field(default_factory=RobotParameters)
+    explorer: ExplorerParameters = field(default_factory=ExplorerParameters)
+    pilot: PilotParameters = field(default_factory=PilotParameters)
 
 
-class Rule(NamedTuple):
+class ConsistencyRule(NamedTuple):
     """A condition that joins several parameters.
 
     :ivar holds: true for a configuration that makes sense.
@@ -62,26 +72,29 @@ class Rule(NamedTuple):
     advice: str
 
 
-RULES: tuple[Rule, ...] = (
-    Rule(
+CONSISTENCY_RULES: tuple[ConsistencyRule, ...] = (
+    ConsistencyRule(
         lambda tree: tree.local_map.field_radius >= 2.0 * tree.local_map.cell,
         "local_map.field_radius has to be at least two cells; raise it or make local_map.cell smaller",
     ),
-    Rule(
+    ConsistencyRule(
         lambda tree: tree.filter.keyframe_distance <= tree.local_map.max_range,
         "filter.keyframe_distance exceeds local_map.max_range, so keyframes would not overlap; lower it",
     ),
-    Rule(
-        lambda tree: not tree.robot.paced or tree.filter.patience < tree.robot.window,
+    ConsistencyRule(
+        lambda tree: (
+            not tree.robot.flow_control
+            or tree.filter.max_scans_waiting_for_odometry < tree.robot.max_unacknowledged_scans
+        ),
         "filter.patience is not below robot.window, so without odometry metric SLAM would wait for scans that the "
         "paced robot holds back; lower the one or raise the other",
     ),
-    Rule(
+    ConsistencyRule(
         lambda tree: tree.robot.drive != "commands" or tree.robot.rate > 0.0,
         "robot.drive is commands and robot.rate is 0, so that time would pass before any command is there; raise the "
         "rate",
     ),
-    Rule(
+    ConsistencyRule(
         lambda tree: tree.features.opening_min < tree.features.opening_max,
         "features.opening_min is not below features.opening_max, so that no opening is found; lower the one or raise "
         "the other",

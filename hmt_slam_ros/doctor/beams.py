@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
-from hmt_slam_ros.doctor.finding import Finding, graded
-from hmt_slam_ros.doctor.statistics import Messages, ScanStatistics, Statistics
+from hmt_slam_ros.doctor.finding import Finding, grade
+from hmt_slam_ros.doctor.statistics import MessageStatistics, ScanStatistics, Statistics
 
 # Shares of all beams from which on something is doubtful, and wrong.
 _NAN, _NEAR = (0.05, 0.3), (0.05, 0.3)
@@ -24,9 +24,15 @@ def findings(statistics: Statistics) -> list[Finding]:
     scans = statistics.scans
     if not len(scans.stamps):
         return []
-    found = [*_angles(scans), *_limits(scans), *_values(scans), *_own_body(statistics), *_sweep(scans)]
+    found = [
+        *_check_angles(scans),
+        *_check_range_limits(scans),
+        *_check_ranges(scans),
+        *_check_own_body(statistics),
+        *_check_sweep(scans),
+    ]
     if statistics.messages is not None:
-        found += _stated_angles(statistics.messages)
+        found += _check_stated_angles(statistics.messages)
     return [_summary(scans), *found]
 
 
@@ -43,7 +49,7 @@ def _summary(scans: ScanStatistics) -> Finding:
     )
 
 
-def _angles(scans: ScanStatistics) -> list[Finding]:
+def _check_angles(scans: ScanStatistics) -> list[Finding]:
     first, increment = scans.geometry[:, 0], scans.geometry[:, 1]
     impossible = ~np.isfinite(first) | ~np.isfinite(increment) | (increment == 0.0)
     if impossible.any():
@@ -74,7 +80,7 @@ def _angles(scans: ScanStatistics) -> list[Finding]:
     return found
 
 
-def _limits(scans: ScanStatistics) -> list[Finding]:
+def _check_range_limits(scans: ScanStatistics) -> list[Finding]:
     least, largest = scans.geometry[:, 2], scans.geometry[:, 3]
     wrong = ~(largest > np.maximum(least, 0.0)) | ~np.isfinite(least)
     if not wrong.any():
@@ -87,18 +93,18 @@ def _limits(scans: ScanStatistics) -> list[Finding]:
     return [Finding("wrong", "range limits", text)]
 
 
-def _values(scans: ScanStatistics) -> list[Finding]:
+def _check_ranges(scans: ScanStatistics) -> list[Finding]:
     counts = scans.counts
     total = max(1, int(counts.beams.sum()))
     nan, near = (float(part.sum()) / total for part in (counts.nan, counts.near))
     found = []
-    if (severity := graded(nan, *_NAN)) != "fine":
+    if (severity := grade(nan, *_NAN)) != "fine":
         text = (
             f"{100.0 * nan:.0f} % of the ranges are NaN: a beam without a return should read inf (REP 117), and NaN "
             "means a failed measurement; look at the laser's window, its supply and the filters behind it."
         )
         found.append(Finding(severity, "NaN ranges", text))
-    if (severity := graded(near, *_NEAR)) != "fine":
+    if (severity := grade(near, *_NEAR)) != "fine":
         text = (
             f"{100.0 * near:.0f} % of the ranges are below range_min = {np.median(scans.geometry[:, 2]):g} m, zeros "
             "included: if zero stands for no return, let the driver say inf; else look for what is before the laser."
@@ -114,8 +120,8 @@ def _values(scans: ScanStatistics) -> list[Finding]:
     return found
 
 
-def _own_body(statistics: Statistics) -> list[Finding]:
-    each, scans = statistics.scans.each_beam, statistics.scans
+def _check_own_body(statistics: Statistics) -> list[Finding]:
+    each, scans = statistics.scans.beam_statistics, statistics.scans
     same = int((scans.counts.beams == each.returns.size).sum())
     if statistics.odometry.distance < _DRIVEN or same < 50:
         return []
@@ -132,17 +138,17 @@ def _own_body(statistics: Statistics) -> list[Finding]:
     return [Finding("doubtful", "beams on the robot", text)]
 
 
-def _sweep(scans: ScanStatistics) -> list[Finding]:
-    if not scans.sweep_faults:
+def _check_sweep(scans: ScanStatistics) -> list[Finding]:
+    if not scans.sweep_fault_count:
         return []
-    text = f"{scans.sweep_faults} scans have a time_increment that cannot be. {scans.sweep_fault}"
+    text = f"{scans.sweep_fault_count} scans have a time_increment that cannot be. {scans.first_sweep_fault}"
     return [Finding("wrong", "time_increment", text)]
 
 
-def _stated_angles(messages: Messages) -> list[Finding]:
+def _check_stated_angles(messages: MessageStatistics) -> list[Finding]:
     """Messages whose last angle is not where the increment leads."""
     off, example = 0, ""
-    for head, count in messages.heads.items():
+    for head, count in messages.scan_headers.items():
         if not head.angle_increment:
             continue
         last = head.angle_min + (head.beams - 1) * head.angle_increment

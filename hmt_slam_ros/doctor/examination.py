@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from hmt_slam_ros.doctor import beams, frames, odometry, timing
-from hmt_slam_ros.doctor.comparison import compared
+from hmt_slam_ros.doctor.comparison import compare_odometry
 from hmt_slam_ros.doctor.finding import SEVERITIES, Finding
 from hmt_slam_ros.doctor.gathering import gather
-from hmt_slam_ros.doctor.statistics import Messages, Statistics
+from hmt_slam_ros.doctor.statistics import MessageStatistics, Statistics
 from hmt_slam_ros.logs import Log
 from hmt_slam_ros.open_log import is_bag, open_log
 
@@ -22,20 +22,20 @@ def examine(path: Path, *, start: float = 0.0, duration: float | None = None) ->
     :raises HmtSlamError: where it cannot be read.
     """
     log = open_log(path, start=start, duration=duration)
-    return findings_of_log(log, _messages(path))
+    return log_findings(log, _messages(path))
 
 
-def findings_of_log(log: Log, messages: Messages | None = None) -> list[Finding]:
+def log_findings(log: Log, messages: MessageStatistics | None = None) -> list[Finding]:
     """All findings on a log that is open, the most serious first."""
     return sorted_findings(findings(gather(log, messages)))
 
 
 def findings(statistics: Statistics) -> list[Finding]:
     """All findings on what was gathered."""
-    comparison = compared(statistics.odometry, statistics.motions)
+    comparison = compare_odometry(statistics.odometry, statistics.motions)
     return [
-        *timing.findings_of_rates(statistics),
-        *timing.findings_of_stamps(statistics, comparison),
+        *timing.rate_findings(statistics),
+        *timing.stamp_findings(statistics, comparison),
         *beams.findings(statistics),
         *odometry.findings(statistics, comparison),
         *frames.findings(statistics),
@@ -47,10 +47,10 @@ def sorted_findings(found: Sequence[Finding]) -> list[Finding]:
     return sorted(found, key=lambda finding: SEVERITIES.index(finding.severity))
 
 
-def _messages(path: Path) -> Messages | None:
+def _messages(path: Path) -> MessageStatistics | None:
     if not is_bag(path):
         return None
     # Its library takes memory that the other formats need not pay for.
-    from hmt_slam_ros.doctor.statistics import messages_of_bag  # noqa: PLC0415
+    from hmt_slam_ros.doctor.statistics import read_message_statistics  # noqa: PLC0415
 
-    return messages_of_bag(path)
+    return read_message_statistics(path)

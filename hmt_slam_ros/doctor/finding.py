@@ -23,11 +23,11 @@ class Finding(NamedTuple):
     text: str
 
 
-def graded(value: float, doubtful: float, wrong: float) -> Severity:
+def grade(value: float, doubtful: float, wrong: float) -> Severity:
     """How serious a value is that should be small."""
     return "wrong" if value >= wrong else "doubtful" if value >= doubtful else "fine"
 
 
-def times(count: int) -> str:
+def times_text(count: int) -> str:
     """How often."""
     return "once" if count == 1 else f"{count} times"

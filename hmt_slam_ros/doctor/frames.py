@@ -8,7 +8,7 @@ from collections import defaultdict
 import numpy as np
 
 from hmt_slam_ros.doctor.finding import Finding
-from hmt_slam_ros.doctor.statistics import Joint, Messages, Statistics
+from hmt_slam_ros.doctor.statistics import FrameTransform, MessageStatistics, Statistics
 
 # A laser tilted by more, rad, has ranges other than those on the floor plan; beyond 10 degrees it is refused.
 _TILT = math.radians(2.0)
@@ -20,17 +20,23 @@ _MOVES = 0.01
 
 def findings(statistics: Statistics) -> list[Finding]:
     """What frames and transforms tell; nothing where the log is of another format than messages."""
-    found = _laser_places(statistics)
+    found = _check_laser_distance(statistics)
     messages = statistics.messages
     if messages is None:
         return found
-    found += [*_names(messages), *_two_parents(messages), *_moving(messages), *_tilted(messages), *_foreign(messages)]
+    found += [
+        *_check_names(messages),
+        *_check_parents(messages),
+        *_check_static(messages),
+        *_check_tilt(messages),
+        *_check_map_to_odom(messages),
+    ]
     odom, base = messages.odometry_frames
-    frames = ", ".join(sorted({head.frame for head in messages.heads}))
+    frames = ", ".join(sorted({head.frame for head in messages.scan_headers}))
     return [*found, Finding("fine", "frames", f"Odometry is {odom} -> {base}, scans are in {frames}.")]
 
 
-def _laser_places(statistics: Statistics) -> list[Finding]:
+def _check_laser_distance(statistics: Statistics) -> list[Finding]:
     poses = statistics.scans.laser_poses
     if not len(poses):
         return []
@@ -44,7 +50,7 @@ def _laser_places(statistics: Statistics) -> list[Finding]:
     return [Finding("wrong", "laser far away", text)]
 
 
-def _names(messages: Messages) -> list[Finding]:
+def _check_names(messages: MessageStatistics) -> list[Finding]:
     odom, base = messages.odometry_frames
     found = []
     if not base:
@@ -53,15 +59,15 @@ def _names(messages: Messages) -> list[Finding]:
     if odom and odom in {base, "map"}:
         text = f"The odometry is given in the frame {odom!r}: its header's frame should be odom (REP 105)."
         found.append(Finding("doubtful", "odometry frames", text))
-    if any(not head.frame for head in messages.heads):
+    if any(not head.frame for head in messages.scan_headers):
         text = "Scans have an empty frame_id: set the frame of the laser in its driver, such as laser."
         found.append(Finding("wrong", "scan frame", text))
     return found
 
 
-def _two_parents(messages: Messages) -> list[Finding]:
+def _check_parents(messages: MessageStatistics) -> list[Finding]:
     parents: dict[str, set[str]] = defaultdict(set)
-    for joint in messages.joints:
+    for joint in messages.transforms:
         parents[joint.child].add(joint.parent)
     return [
         Finding(
@@ -75,20 +81,20 @@ def _two_parents(messages: Messages) -> list[Finding]:
     ]
 
 
-def _moving(messages: Messages) -> list[Finding]:
+def _check_static(messages: MessageStatistics) -> list[Finding]:
     return [
         Finding(
             "doubtful",
             "static transform moves",
-            f"The transform {joint.parent} -> {joint.child} on {joint.topic} changes by {joint.moved:.3f} m though it "
+            f"The transform {joint.parent} -> {joint.child} on {joint.topic} changes by {joint.max_change:.3f} m though it "
             "is static: the first one is believed; look for a second publisher.",
         )
-        for joint in messages.joints
-        if joint.topic.endswith("tf_static") and joint.moved > _MOVES
+        for joint in messages.transforms
+        if joint.topic.endswith("tf_static") and joint.max_change > _MOVES
     ]
 
 
-def _tilted(messages: Messages) -> list[Finding]:
+def _check_tilt(messages: MessageStatistics) -> list[Finding]:
     return [
         Finding(
             "doubtful",
@@ -96,20 +102,20 @@ def _tilted(messages: Messages) -> list[Finding]:
             f"The transform {joint.parent} -> {joint.child} is tilted by {math.degrees(_tilt(joint)):.1f} degrees: the "
             "laser should be level, so that it sees walls and not the floor.",
         )
-        for joint in messages.joints
-        if joint.child in {head.frame for head in messages.heads} and _tilt(joint) > _TILT
+        for joint in messages.transforms
+        if joint.child in {head.frame for head in messages.scan_headers} and _tilt(joint) > _TILT
     ]
 
 
-def _tilt(joint: Joint) -> float:
+def _tilt(joint: FrameTransform) -> float:
     """Of the child's z axis against the parent's, upright or upside down, rad."""
-    return math.acos(min(1.0, abs(float(joint.first[2, 2]))))
+    return math.acos(min(1.0, abs(float(joint.first_transform[2, 2]))))
 
 
-def _foreign(messages: Messages) -> list[Finding]:
+def _check_map_to_odom(messages: MessageStatistics) -> list[Finding]:
     """The transform that rtl will publish is there already."""
     odom, _ = messages.odometry_frames
-    others = [joint for joint in messages.joints if joint.child == odom]
+    others = [joint for joint in messages.transforms if joint.child == odom]
     return [
         Finding(
             "doubtful",

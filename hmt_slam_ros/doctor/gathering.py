@@ -11,8 +11,8 @@ from hmt_slam_ros.arrays import Float32, Float64, Int64
 from hmt_slam_ros.doctor.scan_motion import ScanMotionFinder
 from hmt_slam_ros.doctor.statistics import (
     BeamCounts,
-    EachBeam,
-    Messages,
+    BeamStatistics,
+    MessageStatistics,
     OdometryStatistics,
     ScanStatistics,
     Statistics,
@@ -29,9 +29,9 @@ class Gatherer:
     def __init__(self) -> None:
         self._scan_stamps, self._odometry_stamps = array("q"), array("q")
         self._scan_rows, self._odometry_rows = array("d"), array("d")
-        self._counts, self._not_finite = array("q"), 0
-        self._each_beam = EachBeam(np.zeros(0, np.int64), np.zeros(0), np.zeros(0))
-        self._sweeps, self._sweep_faults, self._sweep_fault = SweepCheck(), 0, ""
+        self._counts, self._non_finite_count = array("q"), 0
+        self._beam_statistics = BeamStatistics(np.zeros(0, np.int64), np.zeros(0), np.zeros(0))
+        self._sweep_check, self._sweep_fault_count, self._first_sweep_fault = SweepCheck(), 0, ""
         self._motions = ScanMotionFinder()
 
     def add(self, record: LogRecord) -> None:
@@ -43,7 +43,7 @@ class Gatherer:
 
     def _add_odometry(self, source_stamp: int, reading: Odometry) -> None:
         if not np.isfinite(reading.pose).all():
-            self._not_finite += 1
+            self._non_finite_count += 1
             return
         self._odometry_stamps.extend((source_stamp, reading.stamp))
         self._odometry_rows.extend(reading.pose)
@@ -51,17 +51,19 @@ class Gatherer:
     def _add_scan(self, source_stamp: int, scan: Scan) -> None:
         if not self._scan_stamps:
             size = scan.ranges.size
-            self._each_beam = EachBeam(np.zeros(size, np.int64), np.full(size, np.inf), np.zeros(size))
+            self._beam_statistics = BeamStatistics(np.zeros(size, np.int64), np.full(size, np.inf), np.zeros(size))
         self._scan_stamps.extend((source_stamp, scan.stamp))
         self._scan_rows.extend((scan.angle_min, scan.angle_increment, scan.range_min, scan.range_max))
         self._scan_rows.extend((scan.time_increment, *scan.laser_pose))
-        self._counts.extend(_count(scan.ranges, max(scan.range_min, 1e-3), scan.range_max, *self._each_beam))
-        scan, fault = self._sweeps.checked(scan)
-        self._sweep_faults += fault is not None
-        self._sweep_fault = self._sweep_fault or fault or ""
+        self._counts.extend(
+            _count_beams(scan.ranges, max(scan.range_min, 1e-3), scan.range_max, *self._beam_statistics)
+        )
+        scan, fault = self._sweep_check.check(scan)
+        self._sweep_fault_count += fault is not None
+        self._first_sweep_fault = self._first_sweep_fault or fault or ""
         self._motions.add(scan)
 
-    def finish(self, name: str, messages: Messages | None = None) -> Statistics:
+    def finish(self, name: str, messages: MessageStatistics | None = None) -> Statistics:
         """All that was gathered."""
         stamps = np.array(self._scan_stamps, np.int64).reshape(-1, 2)
         rows = np.array(self._scan_rows, np.float64).reshape(-1, 8)
@@ -72,17 +74,17 @@ class Gatherer:
             rows[:, :5],
             rows[:, 5:],
             counts,
-            self._each_beam,
-            self._sweep_faults,
-            self._sweep_fault,
+            self._beam_statistics,
+            self._sweep_fault_count,
+            self._first_sweep_fault,
         )
         stamps = np.array(self._odometry_stamps, np.int64).reshape(-1, 2)
         poses = np.array(self._odometry_rows, np.float64).reshape(-1, 3)
-        odometry = OdometryStatistics(stamps[:, 0], stamps[:, 1], poses, self._not_finite)
+        odometry = OdometryStatistics(stamps[:, 0], stamps[:, 1], poses, self._non_finite_count)
         return Statistics(name, scans, odometry, self._motions.finish(), messages)
 
 
-def gather(log: Log, messages: Messages | None = None) -> Statistics:
+def gather(log: Log, messages: MessageStatistics | None = None) -> Statistics:
     """One pass over a log.
 
     :param messages: what its messages tell, where it has some.
@@ -94,7 +96,7 @@ def gather(log: Log, messages: Messages | None = None) -> Statistics:
 
 
 @njit(cache=True)
-def _count(
+def _count_beams(
     ranges: Float32, nearest: float, farthest: float, returns: Int64, least: Float64, most: Float64
 ) -> tuple[int, int, int, int, int, int]:
     """The row of `BeamCounts` of a scan; where it has as many beams as the others, each beam is noted, too.

@@ -13,10 +13,10 @@ import numpy as np
 from numba import njit
 
 from hmt_slam_ros.arrays import Float32
-from hmt_slam_ros.configuration.topology import Refinement
+from hmt_slam_ros.configuration.topology import RefinementParameters
 from hmt_slam_ros.doctor.statistics import ScanMotions
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.registration.scan_to_scan import Weighting, normal_equations, surfaces_of
+from hmt_slam_ros.registration.scan_to_scan import Weighting, extract_surfaces, normal_equations
 from hmt_slam_ros.sensors import Scan
 
 # Scans closer in time are passed over: over a shorter time, a robot moves no farther than the match errs, s.
@@ -28,11 +28,11 @@ _FEWEST_POINTS = 40
 # Turns that are searched, to each side, and the step between them, rad; beams that are compared at most.
 _MOST_TURN, _TURN_STEP, _COMPARED = math.radians(80.0), math.radians(1.0), 180
 # Share of the beams that have to be seen in both scans; ranges that differ by more are no nearer to the truth, m.
-_SEEN_IN_BOTH, _FAR_OFF = 0.4, 1.0
+_MIN_OVERLAP, _MAX_DIFFERENCE = 0.4, 1.0
 # Points farther apart than this do not meet, from step to step, m.
 _GATES = (1.5, 1.0, 1.0, 0.7, 0.5, 0.4, 0.3, 0.3, 0.2, 0.2)
 # What keeps a direction from running away that the scans do not show: deviations of 1 m, 1 m and 30 degrees.
-_LOOSE = np.diag([1.0, 1.0, math.radians(30.0) ** -2])
+_WEAK_PRIOR = np.diag([1.0, 1.0, math.radians(30.0) ** -2])
 
 
 class _Pair(NamedTuple):
@@ -47,7 +47,7 @@ class ScanMotionFinder:
     def __init__(self) -> None:
         self._last: Scan | None = None
         self._pairs: list[_Pair] = []
-        self._found: list[ScanMotions] = []
+        self._motions: list[ScanMotions] = []
 
     def add(self, scan: Scan) -> None:
         """Register a scan with the last one that was at least a moment before."""
@@ -67,7 +67,7 @@ class ScanMotionFinder:
         empty = ScanMotions(
             np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros(0)
         )
-        parts = [empty, *self._found]
+        parts = [empty, *self._motions]
         return ScanMotions(
             *(np.concatenate([getattr(part, name) for part in parts]) for name in ScanMotions.__dataclass_fields__)
         )
@@ -77,9 +77,9 @@ class ScanMotionFinder:
         if not pairs:
             return
         scans = [pairs[0].start, *(pair.end for pair in pairs)]
-        surfaces = surfaces_of(scans, _MAX_RANGE, _MAX_POINTS)
+        surfaces = extract_surfaces(scans, _MAX_RANGE, _MAX_POINTS)
         starts, ends = np.arange(len(pairs)), np.arange(1, len(pairs) + 1)
-        options = Refinement()
+        options = RefinementParameters()
         guess = np.zeros((len(pairs), 3))
         guess[:, 2] = [pair.guess for pair in pairs]
         motions = guess
@@ -88,12 +88,12 @@ class ScanMotionFinder:
             information, gradient, matched = normal_equations(
                 surfaces, ends, surfaces, starts, motions, gate, weights, 1
             )
-            slope = gradient + se2.log(se2.between(guess, motions)) @ _LOOSE
-            step = np.linalg.solve(information + _LOOSE, slope[..., None])[..., 0]
+            slope = gradient + se2.log(se2.between(guess, motions)) @ _WEAK_PRIOR
+            step = np.linalg.solve(information + _WEAK_PRIOR, slope[..., None])[..., 0]
             motions = se2.compose(motions, se2.exp(-np.clip(step, -1.0, 1.0)))
         matched[np.diff(surfaces.starts)[1:] < _FEWEST_POINTS] = 0.0
         stamps = np.array([scan.stamp for scan in scans])
-        self._found.append(ScanMotions(stamps[:-1], stamps[1:], motions, information, matched))
+        self._motions.append(ScanMotions(stamps[:-1], stamps[1:], motions, information, matched))
 
 
 def turn_between(start: Scan, end: Scan) -> float:
@@ -104,11 +104,11 @@ def turn_between(start: Scan, end: Scan) -> float:
     around = size * abs(increment) > 2.0 * math.pi - 1.5 * abs(increment)
     shift = max(1, round(_TURN_STEP / abs(increment)))
     steps = int(_MOST_TURN / abs(increment)) // shift
-    best = _best_shift(_returns(start), _returns(end), shift, steps, max(1, size // _COMPARED), around)
+    best = _best_shift(_capped_ranges(start), _capped_ranges(end), shift, steps, max(1, size // _COMPARED), around)
     return best * increment + start.angle_min - end.angle_min
 
 
-def _returns(scan: Scan) -> Float32:
+def _capped_ranges(scan: Scan) -> Float32:
     """Ranges (n,), m, capped, the cap also where there is no return."""
     return np.where(scan.valid, np.minimum(scan.ranges, _MAX_RANGE), np.float32(_MAX_RANGE)).astype(np.float32)
 
@@ -125,8 +125,8 @@ def _best_shift(start: Float32, end: Float32, shift: int, steps: int, every: int
                 j %= size
             elif j < 0 or j >= size:
                 continue
-            total += min(abs(start[j] - end[i]), _FAR_OFF)
+            total += min(abs(start[j] - end[i]), _MAX_DIFFERENCE)
             seen += 1
-        if seen * every >= _SEEN_IN_BOTH * size and total < least * seen:
+        if seen * every >= _MIN_OVERLAP * size and total < least * seen:
             best, least = k * shift, total / seen
     return best

@@ -18,7 +18,7 @@ from hmt_slam_ros.logs.bag import (
     DEFAULT_SCAN_TOPIC,
     choose_odom_topic,
     choose_scan_topic,
-    header_of,
+    read_header,
     read_messages,
     read_topics,
 )
@@ -47,7 +47,7 @@ class BeamCounts(NamedTuple):
     far: Int64
 
 
-class EachBeam(NamedTuple):
+class BeamStatistics(NamedTuple):
     """What each of the b beams of a laser saw, over the scans that have as many beams as the first.
 
     :ivar returns: shape (b,), with how many returns.
@@ -69,9 +69,9 @@ class ScanStatistics:
     :ivar geometry: shape (n, 5): first angle, increment, rad; least and largest range, m; time from beam to beam, s.
     :ivar laser_poses: shape (n, 3), ``base_T_laser``, m and rad.
     :ivar counts: of beams.
-    :ivar each_beam: of the laser.
-    :ivar sweep_faults: scans whose time from beam to beam cannot be.
-    :ivar sweep_fault: what is said of the first of them.
+    :ivar beam_statistics: of the laser.
+    :ivar sweep_fault_count: scans whose time from beam to beam cannot be.
+    :ivar first_sweep_fault: what is said of the first of them.
     """
 
     source_stamps: Int64
@@ -79,9 +79,9 @@ class ScanStatistics:
     geometry: Float64
     laser_poses: Float64
     counts: BeamCounts
-    each_beam: EachBeam
-    sweep_faults: int
-    sweep_fault: str
+    beam_statistics: BeamStatistics
+    sweep_fault_count: int
+    first_sweep_fault: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,20 +91,20 @@ class OdometryStatistics:
     :ivar source_stamps: shape (m,), the source's own stamps, ns, in the order of arrival.
     :ivar stamps: shape (m,), on the running clock, ns.
     :ivar poses: shape (m, 3), ``odom_T_base``, m and rad, finite.
-    :ivar not_finite: readings that were left out since they are not.
+    :ivar non_finite_count: readings that were left out since they are not.
     """
 
     source_stamps: Int64
     stamps: Int64
     poses: Float64
-    not_finite: int
+    non_finite_count: int
 
     @property
     def distance(self) -> float:
         """Length of the path, m."""
         return float(np.hypot(*np.diff(self.poses[:, :2], axis=0).T).sum()) if len(self.poses) else 0.0
 
-    def at(self, stamps: Float64) -> Float64:
+    def poses_at(self, stamps: Float64) -> Float64:
         """Poses (k, 3) at any stamps (k,), ns: between two readings in proportion, before and after all as those.
 
         Headings are unwrapped.
@@ -132,33 +132,33 @@ class ScanMotions:
     information: Float64
     matched: Float64
 
-    def where(self, chosen: Bool | Int64) -> ScanMotions:
+    def select(self, chosen: Bool | Int64) -> ScanMotions:
         """Some of them."""
         return ScanMotions(
             self.starts[chosen], self.ends[chosen], self.motions[chosen], self.information[chosen], self.matched[chosen]
         )
 
 
-class Joint(NamedTuple):
+class FrameTransform(NamedTuple):
     """A transform as it was heard.
 
     :ivar parent: frame.
     :ivar child: frame.
     :ivar topic: on which.
-    :ivar first: shape (4, 4), ``parent_T_child`` of the first message, m.
-    :ivar messages: how many.
-    :ivar moved: largest distance of any from the first, m, or m of a point at 1 m for a rotation.
+    :ivar first_transform: shape (4, 4), ``parent_T_child`` of the first message, m.
+    :ivar message_count: how many.
+    :ivar max_change: largest distance of any from the first, m, or m of a point at 1 m for a rotation.
     """
 
     parent: str
     child: str
     topic: str
-    first: NDArray[np.float64]
-    messages: int
-    moved: float
+    first_transform: NDArray[np.float64]
+    message_count: int
+    max_change: float
 
 
-class ScanHead(NamedTuple):
+class ScanHeader(NamedTuple):
     """What a LaserScan message says of itself and `Scan` does not keep.
 
     :ivar frame: its frame.
@@ -176,21 +176,21 @@ class ScanHead(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Messages:
+class MessageStatistics:
     """What only messages tell, as opposed to a log of another format.
 
     :ivar counts: messages by topic.
     :ivar types: of the topics.
-    :ivar heads: scans that differ in what they say of themselves, each once, with how many there are.
+    :ivar scan_headers: scans that differ in what they say of themselves, each once, with how many there are.
     :ivar odometry_frames: (frame, child frame) of the odometry; the transform's where there is no topic of it.
-    :ivar joints: all transforms.
+    :ivar transforms: all transforms.
     """
 
     counts: dict[str, int]
     types: dict[str, str]
-    heads: dict[ScanHead, int]
+    scan_headers: dict[ScanHeader, int]
     odometry_frames: tuple[str, str]
-    joints: tuple[Joint, ...]
+    transforms: tuple[FrameTransform, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,7 +208,7 @@ class Statistics:
     scans: ScanStatistics
     odometry: OdometryStatistics
     motions: ScanMotions
-    messages: Messages | None = field(default=None)
+    messages: MessageStatistics | None = field(default=None)
 
     @property
     def duration(self) -> float:
@@ -222,19 +222,20 @@ def seconds_between(stamps: Int64) -> Float64:
     return np.diff(stamps) * _NANOSECOND
 
 
-class JointCollector:
+class TransformCollector:
     """Collects transforms."""
 
     def __init__(self) -> None:
-        self._first: dict[tuple[str, str, str], NDArray[np.float64]] = {}
-        self._messages: Counter[tuple[str, str, str]] = Counter()
-        self._moved: dict[tuple[str, str, str], float] = {}
+        self._first_transforms: dict[tuple[str, str, str], NDArray[np.float64]] = {}
+        self._message_counts: Counter[tuple[str, str, str]] = Counter()
+        self._max_changes: dict[tuple[str, str, str], float] = {}
 
     @property
-    def joints(self) -> tuple[Joint, ...]:
+    def transforms(self) -> tuple[FrameTransform, ...]:
         """All of them."""
         return tuple(
-            Joint(*key[:2], key[2], first, self._messages[key], self._moved[key]) for key, first in self._first.items()
+            FrameTransform(*key[:2], key[2], first, self._message_counts[key], self._max_changes[key])
+            for key, first in self._first_transforms.items()
         )
 
     def add(self, topic: str, message: RosMessage) -> None:
@@ -243,45 +244,47 @@ class JointCollector:
             key = (frame_name(joint.header.frame_id), frame_name(joint.child_frame_id), topic)
             move, turn = joint.transform.translation, joint.transform.rotation
             transform = transform_from_quaternion((move.x, move.y, move.z), (turn.x, turn.y, turn.z, turn.w))
-            first = self._first.setdefault(key, transform)
-            self._messages[key] += 1
-            self._moved[key] = max(self._moved.get(key, 0.0), float(np.abs(transform - first).max()))
+            first = self._first_transforms.setdefault(key, transform)
+            self._message_counts[key] += 1
+            self._max_changes[key] = max(self._max_changes.get(key, 0.0), float(np.abs(transform - first).max()))
 
 
-def messages_of_bag(path: Path) -> Messages:
+def read_message_statistics(path: Path) -> MessageStatistics:
     """Read a bag that `open_log` took."""
     types = read_topics(path)
     scan_topic = choose_scan_topic(types, DEFAULT_SCAN_TOPIC, path.name)
     odom_topic = choose_odom_topic(types, DEFAULT_ODOM_TOPIC, path.name)
-    heads = Counter(scan_head(message.content) for message in read_messages(path, {scan_topic}))
-    joints = JointCollector()
+    heads = Counter(read_scan_header(message.content) for message in read_messages(path, {scan_topic}))
+    joints = TransformCollector()
     for topic in ("/tf_static", "/tf"):
         for message in read_messages(path, {topic}):
             if message.kind == TRANSFORMS:
                 joints.add(topic, deserialize(message.content, TRANSFORMS))
-    return Messages(_counts(path), types, dict(heads), _odometry_frames(path, odom_topic, joints), joints.joints)
+    return MessageStatistics(
+        _message_counts(path), types, dict(heads), _odometry_frames(path, odom_topic, joints), joints.transforms
+    )
 
 
-def _counts(path: Path) -> dict[str, int]:
+def _message_counts(path: Path) -> dict[str, int]:
     with Reader(path) as reader:
         return {topic: info.msgcount for topic, info in reader.topics.items()}
 
 
-def _odometry_frames(path: Path, topic: str | None, joints: JointCollector) -> tuple[str, str]:
+def _odometry_frames(path: Path, topic: str | None, joints: TransformCollector) -> tuple[str, str]:
     if topic is not None:
         for message in read_messages(path, {topic}):
             reading = deserialize(message.content, ODOMETRY)
             return frame_name(reading.header.frame_id), frame_name(reading.child_frame_id)
-    child = next((joint.child for joint in joints.joints if joint.parent == "odom"), "")
+    child = next((joint.child for joint in joints.transforms if joint.parent == "odom"), "")
     return "odom", child
 
 
-def scan_head(content: bytes) -> ScanHead:
+def read_scan_header(content: bytes) -> ScanHeader:
     """What a LaserScan (CDR) says of itself, without reading its ranges."""
     order = "<" if content[1] & 1 else ">"
-    frame = header_of(content).frame
+    frame = read_header(content).frame
     (length,) = struct.unpack_from(order + "I", content, 12)
     # CDR aligns to four bytes, counted from behind its own header of four.
     at = -(-(16 + length) // 4) * 4
     first, last, increment, *_, beams = struct.unpack_from(order + "7fI", content, at)
-    return ScanHead(frame_name(frame), first, last, increment, beams)
+    return ScanHeader(frame_name(frame), first, last, increment, beams)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from hmt_slam_ros.arrays import Bool, Float64, Int64
-from hmt_slam_ros.doctor.comparison import Comparison
-from hmt_slam_ros.doctor.finding import Finding, graded, times
+from hmt_slam_ros.doctor.comparison import OdometryComparison
+from hmt_slam_ros.doctor.finding import Finding, grade, times_text
 from hmt_slam_ros.doctor.statistics import Statistics, seconds_between
 from hmt_slam_ros.geometry import se2
 
@@ -16,20 +16,20 @@ _OFFSET = (0.05, 0.15)
 _JITTER = 0.5
 
 
-def findings_of_stamps(statistics: Statistics, comparison: Comparison | None) -> list[Finding]:
+def stamp_findings(statistics: Statistics, comparison: OdometryComparison | None) -> list[Finding]:
     """What the stamps tell."""
     found = [
-        *_backward("scan", statistics.scans.source_stamps),
-        *_backward("odometry", statistics.odometry.source_stamps),
-        *_equal("scan", statistics.scans.source_stamps),
-        *_uneven(statistics.scans.source_stamps),
+        *_check_backward("scan", statistics.scans.source_stamps),
+        *_check_backward("odometry", statistics.odometry.source_stamps),
+        *_check_equal("scan", statistics.scans.source_stamps),
+        *_check_even(statistics.scans.source_stamps),
     ]
-    if comparison is not None and comparison.offset is not None:
-        found.append(_offset(comparison.offset))
+    if comparison is not None and comparison.clock_offset is not None:
+        found.append(_clock_offset_finding(comparison.clock_offset))
     return found or [Finding("fine", "stamps", "All stamps increase.")]
 
 
-def _backward(what: str, stamps: Int64) -> list[Finding]:
+def _check_backward(what: str, stamps: Int64) -> list[Finding]:
     steps = seconds_between(stamps)
     back = np.flatnonzero(steps < 0.0)
     if not back.size:
@@ -38,14 +38,14 @@ def _backward(what: str, stamps: Int64) -> list[Finding]:
         Finding(
             "doubtful",
             f"{what} stamps jump back",
-            f"The {what} stamps jump back {times(back.size)}, by up to {-steps.min():.3f} s: the order of the messages "
+            f"The {what} stamps jump back {times_text(back.size)}, by up to {-steps.min():.3f} s: the order of the messages "
             "is believed and not the stamps, but other tools that sort by time will break the path; mend the clock or "
             "the driver that stamps them.",
         )
     ]
 
 
-def _equal(what: str, stamps: Int64) -> list[Finding]:
+def _check_equal(what: str, stamps: Int64) -> list[Finding]:
     equal = int((np.diff(stamps) == 0).sum())
     if not equal:
         return []
@@ -59,7 +59,7 @@ def _equal(what: str, stamps: Int64) -> list[Finding]:
     ]
 
 
-def _uneven(stamps: Int64) -> list[Finding]:
+def _check_even(stamps: Int64) -> list[Finding]:
     """Stamps of arrival, in bursts."""
     periods = seconds_between(stamps)
     periods = periods[periods > 0.0]
@@ -79,8 +79,8 @@ def _uneven(stamps: Int64) -> list[Finding]:
     ]
 
 
-def _offset(offset: float) -> Finding:
-    severity = graded(abs(offset), *_OFFSET)
+def _clock_offset_finding(offset: float) -> Finding:
+    severity = grade(abs(offset), *_OFFSET)
     if severity == "fine":
         return Finding("fine", "clock offset", "Scans and odometry are stamped by one clock, as far as turns show.")
     late = "late" if offset < 0.0 else "early"
@@ -102,21 +102,25 @@ _UNCOVERED = (0.0005, 0.01)
 _SPARSE = 1.0
 
 
-def findings_of_rates(statistics: Statistics) -> list[Finding]:
+def rate_findings(statistics: Statistics) -> list[Finding]:
     """What the times between messages tell."""
     scans, odometry = statistics.scans.stamps, statistics.odometry.stamps
     if len(scans) < 2:
         text = "There is not more than one scan: record for longer, or start the laser."
         return [Finding("wrong", "scan rate", text)]
-    found = [_rate(statistics, scans), *_gaps("scan", "laser", scans)]
+    found = [_contents_finding(statistics, scans), *_check_gaps("scan", "laser", scans)]
     if len(odometry) < 2:
         text = "There is no odometry: start its driver, or record its topic; mapping needs it."
         return [*found, Finding("wrong", "odometry rate", text)]
-    found += [*_sparse(statistics), *_odometry_rate(scans, odometry), *_gaps("odometry", "odometry", odometry)]
-    return [*found, *_coverage(scans, odometry)]
+    found += [
+        *_check_scan_spacing(statistics),
+        *_check_odometry_rate(scans, odometry),
+        *_check_gaps("odometry", "odometry", odometry),
+    ]
+    return [*found, *_check_coverage(scans, odometry)]
 
 
-def _rate(statistics: Statistics, scans: Int64) -> Finding:
+def _contents_finding(statistics: Statistics, scans: Int64) -> Finding:
     return Finding(
         "fine",
         "contents",
@@ -136,7 +140,7 @@ def _gap_limit(periods: Float64) -> float:
     return max(_GAP, _GAP_PERIODS * float(max(np.median(periods), periods.mean())))
 
 
-def _gaps(what: str, driver: str, stamps: Int64) -> list[Finding]:
+def _check_gaps(what: str, driver: str, stamps: Int64) -> list[Finding]:
     periods = seconds_between(stamps)
     if np.median(periods) > _SPARSE:
         return []
@@ -149,18 +153,18 @@ def _gaps(what: str, driver: str, stamps: Int64) -> list[Finding]:
         Finding(
             "doubtful",
             f"{what} gaps",
-            f"The {what} messages stop {times(gaps.size)} for more than {_gap_limit(periods):.1f} s, the longest time "
+            f"The {what} messages stop {times_text(gaps.size)} for more than {_gap_limit(periods):.1f} s, the longest time "
             f"for {periods[longest]:.1f} s, {at:.1f} s after the first: look whether the {driver} driver stalls or the "
             "recorder or network drops messages.",
         )
     ]
 
 
-def _sparse(statistics: Statistics) -> list[Finding]:
+def _check_scan_spacing(statistics: Statistics) -> list[Finding]:
     """Scans between which the robot moves far."""
     odometry = statistics.odometry
     stamps = statistics.scans.stamps.astype(np.float64)
-    poses = odometry.at(stamps[(stamps >= odometry.stamps[0]) & (stamps <= odometry.stamps[-1])])
+    poses = odometry.poses_at(stamps[(stamps >= odometry.stamps[0]) & (stamps <= odometry.stamps[-1])])
     if len(poses) < 2:
         return []
     steps = se2.between(poses[:-1], poses[1:])
@@ -178,7 +182,7 @@ def _sparse(statistics: Statistics) -> list[Finding]:
     ]
 
 
-def _odometry_rate(scans: Int64, odometry: Int64) -> list[Finding]:
+def _check_odometry_rate(scans: Int64, odometry: Int64) -> list[Finding]:
     scan_rate, rate = len(scans), len(odometry)
     if rate >= 0.8 * scan_rate:
         return []
@@ -192,10 +196,10 @@ def _odometry_rate(scans: Int64, odometry: Int64) -> list[Finding]:
     ]
 
 
-def _coverage(scans: Int64, odometry: Int64) -> list[Finding]:
-    uncovered = ~_covered(scans, odometry)
+def _check_coverage(scans: Int64, odometry: Int64) -> list[Finding]:
+    uncovered = ~_is_covered(scans, odometry)
     share = float(uncovered.mean())
-    severity = graded(share, *_UNCOVERED)
+    severity = grade(share, *_UNCOVERED)
     # A scan or two before the first reading and after the last are nothing.
     if severity == "fine" or uncovered.sum() <= 2:
         return []
@@ -210,7 +214,7 @@ def _coverage(scans: Int64, odometry: Int64) -> list[Finding]:
     ]
 
 
-def _covered(scans: Int64, odometry: Int64) -> Bool:
+def _is_covered(scans: Int64, odometry: Int64) -> Bool:
     """Which scans (n,) lie between two odometry readings that are no gap apart."""
     after = np.searchsorted(odometry, scans, side="left")
     exact = odometry[np.minimum(after, len(odometry) - 1)] == scans

@@ -13,7 +13,7 @@ from hmt_slam_ros.evaluation.relations import (
     read_relations,
     true_relations,
 )
-from hmt_slam_ros.evaluation.trajectory import StampedPoses, odometry_of, read_tum, truth_of, write_tum
+from hmt_slam_ros.evaluation.trajectory import StampedPoses, read_odometry_poses, read_true_poses, read_tum, write_tum
 
 __all__ = [
     "ErrorStatistics",
@@ -25,11 +25,11 @@ __all__ = [
     "evaluate_folder",
     "evaluate_relations",
     "format_table",
-    "odometry_of",
     "pair_errors",
+    "read_odometry_poses",
     "read_relations",
+    "read_true_poses",
     "read_tum",
     "true_relations",
-    "truth_of",
     "write_tum",
 ]

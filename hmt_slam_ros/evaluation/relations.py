@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmt_slam_ros.errors import HmtSlamError
-from hmt_slam_ros.evaluation.trajectory import StampedPoses, odometry_of, read_tum
+from hmt_slam_ros.evaluation.trajectory import StampedPoses, read_odometry_poses, read_tum
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.logs.stamps import NANOSECONDS, stamp_from_seconds
 from hmt_slam_ros.open_log import open_log
 
-NEAR = NANOSECONDS // 10
+MAX_TIME_GAP = NANOSECONDS // 10
 """Largest time between a relation's end and the pose taken for it, ns."""
 
 LONG_SPAN = 60 * NANOSECONDS
@@ -56,7 +56,7 @@ class RelationScore:
     :ivar count: relations in the set.
     :ivar matched: relations with a pose at both ends.
     :ivar missed: all others.
-    :ivar carried: matched relations of which one end or both were reached along the odometry.
+    :ivar extrapolated: matched relations of which one end or both were reached along the odometry.
     :ivar translation: norm of the difference of the two translations, metres.
     :ivar rotation: absolute difference of heading, degrees.
     """
@@ -64,7 +64,7 @@ class RelationScore:
     count: int
     matched: int
     missed: int
-    carried: int
+    extrapolated: int
     translation: ErrorStatistics
     rotation: ErrorStatistics
 
@@ -84,15 +84,15 @@ class PairErrors:
     :ivar translation: norm of the difference of the two translations, metres.
     :ivar rotation: absolute difference of heading, degrees.
     :ivar span: time between the two poses, ns, int64.
-    :ivar found: whether there is a pose at both ends; where not, the errors mean nothing.
-    :ivar carried: whether one end or both were reached along the odometry.
+    :ivar is_matched: whether there is a pose at both ends; where not, the errors mean nothing.
+    :ivar is_extrapolated: whether one end or both were reached along the odometry.
     """
 
     translation: NDArray[np.float64]
     rotation: NDArray[np.float64]
     span: NDArray[np.int64]
-    found: NDArray[np.bool_]
-    carried: NDArray[np.bool_]
+    is_matched: NDArray[np.bool_]
+    is_extrapolated: NDArray[np.bool_]
 
 
 def read_relations(path: Path) -> Relations:
@@ -132,7 +132,7 @@ def evaluate_folder(output_dir: Path, relations_file: Path, odometry_log: Path |
     :raises HmtSlamError: where one of the files cannot be read.
     """
     trajectory = read_tum(output_dir / "trajectory.tum")
-    odometry = None if odometry_log is None else odometry_of(open_log(odometry_log))
+    odometry = None if odometry_log is None else read_odometry_poses(open_log(odometry_log))
     return evaluate_relations(trajectory, read_relations(relations_file), odometry)
 
 
@@ -143,12 +143,12 @@ def evaluate_relations(
     errors = pair_errors(trajectory, relations, odometry)
 
     def score(chosen: NDArray[np.bool_]) -> RelationScore:
-        kept = chosen & errors.found
+        kept = chosen & errors.is_matched
         return RelationScore(
             count=int(chosen.sum()),
             matched=int(kept.sum()),
-            missed=int((chosen & ~errors.found).sum()),
-            carried=int((kept & errors.carried).sum()),
+            missed=int((chosen & ~errors.is_matched).sum()),
+            extrapolated=int((kept & errors.is_extrapolated).sum()),
             translation=_statistics(errors.translation[kept]),
             rotation=_statistics(errors.rotation[kept]),
         )
@@ -174,8 +174,8 @@ def pair_errors(trajectory: StampedPoses, relations: Relations, odometry: Stampe
         translation=np.hypot(*(estimates[:, :2] - relations.poses[:, :2]).T),
         rotation=np.rad2deg(np.abs(se2.wrap(estimates[:, 2] - relations.poses[:, 2]))),
         span=np.abs(relations.ends - relations.starts),
-        found=start_found & end_found,
-        carried=start_carried | end_carried,
+        is_matched=start_found & end_found,
+        is_extrapolated=start_carried | end_carried,
     )
 
 
@@ -183,13 +183,15 @@ def _poses_at(
     stamps: NDArray[np.int64], trajectory: StampedPoses, odometry: StampedPoses | None
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_]]:
     """Pose at each stamp (n, 3), whether there is one, and whether it was carried there along the odometry."""
-    nearest = trajectory.nearest(stamps)
+    nearest = trajectory.nearest_indices(stamps)
     poses, times = trajectory.poses[nearest], trajectory.stamps[nearest]
-    near = np.abs(times - stamps) <= NEAR
+    near = np.abs(times - stamps) <= MAX_TIME_GAP
     if odometry is None or not odometry.stamps.size:
         return poses, near, np.zeros_like(near)
-    begin, end = odometry.nearest(times), odometry.nearest(stamps)
-    covered = (np.abs(odometry.stamps[begin] - times) <= NEAR) & (np.abs(odometry.stamps[end] - stamps) <= NEAR)
+    begin, end = odometry.nearest_indices(times), odometry.nearest_indices(stamps)
+    covered = (np.abs(odometry.stamps[begin] - times) <= MAX_TIME_GAP) & (
+        np.abs(odometry.stamps[end] - stamps) <= MAX_TIME_GAP
+    )
     carried = ~near & covered
     moved = se2.compose(poses, se2.between(odometry.poses[begin], odometry.poses[end]))
     return np.where(carried[:, None], moved, poses), near | covered, carried
@@ -208,18 +210,18 @@ def format_table(errors: RelationErrors) -> str:
         f"{'relations':<10} {'matched':>18} {'carried':>8} "
         f"{'translation [m]':>18} {'rms':>7} {'max':>7} {'rotation [deg]':>18} {'rms':>7} {'max':>7}"
     )
-    rows = [_row("all", errors.overall), _row("over 60 s", errors.over_60_s)]
+    rows = [_table_row("all", errors.overall), _table_row("over 60 s", errors.over_60_s)]
     policy = "mean +- std; pose nearest in time within 0.1 s, else carried there along the odometry, else missed"
     return "\n".join([header, *rows, policy])
 
 
-def _row(name: str, score: RelationScore) -> str:
+def _table_row(name: str, score: RelationScore) -> str:
     share = 100.0 * score.matched / score.count if score.count else 0.0
     matched = f"{score.matched}/{score.count} ({share:.1f} %)"
     errors = [
         f"{f'{e.mean:.3f} +- {e.std:.3f}':>18} {e.rms:>7.3f} {e.max:>7.3f}" for e in (score.translation, score.rotation)
     ]
-    return f"{name:<10} {matched:>18} {score.carried:>8} {errors[0]} {errors[1]}"
+    return f"{name:<10} {matched:>18} {score.extrapolated:>8} {errors[0]} {errors[1]}"
 
 
 _SPACING = 1.0  # m, driven from one pose to the next

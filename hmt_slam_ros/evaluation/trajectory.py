@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.logs import Log
-from hmt_slam_ros.logs.mounting import heading_of_quaternion
+from hmt_slam_ros.logs.mounting import heading_from_quaternion
 from hmt_slam_ros.logs.stamps import seconds_from_stamp, stamp_from_seconds
 from hmt_slam_ros.sensors import Odometry, Scan
 
@@ -26,7 +26,7 @@ class StampedPoses:
     stamps: NDArray[np.int64]
     poses: NDArray[np.float64]
 
-    def nearest(self, stamps: NDArray[np.int64]) -> NDArray[np.intp]:
+    def nearest_indices(self, stamps: NDArray[np.int64]) -> NDArray[np.intp]:
         """Index of the pose nearest in time to each of some stamps.
 
         Of poses with the same stamp the first counts; of two equally near ones, the earlier.
@@ -62,7 +62,7 @@ def read_tum(path: Path) -> StampedPoses:
             stamps.append(stamp_from_seconds(fields[0]))
         except ValueError:
             raise HmtSlamError(f"line {number} of {path} is not 't x y z qx qy qz qw': mend that line.") from None
-        poses.append((x, y, heading_of_quaternion((qx, qy, qz, qw))))
+        poses.append((x, y, heading_from_quaternion((qx, qy, qz, qw))))
     if not stamps:
         raise HmtSlamError(f"{path} holds no pose: give a trajectory in the TUM format.")
     return StampedPoses(np.array(stamps, dtype=np.int64), np.array(poses))
@@ -77,19 +77,19 @@ def write_tum(path: Path, trajectory: StampedPoses) -> None:
             file.write(f"{seconds_from_stamp(stamp)} {x:.9f} {y:.9f} 0 0 0 {sin:.12f} {cos:.12f}\n")
 
 
-def truth_of(log: Log) -> StampedPoses:
+def read_true_poses(log: Log) -> StampedPoses:
     """The true pose at every scan of a log, with its source stamp.
 
     :raises HmtSlamError: where the log does not know it.
     """
     scans = [record for record in log.records() if isinstance(record.measurement, Scan)]
-    poses = [record.truth for record in scans if record.truth is not None]
+    poses = [record.true_pose for record in scans if record.true_pose is not None]
     if len(poses) < len(scans):
         raise HmtSlamError(f"{log.name} does not tell the truth: give a simulated log, or a bag of one.")
     return StampedPoses(np.array([record.source_stamp for record in scans], dtype=np.int64), np.array(poses))
 
 
-def odometry_of(log: Log) -> StampedPoses:
+def read_odometry_poses(log: Log) -> StampedPoses:
     """All odometry readings of a log with their source stamps."""
     readings = [record for record in log.records() if isinstance(record.measurement, Odometry)]
     stamps = np.array([reading.source_stamp for reading in readings], dtype=np.int64)

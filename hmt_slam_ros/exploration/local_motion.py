@@ -27,14 +27,17 @@ from hmt_slam_ros.sensors import Scan
 _CELL = 0.1  # m
 _HALF = 40  # cells from the robot's to the grid's border
 _SIDE = 2 * _HALF + 1
-_SHY, _SHYNESS = 0.35, 4.0  # m beyond the radius, within which a cell costs up to so many times more
-_UNSEEN = 2.0  # what a cell costs more that is out of the laser's field
-_HUNGER = 2.0  # what a metre that is left to the goal counts, where the goal is not reached
-_CLEAR = 0.2  # m beyond the radius, what a straight line keeps away
+_INFLATION_DISTANCE, _INFLATION_COST = (
+    0.35,
+    4.0,
+)  # m beyond the radius, within which a cell costs up to so many times more
+_UNSEEN_COST = 2.0  # what a cell costs more that is out of the laser's field
+_REMAINING_COST = 2.0  # what a metre that is left to the goal counts, where the goal is not reached
+_LINE_CLEARANCE = 0.2  # m beyond the radius, what a straight line keeps away
 _AHEAD = 0.7  # m, along the path, at least
 
 
-def path_ahead(points: Float64, goal: Float64, radius: float, field: float = math.pi) -> Float64:
+def local_goal(points: Float64, goal: Float64, radius: float, field: float = math.pi) -> Float64:
     """Where to look on the shortest free path to a goal, or on that to the best place on the way there.
 
     It is the farthest place on the path to which the straight line is well clear of surfaces, and at least 0.7 m along
@@ -46,23 +49,23 @@ def path_ahead(points: Float64, goal: Float64, radius: float, field: float = mat
     :param field: largest bearing at which surfaces are seen, rad.
     :returns: shape (2,), m; the robot's own place where there is no better one.
     """
-    return _path_ahead(np.ascontiguousarray(points), np.asarray(goal, dtype=np.float64), radius, field)
+    return _local_goal(np.ascontiguousarray(points), np.asarray(goal, dtype=np.float64), radius, field)
 
 
 @njit(cache=True)
-def _path_ahead(points: Float64, goal: Float64, radius: float, field: float) -> Float64:
-    away = _distances(points, radius + _SHY)
+def _local_goal(points: Float64, goal: Float64, radius: float, field: float) -> Float64:
+    away = _obstacle_distances(points, radius + _INFLATION_DISTANCE)
     column, row = round(goal[0] / _CELL) + _HALF, round(goal[1] / _CELL) + _HALF
     last = row * _SIDE + column if 0 <= column < _SIDE and 0 <= row < _SIDE else -1
-    before, reached = _search(away, goal, radius, field, last)
+    before, reached = _search_path(away, goal, radius, field, last)
     path = [reached]
     while before[path[-1]] >= 0:
         path.append(before[path[-1]])
     path.reverse()
     chosen, length = path[0], 0.0
     for k in range(1, len(path)):
-        length += _length(path[k - 1], path[k])
-        if length <= _AHEAD or _on_line(away, path[k]) >= radius + _CLEAR:
+        length += _cell_distance(path[k - 1], path[k])
+        if length <= _AHEAD or _clearance_on_line(away, path[k]) >= radius + _LINE_CLEARANCE:
             chosen = path[k]
     if chosen == last:
         return goal.copy()
@@ -70,7 +73,7 @@ def _path_ahead(points: Float64, goal: Float64, radius: float, field: float) -> 
 
 
 @njit(cache=True)
-def _on_line(away: Float64, cell: int) -> float:
+def _clearance_on_line(away: Float64, cell: int) -> float:
     """The smallest distance from surfaces on the straight line from the robot to a cell, m."""
     columns, rows = cell % _SIDE - _HALF, cell // _SIDE - _HALF
     steps, nearest = max(abs(columns), abs(rows)), math.inf
@@ -81,7 +84,7 @@ def _on_line(away: Float64, cell: int) -> float:
 
 
 @njit(cache=True)
-def _distances(points: Float64, farthest: float) -> Float64:
+def _obstacle_distances(points: Float64, farthest: float) -> Float64:
     """Distance of the middle of every cell from the nearest point, m, ``farthest`` at most, shape (cells,)."""
     away = np.full(_SIDE * _SIDE, farthest)
     span = int(farthest / _CELL) + 1
@@ -97,7 +100,7 @@ def _distances(points: Float64, farthest: float) -> Float64:
 
 
 @njit(cache=True)
-def _search(away: Float64, goal: Float64, radius: float, field: float, last: int) -> tuple[Int64, int]:
+def _search_path(away: Float64, goal: Float64, radius: float, field: float, last: int) -> tuple[Int64, int]:
     """The cell before each on the cheapest path from the robot, -1 for none, and the goal's or the best reached."""
     start = _HALF * _SIDE + _HALF
     costs = np.full(_SIDE * _SIDE, math.inf)
@@ -112,18 +115,20 @@ def _search(away: Float64, goal: Float64, radius: float, field: float, last: int
         if cell == last:
             return before, cell
         left = math.hypot(_CELL * (cell % _SIDE - _HALF) - goal[0], _CELL * (cell // _SIDE - _HALF) - goal[1])
-        if cost + _HUNGER * left < least:
-            best, least = cell, cost + _HUNGER * left
+        if cost + _REMAINING_COST * left < least:
+            best, least = cell, cost + _REMAINING_COST * left
         for row in range(max(0, cell // _SIDE - 1), min(_SIDE, cell // _SIDE + 2)):
             for column in range(max(0, cell % _SIDE - 1), min(_SIDE, cell % _SIDE + 2)):
                 other = row * _SIDE + column
                 # Out of what is too near it may go away from the surfaces.
                 if away[other] < radius and (away[cell] >= radius or away[other] <= away[cell]):
                     continue
-                price = 1.0 + _SHYNESS * min(1.0, (radius + _SHY - away[other]) / _SHY)
+                price = 1.0 + _INFLATION_COST * min(
+                    1.0, (radius + _INFLATION_DISTANCE - away[other]) / _INFLATION_DISTANCE
+                )
                 if abs(math.atan2(row - _HALF, column - _HALF)) > field:
-                    price += _UNSEEN
-                then = cost + _length(cell, other) * price
+                    price += _UNSEEN_COST
+                then = cost + _cell_distance(cell, other) * price
                 if then < costs[other]:
                     costs[other], before[other] = then, cell
                     heapq.heappush(queue, (then, other))
@@ -131,20 +136,20 @@ def _search(away: Float64, goal: Float64, radius: float, field: float, last: int
 
 
 @njit(cache=True)
-def _length(cell: int, other: int) -> float:
+def _cell_distance(cell: int, other: int) -> float:
     """From one cell to another, m."""
     return _CELL * math.hypot(cell % _SIDE - other % _SIDE, cell // _SIDE - other // _SIDE)
 
 
 _SPEEDS, _TURN_RATES = 9, 21  # velocities that are tried
 _HEADING, _CLEARANCE, _PROGRESS = 0.8, 0.1, 1.0  # alpha, beta and gamma of the objective; the last per m
-_LOOK = 0.6  # s, after which the heading and the progress of velocities are compared
-_FAR = 1.5  # m, beyond which nothing in the way counts
+_SIMULATION_TIME = 0.6  # s, after which the heading and the progress of velocities are compared
+_MAX_FREE_DISTANCE = 1.5  # m, beyond which nothing in the way counts
 _STRAIGHT = 1e-4  # rad/s
 
 
 @dataclass(frozen=True)
-class Limits:
+class MotionLimits:
     """What a robot can do, and how near it may come.
 
     :ivar speed: at most, m/s.
@@ -167,7 +172,7 @@ class Limits:
     tolerance: float = 0.15
 
 
-class Command(NamedTuple):
+class MotionCommand(NamedTuple):
     """What to do until the next scan.
 
     :ivar speed: m/s, never backwards.
@@ -180,7 +185,9 @@ class Command(NamedTuple):
     arrived: bool
 
 
-def command_towards(scan: Scan, goal: NDArray[np.float64], velocity: tuple[float, float], limits: Limits) -> Command:
+def command_towards(
+    scan: Scan, goal: NDArray[np.float64], velocity: tuple[float, float], limits: MotionLimits
+) -> MotionCommand:
     """The velocities with which to drive towards a goal around what the newest scan shows.
 
     It does not see behind what hides the rest, and remembers nothing: goals are to be in sight, or nearly.
@@ -190,16 +197,16 @@ def command_towards(scan: Scan, goal: NDArray[np.float64], velocity: tuple[float
     :param velocity: of the robot now, m/s and rad/s.
     """
     if math.hypot(goal[0], goal[1]) <= limits.tolerance:
-        return Command(0.0, 0.0, arrived=True)
+        return MotionCommand(0.0, 0.0, arrived=True)
     radius = limits.radius + limits.margin
-    ahead = path_ahead(scan.points, goal, radius, _field(scan))
-    near = scan.points[np.hypot(*scan.points.T) < _FAR + radius]
-    window = _window(velocity, math.hypot(goal[0], goal[1]) - 0.5 * limits.tolerance, limits)
-    speed, turn_rate = _best(near, ahead, window, radius, limits.period, limits.acceleration)
-    return Command(speed, turn_rate, arrived=False)
+    ahead = local_goal(scan.points, goal, radius, _field_of_view(scan))
+    near = scan.points[np.hypot(*scan.points.T) < _MAX_FREE_DISTANCE + radius]
+    window = _dynamic_window(velocity, math.hypot(goal[0], goal[1]) - 0.5 * limits.tolerance, limits)
+    speed, turn_rate = _best_velocity(near, ahead, window, radius, limits.period, limits.acceleration)
+    return MotionCommand(speed, turn_rate, arrived=False)
 
 
-def _field(scan: Scan) -> float:
+def _field_of_view(scan: Scan) -> float:
     """Largest bearing to both sides of the robot at which a laser sees, rad."""
     first, last = scan.angle_min, scan.angle_min + scan.angle_increment * (scan.ranges.size - 1)
     gap = abs(scan.angle_increment)
@@ -209,7 +216,7 @@ def _field(scan: Scan) -> float:
     return max(0.0, min(max(first, last) + turn, -min(first, last) - turn)) + gap
 
 
-def _window(velocity: tuple[float, float], left: float, limits: Limits) -> NDArray[np.float64]:
+def _dynamic_window(velocity: tuple[float, float], left: float, limits: MotionLimits) -> NDArray[np.float64]:
     """Smallest and largest speed and turn rate that can be reached, and from which it can stop at the goal, (2, 2).
 
     :param left: to the goal, m.
@@ -223,7 +230,7 @@ def _window(velocity: tuple[float, float], left: float, limits: Limits) -> NDArr
 
 
 @njit(cache=True)
-def _best(
+def _best_velocity(
     points: Float64, ahead: Float64, window: Float64, radius: float, period: float, brake: float
 ) -> tuple[float, float]:
     """The admissible velocity that is best; where there is none, braking, and turning towards the goal."""
@@ -234,22 +241,22 @@ def _best(
         v = window[0, 0] + (window[0, 1] - window[0, 0]) * i / (_SPEEDS - 1)
         for k in range(_TURN_RATES):
             omega = window[1, 0] + (window[1, 1] - window[1, 0]) * k / (_TURN_RATES - 1)
-            free = _free(points, v, omega, radius)
+            free = _free_distance(points, v, omega, radius)
             # Until the next command it goes on like this, and then it brakes.
             if v * period + 0.5 * v * v / brake > free:
                 continue
-            facing, nearer = _gain(ahead, v, omega)
-            score = _HEADING * facing + _CLEARANCE * free / _FAR + _PROGRESS * nearer
+            facing, nearer = _heading_and_progress(ahead, v, omega)
+            score = _HEADING * facing + _CLEARANCE * free / _MAX_FREE_DISTANCE + _PROGRESS * nearer
             if score > best:
                 best, speed, turn_rate = score, v, omega
     return speed, turn_rate
 
 
 @njit(cache=True)
-def _gain(ahead: Float64, v: float, omega: float) -> tuple[float, float]:
+def _heading_and_progress(ahead: Float64, v: float, omega: float) -> tuple[float, float]:
     """How well the robot looks towards a point in a while, from 0 to 1 for straight at it; how much nearer it is, m."""
-    heading = omega * _LOOK
-    shift_x, shift_y = exp_shift(v * _LOOK, 0.0, heading)
+    heading = omega * _SIMULATION_TIME
+    shift_x, shift_y = exp_shift(v * _SIMULATION_TIME, 0.0, heading)
     x, y = ahead[0] - shift_x, ahead[1] - shift_y
     off = math.atan2(y, x) - heading
     off = abs(math.atan2(math.sin(off), math.cos(off)))
@@ -257,9 +264,9 @@ def _gain(ahead: Float64, v: float, omega: float) -> tuple[float, float]:
 
 
 @njit(cache=True)
-def _free(points: Float64, v: float, omega: float, radius: float) -> float:
+def _free_distance(points: Float64, v: float, omega: float, radius: float) -> float:
     """How far a disc goes on an arc before it touches any of the points, m, `_FAR` at most."""
-    free = _FAR
+    free = _MAX_FREE_DISTANCE
     if v <= 0.0:
         return free
     side = 1.0 if omega >= 0.0 else -1.0
@@ -273,12 +280,12 @@ def _free(points: Float64, v: float, omega: float, radius: float) -> float:
             if x > 0.0 and abs(y) < radius:
                 free = min(free, x - math.sqrt(radius * radius - y * y))
         else:
-            free = min(free, _along_arc(x, y, v / abs(omega), radius))
+            free = min(free, _distance_along_arc(x, y, v / abs(omega), radius))
     return free
 
 
 @njit(cache=True)
-def _along_arc(x: float, y: float, bend: float, radius: float) -> float:
+def _distance_along_arc(x: float, y: float, bend: float, radius: float) -> float:
     """The way along an arc to the left of radius ``bend`` until a disc touches a point, m; inf where it never does."""
     away = math.hypot(x, bend - y)
     if abs(bend - away) >= radius or away == 0.0:
@@ -289,4 +296,4 @@ def _along_arc(x: float, y: float, bend: float, radius: float) -> float:
     return bend * (angle if angle >= 0.0 else angle + 2.0 * math.pi)
 
 
-__all__ = ["Command", "Limits", "command_towards"]
+__all__ = ["DriveCommand", "DriveLimits", "command_towards"]

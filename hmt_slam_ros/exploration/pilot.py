@@ -17,35 +17,35 @@ import numpy as np
 
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration import Configuration
-from hmt_slam_ros.exploration.mission_controller import MissionPilot, Phase
-from hmt_slam_ros.exploration.path_follower import limits_of
-from hmt_slam_ros.exploration.rooms import KnownBuilding, rooms
+from hmt_slam_ros.exploration.mission_controller import MissionController, Phase
+from hmt_slam_ros.exploration.path_follower import motion_limits
+from hmt_slam_ros.exploration.rooms import KnownBuilding, named_destinations
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.geometry.gaussian import PoseGaussian, gate
-from hmt_slam_ros.hybrid_map.shortest_path import joined
-from hmt_slam_ros.landmarks.heading import QUARTER
+from hmt_slam_ros.geometry.gaussian import PoseGaussian, chi_square_gate
+from hmt_slam_ros.hybrid_map.shortest_path import connected_areas
+from hmt_slam_ros.landmarks.heading import QUARTER_TURN
 from hmt_slam_ros.logs.stamps import NANOSECONDS
-from hmt_slam_ros.messages.map_changes import Place
-from hmt_slam_ros.messages.messages import Accepted, Carried, Hypotheses, Keyframe, Message, RealTimePose
+from hmt_slam_ros.messages.map_changes import InitialPose
+from hmt_slam_ros.messages.messages import ClosureDecision, Hypotheses, Keyframe, Message, PoseReset, RealTimePose
 from hmt_slam_ros.messages.replica import Replica, ReplicaState
-from hmt_slam_ros.messages.tasks import Errand, Heading, Outcome, PlaceEstimate, Steering
-from hmt_slam_ros.places.edge_existence import WatchedWays
+from hmt_slam_ros.messages.tasks import GoalPose, PlaceEstimate, Task, TaskResult, VelocityCommand
+from hmt_slam_ros.places.edge_existence import EdgeMonitor
 from hmt_slam_ros.places.observation_graph import QUARTERS
 from hmt_slam_ros.places.place_graph import DIRECTION_NAMES, state_of
-from hmt_slam_ros.places.policy import MetricStart, metric_start
-from hmt_slam_ros.places.position_belief import PositionBelief, certain_belief, flat_belief
+from hmt_slam_ros.places.policy import MetricInitialPose, metric_initial_pose
+from hmt_slam_ros.places.position_belief import PositionBelief, certain_belief, uniform_belief
 from hmt_slam_ros.sensors import Odometry, Scan
-from hmt_slam_ros.sensors.motion_model import NO_STEP, Step, increment_covariance
+from hmt_slam_ros.sensors.motion_model import NO_MOTION, RelativeMotion, increment_covariance
 from hmt_slam_ros.sensors.odometry import OdometryBuffer
 
 # Two beliefs over one pose agree with this probability, both known no better than this, m, m, rad.
-_AGREES = gate(0.999)
-_LEAST = np.diag([0.1, 0.1, math.radians(3.0)]) ** 2
+_AGREEMENT_GATE = chi_square_gate(0.999)
+_MIN_COVARIANCE = np.diag([0.1, 0.1, math.radians(3.0)]) ** 2
 # A pose is good for so long, ns.
-_FRESH = NANOSECONDS
+_MAX_POSE_AGE = NANOSECONDS
 
 
-class MetricProcesses:
+class MetricPoseTracker:
     """What RTL said last, at the time of the newest scan, and the map that they have by now.
 
     Where the robot was lost they map on in new areas, and join these to the map as they recognize it.
@@ -55,65 +55,65 @@ class MetricProcesses:
         """:param replica: their map at first."""
         self._replica = replica
         self._readings = OdometryBuffer()
-        self._newest: RealTimePose | None = None
-        self._now: PoseGaussian | None = None
+        self._last_pose: RealTimePose | None = None
+        self._predicted_pose: PoseGaussian | None = None
 
-    def hear(self, message: Message) -> None:
+    def on_message(self, message: Message) -> None:
         """Take in what is newest."""
         if isinstance(message, Odometry):
             self._readings.add(message)
         elif isinstance(message, RealTimePose):
-            self._newest = message
-        elif isinstance(message, Keyframe | Hypotheses | Accepted):
-            self._replica.hear(message)
+            self._last_pose = message
+        elif isinstance(message, Keyframe | Hypotheses | ClosureDecision):
+            self._replica.apply_message(message)
 
-    def carry(self, stamp: int) -> None:
+    def predict_to(self, stamp: int) -> None:
         """Carry the pose on to a time, ns, or back to it."""
-        self._now = None
-        self._readings.at(stamp - _FRESH)
-        newest = self._newest
-        if newest is not None and abs(stamp - newest.stamp) <= _FRESH:
-            since = se2.exp(self._readings.motion(newest.stamp, stamp))
-            self._now = newest.local.compose(PoseGaussian.exactly(since))
+        self._predicted_pose = None
+        self._readings.pose_at(stamp - _MAX_POSE_AGE)
+        newest = self._last_pose
+        if newest is not None and abs(stamp - newest.stamp) <= _MAX_POSE_AGE:
+            since = se2.exp(self._readings.twist_between(newest.stamp, stamp))
+            self._predicted_pose = newest.pose_in_area.compose(PoseGaussian.from_pose(since))
 
-    def told(self, area: int) -> PoseGaussian | None:
+    def pose_in_area(self, area: int) -> PoseGaussian | None:
         """The belief over ``area_T_base``; None where they do not have the robot in the map.
 
         Metric SLAM lays what is around the robot into the frame of the robot's area as the arcs have it, and matches
         with that. So the pose relative to what is there is as good as the match, however long the way over the arcs is.
         """
-        hybrid_map = self._replica.maps[self._replica.best]
-        if self._now is None or self._newest is None or not hybrid_map.has_area(area):
+        hybrid_map = self._replica.maps[self._replica.best_hypothesis]
+        if self._predicted_pose is None or self._last_pose is None or not hybrid_map.has_area(area):
             return None
-        frame = joined(hybrid_map, area).get(self._newest.area)
-        return None if frame is None else PoseGaussian.exactly(frame.mean).compose(self._now)
+        frame = connected_areas(hybrid_map, area).get(self._last_pose.area)
+        return None if frame is None else PoseGaussian.from_pose(frame.mean).compose(self._predicted_pose)
 
-    def agree(self, area: int, belief: PoseGaussian) -> bool:
+    def agrees_with(self, area: int, belief: PoseGaussian) -> bool:
         """Whether they have the robot where another belief over ``area_T_base`` has it."""
-        told = self.told(area)
+        told = self.pose_in_area(area)
         if told is None:
             return False
         off = se2.log(se2.between(belief.mean, told.mean))
-        spread = belief.covariance + told.covariance + _LEAST
-        return float(off @ np.linalg.solve(spread, off)) <= _AGREES
+        spread = belief.covariance + told.covariance + _MIN_COVARIANCE
+        return float(off @ np.linalg.solve(spread, off)) <= _AGREEMENT_GATE
 
 
 # Scans that wait for odometry, at most.
 _WAITING = 50
 # So far before the door, m, it is out of a room.
-_OUT = 0.6
+_EXIT_DISTANCE = 0.6
 # A robot stands that went and turned no more than this since the last scan, m and rad, and waits for so long, ns.
-_GOES, _TURNS, _WAITS = 0.01, math.radians(1.0), 3 * NANOSECONDS
+_STANDING_DISTANCE, _STANDING_ANGLE, _RELOCALIZATION_TIMEOUT = 0.01, math.radians(1.0), 3 * NANOSECONDS
 # A scan that is stamped so much before the one before, ns, says that time went back.
-_BACK = NANOSECONDS
+_TIME_JUMP = NANOSECONDS
 
 
-class Missions:
+class PilotProcess:
     """The pilot as a process. Consumes Errand, Odometry, Scan, RealTimePose and the chain; says Carried, and what
     tasks.py has.
 
     :ivar rooms: {name: the place in it} to which it can be sent.
-    :ivar pilot: that drives.
+    :ivar controller: that drives.
     """
 
     def __init__(self, configuration: Configuration, saved: ReplicaState) -> None:
@@ -121,212 +121,216 @@ class Missions:
 
         :raises HmtSlamError: where no place is in it.
         """
-        replica = Replica.of(saved)
+        replica = Replica.from_state(saved)
         self._configuration = configuration
-        self._known = KnownBuilding.of(replica.maps[replica.best], replica.scans, configuration)
-        self._metric = MetricProcesses(Replica.of(saved))
-        self._limits = limits_of(configuration.explorer)
-        self._patience = round(NANOSECONDS * configuration.pilot.patience)
-        self._ways = WatchedWays(self._known.graph, configuration.features)
-        self._nothing = flat_belief(self._known.graph, configuration.places)
-        self.rooms = rooms(self._known)
-        self._begin()
+        self._building = KnownBuilding.from_map(replica.maps[replica.best_hypothesis], replica.scans, configuration)
+        self._metric_poses = MetricPoseTracker(Replica.from_state(saved))
+        self._limits = motion_limits(configuration.explorer)
+        self._task_timeout = round(NANOSECONDS * configuration.pilot.task_timeout)
+        self._edge_monitor = EdgeMonitor(self._building.graph, configuration.features)
+        self._uniform_belief = uniform_belief(self._building.graph, configuration.places)
+        self.rooms = named_destinations(self._building)
+        self._reset()
 
-    def _begin(self) -> None:
+    def _reset(self) -> None:
         """The robot may be anywhere, at any time."""
-        self._drive_anew(None)
+        self._reset_controller(None)
         self._readings = OdometryBuffer()
         self._waiting: deque[Scan] = deque(maxlen=_WAITING)
         self._stamp, self._odometry = 0, np.zeros(3)
-        self._errand: Errand | None = None
-        self._since: int | None = None
-        self._entered: MetricStart | None = None
-        self._told_at: int | None = None
-        self._seen_through: tuple[int, object] | None = None
-        self._room, self._step = "", NO_STEP
+        self._task: Task | None = None
+        self._task_start: int | None = None
+        self._unconfirmed_pose: MetricInitialPose | None = None
+        self._pose_reset_stamp: int | None = None
+        self._last_opening: tuple[int, object] | None = None
+        self._room_name, self._step = "", NO_MOTION
 
-    def _drive_anew(self, belief: PositionBelief | None) -> None:
-        self.pilot = MissionPilot(self._known, self._configuration, self._limits, belief, self._ways)
+    def _reset_controller(self, belief: PositionBelief | None) -> None:
+        self.controller = MissionController(
+            self._building, self._configuration, self._limits, belief, self._edge_monitor
+        )
 
     def handle(self, message: Message) -> list[Message]:
         """Take in one message; a scan is answered as soon as odometry of its time is there."""
-        if isinstance(message, Errand):
-            return self._take(message)
+        if isinstance(message, Task):
+            return self._accept_task(message)
         said: list[Message] = []
-        self._metric.hear(message)
+        self._metric_poses.on_message(message)
         if isinstance(message, Odometry):
             self._readings.add(message)
         elif isinstance(message, Scan):
-            said += self._back_in_time(message.stamp)
+            said += self._handle_time_jump(message.stamp)
             self._waiting.append(message)
         while self._waiting and self._readings.covers(self._waiting[0].stamp):
-            said += self._see(self._waiting.popleft())
+            said += self._process_scan(self._waiting.popleft())
         return said
 
-    def _take(self, errand: Errand) -> list[Message]:
+    def _accept_task(self, errand: Task) -> list[Message]:
         """Begin an errand in place of the one before."""
         if not self._configuration.pilot.drives:
-            return [Outcome(errand, False, "pilot.drives is false, so others drive the robot: set it to true")]
+            return [TaskResult(errand, False, "pilot.drives is false, so others drive the robot: set it to true")]
         if errand.kind == "go" and errand.place not in self.rooms:
             choice = ", ".join(self.rooms) or "none, as the robot was in no room behind a door"
-            return [Outcome(errand, False, f"there is no such room: choose from {choice}")]
+            return [TaskResult(errand, False, f"there is no such room: choose from {choice}")]
         if errand.kind == "stop":
             return self._stop()
-        self._errand, self._since = errand, None
+        self._task, self._task_start = errand, None
         goal = self.rooms.get(errand.place)
-        if self.pilot.room is None or goal is not None:
-            self.pilot.go(goal)
-        return [] if goal is None else [Heading(self._stamp, goal.opening.area, goal.pose)]
+        if self.controller.room is None or goal is not None:
+            self.controller.start_mission(goal)
+        return [] if goal is None else [GoalPose(self._stamp, goal.opening.area, goal.pose)]
 
     def _stop(self) -> list[Message]:
         """Let the robot stand, if it is on an errand."""
-        if self._errand is None:
+        if self._task is None:
             return []
-        self.pilot.stop()
-        self._errand = None
-        return [Steering(self._stamp, 0.0, 0.0)]
+        self.controller.stop()
+        self._task = None
+        return [VelocityCommand(self._stamp, 0.0, 0.0)]
 
-    def _back_in_time(self, stamp: int) -> list[Message]:
+    def _handle_time_jump(self, stamp: int) -> list[Message]:
         """Begin anew where time went back."""
-        if stamp > self._stamp - _BACK:
+        if stamp > self._stamp - _TIME_JUMP:
             return []
-        errand, stopped = self._errand, self._stop()
-        self._begin()
-        ended = [] if errand is None else [Outcome(errand, False, "given up: time went back")]
+        errand, stopped = self._task, self._stop()
+        self._reset()
+        ended = [] if errand is None else [TaskResult(errand, False, "given up: time went back")]
         return [*ended, *stopped]
 
-    def _see(self, scan: Scan) -> list[Message]:
+    def _process_scan(self, scan: Scan) -> list[Message]:
         """Follow the robot, and drive."""
-        odometry = self._readings.at(scan.stamp)
+        odometry = self._readings.pose_at(scan.stamp)
         if odometry is None or scan.stamp <= self._stamp:
             return []
-        self._move(odometry[0])
+        self._predict(odometry[0])
         self._stamp = scan.stamp
-        self._metric.carry(scan.stamp)
-        before = self.pilot.started
-        command = self.pilot.steer(scan)
-        if self.pilot.started is not before:
-            self._enter(self.pilot.started)
-        self._follow_out()
-        said = [self._estimate(), *self._at_opening(), *self._at_goal()]
-        if self._errand is None:
+        self._metric_poses.predict_to(scan.stamp)
+        before = self.controller.initial_pose
+        command = self.controller.steer(scan)
+        if self.controller.initial_pose is not before:
+            self._begin_room(self.controller.initial_pose)
+        self._detect_room_exit()
+        said = [self._place_estimate(), *self._reset_pose_at_opening(), *self._confirm_room_pose()]
+        if self._task is None:
             return said
-        ended = self._ended(self._errand)
+        ended = self._task_result(self._task)
         if ended is not None:
             return [*said, ended, *self._stop()]
-        stands = self._entered is not None
-        return [*said, Steering(scan.stamp, 0.0, 0.0) if stands else Steering(scan.stamp, *command[:2])]
+        stands = self._unconfirmed_pose is not None
+        return [*said, VelocityCommand(scan.stamp, 0.0, 0.0) if stands else VelocityCommand(scan.stamp, *command[:2])]
 
-    def _move(self, odometry: Float64) -> None:
+    def _predict(self, odometry: Float64) -> None:
         """The robot moved to where odometry has it now, ``odom_T_base`` (3,)."""
         if self._stamp:
             increment = se2.between(self._odometry, odometry)
-            self._step = Step(increment, increment_covariance(increment, self._configuration.motion))
-            self.pilot.moved(self._step)
+            self._step = RelativeMotion(increment, increment_covariance(increment, self._configuration.motion))
+            self.controller.predict(self._step)
         self._odometry = odometry
 
-    def _enter(self, start: MetricStart | None) -> None:
+    def _begin_room(self, start: MetricInitialPose | None) -> None:
         """The metric filter of a room begins."""
-        assert self._errand is not None
-        self._room, self._told_at, self._entered = self._errand.place, None, start
+        assert self._task is not None
+        self._room_name, self._pose_reset_stamp, self._unconfirmed_pose = self._task.place, None, start
 
-    def _at_goal(self) -> list[Message]:
+    def _confirm_room_pose(self) -> list[Message]:
         """The robot stands before the door until the metric processes have it there, or do not find it.
 
         They are told where it is if they do not know, and take that for the place of the next scan. Where they have it
         elsewhere in the map the belief is taken for wrong, since surfaces say more than landmarks.
         """
-        entered, room = self._entered, self.pilot.room
+        entered, room = self._unconfirmed_pose, self.controller.room
         if entered is None or room is None:
-            self._entered = None
+            self._unconfirmed_pose = None
             return []
         belief = PoseGaussian(room.pose, entered.pose.covariance)
-        late = self._told_at is not None and self._stamp - self._told_at > _WAITS
-        if late or self._metric.agree(entered.area, belief):
-            self._entered = None
-        elif self._metric.told(entered.area) is not None and self._stands:
-            self._entered = None
-            self.pilot.begin_anew(self._nothing)
-        elif self._told_at is None and self._stands:
-            self._told_at = self._stamp
-            return [Carried(Place(entered.area, belief))]
+        late = self._pose_reset_stamp is not None and self._stamp - self._pose_reset_stamp > _RELOCALIZATION_TIMEOUT
+        if late or self._metric_poses.agrees_with(entered.area, belief):
+            self._unconfirmed_pose = None
+        elif self._metric_poses.pose_in_area(entered.area) is not None and self._is_standing:
+            self._unconfirmed_pose = None
+            self.controller.restart_in_hallway(self._uniform_belief)
+        elif self._pose_reset_stamp is None and self._is_standing:
+            self._pose_reset_stamp = self._stamp
+            return [PoseReset(InitialPose(entered.area, belief))]
         return []
 
-    def _at_opening(self) -> list[Message]:
+    def _reset_pose_at_opening(self) -> list[Message]:
         """What an opening tells through which a robot looks that others drive, once, unless it is known."""
-        estimator = self.pilot.estimator
-        this = estimator.arrivals, estimator.facing
-        if self._errand is not None or self.pilot.room is not None or this == self._seen_through or self._turns:
+        estimator = self.controller.estimator
+        this = estimator.arrivals, estimator.node_and_direction
+        if self._task is not None or self.controller.room is not None or this == self._last_opening or self._is_turning:
             return []
-        start = metric_start(estimator, self._known.chart)
+        start = metric_initial_pose(estimator, self._building.chart)
         if start is None:
             return []
-        self._seen_through = this
-        known = self._metric.told(start.area) is not None
-        return [] if known else [Carried(Place(start.area, start.pose))]
+        self._last_opening = this
+        known = self._metric_poses.pose_in_area(start.area) is not None
+        return [] if known else [PoseReset(InitialPose(start.area, start.pose))]
 
     @property
-    def _turns(self) -> bool:
-        return abs(float(self._step.increment[2])) > _TURNS
+    def _is_turning(self) -> bool:
+        return abs(float(self._step.increment[2])) > _STANDING_ANGLE
 
     @property
-    def _stands(self) -> bool:
-        return not self._turns and float(np.hypot(*self._step.increment[:2])) <= _GOES
+    def _is_standing(self) -> bool:
+        return not self._is_turning and float(np.hypot(*self._step.increment[:2])) <= _STANDING_DISTANCE
 
-    def _estimate(self) -> PlaceEstimate:
-        estimator, chart = self.pilot.estimator, self._known.chart
-        belief = estimator.belief or self._nothing
-        facing = estimator.facing
+    def _place_estimate(self) -> PlaceEstimate:
+        estimator, chart = self.controller.estimator, self._building.chart
+        belief = estimator.belief or self._uniform_belief
+        facing = estimator.node_and_direction
         share = float(belief.probabilities.max() if facing else belief.probabilities[-1])
         return PlaceEstimate(
             self._stamp,
             chart.name(facing[0]) if facing else None,
             DIRECTION_NAMES[facing[1]] if facing else None,
-            estimator.frame.away if facing else 0.0,
+            estimator.frame.distance_past_node if facing else 0.0,
             share,
             max(0.0, belief.entropy),
-            belief.confident,
-            None if self.pilot.room is None else self._room,
+            belief.is_confident,
+            None if self.controller.room is None else self._room_name,
         )
 
-    def _follow_out(self) -> None:
+    def _detect_room_exit(self) -> None:
         """Where somebody drove the robot out of a room it is at the node before the door."""
-        room = self.pilot.room
-        if room is None or self._errand is not None:
+        room = self.controller.room
+        if room is None or self._task is not None:
             return
-        node, opening, _ = self.rooms[self._room]
+        node, opening, _ = self.rooms[self._room_name]
         off = se2.between(opening.landmark.pose.mean, room.pose)
-        if off[0] > -_OUT:
+        if off[0] > -_EXIT_DISTANCE:
             return
-        state = state_of(node, (opening.direction - round(off[2] / QUARTER)) % QUARTERS)
+        state = state_of(node, (opening.direction - round(off[2] / QUARTER_TURN)) % QUARTERS)
         room.release()
-        self._drive_anew(certain_belief(self._known.graph, self._configuration.places, state))
+        self._reset_controller(certain_belief(self._building.graph, self._configuration.places, state))
 
-    def _found(self, errand: Errand) -> bool:
+    def _is_localized_for(self, errand: Task) -> bool:
         """Whether it is known where the robot is, and that was asked."""
-        estimator = self.pilot.estimator
-        known = estimator.belief is not None and estimator.belief.confident and estimator.facing is not None
-        return errand.kind == "find" and (known or self.pilot.room is not None)
+        estimator = self.controller.estimator
+        known = (
+            estimator.belief is not None and estimator.belief.is_confident and estimator.node_and_direction is not None
+        )
+        return errand.kind == "find" and (known or self.controller.room is not None)
 
     @property
-    def _somewhere(self) -> str:
+    def _location_text(self) -> str:
         """Where it is most probably."""
-        if self.pilot.room is not None:
-            return f"in {self._room}"
-        facing = self.pilot.estimator.facing
+        if self.controller.room is not None:
+            return f"in {self._room_name}"
+        facing = self.controller.estimator.node_and_direction
         assert facing is not None
-        return f"at {self._known.chart.name(facing[0])}, looking {DIRECTION_NAMES[facing[1]]}"
+        return f"at {self._building.chart.name(facing[0])}, looking {DIRECTION_NAMES[facing[1]]}"
 
-    def _ended(self, errand: Errand) -> Outcome | None:
+    def _task_result(self, errand: Task) -> TaskResult | None:
         """How an errand ended, if it did."""
-        if self._since is None:
-            self._since = self._stamp
-        if self._found(errand):
-            return Outcome(errand, True, f"the robot is {self._somewhere}")
-        if errand.kind == "go" and self.pilot.phase is Phase.THERE:
-            return Outcome(errand, True, "the robot is there")
-        if self.pilot.phase is Phase.LOST:
-            return Outcome(errand, False, "no way is known that leads there")
-        if self._stamp - self._since > self._patience:
-            return Outcome(errand, False, f"given up after {self._configuration.pilot.patience:g} s")
+        if self._task_start is None:
+            self._task_start = self._stamp
+        if self._is_localized_for(errand):
+            return TaskResult(errand, True, f"the robot is {self._location_text}")
+        if errand.kind == "go" and self.controller.phase is Phase.THERE:
+            return TaskResult(errand, True, "the robot is there")
+        if self.controller.phase is Phase.LOST:
+            return TaskResult(errand, False, "no way is known that leads there")
+        if self._stamp - self._task_start > self._task_timeout:
+            return TaskResult(errand, False, f"given up after {self._configuration.pilot.task_timeout:g} s")
         return None

@@ -18,44 +18,44 @@ import networkx as nx
 import numpy as np
 
 from hmt_slam_ros.arrays import Float64
-from hmt_slam_ros.configuration.landmarks import Features
-from hmt_slam_ros.exploration.frontiers import REACH, Ground
+from hmt_slam_ros.configuration.landmarks import FeatureParameters
+from hmt_slam_ros.exploration.frontiers import KEYFRAME_RANGE, NavigationGrid
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
-from hmt_slam_ros.hybrid_map.surroundings import Nearness, areas_around
-from hmt_slam_ros.landmarks.area_classes import free_space, log_odds
-from hmt_slam_ros.landmarks.beam_labels import rays_of
+from hmt_slam_ros.hybrid_map.surroundings import Neighborhood, areas_around
+from hmt_slam_ros.landmarks.area_classes import hallway_log_odds, measure_free_space
+from hmt_slam_ros.landmarks.beam_labels import rays_from_scan
 from hmt_slam_ros.landmarks.line_extraction import extract_lines
-from hmt_slam_ros.landmarks.openings import jambs_of, openings_of, up_to_doors
+from hmt_slam_ros.landmarks.openings import distance_to_doors, extract_openings, jamb_positions
 from hmt_slam_ros.sensors import Scan
 
 
-class Outlook(NamedTuple):
+class PlaceClassification(NamedTuple):
     """What a scan shows.
 
-    :ivar hallway: whether the robot is in a hallway; one that sees too little of what is around it is not.
+    :ivar is_hallway: whether the robot is in a hallway; one that sees too little of what is around it is not.
     :ivar doors: shape (n, 4), x and y of both jambs of each door, m, in the frame of the base.
     """
 
-    hallway: bool
+    is_hallway: bool
     doors: Float64
 
 
-def outlook_of(scan: Scan, features: Features, door: float) -> Outlook:
+def classify_place(scan: Scan, features: FeatureParameters, max_door_width: float) -> PlaceClassification:
     """What a scan shows.
 
-    :param door: an opening up to so wide is a door, a wider one a hallway, m.
+    :param max_door_width: an opening up to so wide is a door, a wider one a hallway, m.
     """
-    rays = rays_of(scan, features)
-    openings = openings_of(extract_lines(scan, features), rays, features)
-    narrow = openings.widths <= door
-    doors = jambs_of(openings.poses[narrow], openings.widths[narrow])
-    within = np.minimum(rays.free, up_to_doors(rays.origins, rays.directions, doors))
-    space = free_space(rays._replace(free=within))
-    return Outlook(space is not None and log_odds(space, features) > 0.0, doors)
+    rays = rays_from_scan(scan, features)
+    openings = extract_openings(extract_lines(scan, features), rays, features)
+    narrow = openings.widths <= max_door_width
+    doors = jamb_positions(openings.poses[narrow], openings.widths[narrow])
+    within = np.minimum(rays.free_range, distance_to_doors(rays.origins, rays.directions, doors))
+    space = measure_free_space(rays._replace(free_range=within))
+    return PlaceClassification(space is not None and hallway_log_odds(space, features) > 0.0, doors)
 
 
-def crosses(ways: Float64, doors: Float64) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+def crosses_doors(ways: Float64, doors: Float64) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
     """Which of some straight ways pass any of the doors.
 
     :param ways: shape (n, 4), x and y of both ends, m.
@@ -76,69 +76,69 @@ def _side(a: Float64, b: Float64, p: Float64) -> Float64:
 
 
 # How certain the place of an area has to be for its scans to be laid over those of the robot's area, m.
-_SIGMA = 1.0
+_MAX_AREA_DEVIATION = 1.0
 # What is up to this distance from the robot is found anew, by all that keyframes up to that distance show, m.
-_UP_TO_DATE = 8.0
-_SEEN = _UP_TO_DATE + REACH
+_UPDATE_RADIUS = 8.0
+_SCAN_RADIUS = _UPDATE_RADIUS + KEYFRAME_RANGE
 # Keyframes of the roadmap are joined up to this distance, m; from one to the next the robot drove up to this one.
-_JOINED, _DROVE = 8.0, 1.5
+_MAX_EDGE_LENGTH, _MAX_DRIVEN_STEP = 8.0, 1.5
 # Keyframes that are so near to one, m, may stand for it.
 _BESIDE = 1.5
 # Where fewer keyframes are in a chamber, there is no room.
-_FEW = 3
+_MIN_ROOM_KEYFRAMES = 3
 
 
 @dataclass(frozen=True, eq=False)
-class Opened:
+class Frontier:
     """Where known ground ends, or a room that nobody entered.
 
     :ivar keyframe: from which the way there is shortest.
-    :ivar way: shape (n, 2), from there to a place at the frontier or in the room's middle, m, in the frame of the
+    :ivar path: shape (n, 2), from there to a place at the frontier or in the room's middle, m, in the frame of the
         keyframe's base.
-    :ivar hallway: whether it is expected to be in a hallway; else it is in a room.
+    :ivar is_in_hallway: whether it is expected to be in a hallway; else it is in a room.
     """
 
     keyframe: int
-    way: Float64
-    hallway: bool
+    path: Float64
+    is_in_hallway: bool
 
     @property
     def length(self) -> float:
         """Of the way, m."""
-        return float(np.hypot(*np.diff(self.way, axis=0).T).sum())
+        return float(np.hypot(*np.diff(self.path, axis=0).T).sum())
 
 
-class Here(NamedTuple):
+class EntryPoint(NamedTuple):
     """How the robot gets to the roadmap.
 
     :ivar keyframe: the nearest.
-    :ivar way: shape (n, 2), from beside the robot to there, m, in the frame of the keyframe's base.
+    :ivar path: shape (n, 2), from beside the robot to there, m, in the frame of the keyframe's base.
     """
 
     keyframe: int
-    way: Float64
+    path: Float64
 
 
-class Survey:
+class Roadmap:
     """Roadmap and frontiers.
 
-    :ivar roadmap: its nodes are keyframes, its edges have a ``length``, m, and whether a ``door`` is passed.
+    :ivar graph: its nodes are keyframes, its edges have a ``length``, m, and whether a ``door`` is passed.
     :ivar frontiers: all that are known.
     """
 
-    def __init__(self, features: Features, keep: float, door: float) -> None:
-        """:param keep: that the robot's middle keeps from surfaces, m.
+    def __init__(self, features: FeatureParameters, min_clearance: float, max_door_width: float) -> None:
+        """:param min_clearance: that the robot's middle keeps from surfaces, m.
 
-        :param door: an opening up to so wide is a door, m.
+        :param max_door_width: an opening up to so wide is a door, m.
         """
-        self._features, self._keep, self._door = features, keep, door
-        self._outlooks: dict[int, Outlook] = {}
-        self.roadmap = nx.Graph()
-        self.frontiers: list[Opened] = []
+        self._features, self._min_clearance, self._max_door_width = features, min_clearance, max_door_width
+        self._classifications: dict[int, PlaceClassification] = {}
+        self.graph = nx.Graph()
+        self.frontiers: list[Frontier] = []
         # {keyframe: its area and its pose in that} as of the last look.
-        self._placed: dict[int, tuple[int, Float64]] = {}
+        self._keyframe_poses: dict[int, tuple[int, Float64]] = {}
 
-    def look(self, hybrid_map: HybridMap, scans: Mapping[int, Scan], area: int, pose: Float64) -> Here | None:
+    def update(self, hybrid_map: HybridMap, scans: Mapping[int, Scan], area: int, pose: Float64) -> EntryPoint | None:
         """Bring all around the robot up to date.
 
         :param area: the robot's.
@@ -147,143 +147,147 @@ class Survey:
         """
         poses = {
             keyframe: placed
-            for other, belief in areas_around(hybrid_map, area, Nearness(_SIGMA, _SEEN)).items()
+            for other, belief in areas_around(hybrid_map, area, Neighborhood(_MAX_AREA_DEVIATION, _SCAN_RADIUS)).items()
             for keyframe, own in hybrid_map.keyframes(other).items()
-            if math.dist((placed := se2.compose(belief.mean, own))[:2], pose[:2]) <= _SEEN
+            if math.dist((placed := se2.compose(belief.mean, own))[:2], pose[:2]) <= _SCAN_RADIUS
         }
         names = sorted(poses)
         if not names:
             return None
         placed = np.array([poses[keyframe] for keyframe in names])
-        ground = Ground([scans[keyframe] for keyframe in names], placed, self._keep)
-        doors = self._doors(names, placed, scans)
-        self._forget(hybrid_map, poses, pose)
-        self._join(names, placed, ground, pose, doors)
-        self._find(names, placed, ground, pose, doors)
-        return self._here(names, placed, ground, pose)
+        ground = NavigationGrid([scans[keyframe] for keyframe in names], placed, self._min_clearance)
+        doors = self._doors_in_view(names, placed, scans)
+        self._remove_outdated(hybrid_map, poses, pose)
+        self._connect_keyframes(names, placed, ground, pose, doors)
+        self._find_frontiers(names, placed, ground, pose, doors)
+        return self._entry_point(names, placed, ground, pose)
 
-    def look_everywhere(self, hybrid_map: HybridMap, scans: Mapping[int, Scan]) -> None:
+    def update_everywhere(self, hybrid_map: HybridMap, scans: Mapping[int, Scan]) -> None:
         """Bring all of a map up to date."""
         for area in hybrid_map.area_ids():
             looked: list[Float64] = []
             for pose in hybrid_map.keyframes(area).values():
-                if all(math.dist(pose[:2], other[:2]) > 0.5 * _UP_TO_DATE for other in looked):
+                if all(math.dist(pose[:2], other[:2]) > 0.5 * _UPDATE_RADIUS for other in looked):
                     looked.append(pose)
-                    self.look(hybrid_map, scans, area, pose)
+                    self.update(hybrid_map, scans, area, pose)
 
-    def _here(self, names: list[int], placed: Float64, ground: Ground, pose: Float64) -> Here:
+    def _entry_point(self, names: list[int], placed: Float64, ground: NavigationGrid, pose: Float64) -> EntryPoint:
         """How the robot gets to the roadmap; straight to the nearest keyframe where no other way is seen."""
-        way = ground.way_to(pose[:2])
+        way = ground.path_to(pose[:2])
         if way is not None:
-            row, points = way.keyframe, way.points[::-1]
+            row, points = way.keyframe_row, way.points[::-1]
         else:
             away = np.hypot(*(placed[:, :2] - pose[:2]).T)
             row, points = int(np.argmin(away)), placed[:0, :2]
-        return Here(names[row], se2.transform(se2.inverse(placed[row]), points))
+        return EntryPoint(names[row], se2.transform(se2.inverse(placed[row]), points))
 
-    def _forget(self, hybrid_map: HybridMap, poses: Mapping[int, Float64], pose: Float64) -> None:
+    def _remove_outdated(self, hybrid_map: HybridMap, poses: Mapping[int, Float64], pose: Float64) -> None:
         """Forget what is no more, and what is near to the robot and will be found anew.
 
         :param poses: {keyframe: pose (3,)} around the robot.
         """
         known = {k: (area, own) for area in hybrid_map.area_ids() for k, own in hybrid_map.keyframes(area).items()}
-        self.roadmap.remove_nodes_from([keyframe for keyframe in self.roadmap if keyframe not in known])
+        self.graph.remove_nodes_from([keyframe for keyframe in self.graph if keyframe not in known])
         near = {keyframe for keyframe, placed in poses.items() if _is_near(placed, pose)}
-        self.roadmap.remove_edges_from([edge for edge in self.roadmap.edges if edge[0] in near and edge[1] in near])
+        self.graph.remove_edges_from([edge for edge in self.graph.edges if edge[0] in near and edge[1] in near])
         self.frontiers = [
             one
-            for one in (self._kept(one, known) for one in self.frontiers)
+            for one in (self._reattach_frontier(one, known) for one in self.frontiers)
             if one is not None
-            and not (one.keyframe in poses and _is_near(se2.transform(poses[one.keyframe], one.way[-1]), pose))
+            and not (one.keyframe in poses and _is_near(se2.transform(poses[one.keyframe], one.path[-1]), pose))
         ]
-        self._placed = known
+        self._keyframe_poses = known
 
-    def _kept(self, one: Opened, known: Mapping[int, tuple[int, Float64]]) -> Opened | None:
+    def _reattach_frontier(self, one: Frontier, known: Mapping[int, tuple[int, Float64]]) -> Frontier | None:
         """What is open, as seen from another keyframe of the same area where its own is no more.
 
         :param known: {keyframe: its area and its pose in that}.
         """
         if one.keyframe in known:
             return one
-        area, pose = self._placed[one.keyframe]
-        left = {k: own for k, (other, own) in self._placed.items() if other == area and k in known}
+        area, pose = self._keyframe_poses[one.keyframe]
+        left = {k: own for k, (other, own) in self._keyframe_poses.items() if other == area and k in known}
         if not left:
             return None
         nearest = min(left, key=lambda keyframe: math.dist(left[keyframe][:2], pose[:2]))
-        return Opened(nearest, se2.transform(se2.between(left[nearest], pose), one.way), one.hallway)
+        return Frontier(nearest, se2.transform(se2.between(left[nearest], pose), one.path), one.is_in_hallway)
 
-    def _doors(self, names: list[int], placed: Float64, scans: Mapping[int, Scan]) -> Float64:
+    def _doors_in_view(self, names: list[int], placed: Float64, scans: Mapping[int, Scan]) -> Float64:
         """All doors that keyframes show, (n, 4), in the frame of their poses."""
         found = [np.empty((0, 4))]
         for keyframe, pose in zip(names, placed, strict=True):
-            if keyframe not in self._outlooks:
-                self._outlooks[keyframe] = outlook_of(scans[keyframe], self._features, self._door)
-            doors = self._outlooks[keyframe].doors
+            if keyframe not in self._classifications:
+                self._classifications[keyframe] = classify_place(scans[keyframe], self._features, self._max_door_width)
+            doors = self._classifications[keyframe].doors
             found.append(np.concatenate([se2.transform(pose, doors[:, end : end + 2]) for end in (0, 2)], axis=1))
         return np.concatenate(found)
 
-    def _join(self, names: list[int], placed: Float64, ground: Ground, pose: Float64, doors: Float64) -> None:
+    def _connect_keyframes(
+        self, names: list[int], placed: Float64, ground: NavigationGrid, pose: Float64, doors: Float64
+    ) -> None:
         """Join keyframes between which the robot can go straight."""
         near = np.array([_is_near(own, pose) for own in placed])
-        self.roadmap.add_nodes_from(keyframe for keyframe, own in zip(names, near.tolist(), strict=True) if own)
+        self.graph.add_nodes_from(keyframe for keyframe, own in zip(names, near.tolist(), strict=True) if own)
         apart = np.hypot(*(placed[:, None, :2] - placed[None, :, :2]).transpose(2, 0, 1))
-        firsts, seconds = np.nonzero(np.triu(apart <= _JOINED, 1))
+        firsts, seconds = np.nonzero(np.triu(apart <= _MAX_EDGE_LENGTH, 1))
         starts, ends = placed[firsts, :2], placed[seconds, :2]
         numbers = np.array(names)
-        driven = (numbers[seconds] == numbers[firsts] + 1) & (apart[firsts, seconds] <= _DROVE)
+        driven = (numbers[seconds] == numbers[firsts] + 1) & (apart[firsts, seconds] <= _MAX_DRIVEN_STEP)
         # Nothing stands between places where the robot was that are nearer to each other than it is wide.
-        beside = apart[firsts, seconds] <= self._keep
-        joined = (near[firsts] & near[seconds]) & (driven | beside | ground.clear(starts, ends))
-        passed = crosses(np.concatenate((starts, ends), axis=1), doors)
+        beside = apart[firsts, seconds] <= self._min_clearance
+        joined = (near[firsts] & near[seconds]) & (driven | beside | ground.is_straight_path_free(starts, ends))
+        passed = crosses_doors(np.concatenate((starts, ends), axis=1), doors)
         for i, k, door in zip(firsts[joined].tolist(), seconds[joined].tolist(), passed[joined].tolist(), strict=True):
-            self.roadmap.add_edge(names[i], names[k], length=float(apart[i, k]), door=door)
+            self.graph.add_edge(names[i], names[k], length=float(apart[i, k]), door=door)
 
-    def _find(self, names: list[int], placed: Float64, ground: Ground, pose: Float64, doors: Float64) -> None:
+    def _find_frontiers(
+        self, names: list[int], placed: Float64, ground: NavigationGrid, pose: Float64, doors: Float64
+    ) -> None:
         """Find the frontiers, and the rooms that nobody entered: these may be seen from outside as a whole."""
-        for frontier in ground.frontiers():
-            keyframe = names[frontier.keyframe]
+        for frontier in ground.paths_to_frontiers():
+            keyframe = names[frontier.keyframe_row]
             ways = np.concatenate((frontier.points[:-1], frontier.points[1:]), axis=1)
             # Who looks from one through a door looks into the other.
-            hallway = self._outlooks[keyframe].hallway != bool(crosses(ways, doors).any())
-            self._open(keyframe, placed[frontier.keyframe], frontier.points, pose, hallway=hallway)
-        for room in ground.beyond(doors):
-            self._open(names[room.keyframe], placed[room.keyframe], room.points, pose, hallway=False)
+            hallway = self._classifications[keyframe].is_hallway != bool(crosses_doors(ways, doors).any())
+            self._add_frontier(keyframe, placed[frontier.keyframe_row], frontier.points, pose, hallway=hallway)
+        for room in ground.paths_to_unvisited_rooms(doors):
+            self._add_frontier(names[room.keyframe_row], placed[room.keyframe_row], room.points, pose, hallway=False)
 
-    def _open(self, keyframe: int, at: Float64, points: Float64, pose: Float64, *, hallway: bool) -> None:
+    def _add_frontier(self, keyframe: int, at: Float64, points: Float64, pose: Float64, *, hallway: bool) -> None:
         """Add what is open near the robot.
 
         :param at: pose of the keyframe from which the way (n, 2) leads there.
         """
         if _is_near(points[-1], pose):
-            self.frontiers.append(Opened(keyframe, se2.transform(se2.inverse(at), points), hallway))
+            self.frontiers.append(Frontier(keyframe, se2.transform(se2.inverse(at), points), hallway))
 
     def distances(self, start: int) -> dict[int, float]:
         """{keyframe: how far it is to there from ``start``, m}, of those that can be reached."""
-        return dict(nx.single_source_dijkstra_path_length(self.roadmap, start, weight="length"))
+        return dict(nx.single_source_dijkstra_path_length(self.graph, start, weight="length"))
 
-    def path(self, start: int, end: int) -> list[int]:
+    def shortest_path(self, start: int, end: int) -> list[int]:
         """The shortest way over keyframes, both ends included.
 
         :raises networkx.NetworkXNoPath: where there is none.
         """
-        return list(nx.dijkstra_path(self.roadmap, start, end, weight="length"))
+        return list(nx.dijkstra_path(self.graph, start, end, weight="length"))
 
-    def way_back(self, start: int) -> list[int]:
+    def backtracking_path(self, start: int) -> list[int]:
         """Over the keyframes before one, the newest first; where the robot came from elsewhere, the shortest way."""
         way = [start]
         for keyframe in sorted((one for one in self.distances(start) if one < start), reverse=True):
-            way += self.path(way[-1], keyframe)[1:]
+            way += self.shortest_path(way[-1], keyframe)[1:]
         return way
 
-    def chambers(self) -> list[set[int]]:
+    def segments(self) -> list[set[int]]:
         """The keyframes of hallways and of rooms, each one chamber.
 
         Doors end a chamber, but for those behind which there is no hallway: what one gets to from a room alone, such as
         by a gap between furniture, is part of that room.
         """
-        parts = sorted(nx.connected_components(self._within_doors()), key=min)
+        parts = sorted(nx.connected_components(self._graph_without_doors()), key=min)
         number = {keyframe: k for k, part in enumerate(parts) for keyframe in part}
-        near = ((a, b) for a, b, length in self.roadmap.edges(data="length") if length <= _BESIDE)
+        near = ((a, b) for a, b, length in self.graph.edges(data="length") if length <= _BESIDE)
         beside: list[Counter[int]] = [Counter() for _ in parts]
         for a, b in near:
             if number[a] != number[b]:
@@ -295,36 +299,38 @@ class Survey:
         whole.add_edges_from((k, beside[k].most_common(1)[0][0]) for k in within)
         return [set().union(*(parts[k] for k in group)) for group in nx.connected_components(whole)]
 
-    def room_of(self, keyframe: int) -> tuple[int, ...]:
+    def room_around(self, keyframe: int) -> tuple[int, ...]:
         """The keyframes around one, the nearest first, if its chamber is a room; none where that is a hallway."""
-        chamber = next((own for own in self.chambers() if keyframe in own), set())
-        return self._around(keyframe) if self.is_room(chamber) else ()
+        chamber = next((own for own in self.segments() if keyframe in own), set())
+        return self._keyframes_beside(keyframe) if self.is_room(chamber) else ()
 
     def rooms(self) -> list[tuple[int, ...]]:
         """Of every room that was entered, the first one first, the keyframes around its middle as in `room_of`."""
-        rooms = sorted((own for own in self.chambers() if len(own) >= _FEW and self.is_room(own)), key=min)
-        return [self._around(nx.barycenter(self.roadmap.subgraph(room), weight="length")[0]) for room in rooms]
+        rooms = sorted(
+            (own for own in self.segments() if len(own) >= _MIN_ROOM_KEYFRAMES and self.is_room(own)), key=min
+        )
+        return [self._keyframes_beside(nx.barycenter(self.graph.subgraph(room), weight="length")[0]) for room in rooms]
 
     def is_room(self, chamber: Collection[int]) -> bool:
         """Whether half of a chamber looks like a room: the end of a hallway does, but not all of the hallway."""
-        hallways = sum(self._outlooks[keyframe].hallway for keyframe in chamber)
+        hallways = sum(self._classifications[keyframe].is_hallway for keyframe in chamber)
         return len(chamber) > 0 and hallways <= 0.5 * len(chamber)
 
-    def _around(self, keyframe: int) -> tuple[int, ...]:
+    def _keyframes_beside(self, keyframe: int) -> tuple[int, ...]:
         beside = {
             other: edge["length"]
-            for other, edge in self.roadmap[keyframe].items()
+            for other, edge in self.graph[keyframe].items()
             if edge["length"] <= _BESIDE and not edge["door"]
         }
         return (keyframe, *sorted(beside, key=lambda other: (beside[other], other)))
 
-    def _within_doors(self) -> nx.Graph:
+    def _graph_without_doors(self) -> nx.Graph:
         """The roadmap without ways through doors."""
         within = nx.Graph()
-        within.add_nodes_from(self.roadmap)
-        within.add_edges_from((a, b) for a, b, door in self.roadmap.edges(data="door") if not door)
+        within.add_nodes_from(self.graph)
+        within.add_edges_from((a, b) for a, b, door in self.graph.edges(data="door") if not door)
         return within
 
 
 def _is_near(place: Float64, pose: Float64) -> bool:
-    return math.dist(place[:2], pose[:2]) <= _UP_TO_DATE
+    return math.dist(place[:2], pose[:2]) <= _UPDATE_RADIUS

@@ -18,36 +18,36 @@ Matrix = NDArray[np.float64]
 def inverse(matrix: Matrix) -> Matrix:
     """The inverse of a positive definite matrix, by cofactors."""
     found = np.empty((3, 3))
-    symmetric.into_array(symmetric.inverse(symmetric.of_array(matrix)), found)
+    symmetric.write_to_array(symmetric.inverse(symmetric.symmetric_from_array(matrix)), found)
     return found
 
 
 @njit(cache=True)
-def turned(matrix: Matrix, theta: float) -> Matrix:
+def rotate_covariance(matrix: Matrix, theta: float) -> Matrix:
     """A covariance, or information, of a frame in one that sees it turned by ``theta``."""
-    return _moved(matrix, 0.0, 0.0, theta)
+    return _apply_adjoint(matrix, 0.0, 0.0, theta)
 
 
 @njit(cache=True)
-def carried(covariance: Matrix, increment: NDArray[np.float64]) -> Matrix:
+def propagate_covariance(covariance: Matrix, increment: NDArray[np.float64]) -> Matrix:
     """The covariance at the end of ``increment`` (3,), from that at its start: Ad^-1 C Ad^-T, right tangent frames."""
     cos, sin = np.cos(increment[2]), np.sin(increment[2])
     x, y = -cos * increment[0] - sin * increment[1], sin * increment[0] - cos * increment[1]
-    return _moved(covariance, x, y, -increment[2])
+    return _apply_adjoint(covariance, x, y, -increment[2])
 
 
 @njit(cache=True)
-def of_inverse(covariance: Matrix, pose: NDArray[np.float64]) -> Matrix:
+def inverse_pose_covariance(covariance: Matrix, pose: NDArray[np.float64]) -> Matrix:
     """The covariance of the inverse of ``pose`` (3,): Ad C Ad^T, right tangent frames."""
-    return _moved(covariance, pose[0], pose[1], pose[2])
+    return _apply_adjoint(covariance, pose[0], pose[1], pose[2])
 
 
 @njit(cache=True)
-def _moved(covariance: Matrix, x: float, y: float, theta: float) -> Matrix:
+def _apply_adjoint(covariance: Matrix, x: float, y: float, theta: float) -> Matrix:
     """Ad C Ad^T for the pose (x, y, theta)."""
     cos, sin = np.cos(theta), np.sin(theta)
     ad = ((cos, -sin, y), (sin, cos, -x), (0.0, 0.0, 1.0))
-    half = (_times(ad[0], covariance), _times(ad[1], covariance), _times(ad[2], covariance))
+    half = (_row_times(ad[0], covariance), _row_times(ad[1], covariance), _row_times(ad[2], covariance))
     found = np.empty((3, 3))
     for i in range(3):
         for j in range(3):
@@ -56,7 +56,7 @@ def _moved(covariance: Matrix, x: float, y: float, theta: float) -> Matrix:
 
 
 @njit(cache=True)
-def _times(row: tuple[float, float, float], matrix: Matrix) -> tuple[float, float, float]:
+def _row_times(row: tuple[float, float, float], matrix: Matrix) -> tuple[float, float, float]:
     """A row (3,) times a matrix."""
     x, y, z = row
     return (

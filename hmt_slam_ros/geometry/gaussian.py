@@ -17,10 +17,10 @@ from scipy.special import gammaincinv
 
 from hmt_slam_ros.geometry import se2
 
-_OF_A_POSE = 3
+_POSE_DOF = 3
 
 
-def gate(probability: float, degrees_of_freedom: int = _OF_A_POSE) -> float:
+def chi_square_gate(probability: float, degrees_of_freedom: int = _POSE_DOF) -> float:
     """The bound below which the squared Mahalanobis distance of true pairs stays with this probability.
 
     It is the quantile of chi-square. scipy.stats, which has it too, takes half a second and 45 MB to load.
@@ -37,13 +37,13 @@ ELLIPSE_95 = 2.4477
 class Ellipse(NamedTuple):
     """Of a position, around it.
 
-    :ivar longer: half axis, m.
-    :ivar shorter: half axis, m.
+    :ivar semi_major: half axis, m.
+    :ivar semi_minor: half axis, m.
     :ivar angle: of the longer one, rad.
     """
 
-    longer: float
-    shorter: float
+    semi_major: float
+    semi_minor: float
     angle: float
 
 
@@ -59,7 +59,7 @@ class PoseGaussian:
     covariance: NDArray[np.float64]
 
     @classmethod
-    def exactly(cls, pose: NDArray[np.float64]) -> PoseGaussian:
+    def from_pose(cls, pose: NDArray[np.float64]) -> PoseGaussian:
         """The certainty that it is this pose, (3,)."""
         return cls(pose, np.zeros((3, 3)))
 
@@ -76,7 +76,7 @@ class PoseGaussian:
             ad @ self.covariance @ ad.T + other.covariance,
         )
 
-    def ellipse(self) -> Ellipse:
+    def position_ellipse(self) -> Ellipse:
         """In which the position of b lies with 95 %, in the axes of a."""
         sin, cos = math.sin(self.mean[2]), math.cos(self.mean[2])
         turn = np.array([[cos, -sin], [sin, cos]])
@@ -125,7 +125,7 @@ def fuse(beliefs: list[PoseGaussian], iterations: int = 10) -> PoseGaussian:
     return PoseGaussian(mean, covariance)
 
 
-def moments(weighed: Sequence[tuple[PoseGaussian, float]]) -> PoseGaussian:
+def match_moments(weighed: Sequence[tuple[PoseGaussian, float]]) -> PoseGaussian:
     """The second moment of several beliefs about the mean of the heaviest.
 
     :param weighed: every belief with the log of its weight, at least one.

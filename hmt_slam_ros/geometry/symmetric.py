@@ -23,13 +23,13 @@ class Symmetric(NamedTuple):
 
 
 @njit(cache=True)
-def of_array(matrix: Float64) -> Symmetric:
+def symmetric_from_array(matrix: Float64) -> Symmetric:
     """The upper triangle of an array (3, 3)."""
     return Symmetric(matrix[0, 0], matrix[0, 1], matrix[0, 2], matrix[1, 1], matrix[1, 2], matrix[2, 2])
 
 
 @njit(cache=True)
-def into_array(a: Symmetric, matrix: Float64) -> None:
+def write_to_array(a: Symmetric, matrix: Float64) -> None:
     """Write the whole matrix into an array (3, 3)."""
     matrix[0, 0], matrix[1, 1], matrix[2, 2] = a.xx, a.yy, a.tt
     matrix[0, 1] = matrix[1, 0] = a.xy
@@ -38,7 +38,7 @@ def into_array(a: Symmetric, matrix: Float64) -> None:
 
 
 @njit(cache=True)
-def total(a: Symmetric, b: Symmetric, factor: float) -> Symmetric:
+def add_scaled(a: Symmetric, b: Symmetric, factor: float) -> Symmetric:
     """a + factor b."""
     return Symmetric(
         a.xx + factor * b.xx,
@@ -51,7 +51,7 @@ def total(a: Symmetric, b: Symmetric, factor: float) -> Symmetric:
 
 
 @njit(cache=True)
-def times(a: Symmetric, v: Vector) -> Vector:
+def multiply(a: Symmetric, v: Vector) -> Vector:
     """a v."""
     x, y, t = v
     return a.xx * x + a.xy * y + a.xt * t, a.xy * x + a.yy * y + a.yt * t, a.xt * x + a.yt * y + a.tt * t
@@ -64,10 +64,10 @@ def dot(v: Vector, w: Vector) -> float:
 
 
 @njit(cache=True)
-def sandwiched(a: Symmetric, b: Symmetric) -> Symmetric:
+def sandwich(a: Symmetric, b: Symmetric) -> Symmetric:
     """a b a."""
     x, y, t = (a.xx, a.xy, a.xt), (a.xy, a.yy, a.yt), (a.xt, a.yt, a.tt)
-    bx, by, bt = times(b, x), times(b, y), times(b, t)
+    bx, by, bt = multiply(b, x), multiply(b, y), multiply(b, t)
     return Symmetric(dot(x, bx), dot(x, by), dot(x, bt), dot(y, by), dot(y, bt), dot(t, bt))
 
 
@@ -81,7 +81,7 @@ def inverse(a: Symmetric) -> Symmetric:
 
 
 @njit(cache=True)
-def _decomposed(a: Symmetric) -> tuple[Vector, Vector]:
+def _decompose(a: Symmetric) -> tuple[Vector, Vector]:
     """L D L' of a positive definite matrix: the diagonal of D, and of L what is at xy, xt and yt."""
     xy, xt = a.xy / a.xx, a.xt / a.xx
     yy = a.yy - xy * a.xy
@@ -90,9 +90,9 @@ def _decomposed(a: Symmetric) -> tuple[Vector, Vector]:
 
 
 @njit(cache=True)
-def solved(a: Symmetric, v: Vector) -> Vector:
+def solve(a: Symmetric, v: Vector) -> Vector:
     """a^-1 v for a positive definite matrix, as exact as it is where cofactors would cancel."""
-    (xx, yy, tt), (xy, xt, yt) = _decomposed(a)
+    (xx, yy, tt), (xy, xt, yt) = _decompose(a)
     y = v[1] - xy * v[0]
     t = (v[2] - xt * v[0] - yt * y) / tt
     y = y / yy - yt * t
@@ -102,5 +102,5 @@ def solved(a: Symmetric, v: Vector) -> Vector:
 @njit(cache=True)
 def determinant(a: Symmetric) -> float:
     """Of a positive definite matrix."""
-    diagonal, _ = _decomposed(a)
+    diagonal, _ = _decompose(a)
     return diagonal[0] * diagonal[1] * diagonal[2]

@@ -19,11 +19,11 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 
 from hmt_slam_ros.arrays import Int32, UInt8, UInt32
-from hmt_slam_ros.grids.patches import FAR, MASK, PATCH, SHIFT, Store, writable
+from hmt_slam_ros.grids.patches import FAR, MASK, PATCH, SHIFT, PatchStore, writable_patch
 
 
 @intrinsic
-def lowest(_context: Any, word: Any) -> Any:  # noqa: ANN401  numba's own types
+def lowest_bit(_context: Any, word: Any) -> Any:  # noqa: ANN401  numba's own types
     """The number of the lowest bit that is set; a word without any has no answer."""
 
     def count_trailing_zeros(context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:  # noqa: ANN401
@@ -34,7 +34,7 @@ def lowest(_context: Any, word: Any) -> Any:  # noqa: ANN401  numba's own types
 
 
 @njit(cache=True)
-def any_set(words: UInt32) -> bool:
+def has_bits(words: UInt32) -> bool:
     """Whether a bit is set in any of the words (n,)."""
     found = np.uint32(0)
     for word in words:
@@ -42,7 +42,7 @@ def any_set(words: UInt32) -> bool:
     return found != 0
 
 
-class FieldWork(NamedTuple):
+class FieldWorkspace(NamedTuple):
     """Tables of distances, in cells around an occupied one, and room to work in; r is the field's radius in cells.
 
     The tables have 31 columns of "far" on both sides, so that a row of a patch always takes 32 of theirs.
@@ -65,7 +65,7 @@ class FieldWork(NamedTuple):
     nearest: Int32
 
 
-def field_work(table_size: int, cell: float, radius: float) -> FieldWork:
+def make_field_workspace(table_size: int, cell: float, radius: float) -> FieldWorkspace:
     """The tables for cells of edge ``cell``, m, and a field that ends at ``radius``, m."""
     reach = int(np.ceil(radius / cell))
     far = reach * reach + 1
@@ -73,7 +73,7 @@ def field_work(table_size: int, cell: float, radius: float) -> FieldWork:
     quanta[far] = FAR
     square = np.arange(-reach, reach + 1) ** 2
     stamp = quanta[np.minimum(square[:, None] + square, far)]
-    return FieldWork(
+    return FieldWorkspace(
         quanta,
         np.pad(stamp, ((0, 0), (MASK, MASK)), constant_values=FAR),
         np.pad(square, MASK, constant_values=far).astype(np.int32),
@@ -85,46 +85,46 @@ def field_work(table_size: int, cell: float, radius: float) -> FieldWork:
 
 
 @njit(cache=True)
-def in_reach(work: FieldWork, table_size: int, patches: range) -> range:
+def patches_in_reach(work: FieldWorkspace, table_size: int, patches: range) -> range:
     """The rows of patches, or the columns of them, that the field around those in ``patches`` reaches."""
     margin = (work.stamp.shape[0] // 2 + MASK) >> SHIFT
     return range(max(0, patches.start - margin), min(table_size, patches.stop + margin))
 
 
 @njit(cache=True)
-def lower(table: Int32, store: Store, work: FieldWork, cells: UInt32, tr: int, tc: int) -> None:
+def lower_field(table: Int32, store: PatchStore, work: FieldWorkspace, cells: UInt32, tr: int, tc: int) -> None:
     """Enter the newly occupied cells of a patch, as bits of shape (32,)."""
-    for r in in_reach(work, table.shape[0], range(tr, tr + 1)):
-        for c in in_reach(work, table.shape[0], range(tc, tc + 1)):
+    for r in patches_in_reach(work, table.shape[0], range(tr, tr + 1)):
+        for c in patches_in_reach(work, table.shape[0], range(tc, tc + 1)):
             row, column = (tr - r) << SHIFT, (tc - c) << SHIFT
             patch = table[r, c]
             if patch < 0 or store.references[patch] > 1:
                 field = work.empty if patch < 0 else store.field[patch]
-                if not _lowers(field, work.stamp, cells, row, column):
+                if not _would_lower(field, work.stamp, cells, row, column):
                     continue
-                patch = writable(table, store, r, c)
-            _take_lower(store.field[patch], work.stamp, cells, row, column)
+                patch = writable_patch(table, store, r, c)
+            _apply_stamps(store.field[patch], work.stamp, cells, row, column)
 
 
 @njit(cache=True)
-def mark_dirty(table: Int32, store: Store, work: FieldWork, cells: UInt32, tr: int, tc: int) -> None:
+def mark_dirty(table: Int32, store: PatchStore, work: FieldWorkspace, cells: UInt32, tr: int, tc: int) -> None:
     """Mark the rows in which cells of a patch that became free, as bits of shape (32,), were the nearest."""
-    for r in in_reach(work, table.shape[0], range(tr, tr + 1)):
-        for c in in_reach(work, table.shape[0], range(tc, tc + 1)):
+    for r in patches_in_reach(work, table.shape[0], range(tr, tr + 1)):
+        for c in patches_in_reach(work, table.shape[0], range(tc, tc + 1)):
             patch = table[r, c]
             if patch >= 0:
-                alike = _rows_alike(store.field[patch], work.stamp, cells, (tr - r) << SHIFT, (tc - c) << SHIFT)
+                alike = _rows_sharing_value(store.field[patch], work.stamp, cells, (tr - r) << SHIFT, (tc - c) << SHIFT)
                 work.dirty[r, c] |= alike
 
 
 @njit(cache=True)
-def _near(reach: int, at: int) -> tuple[int, int]:
+def _span_in_reach(reach: int, at: int) -> tuple[int, int]:
     """The rows or columns, from ... to, of a patch that begins ``at`` relative to another, which are in its reach."""
     return max(0, -reach - at), max(0, min(PATCH, PATCH + reach - at))
 
 
 @njit(cache=True)
-def _between(begin: int, end: int) -> np.uint32:
+def _column_bits(begin: int, end: int) -> np.uint32:
     """The bits of the columns from ... to."""
     if begin >= end:
         return np.uint32(0)
@@ -132,7 +132,7 @@ def _between(begin: int, end: int) -> np.uint32:
 
 
 @njit(cache=True, inline="always")
-def _covered(stamp: UInt8, row: int, column: int) -> tuple[int, int, int, int]:
+def _stamp_overlap(stamp: UInt8, row: int, column: int) -> tuple[int, int, int, int]:
     """What the stamp around a cell in reach covers of a patch: its rows, from ... to.
 
     And where the stamp lies on it: the stamp's row on row 0, and its column on column 0.
@@ -142,15 +142,15 @@ def _covered(stamp: UInt8, row: int, column: int) -> tuple[int, int, int, int]:
 
 
 @njit(cache=True)
-def _lowers(field: UInt8, stamp: UInt8, cells: UInt32, row: int, column: int) -> bool:
+def _would_lower(field: UInt8, stamp: UInt8, cells: UInt32, row: int, column: int) -> bool:
     """Whether cells, in a patch that begins at (row, column) relative to the field's, lower the field."""
     reach = stamp.shape[0] // 2
-    columns = _between(*_near(reach, column))
-    begin, end = _near(reach, row)
+    columns = _column_bits(*_span_in_reach(reach, column))
+    begin, end = _span_in_reach(reach, row)
     for r in range(begin, end):
         bits = cells[r] & columns
         while bits:
-            top, bottom, above, left = _covered(stamp, row + r, column + lowest(bits))
+            top, bottom, above, left = _stamp_overlap(stamp, row + r, column + lowest_bit(bits))
             bits &= bits - np.uint32(1)
             for k in range(top, bottom):
                 if _any_lower(field[k], stamp[above + k, left : left + PATCH]):
@@ -167,15 +167,15 @@ def _any_lower(field: UInt8, values: UInt8) -> bool:
 
 
 @njit(cache=True)
-def _take_lower(field: UInt8, stamp: UInt8, cells: UInt32, row: int, column: int) -> None:
+def _apply_stamps(field: UInt8, stamp: UInt8, cells: UInt32, row: int, column: int) -> None:
     """Lower a field by cells in a patch that begins at (row, column) relative to the field's."""
     reach = stamp.shape[0] // 2
-    columns = _between(*_near(reach, column))
-    begin, end = _near(reach, row)
+    columns = _column_bits(*_span_in_reach(reach, column))
+    begin, end = _span_in_reach(reach, row)
     for r in range(begin, end):
         bits = cells[r] & columns
         while bits:
-            top, bottom, above, left = _covered(stamp, row + r, column + lowest(bits))
+            top, bottom, above, left = _stamp_overlap(stamp, row + r, column + lowest_bit(bits))
             bits &= bits - np.uint32(1)
             for k in range(top, bottom):
                 _take_minimum(field[k], stamp[above + k, left : left + PATCH])
@@ -188,24 +188,24 @@ def _take_minimum(kept: UInt8 | Int32, values: UInt8 | Int32) -> None:
 
 
 @njit(cache=True)
-def _rows_alike(field: UInt8, stamp: UInt8, cells: UInt32, row: int, column: int) -> np.uint32:
+def _rows_sharing_value(field: UInt8, stamp: UInt8, cells: UInt32, row: int, column: int) -> np.uint32:
     """The rows, as bits, of a field that may come from cells in a patch that begins at (row, column) relative to it."""
     reach = stamp.shape[0] // 2
-    columns = _between(*_near(reach, column))
-    begin, end = _near(reach, row)
+    columns = _column_bits(*_span_in_reach(reach, column))
+    begin, end = _span_in_reach(reach, row)
     alike = np.uint32(0)
     for r in range(begin, end):
         bits = cells[r] & columns
         while bits:
-            top, bottom, above, left = _covered(stamp, row + r, column + lowest(bits))
+            top, bottom, above, left = _stamp_overlap(stamp, row + r, column + lowest_bit(bits))
             bits &= bits - np.uint32(1)
             for k in range(top, bottom):
-                alike |= np.uint32(_alike(field[k], stamp[above + k, left : left + PATCH])) << np.uint32(k)
+                alike |= np.uint32(_shares_value(field[k], stamp[above + k, left : left + PATCH])) << np.uint32(k)
     return alike
 
 
 @njit(cache=True, inline="always")
-def _alike(field: UInt8, values: UInt8) -> bool:
+def _shares_value(field: UInt8, values: UInt8) -> bool:
     """Whether both have a value below FAR in common."""
     found = False
     for c in range(field.size):
@@ -214,36 +214,36 @@ def _alike(field: UInt8, values: UInt8) -> bool:
 
 
 @njit(cache=True)
-def measure_dirty(table: Int32, store: Store, work: FieldWork, rows: range, columns: range) -> None:
+def recompute_dirty(table: Int32, store: PatchStore, work: FieldWorkspace, rows: range, columns: range) -> None:
     """Measure the dirty rows anew, in a part of the table and around it."""
-    for tr in in_reach(work, table.shape[0], rows):
-        for tc in in_reach(work, table.shape[0], columns):
+    for tr in patches_in_reach(work, table.shape[0], rows):
+        for tc in patches_in_reach(work, table.shape[0], columns):
             dirty = work.dirty[tr, tc]
             if dirty:
                 work.dirty[tr, tc] = 0
                 _find_nearest(table, store, work, dirty, tr, tc)
-                _write(store.field[writable(table, store, tr, tc)], dirty, work.nearest, work.quanta)
+                _write_rows(store.field[writable_patch(table, store, tr, tc)], dirty, work.nearest, work.quanta)
 
 
 @njit(cache=True)
-def _write(field: UInt8, rows: np.uint32, nearest: Int32, quanta: UInt8) -> None:
+def _write_rows(field: UInt8, rows: np.uint32, nearest: Int32, quanta: UInt8) -> None:
     """Enter squared distances into rows, given as bits, of a field."""
     while rows:
-        r = lowest(rows)
+        r = lowest_bit(rows)
         rows &= rows - np.uint32(1)
         for c in range(PATCH):
             field[r, c] = quanta[nearest[r, c]]
 
 
 @njit(cache=True)
-def _find_nearest(table: Int32, store: Store, work: FieldWork, rows: np.uint32, tr: int, tc: int) -> None:
+def _find_nearest(table: Int32, store: PatchStore, work: FieldWorkspace, rows: np.uint32, tr: int, tc: int) -> None:
     """Squared distances from the cells in rows, given as bits, of a patch to their nearest occupied ones."""
     reach = work.stamp.shape[0] // 2
-    top, bottom = lowest(rows), PATCH
+    top, bottom = lowest_bit(rows), PATCH
     while not rows >> np.uint32(bottom - 1):
         bottom -= 1
     work.nearest[top:bottom] = work.quanta.size - 1
-    patches = in_reach(work, table.shape[0], range(tc, tc + 1))
+    patches = patches_in_reach(work, table.shape[0], range(tc, tc + 1))
     first = tr << SHIFT
     for row in range(max(0, first + top - reach), min(table.shape[0] * PATCH, first + bottom + reach)):
         found = False
@@ -263,9 +263,9 @@ def _find_nearest(table: Int32, store: Store, work: FieldWork, rows: np.uint32, 
 def _measure_across(occupied: np.uint32, column: int, squares: Int32, across: Int32) -> None:
     """Squared distances from the columns of a patch to occupied ones of a patch that begins at ``column``."""
     reach = squares.size // 2 - MASK
-    occupied &= _between(*_near(reach, column))
+    occupied &= _column_bits(*_span_in_reach(reach, column))
     while occupied:
-        left = reach + MASK - column - lowest(occupied)
+        left = reach + MASK - column - lowest_bit(occupied)
         occupied &= occupied - np.uint32(1)
         _take_minimum(across, squares[left : left + PATCH])
 

@@ -10,22 +10,24 @@ import numpy as np
 from numba import njit
 
 from hmt_slam_ros.arrays import Float64
-from hmt_slam_ros.grids.patches import FAR, PATCH, MapView, field_at
+from hmt_slam_ros.grids.patches import FAR, PATCH, GridView, field_at
 
 # A beam passes a wall if nothing is known within this distance of it before and behind, m: others run along the wall.
-_CLEAR = 0.2
+_CLEARANCE = 0.2
 # It ends at least so far behind the wall, m.
 _BEHIND = 0.4
 # Of surfaces, one sample every so many m counts.
-_APART = 0.2
+_SAMPLE_SPACING = 0.2
 # A wall was passed where samples of it are so near to each other, m: a single one may be the jamb of a door.
-_TOGETHER = 0.6
+_MAX_SAMPLE_GAP = 0.6
 # Part of a cell by which a beam is followed near surfaces.
 _STEP = 0.7
 
 
 @njit(cache=True)
-def met_and_passed(points: Float64, laser: Float64, pose: Float64, view: MapView, near: int) -> tuple[int, int]:
+def count_hits_and_violations(
+    points: Float64, laser: Float64, pose: Float64, view: GridView, near: int
+) -> tuple[int, int]:
     """How many samples of known surfaces the beams of a scan end on, and of how many they pass.
 
     :param points: ends of the beams in their order, shape (n, 2 or more), m, base frame.
@@ -37,14 +39,14 @@ def met_and_passed(points: Float64, laser: Float64, pose: Float64, view: MapView
     half = 0.5 * view.table.shape[0] * PATCH
     u, v = pose[0] / view.cell + half, pose[1] / view.cell + half
     from_u, from_v = u + cos * laser[0] - sin * laser[1], v + sin * laser[0] + cos * laser[1]
-    apart, together = _APART / view.cell, _TOGETHER / view.cell
+    apart, together = _SAMPLE_SPACING / view.cell, _MAX_SAMPLE_GAP / view.cell
     met, met_u, met_v = 0, -np.inf, -np.inf
     passed, passed_u, passed_v = 0, -np.inf, -np.inf
     for i in range(points.shape[0]):
         to_u, to_v = u + cos * points[i, 0] - sin * points[i, 1], v + sin * points[i, 0] + cos * points[i, 1]
         if field_at(view, int(to_u), int(to_v)) < near and np.hypot(to_u - met_u, to_v - met_v) >= apart:
             met, met_u, met_v = met + 1, to_u, to_v
-        share = _passed(view, from_u, from_v, to_u, to_v)
+        share = _first_wall_passed(view, from_u, from_v, to_u, to_v)
         if share < 0.0:
             continue
         wall_u, wall_v = from_u + share * (to_u - from_u), from_v + share * (to_v - from_v)
@@ -55,11 +57,11 @@ def met_and_passed(points: Float64, laser: Float64, pose: Float64, view: MapView
 
 
 @njit(cache=True)
-def _passed(view: MapView, from_u: float, from_v: float, to_u: float, to_v: float) -> float:
+def _first_wall_passed(view: GridView, from_u: float, from_v: float, to_u: float, to_v: float) -> float:
     """Share of a beam, in cells, up to the first wall that it passes; -1 where it passes none."""
     length = max(np.hypot(to_u - from_u, to_v - from_v), 1e-9)
     du, dv = (to_u - from_u) / length, (to_v - from_v) / length
-    clear, behind, quantum = _CLEAR / view.cell, _BEHIND / view.cell, view.radius / (FAR * view.cell)
+    clear, behind, quantum = _CLEARANCE / view.cell, _BEHIND / view.cell, view.radius / (FAR * view.cell)
     before, wall, at = -np.inf, np.inf, 0.0
     while at < length:
         distance = quantum * field_at(view, int(from_u + at * du), int(from_v + at * dv))

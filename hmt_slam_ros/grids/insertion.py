@@ -8,11 +8,19 @@ import numpy as np
 from numba import njit
 
 from hmt_slam_ros.arrays import Float64, Int8, Int32, UInt32
-from hmt_slam_ros.grids.distance_field import FieldWork, any_set, in_reach, lower, lowest, mark_dirty, measure_dirty
-from hmt_slam_ros.grids.patches import MASK, PATCH, SHIFT, Store, writable
+from hmt_slam_ros.grids.distance_field import (
+    FieldWorkspace,
+    has_bits,
+    lower_field,
+    lowest_bit,
+    mark_dirty,
+    patches_in_reach,
+    recompute_dirty,
+)
+from hmt_slam_ros.grids.patches import MASK, PATCH, SHIFT, PatchStore, writable_patch
 
 
-class InverseModel(NamedTuple):
+class InverseSensorModel(NamedTuple):
     """The inverse sensor model, in quanta of the odds.
 
     :ivar hit: added to a cell with an end point.
@@ -25,7 +33,7 @@ class InverseModel(NamedTuple):
     limit: int
 
 
-class Marks(NamedTuple):
+class BeamMasks(NamedTuple):
     """A bit for every cell of a map, by patch and row: shape (T, T, 32), uint32; zeros between insertions.
 
     :ivar hit: first the cells in which a beam ends, then those of them that became occupied.
@@ -36,14 +44,14 @@ class Marks(NamedTuple):
     passed: UInt32
 
 
-def marks(table_size: int) -> Marks:
+def empty_masks(table_size: int) -> BeamMasks:
     """Nothing marked."""
     shape = (table_size, table_size, PATCH)
-    return Marks(np.zeros(shape, dtype=np.uint32), np.zeros(shape, dtype=np.uint32))
+    return BeamMasks(np.zeros(shape, dtype=np.uint32), np.zeros(shape, dtype=np.uint32))
 
 
 @njit(cache=True)
-def in_cells(points: Float64, poses: Float64, cell: float, table_size: int) -> Float64:
+def cell_coordinates(points: Float64, poses: Float64, cell: float, table_size: int) -> Float64:
     """Points (n, 2) of the base, m, in cells of a map, for each of several ``map_T_base`` (m, 3); shape (m, n, 2)."""
     placed = np.empty((poses.shape[0], points.shape[0], 2))
     half = 0.5 * table_size * PATCH
@@ -56,28 +64,28 @@ def in_cells(points: Float64, poses: Float64, cell: float, table_size: int) -> F
 
 
 @njit(cache=True)
-def patches_needed(tables: Int32, store: Store, work: FieldWork, origins: Float64, ends: Float64) -> int:
+def patches_needed(tables: Int32, store: PatchStore, work: FieldWorkspace, origins: Float64, ends: Float64) -> int:
     """How many new patches :func:`insert` may take at most, with the same arguments."""
     count = 0
     for i in range(tables.shape[0]):
         rows, columns = _patches_around(origins[i], ends[i], tables.shape[1])
-        for tr in in_reach(work, tables.shape[1], rows):
-            for tc in in_reach(work, tables.shape[1], columns):
+        for tr in patches_in_reach(work, tables.shape[1], rows):
+            for tc in patches_in_reach(work, tables.shape[1], columns):
                 patch = tables[i, tr, tc]
                 count += patch < 0 or store.references[patch] > 1
     return count
 
 
 @njit(cache=True)
-def insert(
+def insert_beams(
     tables: Int32,
-    store: Store,
-    marks: Marks,
-    work: FieldWork,
+    store: PatchStore,
+    marks: BeamMasks,
+    work: FieldWorkspace,
     origins: Float64,
     ends: Float64,
     hits: int,
-    model: InverseModel,
+    model: InverseSensorModel,
 ) -> None:
     """Enter beams into several maps.
 
@@ -86,44 +94,46 @@ def insert(
     :param ends: likewise where they end; the first ``hits`` end on a surface.
     """
     for i in range(tables.shape[0]):
-        _insert(tables[i], store, marks, work, origins[i], ends[i], hits, model)
+        _insert_beams(tables[i], store, marks, work, origins[i], ends[i], hits, model)
 
 
 @njit(cache=True)
-def _insert(
+def _insert_beams(
     table: Int32,
-    store: Store,
-    marks: Marks,
-    work: FieldWork,
+    store: PatchStore,
+    marks: BeamMasks,
+    work: FieldWorkspace,
     origins: Float64,
     ends: Float64,
     hits: int,
-    model: InverseModel,
+    model: InverseSensorModel,
 ) -> None:
-    _mark(marks, origins, ends, hits)
+    _mark_beams(marks, origins, ends, hits)
     rows, columns = _patches_around(origins, ends, table.shape[0])
     for tr in rows:
         for tc in columns:
             hit, passed = marks.hit[tr, tc], marks.passed[tr, tc]
-            if any_set(hit) or any_set(passed):
-                patch = writable(table, store, tr, tc)
-                _count(store.odds[patch], store.occupied[patch], hit, passed, model)
-    _renew_field(table, store, marks, work, rows, columns)
+            if has_bits(hit) or has_bits(passed):
+                patch = writable_patch(table, store, tr, tc)
+                _update_odds(store.odds[patch], store.occupied[patch], hit, passed, model)
+    _update_field(table, store, marks, work, rows, columns)
 
 
 @njit(cache=True)
-def _renew_field(table: Int32, store: Store, marks: Marks, work: FieldWork, rows: range, columns: range) -> None:
+def _update_field(
+    table: Int32, store: PatchStore, marks: BeamMasks, work: FieldWorkspace, rows: range, columns: range
+) -> None:
     """Bring the field up to date with the cells that became free or occupied, and empty the marks."""
     for tr in rows:
         for tc in columns:
-            if any_set(marks.passed[tr, tc]):
+            if has_bits(marks.passed[tr, tc]):
                 mark_dirty(table, store, work, marks.passed[tr, tc], tr, tc)
                 marks.passed[tr, tc] = 0
-    measure_dirty(table, store, work, rows, columns)
+    recompute_dirty(table, store, work, rows, columns)
     for tr in rows:
         for tc in columns:
-            if any_set(marks.hit[tr, tc]):
-                lower(table, store, work, marks.hit[tr, tc], tr, tc)
+            if has_bits(marks.hit[tr, tc]):
+                lower_field(table, store, work, marks.hit[tr, tc], tr, tc)
                 marks.hit[tr, tc] = 0
 
 
@@ -144,7 +154,7 @@ def _span(starts: Float64, ends: Float64, table_size: int) -> range:
 
 
 @njit(cache=True)
-def _mark(marks: Marks, origins: Float64, ends: Float64, hits: int) -> None:
+def _mark_beams(marks: BeamMasks, origins: Float64, ends: Float64, hits: int) -> None:
     """Mark the cells in which beams end and which they pass."""
     edge = marks.hit.shape[0] * PATCH
     for i in range(hits):
@@ -186,7 +196,7 @@ def _axis_steps(start: float, end: float) -> tuple[int, float, float]:
 
 
 @njit(cache=True)
-def _count(odds: Int8, occupied: UInt32, hit: UInt32, passed: UInt32, model: InverseModel) -> None:
+def _update_odds(odds: Int8, occupied: UInt32, hit: UInt32, passed: UInt32, model: InverseSensorModel) -> None:
     """Change the odds of a patch's marked cells; a cell in which a beam ends does not count as passed.
 
     :param odds: shape (32, 32); ``occupied``: shape (32,).
@@ -196,29 +206,29 @@ def _count(odds: Int8, occupied: UInt32, hit: UInt32, passed: UInt32, model: Inv
     for r in range(PATCH):
         if hit[r] | passed[r]:
             passed[r] &= ~hit[r]
-            _add(odds, r, hit[r], model.hit, model.limit)
-            _add(odds, r, passed[r], model.miss, model.limit)
+            _add_odds(odds, r, hit[r], model.hit, model.limit)
+            _add_odds(odds, r, passed[r], model.miss, model.limit)
             before = occupied[r]
             kept = before & ~(hit[r] | passed[r])
-            occupied[r] = kept | _positive(odds, r, hit[r] | (passed[r] & before))
+            occupied[r] = kept | _occupied_columns(odds, r, hit[r] | (passed[r] & before))
             hit[r] = occupied[r] & ~before
             passed[r] = before & ~occupied[r]
 
 
 @njit(cache=True, inline="always")
-def _add(odds: Int8, row: int, columns: np.uint32, change: int, limit: int) -> None:
+def _add_odds(odds: Int8, row: int, columns: np.uint32, change: int, limit: int) -> None:
     while columns:
-        c = lowest(columns)
+        c = lowest_bit(columns)
         columns &= columns - np.uint32(1)
         odds[row, c] = min(limit, max(-limit, odds[row, c] + change))
 
 
 @njit(cache=True)
-def _positive(odds: Int8, row: int, columns: np.uint32) -> np.uint32:
+def _occupied_columns(odds: Int8, row: int, columns: np.uint32) -> np.uint32:
     """Those of a row's columns, as bits, whose odds are positive."""
     positive = np.uint32(0)
     while columns:
-        c = lowest(columns)
+        c = lowest_bit(columns)
         if odds[row, c] > 0:
             positive |= np.uint32(1) << np.uint32(c)
         columns &= columns - np.uint32(1)

@@ -19,7 +19,7 @@ from hmt_slam_ros.sensors import Scan
 OCCUPIED, FREE, UNKNOWN = np.uint8(0), np.uint8(254), np.uint8(205)
 
 # A wall that the laser grazes is passed by beams as well as hit, so it keeps its colour down to this share of hits.
-_OCCUPIED_SHARE = 0.4
+_OCCUPIED_RATIO = 0.4
 _MARGIN = 0.5  # m of unknown space around everything that was seen
 _MAX_CELLS = 1 << 26
 _HITS, _MISSES, _LAST_SCAN = 0, 1, 2
@@ -50,7 +50,7 @@ def occupancy_image(
     :param resolution: side of a cell, m; doubled until the image is of a size that a computer can hold.
     :param max_range: m.
     """
-    beams = [_beams(scan, pose, max_range) for scan, pose in zip(scans, poses, strict=True)]
+    beams = [_clip_beams(scan, pose, max_range) for scan, pose in zip(scans, poses, strict=True)]
     lasers = [se2.transform(pose, scan.laser_pose[:2])[None] for scan, pose in zip(scans, poses, strict=True)]
     corners = np.concatenate([points for starts, ends, _ in beams for points in (starts, ends)] + lasers)
     low, high = corners.min(axis=0) - _MARGIN, corners.max(axis=0) + _MARGIN
@@ -62,18 +62,18 @@ def occupancy_image(
     votes[_LAST_SCAN] = -1
     for k, (starts, ends, returned) in enumerate(beams):
         _vote((starts - origin) / resolution, (ends - origin) / resolution, returned, k, votes)
-    return OccupancyImage(_classified(votes[_HITS], votes[_MISSES])[::-1], resolution, origin)
+    return OccupancyImage(_classify(votes[_HITS], votes[_MISSES])[::-1], resolution, origin)
 
 
-def _classified(hits: NDArray[np.int32], misses: NDArray[np.int32]) -> NDArray[np.uint8]:
+def _classify(hits: NDArray[np.int32], misses: NDArray[np.int32]) -> NDArray[np.uint8]:
     seen = hits + misses
     pixels = np.full(hits.shape, UNKNOWN)
     pixels[seen > 0] = FREE
-    pixels[(seen > 0) & (hits >= _OCCUPIED_SHARE * seen)] = OCCUPIED
+    pixels[(seen > 0) & (hits >= _OCCUPIED_RATIO * seen)] = OCCUPIED
     return pixels
 
 
-def _beams(
+def _clip_beams(
     scan: Scan, pose: NDArray[np.float64], max_range: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
     """Starts and ends (k, 2) of the valid beams cut off at ``max_range``, and whether each end is a return."""

@@ -23,7 +23,7 @@ NO_PATCH = -1
 FAR = 255
 
 
-class MapView(NamedTuple):
+class GridView(NamedTuple):
     """One map as the kernels see it.
 
     :ivar table: shape (T, T), indices into the pool.
@@ -40,7 +40,7 @@ class MapView(NamedTuple):
     radius: float
 
 
-class Store(NamedTuple):
+class PatchStore(NamedTuple):
     """The arrays of the pool that change when a map is written to; ``free[:free_count[0]]`` are the free patches."""
 
     odds: Int8
@@ -52,7 +52,7 @@ class Store(NamedTuple):
 
 
 @njit(cache=True)
-def odds_at(view: MapView, column: int, row: int) -> int:
+def odds_at(view: GridView, column: int, row: int) -> int:
     """The odds of a cell, 0 outside the map."""
     if column < 0 or row < 0:
         return 0
@@ -66,7 +66,7 @@ def odds_at(view: MapView, column: int, row: int) -> int:
 
 
 @njit(cache=True)
-def field_at(view: MapView, column: int, row: int) -> int:
+def field_at(view: GridView, column: int, row: int) -> int:
     """The quantised distance at a cell, FAR outside the map."""
     if column < 0 or row < 0:
         return FAR
@@ -80,7 +80,7 @@ def field_at(view: MapView, column: int, row: int) -> int:
 
 
 @njit(cache=True, inline="always")
-def field_of_four(view: MapView, column: int, row: int) -> tuple[int, int, int, int]:
+def field_at_four(view: GridView, column: int, row: int) -> tuple[int, int, int, int]:
     """:func:`field_at` of a cell, of the next one in its row, and of these two in the next row."""
     c, r, tc, tr = column & MASK, row & MASK, column >> SHIFT, row >> SHIFT
     if 0 <= tc < view.table.shape[1] and 0 <= tr < view.table.shape[0] and c < MASK and r < MASK:
@@ -108,7 +108,7 @@ def add_references(table: Int32, references: Int32) -> None:
 
 
 @njit(cache=True)
-def release(table: Int32, store: Store) -> None:
+def release_table(table: Int32, store: PatchStore) -> None:
     """Empty a map's table; patches that no other table names are free again."""
     for row in range(table.shape[0]):
         for column in range(table.shape[1]):
@@ -122,7 +122,7 @@ def release(table: Int32, store: Store) -> None:
 
 
 @njit(cache=True)
-def writable(table: Int32, store: Store, row: int, column: int) -> int:
+def writable_patch(table: Int32, store: PatchStore, row: int, column: int) -> int:
     """The patch at a place of the table, made or unshared where needed."""
     old = table[row, column]
     if old >= 0 and store.references[old] == 1:

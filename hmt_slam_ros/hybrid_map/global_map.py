@@ -8,8 +8,8 @@ import numpy as np
 
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
-from hmt_slam_ros.hybrid_map.pose_graph import Edges, Solution, optimise
-from hmt_slam_ros.hybrid_map.shortest_path import reachable
+from hmt_slam_ros.hybrid_map.pose_graph import Edges, Solution, optimize
+from hmt_slam_ros.hybrid_map.shortest_path import shortest_path_beliefs
 
 # The reference area defines the frame; 0.1 mm and 0.006 degrees keep its covariance regular.
 _REFERENCE = np.diag([1e-8, 1e-8, 1e-8])
@@ -32,8 +32,8 @@ def shortest_path_map(hybrid_map: HybridMap) -> GlobalMap:
 
     Arcs that the tree does not use are ignored, so a loop keeps its error as a gap.
     """
-    poses = reachable(hybrid_map, _reference(hybrid_map))
-    return GlobalMap({area: _regular(poses[area]) for area in sorted(poses)}, {})
+    poses = shortest_path_beliefs(hybrid_map, _reference_area(hybrid_map))
+    return GlobalMap({area: _regularize(poses[area]) for area in sorted(poses)}, {})
 
 
 def consistent_map(hybrid_map: HybridMap) -> GlobalMap:
@@ -41,24 +41,24 @@ def consistent_map(hybrid_map: HybridMap) -> GlobalMap:
 
     Only areas that arcs join with the reference have a place.
     """
-    areas, arcs, solution = _solved(hybrid_map, marginals=True)
+    areas, arcs, solution = _solve_areas(hybrid_map, marginals=True)
     assert solution.covariances is not None
     beliefs = map(PoseGaussian, solution.poses, solution.covariances)
-    poses = {area: _regular(belief) for area, belief in zip(areas, beliefs, strict=True)}
+    poses = {area: _regularize(belief) for area, belief in zip(areas, beliefs, strict=True)}
     chi2 = {(a, b): float(value) for (a, b, _), value in zip(arcs, solution.edge_chi2, strict=True)}
     return GlobalMap(poses, chi2)
 
 
-def contradiction(hybrid_map: HybridMap) -> float:
+def total_arc_chi2(hybrid_map: HybridMap) -> float:
     """The chi-square of all arcs against the poses that agree best with them; 3 degrees of freedom a cycle."""
-    return _solved(hybrid_map, marginals=False)[2].chi2
+    return _solve_areas(hybrid_map, marginals=False)[2].chi2
 
 
-def _solved(
+def _solve_areas(
     hybrid_map: HybridMap, *, marginals: bool
 ) -> tuple[list[int], list[tuple[int, int, PoseGaussian]], Solution]:
     """Areas, arcs among them, and what agrees best with these."""
-    tree = reachable(hybrid_map, _reference(hybrid_map))
+    tree = shortest_path_beliefs(hybrid_map, _reference_area(hybrid_map))
     areas = sorted(tree)
     arcs = [(a, b, value.pose) for a, b, value in hybrid_map.all_arcs() if a in tree]
     row = {area: i for i, area in enumerate(areas)}
@@ -68,12 +68,12 @@ def _solved(
         np.array([pose.mean for _, _, pose in arcs]).reshape(-1, 3),
         np.array([pose.covariance for _, _, pose in arcs]).reshape(-1, 3, 3),
     )
-    return areas, arcs, optimise(np.array([tree[area].mean for area in areas]), edges, marginals=marginals)
+    return areas, arcs, optimize(np.array([tree[area].mean for area in areas]), edges, marginals=marginals)
 
 
-def _reference(hybrid_map: HybridMap) -> int:
+def _reference_area(hybrid_map: HybridMap) -> int:
     return min(hybrid_map.area_ids(), default=0)
 
 
-def _regular(belief: PoseGaussian) -> PoseGaussian:
+def _regularize(belief: PoseGaussian) -> PoseGaussian:
     return belief if belief.covariance.any() else PoseGaussian(belief.mean, _REFERENCE)

@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 from hmt_slam_ros.arrays import Float64, Int64
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian, fuse
-from hmt_slam_ros.hybrid_map.common_map import ArcValue, CommonMap, Keyframes, extent
+from hmt_slam_ros.hybrid_map.common_map import ArcValue, CommonMap, KeyframePoses, extent
 
 _DEGREES_OF_FREEDOM = 3
 
 
-def fused(old: PoseGaussian, new: PoseGaussian, shared: float) -> PoseGaussian:
+def fuse_traversals(old: PoseGaussian, new: PoseGaussian, shared: float) -> PoseGaussian:
     """The belief over ``a_T_b`` from two traversals of an arc.
 
     Eq. (10) takes the traversals for independent. Two things speak against it, and both inflate the two covariances:
@@ -35,7 +35,7 @@ def fused(old: PoseGaussian, new: PoseGaussian, shared: float) -> PoseGaussian:
     return fuse([PoseGaussian(belief.mean, inflation * belief.covariance) for belief in (old, new)])  # Eq. (10)
 
 
-def floored(belief: PoseGaussian, sigma: float, angle: float) -> PoseGaussian:
+def apply_sigma_floor(belief: PoseGaussian, sigma: float, angle: float) -> PoseGaussian:
     """A belief no more certain than the maps that both traversals were matched against.
 
     :param sigma: smallest deviation of the translation along each axis, m.
@@ -46,7 +46,7 @@ def floored(belief: PoseGaussian, sigma: float, angle: float) -> PoseGaussian:
     return PoseGaussian(belief.mean, covariance)
 
 
-def _stored_direction(a: int, b: int) -> tuple[int, int]:
+def _arc_key(a: int, b: int) -> tuple[int, int]:
     return (a, b) if a < b else (b, a)
 
 
@@ -55,55 +55,55 @@ class HybridMap:
     """Areas, keyframes and arcs under one topological hypothesis.
 
     :ivar common: what every live hypothesis agrees on.
-    :ivar areas: the areas in which this hypothesis differs from the common map, with all their keyframes.
-    :ivar arcs: likewise the arcs, keyed by (smaller area, larger area); None for one that this hypothesis lacks.
+    :ivar changed_areas: the areas in which this hypothesis differs from the common map, with all their keyframes.
+    :ivar changed_arcs: likewise the arcs, keyed by (smaller area, larger area); None for one that this hypothesis lacks.
     """
 
     common: CommonMap = field(default_factory=CommonMap)
-    areas: dict[int, dict[int, NDArray[np.float64]]] = field(default_factory=dict)
-    arcs: dict[tuple[int, int], ArcValue | None] = field(default_factory=dict)
+    changed_areas: dict[int, dict[int, NDArray[np.float64]]] = field(default_factory=dict)
+    changed_arcs: dict[tuple[int, int], ArcValue | None] = field(default_factory=dict)
 
     def branch(self) -> HybridMap:
         """A child that may change without its parent noticing."""
-        return HybridMap(self.common, {a: dict(k) for a, k in self.areas.items()}, dict(self.arcs))
+        return HybridMap(self.common, {a: dict(k) for a, k in self.changed_areas.items()}, dict(self.changed_arcs))
 
-    def part(self, areas: Collection[int]) -> HybridMap:
+    def subgraph(self, areas: Collection[int]) -> HybridMap:
         """A map of its own of some areas, and of the arcs between them."""
-        part = HybridMap(areas={area: dict(self.keyframes(area)) for area in areas})
-        part.arcs |= {(a, b): arc for a, b, arc in self.all_arcs() if a in areas and b in areas}
-        part.absorb()
+        part = HybridMap(changed_areas={area: dict(self.keyframes(area)) for area in areas})
+        part.changed_arcs |= {(a, b): arc for a, b, arc in self.all_arcs() if a in areas and b in areas}
+        part.commit()
         return part
 
-    def absorb(self) -> None:
+    def commit(self) -> None:
         """Make this hypothesis's changes common; valid only when it is the one live hypothesis of ``common``."""
-        for area, keyframes in self.areas.items():
+        for area, keyframes in self.changed_areas.items():
             self.common.set_area(area, keyframes)
-        for pair, arc in self.arcs.items():
+        for pair, arc in self.changed_arcs.items():
             if arc is None:
                 self.common.remove_arc(pair)
             else:
                 self.common.set_arc(pair, arc)
-        self.areas, self.arcs = {}, {}
+        self.changed_areas, self.changed_arcs = {}, {}
 
     def area_ids(self) -> list[int]:
         """All areas, ascending."""
-        return sorted(self.common.areas.keys() | self.areas.keys())
+        return sorted(self.common.areas.keys() | self.changed_areas.keys())
 
     def has_area(self, area: int) -> bool:
         """Whether there is such an area."""
-        return area in self.areas or area in self.common.areas
+        return area in self.changed_areas or area in self.common.areas
 
     @property
-    def largest_area(self) -> int:
+    def max_area_id(self) -> int:
         """The largest area that there ever was, -1 where there was none."""
-        return max(self.common.largest, max(self.areas, default=-1))
+        return max(self.common.max_area_id, max(self.changed_areas, default=-1))
 
-    def keyframes(self, area: int) -> Keyframes:
+    def keyframes(self, area: int) -> KeyframePoses:
         """{keyframe: ``area_T_base`` (3,)} of an area, in the order of insertion.
 
         :raises KeyError: where there is no such area.
         """
-        own = self.areas.get(area)
+        own = self.changed_areas.get(area)
         return self.common.areas[area] if own is None else own
 
     def extents(self, areas: Int64) -> Float64:
@@ -111,22 +111,22 @@ class HybridMap:
         common = areas < len(self.common.extents)
         found = np.zeros(len(areas))
         found[common] = self.common.extents[areas[common]]
-        own = np.isin(areas, list(self.areas))
-        found[own] = [extent(self.areas[area]) for area in areas[own].tolist()]
+        own = np.isin(areas, list(self.changed_areas))
+        found[own] = [extent(self.changed_areas[area]) for area in areas[own].tolist()]
         return found
 
-    def place(self, keyframe: int, area: int, pose: NDArray[np.float64]) -> None:
+    def set_keyframe(self, keyframe: int, area: int, pose: NDArray[np.float64]) -> None:
         """Put a keyframe into an area, made where missing, at ``area_T_base``."""
-        self._own(area)[keyframe] = pose
+        self._writable_area(area)[keyframe] = pose
 
-    def remove(self, keyframe: int, area: int) -> None:
+    def remove_keyframe(self, keyframe: int, area: int) -> None:
         """Take a keyframe out of an area."""
-        del self._own(area)[keyframe]
+        del self._writable_area(area)[keyframe]
 
-    def _own(self, area: int) -> dict[int, NDArray[np.float64]]:
-        if area not in self.areas:
-            self.areas[area] = dict(self.common.areas.get(area, {}))
-        return self.areas[area]
+    def _writable_area(self, area: int) -> dict[int, NDArray[np.float64]]:
+        if area not in self.changed_areas:
+            self.changed_areas[area] = dict(self.common.areas.get(area, {}))
+        return self.changed_areas[area]
 
     def arc(self, a: int, b: int) -> PoseGaussian | None:
         """The belief over ``a_T_b``, or None where no arc joins the two."""
@@ -137,25 +137,25 @@ class HybridMap:
 
     def arc_value(self, a: int, b: int) -> ArcValue | None:
         """The arc as stored, from the smaller to the larger area, or None."""
-        key = _stored_direction(a, b)
-        return self.arcs[key] if key in self.arcs else self.common.arcs.get(key)
+        key = _arc_key(a, b)
+        return self.changed_arcs[key] if key in self.changed_arcs else self.common.arcs.get(key)
 
     @property
-    def claimed_closures(self) -> dict[tuple[int, int], ArcValue]:
+    def pending_closures(self) -> dict[tuple[int, int], ArcValue]:
         """The arcs by which this hypothesis closed loops that the common map leaves open."""
         return {
             pair: arc
-            for pair, arc in self.arcs.items()
+            for pair, arc in self.changed_arcs.items()
             if arc is not None and arc.closure and pair not in self.common.arcs
         }
 
     def set_arc(self, a: int, b: int, pose: PoseGaussian, *, closure: bool) -> None:
         """Set or replace the arc between a and b from the belief over ``a_T_b``."""
-        self.arcs[_stored_direction(a, b)] = ArcValue(pose if a < b else pose.inverse(), closure)
+        self.changed_arcs[_arc_key(a, b)] = ArcValue(pose if a < b else pose.inverse(), closure)
 
     def remove_arc(self, a: int, b: int) -> None:
         """Take the arc between a and b out, if there is one."""
-        self.arcs[_stored_direction(a, b)] = None
+        self.changed_arcs[_arc_key(a, b)] = None
 
     def merge(self, area: int, into: int, into_T_area: PoseGaussian) -> None:
         """Make an area part of another; valid only when this is the one live hypothesis of ``common``.
@@ -166,12 +166,12 @@ class HybridMap:
 
         :param into_T_area: the belief over it.
         """
-        self.absorb()
+        self.commit()
         between = self.arc_value(into, area)
         for keyframe, pose in self.keyframes(area).items():
-            self.place(keyframe, into, se2.compose(into_T_area.mean, pose))
+            self.set_keyframe(keyframe, into, se2.compose(into_T_area.mean, pose))
         self.remove_arc(area, into)
-        arcs = {other: self.common.arcs[_stored_direction(area, other)] for other in self.neighbours(area)}
+        arcs = {other: self.common.arcs[_arc_key(area, other)] for other in self.neighbors(area)}
         entered = min((other for other, arc in arcs.items() if not arc.closure), default=None)
         loop = between is None or between.closure
         for other, arc in arcs.items():
@@ -179,23 +179,23 @@ class HybridMap:
             closure = arc.closure or (loop and other == entered)
             known, value = self.arc(into, other), self.arc_value(into, other)
             if known is not None and value is not None:
-                seen, closure = fused(known, seen, shared=1.0), value.closure and closure
+                seen, closure = fuse_traversals(known, seen, shared=1.0), value.closure and closure
             self.remove_arc(area, other)
             self.set_arc(into, other, seen, closure=closure)
-        self.absorb()
+        self.commit()
         self.common.remove_area(area)
 
-    def neighbours(self, area: int) -> list[int]:
+    def neighbors(self, area: int) -> list[int]:
         """The areas one arc away, ascending."""
-        found = set(self.common.neighbours(area))
-        for (a, b), arc in self.arcs.items():
+        found = set(self.common.neighbors(area))
+        for (a, b), arc in self.changed_arcs.items():
             if area in (a, b):
                 (found.discard if arc is None else found.add)(b if a == area else a)
         return sorted(found)
 
     def all_arcs(self) -> Iterator[tuple[int, int, ArcValue]]:
         """All arcs as (a, b, value) with a < b, ascending."""
-        keys = self.common.arcs.keys() | self.arcs.keys()
+        keys = self.common.arcs.keys() | self.changed_arcs.keys()
         for a, b in sorted(keys):
             value = self.arc_value(a, b)
             if value is not None:

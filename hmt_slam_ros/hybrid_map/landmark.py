@@ -26,7 +26,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from hmt_slam_ros.arrays import Float64
-from hmt_slam_ros.configuration.landmarks import Features
+from hmt_slam_ros.configuration.landmarks import FeatureParameters
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 
 
@@ -36,41 +36,41 @@ class Existence:
 
     :ivar confidence: mean of the extraction confidences, in [0, 1].
     :ivar presence: r, the probability that it is still there, in [0, 1].
-    :ivar seen: at how many visits it was seen, 1 or more.
-    :ivar missed: at how many it should have been and was not.
-    :ivar away: whether the robot was away since.
+    :ivar detections: at how many visits it was seen, 1 or more.
+    :ivar misses: at how many it should have been and was not.
+    :ivar robot_was_away: whether the robot was away since.
     """
 
     confidence: float
     presence: float = 1.0
-    seen: int = 1
-    missed: int = 0
-    away: bool = False
+    detections: int = 1
+    misses: int = 0
+    robot_was_away: bool = False
 
     @property
     def probability(self) -> float:
         """p_lmap, in [0, 1]."""
         return self.confidence * self.presence
 
-    def after_sight(self, confidence: float, features: Features) -> Existence:
+    def update_on_detection(self, confidence: float, features: FeatureParameters) -> Existence:
         """It was seen, with an extraction confidence p_l."""
-        seen = self.seen + 1
+        seen = self.detections + 1
         mean = self.confidence + (confidence - self.confidence) / seen  # Eq. (4)
-        presence = self._present(features.landmark_detected, features.landmark_by_chance, features)
-        return replace(self, confidence=mean, presence=presence, seen=seen, away=False)
+        presence = self._update_presence(features.landmark_detected, features.landmark_by_chance, features)
+        return replace(self, confidence=mean, presence=presence, detections=seen, robot_was_away=False)
 
-    def after_miss(self, features: Features) -> Existence:
+    def update_on_miss(self, features: FeatureParameters) -> Existence:
         """It should have been seen and was not."""
-        presence = self._present(1.0 - features.landmark_detected, 1.0 - features.landmark_by_chance, features)
-        return replace(self, presence=presence, missed=self.missed + 1, away=False)
+        presence = self._update_presence(1.0 - features.landmark_detected, 1.0 - features.landmark_by_chance, features)
+        return replace(self, presence=presence, misses=self.misses + 1, robot_was_away=False)
 
-    def after_absence(self) -> Existence:
+    def mark_absence(self) -> Existence:
         """Nobody looked for a while."""
-        return replace(self, away=True)
+        return replace(self, robot_was_away=True)
 
-    def _present(self, likelihood: float, otherwise: float, features: Features) -> float:
+    def _update_presence(self, likelihood: float, otherwise: float, features: FeatureParameters) -> float:
         """Bayes' rule, for something that is there or not."""
-        lasting = features.landmark_lasting * (features.landmark_lasting_away if self.away else 1.0)
+        lasting = features.landmark_lasting * (features.landmark_lasting_away if self.robot_was_away else 1.0)
         prior = lasting * self.presence
         return likelihood * prior / (likelihood * prior + otherwise * (1.0 - prior))
 
@@ -86,7 +86,7 @@ class Landmark:
     :ivar width_deviation: of this, m.
     :ivar existence: whether it is there.
     :ivar scatter: shape (3, 3), sum of the squares of its sightings about their mean, each in deviations.
-    :ivar by_scans: shape (3, 3), what part of their covariances is the scans' own, in deviations, on average.
+    :ivar scan_covariance_share: shape (3, 3), what part of their covariances is the scans' own, in deviations, on average.
     """
 
     kind: int
@@ -95,9 +95,9 @@ class Landmark:
     width_deviation: float
     existence: Existence
     scatter: Float64 = field(default_factory=lambda: np.zeros((3, 3)))
-    by_scans: Float64 = field(default_factory=lambda: np.zeros((3, 3)))
+    scan_covariance_share: Float64 = field(default_factory=lambda: np.zeros((3, 3)))
 
-    def located(self, ratio: Float64) -> PoseGaussian:
+    def pose_from_scatter(self, ratio: Float64) -> PoseGaussian:
         """The belief over its pose by how far its sightings are apart.
 
         What is stated of a sighting is scaled by the scatter of all n, one more being as those of its area. Errors of
@@ -105,6 +105,6 @@ class Landmark:
 
         :param ratio: of its area, see `scatter_ratio`.
         """
-        n = self.existence.seen
+        n = self.existence.detections
         own = np.linalg.cholesky(self.pose.covariance) @ np.linalg.cholesky((ratio + self.scatter) / n)
-        return PoseGaussian(self.pose.mean, own @ (np.eye(3) - (1.0 - 1.0 / n) * self.by_scans) @ own.T)
+        return PoseGaussian(self.pose.mean, own @ (np.eye(3) - (1.0 - 1.0 / n) * self.scan_covariance_share) @ own.T)

@@ -28,7 +28,7 @@ _SMALL_ANGLE, _SERIES_ANGLE = 1e-4, 1e-2
 
 
 @njit(cache=True)
-def linearised(poses: Float64, sources: Int64, targets: Int64, measured: Float64) -> tuple[Float64, Float64, Float64]:
+def linearize(poses: Float64, sources: Int64, targets: Int64, measured: Float64) -> tuple[Float64, Float64, Float64]:
     """Residuals (m, 3) of the edges and their Jacobians (m, 3, 3) with respect to source and target.
 
     :param poses: shape (n, 3), of the nodes.
@@ -88,7 +88,7 @@ def _right_jacobian_inverse(xi: Float64, result: Float64) -> None:
     result[2, 2] = 1.0
 
 
-class Pattern(NamedTuple):
+class SparsityPattern(NamedTuple):
     """Where the blocks of every edge stand in the normal matrix, in compressed columns.
 
     :ivar indices: rows of the entries; ``starts``, shape (columns + 1,), where each column begins among them.
@@ -103,7 +103,7 @@ class Pattern(NamedTuple):
     stride: Int64
 
 
-def pattern(rows: Int64, columns: Int64, nodes: int) -> Pattern:
+def sparsity_pattern(rows: Int64, columns: Int64, nodes: int) -> SparsityPattern:
     """The pattern of blocks that stand at given places.
 
     :param rows: shape (m, 4), node of each block's rows, -1 where it is fixed; ``columns`` likewise.
@@ -122,17 +122,17 @@ def pattern(rows: Int64, columns: Int64, nodes: int) -> Pattern:
     indices = np.empty(9 * len(places), np.int32)
     entry = own[:, None, None] + 3 * in_column[column][:, None, None] * np.arange(3)[:, None] + np.arange(3)
     indices[entry] = 3 * row[:, None, None] + np.arange(3)
-    return Pattern(indices, starts, first, stride)
+    return SparsityPattern(indices, starts, first, stride)
 
 
-def normal_matrix(where: Pattern, of_source: Float64, of_target: Float64, information: Float64) -> csc_matrix:
+def normal_matrix(pattern: SparsityPattern, of_source: Float64, of_target: Float64, information: Float64) -> csc_matrix:
     """The sum of J^T Omega J over all edges.
 
     :param information: shape (m, 3, 3), of the edges.
     """
-    size = len(where.starts) - 1
-    entries = _entries(where.first, where.stride, len(where.indices), of_source, of_target, information)
-    return csc_matrix((entries, where.indices, where.starts), shape=(size, size))
+    size = len(pattern.starts) - 1
+    entries = _entries(pattern.first, pattern.stride, len(pattern.indices), of_source, of_target, information)
+    return csc_matrix((entries, pattern.indices, pattern.starts), shape=(size, size))
 
 
 @njit(cache=True)
@@ -204,7 +204,7 @@ class Solution:
     steps: int
 
 
-def optimise(
+def optimize(
     initial: NDArray[np.float64],
     edges: Edges,
     fixed: int = 0,
@@ -287,7 +287,7 @@ class _System:
         row = np.full(nodes, -1)
         row[self._free] = np.arange(nodes - 1)
         i, j = row[edges.sources], row[edges.targets]
-        self._pattern = pattern(np.stack((i, i, j, j), 1), np.stack((i, j, i, j), 1), nodes - 1)
+        self._pattern = sparsity_pattern(np.stack((i, i, j, j), 1), np.stack((i, j, i, j), 1), nodes - 1)
 
     def _require_connected(self, fixed: int) -> None:
         ones = np.ones(len(self._edges.sources))
@@ -299,7 +299,7 @@ class _System:
 
     def evaluate(self, poses: NDArray[np.float64]) -> _State:
         """Residuals, Jacobians and cost at given poses, shape (n, 3)."""
-        residuals, of_source, of_target = linearised(poses, self._edges.sources, self._edges.targets, self._edges.poses)
+        residuals, of_source, of_target = linearize(poses, self._edges.sources, self._edges.targets, self._edges.poses)
         chi2 = np.einsum("mi,mij,mj->m", residuals, self._information, residuals)
         return _State(residuals, of_source, of_target, chi2, float(chi2.sum()))
 

@@ -22,13 +22,13 @@ from scipy.special import ndtri
 
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.geometry.covariance import carried, of_inverse
+from hmt_slam_ros.geometry.covariance import inverse_pose_covariance, propagate_covariance
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
-from hmt_slam_ros.hybrid_map.shortest_path import Reached, reachable
+from hmt_slam_ros.hybrid_map.shortest_path import ShortestPaths, shortest_path_beliefs
 from hmt_slam_ros.registration.likelihood_grid import AreaGrid, GridModel, Points, build_area_grid
 from hmt_slam_ros.sensors import Scan
-from hmt_slam_ros.sensors.polar_scan import FREE, seen, view_of
+from hmt_slam_ros.sensors.polar_scan import FREE, classify_points, to_polar_scan
 
 _DRAWS = 512
 # Log-ratio above which a cell bars the view, and the share of a line of sight that has to be known as free.
@@ -38,17 +38,17 @@ _NOWHERE = -1
 
 
 @dataclass(frozen=True, eq=False)
-class Place:
+class AreaPlace:
     """An area's keyframes among those of its surroundings.
 
     :ivar area: the area.
-    :ivar owners: shape (k,), int64, the area of every keyframe of the area and its surroundings.
+    :ivar keyframe_areas: shape (k,), int64, the area of every keyframe of the area and its surroundings.
     :ivar positions: shape (k, 2), where they were taken, m, area frame.
     :ivar grid: what these keyframes saw, area frame.
     """
 
     area: int
-    owners: NDArray[np.int64]
+    keyframe_areas: NDArray[np.int64]
     positions: NDArray[np.float64]
     grid: AreaGrid
 
@@ -60,7 +60,7 @@ class Transition(NamedTuple):
     new: float
 
 
-def transition(shares: Mapping[int, float], new_floor: float) -> Transition:
+def transition_model(shares: Mapping[int, float], new_floor: float) -> Transition:
     """The transition model from the probability of every place by itself.
 
     Those were computed one by one, and may add up to more than 1 where beliefs over areas side by side disagree. New
@@ -73,54 +73,56 @@ def transition(shares: Mapping[int, float], new_floor: float) -> Transition:
     return Transition({area: scale * share for area, share in shares.items()}, new if total > 0.0 else 1.0)
 
 
-def owner_at(place: Place, poses: NDArray[np.float64], radius: float) -> int | None:
+def containing_area(place: AreaPlace, poses: NDArray[np.float64], radius: float) -> int | None:
     """The area in whose place most of the keyframes lie, or None where most lie in no place.
 
     :param poses: shape (m, 3), ``area_T_base`` of the keyframes in the place's frame.
     :param radius: farthest distance to a keyframe of the place, m.
     """
-    owner = int(_owners(place, poses[None, :, :2], radius)[0])
+    owner = int(_containing_areas(place, poses[None, :, :2], radius)[0])
     return None if owner == _NOWHERE else owner
 
 
-class Entry(NamedTuple):
+class EntryPrior(NamedTuple):
     """How the keyframes come to lie in an area's place, by the arcs.
 
-    :ivar share: pi(gamma), the probability that they do, exactly 0 where no draw says so.
-    :ivar typical: squared Mahalanobis distance from the belief's mean of half of the poses in which they do.
+    :ivar probability: pi(gamma), the probability that they do, exactly 0 where no draw says so.
+    :ivar median_mahalanobis2: squared Mahalanobis distance from the belief's mean of half of the poses in which they do.
     """
 
-    share: float
-    typical: float
+    probability: float
+    median_mahalanobis2: float
 
 
-def entry(place: Place, belief: PoseGaussian, poses: NDArray[np.float64], radius: float) -> Entry:
+def entry_prior(place: AreaPlace, belief: PoseGaussian, poses: NDArray[np.float64], radius: float) -> EntryPrior:
     """The probability of a place, and what poses it is made of.
 
     :param belief: over ``area_T_reference``.
     :param poses: shape (m, 3), ``reference_T_base`` of the keyframes.
     :param radius: farthest distance to a keyframe of the place, m.
     """
-    inside = _owners(place, _drawn_positions(belief, poses), radius) == place.area
+    inside = _containing_areas(place, _sampled_positions(belief, poses), radius) == place.area
     distances = np.sum(_normal_points()[inside] ** 2, axis=1)
-    return Entry(float(np.mean(inside)), float(np.median(distances)) if inside.any() else 0.0)
+    return EntryPrior(float(np.mean(inside)), float(np.median(distances)) if inside.any() else 0.0)
 
 
-def entry_bound(known: NDArray[np.float64], belief: PoseGaussian, poses: NDArray[np.float64], radius: float) -> float:
+def sampled_entry_bound(
+    known: NDArray[np.float64], belief: PoseGaussian, poses: NDArray[np.float64], radius: float
+) -> float:
     """No less than the share of :func:`entry`, whatever is around the area, from its keyframes' positions (k, 2) alone.
 
     One of the keyframes in question at least has to be near to one of the area's.
     """
-    return float(np.mean(_any_near(_drawn_positions(belief, poses), known, radius)))
+    return float(np.mean(_any_near(_sampled_positions(belief, poses), known, radius)))
 
 
-def _drawn_positions(belief: PoseGaussian, poses: NDArray[np.float64]) -> NDArray[np.float64]:
+def _sampled_positions(belief: PoseGaussian, poses: NDArray[np.float64]) -> NDArray[np.float64]:
     """Positions of keyframes (m, 3) under draws from the belief over their reference, shape (draws, m, 2)."""
-    return _placed(_normal_points(), belief.mean, np.linalg.cholesky(belief.covariance), poses)
+    return _transformed_positions(_normal_points(), belief.mean, np.linalg.cholesky(belief.covariance), poses)
 
 
 @njit(cache=True)
-def _placed(
+def _transformed_positions(
     normal: NDArray[np.float64], mean: NDArray[np.float64], root: NDArray[np.float64], poses: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Positions of the poses (m, 3) that are carried by ``mean exp(root normal)``, for each of n points (n, 3)."""
@@ -164,10 +166,10 @@ def _normal_points() -> NDArray[np.float64]:
     return np.asarray(ndtri((0.5 + steps) % 1.0), dtype=np.float64)
 
 
-def _owners(place: Place, positions: NDArray[np.float64], radius: float) -> NDArray[np.int64]:
+def _containing_areas(place: AreaPlace, positions: NDArray[np.float64], radius: float) -> NDArray[np.int64]:
     """The area that most of the m positions (n, m, 2) belong to, shape (n,); of equals the smallest."""
     count, size = positions.shape[:2]
-    nearest = _nearest_in_sight(
+    nearest = _nearest_visible(
         positions.reshape(-1, 2),
         place.positions,
         radius,
@@ -176,15 +178,15 @@ def _owners(place: Place, positions: NDArray[np.float64], radius: float) -> NDAr
         place.grid.origin,
         place.grid.cell,
     )
-    owners = np.where(nearest < 0, _NOWHERE, place.owners[nearest]).reshape(count, size)
-    areas = np.unique(place.owners)
+    owners = np.where(nearest < 0, _NOWHERE, place.keyframe_areas[nearest]).reshape(count, size)
+    areas = np.unique(place.keyframe_areas)
     votes = np.sum(owners[:, :, None] == areas, axis=1)
     outside = 2 * votes.sum(axis=1) < size
     return np.where(outside, _NOWHERE, areas[votes.argmax(axis=1)])
 
 
 @njit(cache=True)
-def _nearest_in_sight(
+def _nearest_visible(
     positions: NDArray[np.float64],
     keyframes: NDArray[np.float64],
     radius: float,
@@ -203,14 +205,14 @@ def _nearest_in_sight(
             nearest = distance2.argmin()
             if distance2[nearest] > radius * radius:
                 break
-            if _in_sight(positions[n], keyframes[nearest], log_ratio, free, origin, cell):
+            if _is_visible(positions[n], keyframes[nearest], log_ratio, free, origin, cell):
                 found[n] = nearest
             distance2[nearest] = np.inf
     return found
 
 
 @njit(cache=True)
-def _in_sight(
+def _is_visible(
     start: NDArray[np.float64],
     end: NDArray[np.float64],
     log_ratio: NDArray[np.float32],
@@ -239,10 +241,10 @@ Pose = NDArray[np.float64]
 # An area has few others around it; this bounds the work where hundreds are joined by tight arcs.
 _MOST_AROUND = 64
 # Grids are kept up to this size, bytes: those of some ten places of a large building.
-_KEPT = 4 << 23
+_CACHE_BYTES = 4 << 23
 
 
-WHOLE_MAP = 4 * _KEPT
+WHOLE_MAP_CACHE_BYTES = 4 * _CACHE_BYTES
 """The same where a whole map is looked through again and again, while it is not known where the robot is, bytes."""
 
 # What the bounds on distances have in hand, m, and the smallest that is not 0.
@@ -250,54 +252,57 @@ _ROUNDING, _SMALLEST = 1e-6, 1e-300
 
 
 @dataclass(frozen=True)
-class Nearness:
+class Neighborhood:
     """What counts as around an area.
 
-    :ivar sigma: largest deviation of an area's position, m.
-    :ivar reach: largest distance between the nearest keyframes of the two, m.
+    :ivar max_sigma: largest deviation of an area's position, m.
+    :ivar max_distance: largest distance between the nearest keyframes of the two, m.
     """
 
-    sigma: float
-    reach: float
+    max_sigma: float
+    max_distance: float
 
 
 def areas_around(
-    hybrid_map: HybridMap, area: int, nearness: Nearness, without: Collection[int] = ()
+    hybrid_map: HybridMap, area: int, neighborhood: Neighborhood, excluded: Collection[int] = ()
 ) -> dict[int, PoseGaussian]:
     """{other area: belief over ``area_T_other``}, the area itself first, then by growing uncertainty."""
-    beliefs = reachable(hybrid_map, area, nearness.sigma**2, _MOST_AROUND)
-    here = positions(hybrid_map, area, np.zeros(3))
+    beliefs = shortest_path_beliefs(hybrid_map, area, neighborhood.max_sigma**2, _MOST_AROUND)
+    here = keyframe_positions(hybrid_map, area, np.zeros(3))
     found = {}
     for other, belief in beliefs.items():
-        near = other == area or gap(here, positions(hybrid_map, other, belief.mean)) <= nearness.reach
-        if near and other not in without:
+        near = (
+            other == area
+            or min_distance(here, keyframe_positions(hybrid_map, other, belief.mean)) <= neighborhood.max_distance
+        )
+        if near and other not in excluded:
             found[other] = belief
     return found
 
 
-def stacked(poses: Mapping[int, Pose]) -> NDArray[np.float64]:
+def stack_poses(poses: Mapping[int, Pose]) -> NDArray[np.float64]:
     """The poses as an array, shape (n, 3)."""
     return np.array(list(poses.values())).reshape(-1, 3)
 
 
-def same_poses(one: Mapping[int, Pose], other: Mapping[int, Pose]) -> bool:
+def has_same_poses(one: Mapping[int, Pose], other: Mapping[int, Pose]) -> bool:
     """Whether the same keyframes are in the same places."""
     return one.keys() == other.keys() and all(np.array_equal(pose, other[k]) for k, pose in one.items())
 
 
-def positions(hybrid_map: HybridMap, area: int, pose: Pose) -> NDArray[np.float64]:
+def keyframe_positions(hybrid_map: HybridMap, area: int, pose: Pose) -> NDArray[np.float64]:
     """Positions of an area's keyframes, shape (n, 2), where the area's frame stands at ``pose``."""
-    return se2.transform(pose, stacked(hybrid_map.keyframes(area))[:, :2])
+    return se2.transform(pose, stack_poses(hybrid_map.keyframes(area))[:, :2])
 
 
-def gap(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
+def min_distance(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
     """Distance between the nearest points of two sets (n, 2), (m, 2), m; inf where one is empty."""
     between = a[:, None] - b[None]
     return float(np.hypot(between[..., 0], between[..., 1]).min(initial=np.inf))
 
 
-def entry_bounds(
-    found: Reached, query: PoseGaussian, lever: float, reach: Float64, scale: float, deviations: float
+def quick_entry_bounds(
+    found: ShortestPaths, query: PoseGaussian, lever: float, reach: Float64, scale: float, deviations: float
 ) -> Float64:
     """Bounds, quick to tell, on the probability that a query lies in the places of areas, shape (n,).
 
@@ -310,11 +315,13 @@ def entry_bounds(
     :param scale: factor on the deviations of the prior.
     :param deviations: how many deviations are admitted.
     """
-    return _entry_bounds(found.means, found.covariances, query.mean, query.covariance, reach, lever, scale, deviations)
+    return _quick_entry_bounds(
+        found.means, found.covariances, query.mean, query.covariance, reach, lever, scale, deviations
+    )
 
 
 @njit(cache=True)
-def _entry_bounds(
+def _quick_entry_bounds(
     means: Float64,
     covariances: Float64,
     mean: Float64,
@@ -334,7 +341,9 @@ def _entry_bounds(
         widest += lever * (turn + np.sqrt(covariance[2, 2]))
         if distance > reach[n] + deviations * scale * widest + 2.0 * _ROUNDING:
             continue
-        prior = scale * scale * (carried(of_inverse(covariances[n], means[n]), mean) + covariance)
+        prior = (
+            scale * scale * (propagate_covariance(inverse_pose_covariance(covariances[n], means[n]), mean) + covariance)
+        )
         half, apart = 0.5 * (prior[0, 0] + prior[1, 1]), 0.5 * (prior[0, 0] - prior[1, 1])
         turn = np.sqrt(apart * apart + prior[0, 1] * prior[0, 1])
         spread = np.sqrt(max(0.0, half + turn)) + lever * np.sqrt(max(0.0, prior[2, 2]))
@@ -348,7 +357,7 @@ def _entry_bounds(
     return bounds
 
 
-def agreeing(
+def consistent_pose(
     belief: PoseGaussian, area: int, other: int, global_poses: Mapping[int, PoseGaussian], gate: float
 ) -> Pose:
     """``area_T_other`` as the globally consistent map has it, where that agrees with the belief, else its mean.
@@ -364,18 +373,20 @@ def agreeing(
     return pose if agrees else belief.mean
 
 
-class Views:
+class GridCache:
     """Grids and places, built from the keyframes' scans and kept while they are in use."""
 
-    def __init__(self, scans: Mapping[int, Scan], model: GridModel, nearness: Nearness, kept: int = _KEPT) -> None:
+    def __init__(
+        self, scans: Mapping[int, Scan], model: GridModel, neighborhood: Neighborhood, max_bytes: int = _CACHE_BYTES
+    ) -> None:
         """:param scans: {keyframe: scan}, which may grow.
 
-        :param kept: size of the grids that are kept, bytes.
+        :param max_bytes: size of the grids that are kept, bytes.
         """
         self._scans = scans
-        self._kept = kept
+        self._max_bytes = max_bytes
         self._model = model
-        self._nearness = nearness
+        self._neighborhood = neighborhood
         self._grids: OrderedDict[bytes, AreaGrid] = OrderedDict()
 
     def clear(self) -> None:
@@ -384,64 +395,68 @@ class Views:
 
     def grid(self, keyframes: Mapping[int, Pose]) -> AreaGrid:
         """What the keyframes saw, placed at the given poses."""
-        poses = stacked(keyframes)
+        poses = stack_poses(keyframes)
         key = np.array(list(keyframes), dtype=np.int64).tobytes() + poses.tobytes()
         if key not in self._grids:
             self._grids[key] = build_area_grid([self._scans[k] for k in keyframes], poses, self._model)
-            self._drop_oldest()
+            self._evict_oldest()
         self._grids.move_to_end(key)
         return self._grids[key]
 
-    def lasting(self, keyframes: Mapping[int, Pose]) -> Points:
+    def static_points(self, keyframes: Mapping[int, Pose]) -> Points:
         """Surface points of the keyframes, shape (n, 2), m, that none of them sees through: nobody who walked by."""
         points = self.grid(keyframes).points
         passed = np.zeros(len(points), dtype=np.bool_)
         for keyframe, pose in keyframes.items():
-            passed |= seen(view_of(self._scans[keyframe]), se2.transform(se2.inverse(pose), points)) == FREE
+            passed |= (
+                classify_points(to_polar_scan(self._scans[keyframe]), se2.transform(se2.inverse(pose), points)) == FREE
+            )
         return points[~passed]
 
-    def _drop_oldest(self) -> None:
+    def _evict_oldest(self) -> None:
         """Forget the grids that were not used for longest, but not the newest."""
         size = sum(grid.nbytes for grid in self._grids.values())
-        while size > self._kept and len(self._grids) > 1:
+        while size > self._max_bytes and len(self._grids) > 1:
             size -= self._grids.popitem(last=False)[1].nbytes
 
     def forget(self) -> None:
         """Forget all grids."""
         self._grids.clear()
 
-    def seen_before(self, hybrid_map: HybridMap, poses: Mapping[int, Pose], keyframe: int) -> AreaGrid:
+    def grid_before(self, hybrid_map: HybridMap, poses: Mapping[int, Pose], keyframe: int) -> AreaGrid:
         """What keyframes before a given one saw, of the areas that stand at ``poses``, {area: pose}."""
         old: dict[int, Pose] = {}
         for area, pose in poses.items():
             placed = {k: at for k, at in hybrid_map.keyframes(area).items() if k < keyframe}
-            old |= zip(placed, se2.compose(pose, stacked(placed)), strict=True)
+            old |= zip(placed, se2.compose(pose, stack_poses(placed)), strict=True)
         return self.grid(old)
 
     def place(
         self,
         hybrid_map: HybridMap,
         area: int,
-        without: Collection[int],
+        excluded: Collection[int],
         before: float = math.inf,
-        sigma: float | None = None,
-    ) -> Place:
+        max_sigma: float | None = None,
+    ) -> AreaPlace:
         """An area with those around it, so that an overlap is not cut off at the area's edge.
 
-        :param without: areas that are left out.
+        :param excluded: areas that are left out.
         :param before: keyframes from this one on are left out as well.
-        :param sigma: largest deviation of another area's position, m, if not that which counts as around elsewhere.
+        :param max_sigma: largest deviation of another area's position, m, if not that which counts as around elsewhere.
         """
-        nearness = self._nearness if sigma is None else replace(self._nearness, sigma=sigma)
-        around = areas_around(hybrid_map, area, nearness, without)
-        return self.place_of(hybrid_map, area, {other: belief.mean for other, belief in around.items()}, before)
+        nearness = self._neighborhood if max_sigma is None else replace(self._neighborhood, max_sigma=max_sigma)
+        around = areas_around(hybrid_map, area, nearness, excluded)
+        return self.place_among(hybrid_map, area, {other: belief.mean for other, belief in around.items()}, before)
 
-    def place_of(self, hybrid_map: HybridMap, area: int, poses: Mapping[int, Pose], before: float = math.inf) -> Place:
+    def place_among(
+        self, hybrid_map: HybridMap, area: int, poses: Mapping[int, Pose], before: float = math.inf
+    ) -> AreaPlace:
         """The place of ``area`` among the areas that stand at ``poses``, {other area: ``area_T_other``}."""
         keyframes: dict[int, Pose] = {}
         owners: list[int] = []
         for other, pose in poses.items():
             placed = {k: at for k, at in hybrid_map.keyframes(other).items() if k < before}
-            keyframes |= zip(placed, se2.compose(pose, stacked(placed)), strict=True)
+            keyframes |= zip(placed, se2.compose(pose, stack_poses(placed)), strict=True)
             owners += [other] * len(placed)
-        return Place(area, np.array(owners, dtype=np.int64), stacked(keyframes)[:, :2], self.grid(keyframes))
+        return AreaPlace(area, np.array(owners, dtype=np.int64), stack_poses(keyframes)[:, :2], self.grid(keyframes))

@@ -16,23 +16,23 @@ from typing import NamedTuple
 import numpy as np
 
 from hmt_slam_ros.arrays import Float64, Int64
-from hmt_slam_ros.configuration.landmarks import Features
-from hmt_slam_ros.grids.virtual_scan import virtual_scan
+from hmt_slam_ros.configuration.landmarks import FeatureParameters
+from hmt_slam_ros.grids.virtual_scan import cast_virtual_scan
 from hmt_slam_ros.landmarks.beam_labels import Rays
-from hmt_slam_ros.landmarks.virtual_lines import rays_of_map
+from hmt_slam_ros.landmarks.virtual_lines import rays_from_virtual_scan
 from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.submap.local_mapping import LocalMapping
 
 # Sectors of the circle, an even number, in each of which the median beam counts, so that no single beam decides; and
 # how many axes have to be known.
-_SECTORS, _KNOWN = 72, 18
-NOTHING_AROUND = np.full(_SECTORS, np.nan)
+_SECTORS, _MIN_CHORDS = 72, 18
+UNKNOWN_DISTANCES = np.full(_SECTORS, np.nan)
 """How far one sees in every sector before the first scan."""
 
 # Nobody sees farther along a hallway than this, m; so a length does not depend on the laser's reach.
-_FAR = 10.0
+_MAX_DISTANCE = 10.0
 # Share of the axes along which a space is no longer than its length.
-_LENGTH = 0.925
+_LENGTH_QUANTILE = 0.925
 
 
 class FreeSpace(NamedTuple):
@@ -50,58 +50,58 @@ class AreaClass(NamedTuple):
     """What an area is.
 
     :ivar probability: that it is a hallway.
-    :ivar hallway: what it is taken for.
+    :ivar is_hallway: what it is taken for.
     """
 
     probability: float
-    hallway: bool
+    is_hallway: bool
 
 
-def free_space(rays: Rays) -> FreeSpace | None:
+def measure_free_space(rays: Rays) -> FreeSpace | None:
     """The open space that beams from one place show; None where they show less than half of its axes.
 
     :param rays: of a scan all around, real or virtual.
     """
-    return space_within(distances_around(rays))
+    return space_from_distances(distances_around(rays))
 
 
 def distances_around(rays: Rays) -> Float64:
     """How far one sees in every sector of the circle from -pi on, m, shape (72,); nan where no beam tells."""
     bearings = np.arctan2(rays.directions[:, 1], rays.directions[:, 0])
-    sectors = sector_of(bearings)
-    order = np.lexsort((rays.free, sectors))
+    sectors = sector_indices(bearings)
+    order = np.lexsort((rays.free_range, sectors))
     bounds = np.searchsorted(sectors[order], np.arange(_SECTORS + 1))
     told = np.flatnonzero(np.diff(bounds))
     # The two in the middle of each sector, which are one where their number is odd.
     total = bounds[told] + bounds[told + 1]
-    middle = rays.free[order[np.stack(((total - 1) // 2, total // 2))]]
+    middle = rays.free_range[order[np.stack(((total - 1) // 2, total // 2))]]
     away = np.full(_SECTORS, np.nan)
-    away[told] = np.minimum(_FAR, middle.mean(axis=0))
+    away[told] = np.minimum(_MAX_DISTANCE, middle.mean(axis=0))
     return away
 
 
-def sector_of(bearings: Float64) -> Int64:
+def sector_indices(bearings: Float64) -> Int64:
     """The sectors that bearings of any shape, rad, lie in."""
     return np.floor((bearings + math.pi) / (2.0 * math.pi) * _SECTORS).astype(np.int64) % _SECTORS
 
 
-def space_within(away: Float64) -> FreeSpace | None:
+def space_from_distances(away: Float64) -> FreeSpace | None:
     """The open space by how far one sees around, as `distances_around` has it."""
     half = _SECTORS // 2
     chords = away[:half] + away[half:]
     chords = chords[np.isfinite(chords)]
-    if chords.size < _KNOWN:
+    if chords.size < _MIN_CHORDS:
         return None
-    return FreeSpace(float(chords.min()), float(np.quantile(chords, _LENGTH)))
+    return FreeSpace(float(chords.min()), float(np.quantile(chords, _LENGTH_QUANTILE)))
 
 
-def log_odds(space: FreeSpace, features: Features) -> float:
+def hallway_log_odds(space: FreeSpace, features: FeatureParameters) -> float:
     """Log-odds of a space being a hallway, nats."""
     width, ratio = math.log(max(space.width, 1e-3)), math.log(max(space.length / max(space.width, 1e-3), 1e-3))
     return features.hallway_bias + features.hallway_width * width + features.hallway_ratio * ratio
 
 
-def shortest_hallway(width: float, features: Features) -> float:
+def min_hallway_length(width: float, features: FeatureParameters) -> float:
     """From which length on a space of a width is a hallway rather than a room, m; inf where length tells of none."""
     if features.hallway_ratio <= 0.0:
         return math.inf
@@ -109,24 +109,24 @@ def shortest_hallway(width: float, features: Features) -> float:
     return math.exp(logarithm - (features.hallway_bias + features.hallway_width * logarithm) / features.hallway_ratio)
 
 
-def area_class(spaces: Iterable[FreeSpace], features: Features) -> AreaClass:
+def classify_area(spaces: Iterable[FreeSpace], features: FeatureParameters) -> AreaClass:
     """What an area is by the spaces around its keyframes, in the order in which they were taken.
 
     :raises ValueError: where there is none.
     """
     total, count, taken, probability = 0.0, 0, None, 0.5
     for space in spaces:
-        total, count = total + log_odds(space, features), count + 1
+        total, count = total + hallway_log_odds(space, features), count + 1
         probability = 1.0 / (1.0 + math.exp(-max(-50.0, min(50.0, total / count))))
-        taken = after(taken, probability, features)
+        taken = decide_hallway(taken, probability, features)
     if taken is None:
         raise ValueError("an area has no keyframe around which enough is known to tell a hallway from a room")
     return AreaClass(probability, taken)
 
 
-def after(taken: bool | None, probability: float, features: Features) -> bool:
-    """What is taken for a hallway at its present probability and was ``taken`` for one before; None for not yet."""
-    bound = 0.5 if taken is None else 1.0 - features.hallway_sure if taken else features.hallway_sure
+def decide_hallway(was_hallway: bool | None, probability: float, features: FeatureParameters) -> bool:
+    """What is taken for a hallway at its present probability and was ``was_hallway`` for one before; None for not yet."""
+    bound = 0.5 if was_hallway is None else 1.0 - features.hallway_sure if was_hallway else features.hallway_sure
     return probability >= bound
 
 
@@ -134,13 +134,13 @@ def after(taken: bool | None, probability: float, features: Features) -> bool:
 _BEAMS, _REACH = 360, 10.0
 
 
-class AreaKinds:
+class AreaClassifier:
     """Tells areas apart, one after the other; what it needs to do so is made once."""
 
     def __init__(self, mapping: LocalMapping) -> None:
         self._mapping, self._features = mapping, mapping.configuration.features
 
-    def of(self, scans: Iterable[Scan], poses: Float64) -> AreaClass | None:
+    def classify(self, scans: Iterable[Scan], poses: Float64) -> AreaClass | None:
         """What an area is; None where too little is known around its keyframes.
 
         :param scans: of its keyframes, in the order in which they were taken.
@@ -148,9 +148,11 @@ class AreaKinds:
         """
         table = self._mapping.pool.empty_table()
         for scan, pose in zip(scans, poses, strict=True):
-            self._mapping.insert(table[None], np.ascontiguousarray(pose[None]), scan)
+            self._mapping.insert_scan(table[None], np.ascontiguousarray(pose[None]), scan)
         view = self._mapping.pool.view(table)
-        virtual = (virtual_scan(view, pose, _BEAMS, _REACH) for pose in poses)
-        spaces = [space for own in virtual if (space := free_space(rays_of_map(own, self._features)))]
+        virtual = (cast_virtual_scan(view, pose, _BEAMS, _REACH) for pose in poses)
+        spaces = [
+            space for own in virtual if (space := measure_free_space(rays_from_virtual_scan(own, self._features)))
+        ]
         self._mapping.pool.release(table)
-        return area_class(spaces, self._features) if spaces else None
+        return classify_area(spaces, self._features) if spaces else None

@@ -14,7 +14,7 @@ import numpy as np
 from numba import njit
 
 from hmt_slam_ros.arrays import Bool, Float64, Int64
-from hmt_slam_ros.configuration.landmarks import Features
+from hmt_slam_ros.configuration.landmarks import FeatureParameters
 from hmt_slam_ros.landmarks.line_extraction import Lines
 
 _X, _Y, _HEADING, _CONVEX, _SUPPORT, _COVARIANCE, _SIZE = 0, 1, 2, 3, 4, 5, 14
@@ -39,22 +39,22 @@ NO_CORNERS = Corners(np.empty((0, 3)), np.empty((0, 3, 3)), np.empty(0, np.bool_
 """What is followed where openings alone are asked for."""
 
 
-def corners_of(lines: Lines, features: Features) -> Corners:
+def extract_corners(lines: Lines, features: FeatureParameters) -> Corners:
     """The corners that lines make."""
     tolerance = math.sin(math.radians(features.corner_angle))
     parameters = np.ascontiguousarray(lines.parameters)
-    found = _corners(parameters, lines.covariances, lines.pieces, lines.owners, tolerance, features.corner_gap)
+    found = _find_corners(parameters, lines.covariances, lines.segments, lines.owners, tolerance, features.corner_gap)
     covariances, confidences = found[:, _COVARIANCE:].reshape(-1, 3, 3), size_confidence(found[:, _SUPPORT], features)
     return Corners(found[:, :3], covariances, found[:, _CONVEX] > 0.0, confidences)
 
 
-def size_confidence(lengths: Float64, features: Features) -> Float64:
+def size_confidence(lengths: Float64, features: FeatureParameters) -> Float64:
     """Confidence in landmarks by how much, m, was seen of both their walls together, shape (n,)."""
     return 1.0 - np.exp(-0.5 * lengths / features.landmark_size)
 
 
 @njit(cache=True)
-def _corners(
+def _find_corners(
     lines: Float64, covariances: Float64, pieces: Float64, owners: Int64, tolerance: float, gap: float
 ) -> Float64:
     """Every pair of stretches that meet at a right angle, (n, 14)."""
@@ -65,11 +65,11 @@ def _corners(
             if abs(math.cos(b[0] - a[0])) > tolerance:
                 continue
             x, y = _intersection(a, b)
-            one, other = _arm(a, pieces[i], x, y, gap), _arm(b, pieces[k], x, y, gap)
+            one, other = _signed_arm_length(a, pieces[i], x, y, gap), _signed_arm_length(b, pieces[k], x, y, gap)
             if one == 0.0 or other == 0.0:
                 continue
-            if _corner(a, b, x, y, one, other, found[count]):
-                _propagate(a, b, covariances[owners[i]], covariances[owners[k]], found[count])
+            if _write_corner(a, b, x, y, one, other, found[count]):
+                _write_covariance(a, b, covariances[owners[i]], covariances[owners[k]], found[count])
                 count += 1
     return found[:count]
 
@@ -83,7 +83,7 @@ def _intersection(a: Float64, b: Float64) -> tuple[float, float]:
 
 
 @njit(cache=True)
-def _arm(line: Float64, piece: Float64, x: float, y: float, gap: float) -> float:
+def _signed_arm_length(line: Float64, piece: Float64, x: float, y: float, gap: float) -> float:
     """Length of a stretch that begins at a point, below 0 where it goes against the line's direction; 0 for none."""
     at = y * math.cos(line[0]) - x * math.sin(line[0])
     ahead, back = piece[1] - at, at - piece[0]
@@ -95,7 +95,7 @@ def _arm(line: Float64, piece: Float64, x: float, y: float, gap: float) -> float
 
 
 @njit(cache=True)
-def _corner(a: Float64, b: Float64, x: float, y: float, one: float, other: float, found: Float64) -> bool:
+def _write_corner(a: Float64, b: Float64, x: float, y: float, one: float, other: float, found: Float64) -> bool:
     """Write place, kind and support of the corner of two arms; False where their free sides contradict each other."""
     ax, ay, bx, by = math.cos(a[0]), math.sin(a[0]), math.cos(b[0]), math.sin(b[0])
     # Unit vectors along the arms. The free side of a line is that of the origin, against its normal.
@@ -112,7 +112,7 @@ def _corner(a: Float64, b: Float64, x: float, y: float, one: float, other: float
 
 
 @njit(cache=True)
-def _propagate(a: Float64, b: Float64, of_a: Float64, of_b: Float64, found: Float64) -> None:
+def _write_covariance(a: Float64, b: Float64, of_a: Float64, of_b: Float64, found: Float64) -> None:
     """Write the covariance of the corner that follows from those of its lines: n(alpha) p = r of both."""
     ax, ay, bx, by = math.cos(a[0]), math.sin(a[0]), math.cos(b[0]), math.sin(b[0])
     x, y, determinant = found[_X], found[_Y], ax * by - ay * bx

@@ -16,24 +16,24 @@ from typing import NamedTuple
 import numpy as np
 
 from hmt_slam_ros.arrays import Float64
-from hmt_slam_ros.geometry.gaussian import gate
+from hmt_slam_ros.geometry.gaussian import chi_square_gate
 
 # Difference of the squared distances of two sets of pairings of which one is a hundred times as likely as the other.
-_DECIDED = 2.0 * math.log(100.0)
+_MIN_MARGIN = 2.0 * math.log(100.0)
 
 
 class Pairing(NamedTuple):
     """An observed line as a re-observation of a line of the map.
 
-    :ivar observed: number of the line in its scan.
-    :ivar line: number of the line in the map.
+    :ivar scan_line: number of the line in its scan.
+    :ivar map_line: number of the line in the map.
     :ivar difference: (2,), alpha and r as observed minus as expected, rad and m.
     :ivar jacobian: of what is expected by the state, (2, n).
     :ivar noise: covariance of what is observed, (2, 2).
     """
 
-    observed: int
-    line: int
+    scan_line: int
+    map_line: int
     difference: Float64
     jacobian: Float64
     noise: Float64
@@ -44,7 +44,7 @@ class Pairing(NamedTuple):
         return float(self.difference @ np.linalg.solve(spread, self.difference))
 
 
-def compatible(covariance: Float64, pairings: Sequence[Pairing], probability: float) -> list[Pairing]:
+def compatible_pairings(covariance: Float64, pairings: Sequence[Pairing], probability: float) -> list[Pairing]:
     """The largest set of pairings, of those the one that fits best, that chi-square admits together.
 
     :param covariance: of the state, (n, n).
@@ -54,24 +54,24 @@ def compatible(covariance: Float64, pairings: Sequence[Pairing], probability: fl
     """
     if not pairings:
         return []
-    search = _Search(covariance, pairings, probability)
-    best = search.largest()
-    return [pairings[k] for k in best.chosen if search.decided(k, best)]
+    search = _CompatibilitySearch(covariance, pairings, probability)
+    best = search.largest_set()
+    return [pairings[k] for k in best.chosen if search.is_unambiguous(k, best)]
 
 
-class _Set(NamedTuple):
+class _PairingSet(NamedTuple):
     """Pairings, by number, and their joint squared Mahalanobis distance."""
 
     chosen: tuple[int, ...] = ()
     distance2: float = 0.0
 
-    def before(self, other: _Set) -> bool:
+    def is_better_than(self, other: _PairingSet) -> bool:
         """Whether it is the larger one or, where they are equally large, fits better."""
         count = len(self.chosen) - len(other.chosen)
         return count > 0 or (count == 0 and self.distance2 < other.distance2)
 
 
-class _Search:
+class _CompatibilitySearch:
     """A search through the choices for one observed line after the other."""
 
     def __init__(self, covariance: Float64, pairings: Sequence[Pairing], probability: float) -> None:
@@ -80,39 +80,39 @@ class _Search:
         for k, pairing in enumerate(pairings):
             self._spread[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] += pairing.noise
         self._difference = np.concatenate([pairing.difference for pairing in pairings])
-        observed = dict.fromkeys(pairing.observed for pairing in pairings)
-        self._choices = [[k for k, pairing in enumerate(pairings) if pairing.observed == each] for each in observed]
-        self._gates = [gate(probability, 2 * count) for count in range(1, len(observed) + 1)]
+        observed = dict.fromkeys(pairing.scan_line for pairing in pairings)
+        self._choices = [[k for k, pairing in enumerate(pairings) if pairing.scan_line == each] for each in observed]
+        self._gates = [chi_square_gate(probability, 2 * count) for count in range(1, len(observed) + 1)]
 
-    def largest(self, without: int | None = None) -> _Set:
+    def largest_set(self, without: int | None = None) -> _PairingSet:
         """The largest set, of those the one that fits best.
 
         :param without: the number of a pairing that is not to be in it.
         """
-        return self._go_on(0, _Set(), _Set(), without)
+        return self._search_from(0, _PairingSet(), _PairingSet(), without)
 
-    def decided(self, k: int, best: _Set) -> bool:
+    def is_unambiguous(self, k: int, best: _PairingSet) -> bool:
         """Whether a pairing of the best set has no alternative."""
         if any(own == [k] for own in self._choices):
             return True
-        other = self.largest(without=k)
-        return len(other.chosen) < len(best.chosen) or other.distance2 - best.distance2 > _DECIDED
+        other = self.largest_set(without=k)
+        return len(other.chosen) < len(best.chosen) or other.distance2 - best.distance2 > _MIN_MARGIN
 
-    def _go_on(self, level: int, chosen: _Set, best: _Set, without: int | None) -> _Set:
+    def _search_from(self, level: int, chosen: _PairingSet, best: _PairingSet, without: int | None) -> _PairingSet:
         """The better of a set and the best one that ``chosen`` leads to by the observed lines from ``level`` on."""
         left = len(self._choices) - level
         if not left:
-            return chosen if chosen.before(best) else best
+            return chosen if chosen.is_better_than(best) else best
         for k in self._choices[level]:
-            longer = self._with(chosen, k)
+            longer = self._add_pairing(chosen, k)
             if k != without and longer.distance2 <= self._gates[len(chosen.chosen)]:
-                best = self._go_on(level + 1, longer, best, without)
+                best = self._search_from(level + 1, longer, best, without)
         if len(chosen.chosen) + left > len(best.chosen):
-            best = self._go_on(level + 1, chosen, best, without)
+            best = self._search_from(level + 1, chosen, best, without)
         return best
 
-    def _with(self, chosen: _Set, k: int) -> _Set:
+    def _add_pairing(self, chosen: _PairingSet, k: int) -> _PairingSet:
         numbers = (*chosen.chosen, k)
         rows = np.array([row for number in numbers for row in (2 * number, 2 * number + 1)])
         difference = self._difference[rows]
-        return _Set(numbers, float(difference @ np.linalg.solve(self._spread[np.ix_(rows, rows)], difference)))
+        return _PairingSet(numbers, float(difference @ np.linalg.solve(self._spread[np.ix_(rows, rows)], difference)))

@@ -15,15 +15,15 @@ from dataclasses import replace
 import numpy as np
 
 from hmt_slam_ros.arrays import Bool, Float64
-from hmt_slam_ros.configuration.landmarks import Features
+from hmt_slam_ros.configuration.landmarks import FeatureParameters
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.geometry.gaussian import PoseGaussian, fuse, gate
+from hmt_slam_ros.geometry.gaussian import PoseGaussian, chi_square_gate, fuse
 from hmt_slam_ros.hybrid_map.landmark import Existence, Landmark
 from hmt_slam_ros.landmarks.beam_labels import Rays
-from hmt_slam_ros.landmarks.landmarks import OPENING, Landmarks, due
+from hmt_slam_ros.landmarks.landmarks import OPENING, ScanLandmarks, should_be_visible
 
 # Beyond this distance, m, nothing is compared.
-_FAR = 2.0
+_MAX_PAIR_DISTANCE = 2.0
 
 
 def scatter_ratio(landmarks: Iterable[Landmark]) -> Float64:
@@ -31,7 +31,7 @@ def scatter_ratio(landmarks: Iterable[Landmark]) -> Float64:
     or too small, as sightings of one opening are apart. Shape (3, 3), in deviations; one more sighting is as stated.
     """
     openings = [one for one in landmarks if one.kind == OPENING]
-    again = sum(one.existence.seen - 1 for one in openings)
+    again = sum(one.existence.detections - 1 for one in openings)
     return np.asarray((np.eye(3) + sum(one.scatter for one in openings)) / (1 + again))
 
 
@@ -41,57 +41,59 @@ class LandmarkMap:
     :ivar landmarks: all, in the order in which they were found.
     """
 
-    def __init__(self, features: Features, begin: Callable[[float], Existence] = Existence) -> None:
+    def __init__(self, features: FeatureParameters, begin: Callable[[float], Existence] = Existence) -> None:
         """:param begin: what is known of a landmark's existence at first, by its extraction confidence."""
-        self._features, self._begin = features, begin
-        self._gate = gate(features.pair_probability)
+        self._features, self._initial_existence = features, begin
+        self._gate = chi_square_gate(features.pair_probability)
         self.landmarks: list[Landmark] = []
 
-    def observe(self, pose: PoseGaussian, seen: Landmarks, rays: Rays, *, in_map: bool = False) -> None:
+    def observe(self, pose: PoseGaussian, landmarks: ScanLandmarks, rays: Rays, *, is_virtual: bool = False) -> None:
         """Learn what a scan shows, and what it does not show though it should.
 
         :param pose: the belief over ``area_T_base``.
-        :param seen: the landmarks of the scan, in the frame of the base.
+        :param landmarks: the landmarks of the scan, in the frame of the base.
         :param rays: its beams, likewise.
-        :param in_map: whether the scan is a virtual one.
+        :param is_virtual: whether the scan is a virtual one.
         """
         features = self._features
-        if in_map:
+        if is_virtual:
             features = replace(features, landmark_detected=features.landmark_detected_in_map)
-        expected = self._due(pose.mean, rays)
-        placed = [pose.compose(PoseGaussian(*each)) for each in zip(seen.poses, seen.covariances, strict=True)]
-        pairs = dict(self._paired(placed, seen))
+        expected = self._should_be_visible(pose.mean, rays)
+        placed = [
+            pose.compose(PoseGaussian(*each)) for each in zip(landmarks.poses, landmarks.covariances, strict=True)
+        ]
+        pairs = dict(self._associate(placed, landmarks))
         known = len(self.landmarks)
         for k, landmark in enumerate(self.landmarks):
             if k in pairs:
-                self.landmarks[k] = _seen_again(landmark, placed[pairs[k]], seen, pairs[k], features)
+                self.landmarks[k] = _update_landmark(landmark, placed[pairs[k]], landmarks, pairs[k], features)
             elif expected[k]:
-                existence = landmark.existence.after_miss(features)
+                existence = landmark.existence.update_on_miss(features)
                 self.landmarks[k] = replace(landmark, existence=existence)
         for i in sorted(set(range(len(placed))).difference(pairs.values())):
-            if not self._beside_known(placed[i], int(seen.kinds[i]), known):
-                self.landmarks.append(self._new(placed[i], seen, i))
+            if not self._is_near_known(placed[i], int(landmarks.kinds[i]), known):
+                self.landmarks.append(self._new_landmark(placed[i], landmarks, i))
         least = self._features.landmark_least
         self.landmarks = [one for one in self.landmarks if one.existence.probability >= least]
 
-    def come_back(self) -> None:
+    def begin_visit(self) -> None:
         """The robot comes back after a while."""
-        self.landmarks = [replace(one, existence=one.existence.after_absence()) for one in self.landmarks]
+        self.landmarks = [replace(one, existence=one.existence.mark_absence()) for one in self.landmarks]
 
-    def _due(self, pose: Float64, rays: Rays) -> Bool:
+    def _should_be_visible(self, pose: Float64, rays: Rays) -> Bool:
         """Which landmarks the scan from a pose should show."""
         kinds = np.array([landmark.kind for landmark in self.landmarks], dtype=np.int64)
         poses = np.array([landmark.pose.mean for landmark in self.landmarks]).reshape(-1, 3)
         widths = np.array([landmark.width for landmark in self.landmarks])
-        return due(kinds, se2.between(pose, poses), widths, rays, self._features)
+        return should_be_visible(kinds, se2.between(pose, poses), widths, rays, self._features)
 
-    def _paired(self, placed: list[PoseGaussian], seen: Landmarks) -> Iterator[tuple[int, int]]:
+    def _associate(self, placed: list[PoseGaussian], seen: ScanLandmarks) -> Iterator[tuple[int, int]]:
         """Landmarks of the map and of the scan that are one, the nearest first."""
         near = sorted(
             (distance2, k, i)
             for i, pose in enumerate(placed)
             for k, landmark in enumerate(self.landmarks)
-            if landmark.kind == seen.kinds[i] and _apart(landmark.pose, pose) < _FAR
+            if landmark.kind == seen.kinds[i] and _distance(landmark.pose, pose) < _MAX_PAIR_DISTANCE
             if (distance2 := landmark.pose.mahalanobis2(pose)) <= self._gate
         )
         taken: tuple[set[int], set[int]] = set(), set()
@@ -101,30 +103,32 @@ class LandmarkMap:
                 taken[1].add(i)
                 yield k, i
 
-    def _new(self, pose: PoseGaussian, seen: Landmarks, i: int) -> Landmark:
+    def _new_landmark(self, pose: PoseGaussian, seen: ScanLandmarks, i: int) -> Landmark:
         into = np.linalg.inv(np.linalg.cholesky(pose.covariance))
         return Landmark(
             int(seen.kinds[i]),
             pose,
             float(seen.widths[i]),
             float(seen.width_deviations[i]),
-            self._begin(float(seen.confidences[i])),
-            by_scans=into @ seen.covariances[i] @ into.T,
+            self._initial_existence(float(seen.confidences[i])),
+            scan_covariance_share=into @ seen.covariances[i] @ into.T,
         )
 
-    def _beside_known(self, pose: PoseGaussian, kind: int, known: int) -> bool:
+    def _is_near_known(self, pose: PoseGaussian, kind: int, known: int) -> bool:
         """Whether a landmark is so near to a known one of its kind that it is no other one."""
         return any(
             landmark.kind == kind
-            and _apart(landmark.pose, pose) < self._features.landmark_apart
+            and _distance(landmark.pose, pose) < self._features.landmark_apart
             and abs(float(se2.wrap(landmark.pose.mean[2] - pose.mean[2]))) < 0.5
             for landmark in self.landmarks[:known]
         )
 
 
-def _seen_again(landmark: Landmark, pose: PoseGaussian, seen: Landmarks, i: int, features: Features) -> Landmark:
+def _update_landmark(
+    landmark: Landmark, pose: PoseGaussian, seen: ScanLandmarks, i: int, features: FeatureParameters
+) -> Landmark:
     """A landmark after one more observation of it."""
-    n = landmark.existence.seen + 1
+    n = landmark.existence.detections + 1
     width, deviation = seen.widths[i], seen.width_deviations[i]
     into = np.linalg.inv(np.linalg.cholesky(pose.covariance))
     # Welford's update: by what a sighting and the mean of those before it may be apart.
@@ -132,20 +136,21 @@ def _seen_again(landmark: Landmark, pose: PoseGaussian, seen: Landmarks, i: int,
     off = np.linalg.solve(spread, se2.log(se2.between(pose.mean, landmark.pose.mean)))
     return replace(
         landmark,
-        pose=_intersected(landmark.pose, pose, 1.0 / n),
+        pose=_intersect_covariances(landmark.pose, pose, 1.0 / n),
         scatter=landmark.scatter + np.outer(off, off),
-        by_scans=landmark.by_scans + (into @ seen.covariances[i] @ into.T - landmark.by_scans) / n,
+        scan_covariance_share=landmark.scan_covariance_share
+        + (into @ seen.covariances[i] @ into.T - landmark.scan_covariance_share) / n,
         width=landmark.width + float(width - landmark.width) / n,
         width_deviation=landmark.width_deviation + float(deviation - landmark.width_deviation) / n,
-        existence=landmark.existence.after_sight(float(seen.confidences[i]), features),
+        existence=landmark.existence.update_on_detection(float(seen.confidences[i]), features),
     )
 
 
-def _apart(one: PoseGaussian, other: PoseGaussian) -> float:
+def _distance(one: PoseGaussian, other: PoseGaussian) -> float:
     return float(np.hypot(*(one.mean[:2] - other.mean[:2])))
 
 
-def _intersected(known: PoseGaussian, seen: PoseGaussian, weight: float) -> PoseGaussian:
+def _intersect_covariances(known: PoseGaussian, seen: PoseGaussian, weight: float) -> PoseGaussian:
     """Covariance intersection of two beliefs over one pose, the second with a weight."""
     parts = ((known, 1.0 - weight), (seen, weight))
     return fuse([PoseGaussian(part.mean, part.covariance / share) for part, share in parts])

@@ -15,17 +15,17 @@ from typing import NamedTuple
 import numpy as np
 
 from hmt_slam_ros.arrays import Bool, Float64, Int64
-from hmt_slam_ros.configuration.landmarks import Features
+from hmt_slam_ros.configuration.landmarks import FeatureParameters
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.landmarks.beam_labels import Rays
-from hmt_slam_ros.landmarks.corners import Corners, corners_of
+from hmt_slam_ros.landmarks.corners import Corners, extract_corners
 from hmt_slam_ros.landmarks.line_extraction import Lines
-from hmt_slam_ros.landmarks.openings import Openings, openings_of
+from hmt_slam_ros.landmarks.openings import Openings, extract_openings
 
-INNER, OUTER, OPENING = range(3)
+CONCAVE_CORNER, CONVEX_CORNER, OPENING = range(3)
 """What a landmark is: the corner of a room, that of a pillar, or an opening."""
 
-KINDS = ("corner", "convex corner", "opening")
+KIND_NAMES = ("corner", "convex corner", "opening")
 """Their names."""
 
 # What is asked whether it is in sight lies so far before its wall, m; and whether it is passed, so far behind it.
@@ -38,7 +38,7 @@ _WIDE, _FACED, _SHARE = math.radians(3.0), 0.4, 0.5
 _APART = math.radians(1.5)
 
 
-class Landmarks(NamedTuple):
+class ScanLandmarks(NamedTuple):
     """Landmarks of any kind, in one frame.
 
     :ivar kinds: shape (n,), one of the constants above.
@@ -57,16 +57,18 @@ class Landmarks(NamedTuple):
     width_deviations: Float64
 
 
-def landmarks_of(lines: Lines, rays: Rays, features: Features) -> Landmarks:
+def extract_landmarks(lines: Lines, rays: Rays, features: FeatureParameters) -> ScanLandmarks:
     """All that the lines and beams of a scan show."""
-    return both(corners_of(lines, features), openings_of(lines, rays, features))
+    return concatenate_landmarks(extract_corners(lines, features), extract_openings(lines, rays, features))
 
 
-def both(corners: Corners, openings: Openings) -> Landmarks:
+def concatenate_landmarks(corners: Corners, openings: Openings) -> ScanLandmarks:
     """Corners and openings as landmarks, in this order."""
     none = np.zeros(len(corners.poses))
-    return Landmarks(
-        np.concatenate((np.where(corners.convex, OUTER, INNER), np.full(len(openings.poses), OPENING))),
+    return ScanLandmarks(
+        np.concatenate(
+            (np.where(corners.convex, CONVEX_CORNER, CONCAVE_CORNER), np.full(len(openings.poses), OPENING))
+        ),
         np.concatenate((corners.poses, openings.poses)),
         np.concatenate((corners.covariances, openings.covariances)),
         np.concatenate((corners.confidences, openings.confidences)),
@@ -75,7 +77,7 @@ def both(corners: Corners, openings: Openings) -> Landmarks:
     )
 
 
-def due(kinds: Int64, poses: Float64, widths: Float64, rays: Rays, features: Features) -> Bool:
+def should_be_visible(kinds: Int64, poses: Float64, widths: Float64, rays: Rays, features: FeatureParameters) -> Bool:
     """Which landmarks (n,) beams should show.
 
     :param poses: shape (n, 3), in the frame of the beams.
@@ -83,12 +85,12 @@ def due(kinds: Int64, poses: Float64, widths: Float64, rays: Rays, features: Fea
     """
     shown = np.hypot(*poses[:, :2].T) <= features.landmark_reach
     corner = kinds != OPENING
-    shown[corner] &= _corners_due(poses[corner], kinds[corner] == OUTER, rays, features.min_length)
-    shown[~corner] &= _openings_due(poses[~corner], widths[~corner], rays, features.opening_depth)
+    shown[corner] &= _visible_corners(poses[corner], kinds[corner] == CONVEX_CORNER, rays, features.min_length)
+    shown[~corner] &= _visible_openings(poses[~corner], widths[~corner], rays, features.opening_depth)
     return shown
 
 
-def _corners_due(poses: Float64, convex: Bool, rays: Rays, length: float) -> Bool:
+def _visible_corners(poses: Float64, convex: Bool, rays: Rays, length: float) -> Bool:
     """Which corners have both walls in sight for ``length``, m, under a wide enough angle, or one that beams pass."""
     sign = np.where(convex, -1.0, 1.0)
     shown, passed = np.ones(len(poses), np.bool_), np.zeros(len(poses), np.bool_)
@@ -100,20 +102,20 @@ def _corners_due(poses: Float64, convex: Bool, rays: Rays, length: float) -> Boo
         points = se2.transform(poses, places + _BEFORE * before)
         bearings = np.arctan2(points[..., 1], points[..., 0])
         wide = np.abs(se2.wrap(bearings[-1] - bearings[0])) >= _WIDE
-        shown &= in_sight(points, rays).all(axis=0) & wide
-        faced = _faced(poses, before)
-        passed |= faced & in_sight(se2.transform(poses, places - _BEHIND * before), rays).all(axis=0)
+        shown &= is_in_sight(points, rays).all(axis=0) & wide
+        faced = _is_faced(poses, before)
+        passed |= faced & is_in_sight(se2.transform(poses, places - _BEHIND * before), rays).all(axis=0)
     return shown | passed
 
 
-def _faced(poses: Float64, before: Float64) -> Bool:
+def _is_faced(poses: Float64, before: Float64) -> Bool:
     """Which corners (n, 3) have a wall, with a normal (n, 2) in their frame, that the origin is well before."""
     origin = se2.inverse(poses)[:, :2]
     away = np.maximum(np.hypot(*origin.T), 1e-9)
     return np.asarray((origin * before).sum(axis=1) >= _FACED * away)
 
 
-def _openings_due(poses: Float64, widths: Float64, rays: Rays, depth: float) -> Bool:
+def _visible_openings(poses: Float64, widths: Float64, rays: Rays, depth: float) -> Bool:
     """Which openings have their gap and both jambs in sight, or are closed in half of the gap and show a jamb.
 
     :param depth: so far behind its wall an opening is free, m.
@@ -123,16 +125,16 @@ def _openings_due(poses: Float64, widths: Float64, rays: Rays, depth: float) -> 
     over = (np.arange(_PLACES) + 0.5)[:, None] / _PLACES - 0.5
     gap = np.stack(np.broadcast_arrays(-_BEFORE, over * widths), axis=-1)
     jambs = np.stack(np.broadcast_arrays(-_BEFORE, np.array([[-1.0], [1.0]]) * (0.5 * widths + _BESIDE)), axis=-1)
-    seen, sides = (in_sight(se2.transform(poses, points), rays) for points in (gap, jambs))
-    behind = in_sight(se2.transform(poses, gap + np.array([_BEFORE + depth, 0.0])), rays)
+    seen, sides = (is_in_sight(se2.transform(poses, points), rays) for points in (gap, jambs))
+    behind = is_in_sight(se2.transform(poses, gap + np.array([_BEFORE + depth, 0.0])), rays)
     whole = seen.all(axis=0) & sides.all(axis=0)
     closed = (seen.mean(axis=0) >= _SHARE) & sides.any(axis=0) & ~behind.any(axis=0)
     return np.asarray(faced & (whole | closed) & (away > _BEFORE))
 
 
-def in_sight(points: Float64, rays: Rays) -> Bool:
+def is_in_sight(points: Float64, rays: Rays) -> Bool:
     """Which points (..., 2) a beam reaches, shape (...); beams begin near each other."""
-    if not len(rays.free):
+    if not len(rays.free_range):
         return np.zeros(points.shape[:-1], np.bool_)
     bearings = np.arctan2(rays.directions[:, 1], rays.directions[:, 0])
     order = np.argsort(bearings)
@@ -142,5 +144,5 @@ def in_sight(points: Float64, rays: Rays) -> Bool:
     beside = [order[(after - back) % len(order)] for back in (0, 1)]
     apart = [np.abs(se2.wrap(bearings[beam] - asked)) for beam in beside]
     nearest = np.where(apart[0] < apart[1], *beside)
-    reached = rays.free[nearest] >= np.hypot(away[..., 0], away[..., 1])
+    reached = rays.free_range[nearest] >= np.hypot(away[..., 0], away[..., 1])
     return np.asarray(reached & (np.minimum(*apart) <= _APART))

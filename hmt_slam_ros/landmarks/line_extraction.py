@@ -16,16 +16,16 @@ import numpy as np
 from numba import njit
 
 from hmt_slam_ros.arrays import Bool, Float64, Int32, Int64
-from hmt_slam_ros.configuration.landmarks import Features
-from hmt_slam_ros.geometry.gaussian import gate as bound
-from hmt_slam_ros.landmarks.line_fit import Beams, Gate, fit, merge, relabel
+from hmt_slam_ros.configuration.landmarks import FeatureParameters
+from hmt_slam_ros.geometry.gaussian import chi_square_gate
+from hmt_slam_ros.landmarks.line_fit import Beams, MergeGate, fit_line, merge_lines, relabel
 from hmt_slam_ros.sensors import Scan
 
 _NO_LINE = -1
 
 
 @njit(cache=True)
-def segments(
+def partition_beams(
     rays: Float64, begins: Int32, deviations: Float64, line_penalty: float, stray_penalty: float, labels: Int32
 ) -> int:
     """Number the lines of a scan.
@@ -38,7 +38,7 @@ def segments(
     :param labels: shape (n,), written to: the number of each beam's line, from 0, or -1.
     :returns: number of lines.
     """
-    starts = _cheapest(rays, begins, deviations, line_penalty, stray_penalty)
+    starts = _optimal_starts(rays, begins, deviations, line_penalty, stray_penalty)
     end, count = len(rays), 0
     while end > 0:
         start = starts[end - 1]
@@ -53,7 +53,9 @@ def segments(
 
 
 @njit(cache=True)
-def _cheapest(rays: Float64, begins: Int32, deviations: Float64, line_penalty: float, stray_penalty: float) -> Int32:
+def _optimal_starts(
+    rays: Float64, begins: Int32, deviations: Float64, line_penalty: float, stray_penalty: float
+) -> Int32:
     """Where the line begins that ends with each beam in the cheapest partition up to it; -1 where it is on none."""
     count = len(rays)
     costs, starts = np.zeros(count + 1), np.empty(count, np.int32)
@@ -82,11 +84,11 @@ def _cheapest(rays: Float64, begins: Int32, deviations: Float64, line_penalty: f
 
 
 # A beam this near to its neighbour's line, in deviations, may belong to either of the two.
-_EITHER = 3.0
+_AMBIGUOUS = 3.0
 # A beam this far from its line, in deviations, does not belong to it.
 _STRAY = 3.5
 # What a line bends over its uncertainty, in deviations across it.
-_BEND = 1.0
+_MAX_BEND = 1.0
 _NONE = -1
 
 
@@ -97,7 +99,7 @@ class Lines:
     :ivar parameters: shape (n, 2), alpha in [-pi, pi) and r >= 0: direction and length of the perpendicular from the
         origin, rad and m.
     :ivar covariances: shape (n, 2, 2), of alpha and r.
-    :ivar pieces: shape (m, 2), where each stretch that was seen begins and ends, m along its line's direction
+    :ivar segments: shape (m, 2), where each stretch that was seen begins and ends, m along its line's direction
         (-sin(alpha), cos(alpha)) from the foot of the perpendicular.
     :ivar owners: shape (m,), the line of each of them, increasing.
     :ivar labels: shape (k,), the line of each beam with a return, -1 where it shows none.
@@ -105,7 +107,7 @@ class Lines:
 
     parameters: Float64
     covariances: Float64
-    pieces: Float64
+    segments: Float64
     owners: Int64
     labels: Int32
 
@@ -113,7 +115,7 @@ class Lines:
         return len(self.parameters)
 
 
-def extract_lines(scan: Scan, features: Features, deviations: Float64 | None = None) -> Lines:
+def extract_lines(scan: Scan, features: FeatureParameters, deviations: Float64 | None = None) -> Lines:
     """The lines of a scan of any field of view and number of beams; none where it has no return.
 
     :param deviations: shape (k,), of the ranges of the beams with a return, m; ``features.range_deviation`` for all
@@ -124,38 +126,38 @@ def extract_lines(scan: Scan, features: Features, deviations: Float64 | None = N
     if deviations is None:
         deviations = np.full(len(points), features.range_deviation)
     beams = Beams(points, rays / np.maximum(np.hypot(*rays.T), 1e-9)[:, None], deviations)
-    count = segments(
+    count = partition_beams(
         points - scan.laser_pose[:2],
-        _begins(points, numbers, features.max_gap),
+        _gap_starts(points, numbers, features.max_gap),
         deviations,
         features.line_penalty,
         features.stray_penalty,
         labels,
     )
-    gate = Gate(bound(features.merge_probability, 2), features.merge_deviation)
+    gate = MergeGate(chi_square_gate(features.merge_probability, 2), features.merge_deviation)
     found = _extract(beams, labels, count, features.min_beams, gate)
-    pieces, owners = _pieces(points, numbers, labels, found, features.max_gap)
+    pieces, owners = _visible_segments(points, numbers, labels, found, features.max_gap)
     seen = np.zeros(len(found))
     np.add.at(seen, owners, pieces[:, 1] - pieces[:, 0])
-    return _long_enough(found, pieces, owners, labels, (seen >= features.min_length) & _straight(found))
+    return _select_lines(found, pieces, owners, labels, (seen >= features.min_length) & _is_nearly_linear(found))
 
 
-def extract_for_map(scan: Scan, features: Features) -> Lines:
+def extract_for_map(scan: Scan, features: FeatureParameters) -> Lines:
     """The lines of a scan that a stochastic map observes: it joins them itself when it knows more."""
     return extract_lines(scan, replace(features, merge_deviation=features.map_merge_deviation))
 
 
-def _straight(lines: Float64) -> Bool:
+def _is_nearly_linear(lines: Float64) -> Bool:
     """Which of the lines (n, 5) are so certain that a Gaussian over alpha and r is right.
 
     r follows from alpha as n(alpha) c for the middle c of what was seen, whose second derivative is -r: where that
     bends by more than r is uncertain at an exact alpha, no covariance says what is known.
     """
     aa, ar, rr = lines[:, 2], lines[:, 3], lines[:, 4]
-    return lines[:, 1] * aa <= _BEND * np.sqrt(rr - ar * ar / aa)
+    return lines[:, 1] * aa <= _MAX_BEND * np.sqrt(rr - ar * ar / aa)
 
 
-def _long_enough(found: Float64, pieces: Float64, owners: Int64, labels: Int32, kept: Bool) -> Lines:
+def _select_lines(found: Float64, pieces: Float64, owners: Int64, labels: Int32, kept: Bool) -> Lines:
     """The lines that are kept, numbered anew."""
     numbers = np.where(kept, np.cumsum(kept) - 1, _NONE)
     labels = np.append(numbers, _NONE)[labels].astype(np.int32)
@@ -165,25 +167,25 @@ def _long_enough(found: Float64, pieces: Float64, owners: Int64, labels: Int32, 
 
 
 @njit(cache=True)
-def _begins(points: Float64, numbers: Int64, max_gap: float) -> Int32:
+def _gap_starts(points: Float64, numbers: Int64, max_gap: float) -> Int32:
     """The first beam (n,) behind the last gap before each: of two beams or more without a return, and as wide."""
     begins, begin = np.empty(len(points), np.int32), 0
     for k in range(len(points)):
         if k:
             away = math.hypot(points[k, 0] - points[k - 1, 0], points[k, 1] - points[k - 1, 1])
-            begin = k if away > max_gap and _gap(numbers[k - 1], numbers[k]) else begin
+            begin = k if away > max_gap and _is_gap(numbers[k - 1], numbers[k]) else begin
         begins[k] = begin
     return begins
 
 
 @njit(cache=True)
-def _gap(before: int, after: int) -> bool:
+def _is_gap(before: int, after: int) -> bool:
     """Whether between two beams of these numbers there are two or more, and not just one that was lost."""
     return after - before > 2
 
 
 @njit(cache=True)
-def _extract(beams: Beams, labels: Int32, count: int, min_beams: int, gate: Gate) -> Float64:
+def _extract(beams: Beams, labels: Int32, count: int, min_beams: int, gate: MergeGate) -> Float64:
     """Fit the segments that beams were sorted into, join those that are one line, and leave out what is doubtful.
 
     :param labels: shape (k,), the segment of each beam, -1 for none; written to: the line.
@@ -193,15 +195,15 @@ def _extract(beams: Beams, labels: Int32, count: int, min_beams: int, gate: Gate
     """
     lines = np.empty((count, 5))
     count = _fit_all(beams, labels, lines, count, min_beams)
-    count = merge(beams, labels, lines, count, gate)
-    _leave_out_doubtful(beams, labels, lines)
-    _leave_out_ends(labels)
+    count = merge_lines(beams, labels, lines, count, gate)
+    _drop_ambiguous_beams(beams, labels, lines)
+    _drop_run_ends(labels)
     count = _fit_all(beams, labels, lines, count, min_beams)
-    count = merge(beams, labels, lines, count, gate)
-    _leave_out_strays(beams, labels, lines)
+    count = merge_lines(beams, labels, lines, count, gate)
+    _drop_stray_beams(beams, labels, lines)
     lines = lines[: _fit_all(beams, labels, lines, count, min_beams)]
     for step in (1, -1):
-        _take_in(beams, labels, lines, step)
+        _extend_lines(beams, labels, lines, step)
     return lines
 
 
@@ -210,14 +212,14 @@ def _fit_all(beams: Beams, labels: Int32, lines: Float64, count: int, min_beams:
     """Fit every label, give up those of too few beams, and return how many there are."""
     kept = 0
     for line in range(count):
-        enough = fit(beams, labels, line, lines[kept]) >= min_beams
+        enough = fit_line(beams, labels, line, lines[kept]) >= min_beams
         relabel(labels, line, kept if enough else _NONE)
         kept += enough
     return kept
 
 
 @njit(cache=True)
-def _leave_out_doubtful(beams: Beams, labels: Int32, lines: Float64) -> None:
+def _drop_ambiguous_beams(beams: Beams, labels: Int32, lines: Float64) -> None:
     """Take from both lines the beams at their common end that may belong to either.
 
     Where two walls meet, the partition gives a beam to that line which it fits better, so that both lines would be
@@ -227,12 +229,12 @@ def _leave_out_doubtful(beams: Beams, labels: Int32, lines: Float64) -> None:
     for k in range(1, len(labels)):
         before, after = given[k - 1], given[k]
         if before != after and min(before, after) != _NONE:
-            _loosen(beams, labels, lines[after], k - 1, -1, before)
-            _loosen(beams, labels, lines[before], k, 1, after)
+            _unlabel_near(beams, labels, lines[after], k - 1, -1, before)
+            _unlabel_near(beams, labels, lines[before], k, 1, after)
 
 
 @njit(cache=True)
-def _leave_out_ends(labels: Int32) -> None:
+def _drop_run_ends(labels: Int32) -> None:
     """Take the label from the first and the last beam of every run, which may have met an edge or what is behind it."""
     before = labels[0] if len(labels) else _NONE
     for k in range(1, len(labels)):
@@ -243,34 +245,34 @@ def _leave_out_ends(labels: Int32) -> None:
 
 
 @njit(cache=True)
-def _loosen(beams: Beams, labels: Int32, neighbour: Float64, k: int, step: int, own: int) -> None:
+def _unlabel_near(beams: Beams, labels: Int32, neighbour: Float64, k: int, step: int, own: int) -> None:
     """Take the label from the beams from ``k`` on that are near to the neighbour's line."""
-    while 0 <= k < len(labels) and labels[k] == own and _within(beams, k, neighbour, _EITHER):
+    while 0 <= k < len(labels) and labels[k] == own and _is_on_line(beams, k, neighbour, _AMBIGUOUS):
         labels[k] = _NONE
         k += step
 
 
 @njit(cache=True)
-def _leave_out_strays(beams: Beams, labels: Int32, lines: Float64) -> None:
+def _drop_stray_beams(beams: Beams, labels: Int32, lines: Float64) -> None:
     """Take the label from beams that are too far from their line."""
     for k in range(len(labels)):
-        if labels[k] != _NONE and not _within(beams, k, lines[labels[k]], _STRAY):
+        if labels[k] != _NONE and not _is_on_line(beams, k, lines[labels[k]], _STRAY):
             labels[k] = _NONE
 
 
 @njit(cache=True)
-def _take_in(beams: Beams, labels: Int32, lines: Float64, step: int) -> None:
+def _extend_lines(beams: Beams, labels: Int32, lines: Float64, step: int) -> None:
     """Label the beams on no line beside those on one as far as they are on it too; it stays as it was fitted."""
     last = _NONE
     for n in range(len(labels)):
         k = n if step > 0 else len(labels) - 1 - n
-        if labels[k] == _NONE and last != _NONE and _within(beams, k, lines[last], _STRAY):
+        if labels[k] == _NONE and last != _NONE and _is_on_line(beams, k, lines[last], _STRAY):
             labels[k] = last
         last = labels[k]
 
 
 @njit(cache=True)
-def _within(beams: Beams, k: int, line: Float64, deviations: float) -> bool:
+def _is_on_line(beams: Beams, k: int, line: Float64, deviations: float) -> bool:
     """Whether a beam ends so few deviations of its range from a line (5,)."""
     cos, sin = math.cos(line[0]), math.sin(line[0])
     off = cos * beams.points[k, 0] + sin * beams.points[k, 1] - line[1]
@@ -279,7 +281,9 @@ def _within(beams: Beams, k: int, line: Float64, deviations: float) -> bool:
 
 
 @njit(cache=True)
-def _pieces(points: Float64, numbers: Int64, labels: Int32, lines: Float64, max_gap: float) -> tuple[Float64, Int64]:
+def _visible_segments(
+    points: Float64, numbers: Int64, labels: Int32, lines: Float64, max_gap: float
+) -> tuple[Float64, Int64]:
     """What was seen of each line, (m, 2), m along it, and whose each is.
 
     A stretch ends where the next beam of the line is farther away than a gap, with two beams or more in between.
@@ -292,7 +296,7 @@ def _pieces(points: Float64, numbers: Int64, labels: Int32, lines: Float64, max_
             if labels[k] != line:
                 continue
             along = cos * points[k, 1] - sin * points[k, 0]
-            if before < 0 or (abs(along - last) > max_gap and _gap(numbers[before], numbers[k])):
+            if before < 0 or (abs(along - last) > max_gap and _is_gap(numbers[before], numbers[k])):
                 pieces[count, 0] = pieces[count, 1] = along
                 owners[count] = line
                 count += 1

@@ -21,18 +21,18 @@ from numba import njit
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.geometry.covariance import carried, inverse
+from hmt_slam_ros.geometry.covariance import inverse, propagate_covariance
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.landmarks.line_extraction import Lines, extract_for_map
-from hmt_slam_ros.landmarks.stochastic_map import LineMap, Observed
+from hmt_slam_ros.landmarks.stochastic_map import LineAssociations, LineMap
 from hmt_slam_ros.registration.consistency import Agreement
 from hmt_slam_ros.registration.match_covariance import MatchError
 from hmt_slam_ros.sensors import Scan
-from hmt_slam_ros.sensors.motion_model import NO_STEP, Prediction, Step
+from hmt_slam_ros.sensors.motion_model import NO_MOTION, Prediction, RelativeMotion
 from hmt_slam_ros.submap.line_map_state import Marks
-from hmt_slam_ros.submap.local_filter import FilterStep, LineFilterState, PlacedKeyframe, Tracked
-from hmt_slam_ros.submap.local_mapping import LocalMapping, Sighting
-from hmt_slam_ros.submap.scan_evidence import Compared, Experience
+from hmt_slam_ros.submap.local_filter import FilterStep, LineFilterState, PlacedKeyframe, TrackedMotion
+from hmt_slam_ros.submap.local_mapping import LocalMapping, PreparedScan
+from hmt_slam_ros.submap.scan_evidence import ClutterEstimate, MapAgreement
 
 
 def lines_of_scan(scan: Scan, configuration: Configuration) -> Lines:
@@ -41,68 +41,68 @@ def lines_of_scan(scan: Scan, configuration: Configuration) -> Lines:
 
 
 # A beam passes a wall if it does so at least so far from where the wall was seen to end, m.
-_INSIDE = 0.2
+_END_MARGIN = 0.2
 # It ends at least so far behind it, m.
 _BEHIND = 0.4
 # Of walls, one sample every so many m counts.
-_APART = 0.2
+_SAMPLE_SPACING = 0.2
 # A wall was passed where samples of it are so near to each other, m.
-_TOGETHER = 0.6
+_MAX_SAMPLE_GAP = 0.6
 
 
-class Met(NamedTuple):
+class BeamWallCounts(NamedTuple):
     """What the beams of a scan say of walls.
 
-    :ivar ending: beams that end on one.
-    :ivar passing: beams that pass one.
-    :ivar met: samples of walls that beams end on.
-    :ivar passed: samples that beams pass.
+    :ivar beams_ending: beams that end on one.
+    :ivar beams_passing: beams that pass one.
+    :ivar samples_hit: samples of walls that beams end on.
+    :ivar samples_passed: samples that beams pass.
     """
 
-    ending: int
-    passing: int
-    met: int
-    passed: int
+    beams_ending: int
+    beams_passing: int
+    samples_hit: int
+    samples_passed: int
 
 
-def met_and_passed(ends: Float64, laser: Float64, room: LineMap, near: float) -> Met:
+def count_beams_at_walls(ends: Float64, laser: Float64, line_map: LineMap, near: float) -> BeamWallCounts:
     """Lay beams into a map of lines.
 
     :param ends: of the beams in their order, shape (n, 2), m, frame of the map.
     :param laser: where they begin, shape (2,), likewise.
     :param near: distance, m, from a wall below which a beam ends on it.
     """
-    stretches = [(*room.lines[line], *piece) for line, wall in enumerate(room.walls) for piece in wall.pieces]
-    return Met(*_compared(ends, laser, _array(stretches), near))
+    stretches = [(*line_map.lines[line], *piece) for line, wall in enumerate(line_map.walls) for piece in wall.pieces]
+    return BeamWallCounts(*_count_beams(ends, laser, _segment_array(stretches), near))
 
 
-def _array(stretches: Sequence[tuple[float, ...]]) -> Float64:
+def _segment_array(stretches: Sequence[tuple[float, ...]]) -> Float64:
     return np.array(stretches, dtype=np.float64).reshape(-1, 4)
 
 
 @njit(cache=True)
-def _compared(ends: Float64, laser: Float64, stretches: Float64, near: float) -> tuple[int, int, int, int]:
+def _count_beams(ends: Float64, laser: Float64, stretches: Float64, near: float) -> tuple[int, int, int, int]:
     """:param stretches: alpha, r, begin and end of each, (m, 4)."""
     ending = passing = met = passed = 0
     met_at, passed_at = np.full(2, np.inf), np.full(2, np.inf)
     at = np.empty(2)
     for i in range(len(ends)):
-        if _on(ends[i], stretches, near):
+        if _ends_on_wall(ends[i], stretches, near):
             ending += 1
-            if math.hypot(ends[i, 0] - met_at[0], ends[i, 1] - met_at[1]) >= _APART:
+            if math.hypot(ends[i, 0] - met_at[0], ends[i, 1] - met_at[1]) >= _SAMPLE_SPACING:
                 met += 1
                 met_at[:] = ends[i, :2]
-        elif _through(ends[i], laser, stretches, at):
+        elif _passes_wall(ends[i], laser, stretches, at):
             passing += 1
             between = math.hypot(at[0] - passed_at[0], at[1] - passed_at[1])
-            if between >= _APART:
-                passed += between <= _TOGETHER
+            if between >= _SAMPLE_SPACING:
+                passed += between <= _MAX_SAMPLE_GAP
                 passed_at[:] = at
     return ending, passing, met, passed
 
 
 @njit(cache=True)
-def _on(end: Float64, stretches: Float64, near: float) -> bool:
+def _ends_on_wall(end: Float64, stretches: Float64, near: float) -> bool:
     for k in range(len(stretches)):
         cos, sin = math.cos(stretches[k, 0]), math.sin(stretches[k, 0])
         along = cos * end[1] - sin * end[0]
@@ -113,7 +113,7 @@ def _on(end: Float64, stretches: Float64, near: float) -> bool:
 
 
 @njit(cache=True)
-def _through(end: Float64, laser: Float64, stretches: Float64, at: Float64) -> bool:
+def _passes_wall(end: Float64, laser: Float64, stretches: Float64, at: Float64) -> bool:
     """Whether a beam passes a wall from the side from which it was seen; where it does first is written to ``at``."""
     first = np.inf
     for k in range(len(stretches)):
@@ -125,25 +125,25 @@ def _through(end: Float64, laser: Float64, stretches: Float64, at: Float64) -> b
         share = before / (before + behind)
         x, y = laser[0] + share * (end[0] - laser[0]), laser[1] + share * (end[1] - laser[1])
         along = cos * y - sin * x
-        if share < first and stretches[k, 2] + _INSIDE < along < stretches[k, 3] - _INSIDE:
+        if share < first and stretches[k, 2] + _END_MARGIN < along < stretches[k, 3] - _END_MARGIN:
             first, at[0], at[1] = share, x, y
     return first < np.inf
 
 
 # How well keyframes lie in the frame of an area that is loaded: they err independently, m and rad.
-_KEYFRAME = np.diag([0.01, 0.01, math.radians(0.3)]) ** 2
+_KEYFRAME_COVARIANCE = np.diag([0.01, 0.01, math.radians(0.3)]) ** 2
 # Keyframes that were corrected by more than this, m, are told anew.
-_CORRECTED = 0.01
+_MIN_CORRECTION = 0.01
 # Odometry of which more than this share of a scan's lines knows nothing in the map may be wrong.
-_UNKNOWN = 0.5
+_MIN_MATCHED_SHARE = 0.5
 
 
-class _Believed(NamedTuple):
+class _MapPosterior(NamedTuple):
     """A map after a scan, under one prediction of the motion."""
 
-    room: LineMap
-    step: Step
-    observed: Observed
+    line_map: LineMap
+    motion: RelativeMotion
+    associations: LineAssociations
 
 
 class LineFilter:
@@ -151,36 +151,36 @@ class LineFilter:
 
     :ivar hypothesis: id of the hypothesis.
     :ivar area: the current area; the map frame is its frame.
-    :ivar room: the belief.
+    :ivar line_map: the belief.
     :ivar keyframes: the local map's keyframes, ids.
     :ivar keyframe_areas: their areas.
     :ivar tracking_covariance: of the motion since the last filter step, shape (3, 3), right tangent frame.
-    :ivar experience: of the scans so far.
+    :ivar clutter_estimate: of the scans so far.
     """
 
     def __init__(self, mapping: LocalMapping, hypothesis: int, area: int) -> None:
         self.mapping = mapping
         self.hypothesis = hypothesis
         self.area = area
-        self.room = LineMap(mapping.configuration.features)
+        self.line_map = LineMap(mapping.configuration.features)
         self.keyframes: list[int] = []
         self.keyframe_areas: list[int] = []
-        self.room.mark()
-        self._told = np.zeros((0, 3))
+        self.line_map.clone_pose()
+        self._reported_poses = np.zeros((0, 3))
         self.tracking_covariance = np.zeros((3, 3))
-        self.experience = Experience()
+        self.clutter_estimate = ClutterEstimate()
         self._information = np.zeros((3, 3))
-        self._last_covariance, self._since_update = np.zeros((3, 3)), NO_STEP
+        self._last_covariance, self._motion_since_update = np.zeros((3, 3)), NO_MOTION
 
     @classmethod
-    def of(cls, mapping: LocalMapping, state: LineFilterState) -> LineFilter:
+    def from_state(cls, mapping: LocalMapping, state: LineFilterState) -> LineFilter:
         """The filter of a state."""
         found = cls(mapping, state.hypothesis, state.area)
-        found.room = LineMap.of(mapping.configuration.features, state.room)
+        found.line_map = LineMap.from_state(mapping.configuration.features, state.line_map)
         found.keyframes, found.keyframe_areas = list(state.keyframes), list(state.keyframe_areas)
-        found._told, found.tracking_covariance = state.told, state.tracking_covariance
-        found._information, found.experience = state.information, state.experience
-        found._last_covariance, found._since_update = state.last_covariance, state.since_update
+        found._reported_poses, found.tracking_covariance = state.reported_poses, state.tracking_covariance
+        found._information, found.clutter_estimate = state.information, state.clutter_estimate
+        found._last_covariance, found._motion_since_update = state.last_covariance, state.motion_since_update
         return found
 
     @property
@@ -189,21 +189,21 @@ class LineFilter:
         return LineFilterState(
             self.hypothesis,
             self.area,
-            self.room.state,
+            self.line_map.state,
             tuple(self.keyframes),
             tuple(self.keyframe_areas),
-            self._told,
+            self._reported_poses,
             self._last_covariance,
-            self._since_update,
+            self._motion_since_update,
             self._information,
             self.tracking_covariance,
-            self.experience,
+            self.clutter_estimate,
         )
 
     @property
     def pose(self) -> Float64:
         """``area_T_base``, shape (3,)."""
-        return self.room.pose.mean
+        return self.line_map.pose.mean
 
     @property
     def poses(self) -> Float64:
@@ -212,94 +212,98 @@ class LineFilter:
 
     def leading_keyframe_poses(self) -> Float64:
         """``map_T_base`` of the local map's keyframes, shape (K, 3)."""
-        return self.room.marks.poses[1:]
+        return self.line_map.clones.poses[1:]
 
     def branch(self, hypothesis: int) -> LineFilter:
         """A filter of the same state for a child hypothesis."""
-        child = LineFilter.of(self.mapping, self.state)
+        child = LineFilter.from_state(self.mapping, self.state)
         child.hypothesis = hypothesis
         return child
 
     def release(self) -> None:
         """There is nothing to give back."""
 
-    def stand(self, pose: PoseGaussian) -> None:
+    def initialize(self, pose: PoseGaussian) -> None:
         """The robot stands at ``map_T_base``, known so well, and is predicted from there."""
-        self.room.put(pose)
+        self.line_map.reset_pose(pose)
         self.tracking_covariance = np.zeros((3, 3))
-        self._restart()
+        self._restart_prediction()
 
-    def track(self, sighting: Sighting, prediction: Prediction) -> Tracked:
+    def track(self, prepared: PreparedScan, prediction: Prediction) -> TrackedMotion:
         """Predict and correct by the scan's lines."""
-        before, lines = self.pose, sighting.derived(lines_of_scan)
-        believed, contradicted = self._believed(lines, prediction)
-        self.room = believed.room
-        self._since_update = self._since_update.then(believed.step)
-        self._information = _told(lines, believed.observed)
-        self.tracking_covariance = inverse(inverse(self._since_update.covariance) + self._information)
-        return Tracked(se2.between(before, self.pose), self._information, contradicted)
+        before, lines = self.pose, prepared.derived(lines_of_scan)
+        believed, contradicted = self._most_likely_posterior(lines, prediction)
+        self.line_map = believed.line_map
+        self._motion_since_update = self._motion_since_update.compose(believed.motion)
+        self._information = _line_information(lines, believed.associations)
+        self.tracking_covariance = inverse(inverse(self._motion_since_update.covariance) + self._information)
+        return TrackedMotion(se2.between(before, self.pose), self._information, contradicted)
 
-    def _believed(self, lines: Lines, prediction: Prediction) -> tuple[_Believed, bool]:
+    def _most_likely_posterior(self, lines: Lines, prediction: Prediction) -> tuple[_MapPosterior, bool]:
         """After the scan, and whether odometry is not believed: by inertia more of the scan's lines are known."""
         if prediction.odometry is None:
-            return self._after(lines, prediction.inertia), False
-        by_odometry = self._after(lines, prediction.together)
-        known = len(by_odometry.observed.known)
-        if known >= _UNKNOWN * len(lines):
+            return self._posterior(lines, prediction.inertia), False
+        by_odometry = self._posterior(lines, prediction.fused)
+        known = len(by_odometry.associations.matched)
+        if known >= _MIN_MATCHED_SHARE * len(lines):
             return by_odometry, False
-        by_inertia = self._after(lines, prediction.inertia)
-        contradicted = len(by_inertia.observed.known) > known
+        by_inertia = self._posterior(lines, prediction.inertia)
+        contradicted = len(by_inertia.associations.matched) > known
         return (by_inertia if contradicted else by_odometry), contradicted
 
-    def _after(self, lines: Lines, step: Step) -> _Believed:
-        room = LineMap.of(self.mapping.configuration.features, self.room.state)
+    def _posterior(self, lines: Lines, step: RelativeMotion) -> _MapPosterior:
+        room = LineMap.from_state(self.mapping.configuration.features, self.line_map.state)
         room.predict(step)
-        return _Believed(room, step, room.observe(lines))
+        return _MapPosterior(room, step, room.observe(lines))
 
-    def update(self, sighting: Sighting, step: int) -> FilterStep:  # noqa: ARG002  it was tracked; nothing is drawn
+    def update(self, prepared: PreparedScan, step: int) -> FilterStep:  # noqa: ARG002  it was tracked; nothing is drawn
         """What the scans since the last keyframe came to."""
-        here = self.room.pose
-        moved = se2.between(self.room.marks.poses[0], here.mean)
-        matched = inverse(inverse(self._since_update.covariance) + self._information)
+        here = self.line_map.pose
+        moved = se2.between(self.line_map.clones.poses[0], here.mean)
+        matched = inverse(inverse(self._motion_since_update.covariance) + self._information)
         # What the pose in the area's frame became less certain by.
-        lasting = _positive(here.covariance - carried(self._last_covariance, moved))
+        lasting = _positive_part(here.covariance - propagate_covariance(self._last_covariance, moved))
         error = MatchError(matched, lasting, matched @ self._information)
-        self._restart()
-        corrected = bool(np.any(np.hypot(*(self.leading_keyframe_poses() - self._told)[:, :2].T) > _CORRECTED))
+        self._restart_prediction()
+        corrected = bool(
+            np.any(np.hypot(*(self.leading_keyframe_poses() - self._reported_poses)[:, :2].T) > _MIN_CORRECTION)
+        )
         if corrected:
-            self._told = self.leading_keyframe_poses()
+            self._reported_poses = self.leading_keyframe_poses()
         return FilterStep(moved, error, self._information, 1.0, corrected)
 
-    def _restart(self) -> None:
-        self._last_covariance, self._since_update = self.room.pose.covariance, NO_STEP
-        self.room.mark()
-        count = len(self.room.marks.poses)
-        self.room.marks = self.room.marks.only([count - 1, *range(1, count - 1)])
+    def _restart_prediction(self) -> None:
+        self._last_covariance, self._motion_since_update = self.line_map.pose.covariance, NO_MOTION
+        self.line_map.clone_pose()
+        count = len(self.line_map.clones.poses)
+        self.line_map.clones = self.line_map.clones.only([count - 1, *range(1, count - 1)])
 
-    def compared(self, sighting: Sighting) -> Compared:
+    def compare_scan(self, prepared: PreparedScan) -> MapAgreement:
         """A scan in the map: what passes walls contradicts it."""
         near = self.mapping.configuration.matching.matched_distance
-        ends = se2.transform(self.pose, sighting.surfels[:, :2])
-        found = met_and_passed(ends, se2.transform(self.pose, sighting.laser[None])[0], self.room, near)
-        walls = Agreement(found.met + found.passed, found.met, found.passed)
-        return Compared(Agreement(len(ends), found.ending, found.passing), walls)
+        ends = se2.transform(self.pose, prepared.surfels[:, :2])
+        found = count_beams_at_walls(
+            ends, se2.transform(self.pose, prepared.laser_position[None])[0], self.line_map, near
+        )
+        walls = Agreement(found.samples_hit + found.samples_passed, found.samples_hit, found.samples_passed)
+        return MapAgreement(Agreement(len(ends), found.beams_ending, found.beams_passing), walls)
 
     def add_keyframe(self, keyframe: int, scan: Scan) -> None:
         """Note where a scan was taken; with the first one the map begins."""
         if not self.keyframes:
-            self.room.observe(extract_for_map(scan, self.mapping.configuration.features), surely=True)
+            self.line_map.observe(extract_for_map(scan, self.mapping.configuration.features), keep_new=True)
         self.keyframes.append(keyframe)
         self.keyframe_areas.append(self.area)
-        self.room.mark()
-        self._told = np.concatenate((self._told, self.poses))
+        self.line_map.clone_pose()
+        self._reported_poses = np.concatenate((self._reported_poses, self.poses))
 
-    def drop(self, keyframes: Collection[int]) -> None:
+    def drop_keyframes(self, keyframes: Collection[int]) -> None:
         """Forget keyframes, but not what the map holds of them."""
         kept = [k for k, keyframe in enumerate(self.keyframes) if keyframe not in keyframes]
         self.keyframes = [self.keyframes[k] for k in kept]
         self.keyframe_areas = [self.keyframe_areas[k] for k in kept]
-        self.room.marks = self.room.marks.only([0, *(1 + k for k in kept)])
-        self._told = self._told[kept]
+        self.line_map.clones = self.line_map.clones.only([0, *(1 + k for k in kept)])
+        self._reported_poses = self._reported_poses[kept]
 
     def change_area(self, area: int, area_T_previous: Float64, content: Sequence[PlacedKeyframe]) -> None:
         """Go over to the frame of another area and load its local map.
@@ -309,7 +313,7 @@ class LineFilter:
         :param content: all keyframes of the local map, in the new frame.
         """
         self.area = area
-        self._load(content, area_T_previous)
+        self._load_submap(content, area_T_previous)
 
     def reload(self, content: Sequence[PlacedKeyframe], anchor: int) -> None:
         """Build the local map anew after its keyframes moved; the robot stays where it is from one of them.
@@ -319,38 +323,38 @@ class LineFilter:
         """
         before = self.leading_keyframe_poses()[self.keyframes.index(anchor)]
         after = next(placed.pose for placed in content if placed.keyframe == anchor)
-        self._load(content, se2.compose(after, se2.inverse(before)))
+        self._load_submap(content, se2.compose(after, se2.inverse(before)))
 
-    def _load(self, content: Sequence[PlacedKeyframe], moved: Float64) -> None:
+    def _load_submap(self, content: Sequence[PlacedKeyframe], moved: Float64) -> None:
         """Make the map of the lines that keyframes show, and put the robot into it.
 
         :param moved: ``new_T_old`` of the map frame, shape (3,).
         """
-        here, last = (se2.compose(moved, pose) for pose in (self.pose, self.room.marks.poses[0]))
+        here, last = (se2.compose(moved, pose) for pose in (self.pose, self.line_map.clones.poses[0]))
         features = self.mapping.configuration.features
-        self.room = LineMap(features)
+        self.line_map = LineMap(features)
         for placed in content:
-            self.room.put(PoseGaussian(placed.pose, _KEYFRAME))
-            self.room.observe(extract_for_map(placed.scan, features), surely=True)
-        self.room.put(PoseGaussian(here, _KEYFRAME))
-        self._last_covariance = _KEYFRAME
+            self.line_map.reset_pose(PoseGaussian(placed.pose, _KEYFRAME_COVARIANCE))
+            self.line_map.observe(extract_for_map(placed.scan, features), keep_new=True)
+        self.line_map.reset_pose(PoseGaussian(here, _KEYFRAME_COVARIANCE))
+        self._last_covariance = _KEYFRAME_COVARIANCE
         self.keyframes = [placed.keyframe for placed in content]
         self.keyframe_areas = [placed.area for placed in content]
-        self._told = np.array([placed.pose for placed in content]).reshape(-1, 3)
-        self.room.marks = Marks.fixed(np.concatenate((last[None], self._told)), self.room.mean.size)
+        self._reported_poses = np.array([placed.pose for placed in content]).reshape(-1, 3)
+        self.line_map.clones = Marks.fixed(np.concatenate((last[None], self._reported_poses)), self.line_map.mean.size)
 
 
-def _told(lines: Lines, observed: Observed) -> Float64:
+def _line_information(lines: Lines, observed: LineAssociations) -> Float64:
     """Information of the lines that were known about the motion to their scan, in the robot's frame, shape (3, 3)."""
     told = np.zeros((3, 3))
-    for k, _ in observed.known:
+    for k, _ in observed.matched:
         alpha = float(lines.parameters[k, 0])
         slopes = np.array([[0.0, 0.0, -1.0], [-math.cos(alpha), -math.sin(alpha), 0.0]])
         told += slopes.T @ np.linalg.solve(lines.covariances[k], slopes)
     return told
 
 
-def _positive(matrix: Float64) -> Float64:
+def _positive_part(matrix: Float64) -> Float64:
     """The part of a symmetric matrix that is a covariance."""
     values, vectors = np.linalg.eigh(0.5 * (matrix + matrix.T))
     found: Float64 = (vectors * np.maximum(values, 0.0)) @ vectors.T

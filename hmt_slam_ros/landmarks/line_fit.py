@@ -35,7 +35,7 @@ class Beams(NamedTuple):
 
 
 @njit(cache=True)
-def fit(beams: Beams, labels: Int32, line: int, fitted: Float64) -> int:
+def fit_line(beams: Beams, labels: Int32, line: int, fitted: Float64) -> int:
     """Fit the line of the beams with a label.
 
     :param labels: shape (n,).
@@ -44,7 +44,7 @@ def fit(beams: Beams, labels: Int32, line: int, fitted: Float64) -> int:
     :returns: number of beams; below 2, or where they lie in one point, nothing is written.
     """
     points, directions = beams.points, beams.directions
-    count, alpha, r = _through(points, labels, line)
+    count, alpha, r = _initial_line(points, labels, line)
     if count < 2:
         return 0
     aa = ar = rr = determinant = 0.0
@@ -68,17 +68,17 @@ def fit(beams: Beams, labels: Int32, line: int, fitted: Float64) -> int:
             return 0
         alpha += (rr * ga - ar * gr) / determinant
         r += (aa * gr - ar * ga) / determinant
-    normalised(alpha, r, rr / determinant, -ar / determinant, aa / determinant, fitted)
+    write_normalized(alpha, r, rr / determinant, -ar / determinant, aa / determinant, fitted)
     return count
 
 
 @njit(cache=True)
-def normalised(alpha: float, r: float, aa: float, ar: float, rr: float, line: Float64) -> None:
+def write_normalized(alpha: float, r: float, aa: float, ar: float, rr: float, line: Float64) -> None:
     """Write a line and its covariance (5,) with r >= 0 and alpha in [-pi, pi)."""
     if r < 0.0:
         alpha, r = alpha + math.pi, -r
         ar = -ar
-    line[0] = wrapped(alpha)
+    line[0] = wrap_angle(alpha)
     line[1], line[2], line[3], line[4] = r, aa, ar, rr
 
 
@@ -92,13 +92,13 @@ def variance_at(aa: float, ar: float, rr: float, along: float) -> float:
 
 
 @njit(cache=True)
-def wrapped(angle: float) -> float:
+def wrap_angle(angle: float) -> float:
     """The angle in [-pi, pi)."""
     return angle - 2.0 * math.pi * math.floor((angle + math.pi) / (2.0 * math.pi))
 
 
 @njit(cache=True)
-def _through(points: Float64, labels: Int32, line: int) -> tuple[int, float, float]:
+def _initial_line(points: Float64, labels: Int32, line: int) -> tuple[int, float, float]:
     """Number of the points with a label, and the line through them by equal weights (Arras), r of either sign."""
     count, x, y, xx, xy, yy = 0, 0.0, 0.0, 0.0, 0.0, 0.0
     for k in range(len(points)):
@@ -115,7 +115,7 @@ def _through(points: Float64, labels: Int32, line: int) -> tuple[int, float, flo
     return count, alpha, x * math.cos(alpha) + y * math.sin(alpha)
 
 
-class Gate(NamedTuple):
+class MergeGate(NamedTuple):
     """When two segments are one line.
 
     :ivar distance2: squared Mahalanobis distance at most.
@@ -135,23 +135,23 @@ def relabel(labels: Int32, old: int, new: int) -> None:
 
 
 @njit(cache=True)
-def merge(beams: Beams, labels: Int32, lines: Float64, count: int, gate: Gate) -> int:
+def merge_lines(beams: Beams, labels: Int32, lines: Float64, count: int, gate: MergeGate) -> int:
     """Join those two lines that differ least, as long as the gate allows; return how many are left."""
     middles = np.empty((count, 2))
     for line in range(count):
-        _middle(beams.points, labels, line, middles[line])
+        _write_mean_point(beams.points, labels, line, middles[line])
     while True:
         least, one, other = gate.distance2, 0, 0
         for i in range(count):
             for k in range(i):
-                away = distance2(lines[i], lines[k])
-                if away < least and _tell(lines[i], middles[i], lines[k], middles[k]) <= gate.deviation**2:
+                away = line_distance2(lines[i], lines[k])
+                if away < least and _mutual_variance(lines[i], middles[i], lines[k], middles[k]) <= gate.deviation**2:
                     least, one, other = away, k, i
         if one == other:
             return count
         relabel(labels, other, one)
-        fit(beams, labels, one, lines[one])
-        _middle(beams.points, labels, one, middles[one])
+        fit_line(beams, labels, one, lines[one])
+        _write_mean_point(beams.points, labels, one, middles[one])
         count -= 1
         if other != count:
             lines[other], middles[other] = lines[count], middles[count]
@@ -159,7 +159,7 @@ def merge(beams: Beams, labels: Int32, lines: Float64, count: int, gate: Gate) -
 
 
 @njit(cache=True)
-def _middle(points: Float64, labels: Int32, line: int, middle: Float64) -> None:
+def _write_mean_point(points: Float64, labels: Int32, line: int, middle: Float64) -> None:
     """Write the mean of the points of a line, (2,)."""
     count, x, y = 0, 0.0, 0.0
     for k in range(len(labels)):
@@ -169,7 +169,7 @@ def _middle(points: Float64, labels: Int32, line: int, middle: Float64) -> None:
 
 
 @njit(cache=True)
-def _tell(a: Float64, middle_a: Float64, b: Float64, middle_b: Float64) -> float:
+def _mutual_variance(a: Float64, middle_a: Float64, b: Float64, middle_b: Float64) -> float:
     """How well two lines tell that they are one: variance, m^2, of the distance of the one's middle from the other.
 
     Of two short pieces far from each other that lie side by side, either could point at the other; that the one is
@@ -188,14 +188,14 @@ def _variance_at(line: Float64, point: Float64) -> float:
 
 
 @njit(cache=True)
-def distance2(a: Float64, b: Float64) -> float:
+def line_distance2(a: Float64, b: Float64) -> float:
     """Squared Mahalanobis distance of two independent lines (5,); chi-square with 2 degrees of freedom.
 
     The second is taken in that of its two representations, (alpha, r) and (alpha + pi, -r), whose angle is nearer.
     """
-    turn = wrapped(b[0] - a[0])
+    turn = wrap_angle(b[0] - a[0])
     away, sign = b[1] - a[1], 1.0
     if abs(turn) > 0.5 * math.pi:
-        turn, away, sign = wrapped(turn - math.pi), -b[1] - a[1], -1.0
+        turn, away, sign = wrap_angle(turn - math.pi), -b[1] - a[1], -1.0
     aa, ar, rr = a[2] + b[2], a[3] + sign * b[3], a[4] + b[4]
     return (rr * turn * turn - 2.0 * ar * turn * away + aa * away * away) / (aa * rr - ar * ar)

@@ -8,12 +8,12 @@ import numpy as np
 
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration import Configuration
-from hmt_slam_ros.configuration.landmarks import Features
+from hmt_slam_ros.configuration.landmarks import FeatureParameters
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.landmark import Landmark
-from hmt_slam_ros.landmarks.area_landmarks import AreaLandmarks, Sighting, sees_around
+from hmt_slam_ros.landmarks.area_landmarks import AreaLandmarkExtractor, LandmarkObservation, has_full_view
 from hmt_slam_ros.landmarks.landmark_map import LandmarkMap
-from hmt_slam_ros.landmarks.landmarks import OPENING, Landmarks
+from hmt_slam_ros.landmarks.landmarks import OPENING, ScanLandmarks
 from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.submap.local_mapping import LocalMapping
 
@@ -21,9 +21,9 @@ from hmt_slam_ros.submap.local_mapping import LocalMapping
 class LandmarkOpenings:
     """The openings among the landmarks that one keyframe shows."""
 
-    def __init__(self, sighting: Sighting, features: Features) -> None:
-        chosen = sighting.seen.kinds == OPENING
-        self._seen = Landmarks(*(column[chosen] for column in sighting.seen))
+    def __init__(self, sighting: LandmarkObservation, features: FeatureParameters) -> None:
+        chosen = sighting.landmarks.kinds == OPENING
+        self._seen = ScanLandmarks(*(column[chosen] for column in sighting.landmarks))
         self._sighting, self._features = sighting, features
 
     @property
@@ -48,11 +48,11 @@ class LandmarkOpeningDetector:
     """Sees openings as landmarks, by the scan of a keyframe or by a virtual one in the map around it."""
 
     def __init__(self, configuration: Configuration) -> None:
-        self._landmarks, self._features = AreaLandmarks(LocalMapping(configuration)), configuration.features
+        self._landmarks, self._features = AreaLandmarkExtractor(LocalMapping(configuration)), configuration.features
 
     def sees_around(self, scan: Scan) -> bool:
         """Whether a scan shows what is all around by itself."""
-        return sees_around(scan)
+        return has_full_view(scan)
 
     def view(self, scan: Scan, pose: Float64, around: Iterable[Scan], poses: Float64) -> LandmarkOpenings:
         """What one keyframe shows, in the map of it and of others around it.
@@ -61,4 +61,4 @@ class LandmarkOpeningDetector:
         :param around: scans of the others.
         :param poses: shape (n, 3), theirs.
         """
-        return LandmarkOpenings(self._landmarks.sighting(scan, pose, around, poses), self._features)
+        return LandmarkOpenings(self._landmarks.observe_keyframe(scan, pose, around, poses), self._features)

@@ -21,19 +21,29 @@ import numpy as np
 from numba import njit
 
 from hmt_slam_ros.arrays import Float64
-from hmt_slam_ros.configuration.landmarks import Features
+from hmt_slam_ros.configuration.landmarks import FeatureParameters
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.landmarks.beam_labels import DEEP, ON, STRAY, Rays, Told, across, last_behind, sort_out, told_of
+from hmt_slam_ros.landmarks.beam_labels import (
+    DEEP_BEHIND,
+    ON_LINE,
+    STRAY_DEVIATIONS,
+    BeamLabels,
+    Rays,
+    deviation_across,
+    empty_beam_labels,
+    label_beams,
+    last_beam_behind,
+)
 from hmt_slam_ros.landmarks.line_extraction import Lines
 from hmt_slam_ros.landmarks.line_fit import variance_at
 
-PLACE, VARIANCE, SUPPORT = range(3)
+POSITION, VARIANCE, SUPPORT = range(3)
 """Where what is known of a jamb stands in an array: where on the line, m, the variance of that, and support, m."""
 
 
 @njit(cache=True)
-def wall_end(
-    line: Float64, covariance: Float64, rays: Rays, told: Told, k: int, step: int, max_gap: float, jamb: Float64
+def write_wall_end_jamb(
+    line: Float64, covariance: Float64, rays: Rays, told: BeamLabels, k: int, step: int, max_gap: float, jamb: Float64
 ) -> None:
     """Write the jamb where the wall ends on which the beams from ``k`` on lie, away from the gap.
 
@@ -41,19 +51,23 @@ def wall_end(
 
     :param told: what beams say of the line, all of those that say something.
     """
-    end = len(told.kinds)
-    while 0 <= k + step < end and told.kinds[k + step] == ON and told.behind[k] > across(line, rays, told.beams[k]):
+    end = len(told.labels)
+    while (
+        0 <= k + step < end
+        and told.labels[k + step] == ON_LINE
+        and told.behind[k] > deviation_across(line, rays, told.beams[k])
+    ):
         k += step
     spacing, beam = told.along[k - step] - told.along[k], told.beams[k]
-    jamb[PLACE] = told.along[k] + 0.5 * spacing
+    jamb[POSITION] = told.along[k] + 0.5 * spacing
     # Where the end is between two beams, and how far the line's error moves it along the beam.
     facing = math.cos(line[0]) * rays.directions[beam, 0] + math.sin(line[0]) * rays.directions[beam, 1]
     slant = (1.0 - facing * facing) / (facing * facing)
-    uncertain = abs(spacing) + 2.0 * STRAY * rays.deviations[beam]
+    uncertain = abs(spacing) + 2.0 * STRAY_DEVIATIONS * rays.deviations[beam]
     jamb[VARIANCE] = uncertain * uncertain / 12.0
     jamb[VARIANCE] += slant * variance_at(covariance[0, 0], covariance[0, 1], covariance[1, 1], told.along[k])
     last = k
-    while 0 <= last + step < end and told.kinds[last + step] == ON:
+    while 0 <= last + step < end and told.labels[last + step] == ON_LINE:
         if abs(told.along[last + step] - told.along[last]) > max_gap:
             break
         last += step
@@ -61,17 +75,19 @@ def wall_end(
 
 
 @njit(cache=True)
-def crossing_wall(line: Float64, rays: Rays, told: Told, k: int, step: int, max_gap: float, jamb: Float64) -> bool:
+def write_crossing_wall_jamb(
+    line: Float64, rays: Rays, told: BeamLabels, k: int, step: int, max_gap: float, jamb: Float64
+) -> bool:
     """Write the jamb where another wall crosses the line before beam ``k``; False where none does."""
     before = told.beams[k - step]
-    x, y = _end(rays, told.beams[k])
-    from_x, from_y = _end(rays, before)
-    if not rays.met[before] or math.hypot(x - from_x, y - from_y) > max_gap:
+    x, y = _beam_end(rays, told.beams[k])
+    from_x, from_y = _beam_end(rays, before)
+    if not rays.hit[before] or math.hypot(x - from_x, y - from_y) > max_gap:
         return False
     cos, sin = math.cos(line[0]), math.sin(line[0])
     share = told.behind[k - step] / (told.behind[k - step] - told.behind[k])
     crossing_x, crossing_y = from_x + share * (x - from_x), from_y + share * (y - from_y)
-    jamb[PLACE] = cos * crossing_y - sin * crossing_x
+    jamb[POSITION] = cos * crossing_y - sin * crossing_x
     beam = told.beams[k]
     slanted = cos * rays.directions[beam, 1] - sin * rays.directions[beam, 0]
     jamb[VARIANCE] = (rays.deviations[beam] * slanted) ** 2
@@ -80,9 +96,9 @@ def crossing_wall(line: Float64, rays: Rays, told: Told, k: int, step: int, max_
 
 
 @njit(cache=True)
-def _end(rays: Rays, beam: int) -> tuple[float, float]:
+def _beam_end(rays: Rays, beam: int) -> tuple[float, float]:
     """Where a beam ends."""
-    away = rays.free[beam]
+    away = rays.free_range[beam]
     x = rays.origins[beam, 0] + away * rays.directions[beam, 0]
     return x, rays.origins[beam, 1] + away * rays.directions[beam, 1]
 
@@ -119,19 +135,19 @@ NO_OPENINGS = Openings(np.empty((0, 3)), np.empty((0, 3, 3)), np.empty(0), np.em
 """What a scan shows before the first one."""
 
 
-def openings_of(lines: Lines, rays: Rays, features: Features) -> Openings:
+def extract_openings(lines: Lines, rays: Rays, features: FeatureParameters) -> Openings:
     """The openings in the walls that lines show."""
-    return openings_and_evidence(lines, rays, features)[0]
+    return extract_openings_with_evidence(lines, rays, features)[0]
 
 
-def openings_and_evidence(lines: Lines, rays: Rays, features: Features) -> tuple[Openings, Float64]:
+def extract_openings_with_evidence(lines: Lines, rays: Rays, features: FeatureParameters) -> tuple[Openings, Float64]:
     """The openings, and what their confidences follow from.
 
     :returns: the second of shape (n, 3), logarithms of what was seen of the wall, m, of both jambs, m, together, and of
         the share of the width that is seen through.
     """
     parameters = np.ascontiguousarray(lines.parameters)
-    found = _openings(parameters, lines.covariances, rays, features.opening_depth, features.max_gap)
+    found = _select_openings(parameters, lines.covariances, rays, features.opening_depth, features.max_gap)
     widths = found[:, _LAST] - found[:, _FIRST]
     found = found[(widths >= features.opening_min) & (widths <= features.opening_max)]
     own = found[:, _LINE].astype(np.int64)
@@ -150,21 +166,21 @@ def openings_and_evidence(lines: Lines, rays: Rays, features: Features) -> tuple
     confidences = 1.0 / (1.0 + np.exp(-features.opening_bias - evidence @ weights))
     widths = found[:, _LAST] - found[:, _FIRST]
     every = Openings(poses, covariances, widths, np.sqrt(variances), confidences)
-    kept = _without_repetitions(every)
+    kept = _distinct_openings(every)
     return Openings(*(field[kept] for field in every)), evidence[kept]
 
 
 def _evidence(found: Float64, lines: Lines) -> Float64:
     """What speaks for gaps (n, 8) being openings, shape (n, 3)."""
     seen = np.zeros(len(lines))
-    np.add.at(seen, lines.owners, lines.pieces[:, 1] - lines.pieces[:, 0])
+    np.add.at(seen, lines.owners, lines.segments[:, 1] - lines.segments[:, 0])
     walls = np.log(seen[found[:, _LINE].astype(np.int64)])
     jambs = np.log(np.maximum(found[:, [_FIRST + SUPPORT, _LAST + SUPPORT]], _LEAST_JAMB)).sum(axis=1)
     shares = np.log(np.maximum(found[:, _SHARE], _LEAST_SHARE))
     return np.stack((walls, jambs, shares), axis=1)
 
 
-def _without_repetitions(openings: Openings) -> list[int]:
+def _distinct_openings(openings: Openings) -> list[int]:
     """Numbers of those that are one the most confident to a tenth, and of these the one whose wall is known best."""
     kept: list[int] = []
     for k in np.lexsort((openings.covariances[:, 0, 0], -np.round(openings.confidences, 1))).tolist():
@@ -176,40 +192,47 @@ def _without_repetitions(openings: Openings) -> list[int]:
 
 
 @njit(cache=True)
-def _openings(lines: Float64, covariances: Float64, rays: Rays, depth: float, max_gap: float) -> Float64:
+def _select_openings(lines: Float64, covariances: Float64, rays: Rays, depth: float, max_gap: float) -> Float64:
     """All gaps between two jambs in the lines that beams go deep through, (n, 8)."""
-    beams, count = len(rays.free), 0
-    found, room = np.empty((len(lines) * (beams // _BEAMS) + 1, _SIZE)), told_of(beams)
+    beams, count = len(rays.free_range), 0
+    found, room = np.empty((len(lines) * (beams // _BEAMS) + 1, _SIZE)), empty_beam_labels(beams)
     for own in range(len(lines)):
-        last, end = -1, sort_out(lines[own], covariances[own], rays, depth, room)
-        told = Told(room.kinds[:end], room.along[:end], room.behind[:end], room.beams[:end])
+        last, end = -1, label_beams(lines[own], covariances[own], rays, depth, room)
+        told = BeamLabels(room.kinds[:end], room.along[:end], room.behind[:end], room.beams[:end])
         while last + 1 < end:
             first = last + 1
-            last = last_behind(told, first, end)
+            last = last_beam_behind(told, first, end)
             if last < first:
                 last = first
-            elif _gap(lines[own], covariances[own], rays, told, first, last, max_gap, found[count]):
+            elif _write_gap(lines[own], covariances[own], rays, told, first, last, max_gap, found[count]):
                 found[count, _LINE] = own
                 count += 1
     return found[:count]
 
 
 @njit(cache=True)
-def _gap(
-    line: Float64, covariance: Float64, rays: Rays, told: Told, first: int, last: int, max_gap: float, found: Float64
+def _write_gap(
+    line: Float64,
+    covariance: Float64,
+    rays: Rays,
+    told: BeamLabels,
+    first: int,
+    last: int,
+    max_gap: float,
+    found: Float64,
 ) -> bool:
     """Write the gap that beams from the first to the last pass; False where it is none."""
     before, after = first - 1, last + 1
-    if before < 0 or after >= len(told.kinds) or (told.kinds[before] != ON and told.kinds[after] != ON):
+    if before < 0 or after >= len(told.labels) or (told.labels[before] != ON_LINE and told.labels[after] != ON_LINE):
         return False
     for beam, step, jamb in ((before, -1, found[_FIRST:_LAST]), (after, 1, found[_LAST:_SHARE])):
-        if told.kinds[beam] == ON:
-            wall_end(line, covariance, rays, told, beam, step, max_gap, jamb)
-        elif not crossing_wall(line, rays, told, beam, step, max_gap, jamb):
+        if told.labels[beam] == ON_LINE:
+            write_wall_end_jamb(line, covariance, rays, told, beam, step, max_gap, jamb)
+        elif not write_crossing_wall_jamb(line, rays, told, beam, step, max_gap, jamb):
             return False
     deep, clear = 0, 0.0
     for k in range(first, last + 1):
-        if told.kinds[k] == DEEP:
+        if told.labels[k] == DEEP_BEHIND:
             deep, clear = deep + 1, clear + 0.5 * abs(told.along[k + 1] - told.along[k - 1])
     if found[_FIRST] > found[_LAST]:
         for column in range(_SHARE - _LAST):
@@ -219,7 +242,7 @@ def _gap(
     return deep >= _BEAMS
 
 
-def jambs_of(poses: Float64, widths: Float64) -> Float64:
+def jamb_positions(poses: Float64, widths: Float64) -> Float64:
     """Both jambs of openings, shape (n, 4), x and y of the left one and of the right one, m.
 
     :param poses: shape (n, 3), their middles with the heading through them, m and rad.
@@ -229,7 +252,7 @@ def jambs_of(poses: Float64, widths: Float64) -> Float64:
     return np.concatenate([se2.compose(poses, sign * across)[:, :2] for sign in (1.0, -1.0)], axis=1)
 
 
-def up_to_doors(origins: Float64, directions: Float64, doors: Float64) -> Float64:
+def distance_to_doors(origins: Float64, directions: Float64, doors: Float64) -> Float64:
     """How far it is along beams to the first door that they pass, m, shape (n,); inf where there is none.
 
     :param origins: shape (n, 2), where beams begin, m.
@@ -238,12 +261,12 @@ def up_to_doors(origins: Float64, directions: Float64, doors: Float64) -> Float6
     """
     along = doors[None, :, 2:] - doors[None, :, :2]
     to = doors[None, :, :2] - origins[:, None]
-    turned = _cross(directions[:, None], along)
+    turned = _cross_product(directions[:, None], along)
     turned = np.where(turned == 0.0, np.nan, turned)
-    away, share = _cross(to, along) / turned, _cross(to, directions[:, None]) / turned
+    away, share = _cross_product(to, along) / turned, _cross_product(to, directions[:, None]) / turned
     passed = np.where((away > 0.0) & (share >= 0.0) & (share <= 1.0), away, np.inf)
     return np.asarray(passed.min(axis=1, initial=np.inf))
 
 
-def _cross(a: Float64, b: Float64) -> Float64:
+def _cross_product(a: Float64, b: Float64) -> Float64:
     return np.asarray(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])

@@ -30,23 +30,23 @@ from typing import NamedTuple
 import numpy as np
 
 from hmt_slam_ros.arrays import Float64
-from hmt_slam_ros.configuration.landmarks import Features
+from hmt_slam_ros.configuration.landmarks import FeatureParameters
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.geometry.gaussian import PoseGaussian, gate
-from hmt_slam_ros.landmarks.data_association import Pairing, compatible
+from hmt_slam_ros.geometry.gaussian import PoseGaussian, chi_square_gate
+from hmt_slam_ros.landmarks.data_association import Pairing, compatible_pairings
 from hmt_slam_ros.landmarks.line_extraction import Lines
-from hmt_slam_ros.landmarks.line_fit import Gate
-from hmt_slam_ros.sensors.motion_model import Step
-from hmt_slam_ros.submap.line_map_state import NO_MARKS, LineMapState, Marks, Wall
+from hmt_slam_ros.landmarks.line_fit import MergeGate
+from hmt_slam_ros.sensors.motion_model import RelativeMotion
+from hmt_slam_ros.submap.line_map_state import NO_CLONES, LineMapState, Marks, Wall
 
 
-def overlap(pieces: Float64, others: Float64) -> float:
+def overlap_ratio(pieces: Float64, others: Float64) -> float:
     """What two lines have in common along them, as a share of the shorter of the two."""
     common = np.minimum(pieces[:, None, 1], others[None, :, 1]) - np.maximum(pieces[:, None, 0], others[None, :, 0])
-    return float(np.maximum(common, 0.0).sum()) / max(1e-9, min(_length(pieces), _length(others)))
+    return float(np.maximum(common, 0.0).sum()) / max(1e-9, min(_total_length(pieces), _total_length(others)))
 
 
-def joined(pieces: Float64, max_gap: float) -> Float64:
+def join_segments(pieces: Float64, max_gap: float) -> Float64:
     """Pieces of one line, joined where the gap between them is no larger than ``max_gap``, m."""
     pieces = pieces[np.argsort(pieces[:, 0])]
     reached = np.maximum.accumulate(pieces[:, 1])
@@ -54,16 +54,16 @@ def joined(pieces: Float64, max_gap: float) -> Float64:
     return np.stack((pieces[first, 0], np.maximum.reduceat(pieces[:, 1], np.flatnonzero(first))), axis=1)
 
 
-def middle(pieces: Float64) -> float:
+def mean_position(pieces: Float64) -> float:
     """Mean of what was seen, m along the line."""
-    return 0.5 * float((pieces**2 @ (-1.0, 1.0)).sum()) / max(1e-9, _length(pieces))
+    return 0.5 * float((pieces**2 @ (-1.0, 1.0)).sum()) / max(1e-9, _total_length(pieces))
 
 
-def _length(pieces: Float64) -> float:
+def _total_length(pieces: Float64) -> float:
     return float((pieces[:, 1] - pieces[:, 0]).sum())
 
 
-def most_alike(lines: Float64, covariance: Float64, middles: Float64, gate: Gate) -> tuple[int, int] | None:
+def most_similar_pair(lines: Float64, covariance: Float64, middles: Float64, gate: MergeGate) -> tuple[int, int] | None:
     """The two lines that differ least, if there are two that are one.
 
     :param lines: alpha and r, shape (n, 2), rad and m.
@@ -79,13 +79,13 @@ def most_alike(lines: Float64, covariance: Float64, middles: Float64, gate: Gate
     difference = lines[one] - lines[other]
     difference[:, 0] = se2.wrap(difference[:, 0])
     distance2 = np.einsum("ni,nij,nj->n", difference, np.linalg.inv(spread), difference)
-    variance = np.minimum(_variance(spread, middles[one]), _variance(spread, middles[other]))
+    variance = np.minimum(_distance_variances(spread, middles[one]), _distance_variances(spread, middles[other]))
     distance2[variance > gate.deviation**2] = np.inf
     least = int(np.argmin(distance2)) if count > 1 else -1
     return (int(one[least]), int(other[least])) if least >= 0 and distance2[least] <= gate.distance2 else None
 
 
-def _variance(spread: Float64, along: Float64) -> Float64:
+def _distance_variances(spread: Float64, along: Float64) -> Float64:
     """Of the distance of a point of a line from another one, shape (n,), m^2.
 
     :param spread: covariance of the difference of alpha and r, shape (n, 2, 2).
@@ -98,32 +98,32 @@ _DEVIATIONS = 4.0
 _OTHER_SIDE = np.array([[1.0, -1.0], [-1.0, 1.0]])  # on a covariance where r changes its sign
 
 
-class Observed(NamedTuple):
+class LineAssociations(NamedTuple):
     """What became of the lines of a scan and of the map; lines of the map are told by their names.
 
-    :ivar known: pairs of a line of the scan and the line of the map that it re-observed.
+    :ivar matched: pairs of a line of the scan and the line of the map that it re-observed.
     :ivar new: pairs of a line of the scan and the line of the map that it became.
-    :ivar joined: pairs of a line of the map and the one that became part of it.
+    :ivar merged: pairs of a line of the map and the one that became part of it.
     """
 
-    known: tuple[tuple[int, int], ...] = ()
+    matched: tuple[tuple[int, int], ...] = ()
     new: tuple[tuple[int, int], ...] = ()
-    joined: tuple[tuple[int, int], ...] = ()
+    merged: tuple[tuple[int, int], ...] = ()
 
 
-class _Placed(NamedTuple):
+class _OrientedLine(NamedTuple):
     """An observed line, on that of its sides that the map has.
 
     :ivar observed: alpha and r in the robot's frame, (2,).
     :ivar covariance: of these, (2, 2).
     :ivar line: alpha and r in the frame of the map, (2,), Eq. (9).
-    :ivar pieces: what was seen of it, (m, 2), m along it in that frame.
+    :ivar segments: what was seen of it, (m, 2), m along it in that frame.
     """
 
     observed: Float64
     covariance: Float64
     line: Float64
-    pieces: Float64
+    segments: Float64
 
 
 class LineMap:
@@ -132,34 +132,34 @@ class LineMap:
     :ivar mean: shape (3 + 2 n,), x and y in m, theta in rad, then alpha in rad and r in m of each line.
     :ivar covariance: shape (3 + 2 n, 3 + 2 n).
     :ivar walls: the n lines, in the order of the state.
-    :ivar marks: poses where the robot was, corrected by what it learns later.
+    :ivar clones: poses where the robot was, corrected by what it learns later.
     """
 
-    def __init__(self, features: Features, start: PoseGaussian | None = None) -> None:
+    def __init__(self, features: FeatureParameters, start: PoseGaussian | None = None) -> None:
         """:param start: ``map_T_base``; the origin, for certain, unless it is given."""
         self._features = features
-        self._gate = gate(features.pair_probability, 2)
-        self._alike = Gate(gate(features.merge_probability, 2), features.map_merge_deviation)
-        start = start or PoseGaussian.exactly(np.zeros(3))
+        self._gate = chi_square_gate(features.pair_probability, 2)
+        self._merge_gate = MergeGate(chi_square_gate(features.merge_probability, 2), features.map_merge_deviation)
+        start = start or PoseGaussian.from_pose(np.zeros(3))
         self.mean: Float64 = start.mean.copy()
-        turn = _turn(start.mean[2])
+        turn = _rotation(start.mean[2])
         self.covariance: Float64 = turn @ start.covariance @ turn.T
         self.walls: list[Wall] = []
-        self.marks: Marks = NO_MARKS
-        self._names = 0
+        self.clones: Marks = NO_CLONES
+        self._next_number = 0
 
     @classmethod
-    def of(cls, features: Features, state: LineMapState) -> LineMap:
+    def from_state(cls, features: FeatureParameters, state: LineMapState) -> LineMap:
         """The map of a state."""
         found = cls(features)
         found.mean, found.covariance = state.mean, state.covariance
-        found.walls, found._names, found.marks = list(state.walls), state.names, state.marks
+        found.walls, found._next_number, found.clones = list(state.walls), state.next_number, state.clones
         return found
 
     @property
     def state(self) -> LineMapState:
         """All that is known; none of its arrays is written to later."""
-        return LineMapState(self.mean.copy(), self.covariance.copy(), tuple(self.walls), self._names, self.marks)
+        return LineMapState(self.mean.copy(), self.covariance.copy(), tuple(self.walls), self._next_number, self.clones)
 
     def __len__(self) -> int:
         return len(self.walls)
@@ -167,7 +167,7 @@ class LineMap:
     @property
     def pose(self) -> PoseGaussian:
         """The belief over ``map_T_base``."""
-        turn = _turn(self.mean[2])
+        turn = _rotation(self.mean[2])
         return PoseGaussian(self.mean[:3].copy(), turn.T @ self.covariance[:3, :3] @ turn)
 
     @property
@@ -177,10 +177,10 @@ class LineMap:
 
     def line_covariance(self, line: int) -> Float64:
         """Of alpha and r of a line, shape (2, 2)."""
-        at = _place(line)
+        at = _state_slice(line)
         return self.covariance[at, at]
 
-    def predict(self, step: Step) -> None:
+    def predict(self, step: RelativeMotion) -> None:
         """The robot moved, Eqs. (7) and (8)."""
         x, y, _ = self.mean[:3]
         self.mean[:3] = se2.compose(self.mean[:3], step.increment)
@@ -188,59 +188,61 @@ class LineMap:
         by_robot[:2, 2] = y - self.mean[1], self.mean[0] - x
         self.covariance[:3] = by_robot @ self.covariance[:3]
         self.covariance[:, :3] = self.covariance[:, :3] @ by_robot.T
-        self.marks = self.marks.after_motion(by_robot)
-        turn = _turn(self.mean[2])
+        self.clones = self.clones.after_motion(by_robot)
+        turn = _rotation(self.mean[2])
         self.covariance[:3, :3] += turn @ step.covariance @ turn.T
 
-    def put(self, pose: PoseGaussian) -> None:
+    def reset_pose(self, pose: PoseGaussian) -> None:
         """The robot is elsewhere, and how it came there the lines do not tell."""
-        turn = _turn(pose.mean[2])
+        turn = _rotation(pose.mean[2])
         self.mean[:3] = pose.mean
         self.covariance[:3], self.covariance[:, :3] = 0.0, 0.0
         self.covariance[:3, :3] = turn @ pose.covariance @ turn.T
-        self.marks = self.marks.without_robot()
+        self.clones = self.clones.without_robot()
 
-    def mark(self) -> None:
+    def clone_pose(self) -> None:
         """Note where the robot is."""
-        self.marks = self.marks.and_robot(self.mean, self.covariance)
+        self.clones = self.clones.and_robot(self.mean, self.covariance)
 
-    def observe(self, lines: Lines, *, surely: bool = False) -> Observed:
+    def observe(self, lines: Lines, *, keep_new: bool = False) -> LineAssociations:
         """Correct robot and lines by those that are known, take in those that are new, and join what is one.
 
-        :param surely: whether what is new stays though no other scan shows it.
+        :param keep_new: whether what is new stays though no other scan shows it.
         """
         pairings = [pairing for k in range(len(lines)) for pairing in self._pairings(lines, k)]
-        chosen = compatible(self.covariance, pairings, self._features.pair_probability)
-        self._update(chosen)
-        for line in {pairing.line for pairing in chosen}:
+        chosen = compatible_pairings(self.covariance, pairings, self._features.pair_probability)
+        self._update_with_pairings(chosen)
+        for line in {pairing.map_line for pairing in chosen}:
             self.walls[line] = self.walls[line]._replace(sightings=self.walls[line].sightings + 1)
         for pairing in chosen:
-            self._see(pairing.line, self._placed(lines, pairing.observed, self.lines[pairing.line, 0]).pieces)
-        known = {pairing.observed: self.walls[pairing.line].name for pairing in chosen}
+            self._extend_segments(
+                pairing.map_line, self._orient_line(lines, pairing.scan_line, self.lines[pairing.map_line, 0]).segments
+            )
+        known = {pairing.scan_line: self.walls[pairing.map_line].name for pairing in chosen}
         # Against the lines that were there before the scan: its own lines have been told apart already.
         unknown = [k for k in range(len(lines)) if k not in known and not self._pairings(lines, k)]
-        sightings = self._features.min_sightings if surely else 1
-        new = {k: self._add(self._placed(lines, k, None), sightings) for k in unknown}
-        self._give_up({*known.values(), *new.values()})
-        return Observed(tuple(known.items()), tuple(new.items()), tuple(self._join()))
+        sightings = self._features.min_sightings if keep_new else 1
+        new = {k: self._add_line(self._orient_line(lines, k, None), sightings) for k in unknown}
+        self._prune_lines({*known.values(), *new.values()})
+        return LineAssociations(tuple(known.items()), tuple(new.items()), tuple(self._merge_lines()))
 
-    def _placed(self, lines: Lines, k: int, alpha: float | None) -> _Placed:
+    def _orient_line(self, lines: Lines, k: int, alpha: float | None) -> _OrientedLine:
         """A line of a scan; one on which the robot is, on that side on which its angle is nearer to ``alpha``."""
         (angle, r), covariance = lines.parameters[k].tolist(), lines.covariances[k]
-        pieces = lines.pieces[lines.owners == k]
+        pieces = lines.segments[lines.owners == k]
         x, y, theta = self.mean[:3].tolist()
         near = r <= _DEVIATIONS * math.sqrt(covariance[1, 1])
         if alpha is not None and near and math.cos(angle + theta - alpha) < 0.0:
             angle, r, covariance, pieces = angle + math.pi, -r, covariance * _OTHER_SIDE, -pieces[:, ::-1]
         cos, sin = math.cos(angle + theta), math.sin(angle + theta)
         line = np.array([float(se2.wrap(angle + theta)), r + x * cos + y * sin])
-        return _Placed(np.array([angle, r]), covariance, line, pieces + (y * cos - x * sin))
+        return _OrientedLine(np.array([angle, r]), covariance, line, pieces + (y * cos - x * sin))
 
-    def _compared(self, lines: Lines, k: int, line: int) -> Pairing | None:
+    def _pair_lines(self, lines: Lines, k: int, line: int) -> Pairing | None:
         """An observed line as a re-observation of a line of the map, Eq. (12); None where other pieces were seen."""
         alpha, r = self.lines[line].tolist()
-        placed = self._placed(lines, k, alpha)
-        if overlap(placed.pieces, self.walls[line].pieces) < self._features.min_overlap:
+        placed = self._orient_line(lines, k, alpha)
+        if overlap_ratio(placed.segments, self.walls[line].pieces) < self._features.min_overlap:
             return None
         x, y, theta = self.mean[:3].tolist()
         cos, sin = math.cos(alpha), math.sin(alpha)
@@ -248,10 +250,10 @@ class LineMap:
         difference[0] = float(se2.wrap(difference[0]))
         jacobian = np.zeros((2, self.mean.size))
         jacobian[0, 2], jacobian[1, :2] = -1.0, (-cos, -sin)
-        jacobian[:, _place(line)] = ((1.0, 0.0), (x * sin - y * cos, 1.0))
+        jacobian[:, _state_slice(line)] = ((1.0, 0.0), (x * sin - y * cos, 1.0))
         return Pairing(k, line, difference, jacobian, placed.covariance)
 
-    def _parallel(self, lines: Lines, k: int) -> list[int]:
+    def _parallel_lines(self, lines: Lines, k: int) -> list[int]:
         """The lines of the map that an observed line may be by its direction alone: all others are beyond the gate."""
         away = np.abs(se2.wrap(lines.parameters[k, 0] + self.mean[2] - self.lines[:, 0]))
         variances = np.diagonal(self.covariance)
@@ -263,10 +265,10 @@ class LineMap:
 
     def _pairings(self, lines: Lines, k: int) -> list[Pairing]:
         """All lines of the map that an observed line may be, Eq. (13)."""
-        every = (self._compared(lines, k, line) for line in self._parallel(lines, k))
+        every = (self._pair_lines(lines, k, line) for line in self._parallel_lines(lines, k))
         return [each for each in every if each and each.distance2(self.covariance) <= self._gate]
 
-    def _update(self, chosen: Sequence[Pairing]) -> None:
+    def _update_with_pairings(self, chosen: Sequence[Pairing]) -> None:
         """Eqs. (14) to (17) for all pairings at once, the covariance in Joseph's form."""
         if not chosen:
             return
@@ -283,10 +285,10 @@ class LineMap:
         self.mean = self.mean + gain @ difference
         self.mean[2] = se2.wrap(self.mean[2])
         kept = np.eye(self.mean.size) - gain @ jacobian
-        self.marks = self.marks.corrected(jacobian.T @ np.linalg.solve(spread, difference), kept)
+        self.clones = self.clones.corrected(jacobian.T @ np.linalg.solve(spread, difference), kept)
         self.covariance = kept @ self.covariance @ kept.T + gain @ noise @ gain.T
 
-    def _add(self, placed: _Placed, sightings: int) -> int:
+    def _add_line(self, placed: _OrientedLine, sightings: int) -> int:
         """Take a new line in, Eqs. (9) to (11); return its name."""
         size = self.mean.size
         covariance = np.zeros((size + 2, size + 2))
@@ -299,57 +301,57 @@ class LineMap:
         own = by_line @ placed.covariance @ by_line.T
         covariance[size:, size:] = by_robot @ self.covariance[:3, :3] @ by_robot.T + own
         self.mean, self.covariance = np.concatenate((self.mean, placed.line)), covariance
-        self.marks = self.marks.with_line(by_robot)
-        self.walls.append(Wall(self._names, sightings, joined(placed.pieces, self._features.max_gap)))
-        self._names += 1
+        self.clones = self.clones.with_line(by_robot)
+        self.walls.append(Wall(self._next_number, sightings, join_segments(placed.segments, self._features.max_gap)))
+        self._next_number += 1
         return self.walls[-1].name
 
-    def _see(self, line: int, pieces: Float64) -> None:
+    def _extend_segments(self, line: int, pieces: Float64) -> None:
         """Join what was seen of a line with what had been."""
         wall = self.walls[line]
-        pieces = joined(np.concatenate((wall.pieces, pieces)), self._features.max_gap)
+        pieces = join_segments(np.concatenate((wall.pieces, pieces)), self._features.max_gap)
         self.walls[line] = wall._replace(pieces=pieces)
 
-    def _give_up(self, seen: Collection[int]) -> None:
+    def _prune_lines(self, seen: Collection[int]) -> None:
         """Forget the lines that were seen too seldom and, by their names, not this time."""
         enough = self._features.min_sightings
         for line in reversed(range(len(self))):
             if self.walls[line].sightings < enough and self.walls[line].name not in seen:
-                self._drop(line)
+                self._remove_line(line)
 
-    def _join(self) -> Iterator[tuple[int, int]]:
+    def _merge_lines(self) -> Iterator[tuple[int, int]]:
         """Make one of lines that are one; their names."""
-        while pair := most_alike(self.lines, self.covariance[3:, 3:], self._middles(), self._alike):
+        while pair := most_similar_pair(self.lines, self.covariance[3:, 3:], self._mean_positions(), self._merge_gate):
             one, other = pair
             jacobian = np.zeros((2, self.mean.size))
-            jacobian[:, _place(one)], jacobian[:, _place(other)] = np.eye(2), -np.eye(2)
+            jacobian[:, _state_slice(one)], jacobian[:, _state_slice(other)] = np.eye(2), -np.eye(2)
             difference = self.lines[other] - self.lines[one]
             difference[0] = se2.wrap(difference[0])
             # Eqs. (14) to (17), observed for certain: their difference is 0.
             self._correct(jacobian, difference, np.zeros((2, 2)))
             wall, part = self.walls[one], self.walls[other]
             self.walls[one] = wall._replace(sightings=wall.sightings + part.sightings)
-            self._see(one, part.pieces)
-            self._drop(other)
+            self._extend_segments(one, part.pieces)
+            self._remove_line(other)
             yield wall.name, part.name
 
-    def _middles(self) -> Float64:
-        return np.array([middle(wall.pieces) for wall in self.walls])
+    def _mean_positions(self) -> Float64:
+        return np.array([mean_position(wall.pieces) for wall in self.walls])
 
-    def _drop(self, line: int) -> None:
+    def _remove_line(self, line: int) -> None:
         """Take a line out of the state; what it told of the others stays."""
-        left = np.delete(np.arange(self.mean.size), _place(line))
+        left = np.delete(np.arange(self.mean.size), _state_slice(line))
         self.mean, self.covariance = self.mean[left], self.covariance[np.ix_(left, left)]
-        self.marks = self.marks.left(left)
+        self.clones = self.clones.left(left)
         del self.walls[line]
 
 
-def _place(line: int) -> slice:
+def _state_slice(line: int) -> slice:
     """Where a line is in the state."""
     return slice(3 + 2 * line, 5 + 2 * line)
 
 
-def _turn(theta: float) -> Float64:
+def _rotation(theta: float) -> Float64:
     """From the robot's frame to that of the map, (3, 3)."""
     cos, sin = math.cos(theta), math.sin(theta)
     return np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])

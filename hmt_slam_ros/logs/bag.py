@@ -14,9 +14,17 @@ from numpy.typing import NDArray
 from rosbags.rosbag2 import Reader
 
 from hmt_slam_ros.errors import HmtSlamError
-from hmt_slam_ros.logs.mounting import FrameTree, Mounting, frame_name, heading_of_quaternion, planar_mounting
-from hmt_slam_ros.logs.records import LogRecord, Window, require_scans
-from hmt_slam_ros.logs.ros_types import LASER_SCAN, ODOMETRY, POSE, TRANSFORMS, TRUTH_TOPIC, RosMessage, deserialize
+from hmt_slam_ros.logs.mounting import FrameTree, Mounting, frame_name, heading_from_quaternion, planar_mounting
+from hmt_slam_ros.logs.records import LogRecord, TimeWindow, require_scans
+from hmt_slam_ros.logs.ros_types import (
+    GROUND_TRUTH_TOPIC,
+    LASER_SCAN,
+    ODOMETRY,
+    POSE,
+    TRANSFORMS,
+    RosMessage,
+    deserialize,
+)
 from hmt_slam_ros.logs.stamps import NANOSECONDS, running_stamps
 from hmt_slam_ros.sensors import Odometry, Scan
 
@@ -38,7 +46,7 @@ class Header(NamedTuple):
     frame: str
 
 
-def header_of(content: bytes) -> Header:
+def read_header(content: bytes) -> Header:
     """The header that a message begins with, without reading the rest."""
     order = "<" if content[1] & 1 else ">"
     seconds, nanoseconds, length = struct.unpack_from(order + "iII", content, 4)
@@ -50,7 +58,7 @@ def read_topics(path: Path) -> dict[str, str]:
 
     :raises HmtSlamError: where the bag cannot be opened.
     """
-    with _damage_told(path), Reader(path) as reader:
+    with _damage_as_error(path), Reader(path) as reader:
         return {connection.topic: connection.msgtype for connection in reader.connections}
 
 
@@ -59,7 +67,7 @@ def read_messages(path: Path, topics: Collection[str]) -> Iterator[BagMessage]:
 
     :raises HmtSlamError: where the bag is damaged.
     """
-    with _damage_told(path), Reader(path) as reader:
+    with _damage_as_error(path), Reader(path) as reader:
         connections = [connection for connection in reader.connections if connection.topic in topics]
         if not connections:
             return
@@ -72,7 +80,7 @@ def read_messages(path: Path, topics: Collection[str]) -> Iterator[BagMessage]:
 
 
 @contextmanager
-def _damage_told(path: Path) -> Iterator[None]:
+def _damage_as_error(path: Path) -> Iterator[None]:
     """Turn whatever a reader stumbles over into one sentence."""
     try:
         yield
@@ -94,7 +102,7 @@ def choose_scan_topic(topics: Mapping[str, str], wanted: str, name: str) -> str:
     :param name: of the bag, for messages.
     :raises HmtSlamError: where there is none, or more than one to choose from.
     """
-    found = _choose(topics, wanted, DEFAULT_SCAN_TOPIC, LASER_SCAN, name)
+    found = _choose_topic(topics, wanted, DEFAULT_SCAN_TOPIC, LASER_SCAN, name)
     if found is None:
         raise HmtSlamError(f"{name} has no topic of type {LASER_SCAN}: record the laser's scans in it.")
     return found
@@ -105,13 +113,13 @@ def choose_odom_topic(topics: Mapping[str, str], wanted: str, name: str) -> str 
 
     :raises HmtSlamError: where there is neither, or more than one to choose from.
     """
-    found = _choose(topics, wanted, DEFAULT_ODOM_TOPIC, ODOMETRY, name)
+    found = _choose_topic(topics, wanted, DEFAULT_ODOM_TOPIC, ODOMETRY, name)
     if found is None and topics.get("/tf") != TRANSFORMS:
         raise HmtSlamError(f"{name} has neither a topic of type {ODOMETRY} nor /tf: record the wheel odometry in it.")
     return found
 
 
-def _choose(topics: Mapping[str, str], wanted: str, default: str, kind: str, name: str) -> str | None:
+def _choose_topic(topics: Mapping[str, str], wanted: str, default: str, kind: str, name: str) -> str | None:
     of_kind = sorted(topic for topic, topic_kind in topics.items() if topic_kind == kind)
     if wanted in of_kind:
         return wanted
@@ -154,19 +162,19 @@ class BagLog:
     :raises HmtSlamError: where the bag is truncated or damaged, or lacks scans, odometry or the laser's transform.
     """
 
-    def __init__(self, path: Path, window: Window, scan_topic: str, odom_topic: str) -> None:
+    def __init__(self, path: Path, window: TimeWindow, scan_topic: str, odom_topic: str) -> None:
         self._path = path
         topics = read_topics(path)
         self._scan_topic = choose_scan_topic(topics, scan_topic, path.name)
         self._odom_topic = choose_odom_topic(topics, odom_topic, path.name)
-        self._base = self._base_frame()
-        headers = [measurement[:3] for measurement in self._measurements()]
+        self._base_frame = self._find_base_frame()
+        headers = [measurement[:3] for measurement in self._read_measurements()]
         is_scan = [frame is not None for _, _, frame in headers]
         self._stamps = running_stamps([stamp for _, stamp, _ in headers], is_scan, _precedes_its_scan(headers))
-        self._part = window.among(self._stamps)
-        self._scan_count = sum(is_scan[self._part])
+        self._records_in_window = window.select(self._stamps)
+        self._scan_count = sum(is_scan[self._records_in_window])
         require_scans(path.name, self._scan_count, sum(is_scan))
-        self._truth = self._true_poses(topics)
+        self._true_poses = self._read_true_poses(topics)
         self._mountings = self._find_mountings(sorted({frame for _, _, frame in headers if frame is not None}))
 
     @property
@@ -182,52 +190,52 @@ class BagLog:
     @property
     def duration(self) -> float:
         """Seconds from the first to the last record."""
-        part = self._stamps[self._part]
+        part = self._stamps[self._records_in_window]
         return float(part[-1] - part[0]) / NANOSECONDS
 
     def records(self) -> Iterator[LogRecord]:
         """All measurements in file order."""
-        for k, measurement in enumerate(self._measurements()):
-            if k >= self._part.stop:
+        for k, measurement in enumerate(self._read_measurements()):
+            if k >= self._records_in_window.stop:
                 return
-            if k >= self._part.start:
-                yield self._record(measurement, int(self._stamps[k]))
+            if k >= self._records_in_window.start:
+                yield self._make_record(measurement, int(self._stamps[k]))
 
-    def _true_poses(self, topics: Mapping[str, str]) -> dict[int, NDArray[np.float64]]:
+    def _read_true_poses(self, topics: Mapping[str, str]) -> dict[int, NDArray[np.float64]]:
         """True poses (3,) by their source stamps, ns; none where the bag does not tell them."""
-        if topics.get(TRUTH_TOPIC) != POSE:
+        if topics.get(GROUND_TRUTH_TOPIC) != POSE:
             return {}
-        messages = (deserialize(message.content, POSE) for message in read_messages(self._path, {TRUTH_TOPIC}))
-        return {_stamp(message.header): _planar(message.pose) for message in messages}
+        messages = (deserialize(message.content, POSE) for message in read_messages(self._path, {GROUND_TRUTH_TOPIC}))
+        return {_stamp(message.header): _pose_from_message(message.pose) for message in messages}
 
-    def _record(self, measurement: _Measurement, stamp: int) -> LogRecord:
-        truth = self._truth.get(measurement.source_stamp)
+    def _make_record(self, measurement: _Measurement, stamp: int) -> LogRecord:
+        truth = self._true_poses.get(measurement.source_stamp)
         if measurement.scan_frame is not None:
             message = deserialize(measurement.content, LASER_SCAN)
-            scan = _scan(message, stamp, self._mountings[measurement.scan_frame])
+            scan = _scan_from_message(message, stamp, self._mountings[measurement.scan_frame])
             return LogRecord(measurement.source_stamp, scan, truth)
         if self._odom_topic is None:
             joint = measurement.content
-            pose = _planar_pose(joint.translation, joint.rotation)
+            pose = _pose_from_parts(joint.translation, joint.rotation)
         else:
-            pose = _planar(deserialize(measurement.content, ODOMETRY).pose.pose)
+            pose = _pose_from_message(deserialize(measurement.content, ODOMETRY).pose.pose)
         return LogRecord(measurement.source_stamp, Odometry(stamp, pose), truth)
 
-    def _measurements(self) -> Iterator[_Measurement]:
+    def _read_measurements(self) -> Iterator[_Measurement]:
         for message in read_messages(self._path, {self._scan_topic, self._odom_topic or "/tf"}):
             if message.kind == TRANSFORMS:
                 yield from self._odometry_transforms(message)
             else:
-                stamp, frame = header_of(message.content)
+                stamp, frame = read_header(message.content)
                 scan_frame = frame_name(frame) if message.kind == LASER_SCAN else None
                 yield _Measurement(message.bag_time, stamp, scan_frame, message.content)
 
     def _odometry_transforms(self, message: BagMessage) -> Iterator[_Measurement]:
         for joint in deserialize(message.content, TRANSFORMS).transforms:
-            if (frame_name(joint.header.frame_id), frame_name(joint.child_frame_id)) == (_ODOM_FRAME, self._base):
+            if (frame_name(joint.header.frame_id), frame_name(joint.child_frame_id)) == (_ODOM_FRAME, self._base_frame):
                 yield _Measurement(message.bag_time, _stamp(joint.header), None, joint.transform)
 
-    def _base_frame(self) -> str:
+    def _find_base_frame(self) -> str:
         """The robot's frame: the child frame of the odometry."""
         if self._odom_topic is not None:
             for message in read_messages(self._path, {self._odom_topic}):
@@ -259,14 +267,14 @@ class BagLog:
         for frame in frames:
             if frame not in mountings:
                 raise HmtSlamError(
-                    f"{self._path.name} has no transform from {self._base!r} to the scans' frame {frame!r}: "
+                    f"{self._path.name} has no transform from {self._base_frame!r} to the scans' frame {frame!r}: "
                     "record /tf_static with it."
                 )
         return mountings
 
     def _look_up(self, frames: list[str], tree: FrameTree, mountings: dict[str, Mounting]) -> None:
         for frame in frames:
-            base_T_laser = tree.pose(self._base, frame)
+            base_T_laser = tree.lookup_transform(self._base_frame, frame)
             if frame not in mountings and base_T_laser is not None:
                 mountings[frame] = planar_mounting(base_T_laser, f"the laser {frame!r} of {self._path.name}")
 
@@ -276,13 +284,13 @@ def _stamp(header: RosMessage) -> int:
     return int(header.stamp.sec * NANOSECONDS + header.stamp.nanosec)
 
 
-def _planar(pose: RosMessage) -> NDArray[np.float64]:
+def _pose_from_message(pose: RosMessage) -> NDArray[np.float64]:
     """A geometry_msgs/Pose as (x, y, theta), shape (3,), m and rad."""
-    return _planar_pose(pose.position, pose.orientation)
+    return _pose_from_parts(pose.position, pose.orientation)
 
 
-def _planar_pose(place: RosMessage, turn: RosMessage) -> NDArray[np.float64]:
-    return np.array([place.x, place.y, heading_of_quaternion((turn.x, turn.y, turn.z, turn.w))])
+def _pose_from_parts(place: RosMessage, turn: RosMessage) -> NDArray[np.float64]:
+    return np.array([place.x, place.y, heading_from_quaternion((turn.x, turn.y, turn.z, turn.w))])
 
 
 def _precedes_its_scan(headers: list[tuple[int, int, str | None]]) -> list[bool]:
@@ -291,13 +299,13 @@ def _precedes_its_scan(headers: list[tuple[int, int, str | None]]) -> list[bool]
     return [*pairs, False][: len(headers)]
 
 
-def _scan(message: RosMessage, stamp: int, mounting: Mounting) -> Scan:
+def _scan_from_message(message: RosMessage, stamp: int, mounting: Mounting) -> Scan:
     ranges: NDArray[np.float32] = message.ranges
     return Scan(
         stamp,
         ranges,
-        mounting.side * message.angle_min,
-        mounting.side * message.angle_increment,
+        mounting.angle_sign * message.angle_min,
+        mounting.angle_sign * message.angle_increment,
         message.range_min,
         message.range_max,
         mounting.laser_pose,

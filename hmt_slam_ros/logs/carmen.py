@@ -14,17 +14,17 @@ from numpy.typing import NDArray
 
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.logs.records import Entry, EntryLog, Window
+from hmt_slam_ros.logs.records import InMemoryLog, LogEntry, TimeWindow
 from hmt_slam_ros.logs.stamps import stamp_from_seconds
 from hmt_slam_ros.sensors import Odometry, Scan
 
 _FEWEST_REPEATS = 3
 _BAND = 0.01  # a sensor's codes for "no return" lie within one percent: 51.09 ... 51.16 m, 81.83 ... 81.91 m
 _BANDS_BELOW = 5
-_CROWDING = 10.0
+_CROWD_RATIO = 10.0
 
 
-def smallest_saturated(ranges: NDArray[np.float32]) -> float:
+def no_return_threshold(ranges: NDArray[np.float32]) -> float:
     """The smallest range that means "no return" in a log that does not say so, metres.
 
     A sensor reports its maximum, or a few values close to it, for every beam that meets nothing. Real distances
@@ -48,7 +48,7 @@ def smallest_saturated(ranges: NDArray[np.float32]) -> float:
         lowest, crowd_from = np.searchsorted(values, edges.astype(np.float32))
         crowd = counts[crowd_from:].sum()
         background = counts[lowest:crowd_from].sum() / _BANDS_BELOW
-        if crowd_from > 0 and crowd > _CROWDING * background:
+        if crowd_from > 0 and crowd > _CROWD_RATIO * background:
             return float(values[crowd_from])
     return float(np.nextafter(values[-1], np.float32(np.inf)))
 
@@ -83,7 +83,7 @@ class _Sweep:
     is_front: bool
 
 
-class _Reading(NamedTuple):
+class _StampedLine(NamedTuple):
     """An ODOM line's pose (3,), or a scan, with its stamp in ns."""
 
     stamp: int
@@ -91,19 +91,19 @@ class _Reading(NamedTuple):
 
 
 @dataclass
-class _Content:
+class _ParsedFile:
     """What the lines of a file hold."""
 
-    readings: list[_Reading] = field(default_factory=list)
+    readings: list[_StampedLine] = field(default_factory=list)
     front_laser_offset: float = 0.0
 
 
-def looks_like_carmen(content: bytes) -> bool:
+def is_carmen(content: bytes) -> bool:
     """Whether one of the first lines is one that CARMEN writes."""
     return _KNOWN_LINE.search(content[:65536]) is not None
 
 
-def open_carmen(path: Path, content: bytes, window: Window) -> EntryLog:
+def open_carmen(path: Path, content: bytes, window: TimeWindow) -> InMemoryLog:
     """A CARMEN log, in file order.
 
     Odometry is taken from the ODOM lines and from the ``odom_*`` fields of FLASER or the robot pose of ROBOTLASER1,
@@ -120,37 +120,37 @@ def open_carmen(path: Path, content: bytes, window: Window) -> EntryLog:
     sweeps = [reading.content for reading in parsed.readings if isinstance(reading.content, _Sweep)]
     limits = _range_limits(sweeps)
     mounting = _Mountings(sweeps, parsed.front_laser_offset)
-    return EntryLog(_stem(path), list(_entries(parsed.readings, limits, mounting)), window)
+    return InMemoryLog(_stem(path), list(_entries(parsed.readings, limits, mounting)), window)
 
 
 def _stem(path: Path) -> str:
     return Path(path.stem).stem if path.suffix in {".gz", ".xz"} else path.stem
 
 
-def _entries(readings: Iterable[_Reading], limits: dict[float, float], mountings: _Mountings) -> Iterator[Entry]:
+def _entries(readings: Iterable[_StampedLine], limits: dict[float, float], mountings: _Mountings) -> Iterator[LogEntry]:
     for stamp, content in readings:
         if isinstance(content, _Sweep):
-            yield Entry(stamp, Odometry, (content.robot_pose,), precedes_its_scan=True)
+            yield LogEntry(stamp, Odometry, (content.robot_pose,), precedes_its_scan=True)
             limit = limits[content.stated_max]
-            geometry = (content.angle_min, content.increment, 0.0, limit, mountings.of(content))
-            yield Entry(stamp, Scan, (content.ranges, *geometry))
+            geometry = (content.angle_min, content.increment, 0.0, limit, mountings.laser_pose_of(content))
+            yield LogEntry(stamp, Scan, (content.ranges, *geometry))
         else:
-            yield Entry(stamp, Odometry, (content,))
+            yield LogEntry(stamp, Odometry, (content,))
 
 
-def _parse(content: bytes, name: str) -> _Content:
-    parsed = _Content()
+def _parse(content: bytes, name: str) -> _ParsedFile:
+    parsed = _ParsedFile()
     # Line by line: all of them at once would leave as much memory in pieces as the log itself takes.
     for number, line in enumerate(io.BytesIO(content), start=1):
         tokens = line.split()
         if not tokens:
             continue
         try:
-            if tokens[0] in _MEASUREMENTS:
-                parsed.readings.append(_MEASUREMENTS[tokens[0]](tokens))
+            if tokens[0] in _PARSERS:
+                parsed.readings.append(_PARSERS[tokens[0]](tokens))
             elif tokens[:2] == [b"PARAM", _FRONT_LASER_OFFSET]:
                 parsed.front_laser_offset = float(tokens[2])
-            elif any(kind.startswith(tokens[0]) for kind in _MEASUREMENTS):
+            elif any(kind.startswith(tokens[0]) for kind in _PARSERS):
                 raise ValueError("cut off within its first word")
         except (ValueError, IndexError):
             end = "" if line.endswith(b"\n") else " (the last one)"
@@ -160,22 +160,22 @@ def _parse(content: bytes, name: str) -> _Content:
     return parsed
 
 
-def _odom(tokens: list[bytes]) -> _Reading:
+def _parse_odom(tokens: list[bytes]) -> _StampedLine:
     """``ODOM x y theta tv rv accel`` and the trailer."""
-    return _Reading(_stamp(tokens, 7), np.array(_numbers(tokens, 1, 3)))
+    return _StampedLine(_stamp(tokens, 7), np.array(_numbers(tokens, 1, 3)))
 
 
-def _flaser(tokens: list[bytes]) -> _Reading:
+def _parse_flaser(tokens: list[bytes]) -> _StampedLine:
     """``FLASER n r1..rn x y theta odom_x odom_y odom_theta`` and the trailer."""
     count = int(tokens[1])
     stamp = _stamp(tokens, 2 + count + 6)
     poses = np.array(_numbers(tokens, 2 + count, 6))
     increment = np.pi / max(count - count % 2, 1)
     ranges = np.array(_numbers(tokens, 2, count), dtype=np.float32)
-    return _Reading(stamp, _Sweep(ranges, -np.pi / 2, increment, np.inf, poses[3:], poses[:3], is_front=True))
+    return _StampedLine(stamp, _Sweep(ranges, -np.pi / 2, increment, np.inf, poses[3:], poses[:3], is_front=True))
 
 
-def _robotlaser(tokens: list[bytes]) -> _Reading:
+def _parse_robotlaser(tokens: list[bytes]) -> _StampedLine:
     """A laser that tells its geometry.
 
     ``ROBOTLASER1 type start_angle field_of_view resolution maximum_range accuracy remission_mode n r1..rn
@@ -189,13 +189,13 @@ def _robotlaser(tokens: list[bytes]) -> _Reading:
     increment = resolution if resolution > 0.0 else field_of_view / max(count - 1, 1)
     ranges = np.array(_numbers(tokens, 9, count), dtype=np.float32)
     limit = maximum if maximum > 0.0 else np.inf
-    return _Reading(stamp, _Sweep(ranges, start, increment, limit, poses[3:], poses[:3], is_front=False))
+    return _StampedLine(stamp, _Sweep(ranges, start, increment, limit, poses[3:], poses[:3], is_front=False))
 
 
-_MEASUREMENTS: dict[bytes, Callable[[list[bytes]], _Reading]] = {
-    b"ODOM": _odom,
-    b"FLASER": _flaser,
-    b"ROBOTLASER1": _robotlaser,
+_PARSERS: dict[bytes, Callable[[list[bytes]], _StampedLine]] = {
+    b"ODOM": _parse_odom,
+    b"FLASER": _parse_flaser,
+    b"ROBOTLASER1": _parse_robotlaser,
 }
 
 
@@ -218,7 +218,7 @@ def _range_limits(sweeps: Sequence[_Sweep]) -> dict[float, float]:
     limits = {}
     for stated in {sweep.stated_max: None for sweep in sweeps}:
         ranges = np.concatenate([sweep.ranges for sweep in sweeps if sweep.stated_max == stated])
-        limits[stated] = min(smallest_saturated(ranges), float(np.float32(stated)))
+        limits[stated] = min(no_return_threshold(ranges), float(np.float32(stated)))
     return limits
 
 
@@ -235,7 +235,7 @@ class _Mountings:
         front = _constant_offset([sweep for sweep in sweeps if sweep.is_front])
         self._front = np.array([front_laser_offset, 0.0, 0.0]) if front is None else front
 
-    def of(self, sweep: _Sweep) -> NDArray[np.float64]:
+    def laser_pose_of(self, sweep: _Sweep) -> NDArray[np.float64]:
         """Shape (3,); poses that differ by rounding only are one."""
         if sweep.is_front:
             return self._front

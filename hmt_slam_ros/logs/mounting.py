@@ -18,11 +18,11 @@ class Mounting(NamedTuple):
     """Where a laser is in the plane.
 
     :ivar laser_pose: shape (3,), ``base_T_laser`` as (x, y, theta) in m and rad.
-    :ivar side: 1.0, or -1.0 for a laser mounted upside down: its angles count the other way round.
+    :ivar angle_sign: 1.0, or -1.0 for a laser mounted upside down: its angles count the other way round.
     """
 
     laser_pose: NDArray[np.float64]
-    side: float
+    angle_sign: float
 
 
 def planar_mounting(base_T_laser: ArrayLike, laser_name: str) -> Mounting:
@@ -61,7 +61,7 @@ def transform_from_quaternion(translation: ArrayLike, quaternion: ArrayLike) -> 
     return transform
 
 
-def heading_of_quaternion(quaternion: ArrayLike) -> float:
+def heading_from_quaternion(quaternion: ArrayLike) -> float:
     """Rotation about z, rad; exact to the last bits where the rotation is about z alone.
 
     :param quaternion: (x, y, z, w), of any length but zero.
@@ -95,16 +95,16 @@ class FrameTree:
                 transform = transform_from_quaternion((move.x, move.y, move.z), (turn.x, turn.y, turn.z, turn.w))
                 self._parents[child] = (frame_name(joint.header.frame_id), transform)
 
-    def pose(self, base: str, frame: str) -> NDArray[np.float64] | None:
+    def lookup_transform(self, base: str, frame: str) -> NDArray[np.float64] | None:
         """``base_T_frame``, shape (4, 4), metres; None where no chain of transforms joins the two."""
-        to_frame, to_base = self._chain(frame), self._chain(base)
+        to_frame, to_base = self._ancestor_transforms(frame), self._ancestor_transforms(base)
         for ancestor, ancestor_T_frame in to_frame.items():
             if ancestor in to_base:
                 pose: NDArray[np.float64] = np.linalg.inv(to_base[ancestor]) @ ancestor_T_frame
                 return pose
         return None
 
-    def _chain(self, frame: str) -> dict[str, NDArray[np.float64]]:
+    def _ancestor_transforms(self, frame: str) -> dict[str, NDArray[np.float64]]:
         """Each ancestor of a frame, itself included, with ``ancestor_T_frame``, nearest first."""
         chain = {frame: np.eye(4)}
         while frame in self._parents and self._parents[frame][0] not in chain:

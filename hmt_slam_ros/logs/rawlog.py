@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.logs.mounting import planar_mounting, transform_from_quaternion
-from hmt_slam_ros.logs.records import Entry, EntryLog, Window
+from hmt_slam_ros.logs.records import InMemoryLog, LogEntry, TimeWindow
 from hmt_slam_ros.sensors import Odometry, Scan
 
 _END_OF_OBJECT = 0x88
@@ -61,28 +61,28 @@ class OdometryReading:
 
 
 @dataclass(frozen=True, eq=False)
-class Movement:
+class RobotMovement:
     """A movement of the robot: ``increment`` (3,) in m and rad, in the frame of the pose before it."""
 
-    by_odometry: bool
+    is_odometry: bool
     increment: NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Actions:
+class ActionCollection:
     """What the robot did between two frames."""
 
     actions: list[object]
 
 
 @dataclass(frozen=True)
-class Frame:
+class SensoryFrame:
     """Observations made together."""
 
     observations: list[object]
 
 
-def looks_like_rawlog(content: bytes) -> bool:
+def is_rawlog(content: bytes) -> bool:
     """Whether the content begins as an object does: with the marked length of a class name, and that name."""
     length = content[0] & 0x7F if content else 0
     name = content[1 : 1 + length]
@@ -99,20 +99,20 @@ class ObjectStream:
     def __init__(self, content: bytes, name: str) -> None:
         self._content = content
         self._name = name
-        self._at = 0
+        self._offset = 0
 
     def __iter__(self) -> Iterator[object]:
         """Every object.
 
         :raises HmtSlamError: where the content ends inside an object or is of an unknown class or version.
         """
-        while self._at < len(self._content):
+        while self._offset < len(self._content):
             yield self.next_object()
 
     def next_object(self) -> object:
         """The object that starts here, read to its end."""
         name_length = self.integer("B") & 0x7F
-        class_name = self._bytes(name_length).decode("ascii", "replace").removeprefix("mrpt::").split("::")[-1]
+        class_name = self._read_bytes(name_length).decode("ascii", "replace").removeprefix("mrpt::").split("::")[-1]
         reader = _READERS.get(class_name)
         if reader is None:
             raise HmtSlamError(
@@ -124,7 +124,7 @@ class ObjectStream:
             raise HmtSlamError(f"{self._name} is damaged inside an object of class {class_name}: copy the file anew.")
         return result
 
-    def nested(self, kind: type[_Kind]) -> _Kind:
+    def nested_object(self, kind: type[_Kind]) -> _Kind:
         """The object that starts here, of the kind that its owner's class demands.
 
         :raises HmtSlamError: where it is of another.
@@ -136,26 +136,26 @@ class ObjectStream:
 
     def pose(self) -> NDArray[np.float64]:
         """A nested object that stands for a pose or matrix."""
-        return self.nested(np.ndarray)
+        return self.nested_object(np.ndarray)
 
     def integer(self, code: str) -> int:
         """One integer, by its code of the struct module."""
-        return int(struct.unpack("<" + code, self._bytes(struct.calcsize(code)))[0])
+        return int(struct.unpack("<" + code, self._read_bytes(struct.calcsize(code)))[0])
 
     def real(self, code: str) -> float:
         """One floating-point number, by its code of the struct module."""
-        return float(struct.unpack("<" + code, self._bytes(struct.calcsize(code)))[0])
+        return float(struct.unpack("<" + code, self._read_bytes(struct.calcsize(code)))[0])
 
     def numbers(self, dtype: str, count: int) -> NDArray[Any]:
         """``count`` numbers of a little-endian numpy type."""
         kind = np.dtype(dtype).newbyteorder("<")
-        return np.frombuffer(self._bytes(kind.itemsize * count), dtype=kind)
+        return np.frombuffer(self._read_bytes(kind.itemsize * count), dtype=kind)
 
     def skip_text(self) -> None:
         """Pass over a character string."""
-        self._bytes(self.integer("I"))
+        self._read_bytes(self.integer("I"))
 
-    def version_of(self, class_name: str, version: int, newest: int, oldest: int = 0) -> None:
+    def check_version(self, class_name: str, version: int, newest: int, oldest: int = 0) -> None:
         """Check that a version of a class is one that the reader knows.
 
         :raises HmtSlamError: where it is not.
@@ -166,17 +166,17 @@ class ObjectStream:
                 "convert the log with MRPT's rawlog-edit."
             )
 
-    def _bytes(self, count: int) -> bytes:
-        piece = self._content[self._at : self._at + count]
+    def _read_bytes(self, count: int) -> bytes:
+        piece = self._content[self._offset : self._offset + count]
         if len(piece) < count:
             raise HmtSlamError(f"{self._name} is truncated: it ends inside an object; copy the file anew.")
-        self._at += count
+        self._offset += count
         return piece
 
 
 def _matrix(dtype: str) -> Callable[[ObjectStream, int], NDArray[np.float64]]:
     def read(stream: ObjectStream, version: int) -> NDArray[np.float64]:
-        stream.version_of("CMatrix", version, newest=0)
+        stream.check_version("CMatrix", version, newest=0)
         rows, columns = stream.numbers("u4", 2).tolist()
         return stream.numbers(dtype, rows * columns).reshape(rows, columns).astype(np.float64)
 
@@ -184,13 +184,13 @@ def _matrix(dtype: str) -> Callable[[ObjectStream, int], NDArray[np.float64]]:
 
 
 def _pose_2d(stream: ObjectStream, version: int) -> NDArray[np.float64]:
-    stream.version_of("CPose2D", version, newest=1)
+    stream.check_version("CPose2D", version, newest=1)
     return stream.numbers("f8" if version else "f4", 3).astype(np.float64)
 
 
 def _pose_3d(stream: ObjectStream, version: int) -> NDArray[np.float64]:
     """Homogeneous transform, shape (4, 4)."""
-    stream.version_of("CPose3D", version, newest=3)
+    stream.check_version("CPose3D", version, newest=3)
     if version < 2:
         return stream.pose()
     translation = stream.numbers("f8", 3)
@@ -205,7 +205,7 @@ def _pose_3d(stream: ObjectStream, version: int) -> NDArray[np.float64]:
 
 def _pose_gaussian(stream: ObjectStream, version: int) -> NDArray[np.float64]:
     """The mean, shape (3,)."""
-    stream.version_of("CPosePDFGaussian", version, newest=2)
+    stream.check_version("CPosePDFGaussian", version, newest=2)
     mean = stream.pose()
     if version == 0:
         stream.pose()
@@ -214,8 +214,8 @@ def _pose_gaussian(stream: ObjectStream, version: int) -> NDArray[np.float64]:
     return mean
 
 
-def _movement(stream: ObjectStream, version: int) -> Movement:
-    stream.version_of("CActionRobotMovement2D", version, newest=7, oldest=4)
+def _movement(stream: ObjectStream, version: int) -> RobotMovement:
+    stream.check_version("CActionRobotMovement2D", version, newest=7, oldest=4)
     method = stream.integer("i")
     increment = stream.pose()
     if method == _ODOMETRY_METHOD:
@@ -226,7 +226,7 @@ def _movement(stream: ObjectStream, version: int) -> Movement:
     _skip_velocities_and_encoders(stream, old=version < 7)
     if version >= 6:
         stream.integer("Q")
-    return Movement(method == _ODOMETRY_METHOD, increment)
+    return RobotMovement(method == _ODOMETRY_METHOD, increment)
 
 
 def _skip_velocities_and_encoders(stream: ObjectStream, *, old: bool) -> None:
@@ -242,7 +242,7 @@ def _skip_velocities_and_encoders(stream: ObjectStream, *, old: bool) -> None:
 
 
 def _odometry_reading(stream: ObjectStream, version: int) -> OdometryReading:
-    stream.version_of("CObservationOdometry", version, newest=2)
+    stream.check_version("CObservationOdometry", version, newest=2)
     pose = stream.pose()
     stream.skip_text()
     ticks = stream.integer("Q")
@@ -259,7 +259,7 @@ def _odometry_reading(stream: ObjectStream, version: int) -> OdometryReading:
 
 
 def _range_scan(stream: ObjectStream, version: int) -> RangeScan:
-    stream.version_of("CObservation2DRangeScan", version, newest=8, oldest=4)
+    stream.check_version("CObservation2DRangeScan", version, newest=8, oldest=4)
     aperture, right_to_left, max_range = stream.real("f"), bool(stream.integer("?")), stream.real("f")
     sensor_pose = stream.pose()
     if version < 6:
@@ -278,16 +278,16 @@ def _range_scan(stream: ObjectStream, version: int) -> RangeScan:
     return RangeScan(ticks, ranges, valid, aperture, right_to_left, max_range, sensor_pose, sweep_duration)
 
 
-def _frame(stream: ObjectStream, version: int) -> Frame:
-    stream.version_of("CSensoryFrame", version, newest=2, oldest=1)
+def _frame(stream: ObjectStream, version: int) -> SensoryFrame:
+    stream.check_version("CSensoryFrame", version, newest=2, oldest=1)
     if version == 1:
         stream.integer("I")  # a number of the frame
-    return Frame([stream.next_object() for _ in range(stream.integer("I"))])
+    return SensoryFrame([stream.next_object() for _ in range(stream.integer("I"))])
 
 
-def _actions(stream: ObjectStream, version: int) -> Actions:
-    stream.version_of("CActionCollection", version, newest=0)
-    return Actions([stream.next_object() for _ in range(stream.integer("I"))])
+def _actions(stream: ObjectStream, version: int) -> ActionCollection:
+    stream.check_version("CActionCollection", version, newest=0)
+    return ActionCollection([stream.next_object() for _ in range(stream.integer("I"))])
 
 
 _READERS: dict[str, Callable[[ObjectStream, int], object]] = {
@@ -309,7 +309,7 @@ _READERS: dict[str, Callable[[ObjectStream, int], object]] = {
 _TICKS_TO_1970 = 116_444_736_000_000_000  # MRPT counts 100 ns ticks from the year 1601
 
 
-def open_rawlog(path: Path, content: bytes, window: Window) -> EntryLog:
+def open_rawlog(path: Path, content: bytes, window: TimeWindow) -> InMemoryLog:
     """An MRPT rawlog.
 
     In the action-observation form, the odometry increments of the actions are summed up from the origin; the sum is
@@ -324,32 +324,32 @@ def open_rawlog(path: Path, content: bytes, window: Window) -> EntryLog:
     objects = list(ObjectStream(content, path.name))
     absolute = any(isinstance(reading, OdometryReading) for reading in _observations(objects))
     entries = _entries(objects, path.name, with_increments=not absolute)
-    return EntryLog(path.stem, list(entries), window)
+    return InMemoryLog(path.stem, list(entries), window)
 
 
 def _observations(objects: Iterable[object]) -> Iterator[object]:
     for item in objects:
-        if isinstance(item, Frame):
+        if isinstance(item, SensoryFrame):
             yield from item.observations
         else:
             yield item
 
 
-def _entries(objects: Iterable[object], name: str, *, with_increments: bool) -> Iterator[Entry]:
+def _entries(objects: Iterable[object], name: str, *, with_increments: bool) -> Iterator[LogEntry]:
     odom_T_base = np.zeros(3)
     due = with_increments  # an odometry reading is due at the first scan behind an action, and at the first of all
     for item in _observations(objects):
-        if isinstance(item, Actions) and with_increments:
+        if isinstance(item, ActionCollection) and with_increments:
             odom_T_base = se2.compose(odom_T_base, _increment(item, name))
             due = True
         elif isinstance(item, OdometryReading):
-            yield Entry(_stamp(item.ticks, name), Odometry, (item.pose,))
+            yield LogEntry(_stamp(item.ticks, name), Odometry, (item.pose,))
         elif isinstance(item, RangeScan):
             stamp = _stamp(item.ticks, name)
             if due:
-                yield Entry(stamp, Odometry, (odom_T_base,), precedes_its_scan=True)
+                yield LogEntry(stamp, Odometry, (odom_T_base,), precedes_its_scan=True)
             due = False
-            yield Entry(stamp, Scan, _scan_fields(item, name))
+            yield LogEntry(stamp, Scan, _scan_fields(item, name))
 
 
 def _stamp(ticks: int, name: str) -> int:
@@ -358,10 +358,10 @@ def _stamp(ticks: int, name: str) -> int:
     return (ticks - _TICKS_TO_1970) * 100
 
 
-def _increment(actions: Actions, name: str) -> NDArray[np.float64]:
+def _increment(actions: ActionCollection, name: str) -> NDArray[np.float64]:
     """The movement by wheel odometry where there is one, else the first of any kind, shape (3,)."""
-    movements = [action for action in actions.actions if isinstance(action, Movement)]
-    movements.sort(key=lambda movement: not movement.by_odometry)
+    movements = [action for action in actions.actions if isinstance(action, RobotMovement)]
+    movements.sort(key=lambda movement: not movement.is_odometry)
     if not movements:
         raise HmtSlamError(f"{name} has an action without a movement of the robot: give a log with wheel odometry.")
     return movements[0].increment
@@ -370,7 +370,7 @@ def _increment(actions: Actions, name: str) -> NDArray[np.float64]:
 def _scan_fields(scan: RangeScan, name: str) -> tuple[object, ...]:
     """The fields of `Scan` behind the stamp. The beams span the aperture, ends included."""
     mounting = planar_mounting(scan.sensor_pose, f"the laser of {name}")
-    side = mounting.side if scan.right_to_left else -mounting.side
+    side = mounting.angle_sign if scan.right_to_left else -mounting.angle_sign
     ranges = scan.ranges.copy()
     # The flag is the only mark of some faulty beams: their range lies inside the limits.
     ranges[(scan.valid == 0) & (ranges < scan.max_range)] = np.nan

@@ -13,7 +13,7 @@ from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.logs.stamps import NANOSECONDS, running_stamps
 from hmt_slam_ros.sensors import Odometry, Scan
 
-SIMULATED = "sim:"
+SIMULATION_PREFIX = "sim:"
 """What the name of a log begins with that is made while it is read."""
 
 
@@ -30,12 +30,12 @@ class LogRecord:
 
     :ivar source_stamp: the log's own time stamp in ns, which may jump back; results are keyed by it.
     :ivar measurement: the scan or odometry reading, with its ``stamp`` from the running clock, ns.
-    :ivar truth: shape (3,), the robot's true pose ``world_T_base`` at that time, m and rad; None where nobody knows it.
+    :ivar true_pose: shape (3,), the robot's true pose ``world_T_base`` at that time, m and rad; None where nobody knows it.
     """
 
     source_stamp: int
     measurement: Scan | Odometry
-    truth: NDArray[np.float64] | None = None
+    true_pose: NDArray[np.float64] | None = None
 
 
 class Log(Protocol):
@@ -61,7 +61,7 @@ class Log(Protocol):
         """
 
 
-class Entry(NamedTuple):
+class LogEntry(NamedTuple):
     """A measurement that still waits for its stamp.
 
     :ivar source_stamp: the log's own time stamp, ns.
@@ -77,7 +77,7 @@ class Entry(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Window:
+class TimeWindow:
     """The part of a log that is wanted.
 
     :ivar start: seconds from the log's first stamp.
@@ -93,7 +93,7 @@ class Window:
         if self.duration is not None and not self.duration > 0.0:
             raise HmtSlamError(f"duration is {self.duration} s: give more than 0, or leave it away for the whole log.")
 
-    def among(self, stamps: NDArray[np.int64]) -> slice:
+    def select(self, stamps: NDArray[np.int64]) -> slice:
         """The records inside: ``start <= stamp - stamps[0] <= start + duration``.
 
         :param stamps: shape (n,), ns, not decreasing.
@@ -119,18 +119,18 @@ def require_scans(name: str, in_window: int, in_log: int) -> None:
         raise HmtSlamError(f"the part of {name} chosen by start and duration holds no laser scan: widen it.")
 
 
-class EntryLog:
+class InMemoryLog:
     """A log whose measurements are all in memory.
 
     :raises HmtSlamError: where there is no scan.
     """
 
-    def __init__(self, name: str, entries: Sequence[Entry], window: Window) -> None:
+    def __init__(self, name: str, entries: Sequence[LogEntry], window: TimeWindow) -> None:
         is_scan = [entry.kind is Scan for entry in entries]
         stamps = running_stamps(
             [entry.source_stamp for entry in entries], is_scan, [entry.precedes_its_scan for entry in entries]
         )
-        part = window.among(stamps)
+        part = window.select(stamps)
         self._name = name
         self._entries = entries[part]
         self._stamps = stamps[part]

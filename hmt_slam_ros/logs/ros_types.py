@@ -13,7 +13,7 @@ ODOMETRY = "nav_msgs/msg/Odometry"
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
 POSE = "geometry_msgs/msg/PoseStamped"
 
-TRUTH_TOPIC = "/ground_truth"
+GROUND_TRUTH_TOPIC = "/ground_truth"
 """Of the robot's true poses, where somebody knows them."""
 
 RosMessage: TypeAlias = Any

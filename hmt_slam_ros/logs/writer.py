@@ -14,14 +14,22 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, W
 
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.logs.records import Log, LogRecord
-from hmt_slam_ros.logs.ros_types import LASER_SCAN, ODOMETRY, POSE, TRANSFORMS, TRUTH_TOPIC, RosMessage, typestore
+from hmt_slam_ros.logs.ros_types import (
+    GROUND_TRUTH_TOPIC,
+    LASER_SCAN,
+    ODOMETRY,
+    POSE,
+    TRANSFORMS,
+    RosMessage,
+    typestore,
+)
 from hmt_slam_ros.logs.stamps import NANOSECONDS
 from hmt_slam_ros.sensors import Odometry, Scan
 
 ODOM_FRAME, BASE_FRAME, LASER_FRAME, WORLD_FRAME = "odom", "base_link", "laser", "world"
 
 _STORAGES = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}
-_NEVER = QosTime(9223372036, 854775807)  # "no deadline", as rosbag2 itself writes it
+_NO_DEADLINE = QosTime(9223372036, 854775807)  # "no deadline", as rosbag2 itself writes it
 
 
 def write_bag(log: Log, destination: Path, *, storage: str = "mcap") -> None:
@@ -56,8 +64,8 @@ def _write(log: Log, folder: Path, storage: StoragePlugin) -> None:
         writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
     with writer:
         types = {"/scan": LASER_SCAN, "/odom": ODOMETRY, "/tf": TRANSFORMS, "/tf_static": TRANSFORMS}
-        if any(record.truth is not None for record in islice(log.records(), 1)):
-            types[TRUTH_TOPIC] = POSE
+        if any(record.true_pose is not None for record in islice(log.records(), 1)):
+            types[GROUND_TRUTH_TOPIC] = POSE
         connections = {
             topic: writer.add_connection(topic, kind, typestore=typestore(), offered_qos_profiles=[_qos(topic)])
             for topic, kind in types.items()
@@ -75,10 +83,10 @@ def _qos(topic: str) -> Qos:
         1 if static else 100,
         QosReliability.RELIABLE,
         durability,
-        _NEVER,
-        _NEVER,
+        _NO_DEADLINE,
+        _NO_DEADLINE,
         QosLiveliness.AUTOMATIC,
-        _NEVER,
+        _NO_DEADLINE,
         avoid_ros_namespace_conventions=False,
     )
 
@@ -103,10 +111,10 @@ def _messages(
         if k == 0:
             joints = [_transform(source, BASE_FRAME, frame, pose) for frame, pose in frames.values()]
             yield "/tf_static", measurement.stamp, _message(TRANSFORMS, transforms=joints)
-        if record.truth is not None and measurement.stamp != told:
+        if record.true_pose is not None and measurement.stamp != told:
             told = measurement.stamp
-            pose = _pose(record.truth)
-            yield TRUTH_TOPIC, told, _message(POSE, header=_header(source, WORLD_FRAME), pose=pose)
+            pose = _pose(record.true_pose)
+            yield GROUND_TRUTH_TOPIC, told, _message(POSE, header=_header(source, WORLD_FRAME), pose=pose)
         if isinstance(measurement, Odometry):
             yield "/odom", measurement.stamp, _odometry(source, measurement)
             joints = [_transform(source, ODOM_FRAME, BASE_FRAME, measurement.pose)]

@@ -12,19 +12,19 @@ import numpy as np
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.hybrid_map.common_map import ArcValue, Pair
-from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap, floored, fused
-from hmt_slam_ros.hybrid_map.shortest_path import tells_nothing
+from hmt_slam_ros.hybrid_map.common_map import ArcValue, AreaPair
+from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap, apply_sigma_floor, fuse_traversals
+from hmt_slam_ros.hybrid_map.shortest_path import is_uninformative
 from hmt_slam_ros.loop_closure.area_alignment import AreaAlignment
-from hmt_slam_ros.loop_closure.closure_history import Closure, Undo, pair_of
+from hmt_slam_ros.loop_closure.closure_history import Closure, MapSnapshot, area_pair
 from hmt_slam_ros.loop_closure.closure_refinement import ClosureRefinement
-from hmt_slam_ros.messages.map_changes import Arc, Relabelled
-from hmt_slam_ros.messages.messages import Leaf
+from hmt_slam_ros.messages.map_changes import Arc, MovedKeyframe
+from hmt_slam_ros.messages.messages import Hypothesis
 from hmt_slam_ros.sensors import Scan
 
 
 @dataclass(frozen=True, eq=False)
-class Observation:
+class PendingArc:
     """An arc that TSBI set and that is not definite yet.
 
     :ivar event: at which it was observed.
@@ -33,9 +33,9 @@ class Observation:
     :ivar target: area b, the one that the robot entered.
     :ivar pose: belief over ``a_T_b`` as observed.
     :ivar closure: whether it closed a loop.
-    :ivar before: the definite arc ``a_T_b`` that it replaced, or None.
-    :ivar joined: the keyframes that moved into area b.
-    :ivar witnesses: the keyframes by which it was observed.
+    :ivar replaced_arc: the definite arc ``a_T_b`` that it replaced, or None.
+    :ivar joined_keyframes: the keyframes that moved into area b.
+    :ivar observing_keyframes: the keyframes by which it was observed.
     """
 
     event: int
@@ -44,23 +44,23 @@ class Observation:
     target: int
     pose: PoseGaussian
     closure: bool
-    before: Arc | None
-    joined: tuple[int, ...]
-    witnesses: frozenset[int]
+    replaced_arc: Arc | None
+    joined_keyframes: tuple[int, ...]
+    observing_keyframes: frozenset[int]
 
     @property
-    def pair(self) -> Pair:
+    def pair(self) -> AreaPair:
         """The arc, whatever its direction."""
-        return pair_of(self.source, self.target)
+        return area_pair(self.source, self.target)
 
-    def accepted(self, log_odds: float, undo: Undo) -> Closure:
+    def to_closure(self, log_odds: float, snapshot: MapSnapshot) -> Closure:
         """The closure that it becomes."""
         far = self.target if self.near == self.source else self.source
         pose = self.pose if self.near == self.source else self.pose.inverse()
-        return Closure((self.event, self.pair), self.near, far, pose, log_odds, undo)
+        return Closure((self.event, self.pair), self.near, far, pose, log_odds, snapshot)
 
 
-def observed(arc: Arc, leaf: Leaf, event: int, near: int, hybrid_map: HybridMap) -> Observation:
+def pending_arc(arc: Arc, leaf: Hypothesis, event: int, near: int, hybrid_map: HybridMap) -> PendingArc:
     """What TLCA keeps of a leaf's arc.
 
     :param near: the robot's area before the event.
@@ -72,29 +72,29 @@ def observed(arc: Arc, leaf: Leaf, event: int, near: int, hybrid_map: HybridMap)
     )
     value, before = hybrid_map.arc_value(source, target), hybrid_map.arc(source, target)
     old = None if value is None or before is None else Arc(source, target, before, value.closure)
-    joined = tuple(sorted(r.keyframe for r in leaf.relabelled if r.area == target))
+    joined = tuple(sorted(r.keyframe for r in leaf.moved_keyframes if r.area == target))
     witnesses = frozenset(joined or [event])
-    return Observation(event, near, source, target, pose, arc.closure, old, joined, witnesses)
+    return PendingArc(event, near, source, target, pose, arc.closure, old, joined, witnesses)
 
 
-Scans: TypeAlias = Mapping[int, Scan]
-Witnesses: TypeAlias = dict[Pair, frozenset[int]]
+KeyframeScans: TypeAlias = Mapping[int, Scan]
+ArcKeyframes: TypeAlias = dict[AreaPair, frozenset[int]]
 
 
 @dataclass(frozen=True, eq=False)
-class Definite:
+class AcceptanceResult:
     """What became definite.
 
     :ivar arcs: those observed, and those around the areas that closures joined.
-    :ivar relabelled: the keyframes that moved.
-    :ivar witnesses: {arc: the keyframes by which it was observed}, of all definite arcs.
-    :ivar before: the arcs around the areas that closures joined as they were before these were refined.
+    :ivar moved_keyframes: the keyframes that moved.
+    :ivar arc_keyframes: {arc: the keyframes by which it was observed}, of all definite arcs.
+    :ivar arcs_before: the arcs around the areas that closures joined as they were before these were refined.
     """
 
-    arcs: dict[Pair, Arc]
-    relabelled: list[Relabelled]
-    witnesses: Witnesses
-    before: dict[Pair, ArcValue]
+    arcs: dict[AreaPair, Arc]
+    moved_keyframes: list[MovedKeyframe]
+    arc_keyframes: ArcKeyframes
+    arcs_before: dict[AreaPair, ArcValue]
 
 
 class Acceptance:
@@ -107,77 +107,81 @@ class Acceptance:
         self._alignment = AreaAlignment(configuration)
         self._refinement = ClosureRefinement(configuration)
 
-    def of(
+    def accept(
         self,
         hybrid_map: HybridMap,
-        scans: Scans,
-        observations: Iterable[Observation],
-        witnesses: Witnesses,
-        closed: Collection[int],
-    ) -> Definite:
+        scans: KeyframeScans,
+        pending_arcs: Iterable[PendingArc],
+        arc_keyframes: ArcKeyframes,
+        closed_areas: Collection[int],
+    ) -> AcceptanceResult:
         """What becomes of a path that is accepted, changing its map.
 
         :param scans: of all keyframes.
-        :param observations: that wait for it, in order.
-        :param witnesses: {arc: the keyframes by which it was observed}, of the arcs that are definite already.
-        :param closed: the areas that closures joined.
+        :param pending_arcs: that wait for it, in order.
+        :param arc_keyframes: {arc: the keyframes by which it was observed}, of the arcs that are definite already.
+        :param closed_areas: the areas that closures joined.
         """
-        arcs: dict[Pair, Arc] = {}
-        relabelled: list[Relabelled] = []
-        before: dict[Pair, ArcValue] = {}
-        witnesses = dict(witnesses)
-        for seen in observations:
-            aligned, moved = self._aligned(hybrid_map, scans, seen)
+        arcs: dict[AreaPair, Arc] = {}
+        relabelled: list[MovedKeyframe] = []
+        before: dict[AreaPair, ArcValue] = {}
+        arc_keyframes = dict(arc_keyframes)
+        for seen in pending_arcs:
+            aligned, moved = self._align(hybrid_map, scans, seen)
             relabelled += moved
-            old = arcs.get(seen.pair, seen.before)
-            arcs[seen.pair] = self._fused(aligned, old, witnesses.get(seen.pair, frozenset()))
-            witnesses[seen.pair] = witnesses.get(seen.pair, frozenset()) | seen.witnesses
-        if closed:
-            relabelled, before = self._refined_around(hybrid_map, scans, closed, arcs, relabelled)
-        return Definite(arcs, relabelled, witnesses, before)
+            old = arcs.get(seen.pair, seen.replaced_arc)
+            arcs[seen.pair] = self._fuse_arc(aligned, old, arc_keyframes.get(seen.pair, frozenset()))
+            arc_keyframes[seen.pair] = arc_keyframes.get(seen.pair, frozenset()) | seen.observing_keyframes
+        if closed_areas:
+            relabelled, before = self._refine_closed_areas(hybrid_map, scans, closed_areas, arcs, relabelled)
+        return AcceptanceResult(arcs, relabelled, arc_keyframes, before)
 
-    def _refined_around(
+    def _refine_closed_areas(
         self,
         hybrid_map: HybridMap,
-        scans: Scans,
+        scans: KeyframeScans,
         closed: Collection[int],
-        arcs: dict[Pair, Arc],
-        relabelled: list[Relabelled],
-    ) -> tuple[list[Relabelled], dict[Pair, ArcValue]]:
+        arcs: dict[AreaPair, Arc],
+        relabelled: list[MovedKeyframe],
+    ) -> tuple[list[MovedKeyframe], dict[AreaPair, ArcValue]]:
         """Refine the areas that closures joined; the arcs around them follow.
 
         Returns the keyframes that moved, and the arcs as they were before.
         """
         for arc in arcs.values():
             hybrid_map.set_arc(arc.source, arc.target, arc.pose, closure=arc.closure)
-        found = self._refinement.refined(hybrid_map, scans, closed)
+        found = self._refinement.refine(hybrid_map, scans, closed)
         before = {(a, b): value for a, b, value in hybrid_map.all_arcs() if (a, b) in found.arcs}
         for (a, b), value in before.items():
-            arcs[a, b] = Arc(a, b, self._floored(found.arcs[a, b]), value.closure)
+            arcs[a, b] = Arc(a, b, self._apply_sigma_floor(found.arcs[a, b]), value.closure)
         moved = {
-            keyframe: Relabelled(keyframe, area, area, pose)
+            keyframe: MovedKeyframe(keyframe, area, area, pose)
             for area, keyframes in found.keyframes.items()
             for keyframe, pose in keyframes.items()
         }
         return list(({r.keyframe: r for r in relabelled} | moved).values()), before
 
-    def _aligned(self, hybrid_map: HybridMap, scans: Scans, seen: Observation) -> tuple[Observation, list[Relabelled]]:
+    def _align(
+        self, hybrid_map: HybridMap, scans: KeyframeScans, seen: PendingArc
+    ) -> tuple[PendingArc, list[MovedKeyframe]]:
         """A closure that was found by matching areas, finely aligned."""
         if not seen.closure:
             return seen, []
-        if seen.joined:
-            return self._joined(hybrid_map, scans, seen)
-        return self._linked(hybrid_map, scans, seen), []
+        if seen.joined_keyframes:
+            return self._align_joined_keyframes(hybrid_map, scans, seen)
+        return self._align_areas(hybrid_map, scans, seen), []
 
-    def _joined(self, hybrid_map: HybridMap, scans: Scans, seen: Observation) -> tuple[Observation, list[Relabelled]]:
+    def _align_joined_keyframes(
+        self, hybrid_map: HybridMap, scans: KeyframeScans, seen: PendingArc
+    ) -> tuple[PendingArc, list[MovedKeyframe]]:
         """The keyframes that joined a known area, moved to where their scans fit the area's own, and the arc likewise.
 
         Keyframes that the robot stored in the area since then are on neither side: they were matched against both.
         """
         placed = hybrid_map.keyframes(seen.target)
-        joined = [keyframe for keyframe in seen.joined if keyframe in placed]
-        known = [keyframe for keyframe in placed if keyframe < seen.joined[0]]
-        motion = self._alignment.measured(
+        joined = [keyframe for keyframe in seen.joined_keyframes if keyframe in placed]
+        known = [keyframe for keyframe in placed if keyframe < seen.joined_keyframes[0]]
+        motion = self._alignment.align(
             [(scans[keyframe], placed[keyframe]) for keyframe in known],
             [(scans[keyframe], placed[keyframe]) for keyframe in joined],
             PoseGaussian(np.zeros(3), seen.pose.covariance),
@@ -185,30 +189,30 @@ class Acceptance:
         if motion is None:
             return seen, []
         moved = [
-            Relabelled(keyframe, seen.target, seen.target, se2.compose(motion.mean, placed[keyframe]))
+            MovedKeyframe(keyframe, seen.target, seen.target, se2.compose(motion.mean, placed[keyframe]))
             for keyframe in joined
         ]
         for r in moved:
-            hybrid_map.place(r.keyframe, r.area, r.pose)
-        return replace(seen, pose=PoseGaussian.exactly(seen.pose.mean).compose(motion.inverse())), moved
+            hybrid_map.set_keyframe(r.keyframe, r.area, r.pose)
+        return replace(seen, pose=PoseGaussian.from_pose(seen.pose.mean).compose(motion.inverse())), moved
 
-    def _linked(self, hybrid_map: HybridMap, scans: Scans, seen: Observation) -> Observation:
+    def _align_areas(self, hybrid_map: HybridMap, scans: KeyframeScans, seen: PendingArc) -> PendingArc:
         """An arc between areas that keep their keyframes, as the scans of both measure it."""
         known, others = (
             [(scans[keyframe], pose) for keyframe, pose in hybrid_map.keyframes(area).items()]
             for area in (seen.source, seen.target)
         )
-        found = self._alignment.measured(known, others, seen.pose)
+        found = self._alignment.align(known, others, seen.pose)
         return seen if found is None else replace(seen, pose=found)
 
-    def _fused(self, seen: Observation, old: Arc | None, witnesses: frozenset[int]) -> Arc:
+    def _fuse_arc(self, seen: PendingArc, old: Arc | None, witnesses: frozenset[int]) -> Arc:
         """The definite arc from an observation and what was known before, which tells whether it closed a loop."""
         belief, closure = seen.pose, seen.closure
-        if old is not None and not tells_nothing(old.pose):
-            shared = len(seen.witnesses & witnesses) / len(seen.witnesses)
+        if old is not None and not is_uninformative(old.pose):
+            shared = len(seen.observing_keyframes & witnesses) / len(seen.observing_keyframes)
             known = old.pose if old.source == seen.source else old.pose.inverse()
-            belief, closure = fused(known, belief, shared), old.closure
-        return Arc(seen.source, seen.target, self._floored(belief), closure)
+            belief, closure = fuse_traversals(known, belief, shared), old.closure
+        return Arc(seen.source, seen.target, self._apply_sigma_floor(belief), closure)
 
-    def _floored(self, belief: PoseGaussian) -> PoseGaussian:
-        return floored(belief, self._options.arc_sigma_floor, math.radians(self._options.arc_angle_floor))
+    def _apply_sigma_floor(self, belief: PoseGaussian) -> PoseGaussian:
+        return apply_sigma_floor(belief, self._options.arc_sigma_floor, math.radians(self._options.arc_angle_floor))

@@ -10,20 +10,20 @@ from numpy.typing import NDArray
 
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.geometry.gaussian import PoseGaussian, gate, moments
-from hmt_slam_ros.grids.patches import MapView
+from hmt_slam_ros.geometry.gaussian import PoseGaussian, chi_square_gate, match_moments
+from hmt_slam_ros.grids.patches import GridView
 from hmt_slam_ros.registration import scan_to_map
-from hmt_slam_ros.registration.area_to_area import MatchSettings, match
+from hmt_slam_ros.registration.area_to_area import MatchSettings, match_areas
 from hmt_slam_ros.registration.likelihood_grid import AreaGrid, GridModel, build_area_grid
 from hmt_slam_ros.sensors import Scan
-from hmt_slam_ros.sensors.surfels import moved
+from hmt_slam_ros.sensors.surfels import transform_surfels
 from hmt_slam_ros.submap.local_mapping import LocalMapping
 
 # Factor on the covariance of what the match of two whole areas says: they are not quite rigid, and bend by more than
 # the width of their walls.
-_NOT_RIGID = 10.0
+_NONRIGID_INFLATION = 10.0
 
-Placed: TypeAlias = tuple[Scan, NDArray[np.float64]]
+PlacedScan: TypeAlias = tuple[Scan, NDArray[np.float64]]
 
 
 class AreaAlignment:
@@ -35,13 +35,15 @@ class AreaAlignment:
     """
 
     def __init__(self, configuration: Configuration) -> None:
-        self._model = GridModel.of(configuration)
-        self._settings = MatchSettings.of(configuration.tsbi)
+        self._model = GridModel.from_configuration(configuration)
+        self._settings = MatchSettings.from_options(configuration.tsbi)
         self._mapping = LocalMapping(configuration)
         self._alignment = self._mapping.alignment._replace(inflation=1.0 / configuration.matching.temper)
-        self._gate = gate(configuration.tsbi.gate_probability)
+        self._gate = chi_square_gate(configuration.tsbi.gate_probability)
 
-    def measured(self, known: Sequence[Placed], joined: Sequence[Placed], closure: PoseGaussian) -> PoseGaussian | None:
+    def align(
+        self, known: Sequence[PlacedScan], joined: Sequence[PlacedScan], closure: PoseGaussian
+    ) -> PoseGaussian | None:
         """The belief over ``known_T_joined`` by the scans alone, all ways to fit taken together.
 
         :param known: (scan, ``known_T_base``) of the keyframes that the area held before.
@@ -49,25 +51,28 @@ class AreaAlignment:
         :param closure: belief over ``known_T_joined``, as TSBI found it with what is around the area as well.
         :returns: None where the scans tell no more than the closure did.
         """
-        modes = match(self._grid(joined), self._grid(known), closure, self._settings).modes
-        found = moments([(mode.measured, mode.log_mass) for mode in modes]) if modes else closure
+        modes = match_areas(self._build_grid(joined), self._build_grid(known), closure, self._settings).modes
+        found = match_moments([(mode.measured, mode.log_mass) for mode in modes]) if modes else closure
         if np.linalg.det(found.covariance) >= np.linalg.det(closure.covariance):
             return None
         table = self._mapping.pool.empty_table()
         for scan, pose in known:
-            self._mapping.insert(table[None], pose[None], scan)
-        start = [moved(se2.compose(found.mean, pose), self._mapping.matching_points(scan)) for scan, pose in joined]
-        offset = self._offset(np.concatenate(start), closure, found, self._mapping.pool.view(table))
+            self._mapping.insert_scan(table[None], pose[None], scan)
+        start = [
+            transform_surfels(se2.compose(found.mean, pose), self._mapping.matching_surfels(scan))
+            for scan, pose in joined
+        ]
+        offset = self._refine_offset(np.concatenate(start), closure, found, self._mapping.pool.view(table))
         self._mapping.pool.release(table)
-        covariance = min(_NOT_RIGID * found.covariance, closure.covariance, key=np.linalg.det)
+        covariance = min(_NONRIGID_INFLATION * found.covariance, closure.covariance, key=np.linalg.det)
         return PoseGaussian(se2.compose(offset, found.mean), covariance)
 
-    def _grid(self, placed: Sequence[Placed]) -> AreaGrid:
+    def _build_grid(self, placed: Sequence[PlacedScan]) -> AreaGrid:
         poses = np.array([pose for _, pose in placed]).reshape(-1, 3)
         return build_area_grid([scan for scan, _ in placed], poses, self._model)
 
-    def _offset(
-        self, points: NDArray[np.float64], closure: PoseGaussian, found: PoseGaussian, view: MapView
+    def _refine_offset(
+        self, points: NDArray[np.float64], closure: PoseGaussian, found: PoseGaussian, view: GridView
     ) -> NDArray[np.float64]:
         """The motion ``D`` in the area's frame, shape (3,), that makes ``found`` fit better.
 

@@ -18,23 +18,23 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hmt_slam_ros.configuration.topology import LoopClosureAcceptance
-from hmt_slam_ros.geometry.gaussian import PoseGaussian, gate
-from hmt_slam_ros.hybrid_map.common_map import Pair
-from hmt_slam_ros.hybrid_map.global_map import contradiction
+from hmt_slam_ros.configuration.topology import LoopClosureParameters
+from hmt_slam_ros.geometry.gaussian import PoseGaussian, chi_square_gate
+from hmt_slam_ros.hybrid_map.common_map import AreaPair
+from hmt_slam_ros.hybrid_map.global_map import total_arc_chi2
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.loop_closure.closure_history import (
-    Account,
+    AcceptedPath,
     Closure,
-    Name,
-    Step,
-    as_measured,
-    steps_of,
-    unrefined,
-    without,
+    ClosureId,
+    PathStep,
+    list_steps,
+    map_as_measured,
+    undo_refinements,
+    withdraw_closure,
 )
-from hmt_slam_ros.messages.map_changes import Arc, ArcEnds, Relabelled
-from hmt_slam_ros.messages.messages import Leaf, Notice
+from hmt_slam_ros.messages.map_changes import Arc, ArcEnds, MovedKeyframe
+from hmt_slam_ros.messages.messages import Hypothesis, Notice
 from hmt_slam_ros.messages.replica import FIRST_AREA
 
 _DEGREES_OF_FREEDOM = 3
@@ -43,234 +43,244 @@ _DEGREES_OF_FREEDOM = 3
 class Explanation(NamedTuple):
     """One way in which closures that contradict each other go together.
 
-    :ivar account: the path without what is false.
-    :ivar false: the closures that are false, in the order of acceptance.
+    :ivar path: the path without what is false.
+    :ivar false_closures: the closures that are false, in the order of acceptance.
     :ivar probability: that this is so.
     """
 
-    account: Account
-    false: tuple[Closure, ...]
+    path: AcceptedPath
+    false_closures: tuple[Closure, ...]
     probability: float
 
 
-class Doubt(NamedTuple):
+class Inconsistency(NamedTuple):
     """A closure that does not fit.
 
     :ivar closure: the new closure.
-    :ivar excess: by how much the chi-square grows with it.
+    :ivar excess_chi2: by how much the chi-square grows with it.
     :ivar explanations: of that, the most probable first.
     """
 
     closure: Closure
-    excess: float
+    excess_chi2: float
     explanations: tuple[Explanation, ...]
 
 
-class Doubts:
+class ClosureConsistencyCheck:
     """Looks for contradictions in one account.
 
     :param bound: the quantile of chi-square.
     :param new_area: the first number that no area has.
     """
 
-    def __init__(self, account: Account, bound: float, new_area: int) -> None:
-        self._account = account
-        self._bound = bound
+    def __init__(self, path: AcceptedPath, max_excess: float, new_area: int) -> None:
+        self._path = path
+        self._max_excess = max_excess
         self._new_area = new_area
-        self._accounts: dict[frozenset[Name], Account] = {}
-        self._chi2: dict[frozenset[Name], float] = {}
+        self._paths: dict[frozenset[ClosureId], AcceptedPath] = {}
+        self._chi2: dict[frozenset[ClosureId], float] = {}
 
-    def raised(self, new: Collection[Name], least: float) -> Doubt | None:
+    def find_inconsistency(self, new: Collection[ClosureId], min_probability: float) -> Inconsistency | None:
         """The contradiction that new closures bring, or None.
 
-        :param least: explanations less probable are left out.
+        :param min_probability: explanations less probable are left out.
         """
-        excess = {closure: self._excess(closure, frozenset()) for closure in self._closures(new)}
+        excess = {closure: self._excess_chi2(closure, frozenset()) for closure in self._closures_by_id(new)}
         worst = max(excess, key=lambda closure: excess[closure], default=None)
-        if worst is None or excess[worst] <= self._bound:
+        if worst is None or excess[worst] <= self._max_excess:
             return None
-        return Doubt(worst, excess[worst], tuple(self._explanations(worst, least)))
+        return Inconsistency(worst, excess[worst], tuple(self._explanations(worst, min_probability)))
 
     def _explanations(self, doubted: Closure, least: float) -> list[Explanation]:
-        costs = {frozenset[Name](): self._cost(frozenset())}
-        for root in self._account.closures:
-            false = self._false_with(root, doubted)
+        costs = {frozenset[ClosureId](): self._cost(frozenset())}
+        for root in self._path.closures:
+            false = self._false_closures(root, doubted)
             if false is not None:
                 cost = self._cost(false) + 2.0 * root.log_odds
                 costs[false] = min(cost, costs.get(false, np.inf))
         weights = np.exp(-0.5 * (np.array(list(costs.values())) - min(costs.values())))
         found = [
-            Explanation(self._without(false), self._closures(false), float(probability))
+            Explanation(self._path_without(false), self._closures_by_id(false), float(probability))
             for false, probability in zip(costs, weights / weights.sum(), strict=True)
             if probability >= least
         ]
         return sorted(found, key=lambda explanation: -explanation.probability)
 
-    def _false_with(self, root: Closure, doubted: Closure) -> frozenset[Name] | None:
+    def _false_closures(self, root: Closure, doubted: Closure) -> frozenset[ClosureId] | None:
         """What is false where ``root`` is the first that is; None where that does not explain the doubt."""
-        order = [closure.name for closure in self._account.closures]
-        later = [name for name in order[order.index(root.name) + 1 :] if name != doubted.name]
-        false = frozenset({root.name, *later})
-        if root is not doubted and self._excess(doubted, false) > self._bound:
+        order = [closure.closure_id for closure in self._path.closures]
+        later = [name for name in order[order.index(root.closure_id) + 1 :] if name != doubted.closure_id]
+        false = frozenset({root.closure_id, *later})
+        if root is not doubted and self._excess_chi2(doubted, false) > self._max_excess:
             return None
         for name in later:
-            closure = self._closures({name})[0]
-            if self._excess(closure, false - {name}) <= self._bound:
+            closure = self._closures_by_id({name})[0]
+            if self._excess_chi2(closure, false - {name}) <= self._max_excess:
                 false -= {name}
-        return false if self._excess(root, false - {root.name}) > self._bound else None
+        return false if self._excess_chi2(root, false - {root.closure_id}) > self._max_excess else None
 
-    def _closures(self, names: Collection[Name]) -> tuple[Closure, ...]:
-        return tuple(closure for closure in self._account.closures if closure.name in names)
+    def _closures_by_id(self, names: Collection[ClosureId]) -> tuple[Closure, ...]:
+        return tuple(closure for closure in self._path.closures if closure.closure_id in names)
 
-    def _excess(self, closure: Closure, false: frozenset[Name]) -> float:
+    def _excess_chi2(self, closure: Closure, false: frozenset[ClosureId]) -> float:
         """By how much the chi-square grows with a closure, where others are false."""
-        return self._contradiction(false) - self._contradiction(false | {closure.name})
+        return self._total_arc_chi2(false) - self._total_arc_chi2(false | {closure.closure_id})
 
-    def _cost(self, false: frozenset[Name]) -> float:
-        return self._contradiction(false) - _DEGREES_OF_FREEDOM * len(self._without(false).closures)
+    def _cost(self, false: frozenset[ClosureId]) -> float:
+        return self._total_arc_chi2(false) - _DEGREES_OF_FREEDOM * len(self._path_without(false).closures)
 
-    def _contradiction(self, false: frozenset[Name]) -> float:
+    def _total_arc_chi2(self, false: frozenset[ClosureId]) -> float:
         if false not in self._chi2:
-            self._chi2[false] = contradiction(as_measured(self._without(false)))
+            self._chi2[false] = total_arc_chi2(map_as_measured(self._path_without(false)))
         return self._chi2[false]
 
-    def _without(self, false: frozenset[Name]) -> Account:
+    def _path_without(self, false: frozenset[ClosureId]) -> AcceptedPath:
         """The account without some closures; what hangs on several of them hangs on the last."""
-        if false not in self._accounts:
-            account, new_area, closures = self._account, self._new_area, self._closures(false)
-            account = unrefined(account, closures[0].name) if closures else account
+        if false not in self._paths:
+            account, new_area, closures = self._path, self._new_area, self._closures_by_id(false)
+            account = undo_refinements(account, closures[0].closure_id) if closures else account
             for closure in reversed(closures):
-                account = without(account, closure.name, new_area)
+                account = withdraw_closure(account, closure.closure_id, new_area)
                 new_area += 1
-            self._accounts[false] = account
-        return self._accounts[false]
+            self._paths[false] = account
+        return self._paths[false]
 
 
-Key = tuple[tuple[Pair, ...], tuple[Pair, ...]]
+ExplanationKey = tuple[tuple[AreaPair, ...], tuple[AreaPair, ...]]
 
 
-class Question(NamedTuple):
+class RevisionRequest(NamedTuple):
     """A question that is open again.
 
-    :ivar leaves: the answers.
+    :ivar hypotheses: the answers.
     :ivar notice: what a person should know of it.
     """
 
-    leaves: tuple[Leaf, ...]
+    hypotheses: tuple[Hypothesis, ...]
     notice: Notice
 
 
-class Past(NamedTuple):
+class PathHistory(NamedTuple):
     """What a path went through.
 
     :ivar steps: the keyframe events at which the robot changed its area or arcs were new, in order.
     :ivar closures: those that were accepted, in order.
     """
 
-    steps: tuple[Step, ...]
+    steps: tuple[PathStep, ...]
     closures: tuple[Closure, ...]
 
 
 @dataclass(frozen=True, eq=False)
-class ReopeningState:
+class ClosureRevisionState:
     """What is known of questions that were opened again.
 
-    :ivar largest_area: the largest area that there ever was.
-    :ivar asked_at: the keyframe event of the last question, -1 before the first.
-    :ivar answers: {(arcs withdrawn, arcs set): the past of a path that goes on with this answer to it}.
+    :ivar max_area_id: the largest area that there ever was.
+    :ivar requested_at: the keyframe event of the last question, -1 before the first.
+    :ivar histories: {(arcs withdrawn, arcs set): the past of a path that goes on with this answer to it}.
     """
 
-    largest_area: int = FIRST_AREA
-    asked_at: int = -1
-    answers: Mapping[Key, Past] = field(default_factory=dict)
+    max_area_id: int = FIRST_AREA
+    requested_at: int = -1
+    histories: Mapping[ExplanationKey, PathHistory] = field(default_factory=dict)
 
 
-class Reopening:
+class ClosureRevision:
     """Finds contradictions, and knows the answers again that TSBI goes on with."""
 
-    def __init__(self, options: LoopClosureAcceptance, state: ReopeningState) -> None:
+    def __init__(self, options: LoopClosureParameters, state: ClosureRevisionState) -> None:
         """:param state: to go on from."""
-        self._bound = gate(options.contradiction_probability)
-        self._least = 1.0 - options.accept_probability
-        self._largest_area = state.largest_area
-        self._asked_at = state.asked_at
-        self._answers = dict(state.answers)
+        self._max_excess = chi_square_gate(options.contradiction_probability)
+        self._min_probability = 1.0 - options.accept_probability
+        self._max_area_id = state.max_area_id
+        self._requested_at = state.requested_at
+        self._histories = dict(state.histories)
 
     @property
-    def state(self) -> ReopeningState:
+    def state(self) -> ClosureRevisionState:
         """All that is known."""
-        return ReopeningState(self._largest_area, self._asked_at, dict(self._answers))
+        return ClosureRevisionState(self._max_area_id, self._requested_at, dict(self._histories))
 
-    def asked(self, event: int, account: Account, new: Collection[Name], hypothesis: int) -> Question | None:
+    def check(
+        self, event: int, path: AcceptedPath, new: Collection[ClosureId], hypothesis: int
+    ) -> RevisionRequest | None:
         """The question that closures raise which have just been accepted, if they do not fit.
 
         :param new: these closures.
         :param hypothesis: the hypothesis of the account.
         """
-        doubt = Doubts(account, self._bound, self._largest_area + 1).raised(new, self._least)
+        doubt = ClosureConsistencyCheck(path, self._max_excess, self._max_area_id + 1).find_inconsistency(
+            new, self._min_probability
+        )
         if doubt is None:
             return None
-        leaves = tuple(_as_leaf(explanation, hypothesis, account.hybrid_map) for explanation in doubt.explanations)
-        self._asked_at = event
-        self._answers = {
-            _key(leaf): Past(steps_of(explanation.account.history), explanation.account.closures)
+        leaves = tuple(_as_hypothesis(explanation, hypothesis, path.hybrid_map) for explanation in doubt.explanations)
+        self._requested_at = event
+        self._histories = {
+            _explanation_key(leaf): PathHistory(list_steps(explanation.path.history), explanation.path.closures)
             for leaf, explanation in zip(leaves, doubt.explanations, strict=True)
         }
         for leaf in leaves:
-            self._know(leaf)
-        return Question(leaves, Notice("tlca", _told(doubt, self._bound)))
+            self._note_areas(leaf)
+        return RevisionRequest(leaves, Notice("tlca", _notice_text(doubt, self._max_excess)))
 
-    def followed(self, leaf: Leaf, event: int) -> Past | None:
+    def resolve(self, leaf: Hypothesis, event: int) -> PathHistory | None:
         """Learn of a leaf; where it answers the question of the event before, the past of a path with that answer."""
-        self._know(leaf)
-        return self._answers[_key(leaf)] if event == self._asked_at + 1 and self._answers else None
+        self._note_areas(leaf)
+        return self._histories[_explanation_key(leaf)] if event == self._requested_at + 1 and self._histories else None
 
-    def _know(self, leaf: Leaf) -> None:
+    def _note_areas(self, leaf: Hypothesis) -> None:
         areas = [area for arc in leaf.arcs for area in (arc.source, arc.target)]
-        self._largest_area = max(self._largest_area, leaf.area, *areas)
+        self._max_area_id = max(self._max_area_id, leaf.area, *areas)
 
 
-def _as_leaf(explanation: Explanation, hypothesis: int, hybrid_map: HybridMap) -> Leaf:
+def _as_hypothesis(explanation: Explanation, hypothesis: int, hybrid_map: HybridMap) -> Hypothesis:
     """What an explanation changes, as the child of a hypothesis.
 
     :param hybrid_map: of the hypothesis.
     """
-    account = explanation.account
+    account = explanation.path
     changed = account.hybrid_map
-    former = {k: area for area in changed.areas if hybrid_map.has_area(area) for k in hybrid_map.keyframes(area)}
+    former = {
+        k: area for area in changed.changed_areas if hybrid_map.has_area(area) for k in hybrid_map.keyframes(area)
+    }
     relabelled = tuple(
-        Relabelled(k, former[k], area, pose)
-        for area, keyframes in sorted(changed.areas.items())
+        MovedKeyframe(k, former[k], area, pose)
+        for area, keyframes in sorted(changed.changed_areas.items())
         for k, pose in keyframes.items()
         if former[k] != area or not np.array_equal(pose, hybrid_map.keyframes(area)[k])
     )
-    rebase = None if account.rebase is None else PoseGaussian.exactly(account.rebase)
-    return Leaf(
+    rebase = None if account.frame_change is None else PoseGaussian.from_pose(account.frame_change)
+    return Hypothesis(
         hypothesis,
         hypothesis,
         explanation.probability,
         account.area,
         rebase,
         relabelled,
-        tuple(Arc(a, b, arc.pose, arc.closure) for (a, b), arc in sorted(changed.arcs.items()) if arc is not None),
-        withdrawn=tuple(
-            ArcEnds(a, b) for (a, b), arc in sorted(changed.arcs.items()) if arc is None and hybrid_map.arc(a, b)
+        tuple(
+            Arc(a, b, arc.pose, arc.closure) for (a, b), arc in sorted(changed.changed_arcs.items()) if arc is not None
+        ),
+        removed_arcs=tuple(
+            ArcEnds(a, b)
+            for (a, b), arc in sorted(changed.changed_arcs.items())
+            if arc is None and hybrid_map.arc(a, b)
         ),
     )
 
 
-def _key(leaf: Leaf) -> Key:
-    withdrawn = tuple((ends.source, ends.target) for ends in leaf.withdrawn)
+def _explanation_key(leaf: Hypothesis) -> ExplanationKey:
+    withdrawn = tuple((ends.source, ends.target) for ends in leaf.removed_arcs)
     return withdrawn, tuple((arc.source, arc.target) for arc in leaf.arcs)
 
 
-def _told(doubt: Doubt, bound: float) -> str:
+def _notice_text(doubt: Inconsistency, bound: float) -> str:
     """One sentence."""
     a, b = doubt.closure.pair
     best = doubt.explanations[0]
-    false = " and ".join(f"{closure.near}-{closure.far}" for closure in best.false) or "none"
+    false = " and ".join(f"{closure.near}-{closure.far}" for closure in best.false_closures) or "none"
     return (
         f"The closure between areas {a} and {b} contradicts those accepted before by a chi-square of "
-        f"{doubt.excess:.1f}, above {bound:.1f}: of all closures {false} is taken for false with probability "
+        f"{doubt.excess_chi2:.1f}, above {bound:.1f}: of all closures {false} is taken for false with probability "
         f"{best.probability:.3f}; raise tlca.accept_probability if this happens often."
     )

@@ -9,24 +9,24 @@ from numpy.typing import NDArray
 
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
-from hmt_slam_ros.hybrid_map.shortest_path import reachable
+from hmt_slam_ros.hybrid_map.shortest_path import shortest_path_beliefs
 from hmt_slam_ros.messages.replica import FIRST_AREA, Replica
 
-Frame = tuple[int, int, int]
+FrameKey = tuple[int, int, int]
 
 
-class Ambiguity:
+class PoseAmbiguity:
     """Remembers where each hypothesis has the robot's area, as long as nothing about it changes.
 
-    :ivar frames: {(hypothesis, number of the last change of its map, area): ``map_T_area``, shape (3,), or None where
+    :ivar area_frames: {(hypothesis, number of the last change of its map, area): ``map_T_area``, shape (3,), or None where
         no arc joins the area with the first}.
     """
 
-    def __init__(self, frames: Mapping[Frame, NDArray[np.float64] | None] | None = None) -> None:
-        """:param frames: to go on from."""
-        self.frames = dict(frames or {})
+    def __init__(self, area_frames: Mapping[FrameKey, NDArray[np.float64] | None] | None = None) -> None:
+        """:param area_frames: to go on from."""
+        self.area_frames = dict(area_frames or {})
 
-    def of(
+    def second_moment(
         self, replica: Replica, poses: Mapping[int, NDArray[np.float64]], versions: Mapping[int, int]
     ) -> NDArray[np.float64]:
         """The second moment of the robot's pose under all live hypotheses, about its pose under the most probable one.
@@ -41,24 +41,26 @@ class Ambiguity:
         """
         found = np.zeros((3, 3))
         if len(replica.maps) == 1:
-            self.frames = {}
+            self.area_frames = {}
             return found
-        named = {h: (h, versions[h], replica.areas[h]) for h in replica.maps}
-        self.frames = {
-            name: self.frames[name] if name in self.frames else _frame(replica.maps[h], replica.areas[h])
+        named = {h: (h, versions[h], replica.robot_areas[h]) for h in replica.maps}
+        self.area_frames = {
+            name: self.area_frames[name]
+            if name in self.area_frames
+            else _area_frame(replica.maps[h], replica.robot_areas[h])
             for h, name in named.items()
         }
-        frames = {h: frame for h, name in named.items() if (frame := self.frames[name]) is not None}
-        if replica.best in frames:
+        frames = {h: frame for h, name in named.items() if (frame := self.area_frames[name]) is not None}
+        if replica.best_hypothesis in frames:
             placed = {h: se2.compose(frame, poses[h]) for h, frame in frames.items()}
             for hypothesis, pose in placed.items():
-                away = pose - placed[replica.best]
+                away = pose - placed[replica.best_hypothesis]
                 away[2] = se2.wrap(away[2])
                 found += replica.probabilities[hypothesis] * np.outer(away, away)
         return found
 
 
-def _frame(hybrid_map: HybridMap, area: int) -> NDArray[np.float64] | None:
+def _area_frame(hybrid_map: HybridMap, area: int) -> NDArray[np.float64] | None:
     """``map_T_area``, or None where no arc joins the area with the first."""
-    belief = reachable(hybrid_map, FIRST_AREA, until=(area,)).get(area)
+    belief = shortest_path_beliefs(hybrid_map, FIRST_AREA, targets=(area,)).get(area)
     return None if belief is None else belief.mean

@@ -11,94 +11,107 @@ from numpy.typing import NDArray
 
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.geometry.gaussian import PoseGaussian, gate
-from hmt_slam_ros.hybrid_map.common_map import Pair
+from hmt_slam_ros.geometry.gaussian import PoseGaussian, chi_square_gate
+from hmt_slam_ros.hybrid_map.common_map import AreaPair
 from hmt_slam_ros.hybrid_map.global_map import consistent_map, shortest_path_map
-from hmt_slam_ros.loop_closure.acceptance import Acceptance, Observation, observed
+from hmt_slam_ros.loop_closure.acceptance import Acceptance, PendingArc, pending_arc
 from hmt_slam_ros.loop_closure.closure_history import (
-    Account,
+    AcceptedPath,
     Closure,
-    History,
-    Name,
-    Step,
-    Undo,
-    history_of,
-    merged,
-    steps_of,
-    witnesses_of,
+    ClosureId,
+    MapSnapshot,
+    PathStep,
+    StepHistory,
+    apply_area_merge,
+    chain_steps,
+    list_steps,
+    merge_arc_keyframes,
 )
-from hmt_slam_ros.loop_closure.closure_revision import Past, Question, Reopening, ReopeningState
-from hmt_slam_ros.loop_closure.pose_ambiguity import Ambiguity, Frame
-from hmt_slam_ros.messages.map_changes import Arc, AreaPose, Relabelled
-from hmt_slam_ros.messages.messages import Accepted, Hypotheses, Keyframe, Leaf, Message, Notice
+from hmt_slam_ros.loop_closure.closure_revision import (
+    ClosureRevision,
+    ClosureRevisionState,
+    PathHistory,
+    RevisionRequest,
+)
+from hmt_slam_ros.loop_closure.pose_ambiguity import FrameKey, PoseAmbiguity
+from hmt_slam_ros.messages.map_changes import Arc, AreaPose, MovedKeyframe
+from hmt_slam_ros.messages.messages import ClosureDecision, Hypotheses, Hypothesis, Keyframe, Message, Notice
 from hmt_slam_ros.messages.replica import FIRST_HYPOTHESIS, Replica, ReplicaState
 
 # Closures are never taken for more certain than this, whatever tlca.accept_probability is.
-_LEAST_DOUBT = 1e-6
+_MIN_FALSE_PROBABILITY = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
-class _Path:
+class _TopologicalPath:
     """What TLCA remembers of one hypothesis; a value, so that children inherit it.
 
     :ivar version: number of the last change of its areas and arcs, of all hypotheses.
-    :ivar parted: path length at which it parted from others, m.
-    :ivar held: at how many of the latest keyframes in a row it dominated since then.
-    :ivar definite: whether nothing happened since it was accepted.
-    :ivar observations: arcs that wait for acceptance, in order.
-    :ivar witnesses: {arc: the keyframes by which it was observed}, of the definite arcs.
+    :ivar branched_at: path length at which it parted from others, m.
+    :ivar dominant_keyframes: at how many of the latest keyframes in a row it dominated since then.
+    :ivar is_definite: whether nothing happened since it was accepted.
+    :ivar pending_arcs: arcs that wait for acceptance, in order.
+    :ivar arc_keyframes: {arc: the keyframes by which it was observed}, of the definite arcs.
     :ivar history: where the robot was.
     :ivar closures: those that were accepted, in order.
     """
 
     version: int = 0
-    parted: float = 0.0
-    held: int = 0
-    definite: bool = False
-    observations: tuple[Observation, ...] = ()
-    witnesses: dict[Pair, frozenset[int]] = field(default_factory=dict)
-    history: History = None
+    branched_at: float = 0.0
+    dominant_keyframes: int = 0
+    is_definite: bool = False
+    pending_arcs: tuple[PendingArc, ...] = ()
+    arc_keyframes: dict[AreaPair, frozenset[int]] = field(default_factory=dict)
+    history: StepHistory = None
     closures: tuple[Closure, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
-class PathState:
+class TopologicalPathState:
     """What TLCA remembers of one hypothesis.
 
     :ivar version: number of the last change of its areas and arcs, of all hypotheses.
-    :ivar parted: path length at which it parted from others, m.
-    :ivar held: at how many of the latest keyframes in a row it dominated since then.
-    :ivar definite: whether nothing happened since it was accepted.
-    :ivar observations: arcs that wait for acceptance, in order.
-    :ivar witnesses: {arc: the keyframes by which it was observed}, of the definite arcs.
-    :ivar past: where the robot was, and the closures that were accepted.
+    :ivar branched_at: path length at which it parted from others, m.
+    :ivar dominant_keyframes: at how many of the latest keyframes in a row it dominated since then.
+    :ivar is_definite: whether nothing happened since it was accepted.
+    :ivar pending_arcs: arcs that wait for acceptance, in order.
+    :ivar arc_keyframes: {arc: the keyframes by which it was observed}, of the definite arcs.
+    :ivar history: where the robot was, and the closures that were accepted.
     """
 
     version: int
-    parted: float
-    held: int
-    definite: bool
-    observations: tuple[Observation, ...]
-    witnesses: Mapping[Pair, frozenset[int]]
-    past: Past
+    branched_at: float
+    dominant_keyframes: int
+    is_definite: bool
+    pending_arcs: tuple[PendingArc, ...]
+    arc_keyframes: Mapping[AreaPair, frozenset[int]]
+    history: PathHistory
 
     @classmethod
-    def of(cls, path: _Path) -> PathState:
+    def from_path(cls, path: _TopologicalPath) -> TopologicalPathState:
         """Of a path."""
-        past = Past(steps_of(path.history), path.closures)
-        return cls(path.version, path.parted, path.held, path.definite, path.observations, path.witnesses, past)
+        past = PathHistory(list_steps(path.history), path.closures)
+        return cls(
+            path.version,
+            path.branched_at,
+            path.dominant_keyframes,
+            path.is_definite,
+            path.pending_arcs,
+            path.arc_keyframes,
+            past,
+        )
 
-    def path(self) -> _Path:
+    def to_path(self) -> _TopologicalPath:
         """The path."""
-        return _Path(
+        return _TopologicalPath(
             self.version,
-            self.parted,
-            self.held,
-            self.definite,
-            self.observations,
-            dict(self.witnesses),
-            history_of(self.past.steps),
-            self.past.closures,
+            self.branched_at,
+            self.dominant_keyframes,
+            self.is_definite,
+            self.pending_arcs,
+            dict(self.arc_keyframes),
+            chain_steps(self.history.steps),
+            self.history.closures,
         )
 
 
@@ -108,25 +121,27 @@ class TlcaState:
 
     :ivar replica: the maps of the live hypotheses.
     :ivar paths: {hypothesis: what is remembered of it}.
-    :ivar travelled: path length since the start, m.
+    :ivar path_length: path length since the start, m.
     :ivar poses: {hypothesis: the robot's ``area_T_base`` at the last keyframe event, shape (3,), m and rad}.
-    :ivar changes: how often areas or arcs of hypotheses changed.
-    :ivar published: the change after which global poses were told last, -1 before the first.
-    :ivar doubted: definite arcs of which it was told that they do not fit the others.
-    :ivar reopening: what is known of questions that were opened again.
-    :ivar frames: {(hypothesis, number of the last change of its map, area): ``map_T_area``, shape (3,), or None where
+    :ivar change_count: how often areas or arcs of hypotheses changed.
+    :ivar published_change: the change after which global poses were told last, -1 before the first.
+    :ivar reported_arcs: definite arcs of which it was told that they do not fit the others.
+    :ivar closure_revision: what is known of questions that were opened again.
+    :ivar area_frames: {(hypothesis, number of the last change of its map, area): ``map_T_area``, shape (3,), or None where
         no arc joins the area with the first}, of the robot's areas under several hypotheses.
     """
 
     replica: ReplicaState = field(default_factory=ReplicaState)
-    paths: Mapping[int, PathState] = field(default_factory=lambda: {FIRST_HYPOTHESIS: PathState.of(_Path())})
-    travelled: float = 0.0
+    paths: Mapping[int, TopologicalPathState] = field(
+        default_factory=lambda: {FIRST_HYPOTHESIS: TopologicalPathState.from_path(_TopologicalPath())}
+    )
+    path_length: float = 0.0
     poses: Mapping[int, NDArray[np.float64]] = field(default_factory=lambda: {FIRST_HYPOTHESIS: np.zeros(3)})
-    changes: int = 0
-    published: int = -1
-    doubted: frozenset[Pair] = frozenset()
-    reopening: ReopeningState = field(default_factory=ReopeningState)
-    frames: Mapping[Frame, NDArray[np.float64] | None] = field(default_factory=dict)
+    change_count: int = 0
+    published_change: int = -1
+    reported_arcs: frozenset[AreaPair] = frozenset()
+    closure_revision: ClosureRevisionState = field(default_factory=ClosureRevisionState)
+    area_frames: Mapping[FrameKey, NDArray[np.float64] | None] = field(default_factory=dict)
 
 
 class Tlca:
@@ -143,156 +158,169 @@ class Tlca:
         state = state or TlcaState()
         self._options = configuration.tlca
         self._acceptance = Acceptance(configuration)
-        self._replica = Replica.of(state.replica)
-        self._paths = {hypothesis: path.path() for hypothesis, path in state.paths.items()}
-        self._travelled = state.travelled
+        self._replica = Replica.from_state(state.replica)
+        self._paths = {hypothesis: path.to_path() for hypothesis, path in state.paths.items()}
+        self._path_length = state.path_length
         self._poses = dict(state.poses)
-        self._changes, self._published = state.changes, state.published
-        self._gate = gate(configuration.tsbi.gate_probability)
-        self._doubted = set(state.doubted)
-        self._reopening = Reopening(self._options, state.reopening)
-        self._ambiguity = Ambiguity(state.frames)
+        self._change_count, self._published_change = state.change_count, state.published_change
+        self._gate = chi_square_gate(configuration.tsbi.gate_probability)
+        self._reported_arcs = set(state.reported_arcs)
+        self._closure_revision = ClosureRevision(self._options, state.closure_revision)
+        self._ambiguity = PoseAmbiguity(state.area_frames)
         # The stated risk: beyond it, TSBI's probabilities are not taken at their word.
-        self._least_doubt = max(1.0 - self._options.accept_probability, _LEAST_DOUBT)
-        self._accepted_now: frozenset[Name] = frozenset()
-        self._mapping = True
+        self._min_false_probability = max(1.0 - self._options.accept_probability, _MIN_FALSE_PROBABILITY)
+        self._new_closures: frozenset[ClosureId] = frozenset()
+        self._is_mapping = True
 
     @property
     def state(self) -> TlcaState:
         """All that TLCA knows between two keyframe events, as a value."""
         return TlcaState(
             self._replica.state,
-            {hypothesis: PathState.of(path) for hypothesis, path in self._paths.items()},
-            self._travelled,
+            {hypothesis: TopologicalPathState.from_path(path) for hypothesis, path in self._paths.items()},
+            self._path_length,
             dict(self._poses),
-            self._changes,
-            self._published,
-            frozenset(self._doubted),
-            self._reopening.state,
-            dict(self._ambiguity.frames),
+            self._change_count,
+            self._published_change,
+            frozenset(self._reported_arcs),
+            self._closure_revision.state,
+            dict(self._ambiguity.area_frames),
         )
 
     def handle(self, message: Message) -> list[Message]:
         """Learn from a ``Keyframe``; answer ``Hypotheses``."""
         if isinstance(message, Keyframe):
-            self._replica.add(message)
-            self._travelled, self._mapping = message.travelled, message.mapping
-            self._poses |= {leaf.hypothesis: leaf.pose.mean for leaf in message.leaves}
+            self._replica.add_keyframe(message)
+            self._path_length, self._is_mapping = message.path_length, message.mapping
+            self._poses |= {leaf.hypothesis: leaf.pose.mean for leaf in message.estimates}
         elif isinstance(message, Hypotheses):
-            return self._judge(message)
+            return self._decide(message)
         return []
 
     def shortest_path_poses(self) -> dict[int, PoseGaussian]:
         """``map_T_area`` of the most probable hypothesis along the least uncertain paths only, Eq. (15)."""
-        return shortest_path_map(self._replica.maps[self._replica.best]).poses
+        return shortest_path_map(self._replica.maps[self._replica.best_hypothesis]).poses
 
-    def _judge(self, hypotheses: Hypotheses) -> list[Message]:
-        paths = {leaf.hypothesis: self._followed(leaf, hypotheses.sequence) for leaf in hypotheses.leaves}
-        self._poses = {leaf.hypothesis: _rebased(self._poses[leaf.parent], leaf) for leaf in hypotheses.leaves}
-        self._replica.apply(hypotheses)
-        self._paths, self._accepted_now = paths, frozenset()
-        chosen = self._dominant()
-        arcs, relabelled = ((), ()) if chosen is None else self._refined(chosen)
-        accepted = Accepted(hypotheses.sequence, chosen, arcs, relabelled)
-        self._replica.accept(accepted)
+    def _decide(self, hypotheses: Hypotheses) -> list[Message]:
+        paths = {leaf.id: self._updated_path(leaf, hypotheses.sequence) for leaf in hypotheses.hypotheses}
+        self._poses = {leaf.id: _rebase_pose(self._poses[leaf.parent], leaf) for leaf in hypotheses.hypotheses}
+        self._replica.apply_hypotheses(hypotheses)
+        self._paths, self._new_closures = paths, frozenset()
+        chosen = self._dominant_hypothesis()
+        arcs, relabelled = ((), ()) if chosen is None else self._accept_path(chosen)
+        accepted = ClosureDecision(hypotheses.sequence, chosen, arcs, relabelled)
+        self._replica.apply_decision(accepted)
         self._paths = {hypothesis: self._paths[hypothesis] for hypothesis in self._replica.maps}
         versions = {hypothesis: path.version for hypothesis, path in self._paths.items()}
-        accepted = replace(accepted, ambiguity=self._ambiguity.of(self._replica, self._poses, versions))
-        question = None if chosen is None else self._contradicted(chosen, hypotheses.sequence)
+        accepted = replace(accepted, ambiguity=self._ambiguity.second_moment(self._replica, self._poses, versions))
+        question = None if chosen is None else self._revision_request(chosen, hypotheses.sequence)
         if question is not None:
             # No pose is told: the map is not bent to what does not fit.
-            return [question.notice, replace(accepted, reopened=question.leaves)]
+            return [question.notice, replace(accepted, revised_hypotheses=question.hypotheses)]
         poses, notices = self._global_poses()
         return [*notices, replace(accepted, global_poses=poses)]
 
-    def _contradicted(self, hypothesis: int, event: int) -> Question | None:
+    def _revision_request(self, hypothesis: int, event: int) -> RevisionRequest | None:
         """The contradiction that the closures bring that have just been accepted, if any."""
-        path, area = self._paths[hypothesis], self._replica.areas[hypothesis]
-        account = Account(self._replica.maps[hypothesis], path.history, path.closures, area, self._poses[hypothesis])
-        return self._reopening.asked(event, account, self._accepted_now, hypothesis)
+        path, area = self._paths[hypothesis], self._replica.robot_areas[hypothesis]
+        account = AcceptedPath(
+            self._replica.maps[hypothesis], path.history, path.closures, area, self._poses[hypothesis]
+        )
+        return self._closure_revision.check(event, account, self._new_closures, hypothesis)
 
-    def _followed(self, leaf: Leaf, sequence: int) -> _Path:
+    def _updated_path(self, leaf: Hypothesis, sequence: int) -> _TopologicalPath:
         """The path after TSBI's answer, which is not applied yet: the arcs that it replaces are still there."""
-        path, before = self._paths[leaf.parent], self._replica.areas[leaf.parent]
-        if leaf.hypothesis != leaf.parent:
-            path = replace(path, parted=self._travelled, held=0)
+        path, before = self._paths[leaf.parent], self._replica.robot_areas[leaf.parent]
+        if leaf.id != leaf.parent:
+            path = replace(path, branched_at=self._path_length, dominant_keyframes=0)
         dominates = leaf.probability >= self._options.accept_probability
-        path = replace(path, held=path.held + 1 if dominates else 0)
-        if leaf.arcs or leaf.relabelled or leaf.withdrawn or leaf.merged:
-            self._changes += 1
-            path = replace(path, version=self._changes, definite=False)
-        elif leaf.rebase:
-            path = replace(path, definite=False)
-        past = self._reopening.followed(leaf, sequence)
+        path = replace(path, dominant_keyframes=path.dominant_keyframes + 1 if dominates else 0)
+        if leaf.arcs or leaf.moved_keyframes or leaf.removed_arcs or leaf.area_merge:
+            self._change_count += 1
+            path = replace(path, version=self._change_count, is_definite=False)
+        elif leaf.frame_change:
+            path = replace(path, is_definite=False)
+        past = self._closure_revision.resolve(leaf, sequence)
         if past is not None:
-            return replace(path, definite=False, history=history_of(past.steps), closures=past.closures)
+            return replace(path, is_definite=False, history=chain_steps(past.steps), closures=past.closures)
         parent = self._replica.maps[leaf.parent]
-        if leaf.merged is not None:
-            history, closures = merged(Account(parent, path.history, path.closures, before, np.zeros(3)), leaf.merged)
-            witnesses = witnesses_of(path.witnesses, leaf.merged)
-            return replace(path, history=history, closures=closures, witnesses=witnesses)
-        observations = tuple(observed(arc, leaf, sequence, before, parent) for arc in leaf.arcs)
-        new = tuple(seen.pair for seen in observations if seen.before is None)
+        if leaf.area_merge is not None:
+            history, closures = apply_area_merge(
+                AcceptedPath(parent, path.history, path.closures, before, np.zeros(3)), leaf.area_merge
+            )
+            witnesses = merge_arc_keyframes(path.arc_keyframes, leaf.area_merge)
+            return replace(path, history=history, closures=closures, arc_keyframes=witnesses)
+        observations = tuple(pending_arc(arc, leaf, sequence, before, parent) for arc in leaf.arcs)
+        new = tuple(seen.pair for seen in observations if seen.replaced_arc is None)
         if new or leaf.area != before:
-            joined = frozenset(r.keyframe for r in leaf.relabelled if r.area == leaf.area)
-            path = replace(path, history=(path.history, Step(sequence, before, leaf.area, new, joined)))
-        return replace(path, observations=path.observations + observations)
+            joined = frozenset(r.keyframe for r in leaf.moved_keyframes if r.area == leaf.area)
+            path = replace(path, history=(path.history, PathStep(sequence, before, leaf.area, new, joined)))
+        return replace(path, pending_arcs=path.pending_arcs + observations)
 
-    def _dominant(self) -> int | None:
+    def _dominant_hypothesis(self) -> int | None:
         """The hypothesis that becomes definite now, if any."""
-        best = self._replica.best
+        best = self._replica.best_hypothesis
         path = self._paths[best]
         if len(self._paths) == 1:
-            return None if path.definite else best
-        held = path.held >= self._options.accept_keyframes
-        return best if held and self._travelled - path.parted >= self._options.accept_distance else None
+            return None if path.is_definite else best
+        held = path.dominant_keyframes >= self._options.accept_keyframes
+        return best if held and self._path_length - path.branched_at >= self._options.accept_distance else None
 
-    def _refined(self, hypothesis: int) -> tuple[tuple[Arc, ...], tuple[Relabelled, ...]]:
+    def _accept_path(self, hypothesis: int) -> tuple[tuple[Arc, ...], tuple[MovedKeyframe, ...]]:
         """Align and fuse what the accepted path observed, changing its map."""
         path, hybrid_map = self._paths[hypothesis], self._replica.maps[hypothesis]
-        found = [seen.pair for seen in path.observations if seen.closure]
-        found += [closure.pair for closure in path.closures if closure.undo is None]
+        found = [seen.pair for seen in path.pending_arcs if seen.closure]
+        found += [closure.pair for closure in path.closures if closure.snapshot is None]
         # What is refined moves, which is a change of the map.
-        closed = {area for pair in found for area in pair} if self._mapping else set()
+        closed = {area for pair in found for area in pair} if self._is_mapping else set()
         poses = {k: (area, pose) for area in sorted(closed) for k, pose in hybrid_map.keyframes(area).items()}
-        made = self._acceptance.of(hybrid_map, self._replica.scans, path.observations, path.witnesses, closed)
+        made = self._acceptance.accept(hybrid_map, self._replica.scans, path.pending_arcs, path.arc_keyframes, closed)
         if made.arcs:
-            self._changes += 1
-        version = self._changes if made.arcs else path.version
-        closures = self._closures(path, self._replica.probabilities[hypothesis], Undo(poses, made.before))
-        self._paths[hypothesis] = replace(
-            path, version=version, definite=True, observations=(), witnesses=made.witnesses, closures=closures
+            self._change_count += 1
+        version = self._change_count if made.arcs else path.version
+        closures = self._accepted_closures(
+            path, self._replica.probabilities[hypothesis], MapSnapshot(poses, made.arcs_before)
         )
-        return tuple(made.arcs.values()), tuple(made.relabelled)
+        self._paths[hypothesis] = replace(
+            path,
+            version=version,
+            is_definite=True,
+            pending_arcs=(),
+            arc_keyframes=made.arc_keyframes,
+            closures=closures,
+        )
+        return tuple(made.arcs.values()), tuple(made.moved_keyframes)
 
-    def _closures(self, path: _Path, probability: float, undo: Undo) -> tuple[Closure, ...]:
+    def _accepted_closures(self, path: _TopologicalPath, probability: float, undo: MapSnapshot) -> tuple[Closure, ...]:
         """Those of a path that is now accepted; what was observed again since is not to be undone."""
-        again = {seen.pair for seen in path.observations if seen.before is not None}
-        closures = {c.pair: replace(c, undo=undo) if c.undo is None else c.but_for(again) for c in path.closures}
-        doubt = min(max(1.0 - probability, self._least_doubt), 0.5)
-        for seen in path.observations:
+        again = {seen.pair for seen in path.pending_arcs if seen.replaced_arc is not None}
+        closures = {
+            c.pair: replace(c, snapshot=undo) if c.snapshot is None else c.without_arcs(again) for c in path.closures
+        }
+        doubt = min(max(1.0 - probability, self._min_false_probability), 0.5)
+        for seen in path.pending_arcs:
             if seen.closure and seen.pair not in closures:
-                closures[seen.pair] = seen.accepted(math.log((1.0 - doubt) / doubt), undo)
-        self._accepted_now = frozenset(c.name for c in list(closures.values())[len(path.closures) :])
+                closures[seen.pair] = seen.to_closure(math.log((1.0 - doubt) / doubt), undo)
+        self._new_closures = frozenset(c.closure_id for c in list(closures.values())[len(path.closures) :])
         return tuple(closures.values())
 
     def _global_poses(self) -> tuple[tuple[AreaPose, ...], list[Message]]:
         """The poses of all areas under the most probable hypothesis, where they changed; arcs that refuse to fit."""
-        best = self._replica.best
+        best = self._replica.best_hypothesis
         version = self._paths[best].version
-        if version == self._published:
+        if version == self._published_change:
             return (), []
-        self._published = version
+        self._published_change = version
         hybrid_map = self._replica.maps[best]
         consistent = self._options.global_map == "consistent"
         found = consistent_map(hybrid_map) if consistent else shortest_path_map(hybrid_map)
-        notices = self._misfits(found.arc_chi2) if self._paths[best].definite else []
+        notices = self._misfit_notices(found.arc_chi2) if self._paths[best].is_definite else []
         return tuple(AreaPose(area, pose) for area, pose in found.poses.items()), notices
 
-    def _misfits(self, arc_chi2: dict[Pair, float]) -> list[Message]:
+    def _misfit_notices(self, arc_chi2: dict[AreaPair, float]) -> list[Message]:
         """A notice of every definite arc that does not fit the others, once: a sign of a closure that was false."""
-        wrong = [pair for pair, value in arc_chi2.items() if value > self._gate and pair not in self._doubted]
-        self._doubted.update(wrong)
+        wrong = [pair for pair, value in arc_chi2.items() if value > self._gate and pair not in self._reported_arcs]
+        self._reported_arcs.update(wrong)
         return [
             Notice(
                 "tlca",
@@ -303,5 +331,5 @@ class Tlca:
         ]
 
 
-def _rebased(pose: NDArray[np.float64], leaf: Leaf) -> NDArray[np.float64]:
-    return pose if leaf.rebase is None else se2.compose(leaf.rebase.mean, pose)
+def _rebase_pose(pose: NDArray[np.float64], leaf: Hypothesis) -> NDArray[np.float64]:
+    return pose if leaf.frame_change is None else se2.compose(leaf.frame_change.mean, pose)

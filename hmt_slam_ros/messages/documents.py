@@ -15,21 +15,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmt_slam_ros.errors import HmtSlamError
-from hmt_slam_ros.messages.map_changes import Outdated, Place
+from hmt_slam_ros.messages.map_changes import InitialPose, StaleBeams
 from hmt_slam_ros.messages.messages import (
-    Accepted,
     AreaEvents,
-    Arriving,
-    Finished,
+    ClosureDecision,
+    EndOfRun,
     Hypotheses,
+    HypothesisEstimate,
     Keyframe,
-    LeafEstimate,
     LocalEstimate,
     Notice,
+    TrackingReset,
 )
 from hmt_slam_ros.messages.tasks import PlaceEstimate
-from hmt_slam_ros.plain_data import Reader, Values, plain
-from hmt_slam_ros.saved_map.folder import File
+from hmt_slam_ros.plain_data import PlainDataReader, Reader, to_plain
+from hmt_slam_ros.saved_map.folder import FileRecord
 from hmt_slam_ros.sensors import Scan
 
 Document = TypeVar("Document")
@@ -50,35 +50,35 @@ class ScanGeometry:
 
 
 @dataclass(frozen=True, eq=False)
-class KeyframeHead:
+class KeyframeHeader:
     """A :class:`~hmt_slam_ros.messages.messages.Keyframe` without the ranges of its scan."""
 
     sequence: int
     scan: ScanGeometry
-    travelled: float
-    leaves: tuple[LeafEstimate, ...]
-    carried: bool
-    place: Place | None
+    path_length: float
+    estimates: tuple[HypothesisEstimate, ...]
+    motion_unknown: bool
+    initial_pose: InitialPose | None
     mapping: bool
-    outdated: tuple[Outdated, ...]
+    stale_beams: tuple[StaleBeams, ...]
 
     @classmethod
-    def of(cls, keyframe: Keyframe) -> KeyframeHead:
+    def from_keyframe(cls, keyframe: Keyframe) -> KeyframeHeader:
         """What is left of a keyframe without the ranges."""
         scan = keyframe.scan
         geometry = ScanGeometry(**{entry.name: getattr(scan, entry.name) for entry in fields(ScanGeometry)})
         return cls(
             keyframe.sequence,
             geometry,
-            keyframe.travelled,
-            keyframe.leaves,
-            keyframe.carried,
-            keyframe.place,
+            keyframe.path_length,
+            keyframe.estimates,
+            keyframe.motion_unknown,
+            keyframe.initial_pose,
             keyframe.mapping,
-            keyframe.outdated,
+            keyframe.stale_beams,
         )
 
-    def with_ranges(self, ranges: NDArray[np.float32]) -> Keyframe:
+    def to_keyframe(self, ranges: NDArray[np.float32]) -> Keyframe:
         """The keyframe.
 
         :param ranges: shape (n,), m.
@@ -88,27 +88,27 @@ class KeyframeHead:
         return Keyframe(
             self.sequence,
             scan,
-            self.travelled,
-            self.leaves,
-            self.carried,
-            self.place,
+            self.path_length,
+            self.estimates,
+            self.motion_unknown,
+            self.initial_pose,
             self.mapping,
-            self.outdated,
+            self.stale_beams,
         )
 
 
 @dataclass(frozen=True, eq=False)
-class Closing:
+class FinalCounts:
     """slam's last word, and what it had said until then.
 
     :ivar totals: the message itself.
     :ivar keyframes: keyframe events.
-    :ivar trails: trails.
+    :ivar scan_poses: trails.
     """
 
-    totals: Finished
+    totals: EndOfRun
     keyframes: int
-    trails: int
+    scan_poses: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,7 +120,7 @@ class RobotStatus:
     :ivar stamp: of the last record sent, ns, 0 before the first.
     :ivar scans: scans sent.
     :ivar scans_in_log: scans that one pass over the log has.
-    :ivar odometry: odometry readings sent.
+    :ivar odometry_readings: odometry readings sent.
     :ivar acknowledged: scans for which slam gave a pose.
     """
 
@@ -129,7 +129,7 @@ class RobotStatus:
     stamp: int
     scans: int
     scans_in_log: int
-    odometry: int
+    odometry_readings: int
     acknowledged: int
 
 
@@ -140,33 +140,33 @@ class SaveRequest:
     :ivar number: of the request, larger than those before.
     :ivar events: keyframe events after which all parts are.
     :ivar folder: into which they are written.
-    :ivar last: whether all nodes end afterwards.
+    :ivar shutdown: whether all nodes end afterwards.
     """
 
     number: int
     events: int
     folder: str
-    last: bool
+    shutdown: bool
 
 
 @dataclass(frozen=True, eq=False)
-class SavedPart:
+class SaveResponse:
     """The answer to a :class:`SaveRequest`.
 
     :ivar number: of the request.
-    :ivar part: the process that answers.
+    :ivar process: the process that answers.
     :ivar files: what it wrote.
-    :ivar fault: what went wrong, empty where nothing did.
+    :ivar error: what went wrong, empty where nothing did.
     """
 
     number: int
-    part: str
-    files: tuple[File, ...]
-    fault: str = ""
+    process: str
+    files: tuple[FileRecord, ...]
+    error: str = ""
 
 
 @dataclass(frozen=True, eq=False)
-class BeginRequest:
+class ResetRequest:
     """slam asks the others to begin anew.
 
     :ivar number: of the request, larger than those before.
@@ -180,48 +180,48 @@ class BeginRequest:
 
 
 @dataclass(frozen=True, eq=False)
-class BegunPart:
+class ResetResponse:
     """The answer to a :class:`BeginRequest`.
 
     :ivar number: of the request.
-    :ivar part: the process that answers.
-    :ivar fault: what went wrong, empty where nothing did.
+    :ivar process: the process that answers.
+    :ivar error: what went wrong, empty where nothing did.
     """
 
     number: int
-    part: str
-    fault: str = ""
+    process: str
+    error: str = ""
 
 
 # Raise a document's version with every change of its dataclass: a receiver refuses any other.
 _DOCUMENTS: dict[type, tuple[str, int]] = {
-    KeyframeHead: ("keyframe", 9),
+    KeyframeHeader: ("keyframe", 9),
     AreaEvents: ("area_events", 3),
     Hypotheses: ("hypotheses", 8),
-    Accepted: ("accepted", 4),
+    ClosureDecision: ("accepted", 4),
     LocalEstimate: ("local_estimate", 1),
-    Arriving: ("arriving", 1),
+    TrackingReset: ("arriving", 1),
     Notice: ("notice", 1),
-    Closing: ("finished", 1),
+    FinalCounts: ("finished", 1),
     RobotStatus: ("robot_status", 1),
     SaveRequest: ("save_request", 1),
-    SavedPart: ("saved_part", 1),
-    BeginRequest: ("begin_request", 1),
-    BegunPart: ("begun_part", 1),
+    SaveResponse: ("saved_part", 1),
+    ResetRequest: ("begin_request", 1),
+    ResetResponse: ("begun_part", 1),
     PlaceEstimate: ("place_estimate", 1),
 }
 
 
-def encode(message: object, begun: int = 0) -> str:
+def encode(message: object, reset_number: int = 0) -> str:
     """The JSON document of a message, of a :class:`KeyframeHead`, :class:`Closing` or :class:`RobotStatus`.
 
-    :param begun: number of the request after which all began anew, 0 before the first.
+    :param reset_number: number of the request after which all began anew, 0 before the first.
     :raises HmtSlamError: where a float is NaN or infinite.
     """
     name, version = _DOCUMENTS[type(message)]
-    content = {"document": name, "version": version, **plain(message, {np.ndarray: np.ndarray.tolist})}
-    if begun:
-        content["begun"] = begun
+    content = {"document": name, "version": version, **to_plain(message, {np.ndarray: np.ndarray.tolist})}
+    if reset_number:
+        content["begun"] = reset_number
     try:
         return json.dumps(content, allow_nan=False, separators=(",", ":"))
     except ValueError as error:
@@ -234,10 +234,10 @@ def decode(text: str, kind: type[Document]) -> Document:
     :param kind: what the document has to be.
     :raises HmtSlamError: where it is something else, of another version, or malformed; names the field.
     """
-    return decode_numbered(text, kind)[0]
+    return decode_with_reset(text, kind)[0]
 
 
-def decode_numbered(text: str, kind: type[Document]) -> tuple[Document, int]:
+def decode_with_reset(text: str, kind: type[Document]) -> tuple[Document, int]:
     """The message of a JSON document, and the number of the request after which its sender had begun anew.
 
     :raises HmtSlamError: as :func:`decode`.
@@ -253,8 +253,8 @@ def decode_numbered(text: str, kind: type[Document]) -> tuple[Document, int]:
         raise HmtSlamError(
             f"a {name} document has version {found}, not {version}: run the same version of hmt_slam_ros everywhere"
         )
-    begun = _VALUES.value(content.pop("begun", 0), int, f"{name}.begun")
-    return _VALUES.value(content, kind, name), begun
+    begun = _VALUES.read(content.pop("begun", 0), int, f"{name}.begun")
+    return _VALUES.read(content, kind, name), begun
 
 
 def _array_reader(field: str, kind: Hashable) -> Reader:  # noqa: ARG001  all are of one kind
@@ -266,12 +266,12 @@ def _array_reader(field: str, kind: Hashable) -> Reader:  # noqa: ARG001  all ar
         try:
             array = np.array(content)
         except ValueError:  # rows of different lengths
-            raise _VALUES.fault(path, content, wanted) from None
+            raise _VALUES.error_at(path, content, wanted) from None
         if array.shape != shape or array.dtype.kind not in "if" or not np.isfinite(array).all():
-            raise _VALUES.fault(path, content, wanted)
+            raise _VALUES.error_at(path, content, wanted)
         return array.astype(np.float64, copy=False)
 
     return read
 
 
-_VALUES = Values("docs/messages.md", {np.ndarray: _array_reader})
+_VALUES = PlainDataReader("docs/messages.md", {np.ndarray: _array_reader})

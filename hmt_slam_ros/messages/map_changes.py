@@ -37,7 +37,7 @@ class LocalArea:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Place:
+class InitialPose:
     """Where the robot is, as somebody says.
 
     :ivar area: a known area.
@@ -77,7 +77,7 @@ class ArcEnds:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Merged:
+class AreaMerge:
     """Two areas that are one, with all keyframes and arcs.
 
     :ivar area: the one that becomes part of the other.
@@ -91,39 +91,39 @@ class Merged:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Relabelled:
+class MovedKeyframe:
     """A keyframe that is in another area now, or at another pose.
 
     :ivar keyframe: its number.
-    :ivar source: the area in which it was.
+    :ivar previous_area: the area in which it was.
     :ivar area: the area to which it belongs now.
     :ivar pose: shape (3,), ``area_T_base``.
     """
 
     keyframe: int
-    source: int
+    previous_area: int
     area: int
     pose: Pose
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Outdated:
+class StaleBeams:
     """What a keyframe's scan says of the world that is not so any more.
 
     :ivar keyframe: its number.
-    :ivar beams: numbers of the beams whose end is gone, ascending.
-    :ivar cut: numbers of the beams in whose way something came to stand, ascending.
+    :ivar removed: numbers of the beams whose end is gone, ascending.
+    :ivar occluded: numbers of the beams in whose way something came to stand, ascending.
     :ivar starts: from where on each of these still holds, m from the laser.
     """
 
     keyframe: int
-    beams: tuple[int, ...]
-    cut: tuple[int, ...] = ()
+    removed: tuple[int, ...]
+    occluded: tuple[int, ...] = ()
     starts: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Forgotten:
+class PrunedKeyframe:
     """A keyframe of ground that others hold as well.
 
     :ivar keyframe: its number.

@@ -19,22 +19,22 @@ from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.messages.map_changes import (
     Arc,
     ArcEnds,
+    AreaMerge,
     AreaPose,
-    Forgotten,
+    InitialPose,
     LocalArea,
-    Merged,
-    Outdated,
-    Place,
+    MovedKeyframe,
     Pose,
-    Relabelled,
+    PrunedKeyframe,
+    StaleBeams,
 )
-from hmt_slam_ros.messages.tasks import Errand, Heading, Outcome, PlaceEstimate, Steering
+from hmt_slam_ros.messages.tasks import GoalPose, PlaceEstimate, Task, TaskResult, VelocityCommand
 from hmt_slam_ros.registration.consistency import Clutter
 from hmt_slam_ros.sensors import Odometry, Scan
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class LeafEstimate:
+class HypothesisEstimate:
     """What metric SLAM says of one live hypothesis at a keyframe event.
 
     :ivar hypothesis: id of the live hypothesis.
@@ -44,10 +44,10 @@ class LeafEstimate:
     :ivar stored: whether the keyframe enters this hypothesis's map; False where it would add nothing new.
     :ivar log_evidence: log-likelihood of the keyframe's scan where it is in the place that this hypothesis has it in,
         relative to a place that looks alike; nats, not accumulated over keyframes.
-    :ivar doubt: by how much likelier the scan is where the robot was displaced before it, nats, likewise.
+    :ivar log_kidnapping_ratio: by how much likelier the scan is where the robot was displaced before it, nats, likewise.
     :ivar clutter: what contradicts the hypothesis's map usually.
     :ivar effective_samples: ESS of the hypothesis's particles, in [1, number of particles].
-    :ivar revised: earlier keyframes of the area whose pose changed because another particle leads now; ``source`` and
+    :ivar revised_keyframes: earlier keyframes of the area whose pose changed because another particle leads now; ``source`` and
         ``area`` are equal.
     """
 
@@ -56,10 +56,10 @@ class LeafEstimate:
     pose: PoseGaussian
     stored: bool
     log_evidence: float
-    doubt: float
+    log_kidnapping_ratio: float
     clutter: Clutter
     effective_samples: float
-    revised: tuple[Relabelled, ...] = ()
+    revised_keyframes: tuple[MovedKeyframe, ...] = ()
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -68,22 +68,22 @@ class Keyframe:
 
     :ivar sequence: 0, 1, 2, ... without gaps; it also names the keyframe.
     :ivar scan: the keyframe's scan.
-    :ivar travelled: path length since the start, m.
-    :ivar leaves: one estimate for every live hypothesis, ordered by hypothesis id.
-    :ivar carried: whether nothing tells how the robot came there from the keyframe before.
-    :ivar place: where that is as somebody says, None where nobody did.
+    :ivar path_length: path length since the start, m.
+    :ivar estimates: one estimate for every live hypothesis, ordered by hypothesis id.
+    :ivar motion_unknown: whether nothing tells how the robot came there from the keyframe before.
+    :ivar initial_pose: where that is as somebody says, None where nobody did.
     :ivar mapping: whether the map may change; what a robot adds to it that may be anywhere changes nothing of it.
-    :ivar outdated: what the one hypothesis's map holds that is no more, as the last scans see it.
+    :ivar stale_beams: what the one hypothesis's map holds that is no more, as the last scans see it.
     """
 
     sequence: int
     scan: Scan
-    travelled: float
-    leaves: tuple[LeafEstimate, ...]
-    carried: bool = False
-    place: Place | None = None
+    path_length: float
+    estimates: tuple[HypothesisEstimate, ...]
+    motion_unknown: bool = False
+    initial_pose: InitialPose | None = None
     mapping: bool = True
-    outdated: tuple[Outdated, ...] = ()
+    stale_beams: tuple[StaleBeams, ...] = ()
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -115,48 +115,48 @@ class AreaEvents:
 
     :ivar sequence: the keyframe event that it answers.
     :ivar events: of the hypotheses.
-    :ivar forgotten: keyframes that may be forgotten, where this is the map of one hypothesis alone.
+    :ivar redundant_keyframes: keyframes that may be forgotten, where this is the map of one hypothesis alone.
     """
 
     sequence: int
     events: tuple[AreaEvent, ...]
-    forgotten: tuple[Forgotten, ...] = ()
+    redundant_keyframes: tuple[PrunedKeyframe, ...] = ()
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Leaf:
+class Hypothesis:
     """A live hypothesis after keyframe event k, as changes against the leaf ``parent`` before it.
 
-    :ivar hypothesis: its id; equal to ``parent`` where nothing branched; of several children of one parent each has a
+    :ivar id: its id; equal to ``parent`` where nothing branched; of several children of one parent each has a
         new id.
     :ivar parent: the hypothesis it continues.
     :ivar probability: P(gamma^t | d), Eq. (14).
     :ivar area: the robot's area now.
-    :ivar rebase: belief over ``area_T_previous``: the frame of the robot's area before the event in that of ``area``,
+    :ivar frame_change: belief over ``area_T_previous``: the frame of the robot's area before the event in that of ``area``,
         as uncertain as the newest keyframe that came over is in the area, or as the arc; None where the area did not
         change and the robot's pose stands.
-    :ivar relabelled: keyframes that change area.
+    :ivar moved_keyframes: keyframes that change area.
     :ivar arcs: arcs that are new or replaced.
-    :ivar local: the areas of the local map, the current one first; empty where the local map stays as it is.
-    :ivar withdrawn: arcs that this hypothesis does not believe any more.
-    :ivar merged: two areas that are one, where this is the only hypothesis; else None.
+    :ivar local_areas: the areas of the local map, the current one first; empty where the local map stays as it is.
+    :ivar removed_arcs: arcs that this hypothesis does not believe any more.
+    :ivar area_merge: two areas that are one, where this is the only hypothesis; else None.
     :ivar lost: whether the robot may be anywhere in the map, and maps around itself until it is recognized where.
-    :ivar arriving: whether it is lost since now, and nothing was stored that it could map on from: it does from the
+    :ivar tracking_reset: whether it is lost since now, and nothing was stored that it could map on from: it does from the
         next scan on.
     """
 
-    hypothesis: int
+    id: int
     parent: int
     probability: float
     area: int
-    rebase: PoseGaussian | None = None
-    relabelled: tuple[Relabelled, ...] = ()
+    frame_change: PoseGaussian | None = None
+    moved_keyframes: tuple[MovedKeyframe, ...] = ()
     arcs: tuple[Arc, ...] = ()
-    local: tuple[LocalArea, ...] = ()
-    withdrawn: tuple[ArcEnds, ...] = ()
-    merged: Merged | None = None
+    local_areas: tuple[LocalArea, ...] = ()
+    removed_arcs: tuple[ArcEnds, ...] = ()
+    area_merge: AreaMerge | None = None
     lost: bool = False
-    arriving: bool = False
+    tracking_reset: bool = False
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -164,31 +164,31 @@ class Hypotheses:
     """tsbi -> slam, aam, tlca, rtl, recorder; one for every keyframe event.
 
     :ivar sequence: the keyframe event that it answers.
-    :ivar leaves: every live hypothesis, ordered by id; probabilities sum to 1 less ``unexamined``.
+    :ivar hypotheses: every live hypothesis, ordered by id; probabilities sum to 1 less ``unexamined``.
     :ivar unexamined: probability of topologies that the gate did not examine or the reduction dropped.
-    :ivar forgotten: keyframes that are no more, in any map, after all other changes.
-    :ivar outdated: beams that are left out of keyframes' scans from now on.
+    :ivar pruned_keyframes: keyframes that are no more, in any map, after all other changes.
+    :ivar stale_beams: beams that are left out of keyframes' scans from now on.
     """
 
     sequence: int
-    leaves: tuple[Leaf, ...]
+    hypotheses: tuple[Hypothesis, ...]
     unexamined: float = 0.0
-    forgotten: tuple[Forgotten, ...] = ()
-    outdated: tuple[Outdated, ...] = ()
+    pruned_keyframes: tuple[PrunedKeyframe, ...] = ()
+    stale_beams: tuple[StaleBeams, ...] = ()
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Accepted:
+class ClosureDecision:
     """tlca -> slam, aam, tsbi, rtl, recorder; one for every keyframe event.
 
     :ivar sequence: the keyframe event that it answers.
     :ivar hypothesis: the hypothesis whose history is now definite, all others being dropped; None where the question
         stays open.
     :ivar arcs: arcs of that hypothesis refined by alignment and fusion, Eq. (10).
-    :ivar relabelled: keyframes of that hypothesis whose pose in their area was refined.
+    :ivar moved_keyframes: keyframes of that hypothesis whose pose in their area was refined.
     :ivar global_poses: ``map_T_area`` of all areas of the most probable hypothesis, ordered by id; empty where
         unchanged since the last message.
-    :ivar reopened: where accepted closures contradict each other, the explanations of that, the most probable first:
+    :ivar revised_hypotheses: where accepted closures contradict each other, the explanations of that, the most probable first:
         the children into which TSBI branches the hypothesis at the next event, with ids of its own and their local
         maps. Each child withdraws what its explanation takes for false. Else empty.
     :ivar ambiguity: shape (3, 3), the second moment of the robot's pose under the other live hypotheses about that
@@ -198,9 +198,9 @@ class Accepted:
     sequence: int
     hypothesis: int | None = None
     arcs: tuple[Arc, ...] = ()
-    relabelled: tuple[Relabelled, ...] = ()
+    moved_keyframes: tuple[MovedKeyframe, ...] = ()
     global_poses: tuple[AreaPose, ...] = ()
-    reopened: tuple[Leaf, ...] = ()
+    revised_hypotheses: tuple[Hypothesis, ...] = ()
     ambiguity: NDArray[np.float64] = field(default_factory=partial(np.zeros, (3, 3)))
 
 
@@ -225,20 +225,20 @@ class LocalEstimate:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Trail:
+class ScanPoses:
     """slam -> tlca, recorder: where the scans since the last trail were taken, under one hypothesis.
 
     :ivar hypothesis: id of the live hypothesis.
     :ivar first_scan: ``scan_index`` of the first row.
     :ivar stamps: shape (n,), int64, ns.
-    :ivar anchors: shape (n,), int64, the stored keyframe to which the scan's pose is relative.
+    :ivar keyframes: shape (n,), int64, the stored keyframe to which the scan's pose is relative.
     :ivar poses: shape (n, 3), ``anchor_T_base``.
     """
 
     hypothesis: int
     first_scan: int
     stamps: NDArray[np.int64]
-    anchors: NDArray[np.int64]
+    keyframes: NDArray[np.int64]
     poses: NDArray[np.float64]
 
 
@@ -250,7 +250,7 @@ class RealTimePose:
     :ivar area: area gamma of the pose.
     :ivar area_pose: belief over ``map_T_area``.
     :ivar estimate: belief over ``area_T_base`` at the last estimate.
-    :ivar since: belief over the motion of the base since then, from the odometry.
+    :ivar motion: belief over the motion of the base since then, from the odometry.
     :ivar odometry: the reading, ``odom_T_base``, shape (3,).
     :ivar ambiguity: of the newest ``Accepted``, shape (3, 3).
     """
@@ -259,20 +259,20 @@ class RealTimePose:
     area: int
     area_pose: PoseGaussian
     estimate: PoseGaussian
-    since: PoseGaussian
+    motion: PoseGaussian
     odometry: Pose
     ambiguity: NDArray[np.float64]
 
     # In an offline run nobody asks for the poses, and they take longer than all else that rtl does.
     @cached_property
-    def local(self) -> PoseGaussian:
+    def pose_in_area(self) -> PoseGaussian:
         """Belief over ``area_T_base``, p(s_t+k | s_t, u), the HMT pose by dead reckoning from the last estimate."""
-        return self.estimate.compose(self.since)
+        return self.estimate.compose(self.motion)
 
     @cached_property
     def map_pose(self) -> PoseGaussian:
         """Belief over ``map_T_base``: its mean under the most probable hypothesis, its covariance over all of them."""
-        pose = self.area_pose.compose(self.local)
+        pose = self.area_pose.compose(self.pose_in_area)
         turn = se2.adjoint((0.0, 0.0, -pose.mean[2]))
         return PoseGaussian(pose.mean, pose.covariance + turn @ self.ambiguity @ turn.T)
 
@@ -283,26 +283,26 @@ class RealTimePose:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Carried:
+class PoseReset:
     """robot -> slam: the next scan may be from anywhere, at any time; odometry begins anew.
 
-    :ivar place: where it is as somebody says, None where nobody knows. A robot that may be anywhere was not carried
+    :ivar initial_pose: where it is as somebody says, None where nobody knows. A robot that may be anywhere was not carried
         then: that its place was not known is why it is said.
     """
 
-    place: Place | None = None
+    initial_pose: InitialPose | None = None
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Arriving:
+class TrackingReset:
     """slam -> tsbi, rtl, robot: where the robot is, and when, is not known from here on.
 
     :ivar event: the keyframe event with which it arrives, which is the next one.
-    :ivar scans: scans before it; what slam says of these is past.
+    :ivar scans_before: scans before it; what slam says of these is past.
     """
 
     event: int
-    scans: int
+    scans_before: int
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -311,15 +311,15 @@ class EndOfLog:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Finished:
+class EndOfRun:
     """slam -> recorder, robot: every scan received has been processed.
 
-    :ivar scans_in: scans received.
+    :ivar received: scans received.
     :ivar processed: scans for which a pose was given.
     :ivar dropped: scans refused or skipped.
     """
 
-    scans_in: int
+    received: int
     processed: int
     dropped: int
 
@@ -342,18 +342,18 @@ Message = (
     | Keyframe
     | AreaEvents
     | Hypotheses
-    | Accepted
+    | ClosureDecision
     | LocalEstimate
-    | Trail
+    | ScanPoses
     | RealTimePose
-    | Carried
-    | Arriving
+    | PoseReset
+    | TrackingReset
     | EndOfLog
-    | Finished
+    | EndOfRun
     | Notice
-    | Errand
-    | Heading
-    | Outcome
-    | Steering
+    | Task
+    | GoalPose
+    | TaskResult
+    | VelocityCommand
     | PlaceEstimate
 )

@@ -5,21 +5,21 @@ from __future__ import annotations
 from typing import Protocol
 
 from hmt_slam_ros.messages.messages import (
-    Accepted,
     AreaEvents,
-    Arriving,
-    Carried,
+    ClosureDecision,
     EndOfLog,
-    Finished,
+    EndOfRun,
     Hypotheses,
     Keyframe,
     LocalEstimate,
     Message,
     Notice,
+    PoseReset,
     RealTimePose,
-    Trail,
+    ScanPoses,
+    TrackingReset,
 )
-from hmt_slam_ros.messages.tasks import Errand, Outcome, Steering
+from hmt_slam_ros.messages.tasks import Task, TaskResult, VelocityCommand
 from hmt_slam_ros.sensors import Odometry, Scan
 
 
@@ -30,7 +30,7 @@ class Process(Protocol):
         """Take in one message and return what there is to say."""
 
 
-class Remembering(Process, Protocol):
+class Checkpointable(Process, Protocol):
     """A process whose memory is a value, from which another one can go on."""
 
     @property
@@ -38,14 +38,14 @@ class Remembering(Process, Protocol):
         """All that it knows between two messages, or between two keyframe events."""
 
 
-HEARD_BY: dict[str, tuple[type, ...]] = {
-    "slam": (Scan, Odometry, Carried, Hypotheses, Accepted, EndOfLog),
-    "aam": (Keyframe, Hypotheses, Accepted),
-    "tsbi": (Arriving, Keyframe, AreaEvents, Accepted),
+SUBSCRIPTIONS: dict[str, tuple[type, ...]] = {
+    "slam": (Scan, Odometry, PoseReset, Hypotheses, ClosureDecision, EndOfLog),
+    "aam": (Keyframe, Hypotheses, ClosureDecision),
+    "tsbi": (TrackingReset, Keyframe, AreaEvents, ClosureDecision),
     "tlca": (Keyframe, Hypotheses),
-    "rtl": (Odometry, Arriving, LocalEstimate, Hypotheses, Accepted),
-    "explorer": (Errand, Scan, RealTimePose, Keyframe, Hypotheses, Accepted),
-    "pilot": (Errand, Odometry, Scan, RealTimePose, Keyframe, Hypotheses, Accepted),
-    "robot": (Steering, Outcome),
-    "recorder": (Keyframe, Hypotheses, Accepted, Trail, LocalEstimate, Finished, Notice),
+    "rtl": (Odometry, TrackingReset, LocalEstimate, Hypotheses, ClosureDecision),
+    "explorer": (Task, Scan, RealTimePose, Keyframe, Hypotheses, ClosureDecision),
+    "pilot": (Task, Odometry, Scan, RealTimePose, Keyframe, Hypotheses, ClosureDecision),
+    "robot": (VelocityCommand, TaskResult),
+    "recorder": (Keyframe, Hypotheses, ClosureDecision, ScanPoses, LocalEstimate, EndOfRun, Notice),
 }

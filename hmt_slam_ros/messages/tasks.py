@@ -11,17 +11,17 @@ from numpy.typing import NDArray
 
 from hmt_slam_ros.errors import HmtSlamError
 
-Kind = Literal["explore", "go", "backtrack", "find", "stop"]
+TaskKind = Literal["explore", "go", "backtrack", "find", "stop"]
 
-OF_EXPLORER: tuple[Kind, ...] = ("explore", "backtrack", "stop", "go")
+EXPLORER_TASKS: tuple[TaskKind, ...] = ("explore", "backtrack", "stop", "go")
 """Errands of the explorer."""
 
-OF_PILOT: tuple[Kind, ...] = ("find", "stop", "go")
+PILOT_TASKS: tuple[TaskKind, ...] = ("find", "stop", "go")
 """Errands of the pilot."""
 
 
 @dataclass(frozen=True, slots=True)
-class Errand:
+class Task:
     """to explorer or pilot: what to do from now on.
 
     :ivar kind: "explore" until the building is known, "go" to a place, "backtrack" along the robot's own path until
@@ -29,11 +29,11 @@ class Errand:
     :ivar place: name of the place to go to, such as "room 3" or "area 12".
     """
 
-    kind: Kind
+    kind: TaskKind
     place: str = ""
 
 
-def errand_of(text: str, kinds: Sequence[Kind]) -> Errand:
+def parse_task(text: str, kinds: Sequence[TaskKind]) -> Task:
     """The errand that is written as its kind and, where it has one, the name of the place.
 
     :param kinds: those that there are.
@@ -42,46 +42,46 @@ def errand_of(text: str, kinds: Sequence[Kind]) -> Errand:
     word, _, place = text.strip().partition(" ")
     for kind in kinds:
         if kind == word and bool(place) == (kind == "go"):
-            return Errand(kind, place)
+            return Task(kind, place)
     alone = ", ".join(kind for kind in kinds if kind != "go")
     raise HmtSlamError(f"'{text}' is no errand: give one of {alone}, or go and the name of a place")
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class TaskResult:
     """explorer or pilot -> who gave the errand: how it ended.
 
-    :ivar errand: which.
-    :ivar reached: whether all was done that was to be done.
-    :ivar why: in a few words.
+    :ivar task: which.
+    :ivar succeeded: whether all was done that was to be done.
+    :ivar reason: in a few words.
     """
 
-    errand: Errand
-    reached: bool
-    why: str
+    task: Task
+    succeeded: bool
+    reason: str
 
     @property
     def text(self) -> str:
         """One sentence."""
-        return f"{self.errand.kind} {self.errand.place}".strip() + f": {self.why}"
+        return f"{self.task.kind} {self.task.place}".strip() + f": {self.reason}"
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Heading:
+class GoalPose:
     """explorer or pilot -> who drives in its stead, or looks on: where the robot is to go now; one for every new goal.
 
     :ivar stamp: of the newest scan when it was chosen, ns.
     :ivar area: area of the goal.
-    :ivar goal: shape (3,), ``area_T_goal``, m and rad.
+    :ivar pose: shape (3,), ``area_T_goal``, m and rad.
     """
 
     stamp: int
     area: int
-    goal: NDArray[np.float64]
+    pose: NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
-class Steering:
+class VelocityCommand:
     """explorer or pilot -> robot: the velocities until the next scan; one for every scan, of the pilot amid an errand.
 
     :ivar stamp: of the scan, ns.
@@ -101,7 +101,7 @@ class PlaceEstimate:
     :ivar stamp: of the scan, ns.
     :ivar place: name of the most probable place, at which the robot was last, None for unknown ground.
     :ivar heading: the direction in which it looks, "north", "east", "south" or "west", None likewise.
-    :ivar away: how far it is beyond the place, m.
+    :ivar distance_past_node: how far it is beyond the place, m.
     :ivar probability: of the place with the direction of travel, or of unknown ground.
     :ivar entropy: of the belief, Eq. (3), nats.
     :ivar confident: whether that is below `places.max_entropy`.
@@ -111,7 +111,7 @@ class PlaceEstimate:
     stamp: int
     place: str | None
     heading: str | None
-    away: float
+    distance_past_node: float
     probability: float
     entropy: float
     confident: bool

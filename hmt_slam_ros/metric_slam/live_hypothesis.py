@@ -11,31 +11,31 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmt_slam_ros.arrays import Int64
-from hmt_slam_ros.configuration.metric_slam import Filter
+from hmt_slam_ros.configuration.metric_slam import FilterParameters
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.hybrid_map.keyframe_pruning import Successor, in_place, successor
-from hmt_slam_ros.lifelong.change_detection import Look, looked
-from hmt_slam_ros.messages.map_changes import Merged, Relabelled
-from hmt_slam_ros.messages.messages import Leaf, LeafEstimate, Trail
+from hmt_slam_ros.hybrid_map.keyframe_pruning import ReplacementKeyframe, is_same_viewpoint, nearest_replacement
+from hmt_slam_ros.lifelong.change_detection import RecentScan, append_recent_scan
+from hmt_slam_ros.messages.map_changes import AreaMerge, MovedKeyframe
+from hmt_slam_ros.messages.messages import Hypothesis, HypothesisEstimate, ScanPoses
 from hmt_slam_ros.registration.match_covariance import MatchError
 from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.submap.local_filter import (
     FilterFactory,
-    FilterState,
     FilterStep,
     LineFilterState,
     LocalFilter,
+    ParticleFilterState,
     PlacedKeyframe,
 )
-from hmt_slam_ros.submap.local_mapping import Sighting
-from hmt_slam_ros.submap.scan_evidence import NOTHING_SAID, Judgement
+from hmt_slam_ros.submap.local_mapping import PreparedScan
+from hmt_slam_ros.submap.scan_evidence import NO_EVIDENCE, ScanEvidence
 
-_FIRST_COVARIANCE = np.diag([1e-8, 1e-8, 1e-8])
-_STAY = PoseGaussian.exactly(np.zeros(3))
+_INITIAL_COVARIANCE = np.diag([1e-8, 1e-8, 1e-8])
+_IDENTITY = PoseGaussian.from_pose(np.zeros(3))
 # Doubt of a scan, nats, above which it contradicts what the robot should see: most who drive never meet one.
-_CONTRADICTING = 4.0
-_NO_ERROR = MatchError(_FIRST_COVARIANCE, _FIRST_COVARIANCE, np.zeros((3, 3)))
+_CONTRADICTION_NATS = 4.0
+_NO_ERROR = MatchError(_INITIAL_COVARIANCE, _INITIAL_COVARIANCE, np.zeros((3, 3)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,48 +50,48 @@ class KeyframeCovariances:
     covariances: NDArray[np.float64]
 
     @classmethod
-    def of(cls, covariances: Mapping[int, NDArray[np.float64]]) -> KeyframeCovariances:
+    def from_dict(cls, covariances: Mapping[int, NDArray[np.float64]]) -> KeyframeCovariances:
         """Of {keyframe: covariance}."""
         rows = np.array(list(covariances.values())).reshape(-1, 3, 3)
         return cls(np.array(list(covariances), dtype=np.int64), rows)
 
-    def by_keyframe(self) -> dict[int, NDArray[np.float64]]:
+    def to_dict(self) -> dict[int, NDArray[np.float64]]:
         """{keyframe: covariance}."""
         return dict(zip(self.keyframes.tolist(), self.covariances, strict=True))
 
 
 @dataclass(frozen=True, eq=False)
-class LiveState:
+class LiveHypothesisState:
     """One live hypothesis inside metric SLAM.
 
-    :ivar grid: its particles, where its local map is a grid.
-    :ivar lines: its filter, where its local map is one of lines.
+    :ivar particle_filter: its particles, where its local map is a grid.
+    :ivar line_filter: its filter, where its local map is one of lines.
     :ivar event_pose: ``area_T_base`` at the last keyframe event, shape (3,), m and rad.
-    :ivar moved: the motion between the last two keyframe events, as matched, shape (3,).
-    :ivar information: of the last keyframe event's match alone, in the frame of its pose, shape (3, 3).
-    :ivar error: of that motion.
+    :ivar event_motion: the motion between the last two keyframe events, as matched, shape (3,).
+    :ivar match_information: of the last keyframe event's match alone, in the frame of its pose, shape (3, 3).
+    :ivar motion_error: of that motion.
     :ivar anchor: the stored keyframe to which scans are now related.
-    :ivar fresh: what the step which led to a keyframe adds to the drift, of those stored since the area was entered.
-    :ivar placed: of the poses of keyframes in their areas' frames, of all that are known.
-    :ivar drift: covariance of the pose at the last keyframe event in the area's frame, right tangent, shape (3, 3).
-    :ivar trail: (stamp, anchor, ``anchor_T_base``) of the scans since the last keyframe event.
+    :ivar step_covariances: what the step which led to a keyframe adds to the drift, of those stored since the area was entered.
+    :ivar keyframe_covariances: of the poses of keyframes in their areas' frames, of all that are known.
+    :ivar pose_covariance: covariance of the pose at the last keyframe event in the area's frame, right tangent, shape (3, 3).
+    :ivar scan_poses: (stamp, anchor, ``anchor_T_base``) of the scans since the last keyframe event.
     :ivar contradicted: whether the scan of the last keyframe event contradicted what the robot should have seen.
-    :ivar looks: the scans that the next keyframe's is compared with, in mode lifelong.
+    :ivar recent_scans: the scans that the next keyframe's is compared with, in mode lifelong.
     """
 
-    grid: FilterState | None
-    lines: LineFilterState | None
+    particle_filter: ParticleFilterState | None
+    line_filter: LineFilterState | None
     event_pose: NDArray[np.float64]
-    moved: NDArray[np.float64]
-    information: NDArray[np.float64]
-    error: MatchError
+    event_motion: NDArray[np.float64]
+    match_information: NDArray[np.float64]
+    motion_error: MatchError
     anchor: int
-    fresh: KeyframeCovariances
-    placed: KeyframeCovariances
-    drift: NDArray[np.float64]
-    trail: tuple[tuple[int, int, NDArray[np.float64]], ...]
+    step_covariances: KeyframeCovariances
+    keyframe_covariances: KeyframeCovariances
+    pose_covariance: NDArray[np.float64]
+    scan_poses: tuple[tuple[int, int, NDArray[np.float64]], ...]
     contradicted: bool
-    looks: tuple[Look, ...]
+    recent_scans: tuple[RecentScan, ...]
 
 
 @dataclass
@@ -99,72 +99,74 @@ class LiveHypothesis:
     """A filter and what metric SLAM remembers beside it.
 
     :ivar settings: when keyframes are taken, and how far their covariance is to be trusted.
-    :ivar moved: the motion between the last two keyframe events, as matched, shape (3,).
-    :ivar information: of the last keyframe event's match alone, in the frame of its pose, shape (3, 3).
+    :ivar event_motion: the motion between the last two keyframe events, as matched, shape (3,).
+    :ivar match_information: of the last keyframe event's match alone, in the frame of its pose, shape (3, 3).
     :ivar event_pose: ``area_T_base`` at the last keyframe event, shape (3,).
     :ivar anchor: the stored keyframe to which scans are now related.
-    :ivar error: of that motion.
-    :ivar fresh: {keyframe: covariance (3, 3) that the step which led to it adds to the drift}, of those stored since
+    :ivar motion_error: of that motion.
+    :ivar step_covariances: {keyframe: covariance (3, 3) that the step which led to it adds to the drift}, of those stored since
         the area was entered.
-    :ivar placed: {keyframe: covariance (3, 3) of its pose in its area's frame, right tangent}, of all that are known.
-    :ivar drift: covariance of the pose at the last keyframe event in the area's frame, right tangent.
-    :ivar trail: (stamp, anchor, ``anchor_T_base``) of the scans since the last keyframe event.
+    :ivar keyframe_covariances: {keyframe: covariance (3, 3) of its pose in its area's frame, right tangent}, of all that are known.
+    :ivar pose_covariance: covariance of the pose at the last keyframe event in the area's frame, right tangent.
+    :ivar scan_poses: (stamp, anchor, ``anchor_T_base``) of the scans since the last keyframe event.
     :ivar contradicted: whether the scan of the last keyframe event contradicted what the robot should have seen.
-    :ivar looks: the scans that the next keyframe's is compared with, in mode lifelong.
+    :ivar recent_scans: the scans that the next keyframe's is compared with, in mode lifelong.
     """
 
     filter: LocalFilter
-    settings: Filter
+    settings: FilterParameters
     event_pose: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
-    moved: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
-    information: NDArray[np.float64] = field(default_factory=lambda: np.zeros((3, 3)))
-    error: MatchError = _NO_ERROR
+    event_motion: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
+    match_information: NDArray[np.float64] = field(default_factory=lambda: np.zeros((3, 3)))
+    motion_error: MatchError = _NO_ERROR
     anchor: int = 0
-    fresh: dict[int, NDArray[np.float64]] = field(default_factory=dict)
-    placed: dict[int, NDArray[np.float64]] = field(default_factory=dict)
-    drift: NDArray[np.float64] = field(default_factory=_FIRST_COVARIANCE.copy)
-    trail: list[tuple[int, int, NDArray[np.float64]]] = field(default_factory=list)
+    step_covariances: dict[int, NDArray[np.float64]] = field(default_factory=dict)
+    keyframe_covariances: dict[int, NDArray[np.float64]] = field(default_factory=dict)
+    pose_covariance: NDArray[np.float64] = field(default_factory=_INITIAL_COVARIANCE.copy)
+    scan_poses: list[tuple[int, int, NDArray[np.float64]]] = field(default_factory=list)
     contradicted: bool = False
-    looks: tuple[Look, ...] = ()
+    recent_scans: tuple[RecentScan, ...] = ()
 
     @classmethod
-    def of(cls, filters: FilterFactory, settings: Filter, state: LiveState) -> LiveHypothesis:
+    def from_state(
+        cls, filters: FilterFactory, settings: FilterParameters, state: LiveHypothesisState
+    ) -> LiveHypothesis:
         """The hypothesis of a state, whose patches are in the pool."""
-        own = state.grid or state.lines
+        own = state.particle_filter or state.line_filter
         assert own is not None
         return cls(
             filters.restored(own),
             settings,
             state.event_pose,
-            state.moved,
-            state.information,
-            state.error,
+            state.event_motion,
+            state.match_information,
+            state.motion_error,
             state.anchor,
-            state.fresh.by_keyframe(),
-            state.placed.by_keyframe(),
-            state.drift,
-            list(state.trail),
+            state.step_covariances.to_dict(),
+            state.keyframe_covariances.to_dict(),
+            state.pose_covariance,
+            list(state.scan_poses),
             state.contradicted,
-            state.looks,
+            state.recent_scans,
         )
 
-    def state(self) -> LiveState:
+    def state(self) -> LiveHypothesisState:
         """All that is remembered; tables of grids name patches by their numbers in the pool."""
         own = self.filter.state
-        return LiveState(
-            own if isinstance(own, FilterState) else None,
-            None if isinstance(own, FilterState) else own,
+        return LiveHypothesisState(
+            own if isinstance(own, ParticleFilterState) else None,
+            None if isinstance(own, ParticleFilterState) else own,
             self.event_pose,
-            self.moved,
-            self.information,
-            self.error,
+            self.event_motion,
+            self.match_information,
+            self.motion_error,
             self.anchor,
-            KeyframeCovariances.of(self.fresh),
-            KeyframeCovariances.of(self.placed),
-            self.drift,
-            tuple(self.trail),
+            KeyframeCovariances.from_dict(self.step_covariances),
+            KeyframeCovariances.from_dict(self.keyframe_covariances),
+            self.pose_covariance,
+            tuple(self.scan_poses),
             self.contradicted,
-            self.looks,
+            self.recent_scans,
         )
 
     def branch(self, hypothesis: int) -> LiveHypothesis:
@@ -173,19 +175,19 @@ class LiveHypothesis:
             self.filter.branch(hypothesis),
             self.settings,
             self.event_pose,
-            self.moved,
-            self.information,
-            self.error,
+            self.event_motion,
+            self.match_information,
+            self.motion_error,
             self.anchor,
-            dict(self.fresh),
-            dict(self.placed),
-            self.drift,
-            list(self.trail),
+            dict(self.step_covariances),
+            dict(self.keyframe_covariances),
+            self.pose_covariance,
+            list(self.scan_poses),
             self.contradicted,
-            self.looks,
+            self.recent_scans,
         )
 
-    def event_due(self, sighting: Sighting) -> bool:
+    def is_event_due(self, sighting: PreparedScan) -> bool:
         """Whether the robot moved or turned far enough since the last keyframe event, or may have been displaced.
 
         :param sighting: the newest one. Where it is the first that contradicts what the robot should see, it is where
@@ -197,107 +199,114 @@ class LiveHypothesis:
             return True
         if self.contradicted:
             return False
-        return self.filter.experience.judge(self.filter.compared(sighting)).doubt > _CONTRADICTING
+        return (
+            self.filter.clutter_estimate.evaluate(self.filter.compare_scan(sighting)).log_kidnapping_ratio
+            > _CONTRADICTION_NATS
+        )
 
-    def event(
+    def process_keyframe(
         self,
         sequence: int,
-        sighting: Sighting,
+        sighting: PreparedScan,
         *,
-        arriving: bool = False,
-        storing: bool = True,
-        wanted: Callable[[], bool] | None = None,
-    ) -> LeafEstimate:
+        after_reset: bool = False,
+        may_store: bool = True,
+        is_informative: Callable[[], bool] | None = None,
+    ) -> HypothesisEstimate:
         """One filter step with a keyframe's scan, which enters the map where it adds something new.
 
         :param sequence: number of the keyframe event.
         :param sighting: of the scan.
-        :param arriving: whether nothing tells how the robot came there: the scan is matched with nothing.
-        :param storing: whether the hypothesis's map may change.
-        :param wanted: asked after the filter step whether the scan adds something; a new place does if None.
+        :param after_reset: whether nothing tells how the robot came there: the scan is matched with nothing.
+        :param may_store: whether the hypothesis's map may change.
+        :param is_informative: asked after the filter step whether the scan adds something; a new place does if None.
         """
-        if arriving:
+        if after_reset:
             unmoved, nothing = np.zeros(3), np.zeros((3, 3))
             step = FilterStep(unmoved, _NO_ERROR, nothing, float(len(self.filter.poses)), False)
         else:
             step = self.filter.update(sighting, sequence)
-        judgement = NOTHING_SAID if arriving else self._judge(sighting)
-        self.looks = () if arriving else self.looks
-        self.error, self.contradicted = step.error, judgement.doubt > _CONTRADICTING
+        judgement = NO_EVIDENCE if after_reset else self._scan_evidence(sighting)
+        self.recent_scans = () if after_reset else self.recent_scans
+        self.motion_error, self.contradicted = step.match_error, judgement.log_kidnapping_ratio > _CONTRADICTION_NATS
         # Of a displaced robot it is the first of where it is now.
-        stored = arriving or (storing and ((wanted or self.is_new)() or self.contradicted))
-        self._drift_on(sequence if stored else None)
+        stored = after_reset or (may_store and ((is_informative or self.is_new_viewpoint)() or self.contradicted))
+        self._propagate_covariance(sequence if stored else None)
         if stored:
             self.filter.add_keyframe(sequence, sighting.scan)
-        self.moved, self.information = step.moved, step.information
+        self.event_motion, self.match_information = step.increment, step.information
         self.event_pose = self.filter.pose
-        self._relate()
-        return LeafEstimate(
+        self._choose_anchor()
+        return HypothesisEstimate(
             self.filter.hypothesis,
             self.filter.area,
-            PoseGaussian(self.filter.pose, self.drift),
+            PoseGaussian(self.filter.pose, self.pose_covariance),
             stored,
             judgement.log_evidence,
-            judgement.doubt,
-            self.filter.experience.clutter,
+            judgement.log_kidnapping_ratio,
+            self.filter.clutter_estimate.clutter,
             step.effective_samples,
-            self._revised(sequence) if step.history_changed and storing else (),
+            self._revised_keyframes(sequence) if step.keyframes_moved and may_store else (),
         )
 
-    def _judge(self, sighting: Sighting) -> Judgement:
+    def _scan_evidence(self, sighting: PreparedScan) -> ScanEvidence:
         """What the scan says of whether the robot is where the filter has it; learns from it what is usual."""
-        found = self.filter.compared(sighting)
-        judgement = self.filter.experience.judge(found)
-        self.filter.experience = self.filter.experience.after(found)
+        found = self.filter.compare_scan(sighting)
+        judgement = self.filter.clutter_estimate.evaluate(found)
+        self.filter.clutter_estimate = self.filter.clutter_estimate.update(found)
         return judgement
 
-    def note_look(self, scan: Scan) -> None:
+    def add_recent_scan(self, scan: Scan) -> None:
         """Compare what follows with a scan that was taken where the filter is."""
-        self.looks = looked(self.looks, Look(scan, self.filter.pose.copy()))
+        self.recent_scans = append_recent_scan(self.recent_scans, RecentScan(scan, self.filter.pose.copy()))
 
-    def is_new(self) -> bool:
+    def is_new_viewpoint(self) -> bool:
         """Whether no keyframe of the local map was taken from nearby with a like heading."""
         if not self.filter.keyframes:
             return True
         relative = se2.between(self.filter.leading_keyframe_poses(), self.filter.pose)
-        return not bool(np.any(in_place(relative, self.settings)))
+        return not bool(np.any(is_same_viewpoint(relative, self.settings)))
 
-    def _drift_on(self, keyframe: int | None) -> None:
+    def _propagate_covariance(self, keyframe: int | None) -> None:
         """Carry the drift on to the pose now, of a keyframe that is stored, or of none over ground that is mapped."""
         ad = se2.adjoint(se2.between(self.filter.pose, self.event_pose))
-        carried = ad @ self.drift @ ad.T
+        carried = ad @ self.pose_covariance @ ad.T
         if keyframe is None:
-            self.drift = self._bounded(carried)
+            self.pose_covariance = self._map_bounded_covariance(carried)
             return
-        self.drift = carried + self.error.lasting
-        self.fresh[keyframe] = self.error.lasting
-        self.placed[keyframe] = self.drift
+        self.pose_covariance = carried + self.motion_error.drift_covariance
+        self.step_covariances[keyframe] = self.motion_error.drift_covariance
+        self.keyframe_covariances[keyframe] = self.pose_covariance
 
-    def _bounded(self, carried: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _map_bounded_covariance(self, carried: NDArray[np.float64]) -> NDArray[np.float64]:
         """The drift where the map bounds it, as far as the match tells: the pose is as far off as the map is there."""
-        gain = self.error.gain
+        gain = self.motion_error.gain
         free = np.eye(3) - gain
-        return gain @ self._mapped() @ gain.T + free @ carried @ free.T + self.error.matched
+        return gain @ self._map_covariance() @ gain.T + free @ carried @ free.T + self.motion_error.pose_covariance
 
-    def _mapped(self) -> NDArray[np.float64]:
+    def _map_covariance(self) -> NDArray[np.float64]:
         """How far off the map is here: covariance of the area's nearest keyframe, carried here; 0 where unknown."""
         kept = self.filter.keyframes, self.filter.keyframe_areas, self.filter.leading_keyframe_poses()
-        own = [(k, pose) for k, area, pose in zip(*kept, strict=True) if area == self.filter.area and k in self.placed]
+        own = [
+            (k, pose)
+            for k, area, pose in zip(*kept, strict=True)
+            if area == self.filter.area and k in self.keyframe_covariances
+        ]
         if not own:
             return np.zeros((3, 3))
         relative = se2.between(self.filter.pose, np.array([pose for _, pose in own]))
         nearest = int(np.argmin(np.hypot(relative[:, 0], relative[:, 1])))
         ad = se2.adjoint(relative[nearest])
-        covariance: NDArray[np.float64] = ad @ self.placed[own[nearest][0]] @ ad.T
+        covariance: NDArray[np.float64] = ad @ self.keyframe_covariances[own[nearest][0]] @ ad.T
         return covariance
 
-    def _relate(self) -> None:
+    def _choose_anchor(self) -> None:
         """Relate the scans to come to the nearest keyframe."""
         relative = se2.between(self.filter.leading_keyframe_poses(), self.filter.pose)
         cost = np.hypot(relative[:, 0], relative[:, 1]) + np.abs(relative[:, 2])
         self.anchor = self.filter.keyframes[int(np.argmin(cost))]
 
-    def forget(self, keyframes: Collection[int]) -> None:
+    def prune(self, keyframes: Collection[int]) -> None:
         """Go on without some keyframes of known ground; scans related to them are related to those that stay.
 
         What they added to the local map stays there until that is loaded anew.
@@ -305,46 +314,46 @@ class LiveHypothesis:
         if not keyframes:
             return
         for keyframe in keyframes:
-            self.fresh.pop(keyframe, None)
-            self.placed.pop(keyframe, None)
+            self.step_covariances.pop(keyframe, None)
+            self.keyframe_covariances.pop(keyframe, None)
         names, poses = list(self.filter.keyframes), self.filter.leading_keyframe_poses()
         areas, placed = dict(zip(names, self.filter.keyframe_areas, strict=True)), dict(zip(names, poses, strict=True))
-        for lost in ({self.anchor} | {anchor for _, anchor, _ in self.trail}) & set(keyframes):
+        for lost in ({self.anchor} | {anchor for _, anchor, _ in self.scan_poses}) & set(keyframes):
             staying = {k: at for k, at in placed.items() if k not in keyframes and areas[k] == areas[lost]}
-            self._relate_anew(lost, successor(placed[lost], staying))
-        self.filter.drop(keyframes)
+            self._replace_anchor(lost, nearest_replacement(placed[lost], staying))
+        self.filter.drop_keyframes(keyframes)
 
-    def _relate_anew(self, lost: int, held: Successor) -> None:
+    def _replace_anchor(self, lost: int, held: ReplacementKeyframe) -> None:
         """Relate to another keyframe what is related to one that is forgotten."""
-        self.trail = [
+        self.scan_poses = [
             (stamp, held.keyframe, se2.compose(held.pose, pose)) if anchor == lost else (stamp, anchor, pose)
-            for stamp, anchor, pose in self.trail
+            for stamp, anchor, pose in self.scan_poses
         ]
         if self.anchor == lost:
             self.anchor = held.keyframe
 
-    def _revised(self, newest: int) -> tuple[Relabelled, ...]:
+    def _revised_keyframes(self, newest: int) -> tuple[MovedKeyframe, ...]:
         # The messages must not hold on to the poses under all particles.
         poses = self.filter.leading_keyframe_poses().copy()
         return tuple(
-            Relabelled(keyframe, self.filter.area, self.filter.area, poses[self.filter.keyframes.index(keyframe)])
-            for keyframe in self.fresh
+            MovedKeyframe(keyframe, self.filter.area, self.filter.area, poses[self.filter.keyframes.index(keyframe)])
+            for keyframe in self.step_covariances
             if keyframe != newest
         )
 
-    def note_scan(self, stamp: int) -> None:
+    def add_scan_pose(self, stamp: int) -> None:
         """Append the scan just processed to the trail."""
         anchor_pose = self.filter.leading_keyframe_poses()[self.filter.keyframes.index(self.anchor)]
-        self.trail.append((stamp, self.anchor, se2.between(anchor_pose, self.filter.pose)))
+        self.scan_poses.append((stamp, self.anchor, se2.between(anchor_pose, self.filter.pose)))
 
-    def take_trail(self, first_scan: int) -> list[Trail]:
+    def take_scan_poses(self, first_scan: int) -> list[ScanPoses]:
         """The trail as a message, if there is one, and begin it anew."""
-        if not self.trail:
+        if not self.scan_poses:
             return []
-        stamps, anchors, poses = zip(*self.trail, strict=True)
-        self.trail = []
+        stamps, anchors, poses = zip(*self.scan_poses, strict=True)
+        self.scan_poses = []
         return [
-            Trail(
+            ScanPoses(
                 self.filter.hypothesis,
                 first_scan,
                 np.array(stamps, dtype=np.int64),
@@ -353,12 +362,12 @@ class LiveHypothesis:
             )
         ]
 
-    def belief(self) -> PoseGaussian:
+    def pose_belief(self) -> PoseGaussian:
         """The belief over ``area_T_base`` now."""
         ad = se2.adjoint(se2.between(self.filter.pose, self.event_pose))
-        return PoseGaussian(self.filter.pose, ad @ self.drift @ ad.T + self.filter.tracking_covariance)
+        return PoseGaussian(self.filter.pose, ad @ self.pose_covariance @ ad.T + self.filter.tracking_covariance)
 
-    def change_area(self, leaf: Leaf, content: Sequence[PlacedKeyframe], filters: FilterFactory) -> None:
+    def change_area(self, leaf: Hypothesis, content: Sequence[PlacedKeyframe], filters: FilterFactory) -> None:
         """Change the reference frame and load the local map, as TSBI decided.
 
         :param content: the keyframes of the areas that it names, in the frame of the robot's area.
@@ -367,44 +376,52 @@ class LiveHypothesis:
         entered = leaf.area != self.filter.area
         if entered:
             self.filter = filters.entering(self.filter, leaf.area, content)
-        area_T_previous = np.zeros(3) if leaf.rebase is None else leaf.rebase.mean
+        area_T_previous = np.zeros(3) if leaf.frame_change is None else leaf.frame_change.mean
         self.filter.change_area(leaf.area, area_T_previous, content)
         self.event_pose = se2.compose(area_T_previous, self.event_pose)
-        self.looks = tuple(Look(look.scan, se2.compose(area_T_previous, look.pose)) for look in self.looks)
-        if entered and leaf.merged is None:
-            moved = {relabelled.keyframe for relabelled in leaf.relabelled}
-            self.fresh = {keyframe: step for keyframe, step in self.fresh.items() if keyframe in moved}
-            self._drift_into(leaf.rebase or _STAY)
-        self._relate()
+        self.recent_scans = tuple(
+            RecentScan(look.scan, se2.compose(area_T_previous, look.pose)) for look in self.recent_scans
+        )
+        if entered and leaf.area_merge is None:
+            moved = {relabelled.keyframe for relabelled in leaf.moved_keyframes}
+            self.step_covariances = {
+                keyframe: step for keyframe, step in self.step_covariances.items() if keyframe in moved
+            }
+            self._rebase_covariances(leaf.frame_change or _IDENTITY)
+        self._choose_anchor()
 
-    def merge(self, merged: Merged, keyframes: Mapping[int, NDArray[np.float64]]) -> None:
+    def merge(self, merged: AreaMerge, keyframes: Mapping[int, NDArray[np.float64]]) -> None:
         """What is in an area is as uncertain in the one that it becomes part of as that is known relative to it.
 
         :param keyframes: {keyframe: ``area_T_base``, shape (3,)} of the area.
         """
         for keyframe, pose in keyframes.items():
-            if keyframe in self.placed:
-                known = PoseGaussian(pose, self.placed[keyframe])
-                self.placed[keyframe] = merged.pose.compose(known).covariance
+            if keyframe in self.keyframe_covariances:
+                known = PoseGaussian(pose, self.keyframe_covariances[keyframe])
+                self.keyframe_covariances[keyframe] = merged.pose.compose(known).covariance
         if self.filter.area == merged.area:
-            self.drift = merged.pose.compose(PoseGaussian(self.event_pose, self.drift)).covariance
+            self.pose_covariance = merged.pose.compose(PoseGaussian(self.event_pose, self.pose_covariance)).covariance
 
-    def _drift_into(self, rebase: PoseGaussian) -> None:
+    def _rebase_covariances(self, rebase: PoseGaussian) -> None:
         """The drift in the area that was entered: along the keyframes that moved with the robot, or else by the map.
 
         :param rebase: belief over ``area_T_previous``.
         """
-        moved = sorted(self.fresh)
+        moved = sorted(self.step_covariances)
         if not moved:
-            self.drift = self._bounded(self.drift + _carried(rebase, self.event_pose))
+            self.pose_covariance = self._map_bounded_covariance(
+                self.pose_covariance + _propagated_covariance(rebase, self.event_pose)
+            )
             return
         poses = dict(zip(self.filter.keyframes, self.filter.leading_keyframe_poses(), strict=True))
-        self.placed[moved[0]] = _FIRST_COVARIANCE
+        self.keyframe_covariances[moved[0]] = _INITIAL_COVARIANCE
         for previous, keyframe in pairwise(moved):
             ad = se2.adjoint(se2.between(poses[keyframe], poses[previous]))
-            self.placed[keyframe] = ad @ self.placed[previous] @ ad.T + self.fresh[keyframe]
+            self.keyframe_covariances[keyframe] = (
+                ad @ self.keyframe_covariances[previous] @ ad.T + self.step_covariances[keyframe]
+            )
         # TSBI knows how they lie in the area, and takes the drift from there on for what is added to it.
-        self.drift = _carried(rebase, self.event_pose) + _FIRST_COVARIANCE
+        self.pose_covariance = _propagated_covariance(rebase, self.event_pose) + _INITIAL_COVARIANCE
 
     def reload(self, content: Sequence[PlacedKeyframe]) -> None:
         """Build the local map anew after TLCA refined its keyframes; the robot stays where it is from its anchor.
@@ -414,11 +431,13 @@ class LiveHypothesis:
         before = self.filter.pose
         self.filter.reload(content, self.anchor)
         self.event_pose = se2.compose(self.filter.pose, se2.between(before, self.event_pose))
-        moved = [se2.compose(self.filter.pose, se2.between(before, look.pose)) for look in self.looks]
-        self.looks = tuple(Look(look.scan, pose) for look, pose in zip(self.looks, moved, strict=True))
+        moved = [se2.compose(self.filter.pose, se2.between(before, look.pose)) for look in self.recent_scans]
+        self.recent_scans = tuple(
+            RecentScan(look.scan, pose) for look, pose in zip(self.recent_scans, moved, strict=True)
+        )
 
 
-def _carried(rebase: PoseGaussian, pose: NDArray[np.float64]) -> NDArray[np.float64]:
+def _propagated_covariance(rebase: PoseGaussian, pose: NDArray[np.float64]) -> NDArray[np.float64]:
     """What the uncertainty of ``area_T_previous`` adds to the covariance (3, 3) of a pose in the area, (3,)."""
-    known = PoseGaussian.exactly(se2.between(rebase.mean, pose))
+    known = PoseGaussian.from_pose(se2.between(rebase.mean, pose))
     return rebase.compose(known).covariance

@@ -21,33 +21,33 @@ class ScanQueueState:
     :ivar scans: those that wait.
     :ivar last_stamp: of the last scan received, ns, -1 before the first.
     :ivar sweeps: what is known of the times between scans.
-    :ivar noticed: the faults of which something was said.
-    :ivar patient: whether scans wait for odometry.
+    :ivar reported_faults: the faults of which something was said.
+    :ivar waits_for_odometry: whether scans wait for odometry.
     """
 
     scans: tuple[Scan, ...] = ()
     last_stamp: int = -1
     sweeps: SweepState = field(default_factory=SweepState)
-    noticed: frozenset[str] = frozenset()
-    patient: bool = True
+    reported_faults: frozenset[str] = frozenset()
+    waits_for_odometry: bool = True
 
 
 class ScanQueue:
     """The queue of metric SLAM."""
 
-    def __init__(self, patience: int, odometry: OdometryBuffer, state: ScanQueueState) -> None:
-        """:param patience: scans that may wait for the first odometry.
+    def __init__(self, max_waiting: int, odometry: OdometryBuffer, state: ScanQueueState) -> None:
+        """:param max_waiting: scans that may wait for the first odometry.
 
         :param odometry: what the scans wait for.
         :param state: to go on from.
         """
-        self._patience = patience
+        self._max_waiting = max_waiting
         self._odometry = odometry
         self._scans = deque(state.scans)
         self._last_stamp = state.last_stamp
         self._sweeps = SweepCheck(state.sweeps)
-        self._noticed = set(state.noticed)
-        self._patient = state.patient
+        self._reported_faults = set(state.reported_faults)
+        self._waits_for_odometry = state.waits_for_odometry
 
     def __len__(self) -> int:
         return len(self._scans)
@@ -55,25 +55,27 @@ class ScanQueue:
     @property
     def state(self) -> ScanQueueState:
         """All that the queue knows."""
-        noticed = frozenset(self._noticed)
-        return ScanQueueState(tuple(self._scans), self._last_stamp, self._sweeps.state, noticed, self._patient)
+        noticed = frozenset(self._reported_faults)
+        return ScanQueueState(
+            tuple(self._scans), self._last_stamp, self._sweeps.state, noticed, self._waits_for_odometry
+        )
 
-    def emptied(self, odometry: OdometryBuffer) -> ScanQueue:
+    def empty_copy(self, odometry: OdometryBuffer) -> ScanQueue:
         """A queue for scans of any other time, of whose faults nothing is said twice.
 
         :param odometry: what these wait for.
         """
-        return ScanQueue(self._patience, odometry, ScanQueueState(noticed=frozenset(self._noticed)))
+        return ScanQueue(self._max_waiting, odometry, ScanQueueState(reported_faults=frozenset(self._reported_faults)))
 
-    def hear(self, odometry: Odometry) -> None:
+    def add_odometry(self, odometry: Odometry) -> None:
         """Take in a reading."""
         self._odometry.add(odometry)
-        self._patient = True
+        self._waits_for_odometry = True
 
-    def receive(self, scan: Scan) -> list[Message]:
+    def add_scan(self, scan: Scan) -> list[Message]:
         """Take in a scan; say, once for each fault, what is wrong with it."""
         said: list[Message] = []
-        scan, fault = self._sweeps.checked(scan)
+        scan, fault = self._sweeps.check(scan)
         if fault is not None:
             said += self._notice("sweep", fault)
         if scan.stamp <= self._last_stamp:
@@ -91,27 +93,29 @@ class ScanQueue:
             )
         self._scans.append(scan)
         self._last_stamp = scan.stamp
-        return said + self._lose_patience()
+        return said + self._stop_waiting()
 
-    def ready(self, *, ended: bool) -> bool:
+    def is_ready(self, *, ended: bool) -> bool:
         """Whether the next scan can be taken: its odometry is known, or not waited for.
 
         :param ended: whether no more odometry will come.
         """
-        return bool(self._scans) and (ended or not self._patient or self._odometry.covers(self._scans[0].end))
+        return bool(self._scans) and (
+            ended or not self._waits_for_odometry or self._odometry.covers(self._scans[0].end_stamp)
+        )
 
-    def take(self) -> Scan:
+    def pop(self) -> Scan:
         """The next scan."""
         return self._scans.popleft()
 
-    def _lose_patience(self) -> list[Message]:
+    def _stop_waiting(self) -> list[Message]:
         """Where enough scans wait for odometry, go on without until there is more."""
         first = self._scans[0]
-        patience = self._patience * (1 if self._odometry.empty else _LATE)
+        patience = self._max_waiting * (1 if self._odometry.is_empty else _LATE)
         waited = len(self._scans) > patience
-        if not waited or not self._patient or self._odometry.covers(first.end):
+        if not waited or not self._waits_for_odometry or self._odometry.covers(first.end_stamp):
             return []
-        self._patient = False
+        self._waits_for_odometry = False
         return self._notice(
             "odometry",
             f"{len(self._scans)} scans wait for odometry at {first.stamp / 1e9:.6f} s and are matched without from "
@@ -119,7 +123,7 @@ class ScanQueue:
         )
 
     def _notice(self, fault: str, text: str) -> list[Message]:
-        if fault in self._noticed:
+        if fault in self._reported_faults:
             return []
-        self._noticed.add(fault)
+        self._reported_faults.add(fault)
         return [Notice("slam", text)]

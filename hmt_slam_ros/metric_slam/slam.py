@@ -18,31 +18,38 @@ from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.grids.patch_pool import PatchState
-from hmt_slam_ros.hybrid_map.shortest_path import reachable
-from hmt_slam_ros.hybrid_map.surroundings import Nearness, areas_around
-from hmt_slam_ros.lifelong.change_detection import AROUND, CERTAIN, Look, News, news_of, outdated
-from hmt_slam_ros.messages.map_changes import Place
+from hmt_slam_ros.hybrid_map.shortest_path import shortest_path_beliefs
+from hmt_slam_ros.hybrid_map.surroundings import Neighborhood, areas_around
+from hmt_slam_ros.lifelong.change_detection import (
+    MAX_AREA_SIGMA,
+    MAX_KEYFRAME_DISTANCE,
+    Changes,
+    RecentScan,
+    combine_stale_beams,
+    detect_changes,
+)
+from hmt_slam_ros.messages.map_changes import InitialPose
 from hmt_slam_ros.messages.messages import (
-    Accepted,
-    Arriving,
-    Carried,
+    ClosureDecision,
     EndOfLog,
-    Finished,
+    EndOfRun,
     Hypotheses,
     Keyframe,
     LocalEstimate,
     Message,
     Notice,
+    PoseReset,
+    TrackingReset,
 )
 from hmt_slam_ros.messages.replica import FIRST_AREA, FIRST_HYPOTHESIS, Replica, ReplicaState
-from hmt_slam_ros.metric_slam.live_hypothesis import LiveHypothesis, LiveState
-from hmt_slam_ros.metric_slam.odometry_monitor import OdometryWatch, OdometryWatchState
+from hmt_slam_ros.metric_slam.live_hypothesis import LiveHypothesis, LiveHypothesisState
+from hmt_slam_ros.metric_slam.odometry_monitor import OdometryMonitor, OdometryMonitorState
 from hmt_slam_ros.metric_slam.scan_queue import ScanQueue, ScanQueueState
 from hmt_slam_ros.sensors import Odometry, Scan
-from hmt_slam_ros.sensors.deskew import deskewed
+from hmt_slam_ros.sensors.deskew import deskew_scan
 from hmt_slam_ros.sensors.motion_model import MotionModel, MotionState, Prediction
 from hmt_slam_ros.submap.local_filter import FilterFactory, PlacedKeyframe
-from hmt_slam_ros.submap.local_mapping import LocalMapping, Sighting
+from hmt_slam_ros.submap.local_mapping import LocalMapping, PreparedScan
 from hmt_slam_ros.submap.particle_filter import ParticleFilters
 
 
@@ -52,36 +59,36 @@ class SlamState:
 
     :ivar replica: the maps of the live hypotheses.
     :ivar motion: what is known of the motion between scans.
-    :ivar watch: what was heard of odometry and scans.
-    :ivar queue: scans that wait for odometry, or for the answer to a keyframe event.
+    :ivar odometry_monitor: what was heard of odometry and scans.
+    :ivar scan_queue: scans that wait for odometry, or for the answer to a keyframe event.
     :ivar patches: of the grids of all particles, None where there is none.
-    :ivar live: {hypothesis: its filter and what is remembered beside it}.
-    :ivar events: keyframe events.
-    :ivar waiting: whether the answer to the last one is due.
-    :ivar travelled: path length since the start, m.
-    :ivar scans: scans that were given a pose.
-    :ivar dropped: scans that were not.
-    :ivar first_of_trail: number of the first scan that no trail was told of.
-    :ivar arriving: whether nothing tells how the robot comes to where the next scan is from.
+    :ivar live_hypotheses: {hypothesis: its filter and what is remembered beside it}.
+    :ivar keyframe_events: keyframe events.
+    :ivar awaiting_decision: whether the answer to the last one is due.
+    :ivar path_length: path length since the start, m.
+    :ivar processed_scans: scans that were given a pose.
+    :ivar dropped_scans: scans that were not.
+    :ivar first_unpublished_scan: number of the first scan that no trail was told of.
+    :ivar reset_pending: whether nothing tells how the robot comes to where the next scan is from.
     :ivar lost: whether the robot may be anywhere in the map, under all hypotheses.
-    :ivar place: where it is at the next scan as somebody says, None where nobody did.
+    :ivar initial_pose: where it is at the next scan as somebody says, None where nobody did.
     """
 
     replica: ReplicaState = field(default_factory=ReplicaState)
     motion: MotionState = field(default_factory=MotionState)
-    watch: OdometryWatchState = field(default_factory=OdometryWatchState)
-    queue: ScanQueueState = field(default_factory=ScanQueueState)
+    odometry_monitor: OdometryMonitorState = field(default_factory=OdometryMonitorState)
+    scan_queue: ScanQueueState = field(default_factory=ScanQueueState)
     patches: PatchState | None = None
-    live: Mapping[int, LiveState] = field(default_factory=dict)
-    events: int = 0
-    waiting: bool = False
-    travelled: float = 0.0
-    scans: int = 0
-    dropped: int = 0
-    first_of_trail: int = 0
-    arriving: bool = True
+    live_hypotheses: Mapping[int, LiveHypothesisState] = field(default_factory=dict)
+    keyframe_events: int = 0
+    awaiting_decision: bool = False
+    path_length: float = 0.0
+    processed_scans: int = 0
+    dropped_scans: int = 0
+    first_unpublished_scan: int = 0
+    reset_pending: bool = True
     lost: bool = False
-    place: Place | None = None
+    initial_pose: InitialPose | None = None
 
 
 class MetricSlam:
@@ -108,65 +115,72 @@ class MetricSlam:
         self.mode = configuration.mode
         self._mapping = LocalMapping(configuration)
         self._filters = filters(self._mapping)
-        self._in_sight = Nearness(CERTAIN, AROUND)
-        self._replica = Replica.of(state.replica)
+        self._neighborhood = Neighborhood(MAX_AREA_SIGMA, MAX_KEYFRAME_DISTANCE)
+        self._replica = Replica.from_state(state.replica)
         self._motion = MotionModel(configuration.motion, state.motion)
-        self._watch = OdometryWatch(state.watch)
-        self._queue = ScanQueue(configuration.filter.patience, self._motion.odometry, state.queue)
-        self._live = self._live_in(state)
-        self._events, self._arriving = state.events, state.arriving
-        self._lost, self._place = state.lost, state.place
-        self._waiting = state.waiting
-        self._travelled = state.travelled
-        self._scans, self._dropped = state.scans, state.dropped
-        self._first_of_trail = state.first_of_trail
+        self._odometry_monitor = OdometryMonitor(state.odometry_monitor)
+        self._scan_queue = ScanQueue(
+            configuration.filter.max_scans_waiting_for_odometry, self._motion.odometry, state.scan_queue
+        )
+        self._live_hypotheses = self._restored_hypotheses(state)
+        self._keyframe_events, self._reset_pending = state.keyframe_events, state.reset_pending
+        self._lost, self._initial_pose = state.lost, state.initial_pose
+        self._awaiting_decision = state.awaiting_decision
+        self._path_length = state.path_length
+        self._processed_scans, self._dropped_scans = state.processed_scans, state.dropped_scans
+        self._first_unpublished_scan = state.first_unpublished_scan
         self._ended = False
 
-    def _live_in(self, state: SlamState) -> dict[int, LiveHypothesis]:
-        if not state.live:
+    def _restored_hypotheses(self, state: SlamState) -> dict[int, LiveHypothesis]:
+        if not state.live_hypotheses:
             first = self._filters.new(FIRST_HYPOTHESIS, FIRST_AREA)
             return {FIRST_HYPOTHESIS: LiveHypothesis(first, self._configuration.filter)}
-        grids = [live.grid.tables for live in state.live.values() if live.grid is not None]
+        grids = [
+            live.particle_filter.tables for live in state.live_hypotheses.values() if live.particle_filter is not None
+        ]
         if state.patches is not None and grids:
             self._mapping.pool.load(state.patches, np.concatenate(grids))
         settings = self._configuration.filter
-        return {name: LiveHypothesis.of(self._filters, settings, live) for name, live in state.live.items()}
+        return {
+            name: LiveHypothesis.from_state(self._filters, settings, live)
+            for name, live in state.live_hypotheses.items()
+        }
 
     @property
     def state(self) -> SlamState:
         """All that metric SLAM knows, as a value."""
-        live, patches = self._without_pool()
+        live, patches = self._hypothesis_states()
         return SlamState(
             self._replica.state,
             self._motion.state,
-            self._watch.state,
-            self._queue.state,
+            self._odometry_monitor.state,
+            self._scan_queue.state,
             patches,
             live,
-            self._events,
-            self._waiting,
-            self._travelled,
-            self._scans,
-            self._dropped,
-            self._first_of_trail,
-            self._arriving,
+            self._keyframe_events,
+            self._awaiting_decision,
+            self._path_length,
+            self._processed_scans,
+            self._dropped_scans,
+            self._first_unpublished_scan,
+            self._reset_pending,
             self._lost,
-            self._place,
+            self._initial_pose,
         )
 
-    def _without_pool(self) -> tuple[dict[int, LiveState], PatchState | None]:
+    def _hypothesis_states(self) -> tuple[dict[int, LiveHypothesisState], PatchState | None]:
         """The live hypotheses, with the patches of their grids, whose numbers are those in the tables."""
-        states = {name: live.state() for name, live in self._live.items()}
-        grids = {name: state.grid for name, state in states.items() if state.grid is not None}
+        states = {name: live.state() for name, live in self._live_hypotheses.items()}
+        grids = {name: state.particle_filter for name, state in states.items() if state.particle_filter is not None}
         if not grids:
             return states, None
         patches, tables = self._mapping.pool.state(np.concatenate([grid.tables for grid in grids.values()]))
         for (name, grid), own in zip(grids.items(), np.split(tables, len(grids)), strict=True):
-            states[name] = replace(states[name], grid=replace(grid, tables=own))
+            states[name] = replace(states[name], particle_filter=replace(grid, tables=own))
         return states, patches
 
     @property
-    def mapping(self) -> bool:
+    def is_mapping(self) -> bool:
         """Whether the map may change."""
         return self.mode != "localization"
 
@@ -176,208 +190,222 @@ class MetricSlam:
         return self._replica
 
     @property
-    def waiting(self) -> bool:
+    def is_awaiting_decision(self) -> bool:
         """Whether the answer to a keyframe event is due."""
-        return self._waiting
+        return self._awaiting_decision
 
     @property
-    def events(self) -> int:
+    def keyframe_events(self) -> int:
         """Keyframe events so far."""
-        return self._events
+        return self._keyframe_events
 
     @property
-    def scans(self) -> int:
+    def processed_scans(self) -> int:
         """Scans that were given a pose."""
-        return self._scans
+        return self._processed_scans
 
     @property
-    def lost(self) -> bool:
+    def is_lost(self) -> bool:
         """Whether the robot may be anywhere in the map."""
         return self._lost
 
     @property
-    def waiting_scans(self) -> int:
+    def queued_scans(self) -> int:
         """Scans in the queue."""
-        return len(self._queue)
+        return len(self._scan_queue)
 
     @property
-    def map_bytes(self) -> int:
+    def peak_map_bytes(self) -> int:
         """What the maps of all particles took at most, bytes."""
         return self._mapping.pool.peak_bytes
 
     @property
     def particles(self) -> tuple[int, NDArray[np.float64]]:
         """Area of the most probable hypothesis and the poses of its particles, ``area_T_base``, shape (M, 3)."""
-        return self._best.filter.area, self._best.filter.poses
+        return self._best_hypothesis.filter.area, self._best_hypothesis.filter.poses
 
     @property
-    def _best(self) -> LiveHypothesis:
-        return self._live[self._replica.best]
+    def _best_hypothesis(self) -> LiveHypothesis:
+        return self._live_hypotheses[self._replica.best_hypothesis]
 
     def handle(self, message: Message) -> list[Message]:
         """Take in one message, work off what can be worked off, return what there is to say."""
         if isinstance(message, Odometry):
-            self._queue.hear(message)
+            self._scan_queue.add_odometry(message)
         elif isinstance(message, Scan):
-            return self._queue.receive(message) + self._work()
+            return self._scan_queue.add_scan(message) + self._process_queue()
         elif isinstance(message, Hypotheses):
-            self._change_hypotheses(message)
-        elif isinstance(message, Accepted):
-            self._accept(message)
-        elif isinstance(message, Carried):
-            self._place = message.place
-            return [] if self._lost and self._place is not None else self._arrive()
+            self._apply_hypotheses(message)
+        elif isinstance(message, ClosureDecision):
+            self._apply_decision(message)
+        elif isinstance(message, PoseReset):
+            self._initial_pose = message.initial_pose
+            return [] if self._lost and self._initial_pose is not None else self._reset_tracking()
         elif isinstance(message, EndOfLog):
             self._ended = True
-        return self._work()
+        return self._process_queue()
 
-    def _work(self) -> list[Message]:
+    def _process_queue(self) -> list[Message]:
         said: list[Message] = []
-        while not self._waiting and self._queue.ready(ended=self._ended):
-            said += self._process(self._queue.take())
-        if self._ended and not self._queue and not self._waiting:
+        while not self._awaiting_decision and self._scan_queue.is_ready(ended=self._ended):
+            said += self._process_scan(self._scan_queue.pop())
+        if self._ended and not self._scan_queue and not self._awaiting_decision:
             said += self._finish()
         return said
 
-    def _arrive(self) -> list[Message]:
+    def _reset_tracking(self) -> list[Message]:
         """Forget how the robot came here; scans that still wait were taken before and are passed over."""
-        self._motion, self._watch = MotionModel(self._configuration.motion), OdometryWatch()
-        self._dropped += len(self._queue)
-        self._queue = self._queue.emptied(self._motion.odometry)
-        self._arriving = True
-        return [Arriving(self._events, self._scans)]
+        self._motion, self._odometry_monitor = MotionModel(self._configuration.motion), OdometryMonitor()
+        self._dropped_scans += len(self._scan_queue)
+        self._scan_queue = self._scan_queue.empty_copy(self._motion.odometry)
+        self._reset_pending = True
+        return [TrackingReset(self._keyframe_events, self._processed_scans)]
 
-    def _process(self, scan: Scan) -> list[Message]:
+    def _process_scan(self, scan: Scan) -> list[Message]:
         prediction = self._motion.predict(scan.stamp)
-        sighting = Sighting(self._mapping, deskewed(scan, self._motion.odometry, self._configuration.rtl))
+        sighting = PreparedScan(self._mapping, deskew_scan(scan, self._motion.odometry, self._configuration.rtl))
         said: list[Message] = []
-        if self._arriving:
-            self._put_down(prediction)
+        if self._reset_pending:
+            self._reset_filters(prediction)
         else:
             said += self._track(sighting, prediction)
-        if self._arriving or self._place is not None or self._best.event_due(sighting):
+        if self._reset_pending or self._initial_pose is not None or self._best_hypothesis.is_event_due(sighting):
             said += self._keyframe_event(sighting)
-        for live in self._live.values():
-            live.note_scan(scan.stamp)
-        self._scans += 1
-        return [*said, self._estimate(scan.stamp)]
+        for live in self._live_hypotheses.values():
+            live.add_scan_pose(scan.stamp)
+        self._processed_scans += 1
+        return [*said, self._local_estimate(scan.stamp)]
 
-    def _put_down(self, prediction: Prediction) -> None:
+    def _reset_filters(self, prediction: Prediction) -> None:
         """Draw every hypothesis where the motion since the last scan leads.
 
         Of a robot that was carried none is known; one that takes itself for lost may be wrong about that.
         """
-        for live in self._live.values():
-            at = se2.compose(live.filter.pose, prediction.together.increment)
-            live.filter.stand(PoseGaussian.exactly(at))
+        for live in self._live_hypotheses.values():
+            at = se2.compose(live.filter.pose, prediction.fused.increment)
+            live.filter.initialize(PoseGaussian.from_pose(at))
 
-    def _track(self, sighting: Sighting, prediction: Prediction) -> list[Message]:
+    def _track(self, sighting: PreparedScan, prediction: Prediction) -> list[Message]:
         """Move every hypothesis on to the scan, and learn from what the best one found."""
-        tracked = {hypothesis: live.filter.track(sighting, prediction) for hypothesis, live in self._live.items()}
-        best = tracked[self._replica.best]
-        self._motion.observe(best.moved, best.information, best.contradicted)
-        self._travelled += math.hypot(best.moved[0], best.moved[1])
-        return self._tell(self._watch.hear(sighting.scan.stamp, prediction.odometry, best))
+        tracked = {
+            hypothesis: live.filter.track(sighting, prediction) for hypothesis, live in self._live_hypotheses.items()
+        }
+        best = tracked[self._replica.best_hypothesis]
+        self._motion.observe(best.increment, best.information, best.contradicts_odometry)
+        self._path_length += math.hypot(best.increment[0], best.increment[1])
+        return self._notices(self._odometry_monitor.add_scan(sighting.scan.stamp, prediction.odometry, best))
 
     @staticmethod
-    def _tell(text: str | None) -> list[Message]:
+    def _notices(text: str | None) -> list[Message]:
         return [] if text is None else [Notice("slam", text)]
 
-    def _keyframe_event(self, sighting: Sighting) -> list[Message]:
-        sequence, scan = self._events, sighting.scan
-        trails: list[Message] = self._trails()
-        storing = self.mapping or self._lost
-        news: list[tuple[News, float]] = []
+    def _keyframe_event(self, sighting: PreparedScan) -> list[Message]:
+        sequence, scan = self._keyframe_events, sighting.scan
+        trails: list[Message] = self._take_scan_poses()
+        storing = self.is_mapping or self._lost
+        news: list[tuple[Changes, float]] = []
         leaves = tuple(
-            live.event(
+            live.process_keyframe(
                 sequence,
                 sighting,
-                arriving=self._arriving,
-                storing=storing,
-                wanted=partial(self._is_news, live, scan, news) if self._lifelong else None,
+                after_reset=self._reset_pending,
+                may_store=storing,
+                is_informative=partial(self._shows_changes, live, scan, news) if self._is_lifelong else None,
             )
-            for live in self._live.values()
+            for live in self._live_hypotheses.values()
         )
-        self._motion.keyframe(self._best.moved, self._best.information)
-        carried, place = self._arriving and sequence > 0, self._place
-        keyframe = Keyframe(sequence, scan, self._travelled, leaves, carried, place, self.mapping, outdated(news))
-        self._replica.add(keyframe)
-        self._events += 1
+        self._motion.observe_keyframe(self._best_hypothesis.event_motion, self._best_hypothesis.match_information)
+        carried, place = self._reset_pending and sequence > 0, self._initial_pose
+        keyframe = Keyframe(
+            sequence, scan, self._path_length, leaves, carried, place, self.is_mapping, combine_stale_beams(news)
+        )
+        self._replica.add_keyframe(keyframe)
+        self._keyframe_events += 1
         # With the scan of its arrival the robot is put where somebody says, with the next one it is looked for there,
         # even if it stands still.
-        self._waiting, self._arriving, self._place = True, False, place if self._arriving else None
-        return [*trails, keyframe, *self._tell(self._watch.judge(self._motion.noise))]
+        self._awaiting_decision, self._reset_pending, self._initial_pose = (
+            True,
+            False,
+            place if self._reset_pending else None,
+        )
+        return [*trails, keyframe, *self._notices(self._odometry_monitor.check_noise(self._motion.noise))]
 
     @property
-    def _lifelong(self) -> bool:
+    def _is_lifelong(self) -> bool:
         """Whether the map is changed only where the world is new or has changed."""
         return self.mode == "lifelong" and not self._lost
 
-    def _is_news(self, live: LiveHypothesis, scan: Scan, found: list[tuple[News, float]]) -> bool:
+    def _shows_changes(self, live: LiveHypothesis, scan: Scan, found: list[tuple[Changes, float]]) -> bool:
         """Whether a scan shows what a hypothesis's map does not hold; what was found is added."""
         own, hybrid_map = live.filter, self._replica.maps[live.filter.hypothesis]
         placed = zip(own.keyframes, own.keyframe_areas, own.leading_keyframe_poses(), strict=True)
         known = [PlacedKeyframe(k, area, self._replica.scans[k], pose) for k, area, pose in placed]
         # A laser sees farther than the local map reaches.
-        around = areas_around(hybrid_map, own.area, self._in_sight, own.keyframe_areas)
-        beyond = self._content(own.hypothesis, {area: belief.mean for area, belief in around.items()})
-        news = news_of(Look(scan, own.pose), live.looks, [*known, *beyond])
-        live.note_look(scan)
+        around = areas_around(hybrid_map, own.area, self._neighborhood, own.keyframe_areas)
+        beyond = self._area_keyframes(own.hypothesis, {area: belief.mean for area, belief in around.items()})
+        news = detect_changes(RecentScan(scan, own.pose), live.recent_scans, [*known, *beyond])
+        live.add_recent_scan(scan)
         found.append((news, self._replica.probabilities[own.hypothesis]))
-        return news.new or news.changed
+        return news.has_new_surface or news.has_changed_surface
 
-    def _trails(self) -> list[Message]:
+    def _take_scan_poses(self) -> list[Message]:
         """The trails since the last event, of every hypothesis."""
-        said: list[Message] = [trail for live in self._live.values() for trail in live.take_trail(self._first_of_trail)]
-        self._first_of_trail = self._scans
+        said: list[Message] = [
+            trail
+            for live in self._live_hypotheses.values()
+            for trail in live.take_scan_poses(self._first_unpublished_scan)
+        ]
+        self._first_unpublished_scan = self._processed_scans
         return said
 
-    def _estimate(self, stamp: int) -> LocalEstimate:
-        best = self._best
+    def _local_estimate(self, stamp: int) -> LocalEstimate:
+        best = self._best_hypothesis
         odometry = self._motion.odometry_pose
-        return LocalEstimate(stamp, self._scans - 1, best.filter.area, best.belief(), odometry, self._dropped)
+        return LocalEstimate(
+            stamp, self._processed_scans - 1, best.filter.area, best.pose_belief(), odometry, self._dropped_scans
+        )
 
-    def _change_hypotheses(self, hypotheses: Hypotheses) -> None:
+    def _apply_hypotheses(self, hypotheses: Hypotheses) -> None:
         """Branch, re-base and drop filters as TSBI decided."""
-        for live in self._live.values():
-            live.forget({one.keyframe for one in hypotheses.forgotten})
-        for leaf in hypotheses.leaves:
-            if leaf.merged is not None:
-                keyframes = self._replica.maps[leaf.parent].keyframes(leaf.merged.area)
-                self._live[leaf.parent].merge(leaf.merged, keyframes)
-        self._replica.apply(hypotheses)
-        self._lost = all(leaf.lost for leaf in hypotheses.leaves)
-        self._arriving |= all(leaf.arriving for leaf in hypotheses.leaves)
+        for live in self._live_hypotheses.values():
+            live.prune({one.keyframe for one in hypotheses.pruned_keyframes})
+        for leaf in hypotheses.hypotheses:
+            if leaf.area_merge is not None:
+                keyframes = self._replica.maps[leaf.parent].keyframes(leaf.area_merge.area)
+                self._live_hypotheses[leaf.parent].merge(leaf.area_merge, keyframes)
+        self._replica.apply_hypotheses(hypotheses)
+        self._lost = all(leaf.lost for leaf in hypotheses.hypotheses)
+        self._reset_pending |= all(leaf.tracking_reset for leaf in hypotheses.hypotheses)
         children = {}
-        for leaf in hypotheses.leaves:
-            parent = self._live[leaf.parent]
-            live = parent if leaf.hypothesis == leaf.parent else parent.branch(leaf.hypothesis)
-            if leaf.local:
-                areas = {local.area: local.pose for local in leaf.local}
-                live.change_area(leaf, self._content(leaf.hypothesis, areas), self._filters)
-            children[leaf.hypothesis] = live
-        for live in children.values() if hypotheses.outdated else ():
+        for leaf in hypotheses.hypotheses:
+            parent = self._live_hypotheses[leaf.parent]
+            live = parent if leaf.id == leaf.parent else parent.branch(leaf.id)
+            if leaf.local_areas:
+                areas = {local.area: local.pose for local in leaf.local_areas}
+                live.change_area(leaf, self._area_keyframes(leaf.id, areas), self._filters)
+            children[leaf.id] = live
+        for live in children.values() if hypotheses.stale_beams else ():
             if live.filter.keyframes[-1:] == [hypotheses.sequence]:
                 # What stands there now would have to be seen many times to outweigh what was seen before.
-                live.reload(self._surroundings(live))
-        self._replace_live(children)
+                live.reload(self._local_map_keyframes(live))
+        self._replace_hypotheses(children)
 
-    def _accept(self, accepted: Accepted) -> None:
-        self._replica.accept(accepted)
+    def _apply_decision(self, accepted: ClosureDecision) -> None:
+        self._replica.apply_decision(accepted)
         if accepted.hypothesis is not None:
-            live = self._live[accepted.hypothesis]
-            self._replace_live({accepted.hypothesis: live})
-            if accepted.relabelled:
-                live.reload(self._surroundings(live))
-        self._waiting = False
+            live = self._live_hypotheses[accepted.hypothesis]
+            self._replace_hypotheses({accepted.hypothesis: live})
+            if accepted.moved_keyframes:
+                live.reload(self._local_map_keyframes(live))
+        self._awaiting_decision = False
 
-    def _replace_live(self, live: dict[int, LiveHypothesis]) -> None:
-        for hypothesis, old in self._live.items():
+    def _replace_hypotheses(self, live: dict[int, LiveHypothesis]) -> None:
+        for hypothesis, old in self._live_hypotheses.items():
             if live.get(hypothesis) is not old:
                 old.filter.release()
-        self._live = live
+        self._live_hypotheses = live
 
-    def _content(self, hypothesis: int, areas: Mapping[int, NDArray[np.float64]]) -> list[PlacedKeyframe]:
+    def _area_keyframes(self, hypothesis: int, areas: Mapping[int, NDArray[np.float64]]) -> list[PlacedKeyframe]:
         """The keyframes of the areas that the local map has to hold, in the frame of the robot's area.
 
         :param areas: {area: ``robot_area_T_area``, shape (3,)}.
@@ -389,13 +417,15 @@ class MetricSlam:
             for keyframe, pose in hybrid_map.keyframes(area).items()
         ]
 
-    def _surroundings(self, live: LiveHypothesis) -> list[PlacedKeyframe]:
+    def _local_map_keyframes(self, live: LiveHypothesis) -> list[PlacedKeyframe]:
         """The local map's areas as they are now known."""
         held = dict.fromkeys(live.filter.keyframe_areas)
-        reached = reachable(self._replica.maps[live.filter.hypothesis], live.filter.area, until=held)
-        return self._content(live.filter.hypothesis, {area: reached[area].mean for area in held if area in reached})
+        reached = shortest_path_beliefs(self._replica.maps[live.filter.hypothesis], live.filter.area, targets=held)
+        return self._area_keyframes(
+            live.filter.hypothesis, {area: reached[area].mean for area in held if area in reached}
+        )
 
     def _finish(self) -> list[Message]:
         self._ended = False
-        finished = Finished(self._scans + self._dropped, self._scans, self._dropped)
-        return [*self._trails(), *self._tell(self._watch.close()), finished]
+        finished = EndOfRun(self._processed_scans + self._dropped_scans, self._processed_scans, self._dropped_scans)
+        return [*self._take_scan_poses(), *self._notices(self._odometry_monitor.end_disagreement()), finished]

@@ -21,25 +21,25 @@ from dataclasses import replace
 import numpy as np
 
 from hmt_slam_ros.arrays import Float64
-from hmt_slam_ros.configuration.landmarks import Features
+from hmt_slam_ros.configuration.landmarks import FeatureParameters
 from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.landmark import Landmark
-from hmt_slam_ros.landmarks.beam_labels import Rays, rays_of
-from hmt_slam_ros.landmarks.corners import NO_CORNERS, corners_of
-from hmt_slam_ros.landmarks.heading import QUARTER
+from hmt_slam_ros.landmarks.beam_labels import Rays, rays_from_scan
+from hmt_slam_ros.landmarks.corners import NO_CORNERS, extract_corners
+from hmt_slam_ros.landmarks.heading import QUARTER_TURN
 from hmt_slam_ros.landmarks.landmark_map import LandmarkMap
-from hmt_slam_ros.landmarks.landmarks import OPENING, both
+from hmt_slam_ros.landmarks.landmarks import OPENING, concatenate_landmarks
 from hmt_slam_ros.landmarks.line_extraction import Lines, extract_lines
-from hmt_slam_ros.landmarks.openings import NO_OPENINGS, Openings, openings_of
-from hmt_slam_ros.places.chart import BEFORE
-from hmt_slam_ros.places.corridor_frame import ALONG, Noticed, WallFrame, wall_ahead
-from hmt_slam_ros.places.observation import observation_model, place_along
-from hmt_slam_ros.places.observation_graph import QUARTERS, Landmarks, observation_graph, of_walls
+from hmt_slam_ros.landmarks.openings import NO_OPENINGS, Openings, extract_openings
+from hmt_slam_ros.places.chart import END_NODE_TO_WALL
+from hmt_slam_ros.places.corridor_frame import ALIGNMENT_TOLERANCE, CorridorFrame, DetectedNode, distance_to_wall_ahead
+from hmt_slam_ros.places.observation import estimate_distance_past_node, observation_model
+from hmt_slam_ros.places.observation_graph import QUARTERS, LandmarkSequence, observation_graph, select_wall_landmarks
 from hmt_slam_ros.places.place_graph import PlaceGraph, heading_of, node_of
-from hmt_slam_ros.places.position_belief import PositionBelief, Travel, flat_belief
+from hmt_slam_ros.places.position_belief import PositionBelief, Travel, uniform_belief
 from hmt_slam_ros.sensors import Scan
-from hmt_slam_ros.sensors.motion_model import Step
+from hmt_slam_ros.sensors.motion_model import RelativeMotion
 
 # One believes in openings from this confidence and so many sightings on, more than they were missed. They are so far
 # beside the robot at most, m, within this angle of square to its hallway, rad.
@@ -48,37 +48,37 @@ _LEAST, _SIGHTINGS, _ASIDE, _ASKEW = 0.5, 2, 2.5, math.radians(20.0)
 _FORGET = 8.0
 
 
-class OpeningsAround:
+class OpeningTracker:
     """Openings around a robot.
 
-    :ivar seen: in the last scan, the frame of the base.
+    :ivar last_openings: in the last scan, the frame of the base.
     """
 
-    def __init__(self, features: Features) -> None:
+    def __init__(self, features: FeatureParameters) -> None:
         self._features = features
         # Who walks by hides what is there.
-        self._around = LandmarkMap(replace(features, landmark_least=0.0))
-        self.seen = NO_OPENINGS
+        self._landmark_map = LandmarkMap(replace(features, landmark_least=0.0))
+        self.last_openings = NO_OPENINGS
 
-    def observe(self, frame: WallFrame, openings: Openings, rays: Rays) -> None:
+    def observe(self, frame: CorridorFrame, openings: Openings, rays: Rays) -> None:
         """Follow what a scan shows.
 
         :param frame: where it was taken.
         :param rays: its beams.
         """
-        self.seen = openings
-        self._around.observe(frame.pose_belief, both(NO_CORNERS, openings), rays)
-        near = (one for one in self._around.landmarks if math.dist(one.pose.mean[:2], frame.place) < _FORGET)
-        self._around.landmarks = list(near)
+        self.last_openings = openings
+        self._landmark_map.observe(frame.pose_belief, concatenate_landmarks(NO_CORNERS, openings), rays)
+        near = (one for one in self._landmark_map.landmarks if math.dist(one.pose.mean[:2], frame.position) < _FORGET)
+        self._landmark_map.landmarks = list(near)
 
-    def beside(self, frame: WallFrame) -> Iterator[Landmark]:
+    def confirmed_beside_hallway(self, frame: CorridorFrame) -> Iterator[Landmark]:
         """The openings to the sides of a robot's hallway that one believes in, in the frame along the walls."""
-        for one in self._around.landmarks:
-            heading = float(one.pose.mean[2]) - QUARTER * frame.axis
-            beside = float((one.pose.mean[:2] - frame.place) @ frame.left)
+        for one in self._landmark_map.landmarks:
+            heading = float(one.pose.mean[2]) - QUARTER_TURN * frame.travel_axis
+            beside = float((one.pose.mean[:2] - frame.position) @ frame.left)
             side = math.copysign(1.0, beside) * math.sin(heading)
             existence = one.existence
-            believed = existence.confidence >= _LEAST and existence.seen >= max(_SIGHTINGS, existence.missed)
+            believed = existence.confidence >= _LEAST and existence.detections >= max(_SIGHTINGS, existence.misses)
             if one.kind == OPENING and believed and abs(beside) <= _ASIDE and side > math.cos(_ASKEW):
                 yield one
 
@@ -88,8 +88,10 @@ class OpeningsAround:
         None, too, for one that it sees less exactly along a wall than walls are square: who hides most of a wall may
         be a part of its line.
         """
-        seen = self.seen
-        ahead = (seen.confidences >= _LEAST) & (seen.poses[:, 0] > 0.0) & (np.abs(seen.poses[:, 2]) <= ALONG)
+        seen = self.last_openings
+        ahead = (
+            (seen.confidences >= _LEAST) & (seen.poses[:, 0] > 0.0) & (np.abs(seen.poses[:, 2]) <= ALIGNMENT_TOLERANCE)
+        )
         ahead &= np.abs(seen.poses[:, 1]) <= 0.5 * seen.widths
         if not ahead.any():
             return None
@@ -108,14 +110,14 @@ _SAME = 0.6
 _WALL = 1.35
 # A robot turns at its last node up to so far from it, m; where it turns elsewhere it is at one that it did not notice,
 # of which it knows the place so well, m.
-_THERE, _SOMEWHERE = 1.5, 0.4
+_NODE_RADIUS, _UNNOTICED_DEVIATION = 1.5, 0.4
 # A robot that was in a hallway so far ago, m, turns off it.
-_DOORWAY = 1.0
+_HALLWAY_EXIT_DISTANCE = 1.0
 # Deviation of a node's place in the map, m.
 _PLACED = 0.03
 # The robot follows one axis to the next node, in known ground and in unknown, so the turn tells nothing: with this
 # variance, rad^2, none at all is as probable as any is where the map does not tell it, 1 / (2 pi).
-_UNTOLD = 2.0 * math.pi
+_UNINFORMATIVE_TURN_VARIANCE = 2.0 * math.pi
 # Where a robot stands that begins at a node, so exactly, m.
 _BEGIN = 0.1
 
@@ -127,182 +129,202 @@ class PlaceEstimator:
     :ivar openings: those around it.
     :ivar belief: None before the first node is noticed.
     :ivar arrivals: how many nodes were noticed.
-    :ivar in_hallway: whether the robot is in one, along it.
-    :ivar at_wall: whether it is at the wall at the end of one.
+    :ivar is_in_hallway: whether the robot is in one, along it.
+    :ivar is_at_wall: whether it is at the wall at the end of one.
     """
 
     def __init__(self, graph: PlaceGraph, configuration: Configuration, belief: PositionBelief | None = None) -> None:
         """:param belief: of a robot that begins at a node; unless given, nothing is known before one is noticed."""
         self._features, self._places = configuration.features, configuration.places
         self._model = observation_model(configuration.places, configuration.features)
-        self._first, self._begins_there = belief or flat_belief(graph, configuration.places), belief is not None
-        self._passed: list[Float64] = []
-        self._unlisted: list[Float64] = []
-        self._turned_at: Float64 | None = None
+        self._initial_belief, self._begins_there = (
+            belief or uniform_belief(graph, configuration.places),
+            belief is not None,
+        )
+        self._passed_positions: list[Float64] = []
+        self._unmapped_positions: list[Float64] = []
+        self._turn_position: Float64 | None = None
         # Where it looked last, where it looked or arrived last, and where it was in a hallway last.
-        self._looked: Float64 | None = None
-        self._told = np.zeros(2)
-        self._in_hallway_at: Float64 | None = None
-        self.frame = WallFrame(configuration.features)
-        self.openings = OpeningsAround(configuration.features)
+        self._last_look_position: Float64 | None = None
+        self._last_update_position = np.zeros(2)
+        self._last_hallway_position: Float64 | None = None
+        self.frame = CorridorFrame(configuration.features)
+        self.openings = OpeningTracker(configuration.features)
         self.belief: PositionBelief | None = None
         self.arrivals = 0
-        self.in_hallway, self.at_wall = False, False
+        self.is_in_hallway, self.is_at_wall = False, False
 
     @property
-    def turning(self) -> bool:
+    def is_turning(self) -> bool:
         """Whether the robot is on a turn that is not over yet."""
-        return self._turned_at is not None
+        return self._turn_position is not None
 
     @property
-    def at_node(self) -> bool:
+    def is_at_node(self) -> bool:
         """Whether the robot is beside its last node."""
-        return self.frame.node is not None and self.frame.is_near(self.frame.node.place, _THERE)
+        return self.frame.last_node is not None and self.frame.is_near(self.frame.last_node.position, _NODE_RADIUS)
 
     @property
-    def facing(self) -> tuple[int, int] | None:
+    def node_and_direction(self) -> tuple[int, int] | None:
         """The most likely node and the direction in which the robot looks now, also while it turns or is in a room."""
-        state = None if self.belief is None else self.belief.most_likely
+        state = None if self.belief is None else self.belief.most_likely_state
         if state is None:
             return None
-        return node_of(state), (heading_of(state) + self.frame.axis - self.frame.looks) % QUARTERS
+        return node_of(state), (heading_of(state) + self.frame.travel_axis - self.frame.facing_axis) % QUARTERS
 
-    def moved(self, step: Step) -> None:
+    def predict(self, step: RelativeMotion) -> None:
         """The robot moved."""
-        self.frame.moved(step)
+        self.frame.predict(step)
 
     def observe(self, scan: Scan) -> PositionBelief | None:
         """The belief after a scan; None before the first node."""
         frame, features = self.frame, self._features
-        lines, rays = extract_lines(scan, features), rays_of(scan, features)
+        lines, rays = extract_lines(scan, features), rays_from_scan(scan, features)
         frame.observe(lines, rays)
-        if not frame.known:
+        if not frame.is_initialized:
             return None
         if self._begins_there and self.belief is None:
-            frame.node, self.belief = Noticed(frame.place, _BEGIN**2), self._first
-        corners, openings = corners_of(lines, features), openings_of(lines, rays, features)
+            frame.last_node, self.belief = DetectedNode(frame.position, _BEGIN**2), self._initial_belief
+        corners, openings = extract_corners(lines, features), extract_openings(lines, rays, features)
         self.openings.observe(frame, openings, rays)
-        if frame.looks_ahead:
-            self._turned_at = None
-            self.in_hallway = self._is_in_hallway(lines)
+        if frame.is_facing_ahead:
+            self._turn_position = None
+            self.is_in_hallway = self._detect_hallway(lines)
         else:
-            self._turn(lines)
-        if self.in_hallway and frame.looks_ahead:
-            self._notice(0.0)
+            self._update_turn(lines)
+        if self.is_in_hallway and frame.is_facing_ahead:
+            self._notice_openings(0.0)
             self._notice_wall(lines)
-            self._look(of_walls(observation_graph(corners, openings, -frame.askew, self._places)))
+            self._observe_landmarks(
+                select_wall_landmarks(observation_graph(corners, openings, -frame.heading_error, self._places))
+            )
         return self.belief
 
-    def _is_in_hallway(self, lines: Lines) -> bool:
+    def _detect_hallway(self, lines: Lines) -> bool:
         """Whether the robot is in a hallway along which it looks. Where both walls are in sight its middle is known."""
-        if not self.frame.sees_hallway:
+        if not self.frame.has_hallway_in_view:
             return False
-        self._in_hallway_at = self.frame.place
-        self.frame.find_middle(lines)
+        self._last_hallway_position = self.frame.position
+        self.frame.update_hallway_center(lines)
         return True
 
-    def _turn(self, lines: Lines) -> None:
+    def _update_turn(self, lines: Lines) -> None:
         """The robot turns, and at last is along another axis."""
         frame = self.frame
-        if self._turned_at is None:
-            self._turned_at = frame.place
-            if frame.is_near(self._in_hallway_at, _DOORWAY):
-                self._notice(_AHEAD)
-        if not frame.aligned or frame.looks == frame.axis:
+        if self._turn_position is None:
+            self._turn_position = frame.position
+            if frame.is_near(self._last_hallway_position, _HALLWAY_EXIT_DISTANCE):
+                self._notice_openings(_AHEAD)
+        if not frame.is_aligned or frame.facing_axis == frame.travel_axis:
             return
-        quarters = (frame.axis - frame.looks) % QUARTERS
+        quarters = (frame.travel_axis - frame.facing_axis) % QUARTERS
         if quarters % 2:
-            if self._turns_elsewhere and frame.is_near(self._in_hallway_at, _DOORWAY):
-                self._reach(Noticed(self._turned_at, _SOMEWHERE**2))
+            if self._is_turning_elsewhere and frame.is_near(self._last_hallway_position, _HALLWAY_EXIT_DISTANCE):
+                self._process_detection(DetectedNode(self._turn_position, _UNNOTICED_DEVIATION**2))
             # A node is in the middle of the hallways that meet there.
-            frame.middle = frame.node_place
-        if not self._is_in_hallway(lines):
-            self.in_hallway = False
+            frame.hallway_center = frame.last_node_position
+        if not self._detect_hallway(lines):
+            self.is_in_hallway = False
             return
-        if quarters % 2 and self._turns_elsewhere:
+        if quarters % 2 and self._is_turning_elsewhere:
             # Where another hallway leads off there is a node, whatever was seen of it.
-            self._arrive(Noticed(self._turned_at, _SOMEWHERE**2))
-            frame.middle = frame.node_place
+            self._arrive(DetectedNode(self._turn_position, _UNNOTICED_DEVIATION**2))
+            frame.hallway_center = frame.last_node_position
         if self.belief is not None:
-            self.belief = self.belief.turned(quarters)
-        self._looked = None if quarters % 2 else self._looked
-        frame.axis, self._turned_at, self.in_hallway = frame.looks, None, True
+            self.belief = self.belief.predict_turn(quarters)
+        self._last_look_position = None if quarters % 2 else self._last_look_position
+        frame.travel_axis, self._turn_position, self.is_in_hallway = frame.facing_axis, None, True
         # What was passed is passed again.
-        self._passed, self._unlisted = (
-            [place for place in places if frame.is_near(place, _THERE)] for places in (self._passed, self._unlisted)
+        self._passed_positions, self._unmapped_positions = (
+            [place for place in places if frame.is_near(place, _NODE_RADIUS)]
+            for places in (self._passed_positions, self._unmapped_positions)
         )
 
     @property
-    def _turns_elsewhere(self) -> bool:
+    def _is_turning_elsewhere(self) -> bool:
         """Whether the robot turns elsewhere than at its last node."""
-        node, turned_at = self.frame.node, self._turned_at
+        node, turned_at = self.frame.last_node, self._turn_position
         assert turned_at is not None
-        return node is not None and min(math.dist(at, node.place) for at in (self.frame.place, turned_at)) > _THERE
+        return (
+            node is not None
+            and min(math.dist(at, node.position) for at in (self.frame.position, turned_at)) > _NODE_RADIUS
+        )
 
-    def _notice(self, ahead: float) -> None:
+    def _notice_openings(self, ahead: float) -> None:
         """Arrive at the openings that are passed.
 
         :param ahead: so far ahead of the robot they count already, m.
         """
         frame = self.frame
-        openings = self.openings.beside(frame)
-        found = [(float((one.pose.mean[:2] - frame.place) @ frame.direction), one) for one in openings]
+        openings = self.openings.confirmed_beside_hallway(frame)
+        found = [(float((one.pose.mean[:2] - frame.position) @ frame.direction), one) for one in openings]
         for away, landmark in sorted(found, key=lambda each: each[0]):
             if -_BEHIND <= away <= ahead:
                 variance = float(landmark.pose.covariance[:2, :2].trace())
-                self._reach(Noticed(frame.beyond(away), variance))
+                self._process_detection(DetectedNode(frame.center_point_ahead(away), variance))
 
     def _notice_wall(self, lines: Lines) -> None:
         """Arrive at the end of a hallway."""
-        away = wall_ahead(lines, -self.frame.askew)
-        self.at_wall = away is not None and away <= _WALL
-        if away is not None and self.at_wall:
-            self._reach(Noticed(self.frame.beyond(away - BEFORE), _PLACED**2), end=True)
+        away = distance_to_wall_ahead(lines, -self.frame.heading_error)
+        self.is_at_wall = away is not None and away <= _WALL
+        if away is not None and self.is_at_wall:
+            self._process_detection(
+                DetectedNode(self.frame.center_point_ahead(away - END_NODE_TO_WALL), _PLACED**2), end=True
+            )
 
-    def _reach(self, noticed: Noticed, *, end: bool = False) -> None:
+    def _process_detection(self, noticed: DetectedNode, *, end: bool = False) -> None:
         """Arrive at what was noticed, unless it was noticed before, or is none of the map.
 
         An opening at which the robot is again corrects its place. An end that is so near to an opening is no node. One
         that is none of the map may be another one that somebody half hides, and no end is taken for it.
         """
         frame = self.frame
-        known = self._passed if end else self._passed + self._unlisted
-        away = [np.abs((place - noticed.place) @ frame.direction) for place in known]
+        known = self._passed_positions if end else self._passed_positions + self._unmapped_positions
+        away = [np.abs((place - noticed.position) @ frame.direction) for place in known]
         if away and min(away) < _SAME:
             return
-        if frame.node is not None and abs((noticed.place - frame.node.place) @ frame.direction) <= _THERE:
-            frame.node = frame.node if end else noticed
-            self._passed = [*self._passed[-2:], noticed.place]
-        elif self.belief is None or self.belief.is_listed(self._way(noticed)):
+        if (
+            frame.last_node is not None
+            and abs((noticed.position - frame.last_node.position) @ frame.direction) <= _NODE_RADIUS
+        ):
+            frame.last_node = frame.last_node if end else noticed
+            self._passed_positions = [*self._passed_positions[-2:], noticed.position]
+        elif self.belief is None or self.belief.is_mapped_opening(self._travel_to(noticed)):
             self._arrive(noticed)
         else:
-            self._unlisted = [*self._unlisted[-2:], noticed.place]
+            self._unmapped_positions = [*self._unmapped_positions[-2:], noticed.position]
 
-    def _arrive(self, noticed: Noticed) -> None:
-        self._passed = [*self._passed[-2:], noticed.place]
-        self.belief = self._first if self.belief is None else self.belief.arrived(self._way(noticed))
-        self.frame.node, self._looked, self._told = noticed, None, self.frame.place
+    def _arrive(self, noticed: DetectedNode) -> None:
+        self._passed_positions = [*self._passed_positions[-2:], noticed.position]
+        self.belief = (
+            self._initial_belief if self.belief is None else self.belief.predict_arrival(self._travel_to(noticed))
+        )
+        self.frame.last_node, self._last_look_position, self._last_update_position = noticed, None, self.frame.position
         self.arrivals += 1
 
-    def _way(self, noticed: Noticed) -> Travel:
+    def _travel_to(self, noticed: DetectedNode) -> Travel:
         """From the last node."""
-        last = self.frame.node
+        last = self.frame.last_node
         assert last is not None
-        distance = float((noticed.place - last.place) @ self.frame.direction)
-        return Travel(max(0.0, distance), 0.0, (last.variance + noticed.variance, _UNTOLD))
+        distance = float((noticed.position - last.position) @ self.frame.direction)
+        return Travel(max(0.0, distance), 0.0, (last.variance + noticed.variance, _UNINFORMATIVE_TURN_VARIANCE))
 
-    def _look(self, seen: Landmarks) -> None:
+    def _observe_landmarks(self, seen: LandmarkSequence) -> None:
         """Ask the observation function, where as much of the hallway is new as the robot sees of it."""
-        frame, last = self.frame, self.frame.node
-        if self.belief is None or last is None or frame.is_near(self._looked, 2.0 * self._places.reach):
+        frame, last = self.frame, self.frame.last_node
+        if self.belief is None or last is None or frame.is_near(self._last_look_position, 2.0 * self._places.reach):
             return
-        if self.belief.in_room >= 0.5:
+        if self.belief.room_probability >= 0.5:
             return
         variance = last.variance + _PLACED**2
-        gone = math.dist(frame.place, self._told)
-        self.belief = self.belief.gone_on(gone).observed(seen, self._model, frame.away, variance)
-        self._looked = self._told = frame.place
-        state = self.belief.most_likely
-        if self.belief.confident and state is not None:
-            ahead, variance = place_along(seen, self.belief.graph.expected, state, frame.away, variance, self._model)
-            frame.node = Noticed(last.place + (frame.away - ahead) * frame.direction, variance)
+        gone = math.dist(frame.position, self._last_update_position)
+        self.belief = self.belief.predict_travel(gone).update(seen, self._model, frame.distance_past_node, variance)
+        self._last_look_position = self._last_update_position = frame.position
+        state = self.belief.most_likely_state
+        if self.belief.is_confident and state is not None:
+            ahead, variance = estimate_distance_past_node(
+                seen, self.belief.graph.expected_landmarks, state, frame.distance_past_node, variance, self._model
+            )
+            frame.last_node = DetectedNode(
+                last.position + (frame.distance_past_node - ahead) * frame.direction, variance
+            )

@@ -22,20 +22,20 @@ from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.hybrid_map.landmark import Landmark
-from hmt_slam_ros.hybrid_map.surroundings import Nearness, areas_around
-from hmt_slam_ros.landmarks.area_classes import sector_of
+from hmt_slam_ros.hybrid_map.surroundings import Neighborhood, areas_around
+from hmt_slam_ros.landmarks.area_classes import sector_indices
 from hmt_slam_ros.landmarks.landmark_map import scatter_ratio
 from hmt_slam_ros.landmarks.landmarks import OPENING
 from hmt_slam_ros.places.area_views import AreaView
 from hmt_slam_ros.places.observation_graph import QUARTERS
-from hmt_slam_ros.places.place_graph import opposite
+from hmt_slam_ros.places.place_graph import opposite_direction
 
 # Areas whose place is known this well, m, and whose keyframes are this near, m, are put into one frame.
-_NEARNESS = Nearness(1.0, 25.0)
+_NEARNESS = Neighborhood(1.0, 25.0)
 # A chord along an axis that is this share of the longest one is as long as the hallway.
 _LONG = 0.5
 # A place lies between the walls of a hallway, m, where so many places of that at least are so near, m.
-_SAME_WALL, _BESIDE, _FEW = 0.2, 4.0, 2
+_SAME_WALL, _BESIDE, _MIN_NEIGHBORS = 0.2, 4.0, 2
 
 _QUARTER = 0.5 * math.pi
 
@@ -43,54 +43,56 @@ DIRECTIONS: Float64 = np.array([[0.0, 1.0], [1.0, 0.0], [0.0, -1.0], [-1.0, 0.0]
 """Unit vectors of the directions of travel, north, east, south and west, in a frame whose x is east."""
 
 
-class Floor(NamedTuple):
+class AlignedNeighborhood(NamedTuple):
     """What is around an area, in the frame at its origin whose x is east.
 
     :ivar area: it.
     :ivar origin: shape (3,), pose of that frame in the area's.
     :ivar areas: {other area: the belief over its pose in the frame}.
-    :ivar owners: shape (n,), the area of every keyframe.
+    :ivar keyframe_areas: shape (n,), the area of every keyframe.
     :ivar keyframes: shape (n,), its number, which grows with time.
-    :ivar places: shape (n, 2), where they were taken, m.
-    :ivar clear: shape (n, 4), how far one sees from there to the north, east, south and west, m.
-    :ivar along: shape (n, 2), whether they were taken in a hallway from south to north, and from west to east.
+    :ivar positions: shape (n, 2), where they were taken, m.
+    :ivar free_distances: shape (n, 4), how far one sees from there to the north, east, south and west, m.
+    :ivar in_hallway: shape (n, 2), whether they were taken in a hallway from south to north, and from west to east.
     """
 
     area: int
     origin: Float64
     areas: dict[int, PoseGaussian]
-    owners: Int64
+    keyframe_areas: Int64
     keyframes: Int64
-    places: Float64
-    clear: Float64
-    along: Bool
+    positions: Float64
+    free_distances: Float64
+    in_hallway: Bool
 
 
-def floors(hybrid_map: HybridMap, views: Mapping[int, AreaView]) -> dict[int, Floor]:
+def aligned_neighborhoods(hybrid_map: HybridMap, views: Mapping[int, AreaView]) -> dict[int, AlignedNeighborhood]:
     """{area: what is around it}, of all areas around which landmarks tell the building's axes."""
     around = {area: areas_around(hybrid_map, area, _NEARNESS) for area in hybrid_map.area_ids()}
-    norths = _norths(around, views)
-    return {area: _floor(area, north, around[area], views) for area, north in norths.items()}
+    norths = _north_headings(around, views)
+    return {area: _aligned_neighborhood(area, north, around[area], views) for area, north in norths.items()}
 
 
-def quarter_of(headings: Float64) -> Int64:
+def nearest_direction(headings: Float64) -> Int64:
     """The directions of travel that headings (n,), rad, in a frame whose x is east are next to."""
     return np.round(1.0 - headings / _QUARTER).astype(np.int64) % QUARTERS
 
 
-def off_axes(headings: Float64) -> Float64:
+def deviation_from_axes(headings: Float64) -> Float64:
     """How far headings, rad, are from the next one of four axes."""
     return np.abs((headings + 0.5 * _QUARTER) % _QUARTER - 0.5 * _QUARTER)
 
 
-def _norths(around: Mapping[int, Mapping[int, PoseGaussian]], views: Mapping[int, AreaView]) -> dict[int, float]:
+def _north_headings(
+    around: Mapping[int, Mapping[int, PoseGaussian]], views: Mapping[int, AreaView]
+) -> dict[int, float]:
     """{area: direction of north in its frame, rad}, one after the other from neighbour to neighbour."""
     found: dict[int, float] = {}
     for begin in around:
         pending = [] if begin in found else [(begin, 0.0)]
         while pending:
             area, guess = pending.pop()
-            axis = None if area in found else _axis(around[area], views)
+            axis = None if area in found else _wall_axis_around(around[area], views)
             if axis is None:
                 continue
             found[area] = guess + (axis - guess + 0.5 * _QUARTER) % _QUARTER - 0.5 * _QUARTER
@@ -99,12 +101,12 @@ def _norths(around: Mapping[int, Mapping[int, PoseGaussian]], views: Mapping[int
     return found
 
 
-def _axis(areas: Mapping[int, PoseGaussian], views: Mapping[int, AreaView]) -> float | None:
+def _wall_axis_around(areas: Mapping[int, PoseGaussian], views: Mapping[int, AreaView]) -> float | None:
     """The direction of the walls around an area, in its frame, up to quarters of a turn; None where none is known."""
-    return axis_of((one, pose.mean[2]) for area, pose in areas.items() for one in views[area].landmarks)
+    return wall_axis((one, pose.mean[2]) for area, pose in areas.items() for one in views[area].landmarks)
 
 
-def axis_of(landmarks: Iterable[tuple[Landmark, float]]) -> float | None:
+def wall_axis(landmarks: Iterable[tuple[Landmark, float]]) -> float | None:
     """The direction of walls, rad, up to quarters of a turn; None where none is known.
 
     :param landmarks: of the walls, each with the heading of the frame that it is in, rad.
@@ -119,23 +121,25 @@ def axis_of(landmarks: Iterable[tuple[Landmark, float]]) -> float | None:
     return math.atan2(total.imag, total.real) / QUARTERS if total else None
 
 
-def _floor(area: int, north: float, around: Mapping[int, PoseGaussian], views: Mapping[int, AreaView]) -> Floor:
+def _aligned_neighborhood(
+    area: int, north: float, around: Mapping[int, PoseGaussian], views: Mapping[int, AreaView]
+) -> AlignedNeighborhood:
     origin = np.array([0.0, 0.0, north - _QUARTER])
-    into = PoseGaussian.exactly(se2.inverse(origin))
+    into = PoseGaussian.from_pose(se2.inverse(origin))
     areas = {other: into.compose(pose) for other, pose in around.items()}
     poses = np.concatenate([se2.compose(pose.mean, views[other].poses) for other, pose in areas.items()])
     owners = np.concatenate([np.full(len(views[other].poses), other) for other in areas])
     numbers = np.concatenate([views[other].keyframes for other in areas])
-    around_each = np.concatenate([views[other].around for other in areas])
+    around_each = np.concatenate([views[other].sector_distances for other in areas])
     bearings = np.arctan2(DIRECTIONS[:, 1], DIRECTIONS[:, 0]) - poses[:, 2:]
-    clear = np.take_along_axis(around_each, sector_of(bearings), axis=1)
-    hallways = np.concatenate([views[other].hallways for other in areas])
-    shortest = np.concatenate([views[other].shortest for other in areas])
-    along = _along(poses[:, :2], clear, hallways, shortest)
-    return Floor(area, origin, areas, owners, numbers, poses[:, :2], clear, along)
+    clear = np.take_along_axis(around_each, sector_indices(bearings), axis=1)
+    hallways = np.concatenate([views[other].hallway_lengths for other in areas])
+    shortest = np.concatenate([views[other].min_hallway_lengths for other in areas])
+    along = _is_in_hallway(poses[:, :2], clear, hallways, shortest)
+    return AlignedNeighborhood(area, origin, areas, owners, numbers, poses[:, :2], clear, along)
 
 
-def _along(places: Float64, clear: Float64, hallways: Float64, shortest: Float64) -> Bool:
+def _is_in_hallway(places: Float64, clear: Float64, hallways: Float64, shortest: Float64) -> Bool:
     """Along which axes places lie in a hallway, shape (n, 2).
 
     At the end of a hallway, and where people stand about, one sees no farther than in a room. So a place between the
@@ -147,15 +151,15 @@ def _along(places: Float64, clear: Float64, hallways: Float64, shortest: Float64
     within = found.copy()
     for axis in (0, 1):
         there, here = np.flatnonzero(found[:, axis]), np.flatnonzero(~found[:, axis])
-        same = _between_same_walls(places, clear, axis, here, there)
-        enough = same.sum(axis=1) >= _FEW
+        same = _is_between_same_walls(places, clear, axis, here, there)
+        enough = same.sum(axis=1) >= _MIN_NEIGHBORS
         here, same = here[enough], same[enough]
         if len(here):
             within[here, axis] = np.nanmedian(np.where(same, hallways[there], np.nan), axis=1) > shortest[here]
     return within
 
 
-def _between_same_walls(places: Float64, clear: Float64, axis: int, here: Int64, there: Int64) -> Bool:
+def _is_between_same_walls(places: Float64, clear: Float64, axis: int, here: Int64, there: Int64) -> Bool:
     """Which pairs of places, one of each group, are near along an axis and see the same walls beside it, (n, m)."""
     side = axis + 1
     ahead, beside = places @ DIRECTIONS[axis], places @ DIRECTIONS[side]
@@ -168,36 +172,36 @@ def _between_same_walls(places: Float64, clear: Float64, axis: int, here: Int64,
 _LEAST = 0.5
 # An opening is beside a hallway that was driven along so near to it, m, at so many keyframes, which are so far from its
 # wall, m, and see that wall where the opening is to this, m. An opening askew from here on, rad, is in none.
-_NEAR, _FEW_OPENINGS, _ASIDE, _OFF, _ASKEW = 3.0, 2, (0.2, 2.5), 0.5, math.radians(20.0)
+_NEAR, _MIN_KEYFRAMES, _ASIDE, _OFF, _ASKEW = 3.0, 2, (0.2, 2.5), 0.5, math.radians(20.0)
 # Keyframes behind an opening are so far behind it, m, and so far beside its middle at most, m; nearer to it one looks
 # back into the hallway.
-_BEHIND, _WITHIN = (1.5, 5.0), 1.0
+_BEHIND, _MAX_LATERAL_OFFSET = (1.5, 5.0), 1.0
 # A hallway that nobody drove along is so wide, m, and one sees so far along it from its mouth, m, at least.
-_WIDE, _FAR = 1.7, 7.0
+_MIN_HALLWAY_WIDTH, _FAR = 1.7, 7.0
 
 
-class LeadingOff(NamedTuple):
+class SideOpening(NamedTuple):
     """An opening in the wall of a hallway.
 
     :ivar area: in which it is known.
     :ivar number: of the landmark in that area.
     :ivar landmark: as known there.
-    :ivar located: the belief over its pose there, by how far its sightings are apart.
+    :ivar pose: the belief over its pose there, by how far its sightings are apart.
     :ivar direction: in which it leads off.
-    :ivar hallway: whether to another hallway; else to a room.
-    :ivar foot: shape (2,), the place before it in the hallway's middle, in the frame of the area's floor, m.
+    :ivar leads_to_hallway: whether to another hallway; else to a room.
+    :ivar junction_point: shape (2,), the place before it in the hallway's middle, in the frame of the area's floor, m.
     """
 
     area: int
     number: int
     landmark: Landmark
-    located: PoseGaussian
+    pose: PoseGaussian
     direction: int
-    hallway: bool
-    foot: Float64
+    leads_to_hallway: bool
+    junction_point: Float64
 
 
-def leading_off(floor: Floor, landmarks: tuple[Landmark, ...]) -> Iterator[LeadingOff]:
+def find_side_openings(floor: AlignedNeighborhood, landmarks: tuple[Landmark, ...]) -> Iterator[SideOpening]:
     """The openings of an area that lead off hallways.
 
     :param floor: around the area.
@@ -208,42 +212,42 @@ def leading_off(floor: Floor, landmarks: tuple[Landmark, ...]) -> Iterator[Leadi
         if landmark.kind != OPENING or landmark.existence.probability < _LEAST:
             continue
         pose = se2.compose(floor.areas[floor.area].mean, landmark.pose.mean)
-        if off_axes(pose[2]) > _ASKEW:
+        if deviation_from_axes(pose[2]) > _ASKEW:
             continue
-        direction = int(quarter_of(pose[2]))
-        foot = _foot(floor, pose[:2], direction)
+        direction = int(nearest_direction(pose[2]))
+        foot = _junction_point(floor, pose[:2], direction)
         if foot is not None:
-            hallway = _to_hallway(floor, pose[:2], direction, landmark.width)
-            located = landmark.located(ratio)
-            yield LeadingOff(floor.area, number, landmark, located, direction, hallway, foot)
+            hallway = _leads_to_hallway(floor, pose[:2], direction, landmark.width)
+            located = landmark.pose_from_scatter(ratio)
+            yield SideOpening(floor.area, number, landmark, located, direction, hallway, foot)
 
 
-def _foot(floor: Floor, place: Float64, direction: int) -> Float64 | None:
+def _junction_point(floor: AlignedNeighborhood, place: Float64, direction: int) -> Float64 | None:
     """The place before an opening in the middle of the hallway that it leads off; None where it leads off none."""
-    ahead, beside = _seen_from(floor, place, direction)
-    wall, other = floor.clear[:, direction], floor.clear[:, opposite(direction)]
+    ahead, beside = _relative_to_keyframes(floor, place, direction)
+    wall, other = floor.free_distances[:, direction], floor.free_distances[:, opposite_direction(direction)]
     before = (np.abs(beside) <= _NEAR) & (_ASIDE[0] <= ahead) & (ahead <= _ASIDE[1]) & (np.abs(wall - ahead) <= _OFF)
-    own = before & floor.along[:, (direction + 1) % 2]
+    own = before & floor.in_hallway[:, (direction + 1) % 2]
     # In a room, too, one may see into a hallway from some places.
-    if own.sum() < max(_FEW_OPENINGS, 0.5 * before.sum()):
+    if own.sum() < max(_MIN_KEYFRAMES, 0.5 * before.sum()):
         return None
     between = own & (other <= _ASIDE[1])
     middle = np.where(between, 0.5 * (wall - other), np.nan) if between.any() else np.zeros(len(wall))
     return place - DIRECTIONS[direction] * float(np.nanmedian(ahead[own] - middle[own]))
 
 
-def _to_hallway(floor: Floor, place: Float64, direction: int, width: float) -> bool:
+def _leads_to_hallway(floor: AlignedNeighborhood, place: Float64, direction: int, width: float) -> bool:
     """Whether an opening leads to a hallway."""
-    ahead, beside = _seen_from(floor, place, direction)
-    behind = (-_BEHIND[1] <= ahead) & (ahead <= -_BEHIND[0]) & (np.abs(beside) <= _WITHIN)
+    ahead, beside = _relative_to_keyframes(floor, place, direction)
+    behind = (-_BEHIND[1] <= ahead) & (ahead <= -_BEHIND[0]) & (np.abs(beside) <= _MAX_LATERAL_OFFSET)
     if behind.any():
-        return bool(floor.along[behind, direction % 2].mean() >= 0.5)
+        return bool(floor.in_hallway[behind, direction % 2].mean() >= 0.5)
     before = (ahead > 0.0) & (ahead <= _ASIDE[1]) & (np.abs(beside) <= 0.5 * width)
-    deep = floor.clear[before, direction] - ahead[before]
-    return width >= _WIDE and bool(np.any(deep >= _FAR))
+    deep = floor.free_distances[before, direction] - ahead[before]
+    return width >= _MIN_HALLWAY_WIDTH and bool(np.any(deep >= _FAR))
 
 
-def _seen_from(floor: Floor, place: Float64, direction: int) -> tuple[Float64, Float64]:
+def _relative_to_keyframes(floor: AlignedNeighborhood, place: Float64, direction: int) -> tuple[Float64, Float64]:
     """How far a place is ahead and beside of all keyframes that look in a direction, m, shape (n,) each."""
-    away = place - floor.places
+    away = place - floor.positions
     return away @ DIRECTIONS[direction], away @ DIRECTIONS[(direction + 1) % QUARTERS]

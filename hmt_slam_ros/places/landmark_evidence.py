@@ -8,12 +8,12 @@ from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.messages.messages import Notice
-from hmt_slam_ros.places.area_views import AreaViews
-from hmt_slam_ros.places.loop_proposals import LoopProposals
-from hmt_slam_ros.places.relocalization_prior import PlacePrior
+from hmt_slam_ros.places.area_views import AreaViewCache
+from hmt_slam_ros.places.loop_proposals import LoopProposer
+from hmt_slam_ros.places.relocalization_prior import RelocalizationPrior
 from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.submap.local_mapping import LocalMapping
-from hmt_slam_ros.topological_inference.global_localization import Whereabouts
+from hmt_slam_ros.topological_inference.global_localization import PoseDistribution
 
 
 class PlaceEvidence:
@@ -25,19 +25,19 @@ class PlaceEvidence:
 
     def __init__(self, configuration: Configuration, scans: Mapping[int, Scan]) -> None:
         """:param scans: {keyframe: scan} of the map, and of what the robot saw last."""
-        self.views = AreaViews(LocalMapping(configuration), scans)
-        self._prior = PlacePrior(configuration, self.views) if configuration.places.prior else None
-        self.loops = LoopProposals(configuration, self.views) if configuration.places.loops else None
+        self.views = AreaViewCache(LocalMapping(configuration), scans)
+        self._prior = RelocalizationPrior(configuration, self.views) if configuration.places.prior else None
+        self.loops = LoopProposer(configuration, self.views) if configuration.places.loops else None
 
     def weigh(
-        self, where: Whereabouts, hybrid_map: HybridMap, poses: Mapping[int, Float64], before: int
-    ) -> Whereabouts:
+        self, where: PoseDistribution, hybrid_map: HybridMap, poses: Mapping[int, Float64], before: int
+    ) -> PoseDistribution:
         """Places with what landmarks say of them.
 
         :param poses: {keyframe: ``reference_T_base`` (3,)} of what the robot saw, m and rad.
         :param before: the map is that of the keyframes before this one.
         """
-        return where if self._prior is None else self._prior.weighed(where, hybrid_map, poses, before)
+        return where if self._prior is None else self._prior.reweight(where, hybrid_map, poses, before)
 
     def prepare_places(self, maps: Iterable[tuple[HybridMap, int]]) -> None:
         """Between looks, gather a share of what :meth:`weigh` will ask for.
@@ -45,14 +45,14 @@ class PlaceEvidence:
         :param maps: each with the keyframe before which it is.
         """
         if self._prior is not None:
-            self._prior.look_ahead(maps)
+            self._prior.prefetch(maps)
 
     def propose_loop(self, hybrid_map: HybridMap, area: int) -> HybridMap:
         """The map with an arc where landmarks propose a loop; the map itself where they do not.
 
         :param area: the robot's.
         """
-        return hybrid_map if self.loops is None else self.loops.supposed(hybrid_map, area)
+        return hybrid_map if self.loops is None else self.loops.with_proposed_arc(hybrid_map, area)
 
     def prepare_loops(self, hybrid_map: HybridMap, area: int) -> None:
         """Between cuts, gather a share of what :meth:`propose_loop` will ask for.
@@ -60,7 +60,7 @@ class PlaceEvidence:
         :param area: the robot's.
         """
         if self.loops is not None:
-            self.loops.look_ahead(hybrid_map, area)
+            self.loops.prefetch(hybrid_map, area)
 
     def notices(self) -> list[Notice]:
         """What was proposed since this was asked last, for a person."""
@@ -69,8 +69,8 @@ class PlaceEvidence:
     def localized(self) -> None:
         """It is known where the robot is: what areas show is kept for loops alone."""
         if self.loops is None:
-            self.views.forget()
+            self.views.clear()
 
     def forget_scans(self) -> None:
         """Work out anew what is made of scans, of which some have changed."""
-        self.views.forget()
+        self.views.clear()

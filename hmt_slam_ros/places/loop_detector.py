@@ -25,15 +25,15 @@ from typing import NamedTuple
 import numpy as np
 
 from hmt_slam_ros.arrays import Float64
-from hmt_slam_ros.configuration.landmarks import Places
+from hmt_slam_ros.configuration.landmarks import PlaceParameters
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
-from hmt_slam_ros.hybrid_map.shortest_path import reachable
-from hmt_slam_ros.hybrid_map.surroundings import positions
+from hmt_slam_ros.hybrid_map.shortest_path import shortest_path_beliefs
+from hmt_slam_ros.hybrid_map.surroundings import keyframe_positions
 from hmt_slam_ros.places.chart import Chart, ChartNode
-from hmt_slam_ros.places.observation import ObservationModel, reach_of
-from hmt_slam_ros.places.observation_graph import QUARTERS, Landmarks, chosen
+from hmt_slam_ros.places.observation import ObservationModel, visible_interval
+from hmt_slam_ros.places.observation_graph import QUARTERS, LandmarkSequence, select_landmarks
 from hmt_slam_ros.places.place_graph import Edge, PlaceGraph, heading_of, node_of, state_of
-from hmt_slam_ros.places.position_belief import PositionBelief, Travel, flat_belief
+from hmt_slam_ros.places.position_belief import PositionBelief, Travel, uniform_belief
 
 TRANSITIONS = 3
 """In a row in which both peaks have to move in the same way."""
@@ -41,83 +41,83 @@ TRANSITIONS = 3
 _SLIP = 1e-9
 
 
-class Loop(NamedTuple):
+class LoopCandidate(NamedTuple):
     """Two places of the map that are one.
 
     :ivar node: of the higher peak.
-    :ivar other: of the second one.
+    :ivar other_node: of the second one.
     :ivar quarters: how far the other's north is turned to the right against that of the first.
     """
 
     node: int
-    other: int
+    other_node: int
     quarters: int
 
 
-def belief_of_twins(graph: PlaceGraph, places: Places) -> PositionBelief:
+def initial_loop_belief(graph: PlaceGraph, places: PlaceParameters) -> PositionBelief:
     """The belief whose peaks are followed, before anything was seen.
 
     A place is in the map a second time with the probability of coming from unknown ground to known one.
     """
-    return flat_belief(graph, replace(places, slip=_SLIP, unmapped=1.0 - places.discovery))
+    return uniform_belief(graph, replace(places, slip=_SLIP, unmapped=1.0 - places.discovery))
 
 
-class TwinPeaks:
+class TwoPeakTracker:
     """Follows the two highest peaks of a belief from transition to transition."""
 
     def __init__(self) -> None:
         self._trails: tuple[list[int], list[int]] | None = None
 
-    def after_transition(self, belief: PositionBelief) -> Loop | None:
+    def update(self, belief: PositionBelief) -> LoopCandidate | None:
         """A loop that the belief after an arrival, and after what was seen there, proposes; else None."""
-        peaks = _peaks(belief)
+        peaks = _two_peaks(belief)
         if peaks is None:
             self._trails = None
             return None
-        self._trails = self._continued(peaks, belief.graph)
+        self._trails = self._extend_trails(peaks, belief.graph)
         first, second = self._trails
         if len(first) <= TRANSITIONS or set(map(node_of, first)) & set(map(node_of, second)):
             return None
-        best = sorted((first[-1], second[-1]), key=lambda state: -belief.logs[state])
-        return Loop(node_of(best[0]), node_of(best[1]), _quarters(best[0], best[1]))
+        best = sorted((first[-1], second[-1]), key=lambda state: -belief.log_probabilities[state])
+        return LoopCandidate(node_of(best[0]), node_of(best[1]), _relative_quarters(best[0], best[1]))
 
-    def _continued(self, peaks: tuple[int, int], graph: PlaceGraph) -> tuple[list[int], list[int]]:
+    def _extend_trails(self, peaks: tuple[int, int], graph: PlaceGraph) -> tuple[list[int], list[int]]:
         """The trails of both peaks, of which the older part is left out; new ones where they did not both move on."""
         if self._trails is not None:
             first, second = self._trails
             for one, other in (peaks, peaks[::-1]):
-                moved = _moves(graph, first[-1], one) and _moves(graph, second[-1], other)
-                if moved and _quarters(first[-1], one) == _quarters(second[-1], other):
+                moved = _has_transition(graph, first[-1], one) and _has_transition(graph, second[-1], other)
+                if moved and _relative_quarters(first[-1], one) == _relative_quarters(second[-1], other):
                     return [*first[-TRANSITIONS:], one], [*second[-TRANSITIONS:], other]
         return [peaks[0]], [peaks[1]]
 
 
-def _peaks(belief: PositionBelief) -> tuple[int, int] | None:
+def _two_peaks(belief: PositionBelief) -> tuple[int, int] | None:
     """The highest peak of a belief, and the one that is all that is left without it; both of them in the map."""
-    first, second = np.argsort(-belief.logs, kind="stable")[:2].tolist()
+    first, second = np.argsort(-belief.log_probabilities, kind="stable")[:2].tolist()
     left = float(np.delete(belief.probabilities, first).sum())
     twin = left > 0.0 and belief.probabilities[second] >= belief.places.twin_share * left
-    return (first, second) if twin and belief.graph.states not in {first, second} else None
+    return (first, second) if twin and belief.graph.state_count not in {first, second} else None
 
 
-def _moves(graph: PlaceGraph, source: int, target: int) -> bool:
+def _has_transition(graph: PlaceGraph, source: int, target: int) -> bool:
     """Whether an arc leads from the one state to the other."""
-    arcs = graph.arcs
+    arcs = graph.transitions
     return bool(np.any((arcs.sources == source) & (arcs.targets == target)))
 
 
-def _quarters(source: int, target: int) -> int:
+def _relative_quarters(source: int, target: int) -> int:
     """Quarters to the right from the heading of one state to that of another."""
     return (heading_of(target) - heading_of(source)) % QUARTERS
 
 
 # Keyframes that are so near to a node are at it, m.
-_AT = 1.0
+_NODE_RADIUS = 1.0
 # Deviation of a node's place in the map, m.
 _PLACED = 0.03
 
 
-def ways(hybrid_map: HybridMap, chart: Chart) -> list[list[Edge]]:
+def traversed_paths(hybrid_map: HybridMap, chart: Chart) -> list[list[Edge]]:
     """The robot's way from node to node, in pieces; a new one begins where the chart has no edge to the next node.
 
     :param hybrid_map: of which the chart is.
@@ -138,57 +138,63 @@ def ways(hybrid_map: HybridMap, chart: Chart) -> list[list[Edge]]:
 
 def _visits(hybrid_map: HybridMap, node: ChartNode, number: int) -> Iterator[tuple[int, int]]:
     """(keyframe, number) of every time that the robot was at a node: of keyframes in a row the nearest."""
-    keyframes, places = _around(hybrid_map, node.area)
+    keyframes, places = _keyframes_around(hybrid_map, node.area)
     order = np.argsort(keyframes)
     away = np.hypot(*(places[order] - node.pose[:2]).T)
-    near = away <= _AT
+    near = away <= _NODE_RADIUS
     for row in np.split(np.arange(len(order)), np.flatnonzero(near[1:] != near[:-1]) + 1):
         if near[row[0]]:
             yield int(keyframes[order[row[np.argmin(away[row])]]]), number
 
 
-def _around(hybrid_map: HybridMap, area: int) -> tuple[Float64, Float64]:
+def _keyframes_around(hybrid_map: HybridMap, area: int) -> tuple[Float64, Float64]:
     """All keyframes (n,) and their places (n, 2) in the frame of an area."""
-    known = reachable(hybrid_map, area)
+    known = shortest_path_beliefs(hybrid_map, area)
     keyframes = [np.array(list(hybrid_map.keyframes(other))) for other in known]
-    places = [positions(hybrid_map, other, pose.mean) for other, pose in known.items()]
+    places = [keyframe_positions(hybrid_map, other, pose.mean) for other, pose in known.items()]
     return np.concatenate(keyframes), np.concatenate(places)
 
 
-def loops_along(
-    way: Sequence[Edge], graph: PlaceGraph, model: ObservationModel, places: Places
-) -> Iterator[Loop | None]:
+def detect_loops(
+    way: Sequence[Edge], graph: PlaceGraph, model: ObservationModel, places: PlaceParameters
+) -> Iterator[LoopCandidate | None]:
     """At every node of a way, the loop that the belief proposes there; else None.
 
     :param way: edges of the graph, each from where the one before ends.
     """
-    belief, twins, heading = belief_of_twins(graph, places), TwinPeaks(), None
+    belief, twins, heading = initial_loop_belief(graph, places), TwoPeakTracker(), None
     for edge in way:
-        if edge.leaving != heading:
-            quarters = 0 if heading is None else (edge.leaving - heading) % QUARTERS
-            belief = _looked(belief.turned(quarters) if quarters else belief, edge.start, edge.leaving, 0.0, model)
-        belief, heading = _gone(belief, edge, model), edge.arriving
-        yield twins.after_transition(belief)
+        if edge.start_direction != heading:
+            quarters = 0 if heading is None else (edge.start_direction - heading) % QUARTERS
+            belief = _update_at_node(
+                belief.predict_turn(quarters) if quarters else belief, edge.start, edge.start_direction, 0.0, model
+            )
+        belief, heading = _follow_edge(belief, edge, model), edge.end_direction
+        yield twins.update(belief)
 
 
-def _gone(belief: PositionBelief, edge: Edge, model: ObservationModel) -> PositionBelief:
+def _follow_edge(belief: PositionBelief, edge: Edge, model: ObservationModel) -> PositionBelief:
     """Along an edge to its end. What is seen at one look is not seen again at the next."""
     for away in np.arange(2.0 * model.reach, edge.distance[0] - 2.0 * model.reach, 2.0 * model.reach).tolist():
-        belief = _looked(belief, edge.start, edge.leaving, away, model)
+        belief = _update_at_node(belief, edge.start, edge.start_direction, away, model)
     travel = Travel(edge.distance[0], edge.turn[0], (edge.distance[1], edge.turn[1]))
-    return _looked(belief.arrived(travel), edge.end, edge.arriving, 0.0, model)
+    return _update_at_node(belief.predict_arrival(travel), edge.end, edge.end_direction, 0.0, model)
 
 
-def _looked(belief: PositionBelief, node: int, heading: int, away: float, model: ObservationModel) -> PositionBelief:
+def _update_at_node(
+    belief: PositionBelief, node: int, heading: int, away: float, model: ObservationModel
+) -> PositionBelief:
     """After a look at what the map has so far beyond a node, m."""
-    expected = belief.graph.expected
+    expected = belief.graph.expected_landmarks
     state = state_of(node, heading)
-    own = chosen(expected.landmarks, slice(*expected.starts[state : state + 2].tolist()))
-    return belief.observed(_in_sight(own._replace(along=own.along - away), model), model, away, _PLACED**2)
+    own = select_landmarks(expected.landmarks, slice(*expected.starts[state : state + 2].tolist()))
+    return belief.update(
+        _visible_landmarks(own._replace(positions=own.positions - away), model), model, away, _PLACED**2
+    )
 
 
-def _in_sight(landmarks: Landmarks, model: ObservationModel) -> Landmarks:
+def _visible_landmarks(landmarks: LandmarkSequence, model: ObservationModel) -> LandmarkSequence:
     """Those of a list that are in sight from its begin."""
     pairs = zip(landmarks.tracks.tolist(), landmarks.forms.tolist(), strict=True)
-    low, high = np.array([reach_of(track, form, model.reach) for track, form in pairs]).reshape(-1, 2).T
-    return chosen(landmarks, (low <= landmarks.along) & (landmarks.along <= high))
+    low, high = np.array([visible_interval(track, form, model.reach) for track, form in pairs]).reshape(-1, 2).T
+    return select_landmarks(landmarks, (low <= landmarks.positions) & (landmarks.positions <= high))

@@ -38,11 +38,11 @@ import numpy as np
 from numba import njit
 
 from hmt_slam_ros.arrays import Float64, Int64
-from hmt_slam_ros.configuration.landmarks import Features, Places
-from hmt_slam_ros.places.observation_graph import CONVEX, OPENINGS, TRACKS, Landmarks, chosen
+from hmt_slam_ros.configuration.landmarks import FeatureParameters, PlaceParameters
+from hmt_slam_ros.places.observation_graph import CONVEX, OPENINGS, TRACKS, LandmarkSequence, select_landmarks
 
 # Beyond so many deviations nothing is matched, and a landmark is not within reach.
-_FAR = 9.0
+_MAX_DEVIATIONS = 9.0
 # The grid over the robot's place: so many of its deviations to both sides, in steps of so much of a landmark's.
 _SIDES, _STEP = 4.0, 0.5
 
@@ -52,12 +52,12 @@ class ObservationModel(NamedTuple):
 
     :ivar reach: m.
     :ivar detection: p_det.
-    :ivar along: variance of a place along the axis beyond what map and measurement say, m^2.
-    :ivar heading: that of a corner's heading, rad^2.
-    :ivar width: that of an opening's width, m^2.
-    :ivar false: lambda_false, 1/m.
-    :ivar new: lambda_new, 1/m.
-    :ivar usual: lambda_usual, 1/m.
+    :ivar position_variance: variance of a place along the axis beyond what map and measurement say, m^2.
+    :ivar heading_variance: that of a corner's heading, rad^2.
+    :ivar width_variance: that of an opening's width, m^2.
+    :ivar false_density: lambda_false, 1/m.
+    :ivar new_density: lambda_new, 1/m.
+    :ivar usual_density: lambda_usual, 1/m.
     :ivar true_share: pi.
     :ivar corner_form: u of corners, 1/rad.
     :ivar opening_form: u of openings, 1/m.
@@ -65,18 +65,18 @@ class ObservationModel(NamedTuple):
 
     reach: float
     detection: float
-    along: float
-    heading: float
-    width: float
-    false: float
-    new: float
-    usual: float
+    position_variance: float
+    heading_variance: float
+    width_variance: float
+    false_density: float
+    new_density: float
+    usual_density: float
     true_share: float
     corner_form: float
     opening_form: float
 
 
-class Expected(NamedTuple):
+class ExpectedLandmarks(NamedTuple):
     """What is to be seen in every state.
 
     :ivar starts: shape (states + 1,), where the list of each state begins.
@@ -84,10 +84,10 @@ class Expected(NamedTuple):
     """
 
     starts: Int64
-    landmarks: Landmarks
+    landmarks: LandmarkSequence
 
 
-def observation_model(places: Places, features: Features) -> ObservationModel:
+def observation_model(places: PlaceParameters, features: FeatureParameters) -> ObservationModel:
     """The model that parameters say."""
     return ObservationModel(
         places.reach,
@@ -104,60 +104,73 @@ def observation_model(places: Places, features: Features) -> ObservationModel:
     )
 
 
-def log_observation(
-    observed: Landmarks, expected: Expected, away: float, variance: float, model: ObservationModel
+def log_observation_ratios(
+    observed: LandmarkSequence,
+    expected: ExpectedLandmarks,
+    distance_past_node: float,
+    variance: float,
+    model: ObservationModel,
 ) -> Float64:
     """Log-likelihood ratios log OS(o, s) of all states against a place where nothing is expected, shape (states,).
 
-    :param away: how far the robot is beyond the state's node, m.
+    :param distance_past_node: how far the robot is beyond the state's node, m.
     :param variance: of that, m^2.
     """
-    shifts, weights = _places_along(variance, model)
+    shifts, weights = _offset_grid(variance, model)
     tracks = np.searchsorted(observed.tracks, np.arange(TRACKS + 1))
-    return _log_ratios(observed, tracks, _matched(observed, model), expected, away + shifts, weights, model)
+    return _log_ratios(
+        observed, tracks, _match_factors(observed, model), expected, distance_past_node + shifts, weights, model
+    )
 
 
-def place_along(
-    observed: Landmarks, expected: Expected, state: int, away: float, variance: float, model: ObservationModel
+def estimate_distance_past_node(
+    observed: LandmarkSequence,
+    expected: ExpectedLandmarks,
+    state: int,
+    distance_past_node: float,
+    variance: float,
+    model: ObservationModel,
 ) -> tuple[float, float]:
     """How far the robot is beyond a state's node after what it observed, m, and the variance of that, m^2."""
-    shifts, weights = _places_along(variance, model)
+    shifts, weights = _offset_grid(variance, model)
     tracks = np.searchsorted(observed.tracks, np.arange(TRACKS + 1))
-    own = chosen(expected.landmarks, slice(*expected.starts[state : state + 2].tolist()))
-    alone = Expected(np.array([0, len(own.tracks)]), own)
-    matched = _matched(observed, model)
+    own = select_landmarks(expected.landmarks, slice(*expected.starts[state : state + 2].tolist()))
+    alone = ExpectedLandmarks(np.array([0, len(own.tracks)]), own)
+    matched = _match_factors(observed, model)
     logs = np.array(
         [
-            _log_ratios(observed, tracks, matched, alone, np.array([away + shift]), np.array([weight]), model)[0]
+            _log_ratios(
+                observed, tracks, matched, alone, np.array([distance_past_node + shift]), np.array([weight]), model
+            )[0]
             for shift, weight in zip(shifts.tolist(), weights.tolist(), strict=True)
         ]
     )
     shares = np.exp(logs - logs.max())
     shares /= shares.sum()
     mean = float(shares @ shifts)
-    return away + mean, float(shares @ (shifts - mean) ** 2)
+    return distance_past_node + mean, float(shares @ (shifts - mean) ** 2)
 
 
-def log_unknown_ground(observed: Landmarks, model: ObservationModel) -> float:
+def log_unknown_ground_ratio(observed: LandmarkSequence, model: ObservationModel) -> float:
     """The same of unknown ground: one Poisson process against another."""
     there = observed.probabilities / model.true_share
-    none = model.false * (1.0 - observed.probabilities) / (1.0 - model.true_share)
-    more = (model.usual - model.new) * 2.0 * model.reach * TRACKS
-    return float(np.log((model.usual * there + none) / (model.new * there + none)).sum() - more)
+    none = model.false_density * (1.0 - observed.probabilities) / (1.0 - model.true_share)
+    more = (model.usual_density - model.new_density) * 2.0 * model.reach * TRACKS
+    return float(np.log((model.usual_density * there + none) / (model.new_density * there + none)).sum() - more)
 
 
-def _matched(observed: Landmarks, model: ObservationModel) -> Float64:
+def _match_factors(observed: LandmarkSequence, model: ObservationModel) -> Float64:
     """What a match counts, p_l / (pi e), shape (m,)."""
     form = np.where(observed.tracks < OPENINGS, model.corner_form, model.opening_form)
     there = observed.probabilities / model.true_share
-    none = model.false * (1.0 - observed.probabilities) / (1.0 - model.true_share)
-    return there / (form * (none + model.new * there))
+    none = model.false_density * (1.0 - observed.probabilities) / (1.0 - model.true_share)
+    return there / (form * (none + model.new_density * there))
 
 
-def _places_along(variance: float, model: ObservationModel) -> tuple[Float64, Float64]:
+def _offset_grid(variance: float, model: ObservationModel) -> tuple[Float64, Float64]:
     """A grid over delta, m, and the weights of its points."""
     deviation = math.sqrt(variance)
-    count = math.ceil(_SIDES * deviation / (_STEP * math.sqrt(model.along)))
+    count = math.ceil(_SIDES * deviation / (_STEP * math.sqrt(model.position_variance)))
     if not count:
         return np.zeros(1), np.ones(1)
     points = np.linspace(-_SIDES, _SIDES, 2 * count + 1)
@@ -167,17 +180,17 @@ def _places_along(variance: float, model: ObservationModel) -> tuple[Float64, Fl
 
 @njit(cache=True)
 def _log_ratios(
-    observed: Landmarks,
+    observed: LandmarkSequence,
     tracks: Int64,
     matched: Float64,
-    expected: Expected,
+    expected: ExpectedLandmarks,
     aways: Float64,
     weights: Float64,
     model: ObservationModel,
 ) -> Float64:
     states = len(expected.starts) - 1
     logs, found = np.empty(len(aways)), np.empty(states)
-    row = np.empty(len(observed.along) + 1)
+    row = np.empty(len(observed.positions) + 1)
     for state in range(states):
         begin, end = expected.starts[state], expected.starts[state + 1]
         for k in range(len(aways)):
@@ -190,10 +203,10 @@ def _log_ratios(
 
 @njit(cache=True)
 def _log_pairings(
-    observed: Landmarks,
+    observed: LandmarkSequence,
     tracks: Int64,
     matched: Float64,
-    landmarks: Landmarks,
+    landmarks: LandmarkSequence,
     begin: int,
     end: int,
     away: float,
@@ -206,17 +219,17 @@ def _log_pairings(
         first, count = tracks[track], tracks[track + 1] - tracks[track]
         row[: count + 1] = 1.0
         while own < end and landmarks.tracks[own] == track:
-            total += _forward(observed, matched, landmarks, own, first, count, away, model, row)
+            total += _forward_step(observed, matched, landmarks, own, first, count, away, model, row)
             own += 1
         total += math.log(row[count]) if row[count] > 0.0 else -np.inf
     return total
 
 
 @njit(cache=True)
-def _forward(
-    observed: Landmarks,
+def _forward_step(
+    observed: LandmarkSequence,
     matched: Float64,
-    landmarks: Landmarks,
+    landmarks: LandmarkSequence,
     own: int,
     first: int,
     count: int,
@@ -229,22 +242,24 @@ def _forward(
     ``row[j]`` is the sum over the pairings with the first j observed landmarks of the track, of which the others are
     extra. The new one is missed, or matched with any of them.
     """
-    place, variance = landmarks.along[own] - away, landmarks.variances[own, 0] + model.along
-    form_variance = landmarks.variances[own, 1] + (model.heading if landmarks.tracks[own] < OPENINGS else model.width)
+    place, variance = landmarks.positions[own] - away, landmarks.variances[own, 0] + model.position_variance
+    form_variance = landmarks.variances[own, 1] + (
+        model.heading_variance if landmarks.tracks[own] < OPENINGS else model.width_variance
+    )
     seen = landmarks.probabilities[own] * model.detection
-    low, high = reach_of(landmarks.tracks[own], landmarks.forms[own], model.reach)
-    missed = 1.0 - seen * _within(place, math.sqrt(variance), low, high)
+    low, high = visible_interval(landmarks.tracks[own], landmarks.forms[own], model.reach)
+    missed = 1.0 - seen * _probability_between(place, math.sqrt(variance), low, high)
     before, paired = row[0], 0.0
     row[0] *= missed
     for j in range(count):
         k = first + j
-        here = _fit(observed.along[k] - place, variance + observed.variances[k, 0])
-        here = here if low <= observed.along[k] <= high else 0.0
+        here = _gaussian_density(observed.positions[k] - place, variance + observed.variances[k, 0])
+        here = here if low <= observed.positions[k] <= high else 0.0
         if here > 0.0:
             off = observed.forms[k] - landmarks.forms[own]
             if landmarks.tracks[own] < OPENINGS:
                 off = (off + math.pi) % (2.0 * math.pi) - math.pi
-            here *= _fit(off, form_variance + observed.variances[k, 1])
+            here *= _gaussian_density(off, form_variance + observed.variances[k, 1])
         paired += before * seen * here * matched[k]
         before = row[j + 1]
         row[j + 1] = missed * before + paired
@@ -256,15 +271,15 @@ def _forward(
 
 
 @njit(cache=True)
-def _fit(off: float, variance: float) -> float:
+def _gaussian_density(off: float, variance: float) -> float:
     """Density of a difference; 0 far out."""
-    if off * off > _FAR * _FAR * variance:
+    if off * off > _MAX_DEVIATIONS * _MAX_DEVIATIONS * variance:
         return 0.0
     return math.exp(-0.5 * off * off / variance) / math.sqrt(2.0 * math.pi * variance)
 
 
 @njit(cache=True)
-def reach_of(track: int, form: float, reach: float) -> tuple[float, float]:
+def visible_interval(track: int, form: float, reach: float) -> tuple[float, float]:
     """From where to where ahead of the robot a landmark is in sight, m.
 
     :param form: as of `Landmarks`.
@@ -275,11 +290,11 @@ def reach_of(track: int, form: float, reach: float) -> tuple[float, float]:
 
 
 @njit(cache=True)
-def _within(place: float, deviation: float, low: float, high: float) -> float:
+def _probability_between(place: float, deviation: float, low: float, high: float) -> float:
     """Probability that a landmark is measured between two places."""
-    if low + _FAR * deviation < place < high - _FAR * deviation:
+    if low + _MAX_DEVIATIONS * deviation < place < high - _MAX_DEVIATIONS * deviation:
         return 1.0
-    if not low - _FAR * deviation <= place <= high + _FAR * deviation:
+    if not low - _MAX_DEVIATIONS * deviation <= place <= high + _MAX_DEVIATIONS * deviation:
         return 0.0
     scale = 1.0 / (math.sqrt(2.0) * deviation)
     return 0.5 * (math.erf((high - place) * scale) - math.erf((low - place) * scale))

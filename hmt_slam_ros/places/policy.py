@@ -25,8 +25,8 @@ from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.places.chart import Chart
 from hmt_slam_ros.places.estimator import PlaceEstimator
 from hmt_slam_ros.places.observation import ObservationModel
-from hmt_slam_ros.places.observation_graph import QUARTERS, Landmarks, chosen
-from hmt_slam_ros.places.place_graph import PlaceGraph, node_of, turned
+from hmt_slam_ros.places.observation_graph import QUARTERS, LandmarkSequence, select_landmarks
+from hmt_slam_ros.places.place_graph import PlaceGraph, node_of, state_after_turn
 from hmt_slam_ros.places.position_belief import PositionBelief
 
 # A quarter of a turn costs as much as so many metres, and so does a way that is closed: where no other leads to the
@@ -35,7 +35,7 @@ _TURN, _CLOSED = 1.0, 1e6
 # States of which it is worked out what the robot would see.
 _LIKELY = 8
 # Instead of a probability of 0.
-_NEVER = 1e-300
+_MIN_PROBABILITY = 1e-300
 
 
 def next_turn(
@@ -49,21 +49,21 @@ def next_turn(
     :param closed: states whose edges are not to be gone where others lead to the goal.
     :returns: None at the goal, where no way is known to lead there, and in unknown ground.
     """
-    if goal is None or not belief.confident:
+    if goal is None or not belief.is_confident:
         return 0 if ahead else most_informative_turn(belief, model)
-    state = belief.most_likely
+    state = belief.most_likely_state
     return None if state is None else turn_towards(belief.graph, state, goal, closed)
 
 
 def turn_towards(graph: PlaceGraph, state: int, goal: int, closed: Collection[int] = ()) -> int | None:
     """The same for a robot that is in a state for certain, on the shortest way."""
     ways = networkx.DiGraph()
-    for source in range(graph.states):
-        if graph.following[source] >= 0:
+    for source in range(graph.state_count):
+        if graph.successors[source] >= 0:
             length = float(graph.lengths[source]) + (_CLOSED if source in closed else 0.0)
-            ways.add_edge(source, int(graph.following[source]), length=length)
+            ways.add_edge(source, int(graph.successors[source]), length=length)
         for quarters in (1, QUARTERS - 1):
-            ways.add_edge(source, turned(source, quarters), length=_TURN)
+            ways.add_edge(source, state_after_turn(source, quarters), length=_TURN)
     lengths, paths = networkx.single_source_dijkstra(ways, state, weight="length")
     ends = [end for end in range(QUARTERS * goal, QUARTERS * (goal + 1)) if end in lengths]
     if node_of(state) == goal or not ends:
@@ -78,39 +78,41 @@ def most_informative_turn(belief: PositionBelief, model: ObservationModel) -> in
 
     Only such as lead on in the most likely state; of equal ones the first to the right from straight on.
     """
-    state = belief.most_likely
+    state = belief.most_likely_state
     if state is None:
         return None
-    leading = [k for k in range(QUARTERS) if belief.graph.following[turned(state, k)] >= 0]
-    return min(leading, key=lambda quarters: _entropy_after(belief, quarters, model), default=None)
+    leading = [k for k in range(QUARTERS) if belief.graph.successors[state_after_turn(state, k)] >= 0]
+    return min(leading, key=lambda quarters: _expected_entropy(belief, quarters, model), default=None)
 
 
-def _entropy_after(belief: PositionBelief, quarters: int, model: ObservationModel) -> float:
+def _expected_entropy(belief: PositionBelief, quarters: int, model: ObservationModel) -> float:
     """Mean entropy after a turn, the way to the next opening, and what is to be seen there."""
-    there = _led_on(belief.turned(quarters))
+    there = _predict_next_opening(belief.predict_turn(quarters))
     shares = there.probabilities[:-1]
     likely = np.argsort(-shares, kind="stable")[:_LIKELY]
-    left = [there.observed(_most_expected(belief.graph, int(state), model), model).entropy for state in likely]
+    left = [there.update(_ideal_observation(belief.graph, int(state), model), model).entropy for state in likely]
     return float(shares[likely] @ left / shares[likely].sum())
 
 
-def _led_on(belief: PositionBelief) -> PositionBelief:
+def _predict_next_opening(belief: PositionBelief) -> PositionBelief:
     """The belief at the next opening, however far that is."""
-    arcs, there = belief.graph.arcs, np.zeros(belief.graph.states + 1)
+    arcs, there = belief.graph.transitions, np.zeros(belief.graph.state_count + 1)
     np.add.at(there, arcs.targets, arcs.probabilities * belief.probabilities[arcs.sources])
     there[-1] = max(0.0, 1.0 - float(there.sum()))
-    return replace(belief, logs=np.log(np.maximum(there, _NEVER)))
+    return replace(belief, log_probabilities=np.log(np.maximum(there, _MIN_PROBABILITY)))
 
 
-def _most_expected(graph: PlaceGraph, state: int, model: ObservationModel) -> Landmarks:
+def _ideal_observation(graph: PlaceGraph, state: int, model: ObservationModel) -> LandmarkSequence:
     """What would be seen in a state if nothing was missed, off, or extra."""
-    every = chosen(graph.expected.landmarks, slice(*graph.expected.starts[state : state + 2].tolist()))
-    near = chosen(every, np.abs(every.along) <= model.reach)
+    every = select_landmarks(
+        graph.expected_landmarks.landmarks, slice(*graph.expected_landmarks.starts[state : state + 2].tolist())
+    )
+    near = select_landmarks(every, np.abs(every.positions) <= model.reach)
     sure = np.full(len(near.tracks), model.true_share)
     return near._replace(variances=np.zeros_like(near.variances), probabilities=sure)
 
 
-class MetricStart(NamedTuple):
+class MetricInitialPose(NamedTuple):
     """What a metric filter starts with.
 
     :ivar node: the robot is before its opening.
@@ -123,15 +125,15 @@ class MetricStart(NamedTuple):
     pose: PoseGaussian
 
 
-def metric_start(estimator: PlaceEstimator, chart: Chart) -> MetricStart | None:
+def metric_initial_pose(estimator: PlaceEstimator, chart: Chart) -> MetricInitialPose | None:
     """What the opening before the robot tells of its pose; None where it is not confident, or before no opening."""
-    facing, seen = estimator.facing, estimator.openings.door_ahead()
-    if facing is None or seen is None or not estimator.at_node:
+    facing, seen = estimator.node_and_direction, estimator.openings.door_ahead()
+    if facing is None or seen is None or not estimator.is_at_node:
         return None
-    if estimator.belief is None or not estimator.belief.confident:
+    if estimator.belief is None or not estimator.belief.is_confident:
         return None
     node, direction = facing
     for opening in chart.nodes[node].openings:
         if opening.direction == direction:
-            return MetricStart(node, opening.area, opening.located.compose(seen.inverse()))
+            return MetricInitialPose(node, opening.area, opening.pose.compose(seen.inverse()))
     return None

@@ -22,10 +22,10 @@ import numpy as np
 from numba import njit
 
 from hmt_slam_ros.arrays import Float64
-from hmt_slam_ros.configuration.landmarks import Places
-from hmt_slam_ros.places.observation import ObservationModel, log_observation, log_unknown_ground
-from hmt_slam_ros.places.observation_graph import QUARTERS, Landmarks
-from hmt_slam_ros.places.place_graph import Arcs, PlaceGraph
+from hmt_slam_ros.configuration.landmarks import PlaceParameters
+from hmt_slam_ros.places.observation import ObservationModel, log_observation_ratios, log_unknown_ground_ratio
+from hmt_slam_ros.places.observation_graph import QUARTERS, LandmarkSequence
+from hmt_slam_ros.places.place_graph import PlaceGraph, StateTransitions
 
 
 class Travel(NamedTuple):
@@ -47,56 +47,60 @@ class PositionBelief:
 
     :ivar graph: the map.
     :ivar places: parameters.
-    :ivar logs: shape (states + 1,), the log of each state's probability, of unknown ground the last.
+    :ivar log_probabilities: shape (states + 1,), the log of each state's probability, of unknown ground the last.
     """
 
     graph: PlaceGraph
-    places: Places
-    logs: Float64
+    places: PlaceParameters
+    log_probabilities: Float64
 
     @property
     def probabilities(self) -> Float64:
         """SE, shape (states + 1,); the sum is 1."""
-        return np.exp(self.logs)
+        return np.exp(self.log_probabilities)
 
     @property
     def entropy(self) -> float:
         """The unconfidence U(SE), Eq. (3), nats."""
-        return float(-(self.probabilities * np.maximum(self.logs, -1e300)).sum())
+        return float(-(self.probabilities * np.maximum(self.log_probabilities, -1e300)).sum())
 
     @property
-    def confident(self) -> bool:
+    def is_confident(self) -> bool:
         """Whether U(SE) < U_max, Eq. (3)."""
         return self.entropy < self.places.max_entropy
 
     @property
-    def in_room(self) -> float:
+    def room_probability(self) -> float:
         """Probability that the robot's direction is one in which the map has no hallway, but, for example, a room."""
-        return float(self.probabilities[:-1][~self.graph.travelled].sum())
+        return float(self.probabilities[:-1][~self.graph.has_hallway].sum())
 
     @property
-    def most_likely(self) -> int | None:
+    def most_likely_state(self) -> int | None:
         """The most likely state; None for unknown ground."""
-        best = int(np.argmax(self.logs))
-        return best if best < self.graph.states else None
+        best = int(np.argmax(self.log_probabilities))
+        return best if best < self.graph.state_count else None
 
-    def gone_on(self, distance: float) -> PositionBelief:
+    def predict_travel(self, distance: float) -> PositionBelief:
         """After a stretch on which no opening was noticed, m.
 
         T(s, a, s) = 1 - slip over a way as long as that between two places, however often one looks meanwhile.
         """
-        return self._predicted(self.logs, 1.0 - (1.0 - self.places.slip) ** (distance / self.places.spacing))
+        return self._predict_with_slip(
+            self.log_probabilities, 1.0 - (1.0 - self.places.slip) ** (distance / self.places.spacing)
+        )
 
-    def is_listed(self, travel: Travel) -> bool:
+    def is_mapped_opening(self, travel: Travel) -> bool:
         """Whether an opening that was noticed is more probably one of the map, or of unknown ground, than one that the
         map lacks in known ground. One that it lacks is a landmark, and no arrival.
 
         Such a one is noticed only as long as none of the map is, so it is the less probable the farther the way is.
         """
-        logs = _densities(self.graph.arcs, np.array((travel.distance, travel.turn)), np.array(travel.variances))
-        arcs, shares = self.graph.arcs, self.probabilities
+        logs = _log_densities(
+            self.graph.transitions, np.array((travel.distance, travel.turn)), np.array(travel.variances)
+        )
+        arcs, shares = self.graph.transitions, self.probabilities
         ways = shares[arcs.sources] * arcs.probabilities
-        listed = float(ways @ np.exp(logs)) + shares[-1] * math.exp(self._usual(travel))
+        listed = float(ways @ np.exp(logs)) + shares[-1] * math.exp(self._log_unmapped_density(travel))
         ahead = arcs.means[:, 0] - travel.distance
         still = ahead / np.sqrt(2.0 * (arcs.variances[:, 0] + travel.variances[0]))
         passed = float(ways @ [0.5 * math.erfc(each) for each in still.tolist()])
@@ -104,68 +108,75 @@ class PositionBelief:
         turn = math.exp(-0.5 * off) / math.sqrt(2.0 * math.pi * travel.variances[1])
         return listed >= self.places.unlisted * turn * max(0.0, float(shares[:-1].sum()) - passed)
 
-    def turned(self, quarters: int) -> PositionBelief:
+    def predict_turn(self, quarters: int) -> PositionBelief:
         """After so many quarters of a turn to the right at a node."""
-        by_node = self.logs[:-1].reshape(-1, QUARTERS)
-        turned_logs = np.append(np.roll(by_node, quarters, axis=1).ravel(), self.logs[-1])
-        return self._predicted(turned_logs, self.places.slip)
+        by_node = self.log_probabilities[:-1].reshape(-1, QUARTERS)
+        turned_logs = np.append(np.roll(by_node, quarters, axis=1).ravel(), self.log_probabilities[-1])
+        return self._predict_with_slip(turned_logs, self.places.slip)
 
-    def _predicted(self, logs: Float64, slip: float) -> PositionBelief:
+    def _predict_with_slip(self, logs: Float64, slip: float) -> PositionBelief:
         """Each state keeps all but ``slip``, of which every other one gets its share."""
         others = len(logs) - 1
         probabilities = np.exp(logs)
         predicted = (1.0 - slip) * probabilities + slip / others * (probabilities.sum() - probabilities)
-        return replace(self, logs=_normalised(_log(predicted)))
+        return replace(self, log_probabilities=_normalize(_safe_log(predicted)))
 
-    def arrived(self, travel: Travel) -> PositionBelief:
+    def predict_arrival(self, travel: Travel) -> PositionBelief:
         """After the next opening was noticed, Eq. (1) with d as a part of o."""
         way, noise = np.array((travel.distance, travel.turn)), np.array(travel.variances)
-        densities = np.exp(_densities(self.graph.arcs, way, noise) - self._usual(travel))
-        predicted = _arrived(self.probabilities, self.graph.arcs, densities, self.places.slip, self.places.discovery)
-        return replace(self, logs=_normalised(_log(predicted)))
+        densities = np.exp(_log_densities(self.graph.transitions, way, noise) - self._log_unmapped_density(travel))
+        predicted = _arrival_prediction(
+            self.probabilities, self.graph.transitions, densities, self.places.slip, self.places.discovery
+        )
+        return replace(self, log_probabilities=_normalize(_safe_log(predicted)))
 
-    def _usual(self, travel: Travel) -> float:
+    def _log_unmapped_density(self, travel: Travel) -> float:
         """Log-density of a way that the map does not tell."""
         return -math.log(2.0 * math.pi * self.places.spacing) - travel.distance / self.places.spacing
 
-    def observed(
-        self, graph: Landmarks, model: ObservationModel, away: float = 0.0, variance: float = 0.0
+    def update(
+        self, graph: LandmarkSequence, model: ObservationModel, distance_past_node: float = 0.0, variance: float = 0.0
     ) -> PositionBelief:
         """After an observation graph was seen, Eq. (1).
 
-        :param away: how far the robot is beyond the node of its state, m.
+        :param distance_past_node: how far the robot is beyond the node of its state, m.
         :param variance: of that, m^2.
         """
-        told = log_observation(graph, self.graph.expected, away, variance, model)
-        return replace(self, logs=_normalised(self.logs + np.append(told, log_unknown_ground(graph, model))))
+        told = log_observation_ratios(graph, self.graph.expected_landmarks, distance_past_node, variance, model)
+        return replace(
+            self,
+            log_probabilities=_normalize(
+                self.log_probabilities + np.append(told, log_unknown_ground_ratio(graph, model))
+            ),
+        )
 
 
-def flat_belief(graph: PlaceGraph, places: Places) -> PositionBelief:
+def uniform_belief(graph: PlaceGraph, places: PlaceParameters) -> PositionBelief:
     """Nothing is known of where the robot is, but that it is in a hallway that it can go along.
 
     :raises ValueError: where the map has none.
     """
-    if not graph.travelled.any():
+    if not graph.has_hallway.any():
         raise ValueError("a map without a stretch of hallway holds no place to be at")
-    logs = np.full(graph.states + 1, -np.inf)
-    logs[:-1][graph.travelled] = math.log1p(-places.unmapped) - math.log(graph.travelled.sum())
+    logs = np.full(graph.state_count + 1, -np.inf)
+    logs[:-1][graph.has_hallway] = math.log1p(-places.unmapped) - math.log(graph.has_hallway.sum())
     logs[-1] = math.log(places.unmapped)
     return PositionBelief(graph, places, logs)
 
 
-def certain_belief(graph: PlaceGraph, places: Places, state: int) -> PositionBelief:
+def certain_belief(graph: PlaceGraph, places: PlaceParameters, state: int) -> PositionBelief:
     """The robot is in a state for certain."""
-    logs = np.full(graph.states + 1, -np.inf)
+    logs = np.full(graph.state_count + 1, -np.inf)
     logs[state] = 0.0
     return PositionBelief(graph, places, logs)
 
 
-def _log(probabilities: Float64) -> Float64:
+def _safe_log(probabilities: Float64) -> Float64:
     """With -inf for 0."""
     return np.log(probabilities, out=np.full(len(probabilities), -np.inf), where=probabilities > 0.0)
 
 
-def _normalised(logs: Float64) -> Float64:
+def _normalize(logs: Float64) -> Float64:
     """:raises ValueError: where no state can be."""
     top = logs.max()
     if not top > -np.inf:
@@ -174,7 +185,7 @@ def _normalised(logs: Float64) -> Float64:
 
 
 @njit(cache=True)
-def _densities(arcs: Arcs, way: Float64, noise: Float64) -> Float64:
+def _log_densities(arcs: StateTransitions, way: Float64, noise: Float64) -> Float64:
     """Log-densities of a distance, m, and a turn, rad, of all arcs, shape (k,)."""
     found = np.zeros(len(arcs.sources))
     for k in range(len(arcs.sources)):
@@ -188,7 +199,9 @@ def _densities(arcs: Arcs, way: Float64, noise: Float64) -> Float64:
 
 
 @njit(cache=True)
-def _arrived(belief: Float64, arcs: Arcs, densities: Float64, slip: float, discovery: float) -> Float64:
+def _arrival_prediction(
+    belief: Float64, arcs: StateTransitions, densities: Float64, slip: float, discovery: float
+) -> Float64:
     """sum_s T(s, a, s') p(d | s, s') SE_s up to a factor.
 
     :param densities: shape (k,), p(d | s, s') of the arcs against that of what is usual.

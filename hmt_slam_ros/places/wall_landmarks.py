@@ -14,56 +14,56 @@ from typing import NamedTuple
 import numpy as np
 
 from hmt_slam_ros.arrays import Bool, Float64
-from hmt_slam_ros.configuration.landmarks import Places
+from hmt_slam_ros.configuration.landmarks import PlaceParameters
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.landmark import Landmark
 from hmt_slam_ros.landmarks.corners import Corners
-from hmt_slam_ros.landmarks.landmarks import OPENING, OUTER
+from hmt_slam_ros.landmarks.landmarks import CONVEX_CORNER, OPENING
 from hmt_slam_ros.landmarks.openings import Openings
-from hmt_slam_ros.places.floor import DIRECTIONS, Floor
+from hmt_slam_ros.places.floor import DIRECTIONS, AlignedNeighborhood
 from hmt_slam_ros.places.observation_graph import (
     OPENINGS,
     QUARTERS,
-    Landmarks,
-    chosen,
-    joined,
+    LandmarkSequence,
+    merge_sequences,
     observation_graph,
-    of_walls,
+    select_landmarks,
+    select_wall_landmarks,
 )
 
 # Landmarks of one kind that are so near to each other, m and rad, are one that several areas know.
-_TWICE, _TURN = 0.4, 0.5
+_SAME_DISTANCE, _SAME_HEADING = 0.4, 0.5
 # A landmark so far behind a hallway's wall, m, is of the wall; the hallway is as wide as seen from keyframes so near to
 # its middle and to the stretch, m, or, where there are none, half as wide as this, m.
-_WALL, _MIDDLE, _BESIDE, _HALF, _NARROW = 0.4, 0.9, 2.0, 1.2, 0.25
+_WALL, _MIDDLE, _BESIDE, _DEFAULT_HALF_WIDTH, _NARROW = 0.4, 0.9, 2.0, 1.2, 0.25
 # A stretch without an end is this long, m.
 _FAR = 10.0
 
 # The opening of a hallway is so near to its node along another one, m, and believed in so much at least; of one that
 # is no landmark place and width are known so well, m, the width from so far into it, m.
-_SAME, _SURE, _UNSEEN, _INTO = 0.6, 0.9, (0.1, 0.2), (1.5, 6.0)
+_SAME, _MIN_EXISTENCE, _UNSEEN_DEVIATIONS, _WIDTH_INTERVAL = 0.6, 0.9, (0.1, 0.2), (1.5, 6.0)
 
 # All that is on the stretch counts, however far away.
-_EVERYTHING = replace(Places(), reach=100.0, aside=100.0)
+_UNLIMITED = replace(PlaceParameters(), reach=100.0, aside=100.0)
 
 
-class Stretch(NamedTuple):
+class HallwaySegment(NamedTuple):
     """Of a hallway, in the frame of a floor.
 
-    :ivar at: shape (2,), a place in its middle, m.
+    :ivar origin: shape (2,), a place in its middle, m.
     :ivar direction: of travel.
     :ivar begin: from there, m.
     :ivar end: likewise.
     """
 
-    at: Float64
+    origin: Float64
     direction: int
     begin: float
     end: float
 
 
-class Known(NamedTuple):
+class KnownLandmarks(NamedTuple):
     """The landmarks of a floor, each once.
 
     :ivar landmarks: as the area knows them in which they are believed in most.
@@ -76,7 +76,9 @@ class Known(NamedTuple):
     members: list[set[tuple[int, int]]]
 
 
-def known_around(areas: Mapping[int, PoseGaussian], views: Mapping[int, Sequence[Landmark]]) -> Known:
+def known_landmarks_around(
+    areas: Mapping[int, PoseGaussian], views: Mapping[int, Sequence[Landmark]]
+) -> KnownLandmarks:
     """The landmarks of some areas in one frame, such as that of a floor.
 
     :param areas: {area: the belief over its pose in the frame}.
@@ -87,9 +89,9 @@ def known_around(areas: Mapping[int, PoseGaussian], views: Mapping[int, Sequence
         for area, pose in areas.items()
         for number, landmark in enumerate(views[area])
     ]
-    known = Known([], np.empty((len(every), 3)), [])
+    known = KnownLandmarks([], np.empty((len(every), 3)), [])
     for landmark, pose, member in sorted(every, key=lambda each: (-each[0].existence.probability, each[2])):
-        same = [k for k in range(len(known.landmarks)) if _one(known, k, landmark, pose)]
+        same = [k for k in range(len(known.landmarks)) if _is_same_landmark(known, k, landmark, pose)]
         if same:
             known.members[same[0]].add(member)
         else:
@@ -99,31 +101,33 @@ def known_around(areas: Mapping[int, PoseGaussian], views: Mapping[int, Sequence
     return known._replace(poses=known.poses[: len(known.landmarks)])
 
 
-def of_stretch(
-    known: Known,
-    floor: Floor,
-    stretch: Stretch,
-    without: Collection[tuple[int, int]],
-    always: Collection[tuple[int, int]] = (),
-) -> Landmarks:
+def segment_landmarks(
+    known: KnownLandmarks,
+    floor: AlignedNeighborhood,
+    stretch: HallwaySegment,
+    excluded: Collection[tuple[int, int]],
+    always_included: Collection[tuple[int, int]] = (),
+) -> LandmarkSequence:
     """The landmarks of a stretch, as seen from its place.
 
-    :param without: landmarks (area, number) that are left out,
-    :param always: but for these, wherever they are.
+    :param excluded: landmarks (area, number) that are left out,
+    :param always_included: but for these, wherever they are.
     """
     lead = DIRECTIONS[stretch.direction]
-    frame = np.array((*stretch.at, math.atan2(lead[1], lead[0])))
+    frame = np.array((*stretch.origin, math.atan2(lead[1], lead[0])))
     local = se2.between(frame, known.poses)
     begin, end = max(stretch.begin, -_FAR), min(stretch.end, _FAR) if math.isinf(stretch.end) else stretch.end
-    walls = np.abs(local[:, 1]) <= _half(floor, stretch, begin, end) + _WALL
+    walls = np.abs(local[:, 1]) <= _half_width(floor, stretch, begin, end) + _WALL
     on = (begin <= local[:, 0]) & (local[:, 0] < end) & walls
-    on &= np.array([not own.intersection(without) for own in known.members], dtype=np.bool_)
-    on |= np.array([bool(own.intersection(always)) for own in known.members], dtype=np.bool_)
-    on &= _faced(known, local, stretch)
-    return as_seen([known.landmarks[k] for k in np.flatnonzero(on).tolist()], local[on])
+    on &= np.array([not own.intersection(excluded) for own in known.members], dtype=np.bool_)
+    on |= np.array([bool(own.intersection(always_included)) for own in known.members], dtype=np.bool_)
+    on &= _belongs_to_hallway(known, local, stretch)
+    return wall_landmark_sequence([known.landmarks[k] for k in np.flatnonzero(on).tolist()], local[on])
 
 
-def with_hallways(landmarks: Landmarks, floor: Floor, at: Float64, direction: int, sides: Sequence[int]) -> Landmarks:
+def add_hallway_openings(
+    landmarks: LandmarkSequence, floor: AlignedNeighborhood, at: Float64, direction: int, sides: Sequence[int]
+) -> LandmarkSequence:
     """The landmarks of a node with the hallways that lead on from it to the sides as openings.
 
     Those are there, whether or not many scans showed both of their jambs.
@@ -136,39 +140,45 @@ def with_hallways(landmarks: Landmarks, floor: Floor, at: Float64, direction: in
     lists = [landmarks]
     for side in sides:
         track = OPENINGS + (direction - side) % QUARTERS
-        own = (lists[0].tracks == track) & (np.abs(lists[0].along) < _SAME)
-        best = chosen(lists[0], np.flatnonzero(own)[np.argsort(-lists[0].probabilities[own], kind="stable")[:1]])
+        own = (lists[0].tracks == track) & (np.abs(lists[0].positions) < _SAME)
+        best = select_landmarks(
+            lists[0], np.flatnonzero(own)[np.argsort(-lists[0].probabilities[own], kind="stable")[:1]]
+        )
         if not len(best.tracks):
-            hallway = Stretch(at, side % QUARTERS, *_INTO)
-            best = _opening(track, 2.0 * _half(floor, hallway, *_INTO))
-        lists = [chosen(lists[0], ~own), *lists[1:], best._replace(probabilities=np.maximum(best.probabilities, _SURE))]
-    return joined(lists)
+            hallway = HallwaySegment(at, side % QUARTERS, *_WIDTH_INTERVAL)
+            best = _unseen_opening(track, 2.0 * _half_width(floor, hallway, *_WIDTH_INTERVAL))
+        lists = [
+            select_landmarks(lists[0], ~own),
+            *lists[1:],
+            best._replace(probabilities=np.maximum(best.probabilities, _MIN_EXISTENCE)),
+        ]
+    return merge_sequences(lists)
 
 
-def _opening(track: int, width: float) -> Landmarks:
+def _unseen_opening(track: int, width: float) -> LandmarkSequence:
     """An opening at a node that no scan showed as one."""
-    variances = np.array([_UNSEEN]) ** 2
-    return Landmarks(np.array([track]), np.zeros(1), np.array([width]), variances, np.zeros(1))
+    variances = np.array([_UNSEEN_DEVIATIONS]) ** 2
+    return LandmarkSequence(np.array([track]), np.zeros(1), np.array([width]), variances, np.zeros(1))
 
 
-def _one(known: Known, k: int, landmark: Landmark, pose: Float64) -> bool:
+def _is_same_landmark(known: KnownLandmarks, k: int, landmark: Landmark, pose: Float64) -> bool:
     away = known.poses[k] - pose
-    near = math.hypot(away[0], away[1]) < _TWICE and abs(float(se2.wrap(away[2]))) < _TURN
+    near = math.hypot(away[0], away[1]) < _SAME_DISTANCE and abs(float(se2.wrap(away[2]))) < _SAME_HEADING
     return near and known.landmarks[k].kind == landmark.kind
 
 
-def _half(floor: Floor, stretch: Stretch, begin: float, end: float) -> float:
+def _half_width(floor: AlignedNeighborhood, stretch: HallwaySegment, begin: float, end: float) -> float:
     """Half the width of the hallway, m: that at its narrower places, where no other one leads off."""
-    away = floor.places - stretch.at
+    away = floor.positions - stretch.origin
     side = (stretch.direction + 1) % QUARTERS
     ahead, beside = away @ DIRECTIONS[stretch.direction], away @ DIRECTIONS[side]
-    own = floor.along[:, stretch.direction % 2] & (np.abs(beside) <= _MIDDLE)
+    own = floor.in_hallway[:, stretch.direction % 2] & (np.abs(beside) <= _MIDDLE)
     own &= (begin - _BESIDE <= ahead) & (ahead <= end + _BESIDE)
-    widths = floor.clear[own, side] + floor.clear[own, (side + 2) % QUARTERS]
-    return 0.5 * float(np.nanquantile(widths, _NARROW)) if np.isfinite(widths).any() else _HALF
+    widths = floor.free_distances[own, side] + floor.free_distances[own, (side + 2) % QUARTERS]
+    return 0.5 * float(np.nanquantile(widths, _NARROW)) if np.isfinite(widths).any() else _DEFAULT_HALF_WIDTH
 
 
-def _faced(known: Known, local: Float64, stretch: Stretch) -> Bool:
+def _belongs_to_hallway(known: KnownLandmarks, local: Float64, stretch: HallwaySegment) -> Bool:
     """Which landmarks are not those of other walls: openings lead away from the hallway, and beyond where it ends
     corners look back at it.
     """
@@ -178,13 +188,13 @@ def _faced(known: Known, local: Float64, stretch: Stretch) -> Bool:
     return np.where(opening, aside * local[:, 1] > 0.0, ~(beyond & (ahead * local[:, 0] > 0.0)))
 
 
-def as_seen(landmarks: Sequence[Landmark], poses: Float64) -> Landmarks:
+def wall_landmark_sequence(landmarks: Sequence[Landmark], poses: Float64) -> LandmarkSequence:
     """Landmarks at poses in the frame of a robot that looks along the hallway."""
     opening = np.array([landmark.kind == OPENING for landmark in landmarks], dtype=np.bool_)
-    convex = np.array([landmark.kind == OUTER for landmark in landmarks], dtype=np.bool_)
+    convex = np.array([landmark.kind == CONVEX_CORNER for landmark in landmarks], dtype=np.bool_)
     covariances = np.array([landmark.pose.covariance for landmark in landmarks]).reshape(-1, 3, 3)
     existence = np.array([landmark.existence.probability for landmark in landmarks])
     widths = np.array([(landmark.width, landmark.width_deviation) for landmark in landmarks]).reshape(-1, 2)[opening]
     corners = Corners(poses[~opening], covariances[~opening], convex[~opening], existence[~opening])
     openings = Openings(poses[opening], covariances[opening], widths[:, 0], widths[:, 1], existence[opening])
-    return of_walls(observation_graph(corners, openings, 0.0, _EVERYTHING))
+    return select_wall_landmarks(observation_graph(corners, openings, 0.0, _UNLIMITED))

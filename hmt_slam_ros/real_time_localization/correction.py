@@ -15,7 +15,7 @@ Pose = NDArray[np.float64]
 _FARTHEST, _TURN = 2.0, math.radians(45.0)
 
 
-class Correction:
+class CorrectionSmoother:
     """map -> odom as it is shown, which follows what is known of it.
 
     What is left of a correction is a motion of the robot, so that far from odometry's origin a turn does not swing it
@@ -24,25 +24,25 @@ class Correction:
 
     def __init__(self) -> None:
         self._stamp = 0
-        self._shown: Pose | None = None
+        self._map_T_odom: Pose | None = None
 
-    def shown(self, stamp: int, map_T_odom: Pose, odom_T_base: Pose, time: float) -> Pose:
+    def smooth(self, stamp: int, map_T_odom: Pose, odom_T_base: Pose, time_constant: float) -> Pose:
         """``map_T_odom`` to be shown, shape (3,).
 
         :param stamp: of the odometry, ns.
         :param map_T_odom: as it is known, shape (3,).
         :param odom_T_base: shape (3,).
-        :param time: in which a correction falls to a third, s; 0 for at once.
+        :param time_constant: in which a correction falls to a third, s; 0 for at once.
         """
         seconds = 1e-9 * (stamp - self._stamp)
-        if self._shown is None or time <= 0.0 or seconds < 0.0:
-            self._shown = map_T_odom
+        if self._map_T_odom is None or time_constant <= 0.0 or seconds < 0.0:
+            self._map_T_odom = map_T_odom
         else:
             known = se2.compose(map_T_odom, odom_T_base)
-            left = se2.log(se2.between(known, se2.compose(self._shown, odom_T_base)))
+            left = se2.log(se2.between(known, se2.compose(self._map_T_odom, odom_T_base)))
             if math.hypot(left[0], left[1]) > _FARTHEST or abs(left[2]) > _TURN:
                 left = np.zeros(3)
-            base = se2.compose(known, se2.exp(math.exp(-seconds / time) * left))
-            self._shown = se2.compose(base, se2.inverse(odom_T_base))
+            base = se2.compose(known, se2.exp(math.exp(-seconds / time_constant) * left))
+            self._map_T_odom = se2.compose(base, se2.inverse(odom_T_base))
         self._stamp = stamp
-        return self._shown
+        return self._map_T_odom

@@ -15,22 +15,22 @@ from typing import NamedTuple
 import numpy as np
 
 from hmt_slam_ros.arrays import Float64, Int64
-from hmt_slam_ros.configuration.topology import TopologicalInference
+from hmt_slam_ros.configuration.topology import InferenceParameters
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.geometry.gaussian import PoseGaussian, gate, moments
+from hmt_slam_ros.geometry.gaussian import PoseGaussian, chi_square_gate, match_moments
 from hmt_slam_ros.registration import match_modes
-from hmt_slam_ros.registration.branch_and_bound import Cells, Ground, search
+from hmt_slam_ros.registration.branch_and_bound import PositionConstraint, SearchCells, search_cells
 from hmt_slam_ros.registration.likelihood_grid import AreaGrid
-from hmt_slam_ros.registration.search_bounds import Surface, Window, make_window
+from hmt_slam_ros.registration.search_bounds import LogRatioGrid, SearchWindow, make_search_window
 
 # Peaks of one cluster have passes at most this deep, nats.
-_SADDLE = 3.0
+_MAX_SADDLE_DEPTH = 3.0
 # A cell is kept where it alone could hold this share of the prior's weight.
-_NEGLIGIBLE = 1e-5
+_NEGLIGIBLE_SHARE = 1e-5
 _TURN_LIMITS = (math.radians(0.2), math.radians(2.0))
 # Share of the prior's information in what matching alone says of a direction of which it says nothing.
-_WEAK = 0.01
-_SAME_MODE = gate(0.95)
+_WEAK_PRIOR_SHARE = 0.01
+_SAME_MODE_GATE = chi_square_gate(0.95)
 # Modes this far below the best are looked at, nats: the best may lie in the place of another area.
 _MARGIN = 20.0
 
@@ -45,8 +45,8 @@ class MatchSettings:
     :ivar max_modes: at most this many modes are worked out, the heaviest; some may turn out to be the same.
     :ivar sigma_floor: smallest deviation of a mode's translation, m.
     :ivar angle_floor: smallest deviation of a mode's angle, rad.
-    :ivar reverse: whether surfaces of the candidate in what is free space to the query speak against a pose.
-    :ivar least: poses at which the samples' log-ratio is less than this on average are not looked for, nats.
+    :ivar check_reverse: whether surfaces of the candidate in what is free space to the query speak against a pose.
+    :ivar min_log_ratio: poses at which the samples' log-ratio is less than this on average are not looked for, nats.
     """
 
     temper: float = 0.1
@@ -55,16 +55,21 @@ class MatchSettings:
     max_modes: int = 8
     sigma_floor: float = 0.01
     angle_floor: float = math.radians(0.2)
-    least: float = -math.inf
-    reverse: bool = True
+    min_log_ratio: float = -math.inf
+    check_reverse: bool = True
 
     @classmethod
-    def of(cls, options: TopologicalInference) -> MatchSettings:
+    def from_options(cls, options: InferenceParameters) -> MatchSettings:
         """As configured."""
-        return cls(options.temper, gate(options.gate_probability), _MARGIN, max(cls.max_modes, 2 * options.max_modes))
+        return cls(
+            options.temper,
+            chi_square_gate(options.gate_probability),
+            _MARGIN,
+            max(cls.max_modes, 2 * options.max_modes),
+        )
 
 
-class Mode(NamedTuple):
+class MatchMode(NamedTuple):
     """One way in which the query fits into the candidate.
 
     :ivar pose: belief over ``candidate_T_query``: prior and match.
@@ -78,7 +83,7 @@ class Mode(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Match:
+class AreaMatch:
     """The fit of a query into a candidate.
 
     :ivar log_evidence: log of the integral of p(x) (p(z | x, candidate) / p(z | unknown))^temper over the gate, nats;
@@ -86,23 +91,23 @@ class Match:
     """
 
     log_evidence: float = -math.inf
-    _found: Callable[[], tuple[Mode, ...]] = tuple
+    _find_modes: Callable[[], tuple[MatchMode, ...]] = tuple
 
     # Some ask for the evidence alone.
     @cached_property
-    def modes(self) -> tuple[Mode, ...]:
+    def modes(self) -> tuple[MatchMode, ...]:
         """By falling mass."""
-        return self._found()
+        return self._find_modes()
 
 
-def match(
+def match_areas(
     query: AreaGrid,
     candidate: AreaGrid,
     prior: PoseGaussian,
     settings: MatchSettings,
     bounds: Float64 | None = None,
-    ground: Ground | None = None,
-) -> Match:
+    constraint: PositionConstraint | None = None,
+) -> AreaMatch:
     """Find all poses of the query in the candidate that the prior admits.
 
     :param query: the map of the keyframes in question, in the frame of their reference keyframe.
@@ -110,12 +115,12 @@ def match(
     :param prior: belief over ``candidate_T_query``.
     :param bounds: shape (2, 2), the smallest and the largest (x, y) in the candidate where the middle of the query's
         points may be, m; what lies beyond is not searched.
-    :param ground: where one of the query's keyframes has to be, if anywhere.
+    :param constraint: where one of the query's keyframes has to be, if anywhere.
     """
-    searched = _searched(query, candidate, prior, settings, bounds, ground)
+    searched = _search(query, candidate, prior, settings, bounds, constraint)
     if searched is None:
-        return Match()
-    return Match(float(np.logaddexp.reduce(searched.masses)), lambda: tuple(_modes(searched)))
+        return AreaMatch()
+    return AreaMatch(float(np.logaddexp.reduce(searched.masses)), lambda: tuple(_modes(searched)))
 
 
 def best_pose(
@@ -125,40 +130,42 @@ def best_pose(
 
     That costs a fraction of the mode with its covariance.
     """
-    searched = _searched(query, candidate, prior, settings)
+    searched = _search(query, candidate, prior, settings)
     if searched is None:
         return None
-    labels, totals = _clustered(searched)
+    labels, totals = _cluster(searched)
     inside = labels == totals.argmax()
-    peak = _peak(searched.problem, searched.masses[inside], searched.poses[inside])
+    peak = _find_peak(searched.problem, searched.masses[inside], searched.poses[inside])
     return se2.compose(peak, se2.inverse(searched.problem.to_middle.mean)), float(totals.max())
 
 
-def _searched(
+def _search(
     query: AreaGrid,
     candidate: AreaGrid,
     prior: PoseGaussian,
     settings: MatchSettings,
     bounds: Float64 | None = None,
-    ground: Ground | None = None,
-) -> _Searched | None:
+    ground: PositionConstraint | None = None,
+) -> _SearchResult | None:
     if not query.points.size or not candidate.points.size:
         return None
     # About the middle of the samples turns and shifts are least correlated, and the lattice of turns coarsest.
     middle = query.points.mean(axis=0)
-    to_middle = PoseGaussian.exactly(np.array([*middle, 0.0]))
-    centred = query.moved(middle)
+    to_middle = PoseGaussian.from_pose(np.array([*middle, 0.0]))
+    centred = query.shift_origin(middle)
     prior = prior.compose(to_middle)
-    turn = _turn(candidate.cell, centred.points)
-    window = make_window(prior.mean, prior.covariance, candidate.cell, turn, settings.gate, bounds)
-    surface, log_cell = _fine(candidate), _log_cell_mass(prior, candidate.cell, turn)
-    back_points = _within_reach(candidate.points[: None if settings.reverse else 0], window, centred)
-    threshold = max(math.log(_NEGLIGIBLE) - min(0.0, log_cell), settings.temper * settings.least * len(query.points))
-    cells = search(
+    turn = _turn_step(candidate.cell, centred.points)
+    window = make_search_window(prior.mean, prior.covariance, candidate.cell, turn, settings.gate, bounds)
+    surface, log_cell = _fine_grid(candidate), _log_cell_mass(prior, candidate.cell, turn)
+    back_points = _reachable_points(candidate.points[: None if settings.check_reverse else 0], window, centred)
+    threshold = max(
+        math.log(_NEGLIGIBLE_SHARE) - min(0.0, log_cell), settings.temper * settings.min_log_ratio * len(query.points)
+    )
+    cells = search_cells(
         window,
-        _coarse(candidate),
+        _coarse_grid(candidate),
         centred.points,
-        _coarse(centred),
+        _coarse_grid(centred),
         back_points,
         settings.temper,
         threshold,
@@ -167,39 +174,39 @@ def _searched(
     )
     if not cells.score.size:
         return None
-    problem = _Problem(surface, centred.points, window, prior, settings, to_middle)
-    masses, poses = match_modes.quadrature(surface, centred.points, window, cells, settings.temper)
-    return _Searched(problem, cells, masses + log_cell, poses)
+    problem = _MatchProblem(surface, centred.points, window, prior, settings, to_middle)
+    masses, poses = match_modes.integrate_cells(surface, centred.points, window, cells, settings.temper)
+    return _SearchResult(problem, cells, masses + log_cell, poses)
 
 
 @dataclass(frozen=True, eq=False)
-class _Problem:
-    surface: Surface
+class _MatchProblem:
+    surface: LogRatioGrid
     samples: Float64
-    window: Window
+    window: SearchWindow
     prior: PoseGaussian
     settings: MatchSettings
     to_middle: PoseGaussian
 
 
-class _Searched(NamedTuple):
+class _SearchResult(NamedTuple):
     """Where the query may lie: cells, the log of the mass of each, (n,), and the best pose found in it, (n, 3)."""
 
-    problem: _Problem
-    cells: Cells
+    problem: _MatchProblem
+    cells: SearchCells
     masses: Float64
     poses: Float64
 
 
-def _coarse(grid: AreaGrid) -> Surface:
-    return Surface(grid.log_ratio, grid.origin, grid.cell)
+def _coarse_grid(grid: AreaGrid) -> LogRatioGrid:
+    return LogRatioGrid(grid.log_ratio, grid.origin, grid.cell)
 
 
-def _fine(grid: AreaGrid) -> Surface:
-    return Surface(grid.fine, grid.origin, 0.5 * grid.cell)
+def _fine_grid(grid: AreaGrid) -> LogRatioGrid:
+    return LogRatioGrid(grid.fine_log_ratio, grid.origin, 0.5 * grid.cell)
 
 
-def _turn(cell: float, samples: Float64) -> float:
+def _turn_step(cell: float, samples: Float64) -> float:
     """The turn that moves nine samples of ten by less than a cell (the pixel rule of Hess et al. 2016)."""
     radius = max(cell, float(np.quantile(np.hypot(samples[:, 0], samples[:, 1]), 0.9)))
     turn = math.acos(max(-1.0, 1.0 - cell**2 / (2.0 * radius**2)))
@@ -212,7 +219,7 @@ def _log_cell_mass(prior: PoseGaussian, cell: float, turn: float) -> float:
     return math.log(cell * cell * turn) - 1.5 * math.log(2.0 * math.pi) - 0.5 * log_determinant
 
 
-def _within_reach(points: Float64, window: Window, query: AreaGrid) -> Float64:
+def _reachable_points(points: Float64, window: SearchWindow, query: AreaGrid) -> Float64:
     """The candidate's points that can meet the query's grid at a pose of the window."""
     rows, columns = query.log_ratio.shape
     corners = query.origin + query.cell * np.array([[0, 0], [columns, 0], [0, rows], [columns, rows]])
@@ -222,49 +229,49 @@ def _within_reach(points: Float64, window: Window, query: AreaGrid) -> Float64:
     return points[near]
 
 
-def _clustered(searched: _Searched) -> tuple[Int64, Float64]:
+def _cluster(searched: _SearchResult) -> tuple[Int64, Float64]:
     """The cluster of every cell, and the log of the mass of every cluster."""
-    labels = match_modes.clusters(searched.cells, _SADDLE)
+    labels = match_modes.cluster_cells(searched.cells, _MAX_SADDLE_DEPTH)
     totals = np.full(labels.max() + 1, -np.inf)
     np.logaddexp.at(totals, labels, searched.masses)
     return labels, totals
 
 
-def _modes(searched: _Searched) -> list[Mode]:
+def _modes(searched: _SearchResult) -> list[MatchMode]:
     """The modes by falling mass, coinciding ones merged."""
     problem, _, masses, poses = searched
-    labels, totals = _clustered(searched)
+    labels, totals = _cluster(searched)
     floor = totals.max() - problem.settings.margin
-    modes: list[Mode] = []
+    modes: list[MatchMode] = []
     for label in np.argsort(-totals, kind="stable")[: problem.settings.max_modes]:
         if totals[label] >= floor:
             inside = labels == label
-            _add(modes, _mode(problem, masses[inside], poses[inside]))
-    return [_carried(mode, problem.to_middle) for mode in sorted(modes, key=lambda mode: -mode.log_mass)]
+            _add_or_merge(modes, _fit_mode(problem, masses[inside], poses[inside]))
+    return [_mode_in_query_frame(mode, problem.to_middle) for mode in sorted(modes, key=lambda mode: -mode.log_mass)]
 
 
-def _add(modes: list[Mode], mode: Mode) -> None:
+def _add_or_merge(modes: list[MatchMode], mode: MatchMode) -> None:
     """Append a mode, or merge it with one that says the same; the heavier one, which is there first, keeps its mean."""
     for place, other in enumerate(modes):
-        if other.pose.mahalanobis2(mode.pose) < _SAME_MODE:
+        if other.pose.mahalanobis2(mode.pose) < _SAME_MODE_GATE:
             both = (other, mode)
-            modes[place] = Mode(
-                moments([(each.pose, each.log_mass) for each in both]),
-                moments([(each.measured, each.log_mass) for each in both]),
+            modes[place] = MatchMode(
+                match_moments([(each.pose, each.log_mass) for each in both]),
+                match_moments([(each.measured, each.log_mass) for each in both]),
                 float(np.logaddexp(other.log_mass, mode.log_mass)),
             )
             return
     modes.append(mode)
 
 
-def _mode(problem: _Problem, masses: Float64, poses: Float64) -> Mode:
+def _fit_mode(problem: _MatchProblem, masses: Float64, poses: Float64) -> MatchMode:
     """Peak, covariances and mass of a cluster of cells.
 
     The curvature at the peak gives the covariance of a sharp mode; cells that lie farther away than that explains, as
     those along a corridor do, widen it.
     """
     settings, window = problem.settings, problem.window
-    peak = _peak(problem, masses, poses)
+    peak = _find_peak(problem, masses, poses)
     span = 0.3 * window.cell
     bend = match_modes.curvature(
         problem.surface, problem.samples, peak, np.array([span, span, _radian_step(problem, span)])
@@ -272,32 +279,34 @@ def _mode(problem: _Problem, masses: Float64, poses: Float64) -> Mode:
     matched = _positive_part(settings.temper * bend)
     held = np.linalg.inv(problem.prior.covariance_at(peak))
     posterior = np.linalg.inv(matched + held)
-    spread = _spread(problem, peak, masses, poses, posterior)
+    spread = _excess_covariance(problem, peak, masses, poses, posterior)
     floor = np.diag([settings.sigma_floor**2, settings.sigma_floor**2, settings.angle_floor**2])
     peak = np.array([peak[0], peak[1], float(se2.wrap(peak[2]))])
-    return Mode(
+    return MatchMode(
         PoseGaussian(peak, posterior + spread + floor),
-        PoseGaussian(peak, np.linalg.inv(matched + _WEAK * held) + spread + floor),
+        PoseGaussian(peak, np.linalg.inv(matched + _WEAK_PRIOR_SHARE * held) + spread + floor),
         float(np.logaddexp.reduce(masses)),
     )
 
 
-def _peak(problem: _Problem, masses: Float64, poses: Float64) -> Float64:
+def _find_peak(problem: _MatchProblem, masses: Float64, poses: Float64) -> Float64:
     """Where a cluster of cells is highest."""
     window, heaviest = problem.window, poses[int(np.argmax(masses))]
     step = np.array([window.cell / 6.0, window.cell / 6.0, _radian_step(problem, window.cell / 6.0)])
-    return match_modes.climb(
+    return match_modes.climb_to_peak(
         problem.surface, problem.samples, window, problem.settings.temper, heaviest, step, 1.0 / 8.0
     )
 
 
-def _radian_step(problem: _Problem, distance: float) -> float:
+def _radian_step(problem: _MatchProblem, distance: float) -> float:
     """The angle by which the samples move by ``distance`` in the quadratic mean."""
     radius = math.sqrt(float(np.mean(np.sum(problem.samples**2, axis=1))))
     return distance / max(radius, distance)
 
 
-def _spread(problem: _Problem, peak: Float64, masses: Float64, poses: Float64, explained: Float64) -> Float64:
+def _excess_covariance(
+    problem: _MatchProblem, peak: Float64, masses: Float64, poses: Float64, explained: Float64
+) -> Float64:
     """How much wider the cells of a cluster lie around the peak than ``explained`` and the lattice account for."""
     away = se2.log(se2.between(peak, poses))
     weights = np.exp(masses - np.logaddexp.reduce(masses))
@@ -317,7 +326,7 @@ def _positive_part(matrix: Float64) -> Float64:
     return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T / np.outer(scale, scale), dtype=np.float64)
 
 
-def _carried(mode: Mode, to_middle: PoseGaussian) -> Mode:
+def _mode_in_query_frame(mode: MatchMode, to_middle: PoseGaussian) -> MatchMode:
     """The mode of the query's own frame from that of its middle."""
     back = to_middle.inverse()
-    return Mode(mode.pose.compose(back), mode.measured.compose(back), mode.log_mass)
+    return MatchMode(mode.pose.compose(back), mode.measured.compose(back), mode.log_mass)

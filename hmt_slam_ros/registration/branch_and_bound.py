@@ -17,30 +17,30 @@ from numba import njit
 from hmt_slam_ros.arrays import Bool, Float32, Float64, Int8, Int32, Int64
 from hmt_slam_ros.registration.search_bounds import (
     BLOCK,
+    LogRatioGrid,
     Pyramid,
-    Surface,
-    Window,
+    SearchWindow,
     add_block,
-    bound_of_square,
-    bounds_of_quarters,
+    build_pyramid,
     prior_bound,
-    pyramid,
+    quarter_bounds,
     sample_cells,
+    square_bound,
 )
 
 
-class Ground(NamedTuple):
+class PositionConstraint(NamedTuple):
     """Where a keyframe of the query is, one of them at least.
 
-    :ivar cells: above 0 where it may be, candidate frame.
+    :ivar allowed: above 0 where it may be, candidate frame.
     :ivar keyframes: shape (m, 2), positions of the keyframes, m, query frame; none where they may be anywhere.
     """
 
-    cells: Surface
+    allowed: LogRatioGrid
     keyframes: Float64
 
 
-class Passable(NamedTuple):
+class ConstraintPyramid(NamedTuple):
     """A ground, as a search asks for it.
 
     :ivar levels: running maxima of its cells, as of :class:`area_bounds.Pyramid`, and their ``margin``.
@@ -52,7 +52,7 @@ class Passable(NamedTuple):
     keyframes: Int32
 
 
-def ground_around(known: Float64, keyframes: Float64, radius: float, cell: float) -> Ground:
+def constrain_around(known: Float64, keyframes: Float64, radius: float, cell: float) -> PositionConstraint:
     """The ground around the positions ``known``, shape (n, 2), m.
 
     :param keyframes: shape (m, 2), m, query frame.
@@ -64,23 +64,23 @@ def ground_around(known: Float64, keyframes: Float64, radius: float, cell: float
     origin = np.floor((known.min(axis=0) - reach) / cell) * cell
     columns, rows = np.ceil((known.max(axis=0) + reach - origin) / cell).astype(np.int64) + 1
     cells = np.zeros((rows, columns), np.float32)
-    _mark(cells, (known - origin) / cell - 0.5, reach / cell)
-    return Ground(Surface(cells, origin, cell), keyframes)
+    _mark_disks(cells, (known - origin) / cell - 0.5, reach / cell)
+    return PositionConstraint(LogRatioGrid(cells, origin, cell), keyframes)
 
 
-def anywhere(cell: float) -> Ground:
+def no_constraint(cell: float) -> PositionConstraint:
     """No limits."""
-    return Ground(Surface(np.zeros((1, 1), np.float32), np.zeros(2), cell), np.zeros((0, 2)))
+    return PositionConstraint(LogRatioGrid(np.zeros((1, 1), np.float32), np.zeros(2), cell), np.zeros((0, 2)))
 
 
-def passable(ground: Ground, window: Window, height: int) -> Passable:
+def build_constraint_pyramid(ground: PositionConstraint, window: SearchWindow, height: int) -> ConstraintPyramid:
     """A ground for a search of a window down from squares of edge ``2**height``."""
-    levels = pyramid(ground.cells.log_ratio, height)
-    return Passable(levels.levels, levels.margin, sample_cells(window, ground.cells, ground.keyframes))
+    levels = build_pyramid(ground.allowed.log_ratio, height)
+    return ConstraintPyramid(levels.levels, levels.margin, sample_cells(window, ground.allowed, ground.keyframes))
 
 
 @njit(cache=True)
-def _mark(cells: Float32, known: Float64, reach: float) -> None:
+def _mark_disks(cells: Float32, known: Float64, reach: float) -> None:
     """Mark what is within ``reach`` cells of one of the positions ``known``, shape (n, 2), cells."""
     rows, columns = cells.shape
     for n in range(known.shape[0]):
@@ -91,7 +91,7 @@ def _mark(cells: Float32, known: Float64, reach: float) -> None:
 
 
 @njit(cache=True)
-def may_be(ground: Passable, height: int, k: int, i: int, j: int) -> bool:
+def is_admissible(ground: ConstraintPyramid, height: int, k: int, i: int, j: int) -> bool:
     """Whether a keyframe is on the ground at turn ``k`` somewhere in the square of shifts that begins at (i, j)."""
     level, margin, cells = ground.levels[height], ground.margin, ground.keyframes[k]
     rows, columns = np.uint32(level.shape[0]), np.uint32(level.shape[1])
@@ -102,31 +102,33 @@ def may_be(ground: Passable, height: int, k: int, i: int, j: int) -> bool:
     return cells.shape[0] == 0
 
 
-class Reverse(NamedTuple):
+class ReverseCheck(NamedTuple):
     """What is checked.
 
     :ivar grid: the query's.
     :ivar points: shape (m, 2), the candidate's surface points, m, candidate frame.
-    :ivar turned: shape (turns, m, 2), the same as the query sees them without a shift, cells of the grid.
+    :ivar rotated_points: shape (turns, m, 2), the same as the query sees them without a shift, cells of the grid.
     :ivar negative: of the grid's cells and ``reach`` beyond, whether one within ``reach`` has a log-ratio below 0.
     :ivar reach: cells by which the shifts of a block move a point from where it lies at its middle, at most, and one.
     """
 
-    grid: Surface
+    grid: LogRatioGrid
     points: Float64
-    turned: Float32
+    rotated_points: Float32
     negative: Bool
     reach: int
 
 
-def reverse_check(window: Window, grid: Surface, points: Float64) -> Reverse:
+def make_reverse_check(window: SearchWindow, grid: LogRatioGrid, points: Float64) -> ReverseCheck:
     """The reverse check of a window; the arguments are those of :func:`area_search.search`."""
     reach = math.ceil(math.sqrt(0.5) * (BLOCK - 1) * window.cell / grid.cell) + 1
-    return Reverse(grid, points, _turned(window, grid, points), _negative(grid.log_ratio, reach), reach)
+    return ReverseCheck(
+        grid, points, _rotate_points(window, grid, points), _near_negative(grid.log_ratio, reach), reach
+    )
 
 
 @njit(cache=True)
-def _turned(window: Window, grid: Surface, points: Float64) -> Float32:
+def _rotate_points(window: SearchWindow, grid: LogRatioGrid, points: Float64) -> Float32:
     turned = np.empty((window.turns.size, points.shape[0], 2), np.float32)
     for k in range(window.turns.size):
         angle = window.mean[2] + window.turns[k]
@@ -139,7 +141,7 @@ def _turned(window: Window, grid: Surface, points: Float64) -> Float32:
 
 
 @njit(cache=True)
-def _negative(log_ratio: Float32, reach: int) -> Bool:
+def _near_negative(log_ratio: Float32, reach: int) -> Bool:
     rows, columns = log_ratio.shape
     across = np.zeros((rows, columns + 2 * reach), np.bool_)
     for r in range(rows):
@@ -155,9 +157,9 @@ def _negative(log_ratio: Float32, reach: int) -> Bool:
 
 
 @njit(cache=True)
-def points_of_block(check: Reverse, window: Window, node: tuple[int, int, int], points: Float64) -> int:
+def gather_block_points(check: ReverseCheck, window: SearchWindow, node: tuple[int, int, int], points: Float64) -> int:
     """Put those that may contradict at a shift of the block that begins at ``node`` into ``points``: how many."""
-    negative, turned = check.negative, check.turned[node[0]]
+    negative, turned = check.negative, check.rotated_points[node[0]]
     angle, ratio = window.mean[2] + window.turns[node[0]], window.cell / check.grid.cell
     cos, sin = ratio * np.cos(angle), ratio * np.sin(angle)
     x, y = node[1] + 0.5 * (BLOCK - 1), node[2] + 0.5 * (BLOCK - 1)
@@ -173,7 +175,9 @@ def points_of_block(check: Reverse, window: Window, node: tuple[int, int, int], 
 
 
 @njit(cache=True)
-def contradiction(grid: Surface, window: Window, cell: tuple[int, int, int], points: Float64, least: float) -> float:
+def sum_contradictions(
+    grid: LogRatioGrid, window: SearchWindow, cell: tuple[int, int, int], points: Float64, least: float
+) -> float:
     """Sum of the negative log-ratios that points meet in the query's grid at a cell, as far as to ``least``."""
     angle = window.mean[2] + window.turns[cell[0]]
     cos, sin = np.cos(angle), np.sin(angle)
@@ -191,80 +195,80 @@ def contradiction(grid: Surface, window: Window, cell: tuple[int, int, int], poi
     return total
 
 
-_LOWEST, _HIGHEST = 2, 5  # heights of the coarsest nodes; of the lowest, the squares are blocks
+_MIN_HEIGHT, _MAX_HEIGHT = 2, 5  # heights of the coarsest nodes; of the lowest, the squares are blocks
 
 
-class Cells(NamedTuple):
+class SearchCells(NamedTuple):
     """Cells of the window, in the order in which they were found.
 
-    :ivar at: shape (n, 3), int64, (k, i, j).
+    :ivar indices: shape (n, 3), int64, (k, i, j).
     :ivar score: shape (n,), nats: tempered log-ratio plus the prior's exponent.
     :ivar contradiction: shape (n,), nats, at most 0: the part of the score that the reverse check took.
     """
 
-    at: Int64
+    indices: Int64
     score: Float64
     contradiction: Float64
 
 
-class _Task(NamedTuple):
+class _SearchProblem(NamedTuple):
     """What is searched; the members are the arguments of :func:`search`.
 
     :ivar cells: where the samples are, see :func:`sample_cells`.
     """
 
-    window: Window
-    surface: Surface
+    window: SearchWindow
+    surface: LogRatioGrid
     bounds: Pyramid
     cells: Int32
-    ground: Passable
-    reverse: Reverse
+    constraint: ConstraintPyramid
+    reverse: ReverseCheck
     temper: float
     margin: float
 
 
-def search(
-    window: Window,
-    surface: Surface,
+def search_cells(
+    window: SearchWindow,
+    surface: LogRatioGrid,
     samples: Float64,
-    back: Surface,
-    back_samples: Float64,
+    reverse_grid: LogRatioGrid,
+    reverse_samples: Float64,
     temper: float,
     threshold: float,
     margin: float,
-    ground: Ground | None = None,
-) -> Cells:
+    constraint: PositionConstraint | None = None,
+) -> SearchCells:
     """All cells of the window whose score is within ``margin`` of the best and not below ``threshold``.
 
     :param window: where to search; its cell is that of ``surface``.
     :param surface: the candidate's grid.
     :param samples: shape (n, 2), the query's surface points, m, query frame.
-    :param back: the query's grid, for the reverse check.
-    :param back_samples: shape (m, 2), the candidate's surface points, m, candidate frame.
+    :param reverse_grid: the query's grid, for the reverse check.
+    :param reverse_samples: shape (m, 2), the candidate's surface points, m, candidate frame.
     :param temper: factor on the summed log-ratios.
-    :param ground: where one of the query's keyframes has to be, if anywhere.
+    :param constraint: where one of the query's keyframes has to be, if anywhere.
     """
     if (window.first > window.last).any():
-        return Cells(np.empty((0, 3), dtype=np.int64), np.empty(0), np.empty(0))
+        return SearchCells(np.empty((0, 3), dtype=np.int64), np.empty(0), np.empty(0))
     edge = max(1, int((window.last - window.first).max()))
-    height = min(_HIGHEST, max(_LOWEST, int(np.ceil(np.log2(edge))) - 2))
-    task = _Task(
+    height = min(_MAX_HEIGHT, max(_MIN_HEIGHT, int(np.ceil(np.log2(edge))) - 2))
+    task = _SearchProblem(
         window,
         surface,
-        pyramid(surface.log_ratio, height),
+        build_pyramid(surface.log_ratio, height),
         sample_cells(window, surface, samples),
-        passable(ground or anywhere(window.cell), window, height),
-        reverse_check(window, back, back_samples),
+        build_constraint_pyramid(constraint or no_constraint(window.cell), window, height),
+        make_reverse_check(window, reverse_grid, reverse_samples),
         temper,
         margin,
     )
-    found = _search(task, height, threshold)
+    found = _search_depth_first(task, height, threshold)
     kept = found[found[:, 3] >= max(threshold, found[:, 3].max(initial=-np.inf) - margin)]
-    return Cells(kept[:, :3].astype(np.int64), kept[:, 3].copy(), kept[:, 4].copy())
+    return SearchCells(kept[:, :3].astype(np.int64), kept[:, 3].copy(), kept[:, 4].copy())
 
 
 @njit(cache=True)
-def _search(task: _Task, height: int, threshold: float) -> Float64:
+def _search_depth_first(task: _SearchProblem, height: int, threshold: float) -> Float64:
     """Depth first, best bound first: (k, i, j, score, contradiction) of cells, a superset of those wanted."""
     nodes, coarse = _coarse_nodes(task, height)
     stack, bounds = np.empty((4 * height + 8, 4), dtype=np.int64), np.empty(4 * height + 8)
@@ -289,7 +293,7 @@ def _search(task: _Task, height: int, threshold: float) -> Float64:
 
 
 @njit(cache=True)
-def _coarse_nodes(task: _Task, height: int) -> tuple[Int64, Float64]:
+def _coarse_nodes(task: _SearchProblem, height: int) -> tuple[Int64, Float64]:
     """The coarsest nodes of all turns: (k, i, j) and their bounds."""
     window, side = task.window, 2**height
     across, along = (window.last - window.first) // side + 1
@@ -300,8 +304,8 @@ def _coarse_nodes(task: _Task, height: int) -> tuple[Int64, Float64]:
         for i in range(window.first[0], window.last[0] + 1, side):
             for j in range(window.first[1], window.last[1] + 1, side):
                 prior = prior_bound(window, k, i, j, side)
-                if prior > -np.inf and may_be(task.ground, height, k, i, j):
-                    steps = bound_of_square(task.bounds.levels[height], task.bounds.margin, task.cells[k], i, j)
+                if prior > -np.inf and is_admissible(task.constraint, height, k, i, j):
+                    steps = square_bound(task.bounds.levels[height], task.bounds.margin, task.cells[k], i, j)
                     nodes[n, 0], nodes[n, 1], nodes[n, 2] = k, i, j
                     bounds[n] = task.temper * task.bounds.step * steps + prior
                     n += 1
@@ -310,18 +314,29 @@ def _coarse_nodes(task: _Task, height: int) -> tuple[Int64, Float64]:
 
 @njit(cache=True)
 def _push_quarters(
-    task: _Task, stack: Int64, bounds: Float64, size: int, node: tuple[int, int, int], height: int, least: float
+    task: _SearchProblem,
+    stack: Int64,
+    bounds: Float64,
+    size: int,
+    node: tuple[int, int, int],
+    height: int,
+    least: float,
 ) -> int:
     """Push those of a node's four squares that may matter, the most promising on top; the new stack size."""
     window, side = task.window, 2**height
     k, i, j = node
-    steps = bounds_of_quarters(task.bounds.levels[height], task.bounds.margin, task.cells[k], i, j, side)
+    steps = quarter_bounds(task.bounds.levels[height], task.bounds.margin, task.cells[k], i, j, side)
     first = size
     for down in range(2):
         for right in range(2):
             x, y = i + right * side, j + down * side
             bound = task.temper * task.bounds.step * steps[down][right]
-            if bound < least or x > window.last[0] or y > window.last[1] or not may_be(task.ground, height, k, x, y):
+            if (
+                bound < least
+                or x > window.last[0]
+                or y > window.last[1]
+                or not is_admissible(task.constraint, height, k, x, y)
+            ):
                 continue
             bound += prior_bound(window, k, x, y, side)
             if bound < least:
@@ -339,7 +354,7 @@ def _push_quarters(
 
 @njit(cache=True)
 def _take_cells(
-    task: _Task, node: tuple[int, int, int], points: Float64, found: Float64, count: int, least: float
+    task: _SearchProblem, node: tuple[int, int, int], points: Float64, found: Float64, count: int, least: float
 ) -> tuple[int, float]:
     """Append the cells of a block that reach ``least``: how many are found then, and what the next have to reach.
 
@@ -356,11 +371,13 @@ def _take_cells(
             if score < least:
                 continue
             score += prior_bound(window, k, x, y, 1)
-            if score < least or not may_be(task.ground, 0, k, x, y):
+            if score < least or not is_admissible(task.constraint, 0, k, x, y):
                 continue
             if near < 0:
-                near = points_of_block(task.reverse, window, node, points)
-            against = contradiction(task.reverse.grid, window, (k, x, y), points[:near], (least - score) / task.temper)
+                near = gather_block_points(task.reverse, window, node, points)
+            against = sum_contradictions(
+                task.reverse.grid, window, (k, x, y), points[:near], (least - score) / task.temper
+            )
             taken = task.temper * against
             score += taken
             if score >= least:

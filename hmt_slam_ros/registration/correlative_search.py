@@ -11,7 +11,7 @@ import numpy as np
 from numba import njit
 
 from hmt_slam_ros.arrays import Float64, Int64
-from hmt_slam_ros.grids.patches import PATCH, MapView, field_at, odds_at
+from hmt_slam_ros.grids.patches import PATCH, GridView, field_at, odds_at
 from hmt_slam_ros.registration.scan_to_map import BeamModel, Prior, log_prior
 
 
@@ -30,7 +30,7 @@ class Lattice(NamedTuple):
 
 @njit(cache=True)
 def correlative_search(
-    points: Float64, prior: Prior, lattice: Lattice, view: MapView, model: BeamModel, temper: float, most: int
+    points: Float64, prior: Prior, lattice: Lattice, view: GridView, model: BeamModel, temper: float, most: int
 ) -> Float64:
     """The highest peaks of tempered likelihood ratio times prior on a lattice around the prior's mean (Olson 2009).
 
@@ -52,11 +52,11 @@ def correlative_search(
                 pose[1] = prior.mean[1] + up * view.cell
                 ratio = _log_ratio_of_cells(columns, rows, right, up, view, model)
                 scores[i, j, k] = log_prior(pose, prior) + temper * ratio
-    return _peaks(scores, prior.mean, lattice, view.cell, most)
+    return _extract_peaks(scores, prior.mean, lattice, view.cell, most)
 
 
 @njit(cache=True)
-def _find_cells(points: Float64, x: float, y: float, theta: float, view: MapView, columns: Int64, rows: Int64) -> None:
+def _find_cells(points: Float64, x: float, y: float, theta: float, view: GridView, columns: Int64, rows: Int64) -> None:
     """Write the columns and rows, each (n,), of the points at the pose (x, y, theta)."""
     cos, sin = np.cos(theta) / view.cell, np.sin(theta) / view.cell
     half = 0.5 * view.table.shape[0] * PATCH
@@ -66,7 +66,7 @@ def _find_cells(points: Float64, x: float, y: float, theta: float, view: MapView
 
 
 @njit(cache=True)
-def _log_ratio_of_cells(columns: Int64, rows: Int64, right: int, up: int, view: MapView, model: BeamModel) -> float:
+def _log_ratio_of_cells(columns: Int64, rows: Int64, right: int, up: int, view: GridView, model: BeamModel) -> float:
     """Sum of the log-likelihood ratios of end points in these cells, all shifted, nats."""
     total = 0.0
     for n in range(columns.size):
@@ -79,7 +79,7 @@ def _log_ratio_of_cells(columns: Int64, rows: Int64, right: int, up: int, view: 
 
 
 @njit(cache=True)
-def _peaks(scores: Float64, centre: Float64, lattice: Lattice, cell: float, most: int) -> Float64:
+def _extract_peaks(scores: Float64, centre: Float64, lattice: Lattice, cell: float, most: int) -> Float64:
     """The poses (k, 3) of the highest scores, each at least three steps from those before it; empties ``scores``."""
     found = np.empty((most, 3))
     counts, apart = lattice.counts, lattice.stride * cell

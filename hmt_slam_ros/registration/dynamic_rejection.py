@@ -12,32 +12,34 @@ import numpy as np
 from numba import njit
 
 from hmt_slam_ros.arrays import Bool, Float64, Int64
-from hmt_slam_ros.geometry.gaussian import gate
+from hmt_slam_ros.geometry.gaussian import chi_square_gate
 from hmt_slam_ros.geometry.symmetric import (
     Symmetric,
     Vector,
+    add_scaled,
     dot,
-    into_array,
     inverse,
-    of_array,
-    sandwiched,
-    solved,
-    times,
-    total,
+    multiply,
+    sandwich,
+    solve,
+    symmetric_from_array,
+    write_to_array,
 )
-from hmt_slam_ros.grids.patches import MapView
-from hmt_slam_ros.registration.scan_to_map import Alignment, Prior, linearise
+from hmt_slam_ros.grids.patches import GridView
+from hmt_slam_ros.registration.scan_to_map import AlignmentSettings, Prior, linearize
 
 # Neighbouring points farther apart than this, in m and as a share of the range, lie on different things.
-_APART, _APART_SHARE = 0.1, 0.05
+_GAP, _GAP_SHARE = 0.1, 0.05
 # Share of the things that stand still which are matched.
-_GATE = gate(0.999)
+_GATE = chi_square_gate(0.999)
 # Of the covariance of what a thing tells, which is 0 in some directions, this share is added to its diagonal.
 _RIDGE = 1e-9
 
 
 @njit(cache=True)
-def standing(points: Float64, pose: Float64, prior: Prior, view: MapView, settings: Alignment) -> Float64:
+def reject_dynamic(
+    points: Float64, pose: Float64, prior: Prior, view: GridView, settings: AlignmentSettings
+) -> Float64:
     """The surfels (k, 4) of those given (n, 4) that lie on nothing that has moved since it entered the map.
 
     A thing tells at a pose the information L and the gradient g. If a pose off by N(m, C) is what all else tells,
@@ -47,12 +49,12 @@ def standing(points: Float64, pose: Float64, prior: Prior, view: MapView, settin
     :param points: in the order of the beams.
     :param pose: shape (3,), ``map_T_base``, where things meet the map: the prior's mean, or where a match ended.
     """
-    begins = _things(points)
-    predicted = _off(prior.mean, pose)
-    informations, gradients, suspected = _told(points, begins, pose, predicted, prior, view, settings)
+    begins = _segment_starts(points)
+    predicted = _pose_difference(prior.mean, pose)
+    informations, gradients, suspected = _segment_equations(points, begins, pose, predicted, prior, view, settings)
     if not suspected.any():
         return points
-    moved = _moved(np.nonzero(suspected)[0], informations, gradients, predicted, prior.information)
+    moved = _dynamic_segments(np.nonzero(suspected)[0], informations, gradients, predicted, prior.information)
     kept = np.ones(points.shape[0], np.bool_)
     for k in np.nonzero(moved)[0]:
         kept[begins[k] : begins[k + 1]] = False
@@ -60,12 +62,12 @@ def standing(points: Float64, pose: Float64, prior: Prior, view: MapView, settin
 
 
 @njit(cache=True)
-def _things(points: Float64) -> Int64:
+def _segment_starts(points: Float64) -> Int64:
     """The first point of each of k things, and behind them the number of points, (k + 1,)."""
     begins, count = np.zeros(points.shape[0] + 1, dtype=np.int64), min(1, points.shape[0])
     for n in range(1, points.shape[0]):
         step = np.hypot(points[n, 0] - points[n - 1, 0], points[n, 1] - points[n - 1, 1])
-        if step > _APART + _APART_SHARE * np.hypot(points[n, 0], points[n, 1]):
+        if step > _GAP + _GAP_SHARE * np.hypot(points[n, 0], points[n, 1]):
             begins[count] = n
             count += 1
     begins[count] = points.shape[0]
@@ -73,14 +75,14 @@ def _things(points: Float64) -> Int64:
 
 
 @njit(cache=True)
-def _told(
+def _segment_equations(
     points: Float64,
     begins: Int64,
     pose: Float64,
     predicted: Vector,
     prior: Prior,
-    view: MapView,
-    settings: Alignment,
+    view: GridView,
+    settings: AlignmentSettings,
 ) -> tuple[Float64, Float64, Bool]:
     """What each thing tells: information (k, 3, 3), gradient (k, 3), and whether it contradicts the prior (k,).
 
@@ -88,66 +90,70 @@ def _told(
     """
     count = begins.size - 1
     informations, gradients, contradicts = np.empty((count, 3, 3)), np.empty((count, 3)), np.zeros(count, np.bool_)
-    plain = Alignment(settings.sigma * np.sqrt(settings.inflation), np.inf, 1.0, 1)
-    covariance = inverse(of_array(prior.information))
+    plain = AlignmentSettings(settings.sigma * np.sqrt(settings.inflation), np.inf, 1.0, 1)
+    covariance = inverse(symmetric_from_array(prior.information))
     there = predicted[0] == 0.0 and predicted[1] == 0.0 and predicted[2] == 0.0
     for k in range(count):
         own = points[begins[k] : begins[k + 1]]
-        information, gradient, square = linearise(own, pose[0], pose[1], pose[2], view, plain)
+        information, gradient, square = linearize(own, pose[0], pose[1], pose[2], view, plain)
         # At its mean, no chi-square exceeds that of a prior that is certain.
         if square > _GATE or not there:
-            contradicts[k] = _surprise(information, gradient, covariance, predicted) > _GATE
-        into_array(information, informations[k])
+            contradicts[k] = _chi_square(information, gradient, covariance, predicted) > _GATE
+        write_to_array(information, informations[k])
         gradients[k, 0], gradients[k, 1], gradients[k, 2] = gradient
     return informations, gradients, contradicts
 
 
 @njit(cache=True)
-def _surprise(information: Symmetric, gradient: Vector, covariance: Symmetric, shift: Vector) -> float:
+def _chi_square(information: Symmetric, gradient: Vector, covariance: Symmetric, shift: Vector) -> float:
     """Chi-square of what a thing tells, where all else tells that the pose is off by ``shift``."""
-    expected = total(sandwiched(information, covariance), information, 1.0)
+    expected = add_scaled(sandwich(information, covariance), information, 1.0)
     ridge = _RIDGE * (1.0 + expected.xx + expected.yy + expected.tt)
-    expected = total(expected, Symmetric(1.0, 0.0, 0.0, 1.0, 0.0, 1.0), ridge)
-    told = _sum(gradient, times(information, shift), 1.0)
-    return dot(told, solved(expected, told))
+    expected = add_scaled(expected, Symmetric(1.0, 0.0, 0.0, 1.0, 0.0, 1.0), ridge)
+    told = _add_scaled_vector(gradient, multiply(information, shift), 1.0)
+    return dot(told, solve(expected, told))
 
 
 @njit(cache=True)
-def _sum(a: Vector, b: Vector, factor: float) -> Vector:
+def _add_scaled_vector(a: Vector, b: Vector, factor: float) -> Vector:
     """a + factor b."""
     return a[0] + factor * b[0], a[1] + factor * b[1], a[2] + factor * b[2]
 
 
 @njit(cache=True)
-def _moved(suspects: Int64, informations: Float64, gradients: Float64, predicted: Vector, prior: Float64) -> Bool:
+def _dynamic_segments(
+    suspects: Int64, informations: Float64, gradients: Float64, predicted: Vector, prior: Float64
+) -> Bool:
     """Those of the suspects that contradict all that is not among them, (k,).
 
     :param predicted: the prediction, seen from the pose; ``prior``, its information.
     """
     moved = np.zeros(gradients.shape[0], np.bool_)
-    information = of_array(prior)
-    gradient = _sum((0.0, 0.0, 0.0), times(information, predicted), -1.0)
+    information = symmetric_from_array(prior)
+    gradient = _add_scaled_vector((0.0, 0.0, 0.0), multiply(information, predicted), -1.0)
     for k in range(gradients.shape[0]):
-        information = total(information, of_array(informations[k]), 1.0)
-        gradient = _sum(gradient, _row(gradients, k), 1.0)
+        information = add_scaled(information, symmetric_from_array(informations[k]), 1.0)
+        gradient = _add_scaled_vector(gradient, _row(gradients, k), 1.0)
     while True:
         worst, largest = -1, _GATE
         for k in suspects:
             if not moved[k]:
-                own, told = of_array(informations[k]), _row(gradients, k)
-                covariance = inverse(total(information, own, -1.0))
-                surprise = _surprise(own, told, covariance, times(covariance, _sum(told, gradient, -1.0)))
+                own, told = symmetric_from_array(informations[k]), _row(gradients, k)
+                covariance = inverse(add_scaled(information, own, -1.0))
+                surprise = _chi_square(
+                    own, told, covariance, multiply(covariance, _add_scaled_vector(told, gradient, -1.0))
+                )
                 if surprise > largest:
                     worst, largest = k, surprise
         if worst < 0:
             return moved
         moved[worst] = True
-        information = total(information, of_array(informations[worst]), -1.0)
-        gradient = _sum(gradient, _row(gradients, worst), -1.0)
+        information = add_scaled(information, symmetric_from_array(informations[worst]), -1.0)
+        gradient = _add_scaled_vector(gradient, _row(gradients, worst), -1.0)
 
 
 @njit(cache=True)
-def _off(mean: Float64, pose: Float64) -> Vector:
+def _pose_difference(mean: Float64, pose: Float64) -> Vector:
     turn = (mean[2] - pose[2] + np.pi) % (2.0 * np.pi) - np.pi
     return mean[0] - pose[0], mean[1] - pose[1], turn
 

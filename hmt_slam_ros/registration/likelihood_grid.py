@@ -17,11 +17,11 @@ from hmt_slam_ros.sensors import Scan
 Points = NDArray[np.float64]
 
 # Neighbouring end points of one scan at most this far apart (m) lie on one surface, which is filled in between them.
-_JOIN = 0.3
+_MAX_GAP = 0.3
 # Log-ratio above which a sample is on a known surface, and below which in free space: 0.25 m from a surface and more.
-_ON, _OFF = 0.3, -0.5
+_ON_SURFACE, _IN_FREE_SPACE = 0.3, -0.5
 # Half cells from a sample to the free space on every side of it, where it is said to be in free space.
-_BESIDE = 3
+_MARGIN = 3
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class GridModel:
     spacing: float = 0.2
 
     @classmethod
-    def of(cls, configuration: Configuration) -> GridModel:
+    def from_configuration(cls, configuration: Configuration) -> GridModel:
         """As configured."""
         options = configuration.tsbi
         return cls(
@@ -69,7 +69,7 @@ class AreaGrid:
     :ivar cell: edge of a cell, m.
     :ivar log_ratio: shape (rows, columns), float32, indexed [y, x]: log p(z | map) / p(z | unknown) of a surface
         measured in the cell; above 0 near a surface, below 0 in free space, 0 where nothing is known.
-    :ivar fine: shape (2 rows, 2 columns), float32, the same at the centres of cells half as long; smooth enough to be
+    :ivar fine_log_ratio: shape (2 rows, 2 columns), float32, the same at the centres of cells half as long; smooth enough to be
         interpolated, and ``log_ratio`` is the mean of four.
     :ivar free: shape (rows, columns), whether a beam passed through the cell.
     :ivar points: shape (n, 2), one surface point a voxel, m, area frame: samples far enough apart to count as
@@ -79,26 +79,26 @@ class AreaGrid:
     origin: Points
     cell: float
     log_ratio: NDArray[np.float32]
-    fine: NDArray[np.float32]
+    fine_log_ratio: NDArray[np.float32]
     free: NDArray[np.bool_]
     points: Points
 
     @property
     def nbytes(self) -> int:
         """Memory that the grid takes."""
-        return self.log_ratio.nbytes + self.fine.nbytes + self.free.nbytes + self.points.nbytes
+        return self.log_ratio.nbytes + self.fine_log_ratio.nbytes + self.free.nbytes + self.points.nbytes
 
-    def moved(self, shift: Points) -> AreaGrid:
+    def shift_origin(self, shift: Points) -> AreaGrid:
         """The same grid in a frame whose origin lies at ``shift``, shape (2,), of this one and is not turned."""
         return replace(self, origin=self.origin - shift, points=self.points - shift)
 
-    def agreement(self, points: Points, pose: NDArray[np.float64]) -> Agreement:
+    def compare(self, points: Points, pose: NDArray[np.float64]) -> Agreement:
         """How surface samples of another map lie in this one.
 
         :param points: shape (n, 2), m.
         :param pose: ``grid_T_points``, shape (3,).
         """
-        on, free = _agreeing(se2.transform(pose, points), self.fine, self.origin, 0.5 * self.cell)
+        on, free = _count_agreement(se2.transform(pose, points), self.fine_log_ratio, self.origin, 0.5 * self.cell)
         return Agreement(len(points), on, free)
 
 
@@ -110,7 +110,7 @@ def build_area_grid(scans: Sequence[Scan], poses: NDArray[np.float64], model: Gr
     """
     hits, lasers, of = _end_points(scans, poses, model.max_range)
     if not len(hits):
-        return _blank(model.cell)
+        return _empty_grid(model.cell)
     reach = 5.0 * model.sigma
     everything = np.concatenate((hits, lasers))
     # The corner is a multiple of the cell, so that grids of one area agree on where cells lie.
@@ -119,17 +119,17 @@ def build_area_grid(scans: Sequence[Scan], poses: NDArray[np.float64], model: Gr
     free = np.zeros((rows, columns), dtype=np.bool_)
     _mark_free(free, origin, model.cell, lasers, hits)
     fine = np.full((2 * rows, 2 * columns), np.inf, dtype=np.float32)
-    _lower_distances(fine, origin, 0.5 * model.cell, _joined(hits, of, 0.5 * model.cell), reach)
-    _into_log_ratio(fine, free, model.sigma, model.surface_ratio, model.free_ratio)
-    return AreaGrid(origin, model.cell, _halved(fine), fine, free, thinned(hits, model.spacing))
+    _lower_distances(fine, origin, 0.5 * model.cell, _fill_gaps(hits, of, 0.5 * model.cell), reach)
+    _convert_to_log_ratio(fine, free, model.sigma, model.surface_ratio, model.free_ratio)
+    return AreaGrid(origin, model.cell, _downsample(fine), fine, free, thin_points(hits, model.spacing))
 
 
 def surface_points(scan: Scan, model: GridModel) -> Points:
     """The surface points of one scan, one a voxel, m, base frame, shape (n, 2)."""
-    return thinned(_end_points([scan], np.zeros((1, 3)), model.max_range)[0], model.spacing)
+    return thin_points(_end_points([scan], np.zeros((1, 3)), model.max_range)[0], model.spacing)
 
 
-def _blank(cell: float) -> AreaGrid:
+def _empty_grid(cell: float) -> AreaGrid:
     nothing = np.zeros((2, 2), dtype=np.float32)
     return AreaGrid(np.zeros(2), cell, nothing[:1, :1], nothing, np.zeros((1, 1), np.bool_), np.zeros((0, 2)))
 
@@ -148,7 +148,7 @@ def _end_points(
     return se2.transform(poses[of], points[near]), se2.transform(poses[of], origins[near]), of
 
 
-def thinned(points: Points, spacing: float) -> Points:
+def thin_points(points: Points, spacing: float) -> Points:
     """The mean point of every occupied voxel, shape (n, 2), ordered by voxel."""
     if not len(points):
         return points
@@ -160,12 +160,12 @@ def thinned(points: Points, spacing: float) -> Points:
 
 
 @njit(cache=True)
-def _joined(points: Points, of: NDArray[np.int64], step: float) -> Points:
+def _fill_gaps(points: Points, of: NDArray[np.int64], step: float) -> Points:
     """Points in the order of the beams, with the gaps along the surfaces of each scan filled."""
     counts = np.ones(points.shape[0], np.int64)
     for k in range(points.shape[0] - 1):
         length = np.hypot(points[k + 1, 0] - points[k, 0], points[k + 1, 1] - points[k, 1])
-        if of[k] == of[k + 1] and length <= _JOIN:
+        if of[k] == of[k + 1] and length <= _MAX_GAP:
             counts[k] = int(np.ceil(length / step))
     joined = np.empty((counts.sum(), 2))
     place = 0
@@ -179,7 +179,7 @@ def _joined(points: Points, of: NDArray[np.int64], step: float) -> Points:
 
 
 @njit(cache=True)
-def _into_log_ratio(
+def _convert_to_log_ratio(
     fine: NDArray[np.float32], free: NDArray[np.bool_], sigma: float, surface_ratio: float, free_ratio: float
 ) -> None:
     """From squared distances, for cells half as long as those of ``free``: a blend from the surface to what is beside.
@@ -202,7 +202,7 @@ def _into_log_ratio(
 
 
 @njit(cache=True)
-def _halved(fine: NDArray[np.float32]) -> NDArray[np.float32]:
+def _downsample(fine: NDArray[np.float32]) -> NDArray[np.float32]:
     """The means of squares of four cells, in a tenth of numpy's time."""
     coarse = np.empty((fine.shape[0] // 2, fine.shape[1] // 2), np.float32)
     for r in range(coarse.shape[0]):
@@ -248,18 +248,18 @@ def _lower_distances(distance2: NDArray[np.float32], origin: Points, cell: float
 
 
 @njit(cache=True)
-def _agreeing(points: Points, fine: NDArray[np.float32], origin: Points, cell: float) -> tuple[int, int]:
+def _count_agreement(points: Points, fine: NDArray[np.float32], origin: Points, cell: float) -> tuple[int, int]:
     on, free = 0, 0
     for n in range(points.shape[0]):
         column, row = int(np.floor((points[n, 0] - origin[0]) / cell)), int(np.floor((points[n, 1] - origin[1]) / cell))
-        if _BESIDE <= column < fine.shape[1] - _BESIDE and _BESIDE <= row < fine.shape[0] - _BESIDE:
-            on += fine[row, column] > _ON
-            free += fine[row, column] < _OFF and _free_around(fine, row, column)
+        if _MARGIN <= column < fine.shape[1] - _MARGIN and _MARGIN <= row < fine.shape[0] - _MARGIN:
+            on += fine[row, column] > _ON_SURFACE
+            free += fine[row, column] < _IN_FREE_SPACE and _free_around(fine, row, column)
     return on, free
 
 
 @njit(cache=True)
 def _free_around(fine: NDArray[np.float32], row: int, column: int) -> bool:
     """Whether it is free to all sides: along the edge of what a beam passed there may be a wall that it grazed."""
-    across = max(fine[row, column - _BESIDE], fine[row, column + _BESIDE])
-    return bool(max(across, fine[row - _BESIDE, column], fine[row + _BESIDE, column]) < _OFF)
+    across = max(fine[row, column - _MARGIN], fine[row, column + _MARGIN])
+    return bool(max(across, fine[row - _MARGIN, column], fine[row + _MARGIN, column]) < _IN_FREE_SPACE)

@@ -24,9 +24,9 @@ import numpy as np
 from numba import njit
 
 from hmt_slam_ros.arrays import Float64
-from hmt_slam_ros.geometry.covariance import inverse, turned
-from hmt_slam_ros.grids.patches import MapView
-from hmt_slam_ros.registration.scan_to_map import Alignment, linearise
+from hmt_slam_ros.geometry.covariance import inverse, rotate_covariance
+from hmt_slam_ros.grids.patches import GridView
+from hmt_slam_ros.registration.scan_to_map import AlignmentSettings, linearize
 
 # Neighbouring beams in a block: what is wrong with one is wrong with all.
 _BLOCK = 16
@@ -35,36 +35,36 @@ _BLOCK = 16
 class MatchNoise(NamedTuple):
     """What the errors of matches are taken to be.
 
-    :ivar beams: a, the part of the information that is noise of single beams.
-    :ivar blocks: b, the weight of what blocks of beams show.
-    :ivar age: m, of the map that a keyframe is matched against, in keyframes.
+    :ivar beam_noise: a, the part of the information that is noise of single beams.
+    :ivar block_noise: b, the weight of what blocks of beams show.
+    :ivar map_age: m, of the map that a keyframe is matched against, in keyframes.
     """
 
-    beams: float
-    blocks: float
-    age: float
+    beam_noise: float
+    block_noise: float
+    map_age: float
 
 
 class MatchError(NamedTuple):
     """Covariances (3, 3) of a matched step, in the frame of its end.
 
-    :ivar matched: of the pose in the map.
-    :ivar lasting: of what the pose adds to the drift of all poses after it.
+    :ivar pose_covariance: of the pose in the map.
+    :ivar drift_covariance: of what the pose adds to the drift of all poses after it.
     :ivar gain: A, how much of the pose the match determines.
     """
 
-    matched: Float64
-    lasting: Float64
+    pose_covariance: Float64
+    drift_covariance: Float64
     gain: Float64
 
 
-def match_error(
+def estimate_match_error(
     points: Float64,
     pose: Float64,
     hessian: Float64,
     prior: Float64,
-    view: MapView,
-    settings: Alignment,
+    view: GridView,
+    settings: AlignmentSettings,
     noise: MatchNoise,
 ) -> MatchError:
     """The error of the pose to which points were aligned.
@@ -77,20 +77,20 @@ def match_error(
     # All in the frame of the pose.
     share, scatter = 1.0 / settings.inflation, np.zeros((3, 3))
     _add_scatter(points, pose, view, settings, scatter)
-    prior, hessian, scatter = (turned(matrix, -pose[2]) for matrix in (prior, hessian, scatter))
+    prior, hessian, scatter = (rotate_covariance(matrix, -pose[2]) for matrix in (prior, hessian, scatter))
     spread = inverse(prior + share * hessian)
-    pulled = share * share * (noise.beams * hessian + noise.blocks * scatter)
+    pulled = share * share * (noise.beam_noise * hessian + noise.block_noise * scatter)
     matched = spread @ (prior + pulled) @ spread
     gain = spread @ (share * hessian)
-    lasts = np.linalg.inv(np.eye(3) + (noise.age - 1.0) * gain)
+    lasts = np.linalg.inv(np.eye(3) + (noise.map_age - 1.0) * gain)
     return MatchError(matched, lasts @ matched @ lasts.T, gain)
 
 
 @njit(cache=True)
-def _add_scatter(points: Float64, pose: Float64, view: MapView, settings: Alignment, scatter: Float64) -> None:
+def _add_scatter(points: Float64, pose: Float64, view: GridView, settings: AlignmentSettings, scatter: Float64) -> None:
     """Add J, the sum over blocks of beams of g g^T, map coordinates, to ``scatter`` (3, 3)."""
     for begin in range(0, points.shape[0], _BLOCK):
-        _, g, _ = linearise(points[begin : begin + _BLOCK], pose[0], pose[1], pose[2], view, settings)
+        _, g, _ = linearize(points[begin : begin + _BLOCK], pose[0], pose[1], pose[2], view, settings)
         for i in range(3):
             for j in range(3):
                 scatter[i, j] += g[i] * g[j]

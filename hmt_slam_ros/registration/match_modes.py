@@ -8,24 +8,24 @@ import numpy as np
 from numba import njit
 
 from hmt_slam_ros.arrays import Float64, Int32, Int64
-from hmt_slam_ros.registration.branch_and_bound import Cells
-from hmt_slam_ros.registration.search_bounds import Surface, Window
+from hmt_slam_ros.registration.branch_and_bound import SearchCells
+from hmt_slam_ros.registration.search_bounds import LogRatioGrid, SearchWindow
 
 # Of a search's cells, at most this many are divided for the quadrature; the others count with their centre alone.
 _DIVIDED = 400
 
 
-def clusters(cells: Cells, saddle: float) -> Int64:
+def cluster_cells(cells: SearchCells, saddle: float) -> Int64:
     """The cluster of every cell, shape (n,), numbered from 0 by falling height of the peaks.
 
     Two peaks stay apart where the lower one rises by more than ``saddle`` nats above the pass between them.
     """
     order = np.argsort(-cells.score, kind="stable")
-    at = cells.at - cells.at.min(axis=0) + 1
+    at = cells.indices - cells.indices.min(axis=0) + 1
     sides = at.max(axis=0) + 2
     keys = (at[:, 0] * sides[1] + at[:, 1]) * sides[2] + at[:, 2]
     by_key = np.argsort(keys, kind="stable")
-    peaks = _flood(order, by_key, keys[by_key], sides, cells.score, saddle)
+    peaks = _flood_from_peaks(order, by_key, keys[by_key], sides, cells.score, saddle)
     rank = np.empty_like(order)
     rank[order] = np.arange(order.size)
     is_peak = np.zeros(order.size, dtype=np.bool_)
@@ -35,7 +35,7 @@ def clusters(cells: Cells, saddle: float) -> Int64:
 
 
 @njit(cache=True)
-def _flood(order: Int64, by_key: Int64, keys: Int64, sides: Int64, score: Float64, saddle: float) -> Int64:
+def _flood_from_peaks(order: Int64, by_key: Int64, keys: Int64, sides: Int64, score: Float64, saddle: float) -> Int64:
     """Flood from the top: the peak (a cell) that every cell belongs to.
 
     :param keys: ascending, of the cells ``by_key``.
@@ -48,9 +48,9 @@ def _flood(order: Int64, by_key: Int64, keys: Int64, sides: Int64, score: Float6
         for row in range(9):
             for place in range(rows[rank[cell], row, 0], rows[rank[cell], row, 1]):
                 if above[by_key[place]] >= 0:
-                    _join(above, cell, by_key[place], score, saddle)
+                    _merge_peaks(above, cell, by_key[place], score, saddle)
     for cell in order:
-        above[cell] = _peak(above, cell)
+        above[cell] = _peak_of(above, cell)
     return above
 
 
@@ -71,7 +71,7 @@ def _rows_around(keys: Int64, sides: Int64) -> Int32:
 
 
 @njit(cache=True)
-def _peak(above: Int64, cell: int) -> int:
+def _peak_of(above: Int64, cell: int) -> int:
     while above[cell] != cell:
         above[cell] = above[above[cell]]
         cell = above[cell]
@@ -79,16 +79,16 @@ def _peak(above: Int64, cell: int) -> int:
 
 
 @njit(cache=True)
-def _join(above: Int64, cell: int, other: int, score: Float64, saddle: float) -> None:
+def _merge_peaks(above: Int64, cell: int, other: int, score: Float64, saddle: float) -> None:
     """Give the lower of two peaks that meet at ``cell`` to the higher, unless it stands out."""
-    a, b = _peak(above, cell), _peak(above, other)
+    a, b = _peak_of(above, cell), _peak_of(above, other)
     if score[a] < score[b] or (score[a] == score[b] and a > b):
         a, b = b, a
     if a != b and score[b] - score[cell] <= saddle:
         above[b] = a
 
 
-class _Points(NamedTuple):
+class _GridSamples(NamedTuple):
     """Samples, and where they lie in a grid of cells (n,).
 
     :ivar x: shape (n,), m, as ``y``.
@@ -105,9 +105,9 @@ class _Points(NamedTuple):
 
 
 @njit(cache=True)
-def _points(samples: Float64) -> _Points:
+def _grid_samples(samples: Float64) -> _GridSamples:
     n = samples.shape[0]
-    return _Points(
+    return _GridSamples(
         samples[:, 0].copy(),
         samples[:, 1].copy(),
         np.empty(n, np.int32),
@@ -118,17 +118,17 @@ def _points(samples: Float64) -> _Points:
 
 
 @njit(cache=True)
-def log_ratio_at(surface: Surface, samples: Float64, pose: Float64) -> float:
+def log_ratio_at(surface: LogRatioGrid, samples: Float64, pose: Float64) -> float:
     """Sum over the samples of the bilinearly interpolated log-ratio, nats, untempered.
 
     :param samples: shape (n, 2), m, query frame.
     :param pose: shape (3,), ``candidate_T_query``.
     """
-    return _log_ratio_at(surface, _points(samples), pose)
+    return _log_ratio_at(surface, _grid_samples(samples), pose)
 
 
 @njit(cache=True)
-def _log_ratio_at(surface: Surface, points: _Points, pose: Float64) -> float:
+def _log_ratio_at(surface: LogRatioGrid, points: _GridSamples, pose: Float64) -> float:
     """In two loops, as the compiler takes several samples at once in the first."""
     cos, sin = np.cos(pose[2]), np.sin(pose[2])
     x0, y0 = pose[0] - surface.origin[0], pose[1] - surface.origin[1]
@@ -151,7 +151,7 @@ def _log_ratio_at(surface: Surface, points: _Points, pose: Float64) -> float:
 
 
 @njit(cache=True)
-def _score_at(surface: Surface, points: _Points, window: Window, temper: float, pose: Float64) -> float:
+def _score_at(surface: LogRatioGrid, points: _GridSamples, window: SearchWindow, temper: float, pose: Float64) -> float:
     """Tempered log-ratio plus the prior's exponent, without the reverse check."""
     dx, dy = pose[0] - window.mean[0], pose[1] - window.mean[1]
     turn = pose[2] - window.mean[2]
@@ -161,50 +161,62 @@ def _score_at(surface: Surface, points: _Points, window: Window, temper: float, 
     twist = np.array((half_cot * x + 0.5 * turn * y, half_cot * y - 0.5 * turn * x, turn))
     exponent = 0.0
     for r in range(3):
-        exponent += (window.root[r, 0] * twist[0] + window.root[r, 1] * twist[1] + window.root[r, 2] * twist[2]) ** 2
+        exponent += (
+            window.information_root[r, 0] * twist[0]
+            + window.information_root[r, 1] * twist[1]
+            + window.information_root[r, 2] * twist[2]
+        ) ** 2
     return temper * _log_ratio_at(surface, points, pose) - 0.5 * exponent
 
 
-def quadrature(
-    surface: Surface, samples: Float64, window: Window, cells: Cells, temper: float
+def integrate_cells(
+    surface: LogRatioGrid, samples: Float64, window: SearchWindow, cells: SearchCells, temper: float
 ) -> tuple[Float64, Float64]:
     """log of the mean of exp(score) over every cell, shape (n,), and the best pose found in it, shape (n, 3).
 
     The cells are divided as finely as the narrower of prior and likelihood asks for.
     """
-    widths = 1.0 / np.linalg.norm(window.root, axis=0)  # conditional deviations of the prior
-    divisions = np.array([_odd(window.cell / widths[:2].min()), _odd(_step(window) / widths[2])])
+    widths = 1.0 / np.linalg.norm(window.information_root, axis=0)  # conditional deviations of the prior
+    divisions = np.array(
+        [_division_count(window.cell / widths[:2].min()), _division_count(_turn_step(window) / widths[2])]
+    )
     order = np.argsort(-cells.score, kind="stable")
-    means, poses = cells.score.copy(), _centres(window, cells)
+    means, poses = cells.score.copy(), _cell_centers(window, cells)
     inside = order[:_DIVIDED]
-    fine = _divide(surface, samples, window, temper, poses[inside], divisions, _step(window))
+    fine = _integrate_divided(surface, samples, window, temper, poses[inside], divisions, _turn_step(window))
     means[inside], poses[inside] = fine[0] + cells.contradiction[inside], fine[1]
     return means, poses
 
 
-def _step(window: Window) -> float:
+def _turn_step(window: SearchWindow) -> float:
     return float(window.turns[1] - window.turns[0]) if window.turns.size > 1 else 0.0
 
 
-def _odd(ratio: float) -> int:
+def _division_count(ratio: float) -> int:
     """3, 5 or 7 divisions, so that a step is at most 1.5 of the prior's deviations where that is possible."""
     return 3 if ratio <= 4.5 else (5 if ratio <= 7.5 else 7)
 
 
-def _centres(window: Window, cells: Cells) -> Float64:
+def _cell_centers(window: SearchWindow, cells: SearchCells) -> Float64:
     poses = np.empty((cells.score.size, 3))
-    poses[:, :2] = window.mean[:2] + cells.at[:, 1:] * window.cell
-    poses[:, 2] = window.mean[2] + window.turns[cells.at[:, 0]]
+    poses[:, :2] = window.mean[:2] + cells.indices[:, 1:] * window.cell
+    poses[:, 2] = window.mean[2] + window.turns[cells.indices[:, 0]]
     return poses
 
 
 @njit(cache=True)
-def _divide(
-    surface: Surface, samples: Float64, window: Window, temper: float, centres: Float64, divisions: Int64, turn: float
+def _integrate_divided(
+    surface: LogRatioGrid,
+    samples: Float64,
+    window: SearchWindow,
+    temper: float,
+    centres: Float64,
+    divisions: Int64,
+    turn: float,
 ) -> tuple[Float64, Float64]:
     count, turns = divisions
     means, best = np.empty(centres.shape[0]), centres.copy()
-    points, scores = _points(samples), np.empty(count * count * turns)
+    points, scores = _grid_samples(samples), np.empty(count * count * turns)
     pose = np.empty(3)
     for n in range(centres.shape[0]):
         top = -np.inf
@@ -221,15 +233,21 @@ def _divide(
 
 
 @njit(cache=True)
-def climb(
-    surface: Surface, samples: Float64, window: Window, temper: float, start: Float64, step: Float64, finest: float
+def climb_to_peak(
+    surface: LogRatioGrid,
+    samples: Float64,
+    window: SearchWindow,
+    temper: float,
+    start: Float64,
+    step: Float64,
+    finest: float,
 ) -> Float64:
     """The highest pose near ``start``, by a pattern search over the 26 neighbours with halving steps.
 
     :param step: shape (3,), first steps in m, m and rad.
     :param finest: smallest share of the first steps.
     """
-    points = _points(samples)
+    points = _grid_samples(samples)
     best, height = start.copy(), _score_at(surface, points, window, temper, start)
     share = 1.0
     while share >= finest:
@@ -246,12 +264,12 @@ def climb(
 
 
 @njit(cache=True)
-def curvature(surface: Surface, samples: Float64, pose: Float64, step: Float64) -> Float64:
+def curvature(surface: LogRatioGrid, samples: Float64, pose: Float64, step: Float64) -> Float64:
     """Minus the Hessian of the untempered log-ratio in the right tangent space of ``pose``, shape (3, 3).
 
     :param step: shape (3,), finite differences in m, m and rad.
     """
-    points, corner = _points(samples), np.empty((3, 3))
+    points, corner = _grid_samples(samples), np.empty((3, 3))
     hessian = np.empty((3, 3))
     for a in range(3):
         for b in range(a, 3):
@@ -260,7 +278,7 @@ def curvature(surface: Surface, samples: Float64, pose: Float64, step: Float64) 
                     twist = np.zeros(3)
                     twist[a] += p * step[a]
                     twist[b] += q * step[b]
-                    corner[p + 1, q + 1] = _log_ratio_at(surface, points, _beside(pose, twist))
+                    corner[p + 1, q + 1] = _log_ratio_at(surface, points, _perturb(pose, twist))
             mixed = corner[2, 2] - corner[2, 0] - corner[0, 2] + corner[0, 0]
             hessian[a, b] = -mixed / (4.0 * step[a] * step[b])
             hessian[b, a] = hessian[a, b]
@@ -268,7 +286,7 @@ def curvature(surface: Surface, samples: Float64, pose: Float64, step: Float64) 
 
 
 @njit(cache=True)
-def _beside(pose: Float64, twist: Float64) -> Float64:
+def _perturb(pose: Float64, twist: Float64) -> Float64:
     """``pose * exp(twist)`` for a small twist, to second order."""
     cos, sin = np.cos(pose[2]), np.sin(pose[2])
     x, y = twist[0] - 0.5 * twist[2] * twist[1], twist[1] + 0.5 * twist[2] * twist[0]

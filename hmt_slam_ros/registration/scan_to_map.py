@@ -16,21 +16,21 @@ from hmt_slam_ros.arrays import Float64, Int32
 from hmt_slam_ros.geometry.symmetric import (
     Symmetric,
     Vector,
+    add_scaled,
     determinant,
     dot,
-    into_array,
     inverse,
-    of_array,
-    solved,
-    times,
-    total,
+    multiply,
+    solve,
+    symmetric_from_array,
+    write_to_array,
 )
-from hmt_slam_ros.grids.patches import FAR, PATCH, MapView, field_at, field_of_four, odds_at
+from hmt_slam_ros.grids.patches import FAR, PATCH, GridView, field_at, field_at_four, odds_at
 
 # Distance from its surface at which a point in unknown space counts, as a share of the robust scale.
-_UNSEEN = 0.6
+_UNKNOWN_DISTANCE = 0.6
 # Cells from a point to the free space on every side of it, where it is said to be in free space.
-_BESIDE = 3
+_MARGIN = 3
 
 
 class BeamModel(NamedTuple):
@@ -55,22 +55,22 @@ class Prior(NamedTuple):
     information: Float64
 
 
-class Alignment(NamedTuple):
+class AlignmentSettings(NamedTuple):
     """How Gauss-Newton weighs the beams.
 
     :ivar sigma: deviation of an end point from its surface, m.
-    :ivar robust: scale of the Cauchy weight, m.
+    :ivar robust_scale: scale of the Cauchy weight, m.
     :ivar inflation: of how many beams only one tells something of its own; the prior outweighs the others.
     :ivar iterations: steps at most.
     """
 
     sigma: float
-    robust: float
+    robust_scale: float
     inflation: float
     iterations: int
 
 
-def beam_model(radius: float, sigma: float, unknown_range: float, random: float) -> BeamModel:
+def make_beam_model(radius: float, sigma: float, unknown_range: float, random: float) -> BeamModel:
     """The table of log p(z | map) / p(z | unknown).
 
     :param radius: truncation of the distance field, m.
@@ -84,7 +84,7 @@ def beam_model(radius: float, sigma: float, unknown_range: float, random: float)
 
 
 @njit(cache=True)
-def log_ratio(points: Float64, x: float, y: float, theta: float, view: MapView, model: BeamModel) -> float:
+def log_ratio(points: Float64, x: float, y: float, theta: float, view: GridView, model: BeamModel) -> float:
     """Sum over the points of the log-likelihood ratio at the pose (x, y, theta), nats."""
     cos, sin = np.cos(theta) / view.cell, np.sin(theta) / view.cell
     half = 0.5 * view.table.shape[0] * PATCH
@@ -102,7 +102,7 @@ def log_ratio(points: Float64, x: float, y: float, theta: float, view: MapView, 
 
 
 @njit(cache=True)
-def matched_fraction(points: Float64, pose: Float64, view: MapView, near: int) -> float:
+def matched_fraction(points: Float64, pose: Float64, view: GridView, near: int) -> float:
     """Share of the points whose quantised distance to a surface is below ``near``."""
     cos, sin = np.cos(pose[2]) / view.cell, np.sin(pose[2]) / view.cell
     half = 0.5 * view.table.shape[0] * PATCH
@@ -116,7 +116,7 @@ def matched_fraction(points: Float64, pose: Float64, view: MapView, near: int) -
 
 
 @njit(cache=True)
-def agreement(points: Float64, pose: Float64, view: MapView, near: int, far: int) -> tuple[int, int]:
+def count_agreement(points: Float64, pose: Float64, view: GridView, near: int, far: int) -> tuple[int, int]:
     """How many of the points are on a known surface, and how many in space that is known to be free.
 
     :param near: quantised distance to a surface below which a point is on it; ``far``: from which it is off.
@@ -129,22 +129,22 @@ def agreement(points: Float64, pose: Float64, view: MapView, near: int, far: int
         row = int((pose[1] + sin * points[i, 0] + cos * points[i, 1]) / view.cell + half)
         distance = field_at(view, column, row)
         on += distance < near
-        free += distance >= far and odds_at(view, column, row) < 0 and _free_around(view, column, row)
+        free += distance >= far and odds_at(view, column, row) < 0 and _is_surrounded_by_free(view, column, row)
     return on, free
 
 
 @njit(cache=True)
-def _free_around(view: MapView, column: int, row: int) -> bool:
+def _is_surrounded_by_free(view: GridView, column: int, row: int) -> bool:
     """Whether it is free to all sides: along the edge of what a beam passed there may be a wall that it grazed."""
-    across = max(odds_at(view, column - _BESIDE, row), odds_at(view, column + _BESIDE, row))
-    return bool(max(across, odds_at(view, column, row - _BESIDE), odds_at(view, column, row + _BESIDE)) < 0)
+    across = max(odds_at(view, column - _MARGIN, row), odds_at(view, column + _MARGIN, row))
+    return bool(max(across, odds_at(view, column, row - _MARGIN), odds_at(view, column, row + _MARGIN)) < 0)
 
 
 @njit(cache=True)
 def log_prior(pose: Float64, prior: Prior) -> float:
     """-1/2 of the squared Mahalanobis distance, without the normaliser."""
     difference = _difference(pose[0], pose[1], pose[2], prior.mean)
-    return -0.5 * dot(difference, times(of_array(prior.information), difference))
+    return -0.5 * dot(difference, multiply(symmetric_from_array(prior.information), difference))
 
 
 @njit(cache=True)
@@ -153,25 +153,25 @@ def _difference(x: float, y: float, theta: float, mean: Float64) -> Vector:
 
 
 @njit(cache=True)
-def evidence(
-    points: Float64, mode: Float64, hessian: Float64, prior: Prior, view: MapView, model: BeamModel, temper: float
+def laplace_log_evidence(
+    points: Float64, mode: Float64, hessian: Float64, prior: Prior, view: GridView, model: BeamModel, temper: float
 ) -> float:
     """Log of the Laplace integral of prior times tempered likelihood around a mode, relative to unknown space, nats.
 
     :param hessian: (3, 3) information of the points at the mode.
     """
     ratio = log_ratio(points, mode[0], mode[1], mode[2], view, model)
-    known = of_array(prior.information)
-    occam = determinant(known) / determinant(total(known, of_array(hessian), temper))
+    known = symmetric_from_array(prior.information)
+    occam = determinant(known) / determinant(add_scaled(known, symmetric_from_array(hessian), temper))
     return log_prior(mode, prior) + temper * ratio + 0.5 * np.log(occam)
 
 
 @njit(cache=True)
-def _smooth_distance(view: MapView, u: float, v: float) -> tuple[float, float, float]:
+def _smooth_distance(view: GridView, u: float, v: float) -> tuple[float, float, float]:
     """Bilinear distance and its gradient per cell at the continuous cell coordinates (u, v), in quanta."""
     column, row = int(np.floor(u)), int(np.floor(v))
     fu, fv = u - column, v - row
-    four = field_of_four(view, column, row)
+    four = field_at_four(view, column, row)
     d00, d10, d01, d11 = float(four[0]), float(four[1]), float(four[2]), float(four[3])
     low, high = d00 + fu * (d10 - d00), d01 + fu * (d11 - d01)
     gradient_u = (1.0 - fv) * (d10 - d00) + fv * (d11 - d01)
@@ -179,8 +179,8 @@ def _smooth_distance(view: MapView, u: float, v: float) -> tuple[float, float, f
 
 
 @njit(cache=True)
-def linearise(
-    points: Float64, x: float, y: float, theta: float, view: MapView, settings: Alignment
+def linearize(
+    points: Float64, x: float, y: float, theta: float, view: GridView, settings: AlignmentSettings
 ) -> tuple[Symmetric, Vector, float]:
     """Normal equations of the surfels (n, 4) at the pose (x, y, theta): J' W J and J' W r; and r' W r.
 
@@ -199,7 +199,7 @@ def linearise(
             continue
         distance *= quantum
         jx, jy = gu * quantum / view.cell, gv * quantum / view.cell
-        weight = 1.0 / ((1.0 + (distance / settings.robust) ** 2) * settings.sigma**2)
+        weight = 1.0 / ((1.0 + (distance / settings.robust_scale) ** 2) * settings.sigma**2)
         if points[n, 2] != 0.0 or points[n, 3] != 0.0:
             normal_x, normal_y = cos * points[n, 2] - sin * points[n, 3], sin * points[n, 2] + cos * points[n, 3]
             across = jx * normal_x + jy * normal_y
@@ -221,7 +221,7 @@ def linearise(
 
 
 @njit(cache=True)
-def misfit(points: Float64, pose: Float64, prior: Prior, view: MapView, settings: Alignment) -> float:
+def misfit(points: Float64, pose: Float64, prior: Prior, view: GridView, settings: AlignmentSettings) -> float:
     """What :func:`align` minimises, at a pose, nats; but a point counts by its distance in any direction.
 
     One in unknown space counts as if its surface were at ``_UNSEEN``: were it worse, new space ahead would draw the
@@ -231,7 +231,7 @@ def misfit(points: Float64, pose: Float64, prior: Prior, view: MapView, settings
     """
     half = 0.5 * view.table.shape[0] * PATCH - 0.5
     cos, sin = np.cos(pose[2]), np.sin(pose[2])
-    quantum, unseen, cost = view.radius / FAR, _UNSEEN * settings.robust, 0.0
+    quantum, unseen, cost = view.radius / FAR, _UNKNOWN_DISTANCE * settings.robust_scale, 0.0
     for n in range(points.shape[0]):
         u = (pose[0] + cos * points[n, 0] - sin * points[n, 1]) / view.cell + half
         v = (pose[1] + sin * points[n, 0] + cos * points[n, 1]) / view.cell + half
@@ -239,12 +239,14 @@ def misfit(points: Float64, pose: Float64, prior: Prior, view: MapView, settings
         distance *= quantum
         if distance > unseen and odds_at(view, int(u + 0.5), int(v + 0.5)) == 0:
             distance = unseen
-        cost += np.log(1.0 + (distance / settings.robust) ** 2)
-    return 0.5 * settings.robust**2 / (settings.inflation * settings.sigma**2) * cost - log_prior(pose, prior)
+        cost += np.log(1.0 + (distance / settings.robust_scale) ** 2)
+    return 0.5 * settings.robust_scale**2 / (settings.inflation * settings.sigma**2) * cost - log_prior(pose, prior)
 
 
 @njit(cache=True)
-def align(points: Float64, start: Float64, prior: Prior, view: MapView, settings: Alignment) -> tuple[Float64, Float64]:
+def align(
+    points: Float64, start: Float64, prior: Prior, view: GridView, settings: AlignmentSettings
+) -> tuple[Float64, Float64]:
     """Gauss-Newton on the distance field with a Gaussian prior.
 
     Minimises sum rho(d(T p)^2) / (inflation sigma^2) + (T - prior)' information (T - prior), rho being Cauchy's.
@@ -260,27 +262,33 @@ def align(points: Float64, start: Float64, prior: Prior, view: MapView, settings
 
 @njit(cache=True)
 def align_into(
-    points: Float64, start: Float64, prior: Prior, view: MapView, settings: Alignment, mode: Float64, hessian: Float64
+    points: Float64,
+    start: Float64,
+    prior: Prior,
+    view: GridView,
+    settings: AlignmentSettings,
+    mode: Float64,
+    hessian: Float64,
 ) -> None:
     """:func:`align` with its results written into ``mode`` and ``hessian``."""
     if points.shape[1] != 4:
         raise ValueError("points are aligned with their normals: give surfels (n, 4)")
     x, y, theta = start[0], start[1], start[2]
-    known, information = of_array(prior.information), Symmetric(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    known, information = symmetric_from_array(prior.information), Symmetric(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     for _ in range(settings.iterations):
-        information, gradient, _ = linearise(points, x, y, theta, view, settings)
-        held = times(known, _difference(x, y, theta, prior.mean))
+        information, gradient, _ = linearize(points, x, y, theta, view, settings)
+        held = multiply(known, _difference(x, y, theta, prior.mean))
         slope = (
             gradient[0] + settings.inflation * held[0],
             gradient[1] + settings.inflation * held[1],
             gradient[2] + settings.inflation * held[2],
         )
-        step = solved(total(information, known, settings.inflation), slope)
+        step = solve(add_scaled(information, known, settings.inflation), slope)
         x, y, theta = x - step[0], y - step[1], theta - step[2]
         if abs(step[0]) + abs(step[1]) < 1e-4 and abs(step[2]) < 1e-4:
             break
     mode[0], mode[1], mode[2] = x, y, theta
-    into_array(information, hessian)
+    write_to_array(information, hessian)
 
 
 class Proposals(NamedTuple):
@@ -301,13 +309,13 @@ class Proposals(NamedTuple):
 @njit(cache=True)
 def propose_all(
     points: Float64,
-    still: Float64,
+    static_points: Float64,
     starts: Float64,
     priors: Float64,
     information: Float64,
     tables: Int32,
-    view: MapView,
-    settings: Alignment,
+    view: GridView,
+    settings: AlignmentSettings,
     model: BeamModel,
     sharpness: float,
     temper: float,
@@ -318,7 +326,7 @@ def propose_all(
     likelihood itself would not do: along a corridor it varies with the cells of the map, and not with the pose.
 
     :param points: surfels (n, 4), which all count as evidence.
-    :param still: surfels (k, 4), those of them that are matched.
+    :param static_points: surfels (k, 4), those of them that are matched.
     :param starts: (m, 3) poses to start matching from; ``priors``: (m, 3) poses that odometry predicts.
     :param tables: (m, T, T), the particles' maps; ``view`` is any view of the same pool.
     :param sharpness: exponent on the likelihood in the proposal.
@@ -327,15 +335,15 @@ def propose_all(
     m = starts.shape[0]
     modes, hessians = np.empty((m, 3)), np.empty((m, 3, 3))
     covariances, evidences = np.empty((m, 3, 3)), np.empty(m)
-    known = of_array(information)
+    known = symmetric_from_array(information)
     for i in range(m):
-        own = MapView(tables[i], view.odds, view.field, view.cell, view.radius)
+        own = GridView(tables[i], view.odds, view.field, view.cell, view.radius)
         prior = Prior(priors[i], information)
-        align_into(still, starts[i], prior, own, settings, modes[i], hessians[i])
-        into_array(inverse(total(known, of_array(hessians[i]), sharpness)), covariances[i])
+        align_into(static_points, starts[i], prior, own, settings, modes[i], hessians[i])
+        write_to_array(inverse(add_scaled(known, symmetric_from_array(hessians[i]), sharpness)), covariances[i])
     # In a loop of its own: together with two arrays of points the compiler makes the alignment half as fast.
     for i in range(m):
-        own = MapView(tables[i], view.odds, view.field, view.cell, view.radius)
+        own = GridView(tables[i], view.odds, view.field, view.cell, view.radius)
         prior = Prior(priors[i], information)
-        evidences[i] = evidence(points, modes[i], hessians[i], prior, own, model, temper)
+        evidences[i] = laplace_log_evidence(points, modes[i], hessians[i], prior, own, model, temper)
     return Proposals(modes, hessians, covariances, evidences)

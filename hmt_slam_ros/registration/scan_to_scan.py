@@ -13,24 +13,24 @@ import numpy as np
 from numba import njit
 
 from hmt_slam_ros.arrays import Bool, Float64, Int32, Int64
-from hmt_slam_ros.configuration.topology import Refinement
+from hmt_slam_ros.configuration.topology import RefinementParameters
 from hmt_slam_ros.sensors import Scan
-from hmt_slam_ros.sensors.surfels import Wall, fit, running_sums
+from hmt_slam_ros.sensors.surfels import FlatnessLimits, fit_surface, running_sums
 
 # A wall piece is fitted to the points within this reach of a point, or within three beams at one degree where that is
 # more, on at most so many beams to each side.
 _REACH, _REACH_PER_METRE, _BEAMS = 0.25, 0.045, 8
-_WALL = Wall(0.04, 0.5)
+_FLATNESS = FlatnessLimits(0.04, 0.5)
 _EMPTY = -1
 
 
-class Surfaces(NamedTuple):
+class ScanSurfaces(NamedTuple):
     """The end points of n scans, one scan after the other in the order of their beams.
 
     :ivar starts: shape (n + 1,), scan i has the points ``starts[i]`` to before ``starts[i + 1]``.
     :ivar points: shape (k, 2), m, base frame of their scan.
     :ivar normals: shape (k, 2), unit vectors towards the laser.
-    :ivar flat: shape (k,), whether the point lies on a piece of wall, so that its normal means something.
+    :ivar is_flat: shape (k,), whether the point lies on a piece of wall, so that its normal means something.
     :ivar lasers: shape (n, 2), m, where the lasers stood in the base frames.
     :ivar bins: shape (b,), the point seen in each bin of bearing, -1 for none; of several the nearest.
     :ivar bin_starts: shape (n + 1,), scan i has the bins ``bin_starts[i]`` to before ``bin_starts[i + 1]``; they
@@ -40,13 +40,13 @@ class Surfaces(NamedTuple):
     starts: Int64
     points: Float64
     normals: Float64
-    flat: Bool
+    is_flat: Bool
     lasers: Float64
     bins: Int32
     bin_starts: Int64
 
 
-def surfaces_of(scans: Sequence[Scan], max_range: float, max_points: int) -> Surfaces:
+def extract_surfaces(scans: Sequence[Scan], max_range: float, max_points: int) -> ScanSurfaces:
     """Find the surfaces of scans.
 
     :param max_range: returns from farther away are left out, m.
@@ -63,22 +63,22 @@ def surfaces_of(scans: Sequence[Scan], max_range: float, max_points: int) -> Sur
         normals.append(found[::stride])
         flat.append(on_wall[::stride])
         resolution.append(max(1, int(2.0 * np.pi / (abs(scan.angle_increment) * stride or 2.0 * np.pi))))
-    starts = _running([len(part) for part in points])
-    bin_starts = _running(resolution)
+    starts = _offsets([len(part) for part in points])
+    bin_starts = _offsets(resolution)
     stacked = np.concatenate([np.zeros((0, 2)), *points])
     lasers = np.array([scan.laser_pose[:2] for scan in scans]).reshape(-1, 2)
-    return Surfaces(
+    return ScanSurfaces(
         starts,
         stacked,
         np.concatenate([np.zeros((0, 2)), *normals]),
         np.concatenate([np.zeros(0, np.bool_), *flat]),
         lasers,
-        _binned(stacked, starts, lasers, bin_starts),
+        _bin_points(stacked, starts, lasers, bin_starts),
         bin_starts,
     )
 
 
-def _running(counts: Sequence[int]) -> Int64:
+def _offsets(counts: Sequence[int]) -> Int64:
     return np.concatenate(([0], np.cumsum(counts, dtype=np.int64))).astype(np.int64)
 
 
@@ -91,8 +91,8 @@ def _fit_normals(points: Float64, laser: Float64) -> tuple[Float64, Bool]:
     sums = running_sums(beams, ranges)
     for i in range(len(points)):
         reach = max(_REACH, _REACH_PER_METRE * ranges[i])
-        low, high = _piece(points, i, -1, reach), _piece(points, i, 1, reach)
-        if high - low < 2 or not fit(beams, sums, low, i, high, _WALL, normal):
+        low, high = _last_in_reach(points, i, -1, reach), _last_in_reach(points, i, 1, reach)
+        if high - low < 2 or not fit_surface(beams, sums, low, i, high, _FLATNESS, normal):
             continue
         towards = -1.0 if normal[0] * beams[i, 0] + normal[1] * beams[i, 1] > 0.0 else 1.0
         normals[i, 0], normals[i, 1] = towards * normal[0], towards * normal[1]
@@ -101,7 +101,7 @@ def _fit_normals(points: Float64, laser: Float64) -> tuple[Float64, Bool]:
 
 
 @njit(cache=True)
-def _piece(points: Float64, i: int, step: int, reach: float) -> int:
+def _last_in_reach(points: Float64, i: int, step: int, reach: float) -> int:
     """The last of the points that follow each other from i on, downwards or upwards, within reach of it."""
     last = i
     for k in range(i + step, i + step * (_BEAMS + 1), step):
@@ -115,7 +115,7 @@ def _piece(points: Float64, i: int, step: int, reach: float) -> int:
 
 
 @njit(cache=True)
-def _binned(points: Float64, starts: Int64, lasers: Float64, bin_starts: Int64) -> Int32:
+def _bin_points(points: Float64, starts: Int64, lasers: Float64, bin_starts: Int64) -> Int32:
     """The nearest point of each scan in each of its bins of bearing."""
     bins = np.full(bin_starts[-1], _EMPTY, np.int32)
     for scan in range(len(lasers)):
@@ -123,7 +123,7 @@ def _binned(points: Float64, starts: Int64, lasers: Float64, bin_starts: Int64) 
         nearest = np.full(count, np.inf)
         for k in range(starts[scan], starts[scan + 1]):
             dx, dy = points[k, 0] - lasers[scan, 0], points[k, 1] - lasers[scan, 1]
-            place = bin_of(dx, dy, count)
+            place = bin_index(dx, dy, count)
             distance = dx * dx + dy * dy
             if distance < nearest[place]:
                 nearest[place] = distance
@@ -132,7 +132,7 @@ def _binned(points: Float64, starts: Int64, lasers: Float64, bin_starts: Int64) 
 
 
 @njit(cache=True)
-def bin_of(x: float, y: float, count: int) -> int:
+def bin_index(x: float, y: float, count: int) -> int:
     """The bin of the direction (x, y) where ``count`` bins divide the circle."""
     place = int(np.floor(_bearing(x, y) * (count / (2.0 * np.pi)) + 0.5))
     return place + count if place < 0 else min(place, count - 1)
@@ -156,7 +156,7 @@ def _bearing(x: float, y: float) -> float:
 
 
 # Bins of bearing searched to each side at most, and the cosine of the angle between walls that are the same at least.
-_WINDOW = 20
+_MAX_BINS = 20
 _SAME_WALL = 0.7
 
 
@@ -164,55 +164,64 @@ class Weighting(NamedTuple):
     """How the points count.
 
     :ivar sigma: deviation of a point from its wall, m.
-    :ivar robust: scale of Cauchy's weight, m.
+    :ivar robust_scale: scale of Cauchy's weight, m.
     :ivar temper: exponent on the likelihood, since neighbouring beams and overlapping pairs are correlated.
     """
 
     sigma: float
-    robust: float
+    robust_scale: float
     temper: float
 
 
-def weighting(options: Refinement) -> Weighting:
+def weighting_from_options(options: RefinementParameters) -> Weighting:
     """How points count, as configured."""
     return Weighting(options.sigma, options.robust_scale, options.temper)
 
 
 @njit(cache=True)
 def normal_equations(
-    ones: Surfaces,
-    one_of: Int64,
-    others: Surfaces,
-    other_of: Int64,
+    sources: ScanSurfaces,
+    source_indices: Int64,
+    targets: ScanSurfaces,
+    target_indices: Int64,
     relative: Float64,
     gate: float,
     weights: Weighting,
-    every: int,
+    stride: int,
 ) -> tuple[Float64, Float64, Float64]:
     """Linearise the registration of pairs of scans at given relative poses.
 
-    :param one_of: shape (m,), the scan of ``ones`` whose points are registered in each pair.
-    :param other_of: shape (m,), the scan of ``others`` with whose walls.
+    :param source_indices: shape (m,), the scan of ``sources`` whose points are registered in each pair.
+    :param target_indices: shape (m,), the scan of ``targets`` with whose walls.
     :param relative: shape (m, 3), ``other_T_one``, m and rad.
     :param gate: points farther apart than this do not meet, m.
-    :param every: 1 for all points, k for one out of k, which counts for as many.
+    :param stride: 1 for all points, k for one out of k, which counts for as many.
     :returns: information (m, 3, 3) and gradient (m, 3) of half the squared error in the right tangent of
         ``other_T_one``, and the share (m,) of the points that meet a wall.
     """
-    m = len(one_of)
+    m = len(source_indices)
     information, gradient, share = np.zeros((m, 3, 3)), np.zeros((m, 3)), np.zeros(m)
     for e in range(m):
         share[e] = _add_points(
-            ones, one_of[e], others, other_of[e], relative[e], gate, weights, every, information[e], gradient[e]
+            sources,
+            source_indices[e],
+            targets,
+            target_indices[e],
+            relative[e],
+            gate,
+            weights,
+            stride,
+            information[e],
+            gradient[e],
         )
     return information, gradient, share
 
 
 @njit(cache=True)
 def _add_points(
-    ones: Surfaces,
+    ones: ScanSurfaces,
     one: int,
-    others: Surfaces,
+    others: ScanSurfaces,
     other: int,
     pose: Float64,
     gate: float,
@@ -227,13 +236,13 @@ def _add_points(
     :returns: the share of the points that meet a wall.
     """
     cos, sin = np.cos(pose[2]), np.sin(pose[2])
-    most, sharpness = every * weights.temper / weights.sigma**2, 1.0 / weights.robust
+    most, sharpness = every * weights.temper / weights.sigma**2, 1.0 / weights.robust_scale
     # Sums in variables of their own stay in registers.
     xx = xy = xt = yy = yt = tt = gx = gy = gt = 0.0
     seen = met = 0
     # Taken from their tuples once: each time counts references to them.
-    own, own_normals, own_flat = ones.points, ones.normals, ones.flat
-    points, normals, flat, bins = others.points, others.normals, others.flat, others.bins
+    own, own_normals, own_flat = ones.points, ones.normals, ones.is_flat
+    points, normals, flat, bins = others.points, others.normals, others.is_flat, others.bins
     laser_x, laser_y = others.lasers[other, 0], others.lasers[other, 1]
     begin, end = others.bin_starts[other], others.bin_starts[other + 1]
     for k in range(ones.starts[one], ones.starts[one + 1], every):
@@ -241,7 +250,7 @@ def _add_points(
         px, py = own[k, 0], own[k, 1]
         x = pose[0] + cos * px - sin * py
         y = pose[1] + sin * px + cos * py
-        q = _nearest(points, bins, begin, end - begin, x, y, x - laser_x, y - laser_y, gate)
+        q = _nearest_point(points, bins, begin, end - begin, x, y, x - laser_x, y - laser_y, gate)
         if q < 0 or not flat[q]:
             continue
         nx, ny = normals[q, 0], normals[q, 1]
@@ -271,7 +280,7 @@ def _add_points(
 
 
 @njit(cache=True, inline="always")
-def _nearest(
+def _nearest_point(
     points: Float64, bins: Int32, first: int, count: int, x: float, y: float, dx: float, dy: float, gate: float
 ) -> int:
     """The point of a scan nearest to (x, y) in its base frame, among those seen in that direction; -1 for none.
@@ -279,7 +288,7 @@ def _nearest(
     :param bins: see :class:`Surfaces`; those of the scan are ``count`` from ``first`` on.
     :param dx: from the laser to (x, y), ``dy``.
     """
-    middle = bin_of(dx, dy, count)
+    middle = bin_index(dx, dy, count)
     # What is seen so many bins away is at least so far off: the chord grows by about this with each bin.
     squared_width = (2.0 * np.pi / count) ** 2 * (dx * dx + dy * dy)
     nearest, best = -1, gate * gate
@@ -292,7 +301,7 @@ def _nearest(
     # To one side and then to the other, as far as that may bring something nearer.
     for step in (-1, 1):
         place = middle
-        for passed in range(min(_WINDOW, count // 2)):
+        for passed in range(min(_MAX_BINS, count // 2)):
             if passed * passed * squared_width >= best:
                 break
             place += step

@@ -14,7 +14,7 @@ from numba import njit
 from hmt_slam_ros.arrays import Float32, Float64, Int8, Int32, Int64
 
 
-class Window(NamedTuple):
+class SearchWindow(NamedTuple):
     """The lattice of relative poses, and the Gaussian prior on it.
 
     A pose of the lattice is the prior's mean shifted by (i, j) cells along the axes of the candidate's frame, and
@@ -25,7 +25,7 @@ class Window(NamedTuple):
     :ivar cell: edge of a cell, m.
     :ivar turns: shape (t,), rad, ascending, equally spaced.
     :ivar first: shape (2,), int64, smallest shift along x and y, cells; ``last``, the largest.
-    :ivar root: shape (3, 3), the square root of the prior's information, ``root.T @ root``.
+    :ivar information_root: shape (3, 3), the square root of the prior's information, ``root.T @ root``.
     :ivar whitening: shape (t, 3, 2), 1/m.
     :ivar offsets: shape (t, 3).
     :ivar gate: largest squared Mahalanobis distance that is searched.
@@ -36,15 +36,15 @@ class Window(NamedTuple):
     turns: Float64
     first: Int64
     last: Int64
-    root: Float64
+    information_root: Float64
     whitening: Float64
     offsets: Float64
     gate: float
 
 
-def make_window(
+def make_search_window(
     mean: Float64, covariance: Float64, cell: float, turn: float, gate: float, bounds: Float64 | None = None
-) -> Window:
+) -> SearchWindow:
     """The smallest lattice that holds the gate's ellipsoid, as far as it lies within bounds.
 
     :param mean: shape (3,), ``candidate_T_query``.
@@ -72,11 +72,13 @@ def make_window(
     if bounds is not None:
         first = np.maximum(first, np.floor((bounds[0] - mean[:2]) / cell))
         last = np.minimum(last, np.ceil((bounds[1] - mean[:2]) / cell))
-    return Window(mean, cell, turns, first.astype(np.int64), last.astype(np.int64), root, whitening, offsets, gate)
+    return SearchWindow(
+        mean, cell, turns, first.astype(np.int64), last.astype(np.int64), root, whitening, offsets, gate
+    )
 
 
 @njit(cache=True)
-def prior_bound(window: Window, k: int, i: int, j: int, side: int) -> float:
+def prior_bound(window: SearchWindow, k: int, i: int, j: int, side: int) -> float:
     """The largest exponent of the prior in the square of shifts that begins at a cell; -inf outside the gate."""
     whitening, offset = window.whitening[k], window.offsets[k]
     half = 0.5 * (side - 1) * window.cell
@@ -98,7 +100,7 @@ BLOCK = 4
 _TOP = 64  # the largest log-ratio in steps; what is below -128 steps is counted as that
 
 
-class Surface(NamedTuple):
+class LogRatioGrid(NamedTuple):
     """A log-ratio grid: ``log_ratio`` (rows, columns) float32, indexed [y, x], its corner ``origin`` (2,), ``cell``."""
 
     log_ratio: Float32
@@ -120,7 +122,7 @@ class Pyramid(NamedTuple):
     step: float
 
 
-def pyramid(log_ratio: Float32, height: int) -> Pyramid:
+def build_pyramid(log_ratio: Float32, height: int) -> Pyramid:
     """The pyramid of a grid, with levels 0 to ``height``."""
     margin = 2**height
     step = max(float(log_ratio.max()), 1e-6) / _TOP
@@ -151,7 +153,7 @@ def _widen(below: Int8, above: Int8, side: int) -> None:
 
 
 @njit(cache=True)
-def sample_cells(window: Window, surface: Surface, samples: Float64) -> Int32:
+def sample_cells(window: SearchWindow, surface: LogRatioGrid, samples: Float64) -> Int32:
     """Column and row of every sample at every turn without a shift, shape (turns, samples, 2)."""
     cells = np.empty((window.turns.size, samples.shape[0], 2), np.int32)
     x0, y0 = window.mean[0] - surface.origin[0], window.mean[1] - surface.origin[1]
@@ -168,7 +170,7 @@ def sample_cells(window: Window, surface: Surface, samples: Float64) -> Int32:
 
 
 @njit(cache=True)
-def bound_of_square(level: Int8, margin: int, cells: Int32, i: int, j: int) -> int:
+def square_bound(level: Int8, margin: int, cells: Int32, i: int, j: int) -> int:
     """What the samples (n, 2) read at most in the square of shifts that begins at (i, j), steps.
 
     :param level: of the pyramid, for squares of this size.
@@ -183,7 +185,7 @@ def bound_of_square(level: Int8, margin: int, cells: Int32, i: int, j: int) -> i
 
 
 @njit(cache=True)
-def bounds_of_quarters(
+def quarter_bounds(
     level: Int8, margin: int, cells: Int32, i: int, j: int, side: int
 ) -> tuple[tuple[int, int], tuple[int, int]]:
     """:func:`bound_of_square` of the squares of edge ``side`` that begin at (i, j), right of it, and below both."""

@@ -13,13 +13,13 @@ from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.grids.occupancy_map import occupancy_image, write_map
 from hmt_slam_ros.hybrid_map.landmark import Landmark
-from hmt_slam_ros.hybrid_map.surroundings import stacked
-from hmt_slam_ros.landmarks.area_classes import AreaKinds
-from hmt_slam_ros.landmarks.landmarks import KINDS
-from hmt_slam_ros.landmarks.portals import Portal, portals_of
-from hmt_slam_ros.places.area_views import AreaViews
-from hmt_slam_ros.places.chart import NAMES, Chart, ChartNode, chart_of
-from hmt_slam_ros.places.observation_graph import TRACK_NAMES, Landmarks
+from hmt_slam_ros.hybrid_map.surroundings import stack_poses
+from hmt_slam_ros.landmarks.area_classes import AreaClassifier
+from hmt_slam_ros.landmarks.landmarks import KIND_NAMES
+from hmt_slam_ros.landmarks.portals import Portal, find_portals
+from hmt_slam_ros.places.area_views import AreaViewCache
+from hmt_slam_ros.places.chart import NODE_KIND_NAMES, Chart, ChartNode, build_chart
+from hmt_slam_ros.places.observation_graph import TRACK_NAMES, LandmarkSequence
 from hmt_slam_ros.places.place_graph import DIRECTION_NAMES, Edge
 from hmt_slam_ros.results.hmt_map import read_saved_map
 from hmt_slam_ros.results.log_reading import map_folder
@@ -29,12 +29,12 @@ _FINEST, _COARSEST = 0.005, 10.0  # m
 
 
 def export_grid(
-    directory: Path, to: Path, resolution: float | None = None, area: int | None = None
+    directory: Path, folder: Path, resolution: float | None = None, area: int | None = None
 ) -> tuple[Path, Path]:
     """Draw the keyframes of the most probable hypothesis anew, as map.pgm and map.yaml.
 
     :param directory: output folder, or the hmt_map in it or of nodes.
-    :param to: folder, made where it is missing.
+    :param folder: folder, made where it is missing.
     :param resolution: side of a cell, m; that of the local maps where None.
     :param area: one area alone, in the frame of that area; the whole map in its own frame where None.
     :returns: the two files.
@@ -43,7 +43,7 @@ def export_grid(
     if resolution is not None and not _FINEST <= resolution <= _COARSEST:
         raise HmtSlamError(f"--resolution {resolution:g} is none for a grid: give {_FINEST:g} to {_COARSEST:g} m")
     saved = read_saved_map(map_folder(directory))
-    hybrid_map = saved.replica.maps[saved.replica.best]
+    hybrid_map = saved.replica.maps[saved.replica.best_hypothesis]
     areas = [known for known in hybrid_map.area_ids() if known in saved.area_poses]
     if area is not None and area not in areas:
         raise HmtSlamError(f"--area {area} is not in the map: its areas are {', '.join(map(str, areas))}")
@@ -56,12 +56,12 @@ def export_grid(
     scans = [saved.replica.scans[keyframe] for keyframe in placed]
     settings = saved.configuration.local_map
     try:
-        to.mkdir(parents=True, exist_ok=True)
+        folder.mkdir(parents=True, exist_ok=True)
         image = occupancy_image(scans, np.array(list(placed.values())), resolution or settings.cell, settings.max_range)
-        write_map(to, image)
+        write_map(folder, image)
     except OSError as fault:
-        raise HmtSlamError(f"{to} cannot be written ({fault.strerror}): choose another --grid") from fault
-    return to / "map.pgm", to / "map.yaml"
+        raise HmtSlamError(f"{folder} cannot be written ({fault.strerror}): choose another --grid") from fault
+    return folder / "map.pgm", folder / "map.yaml"
 
 
 PLACES = "places.json"
@@ -80,21 +80,21 @@ def write_places(directory: Path, area_poses: Mapping[int, PoseGaussian], chart:
     :param area_poses: {area: the belief over ``map_T_area``}.
     """
     document = {
-        "places": [_place(chart.name(k), area_poses[node.area], node) for k, node in enumerate(chart.nodes)],
-        "ways": [_way(edge) for edge in chart.edges],
+        "places": [_place_entry(chart.name(k), area_poses[node.area], node) for k, node in enumerate(chart.nodes)],
+        "ways": [_edge_entry(edge) for edge in chart.edges],
     }
     (directory / PLACES).write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
     return directory / PLACES
 
 
-def _place(name: str, frame: PoseGaussian, node: ChartNode) -> dict[str, object]:
+def _place_entry(name: str, frame: PoseGaussian, node: ChartNode) -> dict[str, object]:
     openings = [
-        {"direction": DIRECTION_NAMES[one.direction], "width": one.landmark.width, "hallway": one.hallway}
+        {"direction": DIRECTION_NAMES[one.direction], "width": one.landmark.width, "hallway": one.leads_to_hallway}
         for one in node.openings
     ]
     return {
         "name": name,
-        "kind": NAMES[node.kind],
+        "kind": NODE_KIND_NAMES[node.kind],
         "area": node.area,
         "area_T_place": node.pose.tolist(),
         "map_T_place": se2.compose(frame.mean, node.pose).tolist(),
@@ -103,27 +103,27 @@ def _place(name: str, frame: PoseGaussian, node: ChartNode) -> dict[str, object]
     }
 
 
-def _way(edge: Edge) -> dict[str, object]:
+def _edge_entry(edge: Edge) -> dict[str, object]:
     return {
         "start": edge.start,
         "end": edge.end,
-        "direction": DIRECTION_NAMES[edge.leaving],
+        "direction": DIRECTION_NAMES[edge.start_direction],
         "distance": edge.distance[0],
         "deviation": float(np.sqrt(edge.distance[1])),
-        "landmarks": _landmarks(edge.landmarks),
+        "landmarks": _edge_landmark_entries(edge.landmarks),
     }
 
 
-def _landmarks(landmarks: Landmarks) -> list[dict[str, object]]:
+def _edge_landmark_entries(landmarks: LandmarkSequence) -> list[dict[str, object]]:
     """In the order in which they are met."""
     return [
         {
-            "along": float(landmarks.along[k]),
+            "along": float(landmarks.positions[k]),
             "track": TRACK_NAMES[landmarks.tracks[k]],
             "form": float(landmarks.forms[k]),
             "existence": float(landmarks.probabilities[k]),
         }
-        for k in np.argsort(landmarks.along, kind="stable").tolist()
+        for k in np.argsort(landmarks.positions, kind="stable").tolist()
     ]
 
 
@@ -148,70 +148,70 @@ def export_topology(directory: Path) -> tuple[Path, Path, Path]:
     :raises HmtSlamError: where the folder holds no complete map.
     """
     saved = read_saved_map(directory / "hmt_map")
-    best = saved.replica.best
+    best = saved.replica.best_hypothesis
     hybrid_map = saved.replica.maps[best]
     mapping = LocalMapping(saved.configuration)
-    kinds, views = AreaKinds(mapping), AreaViews(mapping, saved.replica.scans).of_map(hybrid_map)
+    kinds, views = AreaClassifier(mapping), AreaViewCache(mapping, saved.replica.scans).views_of_map(hybrid_map)
     landmarks = {area: view.landmarks for area, view in views.items()}
     # Takes a fifth of a second and a dozen megabytes, for this command alone.
     import networkx as nx  # noqa: PLC0415
 
     graph = nx.DiGraph()
     for area in hybrid_map.area_ids():
-        here = area == saved.replica.areas[best]
-        numbers = _numbers(saved.area_poses[area])
+        here = area == saved.replica.robot_areas[best]
+        numbers = _pose_values(saved.area_poses[area])
         keyframes = hybrid_map.keyframes(area)
-        kind = kinds.of([saved.replica.scans[k] for k in keyframes], stacked(keyframes))
+        kind = kinds.classify([saved.replica.scans[k] for k in keyframes], stack_poses(keyframes))
         hallway = {} if kind is None else {"hallway": kind.probability}
         graph.add_node(area, **numbers, keyframes=len(keyframes), robot=here, **hallway)
-    portals = portals_of(hybrid_map, landmarks, saved.configuration.features)
+    portals = find_portals(hybrid_map, landmarks, saved.configuration.features)
     for a, b, arc in hybrid_map.all_arcs():
-        graph.add_edge(a, b, **_numbers(arc.pose), closure=arc.closure, **_annotation(portals, (a, b)))
+        graph.add_edge(a, b, **_pose_values(arc.pose), closure=arc.closure, **_portal_attributes(portals, (a, b)))
     nx.write_graphml_xml(graph, directory / TOPOLOGY)
     document = {
-        "areas": {str(area): [_landmark(one) for one in own] for area, own in landmarks.items()},
-        "portals": [_portal(portal) for portal in portals],
+        "areas": {str(area): [_landmark_entry(one) for one in own] for area, own in landmarks.items()},
+        "portals": [_portal_entry(portal) for portal in portals],
     }
     (directory / LANDMARKS).write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
-    chart = chart_of(hybrid_map, views, saved.configuration.features)
+    chart = build_chart(hybrid_map, views, saved.configuration.features)
     return directory / TOPOLOGY, directory / LANDMARKS, write_places(directory, saved.area_poses, chart)
 
 
-def _annotation(portals: Sequence[Portal], areas: tuple[int, int]) -> dict[str, float]:
+def _portal_attributes(portals: Sequence[Portal], areas: tuple[int, int]) -> dict[str, float]:
     """What an arc says of its portals."""
     own = [portal for portal in portals if portal.areas == areas]
     if not own:
         return {"portals": 0}
     best = max(own, key=lambda portal: portal.existence)
-    pose = {f"portal_{name}": value for name, value in _numbers(best.pose_in_a).items()}
+    pose = {f"portal_{name}": value for name, value in _pose_values(best.pose_in_a).items()}
     return {"portals": len(own), **pose, "portal_width": best.width, "portal_existence": best.existence}
 
 
-def _landmark(landmark: Landmark) -> dict[str, object]:
+def _landmark_entry(landmark: Landmark) -> dict[str, object]:
     existence = landmark.existence
     opening = {"width": landmark.width, "width_deviation": landmark.width_deviation} if landmark.width else {}
     return {
-        "kind": KINDS[landmark.kind],
-        **_numbers(landmark.pose),
+        "kind": KIND_NAMES[landmark.kind],
+        **_pose_values(landmark.pose),
         **opening,
         "existence": existence.probability,
-        "seen": existence.seen,
-        "missed": existence.missed,
+        "seen": existence.detections,
+        "missed": existence.misses,
     }
 
 
-def _portal(portal: Portal) -> dict[str, object]:
+def _portal_entry(portal: Portal) -> dict[str, object]:
     return {
         "areas": list(portal.areas),
-        "in_first": _numbers(portal.pose_in_a),
-        "in_second": _numbers(portal.pose_in_b),
+        "in_first": _pose_values(portal.pose_in_a),
+        "in_second": _pose_values(portal.pose_in_b),
         "width": portal.width,
         "width_deviation": portal.width_deviation,
         "existence": portal.existence,
-        "passages": portal.passages,
+        "passages": portal.crossing_count,
     }
 
 
-def _numbers(belief: PoseGaussian) -> dict[str, float]:
+def _pose_values(belief: PoseGaussian) -> dict[str, float]:
     upper = belief.covariance[np.triu_indices(3)]
     return dict(zip(_POSE + _COVARIANCE, [*belief.mean.tolist(), *upper.tolist()], strict=True))

@@ -12,41 +12,46 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmt_slam_ros.configuration import Configuration
-from hmt_slam_ros.configuration.metric_slam import Motion
-from hmt_slam_ros.configuration.topology import Refinement
+from hmt_slam_ros.configuration.metric_slam import MotionParameters
+from hmt_slam_ros.configuration.topology import RefinementParameters
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.hybrid_map.pose_graph import Edges
-from hmt_slam_ros.hybrid_map.shortest_path import reachable, unknown
+from hmt_slam_ros.hybrid_map.shortest_path import shortest_path_beliefs, uninformative_belief
 from hmt_slam_ros.logs import Log
 from hmt_slam_ros.loop_closure.joint_refinement import (
+    add_distant_pairs,
     certain_areas,
     linked_areas,
-    neighbours,
-    pairs_of,
+    nearest_keyframes,
     refine_jointly,
-    with_other_ways,
+    scan_pairs,
 )
-from hmt_slam_ros.registration.scan_to_scan import Surfaces, normal_equations, surfaces_of, weighting
+from hmt_slam_ros.registration.scan_to_scan import (
+    ScanSurfaces,
+    extract_surfaces,
+    normal_equations,
+    weighting_from_options,
+)
 from hmt_slam_ros.results.recorder import Recording, keyframe_poses
-from hmt_slam_ros.results.trajectories import Trajectory, carried
+from hmt_slam_ros.results.trajectories import Trajectory, trajectory_in_map
 from hmt_slam_ros.sensors import Odometry, Scan
-from hmt_slam_ros.sensors.deskew import SweepCheck, deskewed
+from hmt_slam_ros.sensors.deskew import SweepCheck, deskew_scan
 from hmt_slam_ros.sensors.motion_model import path_covariance
 from hmt_slam_ros.sensors.odometry import OdometryBuffer
 
 # A scan is where metric SLAM matched it, so that few steps suffice.
-_STEPS = 2
+_ITERATIONS = 2
 
 
-def place(
-    surfaces: Surfaces,
+def register_scans(
+    surfaces: ScanSurfaces,
     poses: NDArray[np.float64],
-    scans: Surfaces,
+    scans: ScanSurfaces,
     initial: NDArray[np.float64],
-    around: list[NDArray[np.int64]],
-    options: Refinement,
+    neighbor_rows: list[NDArray[np.int64]],
+    options: RefinementParameters,
 ) -> NDArray[np.float64]:
     """Register scans with keyframes that stay where they are.
 
@@ -55,27 +60,30 @@ def place(
     :param scans: m scans.
     :param initial: shape (m, 3), where they are thought to be, with the deviations ``options.scan_sigma`` and
         ``options.scan_angle``.
-    :param around: for every scan the rows of the keyframes to register with.
+    :param neighbor_rows: for every scan the rows of the keyframes to register with.
     :returns: shape (m, 3).
     """
-    scan_of = np.repeat(np.arange(len(around)), [len(rows) for rows in around])
-    keyframe_of = np.concatenate([np.zeros(0, np.int64), *around])
+    scan_of = np.repeat(np.arange(len(neighbor_rows)), [len(rows) for rows in neighbor_rows])
+    keyframe_of = np.concatenate([np.zeros(0, np.int64), *neighbor_rows])
     prior = np.diag([options.scan_sigma**-2, options.scan_sigma**-2, math.radians(options.scan_angle) ** -2])
     placed = initial
-    for _ in range(_STEPS):
+    for _ in range(_ITERATIONS):
         relative = se2.between(poses[keyframe_of], placed[scan_of])
         information, gradient, share = normal_equations(
-            scans, scan_of, surfaces, keyframe_of, relative, options.last_gate, weighting(options), 1
+            scans, scan_of, surfaces, keyframe_of, relative, options.last_gate, weighting_from_options(options), 1
         )
         meets = share >= options.min_share
-        total, slope = np.broadcast_to(prior, (len(around), 3, 3)).copy(), se2.log(se2.between(initial, placed)) @ prior
+        total, slope = (
+            np.broadcast_to(prior, (len(neighbor_rows), 3, 3)).copy(),
+            se2.log(se2.between(initial, placed)) @ prior,
+        )
         np.add.at(total, scan_of[meets], information[meets])
         np.add.at(slope, scan_of[meets], gradient[meets])
         placed = se2.compose(placed, se2.exp(-np.linalg.solve(total, slope[..., None])[..., 0]))
     return placed
 
 
-def corrected_scans(log: Log, configuration: Configuration) -> Iterator[Scan]:
+def deskewed_scans(log: Log, configuration: Configuration) -> Iterator[Scan]:
     """All scans in file order, each as soon as the odometry covers its sweep, if it has one.
 
     :raises HmtSlamError: where the log is faulty.
@@ -85,16 +93,16 @@ def corrected_scans(log: Log, configuration: Configuration) -> Iterator[Scan]:
         if isinstance(record.measurement, Odometry):
             odometry.add(record.measurement)
         else:
-            waiting.append(sweeps.checked(record.measurement)[0])
-        while waiting and (waiting[0].sweep == 0.0 or odometry.covers(waiting[0].end)):
-            yield _corrected(waiting.popleft(), odometry, configuration)
+            waiting.append(sweeps.check(record.measurement)[0])
+        while waiting and (waiting[0].sweep_duration == 0.0 or odometry.covers(waiting[0].end_stamp)):
+            yield _deskew_by_odometry(waiting.popleft(), odometry, configuration)
     while waiting:
-        yield _corrected(waiting.popleft(), odometry, configuration)
+        yield _deskew_by_odometry(waiting.popleft(), odometry, configuration)
 
 
-def _corrected(scan: Scan, odometry: OdometryBuffer, configuration: Configuration) -> Scan:
-    odometry.at(scan.stamp)  # forgets what lies before
-    return deskewed(scan, odometry, configuration.rtl)
+def _deskew_by_odometry(scan: Scan, odometry: OdometryBuffer, configuration: Configuration) -> Scan:
+    odometry.pose_at(scan.stamp)  # forgets what lies before
+    return deskew_scan(scan, odometry, configuration.rtl)
 
 
 # Scans whose surfaces are in memory at once.
@@ -119,19 +127,23 @@ def final_map(recording: Recording, scans: Iterable[Scan], configuration: Config
 
     :param scans: all scans of the newest log in its order; those of earlier logs stay where they are to keyframes.
     """
-    travelled = carried(recording.scans, keyframe_poses(recording.hybrid_map, _areas_as_travelled(recording)))
+    travelled = trajectory_in_map(
+        recording.relative_trajectory, keyframe_poses(recording.hybrid_map, _open_loop_area_poses(recording))
+    )
     stages = {"filter": travelled, "arcs": recording.trajectory}
     if not configuration.refinement.iterations or configuration.mode == "localization":
         return FinalMap(recording, stages)
-    keyframes = _Keyframes(recording, configuration)
-    refined = _with_keyframes(recording, keyframes.refined(recording))
+    keyframes = _KeyframeRefinement(recording, configuration)
+    refined = _with_keyframe_poses(recording, keyframes.refined_poses(recording))
     stages["keyframes"] = refined.trajectory
-    placed = keyframes.placed(refined, scans)
-    relative = refined.scans.at(placed, keyframe_poses(refined.hybrid_map, refined.area_poses))
-    return FinalMap(replace(refined, trajectory=placed, scans=relative), stages)
+    placed = keyframes.registered_trajectory(refined, scans)
+    relative = refined.relative_trajectory.with_trajectory(
+        placed, keyframe_poses(refined.hybrid_map, refined.area_poses)
+    )
+    return FinalMap(replace(refined, trajectory=placed, relative_trajectory=relative), stages)
 
 
-class _Keyframes:
+class _KeyframeRefinement:
     """The keyframes of the most probable map, in the order in which they were taken.
 
     :ivar ids: their ids, ascending.
@@ -148,31 +160,31 @@ class _Keyframes:
         self.areas = np.array([area_of[keyframe] for keyframe in self.ids], dtype=np.int64)
         self._surfaces = self._surfaces_of([recording.replica.scans[keyframe] for keyframe in self.ids])
 
-    def _surfaces_of(self, scans: list[Scan]) -> Surfaces:
-        return surfaces_of(scans, self._configuration.local_map.max_range, self._options.max_points)
+    def _surfaces_of(self, scans: list[Scan]) -> ScanSurfaces:
+        return extract_surfaces(scans, self._configuration.local_map.max_range, self._options.max_points)
 
     def _poses(self, recording: Recording) -> NDArray[np.float64]:
         poses = keyframe_poses(recording.hybrid_map, recording.area_poses)
         return np.array([poses[keyframe] for keyframe in self.ids])
 
-    def _around(
+    def _neighbor_rows(
         self, poses: NDArray[np.float64], seen_from: NDArray[np.float64], areas: NDArray[np.int64], count: int
     ) -> list[NDArray[np.int64]]:
-        return neighbours(poses, self.areas, seen_from, areas, self._linked, self._options.reach, count)
+        return nearest_keyframes(poses, self.areas, seen_from, areas, self._linked, self._options.reach, count)
 
-    def refined(self, recording: Recording) -> dict[int, NDArray[np.float64]]:
+    def refined_poses(self, recording: Recording) -> dict[int, NDArray[np.float64]]:
         """{keyframe: ``map_T_base``} by joint refinement; the first keyframe stays."""
         poses = self._poses(recording)
         # Each keyframe is the nearest to itself.
-        around = self._around(poses, poses, self.areas, self._options.neighbours + 1)
-        near = pairs_of(around, self._options.min_share)
+        around = self._neighbor_rows(poses, poses, self.areas, self._options.neighbors + 1)
+        near = scan_pairs(around, self._options.min_share)
         certain = certain_areas(recording.hybrid_map, self._options.first_gate)
-        pairs = with_other_ways(near, self._surfaces, poses, self.areas, certain, self._options)
-        motion = self._motion(recording, poses)
+        pairs = add_distant_pairs(near, self._surfaces, poses, self.areas, certain, self._options)
+        motion = self._motion_edges(recording, poses)
         refined = refine_jointly(self._surfaces, poses, pairs, motion, self._options)
         return dict(zip(self.ids, refined, strict=True))
 
-    def _motion(self, recording: Recording, poses: NDArray[np.float64]) -> Edges:
+    def _motion_edges(self, recording: Recording, poses: NDArray[np.float64]) -> Edges:
         """From each keyframe to the next the motion that metric SLAM found, as uncertain as the odometry of that way.
 
         Where no pair of scans overlaps enough, metric SLAM has seen more in its map than odometry could tell. From one
@@ -183,19 +195,21 @@ class _Keyframes:
         covariances = _path_covariances(recording.odometry, rows, self._configuration.motion)
         logs = np.searchsorted(recording.first_scans, rows, side="right")
         for n in np.flatnonzero(np.diff(logs)):
-            covariances[n] = unknown(steps[n]).covariance
+            covariances[n] = uninformative_belief(steps[n]).covariance
         return Edges(np.arange(count), np.arange(1, count + 1), steps, covariances)
 
-    def placed(self, recording: Recording, scans: Iterable[Scan]) -> Trajectory:
+    def registered_trajectory(self, recording: Recording, scans: Iterable[Scan]) -> Trajectory:
         """The trajectory with every scan of the newest log registered with the keyframes around it."""
         poses, options = self._poses(recording), self._options
-        areas = self.areas[np.searchsorted(self.ids, np.maximum(recording.scans.keyframes, self.ids[0]))]
+        areas = self.areas[np.searchsorted(self.ids, np.maximum(recording.relative_trajectory.keyframes, self.ids[0]))]
         placed, remaining = recording.trajectory.copy(), iter(scans)
         for first in range(recording.first_scans[-1], len(placed), _BATCH):
             batch = list(itertools.islice(remaining, _BATCH))
             rows = slice(first, first + len(batch))
-            around = self._around(poses, placed[rows], areas[rows], options.scan_neighbours)
-            placed[rows] = place(self._surfaces, poses, self._surfaces_of(batch), placed[rows], around, options)
+            around = self._neighbor_rows(poses, placed[rows], areas[rows], options.scan_neighbors)
+            placed[rows] = register_scans(
+                self._surfaces, poses, self._surfaces_of(batch), placed[rows], around, options
+            )
         return placed
 
 
@@ -205,7 +219,7 @@ def _scan_rows(recording: Recording, keyframes: list[int]) -> NDArray[np.intp]:
     return np.searchsorted(recording.stamps, stamps)
 
 
-def _path_covariances(odometry: Trajectory, rows: NDArray[np.intp], motion: Motion) -> NDArray[np.float64]:
+def _path_covariances(odometry: Trajectory, rows: NDArray[np.intp], motion: MotionParameters) -> NDArray[np.float64]:
     """Covariances (n - 1, 3, 3) of the odometry along the paths between n scans of the log."""
     steps = se2.between(odometry[:-1], odometry[1:])
     distance = np.concatenate(([0.0], np.cumsum(np.hypot(steps[:, 0], steps[:, 1]))))[rows]
@@ -215,7 +229,7 @@ def _path_covariances(odometry: Trajectory, rows: NDArray[np.intp], motion: Moti
     ).reshape(-1, 3, 3)
 
 
-def _with_keyframes(recording: Recording, poses: Mapping[int, NDArray[np.float64]]) -> Recording:
+def _with_keyframe_poses(recording: Recording, poses: Mapping[int, NDArray[np.float64]]) -> Recording:
     """The recording with its keyframes at given ``map_T_base``.
 
     An area's frame moves with the first of its keyframes. Arcs take over the poses between the frames, and keep their
@@ -229,19 +243,24 @@ def _with_keyframes(recording: Recording, poses: Mapping[int, NDArray[np.float64
         frame = se2.compose(poses[reference], se2.inverse(area_T_reference))
         area_poses[area] = PoseGaussian(frame, recording.area_poses[area].covariance)
         for keyframe in keyframes:
-            hybrid_map.place(keyframe, area, se2.between(frame, poses[keyframe]))
+            hybrid_map.set_keyframe(keyframe, area, se2.between(frame, poses[keyframe]))
     for a, b, arc in list(hybrid_map.all_arcs()):
         mean = se2.between(area_poses[a].mean, area_poses[b].mean)
         hybrid_map.set_arc(a, b, PoseGaussian(mean, arc.pose.covariance), closure=arc.closure)
-    replica = replace(recording.replica, maps=recording.replica.maps | {recording.replica.best: hybrid_map})
-    return replace(recording, replica=replica, area_poses=area_poses, trajectory=carried(recording.scans, poses))
+    replica = replace(recording.replica, maps=recording.replica.maps | {recording.replica.best_hypothesis: hybrid_map})
+    return replace(
+        recording,
+        replica=replica,
+        area_poses=area_poses,
+        trajectory=trajectory_in_map(recording.relative_trajectory, poses),
+    )
 
 
-def _areas_as_travelled(recording: Recording) -> dict[int, PoseGaussian]:
+def _open_loop_area_poses(recording: Recording) -> dict[int, PoseGaussian]:
     """``map_T_area`` along the arcs that closed no loop; as it is where no such arc leads there."""
     hybrid_map = recording.hybrid_map
-    open_map = HybridMap(areas={area: dict(hybrid_map.keyframes(area)) for area in hybrid_map.area_ids()})
+    open_map = HybridMap(changed_areas={area: dict(hybrid_map.keyframes(area)) for area in hybrid_map.area_ids()})
     for a, b, arc in hybrid_map.all_arcs():
         if not arc.closure:
             open_map.set_arc(a, b, arc.pose, closure=False)
-    return recording.area_poses | reachable(open_map, hybrid_map.area_ids()[0])
+    return recording.area_poses | shortest_path_beliefs(open_map, hybrid_map.area_ids()[0])

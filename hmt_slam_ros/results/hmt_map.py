@@ -22,10 +22,10 @@ from hmt_slam_ros.messages.messages import LocalEstimate
 from hmt_slam_ros.messages.replica import Replica, ReplicaState
 from hmt_slam_ros.metric_slam.slam import SlamState
 from hmt_slam_ros.real_time_localization.rtl import RtlState
-from hmt_slam_ros.results.log_reading import LogState
-from hmt_slam_ros.results.record import Record
-from hmt_slam_ros.results.trajectories import Anchored
-from hmt_slam_ros.saved_map.folder import CONFIGURATION, FORMAT, VERSION, File, FolderReader, FolderWriter
+from hmt_slam_ros.results.log_reading import LogProgress
+from hmt_slam_ros.results.record import RunRecord
+from hmt_slam_ros.results.trajectories import RelativeTrajectory
+from hmt_slam_ros.saved_map.folder import CONFIGURATION, FORMAT, VERSION, FileRecord, FolderReader, FolderWriter
 from hmt_slam_ros.topological_inference.tsbi import TsbiState
 
 
@@ -38,13 +38,13 @@ class RunState:
     :ivar recorder: what the output folder needs of the run so far.
     """
 
-    log: LogState = field(default_factory=LogState)
+    log: LogProgress = field(default_factory=LogProgress)
     slam: SlamState = field(default_factory=SlamState)
     aam: AamState = field(default_factory=AamState)
     tsbi: TsbiState = field(default_factory=TsbiState)
     tlca: TlcaState = field(default_factory=TlcaState)
     rtl: RtlState = field(default_factory=RtlState)
-    recorder: Record = field(default_factory=Record)
+    recorder: RunRecord = field(default_factory=RunRecord)
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,14 +53,14 @@ class MapDocument:
 
     :ivar replica: the maps of the live hypotheses; that of the most probable one is refined.
     :ivar area_poses: ``map_T_area`` of all areas of the most probable hypothesis, ordered by id.
-    :ivar robot: where the robot was last.
-    :ivar scans: where the scans of all logs were taken; none in a map that nodes saved.
+    :ivar last_estimate: where the robot was last.
+    :ivar relative_trajectory: where the scans of all logs were taken; none in a map that nodes saved.
     """
 
     replica: ReplicaState
     area_poses: tuple[AreaPose, ...]
-    robot: LocalEstimate
-    scans: Anchored
+    last_estimate: LocalEstimate
+    relative_trajectory: RelativeTrajectory
 
 
 @dataclass(frozen=True)
@@ -84,13 +84,13 @@ class SavedMap:
     :ivar replica: scans and maps of the live hypotheses with their probabilities.
     :ivar area_poses: {area: belief over ``map_T_area``} of the most probable hypothesis.
     :ivar configuration: that of the run.
-    :ivar scans: where the scans of all logs were taken, if that is known.
+    :ivar relative_trajectory: where the scans of all logs were taken, if that is known.
     """
 
     replica: Replica
     area_poses: dict[int, PoseGaussian]
     configuration: Configuration
-    scans: Anchored = field(default_factory=Anchored.none)
+    relative_trajectory: RelativeTrajectory = field(default_factory=RelativeTrajectory.empty)
 
 
 class MapWriter:
@@ -104,35 +104,37 @@ class MapWriter:
         """Write what a run goes on from."""
         for name in PARTS:
             self._folder.write(name, getattr(state, name))
-        self._folder.write("chain", ChainState(state.slam.events))
+        self._folder.write("chain", ChainState(state.slam.keyframe_events))
 
-    def write_slam(self, state: SlamState) -> None:
+    def write_slam_state(self, state: SlamState) -> None:
         """Write metric SLAM's part of what nodes go on from; :meth:`join` takes those of the others."""
         self._folder.write("slam", state)
-        self._folder.write("chain", ChainState(state.events))
+        self._folder.write("chain", ChainState(state.keyframe_events))
 
-    def join(self, files: Iterable[File]) -> None:
+    def add_files(self, files: Iterable[FileRecord]) -> None:
         """Take in files that others wrote into the folder."""
-        self._folder.join(files)
+        self._folder.add_files(files)
 
     def write_map(
         self,
         replica: Replica,
         area_poses: Mapping[int, PoseGaussian],
-        robot: LocalEstimate,
-        placed: Anchored | None = None,
+        last_estimate: LocalEstimate,
+        relative_trajectory: RelativeTrajectory | None = None,
     ) -> None:
         """Write the map at its best.
 
         :param area_poses: {area: belief over ``map_T_area``} of the most probable hypothesis.
-        :param robot: the last of what metric SLAM said.
-        :param placed: where the scans of all logs were taken, where that is known.
+        :param last_estimate: the last of what metric SLAM said.
+        :param relative_trajectory: where the scans of all logs were taken, where that is known.
         """
         mapped = sorted({k for own in replica.maps.values() for area in own.area_ids() for k in own.keyframes(area)})
         scans = {keyframe: replica.scans[keyframe] for keyframe in mapped}
-        kept = Replica(scans, replica.maps, replica.probabilities, replica.areas)
+        kept = Replica(scans, replica.maps, replica.probabilities, replica.robot_areas)
         poses = tuple(AreaPose(area, pose) for area, pose in sorted(area_poses.items()))
-        self._folder.write("map", MapDocument(kept.state, poses, robot, placed or Anchored.none()))
+        self._folder.write(
+            "map", MapDocument(kept.state, poses, last_estimate, relative_trajectory or RelativeTrajectory.empty())
+        )
 
     def finish(self, configuration: Configuration) -> None:
         """Write the configuration, and last the manifest."""
@@ -148,7 +150,7 @@ def read_saved_map(directory: Path) -> SavedMap:
     document = FolderReader(directory, FORMAT, VERSION).read("map", MapDocument)
     poses = {entry.area: entry.pose for entry in document.area_poses}
     configuration = load_configuration(directory / CONFIGURATION)
-    return SavedMap(Replica.of(document.replica), poses, configuration, document.scans)
+    return SavedMap(Replica.from_state(document.replica), poses, configuration, document.relative_trajectory)
 
 
 def read_run_state(directory: Path) -> tuple[RunState, Configuration]:

@@ -17,7 +17,7 @@ from hmt_slam_ros.configuration.flat import as_flat
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.logs.records import Log, LogRecord
 from hmt_slam_ros.logs.stamps import NANOSECONDS, seconds_from_stamp
-from hmt_slam_ros.results.trajectories import Anchored
+from hmt_slam_ros.results.trajectories import RelativeTrajectory
 from hmt_slam_ros.saved_map.folder import HMT_MAP
 from hmt_slam_ros.sensors import Scan
 
@@ -26,29 +26,29 @@ _BETWEEN_LOGS = 60 * NANOSECONDS
 
 
 @dataclass(frozen=True, eq=False)
-class LogState:
+class LogProgress:
     """How far the logs of a map were read.
 
-    :ivar records: scans and odometry readings of the newest log.
+    :ivar records_read: scans and odometry readings of the newest log.
     :ivar stamps: shape (n,), of the scans of all logs on the map's clock, ns, increasing.
     :ivar source_stamps: shape (n,), the logs' own stamps of them, ns.
     :ivar first_scans: number of the first scan of each log.
-    :ivar earlier: where the scans of all logs before the newest were taken after the final refinement of that time, or
+    :ivar earlier_trajectory: where the scans of all logs before the newest were taken after the final refinement of that time, or
         none.
-    :ivar shift: what the map's clock is ahead of the running clock of the newest log, ns.
+    :ivar clock_offset: what the map's clock is ahead of the running clock of the newest log, ns.
     :ivar checksum: CRC-32 of the ranges of the first scan of the newest log.
     """
 
-    records: int = 0
+    records_read: int = 0
     stamps: Int64 = field(default_factory=lambda: np.zeros(0, np.int64))
     source_stamps: Int64 = field(default_factory=lambda: np.zeros(0, np.int64))
     first_scans: tuple[int, ...] = (0,)
-    earlier: Anchored = field(default_factory=Anchored.none)
-    shift: int = 0
+    earlier_trajectory: RelativeTrajectory = field(default_factory=RelativeTrajectory.empty)
+    clock_offset: int = 0
     checksum: int = 0
 
 
-def goes_on(state: LogState, log: Log) -> bool:
+def is_newest_log(state: LogProgress, log: Log) -> bool:
     """Whether a log is the newest one of a map, and no further one: it begins with the same scan."""
     first = state.first_scans[-1]
     if first == state.stamps.size:
@@ -59,23 +59,35 @@ def goes_on(state: LogState, log: Log) -> bool:
     return False
 
 
-class Reading:
+class LogReader:
     """Reads one log after the other."""
 
-    def __init__(self, state: LogState) -> None:
+    def __init__(self, state: LogProgress) -> None:
         """:param state: to go on from."""
-        self._records, self._first_scans, self._earlier = state.records, state.first_scans, state.earlier
-        self._shift, self._checksum = state.shift, state.checksum
+        self._records_read, self._first_scans, self._earlier_trajectory = (
+            state.records_read,
+            state.first_scans,
+            state.earlier_trajectory,
+        )
+        self._clock_offset, self._checksum = state.clock_offset, state.checksum
         self._stamps, self._source_stamps = (array("q", part.tobytes()) for part in (state.stamps, state.source_stamps))
 
     @property
-    def state(self) -> LogState:
+    def state(self) -> LogProgress:
         """How far the logs were read, as a value."""
         running, source = np.array(self._stamps, np.int64), np.array(self._source_stamps, np.int64)
-        return LogState(self._records, running, source, self._first_scans, self._earlier, self._shift, self._checksum)
+        return LogProgress(
+            self._records_read,
+            running,
+            source,
+            self._first_scans,
+            self._earlier_trajectory,
+            self._clock_offset,
+            self._checksum,
+        )
 
     @property
-    def scans(self) -> int:
+    def scans_read(self) -> int:
         """Scans of the newest log that were read."""
         return len(self._stamps) - self._first_scans[-1]
 
@@ -84,22 +96,22 @@ class Reading:
         """What the stamps of the scans take."""
         return sum(len(stamps) * stamps.itemsize for stamps in (self._stamps, self._source_stamps))
 
-    def begin(self, log: Log) -> None:
+    def begin_log(self, log: Log) -> None:
         """Begin a further log, on a clock that goes on."""
         self._first_scans = (*self._first_scans, len(self._stamps))
         first = next((record.measurement.stamp for record in log.records()), 0)
-        self._records, self._shift = 0, self._stamps[-1] + _BETWEEN_LOGS - first
+        self._records_read, self._clock_offset = 0, self._stamps[-1] + _BETWEEN_LOGS - first
 
-    def unread(self, log: Log) -> Iterator[LogRecord]:
+    def unread_records(self, log: Log) -> Iterator[LogRecord]:
         """The records of the newest log that were not read, with stamps on the map's clock.
 
         :raises HmtSlamError: where it is not as it was when the others were read.
         """
         first = self._first_scans[-1]
         scans = zip(self._stamps[first:], self._source_stamps[first:], strict=True)
-        records = map(self._shifted, log.records())
-        for record in itertools.islice(records, self._records):
-            if isinstance(record.measurement, Scan) and next(scans, None) != _stamps(record):
+        records = map(self._to_map_clock, log.records())
+        for record in itertools.islice(records, self._records_read):
+            if isinstance(record.measurement, Scan) and next(scans, None) != _scan_stamps(record):
                 raise HmtSlamError(
                     f"{log.name} begins as the log that the map was made of and is another: a scan of it, at "
                     f"{seconds_from_stamp(record.source_stamp)} s, is not in the map; give that log"
@@ -111,23 +123,25 @@ class Reading:
             )
         return records
 
-    def note(self, record: LogRecord) -> None:
+    def mark_read(self, record: LogRecord) -> None:
         """Note that a record was read."""
-        self._records += 1
+        self._records_read += 1
         if isinstance(record.measurement, Scan):
-            if not self.scans:
+            if not self.scans_read:
                 self._checksum = _checksum(record.measurement)
-            running, source = _stamps(record)
+            running, source = _scan_stamps(record)
             self._stamps.append(running)
             self._source_stamps.append(source)
 
-    def _shifted(self, record: LogRecord) -> LogRecord:
-        if not self._shift:
+    def _to_map_clock(self, record: LogRecord) -> LogRecord:
+        if not self._clock_offset:
             return record
-        return replace(record, measurement=replace(record.measurement, stamp=record.measurement.stamp + self._shift))
+        return replace(
+            record, measurement=replace(record.measurement, stamp=record.measurement.stamp + self._clock_offset)
+        )
 
 
-def _stamps(record: LogRecord) -> tuple[int, int]:
+def _scan_stamps(record: LogRecord) -> tuple[int, int]:
     """Of a scan, on the map's clock and the log's own, ns."""
     return record.measurement.stamp, record.source_stamp
 
@@ -137,11 +151,17 @@ def _checksum(scan: Scan) -> int:
 
 
 # Which part of a log is used, how it is played, what is done with known ground, and who drives.
-_FREE = ("robot.", "mode", "explorer.", "pilot.")
+_CHANGEABLE = ("robot.", "mode", "explorer.", "pilot.")
 # Where a log begins that goes on.
 _START = "robot.start"
 # What the numbers in the state mean depends on these.
-SHAPING = ("filter.particles", "local_map.kind", "local_map.cell", "local_map.extent", "local_map.field_radius")
+FIXED_PARAMETERS = (
+    "filter.particles",
+    "local_map.kind",
+    "local_map.cell",
+    "local_map.extent",
+    "local_map.field_radius",
+)
 
 
 def map_folder(path: Path) -> Path:
@@ -150,7 +170,7 @@ def map_folder(path: Path) -> Path:
     return inner if inner.is_dir() else path
 
 
-def which_log(read: LogState, name: str, *, further: bool) -> str:
+def describe_log(read: LogProgress, name: str, *, further: bool) -> str:
     """A sentence about whether a log is the newest one of a map, or a further one.
 
     :param read: what was read of the logs of the map.
@@ -165,7 +185,7 @@ def which_log(read: LogState, name: str, *, further: bool) -> str:
     return f"{name} is the log that the map was made of, of which {scans} scans are in it: goes on with the next"
 
 
-def differences(saved: Configuration, asked: Configuration, *, further: bool = False) -> str | None:
+def describe_parameter_changes(saved: Configuration, asked: Configuration, *, further: bool = False) -> str | None:
     """A sentence about the parameters that change as the run goes on, None where none does.
 
     :param saved: the configuration of the map.
@@ -174,15 +194,19 @@ def differences(saved: Configuration, asked: Configuration, *, further: bool = F
     """
     before, now = as_flat(saved), as_flat(asked)
     changed = [name for name in before if before[name] != now[name]]
-    fixed = [name for name in changed if name in SHAPING or (name == _START and not further)]
+    fixed = [name for name in changed if name in FIXED_PARAMETERS or (name == _START and not further)]
     if fixed:
         raise HmtSlamError(
-            f"the map was made with {_listed(fixed, before)}, not with {_listed(fixed, now)}, and cannot go on with "
+            f"the map was made with {_join_settings(fixed, before)}, not with {_join_settings(fixed, now)}, and cannot go on with "
             "another value: leave that away, or map the log anew"
         )
-    free = [name for name in changed if not name.startswith(_FREE)]
-    return f"goes on with {_listed(free, now)}; the map was made with {_listed(free, before)}" if free else None
+    free = [name for name in changed if not name.startswith(_CHANGEABLE)]
+    return (
+        f"goes on with {_join_settings(free, now)}; the map was made with {_join_settings(free, before)}"
+        if free
+        else None
+    )
 
 
-def _listed(names: list[str], values: dict[str, bool | int | float | str]) -> str:
+def _join_settings(names: list[str], values: dict[str, bool | int | float | str]) -> str:
     return " and ".join(f"{name} = {values[name]}" for name in names)

@@ -21,19 +21,19 @@ from hmt_slam_ros.results.export import LANDMARKS, PLACES, TOPOLOGY
 from hmt_slam_ros.results.final_map import FinalMap
 from hmt_slam_ros.results.hmt_map import MapWriter
 from hmt_slam_ros.results.recorder import Recording, keyframe_poses
-from hmt_slam_ros.results.report import RunFigures, report, write_cost, write_probabilities, write_report
-from hmt_slam_ros.saved_map.folder import HMT_MAP, MANIFEST, put_in_place
+from hmt_slam_ros.results.report import RunMetrics, build_report, write_cost, write_probabilities, write_report
+from hmt_slam_ros.saved_map.folder import HMT_MAP, MANIFEST, replace_folder
 
-EARLIER = "earlier"
+EARLIER_LOGS = "earlier"
 """The folder of the trajectories of earlier logs, 1.tum, 2.tum and so on."""
 
 # Everything that ever stands in an output folder; a folder with anything else in it is not ours to replace.
-OWN_NAMES = frozenset(
+OUTPUT_NAMES = frozenset(
     {
         "trajectory.tum",
         "trajectory_online.tum",
         "stages",
-        EARLIER,
+        EARLIER_LOGS,
         "map.pgm",
         "map.yaml",
         "map.png",
@@ -52,7 +52,7 @@ OWN_NAMES = frozenset(
 
 
 @contextmanager
-def replacing(directory: Path) -> Iterator[Path]:
+def atomic_output(directory: Path) -> Iterator[Path]:
     """A folder to write into that becomes ``directory`` if all goes well, and vanishes if not.
 
     :raises HmtSlamError: where ``directory`` is something else than an old output folder, or cannot be made.
@@ -70,7 +70,7 @@ def replacing(directory: Path) -> Iterator[Path]:
         yield folder
         check_replaceable(target)
         target.parent.mkdir(parents=True, exist_ok=True)
-        put_in_place(folder, target)
+        replace_folder(folder, target)
     except OSError as fault:
         raise HmtSlamError(f"{directory} cannot be written ({fault.strerror}): choose another --out") from fault
     finally:
@@ -88,7 +88,7 @@ def check_replaceable(directory: Path) -> None:
     if blocking is not None:
         raise HmtSlamError(f"{directory} cannot be made since {blocking} is not a folder: choose another --out")
     names = {entry.name for entry in directory.iterdir()} if directory.exists() else set()
-    strange = sorted(names - OWN_NAMES)
+    strange = sorted(names - OUTPUT_NAMES)
     if strange or (names and not (directory / HMT_MAP / MANIFEST).is_file()):
         found = strange[0] if strange else min(names)
         raise HmtSlamError(f"{directory} is not an output folder, it holds {found}: choose another --out or empty it")
@@ -98,7 +98,7 @@ def write_output(
     directory: Path,
     final: FinalMap,
     source_stamps: NDArray[np.int64],
-    figures: RunFigures,
+    figures: RunMetrics,
     configuration: Configuration,
     state: MapWriter | None = None,
 ) -> None:
@@ -112,12 +112,12 @@ def write_output(
     _write_trajectories(directory, final, source_stamps)
     _write_map(directory, recording, configuration)
     saved = state or map_writer(directory)
-    saved.write_map(recording.replica, recording.area_poses, recording.last, recording.scans)
+    saved.write_map(recording.replica, recording.area_poses, recording.last_estimate, recording.relative_trajectory)
     saved.finish(configuration)
     write_graph(directory / "graph.g2o", recording)
     write_probabilities(directory / "pmf.csv", recording.probabilities)
     write_cost(directory / "cost.csv", figures.seconds_per_scan)
-    write_report(directory / "report.json", report(recording, configuration, figures))
+    write_report(directory / "report.json", build_report(recording, configuration, figures))
     # matplotlib is loaded when the processes have given their memory back, and only where something is drawn.
     from hmt_slam_ros.results.plots import plot_map  # noqa: PLC0415
 
@@ -127,16 +127,16 @@ def write_output(
 def _write_trajectories(directory: Path, final: FinalMap, source_stamps: NDArray[np.int64]) -> None:
     """Those of the newest log, and of the earlier ones where they are in the final map."""
     recording = final.recording
-    trajectories = {"trajectory": recording.trajectory, "trajectory_online": recording.online}
+    trajectories = {"trajectory": recording.trajectory, "trajectory_online": recording.online_trajectory}
     trajectories |= {f"stages/{name}": trajectory for name, trajectory in final.stages.items()}
     (directory / "stages").mkdir()
     newest = slice(recording.first_scans[-1], None)
     for name, trajectory in trajectories.items():
         write_tum(directory / f"{name}.tum", StampedPoses(source_stamps[newest], trajectory[newest]))
     for number, (first, end) in enumerate(pairwise(recording.first_scans), start=1):
-        (directory / EARLIER).mkdir(exist_ok=True)
+        (directory / EARLIER_LOGS).mkdir(exist_ok=True)
         poses = StampedPoses(source_stamps[first:end], recording.trajectory[first:end])
-        write_tum(directory / EARLIER / f"{number}.tum", poses)
+        write_tum(directory / EARLIER_LOGS / f"{number}.tum", poses)
 
 
 def map_writer(directory: Path) -> MapWriter:
@@ -157,13 +157,13 @@ def write_graph(path: Path, recording: Recording) -> None:
     The error that g2o weighs is the vector (x, y, theta) of measurement^-1 * estimate, which to first order is the
     right tangent xi of our covariances, so the information matrix is their inverse.
     """
-    lines = [f"VERTEX_SE2 {area} {_numbers(pose.mean)}\n" for area, pose in sorted(recording.area_poses.items())]
+    lines = [f"VERTEX_SE2 {area} {_format_numbers(pose.mean)}\n" for area, pose in sorted(recording.area_poses.items())]
     upper = np.triu_indices(3)
     for a, b, arc in recording.hybrid_map.all_arcs():
         information = np.linalg.inv(arc.pose.covariance)
-        lines.append(f"EDGE_SE2 {a} {b} {_numbers(arc.pose.mean)} {_numbers(information[upper])}\n")
+        lines.append(f"EDGE_SE2 {a} {b} {_format_numbers(arc.pose.mean)} {_format_numbers(information[upper])}\n")
     path.write_text("".join(lines), encoding="utf-8")
 
 
-def _numbers(values: NDArray[Any]) -> str:
+def _format_numbers(values: NDArray[Any]) -> str:
     return " ".join(f"{value:.12g}" for value in values)

@@ -25,7 +25,7 @@ from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.results.hmt_map import SavedMap, read_saved_map
 from hmt_slam_ros.results.report import read_table
 
-Colour = tuple[float, float, float]
+Color = tuple[float, float, float]
 
 _DPI = 150
 _CLOSURE, _ARC, _PATH = "#d62728", "#1f3b70", "#555555"
@@ -48,7 +48,7 @@ def plot_map(directory: Path) -> Path:
     height, width = (size * image.resolution for size in image.pixels.shape)
     figure = Figure(figsize=_figure_size(width, height), layout="constrained")
     axes = figure.add_subplot()
-    hybrid_map = saved.replica.maps[saved.replica.best]
+    hybrid_map = saved.replica.maps[saved.replica.best_hypothesis]
     _draw_grid(axes, image)
     axes.plot(path[:, 0], path[:, 1], color=_PATH, linewidth=0.8, label="path", zorder=2)
     _draw_keyframes(axes, hybrid_map, saved.area_poses)
@@ -65,7 +65,7 @@ def _figure_size(width: float, height: float) -> tuple[float, float]:
 
 
 def _draw_grid(axes: Axes, image: OccupancyImage) -> None:
-    axes.add_artist(_Grid(axes, image.pixels))
+    axes.add_artist(_GridArtist(axes, image.pixels))
     height, width = image.pixels.shape
     left, bottom = image.origin
     axes.set_xlim(left, left + width * image.resolution)
@@ -76,26 +76,26 @@ def _draw_grid(axes: Axes, image: OccupancyImage) -> None:
     axes.tick_params(labelsize=7)
 
 
-class _Grid(Artist):
+class _GridArtist(Artist):
     """The occupancy grid, which fills the axes; ``imshow`` takes 60 MB more, for colours and interpolation."""
 
     def __init__(self, axes: Axes, pixels: NDArray[np.uint8]) -> None:
         super().__init__()
-        self._filled, self._pixels = axes, pixels
+        self._grid_axes, self._pixels = axes, pixels
         self.set_zorder(0)
 
     def draw(self, renderer: RendererBase) -> None:
         """Paint every pixel of the picture in the darkest gray of the cells that it shows, so that walls stay."""
-        box = self._filled.get_window_extent(renderer)
+        box = self._grid_axes.get_window_extent(renderer)
         left, bottom = round(box.x0), round(box.y0)
         width, height = round(box.x1) - left, round(box.y1) - bottom
-        gray = _darkest(_darkest(self._pixels, height).T, width).T[::-1]
+        gray = _darkest_rows(_darkest_rows(self._pixels, height).T, width).T[::-1]
         colours = np.full((height, width, 4), 255, np.uint8)
         colours[..., :3] = gray[..., None]
         renderer.draw_image(renderer.new_gc(), left, bottom, colours)
 
 
-def _darkest(pixels: NDArray[np.uint8], count: int) -> NDArray[np.uint8]:
+def _darkest_rows(pixels: NDArray[np.uint8], count: int) -> NDArray[np.uint8]:
     """As many rows as asked for: the minimum of the rows (n, m) that each covers, or the nearest where rows repeat."""
     starts = np.arange(count) * len(pixels) // count
     return pixels[starts] if count >= len(pixels) else np.minimum.reduceat(pixels, starts)
@@ -105,7 +105,7 @@ def _draw_keyframes(axes: Axes, hybrid_map: HybridMap, area_poses: Mapping[int, 
     for area in hybrid_map.area_ids():
         poses = np.array(list(hybrid_map.keyframes(area).values())).reshape(-1, 3)
         points = se2.transform(area_poses[area].mean, poses[:, :2])
-        axes.plot(points[:, 0], points[:, 1], ".", color=_colour(area), markersize=4, zorder=3)
+        axes.plot(points[:, 0], points[:, 1], ".", color=_color_of(area), markersize=4, zorder=3)
 
 
 def _draw_arcs(axes: Axes, hybrid_map: HybridMap, area_poses: Mapping[int, PoseGaussian]) -> None:
@@ -121,20 +121,20 @@ def _draw_arcs(axes: Axes, hybrid_map: HybridMap, area_poses: Mapping[int, PoseG
 
 def _draw_areas(axes: Axes, saved: SavedMap, visible: float) -> None:
     """Origins with their ids and ellipses; ellipses too small to see are drawn larger by a round factor, in metres."""
-    ellipses = {area: belief.ellipse() for area, belief in saved.area_poses.items()}
-    largest = max(ellipse.longer for ellipse in ellipses.values())
+    ellipses = {area: belief.position_ellipse() for area, belief in saved.area_poses.items()}
+    largest = max(ellipse.semi_major for ellipse in ellipses.values())
     factor = 1 if largest <= 0.0 else int(10 ** np.clip(np.ceil(np.log10(visible / largest)), 0, 2))
     for area, ellipse in ellipses.items():
         x, y = saved.area_poses[area].mean[:2].tolist()
         axes.add_patch(
             Ellipse(
                 (x, y),
-                2.0 * factor * ellipse.longer,
-                2.0 * factor * ellipse.shorter,
+                2.0 * factor * ellipse.semi_major,
+                2.0 * factor * ellipse.semi_minor,
                 zorder=5,
                 angle=float(np.degrees(ellipse.angle)),
-                facecolor=(*_colour(area), 0.25),
-                edgecolor=_colour(area),
+                facecolor=(*_color_of(area), 0.25),
+                edgecolor=_color_of(area),
                 linewidth=1.0,
             )
         )
@@ -146,7 +146,7 @@ def _draw_areas(axes: Axes, saved: SavedMap, visible: float) -> None:
             fontsize=7,
             fontweight="bold",
             zorder=6,
-            bbox={"boxstyle": "circle,pad=0.25", "facecolor": "white", "edgecolor": _colour(area), "linewidth": 1.5},
+            bbox={"boxstyle": "circle,pad=0.25", "facecolor": "white", "edgecolor": _color_of(area), "linewidth": 1.5},
         )
     enlarged = f", enlarged {factor} times" if factor > 1 else ""
     axes.plot([], [], "o", markerfacecolor="none", color="black", label=f"area, 95 % ellipse{enlarged}")
@@ -161,7 +161,7 @@ def _map_title(hybrid_map: HybridMap, path: NDArray[np.float64]) -> str:
 
 def plot_probabilities(directory: Path) -> Path:
     """pmf.png: the distribution over the live topologies at every keyframe event, Eq. (14), and how many there are."""
-    table = _table(directory / "pmf.csv")
+    table = _read_columns(directory / "pmf.csv")
     if not table["stamp"].size:
         raise HmtSlamError(f"{directory / 'pmf.csv'} holds no probabilities: map the log again")
     minutes = (table["stamp"] - table["stamp"][0]) / 60e9
@@ -174,7 +174,7 @@ def plot_probabilities(directory: Path) -> Path:
     upper.set_ylabel("P(topology | data)")
     upper.set_ylim(0.0, 1.06)
     upper.legend(loc="lower left", fontsize=7)
-    lower.stairs(np.diff(np.append(firsts, minutes.size)), _edges(minutes[firsts]), color=_ARC, baseline=None)
+    lower.stairs(np.diff(np.append(firsts, minutes.size)), _bar_edges(minutes[firsts]), color=_ARC, baseline=None)
     lower.yaxis.set_major_locator(MaxNLocator(integer=True))
     lower.set_ylabel("live topologies")
     lower.set_xlabel("time [min]")
@@ -189,23 +189,23 @@ def _draw_bars(
     tops = np.cumsum(table["probability"])
     tops -= np.repeat(tops[firsts] - table["probability"][firsts], counts)
     bottoms = tops - table["probability"]
-    edges = _edges(minutes[firsts])
+    edges = _bar_edges(minutes[firsts])
     left, right = edges[:-1].repeat(counts), edges[1:].repeat(counts)
     corners = np.stack([(left, bottoms), (right, bottoms), (right, tops), (left, tops)]).transpose(2, 0, 1)
-    colours = [_colour(int(hypothesis)) for hypothesis in table["hypothesis"]]
+    colours = [_color_of(int(hypothesis)) for hypothesis in table["hypothesis"]]
     axes.add_collection(PolyCollection(list(corners), facecolors=colours, edgecolors="none"))
     axes.plot([], [], "s", color="none", markeredgecolor="gray", label="white: not examined or dropped")
     axes.set_xlim(edges[0], edges[-1])
 
 
-def _edges(starts: NDArray[np.float64]) -> NDArray[np.float64]:
+def _bar_edges(starts: NDArray[np.float64]) -> NDArray[np.float64]:
     """Starts of all bars and the end of the last one, which is as wide as most are."""
     return np.append(starts, starts[-1] + (float(np.median(np.diff(starts))) if starts.size > 1 else 1.0))
 
 
 def plot_cost(directory: Path) -> Path:
     """cost.png: what every process computed for every scan."""
-    table = _table(directory / "cost.csv")
+    table = _read_columns(directory / "cost.csv")
     figure = Figure(figsize=(11.0, 5.0), layout="constrained")
     axes = figure.add_subplot()
     for k, (name, cost) in enumerate(table.items()):
@@ -223,14 +223,14 @@ def plot_cost(directory: Path) -> Path:
     return _save(figure, directory / "cost.png")
 
 
-def _table(path: Path) -> dict[str, NDArray[np.float64]]:
+def _read_columns(path: Path) -> dict[str, NDArray[np.float64]]:
     try:
         return read_table(path)
     except (OSError, ValueError, StopIteration) as fault:
         raise HmtSlamError(f"{path} is missing or damaged: map the log again") from fault
 
 
-def _colour(number: int) -> Colour:
+def _color_of(number: int) -> Color:
     """Colours of neighbouring numbers are far apart: hues by the golden section, in two shades."""
     return colorsys.hsv_to_rgb((0.58 + number * _GOLDEN) % 1.0, 0.85, 0.85 if number % 2 else 0.65)
 

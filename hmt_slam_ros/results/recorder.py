@@ -18,37 +18,37 @@ from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
-from hmt_slam_ros.hybrid_map.keyframe_pruning import Successor, successor
-from hmt_slam_ros.hybrid_map.shortest_path import reachable
-from hmt_slam_ros.messages.map_changes import AreaPose, Forgotten
+from hmt_slam_ros.hybrid_map.keyframe_pruning import ReplacementKeyframe, nearest_replacement
+from hmt_slam_ros.hybrid_map.shortest_path import shortest_path_beliefs
+from hmt_slam_ros.messages.map_changes import AreaPose, PrunedKeyframe
 from hmt_slam_ros.messages.messages import (
-    Accepted,
-    Finished,
+    ClosureDecision,
+    EndOfRun,
     Hypotheses,
+    Hypothesis,
     Keyframe,
-    Leaf,
     LocalEstimate,
     Message,
     Notice,
-    Trail,
+    ScanPoses,
 )
 from hmt_slam_ros.messages.replica import Replica
-from hmt_slam_ros.results.record import EstimateTable, ProbabilityTable, Record, TopologyProbability, TrailTable
+from hmt_slam_ros.results.record import EstimateTable, ProbabilityTable, RunRecord, ScanPoseTable, TopologyProbability
 from hmt_slam_ros.results.trajectories import (
-    Anchored,
-    OnlinePose,
-    OnlinePoses,
+    AreaPoseUpdate,
+    OnlineEstimate,
+    OnlineTrajectory,
+    RelativeTrajectory,
     Trajectory,
-    Verdict,
-    anchored,
-    carried,
-    of_all,
+    complete_trajectory,
+    relative_trajectory_of,
+    trajectory_in_map,
 )
 
 # Keyframe events whose messages are kept at least, and as a share of all before: a record is written anew as a whole.
-_FOLDED, _SHARE = 64, 32
+_MIN_EVENTS, _EVENT_SHARE = 64, 32
 
-Numbered = TypeVar("Numbered", Keyframe, Hypotheses, Accepted)
+Numbered = TypeVar("Numbered", Keyframe, Hypotheses, ClosureDecision)
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,12 +59,12 @@ class Recording:
     :ivar area_poses: {area: belief over ``map_T_area``} of the most probable hypothesis.
     :ivar stamps: shape (n,), of all scans of all logs, ns, increasing.
     :ivar first_scans: number of the first scan of each log.
-    :ivar scans: the scans relative to the keyframes of the most probable hypothesis.
+    :ivar relative_trajectory: the scans relative to the keyframes of the most probable hypothesis.
     :ivar odometry: ``odom_T_base`` of the scans.
     :ivar trajectory: ``map_T_base`` of the scans in the map.
-    :ivar online: the same as it was known when the scan was taken.
+    :ivar online_trajectory: the same as it was known when the scan was taken.
     :ivar probabilities: of every live topology at every keyframe event, in their order.
-    :ivar last: the last estimate of metric SLAM.
+    :ivar last_estimate: the last estimate of metric SLAM.
     :ivar totals: scans received, processed and dropped.
     :ivar notices: what the processes had to tell a person.
     """
@@ -73,19 +73,19 @@ class Recording:
     area_poses: dict[int, PoseGaussian]
     stamps: NDArray[np.int64]
     first_scans: tuple[int, ...]
-    scans: Anchored
+    relative_trajectory: RelativeTrajectory
     odometry: Trajectory
     trajectory: Trajectory
-    online: Trajectory
+    online_trajectory: Trajectory
     probabilities: list[TopologyProbability]
-    last: LocalEstimate
-    totals: Finished
+    last_estimate: LocalEstimate
+    totals: EndOfRun
     notices: tuple[Notice, ...]
 
     @property
     def hybrid_map(self) -> HybridMap:
         """The map of the most probable hypothesis."""
-        return self.replica.maps[self.replica.best]
+        return self.replica.maps[self.replica.best_hypothesis]
 
 
 @dataclass
@@ -93,28 +93,28 @@ class Recorder:
     """Value machine that answers nothing and remembers everything.
 
     :ivar configuration: that of the run, which goes into the output.
-    :ivar past: what was recorded before the run, if it goes on from there.
+    :ivar earlier_record: what was recorded before the run, if it goes on from there.
     :ivar keyframes: {keyframe event: message}, likewise ``hypotheses`` and ``accepted``.
-    :ivar trails: {(hypothesis, first scan): message}.
+    :ivar scan_poses: {(hypothesis, first scan): message}.
     :ivar estimates: {scan index: what is kept of the message}; ``last``, the message of the last scan.
     :ivar notices: {(process, text): message} in the order of arrival.
-    :ivar finished: the last word of metric SLAM, None before it.
+    :ivar end_of_run: the last word of metric SLAM, None before it.
     """
 
     configuration: Configuration
-    past: Record = field(default_factory=Record)
+    earlier_record: RunRecord = field(default_factory=RunRecord)
     keyframes: dict[int, Keyframe] = field(default_factory=dict)
     hypotheses: dict[int, Hypotheses] = field(default_factory=dict)
-    accepted: dict[int, Accepted] = field(default_factory=dict)
-    trails: dict[tuple[int, int], Trail] = field(default_factory=dict)
-    estimates: dict[int, OnlinePose] = field(default_factory=dict)
-    last: LocalEstimate | None = None
+    decisions: dict[int, ClosureDecision] = field(default_factory=dict)
+    scan_poses: dict[tuple[int, int], ScanPoses] = field(default_factory=dict)
+    estimates: dict[int, OnlineEstimate] = field(default_factory=dict)
+    last_estimate: LocalEstimate | None = None
     notices: dict[tuple[str, str], Notice] = field(default_factory=dict)
-    finished: Finished | None = None
+    end_of_run: EndOfRun | None = None
 
     def __post_init__(self) -> None:
-        self.last = self.past.last
-        self.notices = {(notice.process, notice.text): notice for notice in self.past.notices}
+        self.last_estimate = self.earlier_record.last_estimate
+        self.notices = {(notice.process, notice.text): notice for notice in self.earlier_record.notices}
 
     def handle(self, message: Message) -> list[Message]:
         """File a message; one that comes twice counts once."""
@@ -123,93 +123,95 @@ class Recorder:
                 self.keyframes.setdefault(message.sequence, message)
             case Hypotheses():
                 self.hypotheses.setdefault(message.sequence, message)
-            case Accepted():
-                self.accepted.setdefault(message.sequence, message)
-            case Trail():
-                self.trails[message.hypothesis, message.first_scan] = message
+            case ClosureDecision():
+                self.decisions.setdefault(message.sequence, message)
+            case ScanPoses():
+                self.scan_poses[message.hypothesis, message.first_scan] = message
             case LocalEstimate():
-                self._keep(message)
+                self._add_estimate(message)
             case Notice():
                 self.notices.setdefault((message.process, message.text), message)
-            case Finished():
-                self.finished = message
+            case EndOfRun():
+                self.end_of_run = message
         return []
 
-    def _keep(self, message: LocalEstimate) -> None:
+    def _add_estimate(self, message: LocalEstimate) -> None:
         # The pose is one of all particles', which a view of it would keep.
-        kept = OnlinePose(message.stamp, message.area, message.pose.mean.copy(), message.odometry)
+        kept = OnlineEstimate(message.stamp, message.area, message.pose.mean.copy(), message.odometry)
         self.estimates.setdefault(message.scan_index, kept)
-        if self.last is None or message.scan_index > self.last.scan_index:
-            self.last = message
+        if self.last_estimate is None or message.scan_index > self.last_estimate.scan_index:
+            self.last_estimate = message
 
     @property
-    def complete(self) -> bool:
+    def is_complete(self) -> bool:
         """Whether the end has been heard and nothing is still on its way."""
-        events, estimates = len(self.keyframes), len(self.past.estimates.scans) + len(self.estimates)
+        events, estimates = len(self.keyframes), len(self.earlier_record.estimates.scans) + len(self.estimates)
         return (
-            self.finished is not None
-            and len(self.hypotheses) == len(self.accepted) == events
-            and estimates >= self.finished.processed
+            self.end_of_run is not None
+            and len(self.hypotheses) == len(self.decisions) == events
+            and estimates >= self.end_of_run.processed
         )
 
-    def record(self) -> Record:
+    def record(self) -> RunRecord:
         """All that was heard up to now, when the answers to all keyframe events are here.
 
         :raises HmtSlamError: where messages were lost on the way.
         """
-        past, first = self.past, self.past.events
-        events = 1 + max([first - 1, *self.keyframes, *self.hypotheses, *self.accepted])
-        keyframes = _gapless("Keyframe", self.keyframes, first, events)
-        hypotheses = _gapless("Hypotheses", self.hypotheses, first, events)
-        accepted = _gapless("Accepted", self.accepted, first, events)
+        past, first = self.earlier_record, self.earlier_record.events
+        events = 1 + max([first - 1, *self.keyframes, *self.hypotheses, *self.decisions])
+        keyframes = _ordered_messages("Keyframe", self.keyframes, first, events)
+        hypotheses = _ordered_messages("Hypotheses", self.hypotheses, first, events)
+        accepted = _ordered_messages("Accepted", self.decisions, first, events)
         replica, sizes, probabilities, successors = _replay(past, keyframes, hypotheses, accepted)
-        branched = {leaf.hypothesis: leaf.parent for message in hypotheses for leaf in _branched(message)}
+        branched = {leaf.id: leaf.parent for message in hypotheses for leaf in _new_branches(message)}
         given = [verdict.global_poses for verdict in accepted if verdict.global_poses]
         found = replace(
             past,
             events=events,
             replica=replica.state,
-            sizes=sizes,
+            map_sizes=sizes,
             parents={**past.parents, **branched},
-            probabilities=past.probabilities.and_then(ProbabilityTable.of(probabilities)),
+            probabilities=past.probabilities.concatenate(ProbabilityTable.from_rows(probabilities)),
             global_poses=given[-1] if given else past.global_poses,
-            estimates=past.estimates.and_then(EstimateTable.of(self.estimates)),
-            online=np.concatenate((past.online, self._online(keyframes, accepted))),
-            last=self.last if self.last is None or not hypotheses else _in_area_now(self.last, hypotheses[-1]),
+            estimates=past.estimates.concatenate(EstimateTable.from_estimates(self.estimates)),
+            online_trajectory=np.concatenate((past.online_trajectory, self._online_trajectory(keyframes, accepted))),
+            last_estimate=self.last_estimate
+            if self.last_estimate is None or not hypotheses
+            else _follow_area_merge(self.last_estimate, hypotheses[-1]),
             notices=tuple(self.notices.values()),
         )
         alive = {known for hypothesis in replica.maps for known in found.lineage(hypothesis)}
-        trails = past.trails.and_then(TrailTable.of(self.trails.values()))
+        trails = past.scan_poses.concatenate(ScanPoseTable.from_messages(self.scan_poses.values()))
         return replace(
             found,
             parents={child: parent for child, parent in found.parents.items() if child in alive},
-            trails=trails.of_hypotheses(alive).related_to(successors),
+            scan_poses=trails.select_hypotheses(alive).replace_pruned(successors),
         )
 
-    def fold(self) -> None:
+    def compact(self) -> None:
         """Keep a record of what was heard instead of the messages, if these are many by now.
 
         They take ten times as much memory. To be called when the answers to all keyframe events are here.
         """
-        if len(self.accepted) < max(_FOLDED, self.past.events // _SHARE):
+        if len(self.decisions) < max(_MIN_EVENTS, self.earlier_record.events // _EVENT_SHARE):
             return
-        self.past = self.record()
-        for messages in (self.keyframes, self.hypotheses, self.accepted, self.trails, self.estimates):
+        self.earlier_record = self.record()
+        for messages in (self.keyframes, self.hypotheses, self.decisions, self.scan_poses, self.estimates):
             messages.clear()
 
-    def _online(self, keyframes: list[Keyframe], accepted: list[Accepted]) -> Trajectory:
+    def _online_trajectory(self, keyframes: list[Keyframe], accepted: list[ClosureDecision]) -> Trajectory:
         """The poses of the scans that came since the past."""
-        past = self.past
-        before = None if not past.online.size else (past.online[-1], past.estimates.odometry[-1])
+        past = self.earlier_record
+        before = None if not past.online_trajectory.size else (past.online_trajectory[-1], past.estimates.odometry[-1])
         verdicts = [
-            Verdict(keyframe.scan.stamp, {entry.area: entry.pose.mean for entry in verdict.global_poses})
+            AreaPoseUpdate(keyframe.scan.stamp, {entry.area: entry.pose.mean for entry in verdict.global_poses})
             for keyframe, verdict in zip(keyframes, accepted, strict=True)
         ]
-        poses = OnlinePoses({entry.area: entry.pose.mean for entry in past.global_poses}, before)
-        return poses.of([self.estimates[scan] for scan in sorted(self.estimates)], verdicts)
+        poses = OnlineTrajectory({entry.area: entry.pose.mean for entry in past.global_poses}, before)
+        return poses.advance([self.estimates[scan] for scan in sorted(self.estimates)], verdicts)
 
     def finish(
-        self, stamps: NDArray[np.int64], first_scans: tuple[int, ...] = (0,), earlier: Anchored | None = None
+        self, stamps: NDArray[np.int64], first_scans: tuple[int, ...] = (0,), earlier: RelativeTrajectory | None = None
     ) -> Recording:
         """Work out the final map, trajectories and probabilities.
 
@@ -219,46 +221,48 @@ class Recorder:
         :param earlier: where scans of earlier logs were taken after the final refinement of that time.
         :raises HmtSlamError: where no scan gave a pose, or messages were lost on the way.
         """
-        if self.last is None or self.finished is None or not (self.keyframes or self.past.events):
+        if self.last_estimate is None or self.end_of_run is None or not (self.keyframes or self.earlier_record.events):
             raise HmtSlamError(
                 f"none of the {stamps.size} scans gave a pose: check that their ranges lie between range_min and "
                 "range_max and that the log has odometry"
             )
         record = self.record()
-        assert record.last is not None
-        replica, given = Replica.of(record.replica), record.estimates
-        area_poses = placed_areas(replica.maps[replica.best], record.global_poses)
-        poses = keyframe_poses(replica.maps[replica.best], area_poses)
-        scans = anchored(stamps, record.own_trails(replica.best)).beginning_with(earlier or Anchored.none(), poses)
+        assert record.last_estimate is not None
+        replica, given = Replica.from_state(record.replica), record.estimates
+        area_poses = complete_area_poses(replica.maps[replica.best_hypothesis], record.global_poses)
+        poses = keyframe_poses(replica.maps[replica.best_hypothesis], area_poses)
+        scans = relative_trajectory_of(stamps, record.lineage_scan_poses(replica.best_hypothesis)).replace_start(
+            earlier or RelativeTrajectory.empty(), poses
+        )
         return Recording(
             replica,
             area_poses,
             stamps,
             first_scans,
             scans,
-            of_all(stamps, given.stamps, given.odometry),
-            carried(scans, poses),
-            of_all(stamps, given.stamps, record.online),
+            complete_trajectory(stamps, given.stamps, given.odometry),
+            trajectory_in_map(scans, poses),
+            complete_trajectory(stamps, given.stamps, record.online_trajectory),
             record.probabilities.rows(),
-            record.last,
-            self.finished,
+            record.last_estimate,
+            self.end_of_run,
             record.notices,
         )
 
 
-def _in_area_now(last: LocalEstimate, newest: Hypotheses) -> LocalEstimate:
+def _follow_area_merge(last: LocalEstimate, newest: Hypotheses) -> LocalEstimate:
     """The last estimate, where its area became part of another since in the frame of that one."""
-    for leaf in newest.leaves:
-        if leaf.merged is not None and leaf.merged.area == last.area:
-            return replace(last, area=leaf.merged.into, pose=leaf.merged.pose.compose(last.pose))
+    for leaf in newest.hypotheses:
+        if leaf.area_merge is not None and leaf.area_merge.area == last.area:
+            return replace(last, area=leaf.area_merge.into, pose=leaf.area_merge.pose.compose(last.pose))
     return last
 
 
-def _branched(message: Hypotheses) -> list[Leaf]:
-    return [leaf for leaf in message.leaves if leaf.hypothesis != leaf.parent]
+def _new_branches(message: Hypotheses) -> list[Hypothesis]:
+    return [leaf for leaf in message.hypotheses if leaf.id != leaf.parent]
 
 
-def _gapless(name: str, messages: dict[int, Numbered], first: int, events: int) -> list[Numbered]:
+def _ordered_messages(name: str, messages: dict[int, Numbered], first: int, events: int) -> list[Numbered]:
     missing = next((sequence for sequence in range(first, events) if sequence not in messages), None)
     if missing is not None:
         raise HmtSlamError(f"the message {name} {missing} was lost: run again, with robot.paced=true in a replay")
@@ -266,62 +270,64 @@ def _gapless(name: str, messages: dict[int, Numbered], first: int, events: int) 
 
 
 def _replay(
-    past: Record, keyframes: list[Keyframe], hypotheses: list[Hypotheses], accepted: list[Accepted]
-) -> tuple[Replica, Mapping[int, tuple[int, int]], list[TopologyProbability], dict[int, Successor]]:
+    past: RunRecord, keyframes: list[Keyframe], hypotheses: list[Hypotheses], accepted: list[ClosureDecision]
+) -> tuple[Replica, Mapping[int, tuple[int, int]], list[TopologyProbability], dict[int, ReplacementKeyframe]]:
     """The maps after some events, their numbers of areas and loop closures, and the probabilities at the events.
 
     Last, in their order, the keyframes that were forgotten and those that stand for them since then.
     """
-    replica, sizes, probabilities = Replica.of(past.replica), past.sizes, list[TopologyProbability]()
-    successors: dict[int, Successor] = {}
+    replica, sizes, probabilities = Replica.from_state(past.replica), past.map_sizes, list[TopologyProbability]()
+    successors: dict[int, ReplacementKeyframe] = {}
     for keyframe, belief, verdict in zip(keyframes, hypotheses, accepted, strict=True):
-        replica.add(keyframe)
-        successors |= _successors(replica, belief.forgotten)
-        replica.apply(belief)
-        sizes = {leaf.hypothesis: _size(replica, leaf, sizes) for leaf in belief.leaves}
+        replica.add_keyframe(keyframe)
+        successors |= _successors(replica, belief.pruned_keyframes)
+        replica.apply_hypotheses(belief)
+        sizes = {leaf.id: _map_size(replica, leaf, sizes) for leaf in belief.hypotheses}
         probabilities += [
             TopologyProbability(
                 keyframe.sequence,
                 keyframe.scan.stamp,
-                keyframe.travelled,
-                leaf.hypothesis,
+                keyframe.path_length,
+                leaf.id,
                 leaf.parent,
                 leaf.probability,
                 leaf.area,
-                *sizes[leaf.hypothesis],
-                leaf.hypothesis == verdict.hypothesis,
+                *sizes[leaf.id],
+                leaf.id == verdict.hypothesis,
                 belief.unexamined,
             )
-            for leaf in belief.leaves
+            for leaf in belief.hypotheses
         ]
-        replica.accept(verdict)
+        replica.apply_decision(verdict)
     return replica, sizes, probabilities, successors
 
 
-def _successors(replica: Replica, forgotten: Sequence[Forgotten]) -> dict[int, Successor]:
+def _successors(replica: Replica, forgotten: Sequence[PrunedKeyframe]) -> dict[int, ReplacementKeyframe]:
     """{keyframe that is forgotten: the one that stands for it}, of the one hypothesis that there is then."""
-    gone, hybrid_map = {one.keyframe for one in forgotten}, replica.maps[replica.best]
+    gone, hybrid_map = {one.keyframe for one in forgotten}, replica.maps[replica.best_hypothesis]
     found = {}
     for one in forgotten:
         placed = hybrid_map.keyframes(one.area)
-        found[one.keyframe] = successor(placed[one.keyframe], {k: at for k, at in placed.items() if k not in gone})
+        found[one.keyframe] = nearest_replacement(
+            placed[one.keyframe], {k: at for k, at in placed.items() if k not in gone}
+        )
     return found
 
 
-def _size(replica: Replica, leaf: Leaf, sizes: Mapping[int, tuple[int, int]]) -> tuple[int, int]:
+def _map_size(replica: Replica, leaf: Hypothesis, sizes: Mapping[int, tuple[int, int]]) -> tuple[int, int]:
     """Areas and loop closures of a leaf, counted anew only where the leaf changed."""
-    if leaf.hypothesis in sizes and not (leaf.arcs or leaf.relabelled or leaf.withdrawn or leaf.merged):
-        return sizes[leaf.hypothesis]
-    hybrid_map = replica.maps[leaf.hypothesis]
+    if leaf.id in sizes and not (leaf.arcs or leaf.moved_keyframes or leaf.removed_arcs or leaf.area_merge):
+        return sizes[leaf.id]
+    hybrid_map = replica.maps[leaf.id]
     return len(hybrid_map.area_ids()), sum(arc.closure for _, _, arc in hybrid_map.all_arcs())
 
 
-def placed_areas(hybrid_map: HybridMap, given: Sequence[AreaPose]) -> dict[int, PoseGaussian]:
+def complete_area_poses(hybrid_map: HybridMap, given: Sequence[AreaPose]) -> dict[int, PoseGaussian]:
     """``map_T_area`` of every area: as TLCA last gave it, else along the arcs from an area that TLCA did give."""
     known = {entry.area: entry.pose for entry in given}
     areas = hybrid_map.area_ids()
     start = next((area for area in areas if area in known), areas[0])
-    along_arcs = reachable(hybrid_map, start)
+    along_arcs = shortest_path_beliefs(hybrid_map, start)
     origin = known.get(start, along_arcs[start])
     return {area: known[area] if area in known else origin.compose(along_arcs[area]) for area in areas}
 

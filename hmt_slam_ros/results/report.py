@@ -52,7 +52,7 @@ _LIBRARIES = ("numpy", "scipy", "networkx", "numba", "rosbags", "matplotlib")
 
 
 @dataclass(frozen=True, eq=False)
-class RunFigures:
+class RunMetrics:
     """What a run cost, as whoever ran it measured.
 
     :ivar log: name of the log.
@@ -75,15 +75,15 @@ class RunFigures:
     memory: Mapping[str, int] = field(default_factory=dict)
 
 
-def report(recording: Recording, configuration: Configuration, figures: RunFigures) -> dict[str, Any]:
+def build_report(recording: Recording, configuration: Configuration, figures: RunMetrics) -> dict[str, Any]:
     """The content of report.json."""
     totals, replica, hybrid_map = recording.totals, recording.replica, recording.hybrid_map
     arcs = [arc for _, _, arc in hybrid_map.all_arcs()]
     return {
         "log": figures.log,
         "runtime": figures.runtime,
-        "scans": {"in": totals.scans_in, "processed": totals.processed, "dropped": totals.dropped},
-        "travelled_m": recording.probabilities[-1].travelled,
+        "scans": {"in": totals.received, "processed": totals.processed, "dropped": totals.dropped},
+        "travelled_m": recording.probabilities[-1].path_length,
         "keyframe_events": recording.probabilities[-1].keyframe + 1,
         "keyframes": sum(len(hybrid_map.keyframes(area)) for area in hybrid_map.area_ids()),
         "areas": len(hybrid_map.area_ids()),
@@ -91,11 +91,11 @@ def report(recording: Recording, configuration: Configuration, figures: RunFigur
         "loop_closures": sum(arc.closure for arc in arcs),
         "hypotheses": {
             "alive": len(replica.maps),
-            "most_probable": replica.best,
-            "probability": replica.probabilities[replica.best],
+            "most_probable": replica.best_hypothesis,
+            "probability": replica.probabilities[replica.best_hypothesis],
         },
         "notices": [{"process": notice.process, "text": notice.text} for notice in recording.notices],
-        "processes": {name: _cost(seconds) for name, seconds in figures.seconds_per_scan.items()},
+        "processes": {name: _cost_summary(seconds) for name, seconds in figures.seconds_per_scan.items()},
         "peak_rss_bytes": dict(figures.peak_rss),
         "memory_bytes": dict(figures.memory) | {"keyframe_scans": scan_bytes(replica.scans.values())},
         "wall_s": figures.wall_seconds,
@@ -112,7 +112,7 @@ def write_report(path: Path, content: Mapping[str, Any]) -> None:
     path.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
 
-def _cost(seconds: NDArray[np.float64]) -> dict[str, float]:
+def _cost_summary(seconds: NDArray[np.float64]) -> dict[str, float]:
     milliseconds = 1e3 * seconds if seconds.size else np.zeros(1)
     return {
         "total_s": float(seconds.sum()),
@@ -124,11 +124,11 @@ def _cost(seconds: NDArray[np.float64]) -> dict[str, float]:
 
 def _versions() -> dict[str, str]:
     return {"hmt_slam_ros": __version__, "python": platform.python_version()} | {
-        name: _installed(name) for name in _LIBRARIES
+        name: _installed_version(name) for name in _LIBRARIES
     }
 
 
-def _installed(name: str) -> str:
+def _installed_version(name: str) -> str:
     try:
         return version(name)
     except PackageNotFoundError:
@@ -144,10 +144,10 @@ def write_cost(path: Path, seconds_per_scan: Mapping[str, NDArray[np.float64]]) 
 def write_probabilities(path: Path, probabilities: list[TopologyProbability]) -> None:
     """pmf.csv: Eq. (14), one line for every live topology at every keyframe event."""
     names = [entry.name for entry in fields(TopologyProbability)]
-    _write_table(path, names, [[_plain(getattr(row, name)) for name in names] for row in probabilities])
+    _write_table(path, names, [[_csv_value(getattr(row, name)) for name in names] for row in probabilities])
 
 
-def _plain(value: float) -> float:
+def _csv_value(value: float) -> float:
     return int(value) if isinstance(value, bool) else value
 
 

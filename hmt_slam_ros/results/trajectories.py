@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 from hmt_slam_ros.arrays import Float64, Int64
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.messages.messages import Trail
+from hmt_slam_ros.messages.messages import ScanPoses
 from hmt_slam_ros.messages.replica import FIRST_AREA
 
 Trajectory = NDArray[np.float64]
 """Shape (scans, 3), ``map_T_base`` as (x, y, theta), m and rad, in the order of the log."""
 
 
-class Anchored(NamedTuple):
+class RelativeTrajectory(NamedTuple):
     """Where the scans of a log were taken, relative to keyframes.
 
     :ivar keyframes: shape (n,), the keyframe to which a scan is related, -1 for none.
@@ -29,18 +29,20 @@ class Anchored(NamedTuple):
     poses: Float64
 
     @classmethod
-    def none(cls) -> Anchored:
+    def empty(cls) -> RelativeTrajectory:
         """Of no scan."""
         return cls(np.zeros(0, np.int64), np.zeros((0, 3)))
 
-    def beginning_with(self, better: Anchored, known: Collection[int]) -> Anchored:
+    def replace_start(self, better: RelativeTrajectory, known: Collection[int]) -> RelativeTrajectory:
         """The same with the first scans where they are better known to be, relative to keyframes that are known."""
         keyframes, poses = self.keyframes.copy(), self.poses.copy()
         rows = np.flatnonzero(np.isin(better.keyframes, list(known)))
         keyframes[rows], poses[rows] = better.keyframes[rows], better.poses[rows]
-        return Anchored(keyframes, poses)
+        return RelativeTrajectory(keyframes, poses)
 
-    def at(self, trajectory: Trajectory, keyframes: Mapping[int, NDArray[np.float64]]) -> Anchored:
+    def with_trajectory(
+        self, trajectory: Trajectory, keyframes: Mapping[int, NDArray[np.float64]]
+    ) -> RelativeTrajectory:
         """The same scans where a trajectory has them.
 
         :param keyframes: {keyframe: ``map_T_base``, shape (3,)}.
@@ -48,10 +50,10 @@ class Anchored(NamedTuple):
         poses, known = self.poses.copy(), self.keyframes >= 0
         map_T_keyframe = np.array([keyframes[keyframe] for keyframe in self.keyframes[known].tolist()])
         poses[known] = se2.between(map_T_keyframe, trajectory[known])
-        return Anchored(self.keyframes, poses)
+        return RelativeTrajectory(self.keyframes, poses)
 
 
-class OnlinePose(NamedTuple):
+class OnlineEstimate(NamedTuple):
     """What is kept of a ``LocalEstimate``.
 
     :ivar stamp: the scan's, ns.
@@ -66,7 +68,7 @@ class OnlinePose(NamedTuple):
     odometry: NDArray[np.float64]
 
 
-def anchored(stamps: NDArray[np.int64], trails: Sequence[Trail]) -> Anchored:
+def relative_trajectory_of(stamps: NDArray[np.int64], trails: Sequence[ScanPoses]) -> RelativeTrajectory:
     """The scans of one hypothesis relative to its keyframes.
 
     :param stamps: shape (n,), of all scans, ns, increasing.
@@ -75,14 +77,14 @@ def anchored(stamps: NDArray[np.int64], trails: Sequence[Trail]) -> Anchored:
     """
     keyframes, poses = np.full(stamps.size, -1, dtype=np.int64), np.zeros((stamps.size, 3))
     for trail in trails:
-        rows = _rows(stamps, trail.stamps)
-        keyframes[rows], poses[rows] = trail.anchors, trail.poses
+        rows = _rows_of_stamps(stamps, trail.stamps)
+        keyframes[rows], poses[rows] = trail.keyframes, trail.poses
     if not (keyframes >= 0).any():
         raise HmtSlamError(f"none of the {len(poses)} scans gave a pose: check the ranges and the odometry of the log")
-    return Anchored(keyframes, poses)
+    return RelativeTrajectory(keyframes, poses)
 
 
-def carried(scans: Anchored, keyframes: Mapping[int, NDArray[np.float64]]) -> Trajectory:
+def trajectory_in_map(scans: RelativeTrajectory, keyframes: Mapping[int, NDArray[np.float64]]) -> Trajectory:
     """``map_T_keyframe`` * ``keyframe_T_base`` of every scan.
 
     :param keyframes: {keyframe: ``map_T_base``, shape (3,)}.
@@ -91,10 +93,10 @@ def carried(scans: Anchored, keyframes: Mapping[int, NDArray[np.float64]]) -> Tr
     known = scans.keyframes >= 0
     map_T_keyframe = np.array([keyframes[keyframe] for keyframe in scans.keyframes[known].tolist()])
     poses[known] = se2.compose(map_T_keyframe, scans.poses[known])
-    return _filled(poses)
+    return _fill_gaps(poses)
 
 
-def of_all(stamps: NDArray[np.int64], given: NDArray[np.int64], poses: Trajectory) -> Trajectory:
+def complete_trajectory(stamps: NDArray[np.int64], given: NDArray[np.int64], poses: Trajectory) -> Trajectory:
     """A pose for every scan, of which some are given.
 
     :param stamps: shape (n,), of all scans, ns, increasing.
@@ -103,22 +105,22 @@ def of_all(stamps: NDArray[np.int64], given: NDArray[np.int64], poses: Trajector
     :raises HmtSlamError: where a stamp is of none of the scans, or no pose is given.
     """
     found = np.full((stamps.size, 3), np.nan)
-    found[_rows(stamps, given)] = poses
-    return _filled(found)
+    found[_rows_of_stamps(stamps, given)] = poses
+    return _fill_gaps(found)
 
 
-class Verdict(NamedTuple):
+class AreaPoseUpdate(NamedTuple):
     """TLCA's answer to a keyframe event.
 
     :ivar stamp: of the keyframe's scan, ns.
-    :ivar areas: {area: ``map_T_area``, shape (3,)}, empty where they stay as they were.
+    :ivar area_poses: {area: ``map_T_area``, shape (3,)}, empty where they stay as they were.
     """
 
     stamp: int
-    areas: Mapping[int, NDArray[np.float64]]
+    area_poses: Mapping[int, NDArray[np.float64]]
 
 
-class OnlinePoses:
+class OnlineTrajectory:
     """``map_T_base`` of one scan after the other from what was known when it was taken.
 
     The verdict on a keyframe holds for the scans after it. In an area that no verdict has placed yet, the pose goes on
@@ -132,27 +134,27 @@ class OnlinePoses:
 
         :param previous: of the scan before, ``map_T_base`` and ``odom_T_base``, shape (3,); None before the first.
         """
-        self._areas = areas or {FIRST_AREA: np.zeros(3)}
+        self._area_poses = areas or {FIRST_AREA: np.zeros(3)}
         self._previous = previous
 
-    def of(self, estimates: Sequence[OnlinePose], verdicts: Sequence[Verdict]) -> Trajectory:
+    def advance(self, estimates: Sequence[OnlineEstimate], updates: Sequence[AreaPoseUpdate]) -> Trajectory:
         """The poses of the scans to come, shape (n, 3)."""
         poses, given = np.zeros((len(estimates), 3)), 0
         for k, estimate in enumerate(estimates):
-            while given < len(verdicts) and verdicts[given].stamp < estimate.stamp:
-                self._areas = verdicts[given].areas or self._areas
+            while given < len(updates) and updates[given].stamp < estimate.stamp:
+                self._area_poses = updates[given].area_poses or self._area_poses
                 given += 1
-            poses[k] = self._placed(estimate)
+            poses[k] = self._pose_in_map(estimate)
             self._previous = (poses[k], estimate.odometry)
         return poses
 
-    def _placed(self, estimate: OnlinePose) -> NDArray[np.float64]:
-        if estimate.area in self._areas or self._previous is None:
-            return se2.compose(self._areas.get(estimate.area, np.zeros(3)), estimate.pose)
+    def _pose_in_map(self, estimate: OnlineEstimate) -> NDArray[np.float64]:
+        if estimate.area in self._area_poses or self._previous is None:
+            return se2.compose(self._area_poses.get(estimate.area, np.zeros(3)), estimate.pose)
         return se2.compose(self._previous[0], se2.between(self._previous[1], estimate.odometry))
 
 
-def _rows(stamps: NDArray[np.int64], wanted: NDArray[np.int64]) -> NDArray[np.intp]:
+def _rows_of_stamps(stamps: NDArray[np.int64], wanted: NDArray[np.int64]) -> NDArray[np.intp]:
     """The scans that have the given stamps."""
     rows = np.minimum(np.searchsorted(stamps, wanted), stamps.size - 1)
     strange = wanted[stamps[rows] != wanted]
@@ -161,7 +163,7 @@ def _rows(stamps: NDArray[np.int64], wanted: NDArray[np.int64]) -> NDArray[np.in
     return rows
 
 
-def _filled(poses: Trajectory) -> Trajectory:
+def _fill_gaps(poses: Trajectory) -> Trajectory:
     """Scans without a pose get one between their neighbours in the log, or the nearest one at either end."""
     known = np.flatnonzero(~np.isnan(poses[:, 0]))
     if known.size == 0:

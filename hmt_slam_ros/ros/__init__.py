@@ -2,9 +2,9 @@
 
 import sys
 
-from hmt_slam_ros.process_settings import end_when_told, settle
+from hmt_slam_ros.process_settings import apply_process_settings, exit_on_signals
 
-settle()
+apply_process_settings()
 # So Python calls a program of this package, `python -m hmt_slam_ros.ros.slam_node`, while it loads the package.
 if sys.argv[0] == "-m":
-    end_when_told()
+    exit_on_signals()

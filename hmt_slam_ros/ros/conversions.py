@@ -32,8 +32,8 @@ from std_msgs.msg import Header
 
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.logs.mounting import heading_of_quaternion
-from hmt_slam_ros.messages.messages import Trail
+from hmt_slam_ros.logs.mounting import heading_from_quaternion
+from hmt_slam_ros.messages.messages import ScanPoses
 from hmt_slam_ros.sensors import Odometry, Scan
 
 _SECOND = 1_000_000_000
@@ -41,7 +41,7 @@ _SECOND = 1_000_000_000
 _PLANAR = np.ix_((0, 1, 5), (0, 1, 5))
 # Units in the last place by which a quaternion may be off, the smallest first.
 _NUDGES = ((0, 0), (1, 0), (-1, 0), (0, 1), (0, -1), (2, 0), (-2, 0), (0, 2), (0, -2))
-_TRAIL_FRAME = re.compile(r"hypothesis_(\d+)/scan_(\d+)")
+_SCAN_POSES_FRAME = re.compile(r"hypothesis_(\d+)/scan_(\d+)")
 _AREA_FRAME = re.compile(r"area_(\d+)")
 _KEYFRAME_FRAME = re.compile(r"keyframe_(\d+)(?:/begun_(\d+))?")
 
@@ -52,17 +52,17 @@ def time_message(stamp: int) -> Time:
     return Time(sec=seconds, nanosec=nanoseconds)
 
 
-def stamp_of(time: Time) -> int:
+def stamp_from_time(time: Time) -> int:
     """Stamp in ns of a ROS time."""
     return int(time.sec) * _SECOND + int(time.nanosec)
 
 
-def header(stamp: int, frame: str) -> Header:
+def header_message(stamp: int, frame: str) -> Header:
     """Header from a stamp in ns and the name of a frame."""
     return Header(stamp=time_message(stamp), frame_id=frame)
 
 
-def quaternion(theta: float) -> Quaternion:
+def quaternion_message(theta: float) -> Quaternion:
     """Rotation by ``theta`` rad, in [-pi, pi), about z, from which the receiver gets ``theta`` back bit for bit.
 
     Sine and cosine are rounded, so the angle may come back with another last bit, and a run of the nodes would drift
@@ -72,7 +72,7 @@ def quaternion(theta: float) -> Quaternion:
     sin, cos = math.sin(0.5 * theta), math.cos(0.5 * theta)
     for steps_z, steps_w in _NUDGES:
         z, w = sin + steps_z * math.ulp(sin), cos + steps_w * math.ulp(cos)
-        if heading_of_quaternion((0.0, 0.0, z, w)) == theta:
+        if heading_from_quaternion((0.0, 0.0, z, w)) == theta:
             return Quaternion(z=z, w=w)
     return Quaternion(z=sin, w=cos)
 
@@ -80,26 +80,26 @@ def quaternion(theta: float) -> Quaternion:
 def pose_message(pose: NDArray[np.float64]) -> Pose:
     """ROS pose of (x, y, theta)."""
     x, y, theta = pose.tolist()
-    return Pose(position=PointMessage(x=x, y=y), orientation=quaternion(theta))
+    return Pose(position=PointMessage(x=x, y=y), orientation=quaternion_message(theta))
 
 
-def planar_pose(pose: Pose) -> NDArray[np.float64]:
+def pose_from_message(pose: Pose) -> NDArray[np.float64]:
     """(x, y, theta) of a ROS pose."""
     turn = pose.orientation
-    return np.array([pose.position.x, pose.position.y, heading_of_quaternion((turn.x, turn.y, turn.z, turn.w))])
+    return np.array([pose.position.x, pose.position.y, heading_from_quaternion((turn.x, turn.y, turn.z, turn.w))])
 
 
 def transform_message(stamp: int, parent: str, child: str, parent_T_child: NDArray[np.float64]) -> TransformStamped:
     """ROS transform of the pose ``parent_T_child`` (3,)."""
     x, y, theta = parent_T_child.tolist()
-    transform = TransformMessage(translation=Vector3(x=x, y=y), rotation=quaternion(theta))
-    return TransformStamped(header=header(stamp, parent), child_frame_id=child, transform=transform)
+    transform = TransformMessage(translation=Vector3(x=x, y=y), rotation=quaternion_message(theta))
+    return TransformStamped(header=header_message(stamp, parent), child_frame_id=child, transform=transform)
 
 
-def laser_scan(scan: Scan, frame: str) -> LaserScan:
+def scan_message(scan: Scan, frame: str) -> LaserScan:
     """ROS scan; the pose of the laser is left to the transform of ``frame``."""
     return LaserScan(
-        header=header(scan.stamp, frame),
+        header=header_message(scan.stamp, frame),
         angle_min=scan.angle_min,
         angle_max=scan.angle_min + (scan.ranges.size - 1) * scan.angle_increment,
         angle_increment=scan.angle_increment,
@@ -110,22 +110,22 @@ def laser_scan(scan: Scan, frame: str) -> LaserScan:
     )
 
 
-def ranges_of(message: LaserScan) -> NDArray[np.float32]:
+def ranges_from_message(message: LaserScan) -> NDArray[np.float32]:
     """Ranges, shape (n,), m, not to be written to."""
     return np.frombuffer(message.ranges, dtype=np.float32) if len(message.ranges) else np.zeros(0, dtype=np.float32)
 
 
-def scan_from(message: LaserScan, laser_pose: NDArray[np.float64], side: float = 1.0) -> Scan:
+def scan_from_message(message: LaserScan, laser_pose: NDArray[np.float64], angle_sign: float = 1.0) -> Scan:
     """A scan.
 
     :param laser_pose: shape (3,), ``base_T_laser``.
-    :param side: -1.0 for a laser that is mounted upside down, whose angles count the other way round.
+    :param angle_sign: -1.0 for a laser that is mounted upside down, whose angles count the other way round.
     """
     return Scan(
-        stamp_of(message.header.stamp),
-        ranges_of(message),
-        side * message.angle_min,
-        side * message.angle_increment,
+        stamp_from_time(message.header.stamp),
+        ranges_from_message(message),
+        angle_sign * message.angle_min,
+        angle_sign * message.angle_increment,
         message.range_min,
         message.range_max,
         laser_pose,
@@ -136,18 +136,18 @@ def scan_from(message: LaserScan, laser_pose: NDArray[np.float64], side: float =
 def odometry_message(reading: Odometry, odom_frame: str, base_frame: str) -> OdometryMessage:
     """ROS odometry without velocities."""
     return OdometryMessage(
-        header=header(reading.stamp, odom_frame),
+        header=header_message(reading.stamp, odom_frame),
         child_frame_id=base_frame,
         pose=PoseWithCovariance(pose=pose_message(reading.pose)),
     )
 
 
-def odometry_from(message: OdometryMessage) -> Odometry:
+def odometry_from_message(message: OdometryMessage) -> Odometry:
     """An odometry reading."""
-    return Odometry(stamp_of(message.header.stamp), planar_pose(message.pose.pose))
+    return Odometry(stamp_from_time(message.header.stamp), pose_from_message(message.pose.pose))
 
 
-def pose_with_covariance(stamp: int, frame: str, belief: PoseGaussian) -> PoseWithCovarianceStamped:
+def pose_with_covariance_message(stamp: int, frame: str, belief: PoseGaussian) -> PoseWithCovarianceStamped:
     """ROS pose with covariance.
 
     Ours lives in the right tangent frame, that is, in the robot's axes; ROS gives x and y in the axes of ``frame``.
@@ -157,14 +157,14 @@ def pose_with_covariance(stamp: int, frame: str, belief: PoseGaussian) -> PoseWi
     covariance = np.zeros((6, 6))
     covariance[_PLANAR] = axes @ belief.covariance @ axes.T
     return PoseWithCovarianceStamped(
-        header=header(stamp, frame),
+        header=header_message(stamp, frame),
         pose=PoseWithCovariance(pose=pose_message(belief.mean), covariance=covariance.ravel()),
     )
 
 
-def belief_from(message: PoseWithCovariance) -> PoseGaussian:
+def gaussian_from_message(message: PoseWithCovariance) -> PoseGaussian:
     """The inverse of :func:`pose_with_covariance`."""
-    mean = planar_pose(message.pose)
+    mean = pose_from_message(message.pose)
     sin, cos = math.sin(mean[2]), math.cos(mean[2])
     axes = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
     return PoseGaussian(mean, axes.T @ np.reshape(message.covariance, (6, 6))[_PLANAR] @ axes)
@@ -175,64 +175,66 @@ def area_frame(area: int) -> str:
     return f"area_{area}"
 
 
-def area_of(frame: str) -> int:
+def area_from_frame(frame: str) -> int:
     """The area that a frame is named after.
 
     :raises HmtSlamError: where it is named after something else.
     """
-    return int(_matched(_AREA_FRAME, frame)[1])
+    return int(_match_frame(_AREA_FRAME, frame)[1])
 
 
-def keyframe_frame(keyframe: int, begun: int = 0) -> str:
+def keyframe_frame(keyframe: int, reset_number: int = 0) -> str:
     """Name of a keyframe's frame.
 
-    :param begun: number of the request after which slam began anew, 0 before the first.
+    :param reset_number: number of the request after which slam began anew, 0 before the first.
     """
-    return f"keyframe_{keyframe}/begun_{begun}" if begun else f"keyframe_{keyframe}"
+    return f"keyframe_{keyframe}/begun_{reset_number}" if reset_number else f"keyframe_{keyframe}"
 
 
-def keyframe_of(frame: str) -> tuple[int, int]:
+def keyframe_from_frame(frame: str) -> tuple[int, int]:
     """The keyframe that a frame is named after, and the request after which slam had begun anew.
 
     :raises HmtSlamError: where it is named after something else.
     """
-    found = _matched(_KEYFRAME_FRAME, frame)
+    found = _match_frame(_KEYFRAME_FRAME, frame)
     return int(found[1]), int(found[2] or 0)
 
 
-def path_message(trail: Trail) -> Path:
+def path_message(scan_poses: ScanPoses) -> Path:
     """A trail as a path: every pose in the frame of its own keyframe."""
-    rows = zip(trail.stamps.tolist(), trail.anchors.tolist(), trail.poses, strict=True)
+    rows = zip(scan_poses.stamps.tolist(), scan_poses.keyframes.tolist(), scan_poses.poses, strict=True)
     poses = [
-        PoseStamped(header=header(stamp, keyframe_frame(anchor)), pose=pose_message(pose))
+        PoseStamped(header=header_message(stamp, keyframe_frame(anchor)), pose=pose_message(pose))
         for stamp, anchor, pose in rows
     ]
-    first = int(trail.stamps[0]) if trail.stamps.size else 0
-    return Path(header=header(first, f"hypothesis_{trail.hypothesis}/scan_{trail.first_scan}"), poses=poses)
+    first = int(scan_poses.stamps[0]) if scan_poses.stamps.size else 0
+    return Path(
+        header=header_message(first, f"hypothesis_{scan_poses.hypothesis}/scan_{scan_poses.first_scan}"), poses=poses
+    )
 
 
-def trail_from(message: Path) -> Trail:
+def scan_poses_from_message(message: Path) -> ScanPoses:
     """The inverse of :func:`path_message`.
 
     :raises HmtSlamError: where the frames have other names.
     """
-    found = _matched(_TRAIL_FRAME, message.header.frame_id)
-    return Trail(
+    found = _match_frame(_SCAN_POSES_FRAME, message.header.frame_id)
+    return ScanPoses(
         int(found[1]),
         int(found[2]),
-        np.array([stamp_of(pose.header.stamp) for pose in message.poses], dtype=np.int64),
-        np.array([keyframe_of(pose.header.frame_id)[0] for pose in message.poses], dtype=np.int64),
-        np.array([planar_pose(pose.pose) for pose in message.poses], dtype=np.float64).reshape(-1, 3),
+        np.array([stamp_from_time(pose.header.stamp) for pose in message.poses], dtype=np.int64),
+        np.array([keyframe_from_frame(pose.header.frame_id)[0] for pose in message.poses], dtype=np.int64),
+        np.array([pose_from_message(pose.pose) for pose in message.poses], dtype=np.float64).reshape(-1, 3),
     )
 
 
-def _matched(pattern: re.Pattern[str], frame: str) -> re.Match[str]:
+def _match_frame(pattern: re.Pattern[str], frame: str) -> re.Match[str]:
     found = pattern.fullmatch(frame)
     if found is None:
         raise HmtSlamError(f"frame '{frame}' is not of the form {pattern.pattern}: run the same version everywhere")
     return found
 
 
-def rows_message_data(rows: Iterable[Iterable[float]]) -> array[float]:
+def flatten_rows(rows: Iterable[Iterable[float]]) -> array[float]:
     """Rows of numbers one after the other, as a MultiArray holds them."""
     return array("d", [value for row in rows for value in row])

@@ -18,24 +18,24 @@ from rclpy.task import Future
 from std_msgs.msg import String
 
 from hmt_slam_ros.errors import HmtSlamError
-from hmt_slam_ros.messages.documents import BeginRequest, BegunPart, SavedPart, SaveRequest, decode, encode
+from hmt_slam_ros.messages.documents import ResetRequest, ResetResponse, SaveRequest, SaveResponse, decode, encode
 from hmt_slam_ros.messages.messages import Message
-from hmt_slam_ros.messages.routing import HEARD_BY
+from hmt_slam_ros.messages.routing import SUBSCRIPTIONS
 from hmt_slam_ros.ros import topics
 from hmt_slam_ros.ros.diagnostics import PERIOD
 from hmt_slam_ros.ros.inbox import CHAIN
-from hmt_slam_ros.ros.topics import BEGIN, BEGUN, SAVE, SAVED
-from hmt_slam_ros.saved_map.folder import File, FolderWriter
+from hmt_slam_ros.ros.topics import RESET_REQUEST, RESET_RESPONSE, SAVE_REQUEST, SAVE_RESPONSE
+from hmt_slam_ros.saved_map.folder import FileRecord, FolderWriter
 
 if TYPE_CHECKING:
     from hmt_slam_ros.ros.process_node import ProcessNode
     from hmt_slam_ros.ros.slam_node import SlamNode
 
-PARTS = ("aam", "tsbi", "tlca", "rtl")
+PARTICIPANTS = ("aam", "tsbi", "tlca", "rtl")
 """The nodes that slam asks."""
 
 
-class Part:
+class RequestParticipant:
     """Answers slam when the node's process has heard as many keyframe events as slam says."""
 
     def __init__(self, node: ProcessNode, name: str) -> None:
@@ -45,63 +45,69 @@ class Part:
         """
         self._node, self._name = node, name
         # The last message of an event that the process hears.
-        self._last = [kind for kind in CHAIN if kind in HEARD_BY[name]][-1]
-        self._events = node.beginning.events
-        self._requests: deque[SaveRequest | BeginRequest] = deque()
-        self._gave_last: float | None = None
-        self._saved = node.create_publisher(String, SAVED, topics.CHAIN)
-        self._begun = node.create_publisher(String, BEGUN, topics.CHAIN)
-        self._listen(SAVE, SaveRequest, topics.CHAIN_FROM_NOW)
+        self._last_event_type = [kind for kind in CHAIN if kind in SUBSCRIPTIONS[name]][-1]
+        self._events = node.initial_state.events
+        self._requests: deque[SaveRequest | ResetRequest] = deque()
+        self._final_part_saved_at: float | None = None
+        self._save_response_publisher = node.create_publisher(String, SAVE_RESPONSE, topics.CHAIN)
+        self._reset_response_publisher = node.create_publisher(String, RESET_RESPONSE, topics.CHAIN)
+        self._subscribe(SAVE_REQUEST, SaveRequest, topics.VOLATILE_CHAIN)
         # Who was not there hears of it all the same.
-        self._listen(BEGIN, BeginRequest, topics.CHAIN)
+        self._subscribe(RESET_REQUEST, ResetRequest, topics.CHAIN)
 
-    def _listen(self, topic: str, kind: type[SaveRequest | BeginRequest], profile: QoSProfile) -> None:
+    def _subscribe(self, topic: str, kind: type[SaveRequest | ResetRequest], profile: QoSProfile) -> None:
         def hear(message: String) -> None:
             try:
                 request = decode(message.data, kind)
             except HmtSlamError as error:
-                self._node.figures.fail(f"{topic}: {error}")
+                self._node.diagnostics.fail(f"{topic}: {error}")
             else:
-                self._hear(request)
+                self._on_request(request)
 
         self._node.create_subscription(String, topic, hear, profile)
 
-    def _hear(self, request: SaveRequest | BeginRequest) -> None:
+    def _on_request(self, request: SaveRequest | ResetRequest) -> None:
         """Take note of a request, unless it was answered before."""
-        if isinstance(request, SaveRequest) or request.number > self._node.answered:
+        if isinstance(request, SaveRequest) or request.number > self._node.reset_number:
             self._requests.append(request)
-            self.look()
+            self.answer_due_requests()
 
-    def delivered(self, message: Message) -> None:
+    def on_delivered(self, message: Message) -> None:
         """Count an event that the process has worked off; do what waits for it."""
-        if isinstance(message, self._last):
+        if isinstance(message, self._last_event_type):
             self._events += 1
-            self.look()
+            self.answer_due_requests()
 
-    def gave_last(self, linger: float) -> bool:
+    def has_saved_final_part(self, linger: float) -> bool:
         """Whether the part of the last map was written, at least some seconds ago, or there is nothing to be saved."""
-        return not self._events or (self._gave_last is not None and time.monotonic() - self._gave_last >= linger)
+        return not self._events or (
+            self._final_part_saved_at is not None and time.monotonic() - self._final_part_saved_at >= linger
+        )
 
-    def look(self) -> None:
+    def answer_due_requests(self) -> None:
         """Answer what is due, and what would never be as nothing is heard."""
-        while self._requests and (self._events >= self._requests[0].events or self._node.inbox.waits):
+        while self._requests and (self._events >= self._requests[0].events or self._node.inbox.is_holding):
             self._answer(self._requests.popleft())
 
-    def _answer(self, request: SaveRequest | BeginRequest) -> None:
-        fault = self._apart(request)
-        if isinstance(request, BeginRequest):
-            fault = fault or self._begin(request)
-            self._begun.publish(String(data=encode(BegunPart(request.number, self._name, fault))))
-            self._node.inbox.catch_up()
+    def _answer(self, request: SaveRequest | ResetRequest) -> None:
+        fault = self._event_mismatch(request)
+        if isinstance(request, ResetRequest):
+            fault = fault or self._reset(request)
+            self._reset_response_publisher.publish(
+                String(data=encode(ResetResponse(request.number, self._name, fault)))
+            )
+            self._node.inbox.deliver_early()
             return
-        files: tuple[File, ...] = ()
+        files: tuple[FileRecord, ...] = ()
         if not fault:
-            files, fault = self._written(request)
-        self._saved.publish(String(data=encode(SavedPart(request.number, self._name, files, fault))))
-        if request.last:
-            self._gave_last = time.monotonic()
+            files, fault = self._write_part(request)
+        self._save_response_publisher.publish(
+            String(data=encode(SaveResponse(request.number, self._name, files, fault)))
+        )
+        if request.shutdown:
+            self._final_part_saved_at = time.monotonic()
 
-    def _apart(self, request: SaveRequest | BeginRequest) -> str:
+    def _event_mismatch(self, request: SaveRequest | ResetRequest) -> str:
         """What is wrong where the process heard more keyframe events than slam, or less; who forgets may lack some."""
         if self._events > request.events:
             return f"it is at keyframe event {self._events}, not {request.events}: restart all nodes"
@@ -109,16 +115,16 @@ class Part:
             return f"it is inactive, at keyframe event {self._events} of {request.events}: activate it"
         return ""
 
-    def _begin(self, request: BeginRequest) -> str:
+    def _reset(self, request: ResetRequest) -> str:
         """Begin anew; what went wrong."""
         try:
-            self._node.begin_anew(request.folder, request.number)
+            self._node.reset(request.folder, request.number)
         except HmtSlamError as fault:
             return f"{fault}; restart all nodes"
-        self._events = self._node.beginning.events
+        self._events = self._node.initial_state.events
         return ""
 
-    def _written(self, request: SaveRequest) -> tuple[tuple[File, ...], str]:
+    def _write_part(self, request: SaveRequest) -> tuple[tuple[FileRecord, ...], str]:
         """What was written, or what went wrong."""
         folder = Path(request.folder)
         if not folder.is_dir():
@@ -131,74 +137,74 @@ class Part:
         return writer.files, ""
 
 
-_PATIENCE = 60.0  # s, for the end of a keyframe event and for the answers of the others, who may compile kernels
-_DISCOVERY = 5.0  # s, until DDS has made processes known to each other that just began
+_REQUEST_TIMEOUT = 60.0  # s, for the end of a keyframe event and for the answers of the others, who may compile kernels
+_DISCOVERY_TIMEOUT = 5.0  # s, until DDS has made processes known to each other that just began
 
 
-class Round(ABC):
+class RequestCoordinator(ABC):
     """Asks the other processes for something.
 
-    :ivar holding: whether slam has to wait with what it hears.
+    :ivar is_blocking: whether slam has to wait with what it hears.
     """
 
     def __init__(
         self,
         node: SlamNode,
-        release: Callable[[], None],
-        names: tuple[str, str],
-        kind: type[SavedPart | BegunPart],
-        failing: str,
+        on_release: Callable[[], None],
+        topic_names: tuple[str, str],
+        kind: type[SaveResponse | ResetResponse],
+        failure: str,
     ) -> None:
         """Listen.
 
-        :param release: called when slam need not wait any more.
-        :param names: of the topics of the requests and of the answers.
+        :param on_release: called when slam need not wait any more.
+        :param topic_names: of the topics of the requests and of the answers.
         :param kind: of the answers.
-        :param failing: what cannot be done where something goes wrong.
+        :param failure: what cannot be done where something goes wrong.
         """
-        self.holding = False
-        self._node, self._release, self._kind, self._failing = node, release, kind, failing
-        self._asked: Future | None = None
-        self._since, self._number = 0.0, 0
-        self._answers: dict[str, SavedPart | BegunPart] = {}
-        self._requests = node.create_publisher(String, names[0], topics.CHAIN)
-        node.create_subscription(String, names[1], self._hear, topics.CHAIN_FROM_NOW)
-        node.create_timer(PERIOD, self._look_at_clock, clock=node.figures.steady_clock)
+        self.is_blocking = False
+        self._node, self._on_release, self._kind, self._failure = node, on_release, kind, failure
+        self._outcome: Future | None = None
+        self._requested_at, self._number = 0.0, 0
+        self._answers: dict[str, SaveResponse | ResetResponse] = {}
+        self._request_publisher = node.create_publisher(String, topic_names[0], topics.CHAIN)
+        node.create_subscription(String, topic_names[1], self._on_response, topics.VOLATILE_CHAIN)
+        node.create_timer(PERIOD, self._check_timeout, clock=node.diagnostics.steady_clock)
 
     @property
-    def busy(self) -> bool:
+    def is_busy(self) -> bool:
         """Whether something is asked for."""
-        return self._asked is not None
+        return self._outcome is not None
 
-    def ask(self) -> Future:
+    def request(self) -> Future:
         """The outcome of what is begun now: whether it was done, and a sentence."""
-        asked = self._asked = Future()
-        self._since = time.monotonic()
-        self.look()
+        asked = self._outcome = Future()
+        self._requested_at = time.monotonic()
+        self.start_if_ready()
         return asked
 
-    def look(self) -> None:
+    def start_if_ready(self) -> None:
         """Begin where that is asked for and no keyframe event is under way."""
-        if self._asked is None or self.holding or self._node.process.waiting:
+        if self._outcome is None or self.is_blocking or self._node.process.is_awaiting_decision:
             return
-        listening = self._requests.get_subscription_count()
-        if listening < len(PARTS) and time.monotonic() - self._since < _DISCOVERY:
+        listening = self._request_publisher.get_subscription_count()
+        if listening < len(PARTICIPANTS) and time.monotonic() - self._requested_at < _DISCOVERY_TIMEOUT:
             return
         self._answers = {}
         # Also above those of a slam that was killed.
         self._number = max(self._number + 1, time.time_ns())
         try:
-            self.holding = True
-            request = self._begin(self._number, self._node.process.events)
-            if listening < len(PARTS):
-                raise HmtSlamError(f"{listening} of {', '.join(PARTS)} are running: start all of them")
+            self.is_blocking = True
+            request = self._make_request(self._number, self._node.process.keyframe_events)
+            if listening < len(PARTICIPANTS):
+                raise HmtSlamError(f"{listening} of {', '.join(PARTICIPANTS)} are running: start all of them")
         except (HmtSlamError, OSError) as fault:
-            self._end(f"{self._failing}: {fault}")
+            self._end(f"{self._failure}: {fault}")
         else:
-            self._requests.publish(String(data=encode(request)))
+            self._request_publisher.publish(String(data=encode(request)))
 
     @abstractmethod
-    def _begin(self, number: int, events: int) -> SaveRequest | BeginRequest:
+    def _make_request(self, number: int, events: int) -> SaveRequest | ResetRequest:
         """Do slam's own part, and make the request to the others.
 
         :param number: of the request.
@@ -217,14 +223,14 @@ class Round(ABC):
     def _clean_up(self) -> None:
         """Forget what was needed on the way, however it ended."""
 
-    def _hear(self, message: String) -> None:
+    def _on_response(self, message: String) -> None:
         part = decode(message.data, self._kind)
-        if not self.holding or part.number != self._number:
+        if not self.is_blocking or part.number != self._number:
             return
-        self._answers[part.part] = part
-        if part.fault:
-            self._end(f"{self._failing}: {part.part} says that {part.fault}")
-        elif set(PARTS) <= self._answers.keys():
+        self._answers[part.process] = part
+        if part.error:
+            self._end(f"{self._failure}: {part.process} says that {part.error}")
+        elif set(PARTICIPANTS) <= self._answers.keys():
             try:
                 done = self._finish()
             except HmtSlamError as fault:
@@ -232,21 +238,21 @@ class Round(ABC):
             else:
                 self._end(None, done)
 
-    def _look_at_clock(self) -> None:
-        self.look()
-        if self._asked is None or time.monotonic() - self._since < _PATIENCE:
+    def _check_timeout(self) -> None:
+        self.start_if_ready()
+        if self._outcome is None or time.monotonic() - self._requested_at < _REQUEST_TIMEOUT:
             return
-        missing = [name for name in PARTS if self.holding and name not in self._answers]
+        missing = [name for name in PARTICIPANTS if self.is_blocking and name not in self._answers]
         late = f"{' and '.join(missing)} did not answer" if missing else "a keyframe event is not answered"
-        self._end(f"{self._failing}: {late} within {_PATIENCE:g} s, look at /diagnostics")
+        self._end(f"{self._failure}: {late} within {_REQUEST_TIMEOUT:g} s, look at /diagnostics")
 
     def _end(self, fault: str | None, done: str = "") -> None:
         """Answer, and let slam go on."""
         self._clean_up()
-        self.holding = False
+        self.is_blocking = False
         if fault is not None:
-            self._node.figures.warn(fault)
-        asked, self._asked = self._asked, None
+            self._node.diagnostics.warn(fault)
+        asked, self._outcome = self._outcome, None
         if asked is not None:
             asked.set_result((fault is None, fault or done))
-        self._release()
+        self._on_release()

@@ -15,7 +15,7 @@ from std_msgs.msg import Float64MultiArray, MultiArrayDimension, MultiArrayLayou
 
 from hmt_slam_ros.messages.messages import Keyframe, LocalEstimate, Message
 from hmt_slam_ros.ros import topics
-from hmt_slam_ros.ros.conversions import rows_message_data
+from hmt_slam_ros.ros.conversions import flatten_rows
 from hmt_slam_ros.ros.topics import COST, DIAGNOSTICS
 
 PERIOD = 1.0  # s
@@ -25,12 +25,12 @@ STATE, ACTIVE = "state", "active"
 _SECOND = 1_000_000_000
 
 
-class Figures:
+class NodeDiagnostics:
     """Counts, durations and the last error of a node, published every second.
 
     :ivar received: {kind of message: count}.
     :ivar sent: {kind of message: count}.
-    :ivar state: further lines, {name: value}.
+    :ivar values: further lines, {name: value}.
     :ivar steady_clock: for timers.
     """
 
@@ -38,7 +38,7 @@ class Figures:
         self._node = node
         self.clear()
         self._clock = Clock(clock_type=ClockType.SYSTEM_TIME)
-        self._diagnostics = node.create_publisher(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
+        self._publisher = node.create_publisher(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
         self._cost = node.create_publisher(Float64MultiArray, COST, topics.CHAIN)
         # It also runs while simulated time stands still.
         self.steady_clock = Clock(clock_type=ClockType.STEADY_TIME)
@@ -48,28 +48,28 @@ class Figures:
         """Begin to count anew."""
         self.received: Counter[str] = Counter()
         self.sent: Counter[str] = Counter()
-        self.state: dict[str, object] = {}
+        self.values: dict[str, object] = {}
         self._error = ""
         self._level = DiagnosticStatus.OK
-        self._moment = 0
-        self._counted: dict[str, int] = {}
-        self._counted_at = time.monotonic()
+        self._last_stamp = 0
+        self._previous_counts: dict[str, int] = {}
+        self._previous_counts_at = time.monotonic()
         self._costs: list[tuple[int, float]] = []
-        self._handled, self._busy, self._longest = 0, 0.0, 0.0
+        self._handled, self._busy_seconds, self._longest = 0, 0.0, 0.0
 
     def warn(self, sentence: str) -> None:
         """Remember and log something that the node survives; the same sentence is logged once."""
-        self._remember(sentence, DiagnosticStatus.WARN)
+        self._record_fault(sentence, DiagnosticStatus.WARN)
 
     def fail(self, sentence: str) -> None:
         """Remember and log something that the run does not survive."""
-        self._remember(sentence, DiagnosticStatus.ERROR)
+        self._record_fault(sentence, DiagnosticStatus.ERROR)
 
     def note(self, sentence: str) -> None:
         """Log that something is well again; the last error stays to be seen."""
         self._node.get_logger().info(sentence)
 
-    def _remember(self, sentence: str, level: bytes) -> None:
+    def _record_fault(self, sentence: str, level: bytes) -> None:
         if sentence != self._error:
             self._error, self._level = sentence, max(level, self._level)
             logger = self._node.get_logger()
@@ -80,17 +80,21 @@ class Figures:
                 logger.warning(sentence)
 
     @contextmanager
-    def timed(self, message: Message, said: list[Message]) -> Iterator[None]:
+    def measure(self, message: Message, outputs: list[Message]) -> Iterator[None]:
         """Measure how long a message takes, on the account of the scan that it is about.
 
-        :param said: filled by the body with the answers.
+        :param outputs: filled by the body with the answers.
         """
         begin = time.perf_counter()
         yield
         seconds = time.perf_counter() - begin
-        self._handled, self._busy, self._longest = self._handled + 1, self._busy + seconds, max(self._longest, seconds)
-        self._moment = _moment(message, self._moment)
-        scans = [answer.stamp for answer in said if isinstance(answer, LocalEstimate)] or [self._moment]
+        self._handled, self._busy_seconds, self._longest = (
+            self._handled + 1,
+            self._busy_seconds + seconds,
+            max(self._longest, seconds),
+        )
+        self._last_stamp = _message_stamp(message, self._last_stamp)
+        scans = [answer.stamp for answer in outputs if isinstance(answer, LocalEstimate)] or [self._last_stamp]
         self._costs += [(stamp, seconds / len(scans)) for stamp in scans]
 
     def publish(self) -> None:
@@ -98,29 +102,29 @@ class Figures:
         self._publish_costs()
         values = {
             **self._counts_and_rates(),
-            **self.state,
+            **self.values,
             "messages handled": self._handled,
-            "busy": f"{self._busy:.3f} s",
+            "busy": f"{self._busy_seconds:.3f} s",
             "longest message": f"{1e3 * self._longest:.1f} ms",
-            "memory": f"{resident() / 1e6:.0f} MB",
+            "memory": f"{current_rss() / 1e6:.0f} MB",
             "peak memory": f"{peak_rss() / 1e6:.0f} MB",
             "last error": self._error,
         }
         status = DiagnosticStatus(
             level=self._level,
             name=self._node.get_fully_qualified_name(),
-            message=self._error or self._doing,
+            message=self._error or self._status_text,
             hardware_id="hmt_slam_ros",
             values=[KeyValue(key=name, value=str(value)) for name, value in values.items()],
         )
         message = DiagnosticArray(status=[status])
         message.header.stamp = self._clock.now().to_msg()
-        self._diagnostics.publish(message)
+        self._publisher.publish(message)
 
     @property
-    def _doing(self) -> str:
+    def _status_text(self) -> str:
         """The state of a node that has states, unless it takes part."""
-        state = str(self.state.get(STATE, ACTIVE))
+        state = str(self.values.get(STATE, ACTIVE))
         return "running" if state == ACTIVE else state
 
     def _counts_and_rates(self) -> dict[str, object]:
@@ -131,8 +135,8 @@ class Figures:
             for verb, counter in (("received", self.received), ("sent", self.sent))
             for kind, count in sorted(counter.items())
         }
-        since, self._counted_at = max(now - self._counted_at, 1e-3), now
-        last, self._counted = self._counted, counts
+        since, self._previous_counts_at = max(now - self._previous_counts_at, 1e-3), now
+        last, self._previous_counts = self._previous_counts, counts
         rates = {f"{name} a second": f"{(count - last.get(name, 0)) / since:.1f}" for name, count in counts.items()}
         return {**counts, **rates}
 
@@ -142,7 +146,7 @@ class Figures:
             self._costs = []
 
 
-def _moment(message: Message, otherwise: int) -> int:
+def _message_stamp(message: Message, otherwise: int) -> int:
     """Stamp of the scan or odometry reading that a message is about, ns."""
     if isinstance(message, Keyframe):
         return message.scan.stamp
@@ -156,7 +160,7 @@ def _cost_message(name: str, costs: Sequence[tuple[int, float]]) -> Float64Multi
         MultiArrayDimension(label=name, size=len(rows), stride=3 * len(rows)),
         MultiArrayDimension(label="stamp_sec,stamp_nanosec,seconds", size=3, stride=3),
     ]
-    return Float64MultiArray(layout=MultiArrayLayout(dim=layout), data=rows_message_data(rows))
+    return Float64MultiArray(layout=MultiArrayLayout(dim=layout), data=flatten_rows(rows))
 
 
 def peak_rss(process: int | str = "self") -> int:
@@ -164,7 +168,7 @@ def peak_rss(process: int | str = "self") -> int:
     return _memory(process, "VmHWM")
 
 
-def resident(process: int | str = "self") -> int:
+def current_rss(process: int | str = "self") -> int:
     """Resident memory of an OS process now, bytes; 0 where the system does not tell."""
     return _memory(process, "VmRSS")
 

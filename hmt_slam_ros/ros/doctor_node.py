@@ -31,8 +31,8 @@ from hmt_slam_ros.doctor import running
 from hmt_slam_ros.doctor.examination import findings, sorted_findings
 from hmt_slam_ros.doctor.finding import Finding
 from hmt_slam_ros.doctor.gathering import Gatherer
-from hmt_slam_ros.doctor.running import Mismatch, Running, Told, Topic
-from hmt_slam_ros.doctor.statistics import JointCollector, Messages, ScanHead
+from hmt_slam_ros.doctor.running import Mismatch, NodeStatus, RunningSystem, Topic
+from hmt_slam_ros.doctor.statistics import MessageStatistics, ScanHeader, TransformCollector
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.logs.mounting import FrameTree, Mounting, frame_name, planar_mounting
 from hmt_slam_ros.logs.records import LogRecord
@@ -43,15 +43,15 @@ from hmt_slam_ros.ros.topics import DIAGNOSTICS
 from hmt_slam_ros.ros.transforms import TFMessage
 from hmt_slam_ros.sensors import Odometry, Scan
 
-_REFUSED = (rclpy_implementation.RCLError, rclpy_implementation.UnknownROSArgsError)
+_ARGUMENT_ERRORS = (rclpy_implementation.RCLError, rclpy_implementation.UnknownROSArgsError)
 # Heard by best effort, which every publisher offers.
-_ANYHOW = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
+_BEST_EFFORT = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
 # Nodes that are there at all are found in this time, s.
-_DISCOVERY = 5.0
-_SIMULATED, _LASER_POSE = "use_sim_time", "laser_pose"
-_ALSO = ("map", "pose", "hmt/keyframes", "hmt/hypotheses", "hmt/accepted")
+_DISCOVERY_TIMEOUT = 5.0
+_USE_SIM_TIME, _LASER_POSE = "use_sim_time", "laser_pose"
+_GRAPH_ONLY_TOPICS = ("map", "pose", "hmt/keyframes", "hmt/hypotheses", "hmt/accepted")
 _ODOM_FRAME, _BASE_FRAME = "odom", "base_link"
-_MAP_TO_ODOM = "rtl"  # the node of ours that publishes that
+_MAP_TO_ODOM_NODE = "rtl"  # the node of ours that publishes that
 
 
 def examine_running(seconds: float, ros_arguments: Sequence[str]) -> list[Finding]:
@@ -62,24 +62,24 @@ def examine_running(seconds: float, ros_arguments: Sequence[str]) -> list[Findin
     """
     if not 0.0 < seconds < float("inf"):
         raise HmtSlamError(f"--seconds {seconds:g} is no time to listen: give more than 0")
-    with _node(ros_arguments) as (node, executor):
+    with _make_node(ros_arguments) as (node, executor):
         begin = time.monotonic()
-        while not node.others and time.monotonic() < begin + _DISCOVERY:
+        while not node.other_nodes and time.monotonic() < begin + _DISCOVERY_TIMEOUT:
             executor.spin_once(timeout_sec=0.05)
         begin = time.monotonic()
         while time.monotonic() < begin + seconds:
             executor.spin_once(timeout_sec=0.05)
-            node.ask()
+            node.request_parameters()
         return sorted_findings(node.findings(seconds))
 
 
 @contextmanager
-def _node(ros_arguments: Sequence[str]) -> Iterator[tuple[DoctorNode, SingleThreadedExecutor]]:
+def _make_node(ros_arguments: Sequence[str]) -> Iterator[tuple[DoctorNode, SingleThreadedExecutor]]:
     context = Context()
     try:
         rclpy.init(args=["--ros-args", *ros_arguments], context=context)
         node = DoctorNode(context)
-    except _REFUSED as fault:
+    except _ARGUMENT_ERRORS as fault:
         raise HmtSlamError(f"--ros-args {' '.join(ros_arguments)} cannot be ({fault}): see ros2 run --help") from fault
     executor = SingleThreadedExecutor(context=context)
     executor.add_node(node)
@@ -101,108 +101,115 @@ class DoctorNode(Node):
         self._scans: list[LaserScan] = []
         self._readings: list[Odometry] = []
         self._odometry_frames = ("", "")
-        self._by_transform: dict[str, list[Odometry]] = defaultdict(list)
+        self._transform_odometry: dict[str, list[Odometry]] = defaultdict(list)
         self._counts: dict[str, int] = defaultdict(int)
-        self._away: dict[str, list[float]] = defaultdict(list)
-        self._tree, self._joints = FrameTree(), JointCollector()
-        self._last_joints: dict[tuple[str, str], tuple[int, bytes]] = {}
-        self._doubled: dict[str, int] = defaultdict(int)
-        self._told: dict[str, Told] = {}
-        self._askable: dict[str, Client] = {}
-        self._asked: dict[str, dict[str, Future]] = {}
-        self.create_subscription(LaserScan, running.SCAN, self._hear_scan, _ANYHOW)
-        self.create_subscription(OdometryMessage, running.ODOM, self._hear_odometry, _ANYHOW)
-        self.create_subscription(DiagnosticArray, DIAGNOSTICS, self._hear_diagnostics, _ANYHOW)
-        self.create_subscription(String, running.ESTIMATES, self._hear_estimate, _ANYHOW)
+        self._clock_offsets: dict[str, list[float]] = defaultdict(list)
+        self._frame_tree, self._transforms = FrameTree(), TransformCollector()
+        self._last_transforms: dict[tuple[str, str], tuple[int, bytes]] = {}
+        self._conflicting_transforms: dict[str, int] = defaultdict(int)
+        self._node_statuses: dict[str, NodeStatus] = {}
+        self._parameter_clients: dict[str, Client] = {}
+        self._parameter_futures: dict[str, dict[str, Future]] = {}
+        self.create_subscription(LaserScan, running.SCAN, self._on_scan, _BEST_EFFORT)
+        self.create_subscription(OdometryMessage, running.ODOM, self._on_odometry, _BEST_EFFORT)
+        self.create_subscription(DiagnosticArray, DIAGNOSTICS, self._on_diagnostics, _BEST_EFFORT)
+        self.create_subscription(String, running.ESTIMATES, self._on_estimate, _BEST_EFFORT)
         if TFMessage is not None:
-            self.create_subscription(TFMessage, running.TF, self._hear_moving, _ANYHOW)
-            self.create_subscription(TFMessage, running.TF_STATIC, self._hear_static, topics.TF_STATIC)
+            self.create_subscription(TFMessage, running.TF, self._on_transforms, _BEST_EFFORT)
+            self.create_subscription(TFMessage, running.TF_STATIC, self._on_static_transforms, topics.TF_STATIC)
 
     @property
-    def others(self) -> tuple[str, ...]:
+    def other_nodes(self) -> tuple[str, ...]:
         """Names of all nodes but this one."""
         return tuple(name for name in self.get_node_names() if name != self.get_name())
 
-    def ask(self) -> None:
+    def request_parameters(self) -> None:
         """Ask every node that was not asked so far for the parameters that matter here."""
         for name, namespace in self.get_node_names_and_namespaces():
             full = f"{namespace.rstrip('/')}/{name}"
-            if full in self._asked or name == self.get_name():
+            if full in self._parameter_futures or name == self.get_name():
                 continue
-            if full not in self._askable:
-                self._askable[full] = self.create_client(GetParameters, f"{full}/get_parameters")
-            client = self._askable[full]
+            if full not in self._parameter_clients:
+                self._parameter_clients[full] = self.create_client(GetParameters, f"{full}/get_parameters")
+            client = self._parameter_clients[full]
             if client.service_is_ready():
                 # One by one: a node that lacks one of them answers nothing to all.
-                self._asked[full] = {
-                    name: client.call_async(GetParameters.Request(names=[name])) for name in (_SIMULATED, _LASER_POSE)
+                self._parameter_futures[full] = {
+                    name: client.call_async(GetParameters.Request(names=[name]))
+                    for name in (_USE_SIM_TIME, _LASER_POSE)
                 }
 
     def findings(self, seconds: float) -> list[Finding]:
         """All that was found."""
-        system = self._running(seconds)
+        system = self._running_system(seconds)
         found = running.findings(system)
-        if not system.topics[running.SCAN].heard:
+        if not system.topics[running.SCAN].message_count:
             return found
-        return [*found, *findings(self._gathered().finish("the running system", self._messages()))]
+        return [*found, *findings(self._gather().finish("the running system", self._message_statistics()))]
 
-    def _hear_scan(self, message: LaserScan) -> None:
-        self._note(running.SCAN, conversions.stamp_of(message.header.stamp))
+    def _on_scan(self, message: LaserScan) -> None:
+        self._count_message(running.SCAN, conversions.stamp_from_time(message.header.stamp))
         self._scans.append(message)
 
-    def _hear_odometry(self, message: OdometryMessage) -> None:
-        self._note(running.ODOM, conversions.stamp_of(message.header.stamp))
+    def _on_odometry(self, message: OdometryMessage) -> None:
+        self._count_message(running.ODOM, conversions.stamp_from_time(message.header.stamp))
         self._odometry_frames = (frame_name(message.header.frame_id), frame_name(message.child_frame_id))
-        self._readings.append(conversions.odometry_from(message))
+        self._readings.append(conversions.odometry_from_message(message))
 
-    def _note(self, topic: str, stamp: int) -> None:
+    def _count_message(self, topic: str, stamp: int) -> None:
         self._counts[topic] += 1
-        self._away[topic].append(1e-9 * (time.time_ns() - stamp))
+        self._clock_offsets[topic].append(1e-9 * (time.time_ns() - stamp))
 
-    def _hear_estimate(self, _: String) -> None:
+    def _on_estimate(self, _: String) -> None:
         self._counts[running.ESTIMATES] += 1
 
-    def _hear_diagnostics(self, message: DiagnosticArray) -> None:
-        for status in message.status:
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        for status in message.robot_status:
             level = status.level[0] if isinstance(status.level, bytes) else int(status.level)
             state = next((entry.value for entry in status.values if entry.key == STATE), "")
-            self._told[status.name] = Told(status.name, level, status.message, state)
+            self._node_statuses[status.name] = NodeStatus(status.name, level, status.message, state)
 
-    def _hear_static(self, message: Any) -> None:  # noqa: ANN401  a TFMessage, where there is one
+    def _on_static_transforms(self, message: Any) -> None:  # noqa: ANN401  a TFMessage, where there is one
         self._counts[running.TF_STATIC] += 1
-        self._tree.add(message)
-        self._joints.add(running.TF_STATIC, message)
+        self._frame_tree.add(message)
+        self._transforms.add(running.TF_STATIC, message)
 
-    def _hear_moving(self, message: Any) -> None:  # noqa: ANN401  a TFMessage, where there is one
+    def _on_transforms(self, message: Any) -> None:  # noqa: ANN401  a TFMessage, where there is one
         self._counts[running.TF] += 1
-        self._joints.add(running.TF, message)
+        self._transforms.add(running.TF, message)
         for joint in message.transforms:
             parent, child = frame_name(joint.header.frame_id), frame_name(joint.child_frame_id)
-            stamp = conversions.stamp_of(joint.header.stamp)
+            stamp = conversions.stamp_from_time(joint.header.stamp)
             move, turn = joint.transform.translation, joint.transform.rotation
             value = np.array([move.x, move.y, turn.z, turn.w])
-            last = self._last_joints.get((parent, child))
+            last = self._last_transforms.get((parent, child))
             if last is not None and last[0] == stamp and last[1] != value.tobytes():
-                self._doubled[f"{parent} -> {child}"] += 1
-            self._last_joints[parent, child] = (stamp, value.tobytes())
+                self._conflicting_transforms[f"{parent} -> {child}"] += 1
+            self._last_transforms[parent, child] = (stamp, value.tobytes())
             if parent == _ODOM_FRAME:
                 heading = 2.0 * float(np.arctan2(turn.z, turn.w))
-                self._by_transform[child].append(Odometry(stamp, np.array([move.x, move.y, heading])))
+                self._transform_odometry[child].append(Odometry(stamp, np.array([move.x, move.y, heading])))
 
-    def _running(self, seconds: float) -> Running:
+    def _running_system(self, seconds: float) -> RunningSystem:
         names = (running.SCAN, running.ODOM, running.TF, running.TF_STATIC, running.CLOCK, running.ESTIMATES)
         topics = {name: self._topic(name, self._counts[name]) for name in names}
-        topics |= {name: self._topic(name, None) for name in _ALSO}
+        topics |= {name: self._topic(name, None) for name in _GRAPH_ONLY_TOPICS}
         clock = bool(topics[running.CLOCK].publishers)
-        return Running(
+        return RunningSystem(
             seconds,
             topics,
-            self.others,
-            tuple(sorted(full.lstrip("/") for full in self._asked if self._answer(full, _SIMULATED).bool_value)),
-            tuple(self._told.values()),
-            {} if clock else {name: float(np.median(away)) for name, away in self._away.items()},
-            dict(self._doubled),
-            self._missing_laser(),
+            self.other_nodes,
+            tuple(
+                sorted(
+                    full.lstrip("/")
+                    for full in self._parameter_futures
+                    if self._parameter_value(full, _USE_SIM_TIME).bool_value
+                )
+            ),
+            tuple(self._node_statuses.values()),
+            {} if clock else {name: float(np.median(away)) for name, away in self._clock_offsets.items()},
+            dict(self._conflicting_transforms),
+            self._missing_laser_transform(),
         )
 
     def _topic(self, name: str, heard: int | None) -> Topic:
@@ -217,68 +224,68 @@ class DoctorNode(Node):
                     mismatches.append(Mismatch(publisher.node_name, subscriber.node_name, reason.strip().rstrip(".;")))
         return Topic(heard, tuple(end.node_name for end in publishers), tuple(mismatches))
 
-    def _answer(self, full: str, parameter: str) -> ParameterValue:
+    def _parameter_value(self, full: str, parameter: str) -> ParameterValue:
         """What a node has for a parameter; a value that is not set where it has none."""
-        future = self._asked[full][parameter]
+        future = self._parameter_futures[full][parameter]
         answer = future.result() if future.done() and future.exception() is None else None
         return answer.values[0] if answer is not None and answer.values else ParameterValue()
 
-    def _base(self) -> str:
-        return self._odometry_frames[1] or next(iter(self._by_transform), _BASE_FRAME)
+    def _base_frame(self) -> str:
+        return self._odometry_frames[1] or next(iter(self._transform_odometry), _BASE_FRAME)
 
-    def _given_laser(self) -> Mounting | None:
+    def _configured_mounting(self) -> Mounting | None:
         """Where the parameter of slam says that the laser is."""
-        for full in self._asked:
-            value = self._answer(full, _LASER_POSE)
+        for full in self._parameter_futures:
+            value = self._parameter_value(full, _LASER_POSE)
             if full.endswith("/slam") and value.type == ParameterType.PARAMETER_DOUBLE_ARRAY:
                 return Mounting(np.array(value.double_array_value), 1.0)
         return None
 
     def _mounting(self, frame: str) -> Mounting | None:
-        given, pose = self._given_laser(), self._tree.pose(self._base(), frame)
+        given, pose = self._configured_mounting(), self._frame_tree.lookup_transform(self._base_frame(), frame)
         return given if given is not None or pose is None else planar_mounting(pose, f"the laser {frame!r}")
 
-    def _missing_laser(self) -> str:
+    def _missing_laser_transform(self) -> str:
         missing = sorted({frame for frame in self._scan_frames() if self._mounting(frame) is None})
         if not missing:
             return ""
         return (
-            f"No transform leads from {self._base()!r} to the scans' frame {missing[0]!r} on /tf_static: start "
+            f"No transform leads from {self._base_frame()!r} to the scans' frame {missing[0]!r} on /tf_static: start "
             "robot_state_publisher or static_transform_publisher, or set the parameter laser_pose of slam."
         )
 
     def _scan_frames(self) -> set[str]:
         return {frame_name(message.header.frame_id) for message in self._scans}
 
-    def _gathered(self) -> Gatherer:
+    def _gather(self) -> Gatherer:
         """The measurements in the order of their stamps, each kind as it came."""
         mountings = {frame: self._mounting(frame) or Mounting(np.zeros(3), 1.0) for frame in self._scan_frames()}
-        scans: list[Scan | Odometry] = [self._scan(message, mountings) for message in self._scans]
-        readings: list[Scan | Odometry] = [*(self._readings or self._by_transform[self._base()])]
+        scans: list[Scan | Odometry] = [self._convert_scan(message, mountings) for message in self._scans]
+        readings: list[Scan | Odometry] = [*(self._readings or self._transform_odometry[self._base_frame()])]
         ordered = list(heapq.merge(readings, scans, key=lambda measurement: measurement.stamp))
         sources = [measurement.stamp for measurement in ordered]
         is_scan = [isinstance(measurement, Scan) for measurement in ordered]
         stamps = running_stamps(sources, is_scan, [False] * len(ordered))
         gatherer = Gatherer()
         for source, stamp, measurement in zip(sources, stamps.tolist(), ordered, strict=True):
-            gatherer.add(LogRecord(source, _stamped(measurement, stamp)))
+            gatherer.add(LogRecord(source, _with_stamp(measurement, stamp)))
         return gatherer
 
-    def _scan(self, message: LaserScan, mountings: dict[str, Mounting]) -> Scan:
-        return conversions.scan_from(message, *mountings[frame_name(message.header.frame_id)])
+    def _convert_scan(self, message: LaserScan, mountings: dict[str, Mounting]) -> Scan:
+        return conversions.scan_from_message(message, *mountings[frame_name(message.header.frame_id)])
 
-    def _messages(self) -> Messages:
-        heads: dict[ScanHead, int] = defaultdict(int)
+    def _message_statistics(self) -> MessageStatistics:
+        heads: dict[ScanHeader, int] = defaultdict(int)
         for scan in self._scans:
             frame = frame_name(scan.header.frame_id)
-            heads[ScanHead(frame, scan.angle_min, scan.angle_max, scan.angle_increment, len(scan.ranges))] += 1
-        frames = self._odometry_frames if self._readings else (_ODOM_FRAME, self._base())
+            heads[ScanHeader(frame, scan.angle_min, scan.angle_max, scan.angle_increment, len(scan.ranges))] += 1
+        frames = self._odometry_frames if self._readings else (_ODOM_FRAME, self._base_frame())
         types = {name: kind[0] for name, kind in self.get_topic_names_and_types()}
-        joints = self._joints.joints
-        if _MAP_TO_ODOM in self.others:
+        joints = self._transforms.transforms
+        if _MAP_TO_ODOM_NODE in self.other_nodes:
             joints = tuple(joint for joint in joints if joint.child != frames[0])
-        return Messages(dict(self._counts), types, dict(heads), frames, joints)
+        return MessageStatistics(dict(self._counts), types, dict(heads), frames, joints)
 
 
-def _stamped(measurement: Scan | Odometry, stamp: int) -> Scan | Odometry:
+def _with_stamp(measurement: Scan | Odometry, stamp: int) -> Scan | Odometry:
     return measurement if measurement.stamp == stamp else replace(measurement, stamp=stamp)

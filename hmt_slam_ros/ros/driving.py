@@ -11,14 +11,14 @@ from geometry_msgs.msg import PoseStamped, Twist
 from numpy.typing import NDArray
 from rclpy.node import Node
 
-from hmt_slam_ros.configuration.robot import Robot
+from hmt_slam_ros.configuration.robot import RobotParameters
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.logs.records import LogRecord
 from hmt_slam_ros.logs.stamps import NANOSECONDS
 from hmt_slam_ros.logs.writer import WORLD_FRAME
 from hmt_slam_ros.open_log import is_simulated
 from hmt_slam_ros.ros import conversions, topics
-from hmt_slam_ros.ros.topics import COMMANDS, GROUND_TRUTH
+from hmt_slam_ros.ros.topics import CMD_VEL, GROUND_TRUTH
 from hmt_slam_ros.sensors import Odometry
 from hmt_slam_ros.simulation import open_simulated
 from hmt_slam_ros.simulation.driven_robot import DrivenLog, DrivenRobot
@@ -27,13 +27,13 @@ from hmt_slam_ros.simulation.scenario import START
 _AGAIN = 10.0  # s, after which a fault is told again
 
 
-class Driving:
+class DrivenRobotSource:
     """A driven robot as a log for the player: each record is made right after the one before it was sent.
 
     So a command counts from the next odometry reading on, until `driven_robot.PATIENCE` of simulated time later.
     """
 
-    def __init__(self, node: Node, name: str, settings: Robot) -> None:
+    def __init__(self, node: Node, name: str, settings: RobotParameters) -> None:
         """Put the robot where the scripted drive is after ``robot.start``.
 
         :param name: ``sim:WORLD,...``.
@@ -46,16 +46,16 @@ class Driving:
         self._robot = DrivenRobot(simulated.scenario, start)
         self._log = DrivenLog(simulated.name, self._robot, settings.duration)
         self.name, self.scan_count, self.duration = simulated.name, self._log.scan_count, self._log.duration
-        self._truths: deque[tuple[int, NDArray[np.float64]]] = deque()
+        self._true_poses: deque[tuple[int, NDArray[np.float64]]] = deque()
         self._node = node
-        self._poses = node.create_publisher(PoseStamped, GROUND_TRUTH, topics.STREAM)
-        node.create_subscription(Twist, COMMANDS, self._told, topics.NEWEST)
+        self._ground_truth_publisher = node.create_publisher(PoseStamped, GROUND_TRUTH, topics.STREAM)
+        node.create_subscription(Twist, CMD_VEL, self._on_command, topics.NEWEST)
 
     def records(self) -> Iterator[LogRecord]:
         """What the robot measures, for as long as somebody asks."""
         for record in self._log.records():
             if isinstance(record.measurement, Odometry):
-                self._truths.append((record.measurement.stamp, self._robot.pose))
+                self._true_poses.append((record.measurement.stamp, self._robot.pose))
             yield record
 
     @property
@@ -63,17 +63,17 @@ class Driving:
         """How often the robot came upon something."""
         return self._robot.contacts
 
-    def tell_truth(self, stamp: int) -> None:
+    def publish_ground_truth(self, stamp: int) -> None:
         """Publish where the robot truly was at the odometry readings that are sent.
 
         :param stamp: of the last one, ns.
         """
-        while self._truths and self._truths[0][0] <= stamp:
-            when, pose = self._truths.popleft()
-            header = conversions.header(when, WORLD_FRAME)
-            self._poses.publish(PoseStamped(header=header, pose=conversions.pose_message(pose)))
+        while self._true_poses and self._true_poses[0][0] <= stamp:
+            when, pose = self._true_poses.popleft()
+            header = conversions.header_message(when, WORLD_FRAME)
+            self._ground_truth_publisher.publish(PoseStamped(header=header, pose=conversions.pose_message(pose)))
 
-    def _told(self, command: Twist) -> None:
+    def _on_command(self, command: Twist) -> None:
         speed, turn_rate = command.linear.x, command.angular.z
         if not (math.isfinite(speed) and math.isfinite(turn_rate)):
             self._node.get_logger().warning(
@@ -81,4 +81,4 @@ class Driving:
                 throttle_duration_sec=_AGAIN,
             )
             speed = turn_rate = 0.0
-        self._robot.command(speed, turn_rate)
+        self._robot.set_velocity(speed, turn_rate)

@@ -29,7 +29,7 @@ _SIGEV_THREAD = 2
 _CLOCK_MONOTONIC = 1
 # From the disappearance of another node's name until all its topics are gone as well.
 _AFTERMATH = 0.1  # s
-_DEPARTURE_POLL = 0.01  # s
+_SHUTDOWN_POLL = 0.01  # s
 
 
 class _SignalEvent(ctypes.Structure):
@@ -56,7 +56,7 @@ class _TimerSpecification(ctypes.Structure):
     )
 
 
-def end_within(seconds: float, status: int) -> None:
+def force_exit_after(seconds: float, status: int) -> None:
     """Let the system end this process if it is still there then; on systems other than Linux, do nothing.
 
     :param seconds: from now, above 0.
@@ -76,14 +76,14 @@ def end_within(seconds: float, status: int) -> None:
         raise OSError(ctypes.get_errno(), "timer_settime")
 
 
-def await_departures(node: Node, seconds: float) -> None:
+def wait_until_alone(node: Node, seconds: float) -> None:
     """Wait until nobody else is there, so that the node can be destroyed safely.
 
     :param seconds: at most, for those that were killed and did not say goodbye.
     """
     deadline = time.monotonic() + seconds
     while len(node.get_node_names()) > 1 and time.monotonic() < deadline:
-        time.sleep(_DEPARTURE_POLL)
+        time.sleep(_SHUTDOWN_POLL)
     time.sleep(_AFTERMATH)
 
 
@@ -91,7 +91,7 @@ def await_departures(node: Node, seconds: float) -> None:
 _PRIORITY = 1
 
 
-def take_precedence() -> bool:
+def set_realtime_priority() -> bool:
     """Let all threads of this process run before ordinary ones whenever they have something to do (SCHED_RR).
 
     :returns: whether the system permits that, as it does to root and to those with an ``rtprio`` limit.
@@ -112,9 +112,9 @@ PARENT_VARIABLE = "HMT_SLAM_PARENT"
 FAULT = 2
 _PR_SET_PDEATHSIG = 1
 # How long what is being done may take to end, such as the compilation of a kernel, before it is broken off.
-_GRACE = 8.0  # s
+_GRACE_PERIOD = 8.0  # s
 # How long taking leave of the other nodes may take.
-_DEPARTURE = 2.0  # s
+_SHUTDOWN_TIMEOUT = 2.0  # s
 # Between two looks whether a node is at its end for another reason than a signal.
 _POLL = 0.05  # s
 # What calls of rclpy raise whose context is gone; the last two where they find None in its place.
@@ -136,11 +136,11 @@ def run(make: Callable[[], NodeType], spin: Callable[[NodeType], None]) -> int:
     :param spin: returns when the node has nothing more to do.
     :returns: exit status.
     """
-    stop = _Stop()
+    stop = _SignalListener()
     nodes: list[NodeType] = []
     try:
-        status = _live(make, spin, stop, nodes)
-        end_within(_DEPARTURE, status)
+        status = _run_node(make, spin, stop, nodes)
+        force_exit_after(_SHUTDOWN_TIMEOUT, status)
     finally:
         _ignore_signals()
         for node in nodes:
@@ -149,31 +149,33 @@ def run(make: Callable[[], NodeType], spin: Callable[[NodeType], None]) -> int:
     return status
 
 
-def spin_until(node: Node, over: Callable[[], bool] | None = None) -> None:
+def spin_until(node: Node, is_done: Callable[[], bool] | None = None) -> None:
     """Spin a node until SIGINT or SIGTERM, or until it is at its end.
 
     By an executor of its own: ``rclpy.spin`` shares one, and fails where the signal comes before it has it.
 
-    :param over: whether it is at its end, asked 20 times a second.
+    :param is_done: whether it is at its end, asked 20 times a second.
     """
     if not rclpy.ok():
         return
     executor = SingleThreadedExecutor()
     try:
         executor.add_node(node)
-        while rclpy.ok() and not (over and over()):
-            executor.spin_once(timeout_sec=_POLL if over else None)
+        while rclpy.ok() and not (is_done and is_done()):
+            executor.spin_once(timeout_sec=_POLL if is_done else None)
     finally:
         executor.shutdown()
 
 
-def _live(make: Callable[[], NodeType], spin: Callable[[NodeType], None], stop: _Stop, nodes: list[NodeType]) -> int:
+def _run_node(
+    make: Callable[[], NodeType], spin: Callable[[NodeType], None], stop: _SignalListener, nodes: list[NodeType]
+) -> int:
     """Make a node, which is also put into ``nodes``, and spin it; return the exit status."""
     try:
-        _end_with_parent()
+        _exit_with_parent()
         rclpy.init()
         try:
-            if not stop.told:
+            if not stop.received:
                 nodes.append(make())
                 if rclpy.ok():
                     spin(nodes[0])
@@ -185,13 +187,13 @@ def _live(make: Callable[[], NodeType], spin: Callable[[NodeType], None], stop: 
         return 0
     except HmtSlamError as error:
         # With the error goes what is there of a node that could not be made, and with it its participant.
-        end_within(_DEPARTURE, FAULT)
+        force_exit_after(_SHUTDOWN_TIMEOUT, FAULT)
         print(f"{sys.argv[0].rsplit('/', 1)[-1]}: {error}", file=sys.stderr, flush=True)
         return FAULT
     return 0
 
 
-class _Stop:
+class _SignalListener:
     """Takes note of SIGINT and SIGTERM; rclpy's own handler shuts the context down, and spinning ends.
 
     Nothing is raised: an exception would come up at any line, also inside of a compiler, which cannot bear it. A thread
@@ -200,20 +202,20 @@ class _Stop:
     """
 
     def __init__(self) -> None:
-        self.told = False
-        self._come, told = os.pipe()
+        self.received = False
+        self._wakeup_fd, told = os.pipe()
         os.set_blocking(told, False)
         signal.set_wakeup_fd(told, warn_on_full_buffer=False)
         for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, self._take_note)
-        threading.Thread(target=self._end_in_time, daemon=True).start()
+            signal.signal(number, self._on_signal)
+        threading.Thread(target=self._exit_after_signal, daemon=True).start()
 
-    def _take_note(self, _number: int, _frame: object) -> None:
-        self.told = True
+    def _on_signal(self, _number: int, _frame: object) -> None:
+        self.received = True
 
-    def _end_in_time(self) -> None:
-        os.read(self._come, 1)
-        end_within(_GRACE, 0)
+    def _exit_after_signal(self) -> None:
+        os.read(self._wakeup_fd, 1)
+        force_exit_after(_GRACE_PERIOD, 0)
 
 
 def _ignore_signals() -> None:
@@ -222,7 +224,7 @@ def _ignore_signals() -> None:
         signal.signal(number, signal.SIG_IGN)
 
 
-def _end_with_parent() -> None:
+def _exit_with_parent() -> None:
     """Where another program started this node as its helper, see to it that the node does not outlive it."""
     parent = os.environ.get(PARENT_VARIABLE)
     if parent is None or not sys.platform.startswith("linux"):

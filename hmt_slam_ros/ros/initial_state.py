@@ -18,10 +18,10 @@ from hmt_slam_ros.configuration import load_configuration
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.hybrid_map.shortest_path import joined
-from hmt_slam_ros.hybrid_map.surroundings import positions
-from hmt_slam_ros.messages.map_changes import AreaPose, Place
-from hmt_slam_ros.results.log_reading import differences, map_folder
+from hmt_slam_ros.hybrid_map.shortest_path import connected_areas
+from hmt_slam_ros.hybrid_map.surroundings import keyframe_positions
+from hmt_slam_ros.messages.map_changes import AreaPose, InitialPose
+from hmt_slam_ros.results.log_reading import describe_parameter_changes, map_folder
 from hmt_slam_ros.ros.parameters import ConfiguredNode
 from hmt_slam_ros.ros.recovery import CHECKPOINT
 from hmt_slam_ros.saved_map.folder import CONFIGURATION, FORMAT, VERSION, FolderReader
@@ -31,34 +31,34 @@ if TYPE_CHECKING:
 
     from hmt_slam_ros.metric_slam.slam import MetricSlam
     from hmt_slam_ros.results.hmt_map import MapDocument
-    from hmt_slam_ros.ros.recovery import Base
+    from hmt_slam_ros.ros.recovery import JournalHeader
 
 State = TypeVar("State")
 
-_FROM = ParameterDescriptor(description="Output folder or hmt_map to go on from.", read_only=True)
-_CARRIED = ParameterDescriptor(
+_START_FROM = ParameterDescriptor(description="Output folder or hmt_map to go on from.", read_only=True)
+_START_LOST = ParameterDescriptor(
     description="Whether the robot may be anywhere in the map of start_from; otherwise it is where it was.",
     read_only=True,
 )
 
 
-class Beginning:
+class InitialState:
     """A saved map, or nothing.
 
     :ivar events: keyframe events in it, 0 without.
-    :ivar carried: whether nothing tells how the robot came from where it was then.
+    :ivar lost: whether nothing tells how the robot came from where it was then.
     :ivar folder: of the map, None without.
-    :ivar scans: scans that had a pose before; those to come are numbered on, so that they are told from these.
+    :ivar previous_scans: scans that had a pose before; those to come are numbered on, so that they are told from these.
     """
 
-    def __init__(self, node: ConfiguredNode, path: str, *, carried: bool, scans: int = 0) -> None:
+    def __init__(self, node: ConfiguredNode, path: str, *, lost: bool, previous_scans: int = 0) -> None:
         """Check the map.
 
         :param path: its folder or the output folder around it, empty for nothing.
         :raises HmtSlamError: where it is damaged, or the node's parameters do not go with it.
         """
-        self.events, self.carried, self.scans = 0, carried and bool(path), scans
-        self._folder: FolderReader | None = None
+        self.events, self.lost, self.previous_scans = 0, lost and bool(path), previous_scans
+        self._reader: FolderReader | None = None
         self.folder: Path | None = None
         if path:
             self.folder = map_folder(Path(path)).absolute()
@@ -67,68 +67,68 @@ class Beginning:
             self.events = self._chain_events()
 
     @classmethod
-    def at_checkpoint(cls, node: ConfiguredNode, state: Path, base: Base) -> Beginning:
+    def from_checkpoint(cls, node: ConfiguredNode, state: Path, header: JournalHeader) -> InitialState:
         """Where a node that was killed goes on.
 
         :param state: the folder of its checkpoint.
-        :param base: what it was then.
+        :param header: what it was then.
         :raises HmtSlamError: as for a map.
         """
-        made = cls(node, "", carried=False)
+        made = cls(node, "", lost=False)
         made._open(node, state, CHECKPOINT)
-        made.events, made.folder = base.events, Path(base.folder) if base.folder else None
+        made.events, made.folder = header.events, Path(header.folder) if header.folder else None
         made.map = None  # what was shown of it is part of the checkpoint
         return made
 
     def _open(self, node: ConfiguredNode, folder: Path, kind: str) -> None:
-        self._folder = FolderReader(folder, kind, VERSION)
+        self._reader = FolderReader(folder, kind, VERSION)
         saved = load_configuration(folder / CONFIGURATION)
-        told = differences(saved, replace(node.configuration, robot=saved.robot))
+        told = describe_parameter_changes(saved, replace(node.configuration, robot=saved.robot))
         if told:
             node.get_logger().warning(told)
 
     def _chain_events(self) -> int:
         from hmt_slam_ros.results.hmt_map import ChainState  # noqa: PLC0415
 
-        state = self.part("chain", ChainState)
+        state = self.read_part("chain", ChainState)
         return 0 if state is None else state.events
 
-    def part(self, name: str, kind: type[State]) -> State | None:
+    def read_part(self, name: str, kind: type[State]) -> State | None:
         """A part of the map, None where the node begins with nothing.
 
         :raises HmtSlamError: where the map lacks it.
         """
-        if self._folder is None:
+        if self._reader is None:
             return None
-        if f"{name}.json" not in self._folder.names:
+        if f"{name}.json" not in self._reader.names:
             raise HmtSlamError(
                 f"the map to start from lacks the part {name}: give one that hmt_slam map wrote or nodes saved"
             )
-        return self._folder.read(name, kind)
+        return self._reader.read(name, kind)
 
     @cached_property
     def map(self) -> MapDocument | None:
         """The map itself."""
         from hmt_slam_ros.results.hmt_map import MapDocument  # noqa: PLC0415  for those who ask for it
 
-        return self.part("map", MapDocument)
+        return self.read_part("map", MapDocument)
 
 
-def declare_map(node: ConfiguredNode) -> str:
+def declare_start_from(node: ConfiguredNode) -> str:
     """Path of the map, empty for none."""
-    return str(node.declare_parameter("start_from", "", _FROM).value)
+    return str(node.declare_parameter("start_from", "", _START_FROM).value)
 
 
-def declare_beginning(node: ConfiguredNode) -> tuple[str, bool]:
+def declare_initial_state(node: ConfiguredNode) -> tuple[str, bool]:
     """Path of the map, empty for none, and whether the robot may be anywhere in it."""
-    return declare_map(node), bool(node.declare_parameter("start_carried", True, _CARRIED).value)
+    return declare_start_from(node), bool(node.declare_parameter("start_carried", True, _START_LOST).value)
 
 
 # Nobody knows better where a robot is, m, m, rad: some programs send zeros.
-_LEAST = np.diag([0.1, 0.1, math.radians(3.0)]) ** 2
+_MIN_COVARIANCE = np.diag([0.1, 0.1, math.radians(3.0)]) ** 2
 # What RViz says of a pose that is drawn with the mouse.
-_USUAL = np.diag([0.5, 0.5, math.radians(15.0)]) ** 2
-_DEVIATIONS = 3.0
+_RVIZ_COVARIANCE = np.diag([0.5, 0.5, math.radians(15.0)]) ** 2
+_GATE_DEVIATIONS = 3.0
 
 
 def declare_initial_pose(node: Node) -> PoseGaussian | None:
@@ -146,13 +146,15 @@ def declare_initial_pose(node: Node) -> PoseGaussian | None:
         return None
     if len(value) != 3 or not np.isfinite(value).all():
         raise HmtSlamError(f"initial_pose = {list(value)} is no pose: give x, y in m and theta in rad")
-    return PoseGaussian(np.array(value, dtype=np.float64), _USUAL)
+    return PoseGaussian(np.array(value, dtype=np.float64), _RVIZ_COVARIANCE)
 
 
-def place_of(process: MetricSlam, areas: Mapping[int, AreaPose], belief: PoseGaussian, radius: float) -> Place:
+def locate_in_map(
+    process: MetricSlam, area_poses: Mapping[int, AreaPose], belief: PoseGaussian, radius: float
+) -> InitialPose:
     """Where a robot is in the map of the most probable hypothesis.
 
-    :param areas: ``map_T_area`` by area.
+    :param area_poses: ``map_T_area`` by area.
     :param belief: over ``map_T_base``.
     :param radius: farthest distance to a keyframe of an area's place, m.
     :raises HmtSlamError: where the map does not reach there, or the belief is none.
@@ -163,32 +165,34 @@ def place_of(process: MetricSlam, areas: Mapping[int, AreaPose], belief: PoseGau
     if spread[0] < -1e-9:
         raise HmtSlamError("the covariance of the pose has a negative eigenvalue: give one that is positive")
     x, y, _ = belief.mean
-    near = _nearest(process, areas, belief.mean)
+    near = _nearest_area(process, area_poses, belief.mean)
     if near is None:
         raise HmtSlamError("there is no map yet in which the robot could be: map, or start from a map")
     area, away = near
-    reach = radius + _DEVIATIONS * math.sqrt(float(np.linalg.eigvalsh(belief.covariance[:2, :2])[-1]))
+    reach = radius + _GATE_DEVIATIONS * math.sqrt(float(np.linalg.eigvalsh(belief.covariance[:2, :2])[-1]))
     if away > reach:
         raise HmtSlamError(
             f"({x:.2f}, {y:.2f}) is outside of the map, {away:.1f} m from where the robot ever was in it: give a pose "
             f"within {reach:.1f} m, or a larger covariance"
         )
-    pose = se2.between(areas[area].pose.mean, belief.mean)
-    return Place(area, PoseGaussian(pose, belief.covariance + _LEAST))
+    pose = se2.between(area_poses[area].pose.mean, belief.mean)
+    return InitialPose(area, PoseGaussian(pose, belief.covariance + _MIN_COVARIANCE))
 
 
-def _nearest(process: MetricSlam, areas: Mapping[int, AreaPose], pose: NDArray[np.float64]) -> tuple[int, float] | None:
+def _nearest_area(
+    process: MetricSlam, area_poses: Mapping[int, AreaPose], pose: NDArray[np.float64]
+) -> tuple[int, float] | None:
     """The area with the keyframe nearest to a pose in the map (3,), and its distance, m; None where there is none.
 
     What a robot maps that may be anywhere is no part of the map.
     """
     replica = process.replica
-    hybrid_map, here = replica.maps[replica.best], replica.areas[replica.best]
-    beside = joined(hybrid_map, here) if process.lost else {}
+    hybrid_map, here = replica.maps[replica.best_hypothesis], replica.robot_areas[replica.best_hypothesis]
+    beside = connected_areas(hybrid_map, here) if process.is_lost else {}
     away = {
-        area: float(np.hypot(*(positions(hybrid_map, area, areas[area].pose.mean) - pose[:2]).T).min())
+        area: float(np.hypot(*(keyframe_positions(hybrid_map, area, area_poses[area].pose.mean) - pose[:2]).T).min())
         for area in hybrid_map.area_ids()
-        if area in areas and area not in beside and hybrid_map.keyframes(area)
+        if area in area_poses and area not in beside and hybrid_map.keyframes(area)
     }
     if not away:
         return None

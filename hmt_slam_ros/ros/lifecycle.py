@@ -18,7 +18,7 @@ from rclpy.lifecycle.node import TransitionCallbackReturn
 from rclpy.time_source import CLOCK_TOPIC
 
 from hmt_slam_ros.errors import HmtSlamError
-from hmt_slam_ros.ros.diagnostics import STATE, Figures
+from hmt_slam_ros.ros.diagnostics import STATE, NodeDiagnostics
 from hmt_slam_ros.ros.parameters import ConfiguredNode
 
 _AUTOSTART = ParameterDescriptor(
@@ -30,9 +30,9 @@ _AUTOSTART = ParameterDescriptor(
 class ManagedNode(LifecycleNodeMixin, ConfiguredNode):
     """A node with parameters, diagnostics and the services of its states; what it does in them is of subclasses.
 
-    :ivar figures: what it counts, also while it is not configured.
-    :ivar configured: whether it is inactive or active.
-    :ivar active: whether it takes part.
+    :ivar diagnostics: what it counts, also while it is not configured.
+    :ivar is_configured: whether it is inactive or active.
+    :ivar is_active: whether it takes part.
     """
 
     def __init__(self, name: str, changeable: Iterable[str] = ()) -> None:
@@ -41,38 +41,38 @@ class ManagedNode(LifecycleNodeMixin, ConfiguredNode):
         :param name: of the node.
         :param changeable: dotted names of the parameters that may change while the node runs.
         """
-        self.configured = self.active = False
+        self.is_configured = self.is_active = False
         self._fault: Exception | None = None
-        self._misgiven: HmtSlamError | None = None
+        self._parameter_fault: HmtSlamError | None = None
         try:
             ConfiguredNode.__init__(self, name, changeable)
-            self.declare()
+            self.declare_own_parameters()
         except HmtSlamError as fault:
-            self._misgiven = fault
+            self._parameter_fault = fault
         self._autostart = bool(self.declare_parameter("autostart", True, _AUTOSTART).value)
-        self.figures = Figures(self)
+        self.diagnostics = NodeDiagnostics(self)
         LifecycleNodeMixin.__init__(self)
         self._change_state = self._service_change_state.callback
-        self._service_change_state.callback = self._answer_change
-        self._own = set(self._entities())
-        self._tell_state()
+        self._service_change_state.callback = self._handle_change_state
+        self._permanent_entities = set(self._entities())
+        self._update_state()
 
-    def declare(self) -> None:
+    def declare_own_parameters(self) -> None:
         """Declare the parameters that are not in the tree.
 
         :raises HmtSlamError: for a value that cannot be.
         """
 
-    def set_up(self) -> None:
+    def configure_node(self) -> None:
         """Make all that the node needs to take part.
 
         :raises HmtSlamError: where it cannot be; what was made by then is destroyed.
         """
 
-    def take_part(self) -> None:
+    def activate_node(self) -> None:
         """Begin, or go on after :meth:`stand_still`."""
 
-    def stand_still(self) -> None:
+    def deactivate_node(self) -> None:
         """Do nothing new, and lose nothing."""
 
     def check_clean_up(self) -> None:
@@ -81,87 +81,87 @@ class ManagedNode(LifecycleNodeMixin, ConfiguredNode):
         :raises HmtSlamError: where that cannot be now.
         """
 
-    def give_up(self) -> None:
+    def clean_up_node(self) -> None:
         """Forget what :meth:`set_up` made; publishers, subscriptions, services and timers vanish by themselves."""
 
-    def abandon(self) -> None:
+    def abandon_configuration(self) -> None:
         """Forget what :meth:`set_up` made before it failed."""
-        self._destroy_made()
+        self._destroy_configured_entities()
 
-    def leave(self) -> None:
+    def shut_down_node(self) -> None:
         """Do what is left to do when the node is shut down, and :meth:`take_down` at its end."""
-        self.take_down()
+        self.tear_down()
 
     @property
-    def first_states(self) -> tuple[bool, bool]:
+    def startup_states(self) -> tuple[bool, bool]:
         """Whether the node configures itself at its start, and activates itself."""
         return self._autostart, self._autostart
 
-    def begin(self) -> None:
+    def enter_startup_states(self) -> None:
         """Enter the states in which the node starts.
 
         :raises HmtSlamError: where it cannot be configured.
         """
-        if self._misgiven is not None and self._autostart:
-            raise self._misgiven
-        configure, activate = (False, False) if self._misgiven else self.first_states
+        if self._parameter_fault is not None and self._autostart:
+            raise self._parameter_fault
+        configure, activate = (False, False) if self._parameter_fault else self.startup_states
         for wanted, trigger in ((configure, self.trigger_configure), (activate, self.trigger_activate)):
             if wanted:
                 trigger()
-                self._tell_state()
+                self._update_state()
                 if self._fault is not None:
                     raise self._fault
 
-    def take_down(self) -> None:
+    def tear_down(self) -> None:
         """Destroy all that was made since the node is there."""
-        self.give_up()
-        self.configured = self.active = False
-        self._destroy_made()
+        self.clean_up_node()
+        self.is_configured = self.is_active = False
+        self._destroy_configured_entities()
 
     def on_configure(self, _state: LifecycleState) -> TransitionCallbackReturn:
         """From unconfigured to inactive."""
-        return self._outcome(self._configure)
+        return self._run_transition(self._configure)
 
     def on_activate(self, _state: LifecycleState) -> TransitionCallbackReturn:
         """From inactive to active."""
-        return self._outcome(self._activate)
+        return self._run_transition(self._activate)
 
     def on_deactivate(self, _state: LifecycleState) -> TransitionCallbackReturn:
         """From active to inactive."""
-        return self._outcome(self._deactivate)
+        return self._run_transition(self._deactivate)
 
     def on_cleanup(self, _state: LifecycleState) -> TransitionCallbackReturn:
         """From inactive to unconfigured."""
-        return self._outcome(self._clean_up)
+        return self._run_transition(self._clean_up)
 
     def on_shutdown(self, _state: LifecycleState) -> TransitionCallbackReturn:
         """From any of them to finalized."""
-        return self._outcome(self.leave if self.configured else lambda: None)
+        return self._run_transition(self.shut_down_node if self.is_configured else lambda: None)
 
     def _configure(self) -> None:
-        if self._misgiven is not None:
-            raise self._misgiven
-        self.figures.clear()
+        if self._parameter_fault is not None:
+            raise self._parameter_fault
+        self.diagnostics.clear()
         try:
-            self.set_up()
+            self.configure_node()
         except HmtSlamError:
-            self.abandon()
+            self.abandon_configuration()
             raise
-        self.configured = True
+        self.is_configured = True
 
     def _activate(self) -> None:
-        self.active = True
-        self.take_part()
+        self.is_active = True
+        self.activate_node()
 
     def _deactivate(self) -> None:
-        self.active = False
-        self.stand_still()
+        self.is_active = False
+        self.deactivate_node()
 
     def _clean_up(self) -> None:
         self.check_clean_up()
-        self.take_down()
+        self.tear_down()
 
-    def _outcome(self, change: Callable[[], None]) -> TransitionCallbackReturn:
+    def _run_transition(self, change: Callable[[], None]) -> TransitionCallbackReturn:
         """Keep what rclpy would pass over."""
         self._fault = None
         try:
@@ -174,16 +174,18 @@ class ManagedNode(LifecycleNodeMixin, ConfiguredNode):
             return TransitionCallbackReturn.ERROR
         return TransitionCallbackReturn.SUCCESS
 
-    def _answer_change(self, request: ChangeState.Request, response: ChangeState.Response) -> ChangeState.Response:
+    def _handle_change_state(
+        self, request: ChangeState.Request, response: ChangeState.Response
+    ) -> ChangeState.Response:
         """Change the state as somebody asks; a transition that there is not is refused, and a defect ends the node."""
         self._fault = None
         try:
             self._change_state(request, response)
         except rclpy_implementation.RCLError:
             response.success = False  # rcl has told why
-        self._tell_state()
+        self._update_state()
         if isinstance(self._fault, HmtSlamError):
-            self.figures.fail(str(self._fault))
+            self.diagnostics.fail(str(self._fault))
         elif self._fault is not None:
             raise self._fault
         return response
@@ -198,21 +200,21 @@ class ManagedNode(LifecycleNodeMixin, ConfiguredNode):
         super().destroy_node()
         self._state_machine.destroy_when_not_in_use()
 
-    def _tell_state(self) -> None:
-        self.figures.state[STATE] = self.state
+    def _update_state(self) -> None:
+        self.diagnostics.values[STATE] = self.state
 
     def _entities(self) -> Iterator[Any]:
         for there in (self.publishers, self.subscriptions, self.services, self.timers):
             yield from there
 
-    def _destroy_made(self) -> None:
+    def _destroy_configured_entities(self) -> None:
         for there, destroy in (
             (self.subscriptions, self.destroy_subscription),
             (self.services, self.destroy_service),
             (self.timers, self.destroy_timer),
             (self.publishers, self.destroy_publisher),
         ):
-            for entity in set(there) - self._own:
+            for entity in set(there) - self._permanent_entities:
                 # Made by rclpy, maybe later, as use_sim_time is set.
                 if getattr(entity, "topic_name", "") != CLOCK_TOPIC:
                     destroy(entity)

@@ -26,14 +26,14 @@ from rclpy.task import Future
 from std_srvs.srv import Trigger
 
 from hmt_slam_ros.errors import HmtSlamError
-from hmt_slam_ros.messages.documents import BeginRequest, BegunPart, SavedPart, SaveRequest
-from hmt_slam_ros.ros.coordinated_request import PARTS, Round
-from hmt_slam_ros.ros.execution import end_within, spin_until
-from hmt_slam_ros.ros.initial_state import Beginning
-from hmt_slam_ros.ros.map_view import MapView, Seen
-from hmt_slam_ros.ros.process_node import SAVING_PATIENCE, ProcessNode
-from hmt_slam_ros.ros.topics import BEGIN, BEGUN, SAVE, SAVED
-from hmt_slam_ros.saved_map.folder import HMT_MAP, MANIFEST, put_in_place
+from hmt_slam_ros.messages.documents import ResetRequest, ResetResponse, SaveRequest, SaveResponse
+from hmt_slam_ros.ros.coordinated_request import PARTICIPANTS, RequestCoordinator
+from hmt_slam_ros.ros.execution import force_exit_after, spin_until
+from hmt_slam_ros.ros.initial_state import InitialState
+from hmt_slam_ros.ros.map_view import MapRenderer, MapRendererState
+from hmt_slam_ros.ros.process_node import SAVE_TIMEOUT, ProcessNode
+from hmt_slam_ros.ros.topics import RESET_REQUEST, RESET_RESPONSE, SAVE_REQUEST, SAVE_RESPONSE
+from hmt_slam_ros.saved_map.folder import HMT_MAP, MANIFEST, replace_folder
 
 if TYPE_CHECKING:
     from hmt_slam_ros.results.hmt_map import MapWriter
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 _REMEDY = "the map of before stays; make room, or set save_to of slam to another folder"
 
 
-class _Saving(NamedTuple):
+class _PendingSave(NamedTuple):
     """A map that is being saved.
 
     :ivar scratch: folder that vanishes at the end.
@@ -57,38 +57,40 @@ class _Saving(NamedTuple):
         return self.scratch / "new"
 
 
-class MapSaver(Round):
+class MapSaver(RequestCoordinator):
     """Answers the service ``save``."""
 
-    def __init__(self, node: SlamNode, release: Callable[[], None]) -> None:
+    def __init__(self, node: SlamNode, on_release: Callable[[], None]) -> None:
         """Offer the service.
 
-        :param release: called when slam need not wait any more.
+        :param on_release: called when slam need not wait any more.
         """
         self._target = node.save_to
-        super().__init__(node, release, (SAVE, SAVED), SavedPart, f"{self._target} cannot be saved")
-        self._last: Future | None = None
-        self._ending = False
-        self._saving: _Saving | None = None
+        super().__init__(
+            node, on_release, (SAVE_REQUEST, SAVE_RESPONSE), SaveResponse, f"{self._target} cannot be saved"
+        )
+        self._final_save: Future | None = None
+        self._is_shutting_down = False
+        self._pending_save: _PendingSave | None = None
         # A group of its own, so that the node goes on while the answer is awaited.
         group = MutuallyExclusiveCallbackGroup()
         node.create_service(Trigger, "~/save", self._answer, callback_group=group)
 
     async def _answer(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        if self._node.busy:
+        if self._node.is_busy:
             response.message = "a map is being saved or loaded already: ask again"
             return response
-        response.success, response.message = await self.ask()
+        response.success, response.message = await self.request()
         return response
 
-    def saved_last(self) -> bool:
+    def poll_final_save(self) -> bool:
         """Whether the map of a node that was told to end is saved, or cannot be; the first call asks for it."""
-        self._ending = True
-        if self._last is None and not self._node.busy:
-            self._last = self.ask()
-        return self._last is not None and self._last.done()
+        self._is_shutting_down = True
+        if self._final_save is None and not self._node.is_busy:
+            self._final_save = self.request()
+        return self._final_save is not None and self._final_save.done()
 
-    def _begin(self, number: int, events: int) -> SaveRequest:
+    def _make_request(self, number: int, events: int) -> SaveRequest:
         """Write the part of slam, and ask the others for theirs."""
         from hmt_slam_ros.results.hmt_map import MapWriter  # noqa: PLC0415  only where something is saved
 
@@ -99,38 +101,38 @@ class MapSaver(Round):
         try:
             self._target.parent.mkdir(parents=True, exist_ok=True)
             scratch = Path(tempfile.mkdtemp(prefix=f".{self._target.name}.partial-", dir=self._target.parent))
-            self._saving = _Saving(scratch, MapWriter(scratch / "new"))
-            self._saving.writer.write_slam(self._node.process.state)
-            self._node.write_map(self._saving.writer)
+            self._pending_save = _PendingSave(scratch, MapWriter(scratch / "new"))
+            self._pending_save.writer.write_slam_state(self._node.process.state)
+            self._node.write_map(self._pending_save.writer)
         except OSError as fault:
             raise HmtSlamError(f"{fault.strerror}; {_REMEDY}") from fault
-        return SaveRequest(number, events, str(self._saving.folder), self._ending)
+        return SaveRequest(number, events, str(self._pending_save.folder), self._is_shutting_down)
 
     def _finish(self) -> str:
-        assert self._saving is not None
+        assert self._pending_save is not None
         try:
             for part in self._answers.values():
-                assert isinstance(part, SavedPart)
-                self._saving.writer.join(part.files)
-            self._saving.writer.finish(self._node.configuration)
-            put_in_place(self._kept() or self._saving.folder, self._target)
+                assert isinstance(part, SaveResponse)
+                self._pending_save.writer.add_files(part.files)
+            self._pending_save.writer.finish(self._node.configuration)
+            replace_folder(self._copy_unchanged_map() or self._pending_save.folder, self._target)
         except OSError as fault:
             raise HmtSlamError(f"{self._target} cannot be saved: {fault.strerror}; {_REMEDY}") from fault
         return f"saved to {self._target}"
 
-    def _kept(self) -> Path | None:
+    def _copy_unchanged_map(self) -> Path | None:
         """A copy of the map that was loaded, where the robot was only localized in it, without what it saw since."""
-        assert self._saving is not None
-        loaded = self._node.unchanged_map
-        return None if loaded is None else Path(shutil.copytree(loaded, self._saving.scratch / "kept"))
+        assert self._pending_save is not None
+        loaded = self._node.unchanged_map_folder
+        return None if loaded is None else Path(shutil.copytree(loaded, self._pending_save.scratch / "kept"))
 
     def _clean_up(self) -> None:
-        if self._saving is not None:
-            shutil.rmtree(self._saving.scratch, ignore_errors=True)
-        self._saving = None
+        if self._pending_save is not None:
+            shutil.rmtree(self._pending_save.scratch, ignore_errors=True)
+        self._pending_save = None
 
 
-def declare_target(node: Node) -> Path:
+def declare_save_to(node: Node) -> Path:
     """The folder for the map, from the parameter ``save_to``."""
     return Path(node.declare_parameter("save_to", HMT_MAP, _DESCRIPTOR).value).absolute()
 
@@ -141,15 +143,17 @@ _DESCRIPTOR = ParameterDescriptor(description="Folder into which the service sav
 _FILE = "file://"
 
 
-class MapChanger(Round):
+class MapLoader(RequestCoordinator):
     """Answers the services ``load_map`` and ``reset``."""
 
-    def __init__(self, node: SlamNode, release: Callable[[], None]) -> None:
+    def __init__(self, node: SlamNode, on_release: Callable[[], None]) -> None:
         """Offer the services.
 
-        :param release: called when slam need not wait any more.
+        :param on_release: called when slam need not wait any more.
         """
-        super().__init__(node, release, (BEGIN, BEGUN), BegunPart, "the map cannot be exchanged")
+        super().__init__(
+            node, on_release, (RESET_REQUEST, RESET_RESPONSE), ResetResponse, "the map cannot be exchanged"
+        )
         self._folder = ""
         # A group of its own, so that the node goes on while the answer is awaited.
         group = MutuallyExclusiveCallbackGroup()
@@ -157,54 +161,54 @@ class MapChanger(Round):
         node.create_service(Trigger, "~/reset", self._reset, callback_group=group)
 
     async def _reset(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        if self._node.busy:
+        if self._node.is_busy:
             response.message = "a map is being saved or loaded: ask again"
             return response
-        if not self._node.process.mapping:
+        if not self._node.process.is_mapping:
             response.message = "mode = localization keeps the map: set mode of slam to mapping first"
             return response
-        response.success, response.message = await self.ask()
+        response.success, response.message = await self.request()
         return response
 
     async def _load(self, request: LoadMap.Request, response: LoadMap.Response) -> LoadMap.Response:
         """As the result code of nav2's map_server, which has no sentence; that is in the log and in /diagnostics."""
         response.result = LoadMap.Response.RESULT_UNDEFINED_FAILURE
-        if self._node.busy:
-            self._node.figures.warn("a map is being saved or loaded, so no other one is loaded: ask again")
+        if self._node.is_busy:
+            self._node.diagnostics.warn("a map is being saved or loaded, so no other one is loaded: ask again")
             return response
         folder = Path(request.map_url.removeprefix(_FILE)).absolute()
         if not folder.is_dir():
-            self._node.figures.warn(f"there is no folder {folder}: set map_url to an output folder or hmt_map")
+            self._node.diagnostics.warn(f"there is no folder {folder}: set map_url to an output folder or hmt_map")
             response.result = LoadMap.Response.RESULT_MAP_DOES_NOT_EXIST
             return response
         try:
-            known = self._check(folder).map
+            known = self._read_checked_map(folder).map
         except HmtSlamError as fault:
-            self._node.figures.warn(f"{folder} is not loaded: {fault}")
+            self._node.diagnostics.warn(f"{folder} is not loaded: {fault}")
             response.result = LoadMap.Response.RESULT_INVALID_MAP_DATA
             return response
         self._folder = str(folder)
-        done, _ = await self.ask()
+        done, _ = await self.request()
         if done:
             response.result = LoadMap.Response.RESULT_SUCCESS
-            view = MapView(self._node.configuration, self._node.map_frame, Seen.of(known))
-            response.map = view.grid() or response.map
+            view = MapRenderer(self._node.configuration, self._node.map_frame, MapRendererState.from_document(known))
+            response.map = view.occupancy_grid() or response.map
         return response
 
-    def _check(self, folder: Path) -> Beginning:
+    def _read_checked_map(self, folder: Path) -> InitialState:
         """A map of which all parts can be read, so that either all processes begin with it or none does."""
         from hmt_slam_ros.results.hmt_map import PARTS as KINDS  # noqa: PLC0415  only where something is loaded
 
-        beginning = Beginning(self._node, str(folder), carried=True)
-        for name in PARTS:
-            beginning.part(name, KINDS[name])
+        beginning = InitialState(self._node, str(folder), lost=True)
+        for name in PARTICIPANTS:
+            beginning.read_part(name, KINDS[name])
         return beginning
 
-    def _begin(self, number: int, events: int) -> BeginRequest:
-        return BeginRequest(number, events, self._folder)
+    def _make_request(self, number: int, events: int) -> ResetRequest:
+        return ResetRequest(number, events, self._folder)
 
     def _finish(self) -> str:
-        self._node.begin_anew(self._folder, self._number)
+        self._node.reset(self._folder, self._number)
         return f"goes on from {self._folder}" if self._folder else "the map is forgotten, a new one begins"
 
     def _clean_up(self) -> None:
@@ -216,79 +220,79 @@ def spin(node: ProcessNode) -> None:
 
     :raises HmtSlamError: where it cannot begin.
     """
-    node.begin()
+    node.enter_startup_states()
     ended = False
     try:
         _spin(node)
         ended = True
     finally:
         if ended or not rclpy.ok():
-            node.depart()
+            node.discard_recovery()
 
 
 def _spin(node: ProcessNode) -> None:
-    if not node.saves_at_end or not rclpy.ok():
+    if not node.save_on_shutdown or not rclpy.ok():
         spin_until(node)
         return
-    told = _Told()
-    spin_until(node, lambda: told.over or (told.at is not None and node.saved_last()))
+    told = _FirstSignal()
+    spin_until(node, lambda: told.has_timed_out or (told.received_at is not None and node.poll_final_save()))
 
 
-class _Told:
+class _FirstSignal:
     """Takes note of the first signal in place of rclpy's handler; more of them change nothing.
 
-    :ivar at: when that was, by the monotonic clock, None before.
+    :ivar received_at: when that was, by the monotonic clock, None before.
     """
 
     def __init__(self) -> None:
-        self.at: float | None = None
+        self.received_at: float | None = None
         uninstall_signal_handlers()
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, self)
 
     @property
-    def over(self) -> bool:
+    def has_timed_out(self) -> bool:
         """Whether there is no time left."""
-        return self.at is not None and time.monotonic() - self.at > SAVING_PATIENCE
+        return self.received_at is not None and time.monotonic() - self.received_at > SAVE_TIMEOUT
 
     def __call__(self, _number: int, _frame: object) -> None:
-        if self.at is None:
-            self.at = time.monotonic()
-            end_within(SAVING_PATIENCE + 1.0, 0)
+        if self.received_at is None:
+            self.received_at = time.monotonic()
+            force_exit_after(SAVE_TIMEOUT + 1.0, 0)
 
 
 # Until DDS tells that a subscription is gone.
-_PATIENCE = 2.0  # s
+_UNSUBSCRIBE_TIMEOUT = 2.0  # s
 _POLL = 0.02  # s
 
 
-class Listeners:
+class StaleSubscribers:
     """Those that are asked for their part of a map; a node that is configured anew is another one."""
 
     def __init__(self, node: Node) -> None:
         """Nothing was given up yet."""
         self._node = node
-        self._bereft: set[bytes] = set()
+        self._stale: set[bytes] = set()
 
-    def remember(self) -> None:
+    def mark_current(self) -> None:
         """All that there are now have a map that is given up."""
-        self._bereft = set(self._names())
+        self._stale = set(self._current_subscribers())
 
-    def check(self) -> None:
+    def check_gone(self) -> None:
         """See whether a map can begin.
 
         :raises HmtSlamError: where others have what was given up.
         """
-        deadline = time.monotonic() + _PATIENCE
-        while left := self._bereft & self._names().keys():
+        deadline = time.monotonic() + _UNSUBSCRIBE_TIMEOUT
+        while left := self._stale & self._current_subscribers().keys():
             if time.monotonic() > deadline:
-                names = sorted(self._names()[one] for one in left)
+                names = sorted(self._current_subscribers()[one] for one in left)
                 raise HmtSlamError(
                     f"{', '.join(names)} still have the map that slam gave up: clean these up too, then configure slam"
                 )
             time.sleep(_POLL)
 
-    def _names(self) -> dict[bytes, str]:
+    def _current_subscribers(self) -> dict[bytes, str]:
         """{identity of a subscription: name of its node}."""
-        there = self._node.get_subscriptions_info_by_topic(self._node.resolve_topic_name(SAVE))
+        there = self._node.get_subscriptions_info_by_topic(self._node.resolve_topic_name(SAVE_REQUEST))
         return {bytes(one.endpoint_gid): one.node_name for one in there}

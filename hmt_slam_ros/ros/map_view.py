@@ -17,11 +17,11 @@ from visualization_msgs.msg import Marker, MarkerArray
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import ELLIPSE_95, PoseGaussian
-from hmt_slam_ros.hybrid_map.shortest_path import tells_nothing
+from hmt_slam_ros.hybrid_map.shortest_path import is_uninformative
 from hmt_slam_ros.messages.map_changes import AreaPose
-from hmt_slam_ros.messages.messages import Accepted, Hypotheses, Keyframe, Message
+from hmt_slam_ros.messages.messages import ClosureDecision, Hypotheses, Keyframe, Message
 from hmt_slam_ros.messages.replica import Replica, ReplicaState
-from hmt_slam_ros.ros.conversions import header, quaternion, time_message
+from hmt_slam_ros.ros.conversions import header_message, quaternion_message, time_message
 
 if TYPE_CHECKING:
     from hmt_slam_ros.results.hmt_map import MapDocument
@@ -31,12 +31,12 @@ _ROBOT_AREA = ColorRGBA(r=0.84, g=0.15, b=0.16, a=0.9)
 _ARC = ColorRGBA(r=0.3, g=0.3, b=0.3, a=0.9)
 _CLOSURE = ColorRGBA(r=1.0, g=0.5, b=0.05, a=0.9)
 _TEXT = ColorRGBA(a=1.0)
-_UNCERTAIN = 0.3  # opacity of ellipses
-_VISIBLE = 1e-3  # m, since RViz complains of what has no size
+_ELLIPSE_OPACITY = 0.3  # opacity of ellipses
+_MIN_SIZE = 1e-3  # m, since RViz complains of what has no size
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
+class MapRendererState:
     """What there is to be drawn.
 
     :ivar stamp: of the newest keyframe, ns, 0 before the first.
@@ -49,54 +49,56 @@ class Seen:
     area_poses: tuple[AreaPose, ...] = ()
 
     @classmethod
-    def of(cls, known: MapDocument | None) -> Seen:
+    def from_document(cls, document: MapDocument | None) -> MapRendererState:
         """Of a saved map, or of nothing."""
-        return cls() if known is None else cls(known.robot.stamp, known.replica, known.area_poses)
+        return cls() if document is None else cls(document.last_estimate.stamp, document.replica, document.area_poses)
 
 
-class MapView:
+class MapRenderer:
     """Follows the chain, and draws the most probable hypothesis.
 
     :ivar stamp: of the newest keyframe, ns.
     :ivar version: number of changes so far.
     """
 
-    def __init__(self, configuration: Configuration, frame: str, seen: Seen) -> None:
-        """:param seen: what to begin with."""
-        self.stamp = seen.stamp
-        self.version = 1 if seen.area_poses else 0
+    def __init__(self, configuration: Configuration, frame: str, state: MapRendererState) -> None:
+        """:param state: what to begin with."""
+        self.stamp = state.stamp
+        self.version = 1 if state.area_poses else 0
         self._settings, self._frame = configuration.local_map, frame
-        self._replica = Replica.of(seen.replica)
-        self._poses = {entry.area: entry.pose for entry in seen.area_poses}
+        self._replica = Replica.from_state(state.replica)
+        self._area_poses = {entry.area: entry.pose for entry in state.area_poses}
 
     @property
-    def seen(self) -> Seen:
+    def state(self) -> MapRendererState:
         """All that is drawn, as a value."""
-        poses = tuple(AreaPose(area, pose) for area, pose in self._poses.items())
-        return Seen(self.stamp, self._replica.state, poses)
+        poses = tuple(AreaPose(area, pose) for area, pose in self._area_poses.items())
+        return MapRendererState(self.stamp, self._replica.state, poses)
 
-    def hear(self, message: Message) -> None:
+    def update(self, message: Message) -> None:
         """Take in a message of the chain."""
-        if isinstance(message, Keyframe | Hypotheses | Accepted):
-            self._replica.hear(message)
+        if isinstance(message, Keyframe | Hypotheses | ClosureDecision):
+            self._replica.apply_message(message)
         if isinstance(message, Keyframe):
             self.stamp = message.scan.stamp
-        elif isinstance(message, Accepted):
+        elif isinstance(message, ClosureDecision):
             if message.global_poses:
-                self._poses = {area.area: area.pose for area in message.global_poses}
+                self._area_poses = {area.area: area.pose for area in message.global_poses}
             self.version += 1
 
-    def _areas(self) -> list[int]:
-        return [area for area in self._replica.maps[self._replica.best].area_ids() if area in self._poses]
+    def _area_ids(self) -> list[int]:
+        return [
+            area for area in self._replica.maps[self._replica.best_hypothesis].area_ids() if area in self._area_poses
+        ]
 
-    def grid(self) -> OccupancyGrid | None:
+    def occupancy_grid(self) -> OccupancyGrid | None:
         """The occupancy grid, None while there is no keyframe."""
         from hmt_slam_ros.grids.occupancy_map import occupancy_image  # noqa: PLC0415  only where someone looks
 
-        best = self._replica.maps[self._replica.best]
+        best = self._replica.maps[self._replica.best_hypothesis]
         placed = {
-            keyframe: se2.compose(self._poses[area].mean, pose)
-            for area in self._areas()
+            keyframe: se2.compose(self._area_poses[area].mean, pose)
+            for area in self._area_ids()
             for keyframe, pose in best.keyframes(area).items()
         }
         if not placed:
@@ -106,50 +108,53 @@ class MapView:
         image = occupancy_image(scans, poses, self._settings.cell, self._settings.max_range)
         return grid_message(self.stamp, self._frame, image)
 
-    def graph(self) -> MarkerArray:
+    def graph_markers(self) -> MarkerArray:
         """Areas as labelled discs, arcs as lines, both with 95 % ellipses.
 
         The robot's area and the arcs that closed a loop stand out. An arc's ellipse, in its middle, is that of one
         area seen from the other; an area's, around it, that of its place in the map. Its text says it in words. There
         is none where that could be any.
         """
-        best, areas = self._replica.maps[self._replica.best], self._areas()
-        here = self._replica.areas[self._replica.best]
+        best, areas = self._replica.maps[self._replica.best_hypothesis], self._area_ids()
+        here = self._replica.robot_areas[self._replica.best_hypothesis]
         markers = [Marker(action=Marker.DELETEALL)]
         for area in areas:
-            belief, color = self._poses[area], _ROBOT_AREA if area == here else _AREA
+            belief, color = self._area_poses[area], _ROBOT_AREA if area == here else _AREA
             disc = self._marker("areas", area, Marker.CYLINDER, (0.6, 0.6, 0.1), color)
             label = self._marker("labels", area, Marker.TEXT_VIEW_FACING, (0.0, 0.0, 0.5), _TEXT)
-            at = disc.pose.position = _point(belief.mean)
+            at = disc.pose.position = _point_message(belief.mean)
             label.pose.position, label.text = Point(x=at.x, y=at.y, z=0.6), str(area)
-            text = f"Area {area} in the map: {_deviations(belief)}"
-            markers += [disc, label, *self._ellipse("area_uncertainty", area, belief, at, color, text)]
+            text = f"Area {area} in the map: {_deviation_text(belief)}"
+            markers += [disc, label, *self._ellipse_markers("area_uncertainty", area, belief, at, color, text)]
         for number, (a, b, arc) in enumerate(best.all_arcs()):
-            if a in self._poses and b in self._poses:
+            if a in self._area_poses and b in self._area_poses:
                 color, group = (_CLOSURE, "closures") if arc.closure else (_ARC, "arcs")
                 line = self._marker(group, number, Marker.LINE_STRIP, (0.08, 0.0, 0.0), color)
-                start, end = line.points = [_point(self._poses[a].mean), _point(self._poses[b].mean)]
-                seen = PoseGaussian.exactly(self._poses[a].mean).compose(arc.pose)
+                start, end = line.points = [
+                    _point_message(self._area_poses[a].mean),
+                    _point_message(self._area_poses[b].mean),
+                ]
+                seen = PoseGaussian.from_pose(self._area_poses[a].mean).compose(arc.pose)
                 middle = Point(x=0.5 * (start.x + end.x), y=0.5 * (start.y + end.y))
-                text = f"Area {b} seen from {a}: {_deviations(arc.pose)}{', closed a loop' * arc.closure}"
-                markers += [line, *self._ellipse("arc_uncertainty", number, seen, middle, color, text)]
+                text = f"Area {b} seen from {a}: {_deviation_text(arc.pose)}{', closed a loop' * arc.closure}"
+                markers += [line, *self._ellipse_markers("arc_uncertainty", number, seen, middle, color, text)]
         return MarkerArray(markers=markers)
 
-    def _ellipse(
+    def _ellipse_markers(
         self, group: str, number: int, belief: PoseGaussian, at: Point, color: ColorRGBA, text: str
     ) -> list[Marker]:
         """The ellipse; none where it would only hide the map."""
-        if tells_nothing(belief):
+        if is_uninformative(belief):
             return []
-        ellipse = belief.ellipse()
-        faint = ColorRGBA(r=color.r, g=color.g, b=color.b, a=_UNCERTAIN)
-        size = (max(2.0 * ellipse.longer, _VISIBLE), max(2.0 * ellipse.shorter, _VISIBLE), 0.02)
+        ellipse = belief.position_ellipse()
+        faint = ColorRGBA(r=color.r, g=color.g, b=color.b, a=_ELLIPSE_OPACITY)
+        size = (max(2.0 * ellipse.semi_major, _MIN_SIZE), max(2.0 * ellipse.semi_minor, _MIN_SIZE), 0.02)
         marker = self._marker(group, number, Marker.CYLINDER, size, faint)
-        marker.pose.position, marker.pose.orientation, marker.text = at, quaternion(ellipse.angle), text
+        marker.pose.position, marker.pose.orientation, marker.text = at, quaternion_message(ellipse.angle), text
         return [marker]
 
     def _marker(self, group: str, number: int, kind: int, size: tuple[float, float, float], color: ColorRGBA) -> Marker:
-        marker = Marker(header=header(self.stamp, self._frame), ns=group, id=number, type=kind, color=color)
+        marker = Marker(header=header_message(self.stamp, self._frame), ns=group, id=number, type=kind, color=color)
         marker.scale = Vector3(x=size[0], y=size[1], z=size[2])
         marker.pose.orientation.w = 1.0
         return marker
@@ -168,14 +173,14 @@ def grid_message(stamp: int, frame: str, image: Any) -> OccupancyGrid:  # noqa: 
     )
     info.origin.position.x, info.origin.position.y = image.origin.tolist()
     info.origin.orientation.w = 1.0
-    return OccupancyGrid(header=header(stamp, frame), info=info, data=array("b", cells.tobytes()))
+    return OccupancyGrid(header=header_message(stamp, frame), info=info, data=array("b", cells.tobytes()))
 
 
-def _deviations(belief: PoseGaussian) -> str:
+def _deviation_text(belief: PoseGaussian) -> str:
     """Standard deviations of a pose, that of the position where it is largest."""
     turn = math.degrees(math.sqrt(belief.covariance[2, 2]))
-    return f"±{belief.ellipse().longer / ELLIPSE_95:.2f} m, ±{turn:.1f}°"
+    return f"±{belief.position_ellipse().semi_major / ELLIPSE_95:.2f} m, ±{turn:.1f}°"
 
 
-def _point(pose: NDArray[np.float64]) -> Point:
+def _point_message(pose: NDArray[np.float64]) -> Point:
     return Point(x=float(pose[0]), y=float(pose[1]))

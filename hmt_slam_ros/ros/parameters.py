@@ -46,13 +46,13 @@ class ConfiguredNode(Node):
         super().__init__(name, **options)
         self._changeable = frozenset(changeable)
         # rclpy has no public way to list what the node is started with.
-        self.configuration = _changed(Configuration(), self._parameter_overrides.values())
+        self.configuration = _with_values(Configuration(), self._parameter_overrides.values())
         for leaf in flat_parameters(self.configuration):
             self.declare_parameter(leaf.name, leaf.default, _descriptor(leaf))
-        self.add_on_set_parameters_callback(self._check)
-        self.add_post_set_parameters_callback(self._apply)
+        self.add_on_set_parameters_callback(self._check_changes)
+        self.add_post_set_parameters_callback(self._apply_changes)
 
-    def configuration_changed(self, configuration: Configuration) -> None:
+    def on_configuration_changed(self, configuration: Configuration) -> None:
         """Take note of new values of the parameters that may change."""
         self.configuration = configuration
 
@@ -61,27 +61,27 @@ class ConfiguredNode(Node):
 
         rclpy looks at types and ranges before it asks the callbacks, and refuses without advice: ours is asked first.
         """
-        result = self._check(parameter_list)
+        result = self._check_changes(parameter_list)
         return super().set_parameters_atomically(parameter_list) if result.successful else result
 
-    def _check(self, parameters: list[Parameter]) -> SetParametersResult:
+    def _check_changes(self, parameters: list[Parameter]) -> SetParametersResult:
         """Whether all of the changes are possible."""
         try:
-            _changed(self.configuration, parameters)
+            _with_values(self.configuration, parameters)
         except HmtSlamError as error:
             return SetParametersResult(successful=False, reason=str(error))
-        fixed = sorted(_ours(parameters).keys() - self._changeable)
+        fixed = sorted(_tree_values(parameters).keys() - self._changeable)
         if fixed:
             reason = f"{fixed[0]} is fixed while the node runs: set it in the parameter file and restart"
             return SetParametersResult(successful=False, reason=reason)
         return SetParametersResult(successful=True)
 
-    def _apply(self, parameters: list[Parameter]) -> None:
-        if _ours(parameters):
-            self.configuration_changed(_changed(self.configuration, parameters))
+    def _apply_changes(self, parameters: list[Parameter]) -> None:
+        if _tree_values(parameters):
+            self.on_configuration_changed(_with_values(self.configuration, parameters))
 
 
-def _ours(parameters: Iterable[Parameter]) -> dict[str, Any]:
+def _tree_values(parameters: Iterable[Parameter]) -> dict[str, Any]:
     """Name -> value of those that the tree has, or that nobody has."""
     return {
         parameter.name: parameter.value
@@ -90,9 +90,9 @@ def _ours(parameters: Iterable[Parameter]) -> dict[str, Any]:
     }
 
 
-def _changed(configuration: Configuration, parameters: Iterable[Parameter]) -> Configuration:
+def _with_values(configuration: Configuration, parameters: Iterable[Parameter]) -> Configuration:
     """The configuration with new values, which have to be of the type that ROS wants too."""
-    changes = _ours(parameters)
+    changes = _tree_values(parameters)
     changed = with_changes(configuration, changes)
     for leaf in flat_parameters(changed):
         if leaf.kind is float and type(changes.get(leaf.name)) is int:

@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Iterator
 from dataclasses import replace
 
-from hmt_slam_ros.configuration.robot import Robot
+from hmt_slam_ros.configuration.robot import RobotParameters
 from hmt_slam_ros.logs import Log
 from hmt_slam_ros.sensors import Odometry, Scan
 
@@ -14,78 +14,82 @@ _SECOND = 1_000_000_000
 # Between the last record of one pass and the first of the next.
 _LOOP_GAP = 100_000_000  # ns
 # A player that is later than this does not catch up in a burst, but goes on from where it is.
-_PATIENCE = 0.1  # s
+_MAX_LAG = 0.1  # s
 
 
 class Player:
     """Hands out the measurements of a log when they are due; the time is told to it.
 
     :ivar settings: rate, pace and so on; may be exchanged while playing.
-    :ivar paused: whether nothing is due.
-    :ivar scans: scans handed out.
-    :ivar odometry: odometry readings handed out.
+    :ivar is_paused: whether nothing is due.
+    :ivar scans_sent: scans handed out.
+    :ivar readings_sent: odometry readings handed out.
     :ivar stamp: of the last measurement handed out, ns.
-    :ivar ended: whether the last measurement has been handed out.
+    :ivar has_ended: whether the last measurement has been handed out.
     """
 
-    def __init__(self, log: Log, settings: Robot) -> None:
+    def __init__(self, log: Log, settings: RobotParameters) -> None:
         self.settings = settings
-        self.paused = False
-        self.ended = False
-        self.scans, self.odometry, self.stamp = 0, 0, 0
+        self.is_paused = False
+        self.has_ended = False
+        self.scans_sent, self.readings_sent, self.stamp = 0, 0, 0
         self._records = _measurements(log, settings)
-        self._next: Scan | Odometry | None = next(self._records, None)
-        self._last_due: float | None = None
-        self._open: deque[int] = deque()
-        self.ended = self._next is None
+        self._next_measurement: Scan | Odometry | None = next(self._records, None)
+        self._last_due_time: float | None = None
+        self._unacknowledged: deque[int] = deque()
+        self.has_ended = self._next_measurement is None
 
     @property
-    def acknowledged(self) -> int:
+    def scans_acknowledged(self) -> int:
         """Scans of which nothing more is awaited."""
-        return self.scans - len(self._open)
+        return self.scans_sent - len(self._unacknowledged)
 
     def acknowledge(self, stamp: int) -> None:
         """The scan of ``stamp`` (ns), and with it every earlier one, has been worked off."""
-        while self._open and self._open[0] <= stamp:
-            self._open.popleft()
+        while self._unacknowledged and self._unacknowledged[0] <= stamp:
+            self._unacknowledged.popleft()
 
     @property
-    def held(self) -> bool:
+    def is_held_up(self) -> bool:
         """Whether the next measurement waits for an acknowledgement."""
-        return self.settings.paced and isinstance(self._next, Scan) and len(self._open) >= self.settings.window
+        return (
+            self.settings.flow_control
+            and isinstance(self._next_measurement, Scan)
+            and len(self._unacknowledged) >= self.settings.max_unacknowledged_scans
+        )
 
-    def wait(self, now: float) -> float | None:
+    def seconds_until_due(self, now: float) -> float | None:
         """Seconds until the next measurement is due, 0 where it is due now, None where it is not known.
 
         :param now: seconds of a clock that runs evenly.
         """
-        if self._next is None or self.paused or self.held:
+        if self._next_measurement is None or self.is_paused or self.is_held_up:
             return None
-        return max(0.0, self._due(now) - now)
+        return max(0.0, self._due_time(now) - now)
 
-    def take(self, now: float) -> Scan | Odometry:
+    def take_next(self, now: float) -> Scan | Odometry:
         """The next measurement."""
-        assert self._next is not None
-        taken, due = self._next, self._due(now)
-        self._last_due = due if now - due < _PATIENCE else now
+        assert self._next_measurement is not None
+        taken, due = self._next_measurement, self._due_time(now)
+        self._last_due_time = due if now - due < _MAX_LAG else now
         self.stamp = taken.stamp
         if isinstance(taken, Scan):
-            self.scans += 1
-            self._open.append(taken.stamp)
+            self.scans_sent += 1
+            self._unacknowledged.append(taken.stamp)
         else:
-            self.odometry += 1
-        self._next = next(self._records, None)
-        self.ended = self._next is None
+            self.readings_sent += 1
+        self._next_measurement = next(self._records, None)
+        self.has_ended = self._next_measurement is None
         return taken
 
-    def _due(self, now: float) -> float:
-        assert self._next is not None
-        if self._last_due is None or self.settings.rate == 0.0:
+    def _due_time(self, now: float) -> float:
+        assert self._next_measurement is not None
+        if self._last_due_time is None or self.settings.rate == 0.0:
             return now
-        return self._last_due + (self._next.stamp - self.stamp) / _SECOND / self.settings.rate
+        return self._last_due_time + (self._next_measurement.stamp - self.stamp) / _SECOND / self.settings.rate
 
 
-def _measurements(log: Log, settings: Robot) -> Iterator[Scan | Odometry]:
+def _measurements(log: Log, settings: RobotParameters) -> Iterator[Scan | Odometry]:
     """Measurements of the log, over and over where it loops, with stamps that go on increasing."""
     shift = last = 0
     while True:

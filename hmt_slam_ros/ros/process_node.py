@@ -10,25 +10,33 @@ from pathlib import Path
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.parameter import Parameter
 
-from hmt_slam_ros.compilation import tell_of_compilation
+from hmt_slam_ros.compilation import report_compilation
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.configuration.flat import as_flat
-from hmt_slam_ros.messages.messages import Arriving, Message, Notice, RealTimePose
-from hmt_slam_ros.messages.routing import HEARD_BY, Remembering
-from hmt_slam_ros.ros.coordinated_request import PARTS, Part
+from hmt_slam_ros.messages.messages import Message, Notice, RealTimePose, TrackingReset
+from hmt_slam_ros.messages.routing import SUBSCRIPTIONS, Checkpointable
+from hmt_slam_ros.ros.coordinated_request import PARTICIPANTS, RequestParticipant
 from hmt_slam_ros.ros.inbox import Inbox
-from hmt_slam_ros.ros.initial_state import Beginning, declare_beginning
+from hmt_slam_ros.ros.initial_state import InitialState, declare_initial_state
 from hmt_slam_ros.ros.lifecycle import ManagedNode
 from hmt_slam_ros.ros.outbox import Outbox
-from hmt_slam_ros.ros.recovery import Active, Base, Found, Recovery, Setting, Told, declare_recovery
+from hmt_slam_ros.ros.recovery import (
+    ActivationChange,
+    ControlEvent,
+    JournalHeader,
+    ParameterChange,
+    RecoveredState,
+    Recovery,
+    declare_recovery,
+)
 
-SAVING_PATIENCE = 8.0
+SAVE_TIMEOUT = 8.0
 """Seconds for the last map: a launch tells its nodes to end once more after 5 s, and kills them after 10 s."""
 
 # What a node said last has to reach the others before it takes leave.
 _LINGER = 0.5  # s
 _POLL = 0.05  # s
-_SAVE_AT_END = ParameterDescriptor(
+_SAVE_ON_SHUTDOWN = ParameterDescriptor(
     description="Whether all nodes save the map to save_to of slam when they are told to end.", read_only=True
 )
 
@@ -36,294 +44,296 @@ _SAVE_AT_END = ParameterDescriptor(
 class ProcessNode(ManagedNode):
     """A process of :mod:`hmt_slam_ros.messages` as a node of the same name.
 
-    :ivar hears_on: whether the process hears all the same while the node is inactive, and says what it has to.
-    :ivar saves_at_end: whether it stays for that when it is told to end.
+    :ivar is_always_listening: whether the process hears all the same while the node is inactive, and says what it has to.
+    :ivar save_on_shutdown: whether it stays for that when it is told to end.
     """
 
-    hears_on = False
-    saves_at_end = False
+    is_always_listening = False
+    save_on_shutdown = False
 
     def __init__(
         self,
         name: str,
-        make_process: Callable[[Configuration, Beginning], Remembering],
-        said: Iterable[type],
+        make_process: Callable[[Configuration, InitialState], Checkpointable],
+        output_types: Iterable[type],
         changeable: Iterable[str] = (),
     ) -> None:
         """Declare the parameters.
 
         :param name: one of those in ``HEARD_BY``.
         :param make_process: makes it from what the node begins with.
-        :param said: kinds of messages that the process says.
+        :param output_types: kinds of messages that the process says.
         :param changeable: parameters that may change while the node runs.
         """
-        self._make_process, self._name, self._said = make_process, name, (*said, Notice)
+        self._make_process, self._name, self._output_types = make_process, name, (*output_types, Notice)
         super().__init__(name, changeable)
 
-    def declare(self) -> None:
+    def declare_own_parameters(self) -> None:
         """Declare those of all processes, and look for what a node of the same name left behind.
 
         :raises HmtSlamError: where that is damaged.
         """
-        self.saves_at_end = bool(self.declare_parameter("save_at_end", False, _SAVE_AT_END).value)
-        self.start_from, self._start_carried = declare_beginning(self)
+        self.save_on_shutdown = bool(self.declare_parameter("save_at_end", False, _SAVE_ON_SHUTDOWN).value)
+        self.start_from, self._start_lost = declare_initial_state(self)
         self._recovery_folder = declare_recovery(self)
         self.recovery = Recovery(self, self._recovery_folder)
 
     @property
-    def first_states(self) -> tuple[bool, bool]:
+    def startup_states(self) -> tuple[bool, bool]:
         """Those in which a node of the same name was when it was killed, if one was."""
-        found, (configure, activate) = self.recovery.found, super().first_states
+        found, (configure, activate) = self.recovery.recovered_state, super().startup_states
         if found is None:
             return configure, activate
-        return True, activate if found.active is None else found.active
+        return True, activate if found.was_active is None else found.was_active
 
-    def set_up(self) -> None:
+    def configure_node(self) -> None:
         """Make the process with what it begins with or what was left behind, and all that it hears and says.
 
         :raises HmtSlamError: for a map that cannot be.
         """
-        found = self.recovery.found
-        self._answered, self._checkpoints, self._recovering = 0, 0, found is not None
+        found = self.recovery.recovered_state
+        self._reset_number, self._checkpoint_count, self._is_recovering = 0, 0, found is not None
         if found is None:
-            self.beginning = Beginning(self, self.start_from, carried=self._start_carried)
+            self.initial_state = InitialState(self, self.start_from, lost=self._start_lost)
         else:
-            self.beginning = self._where_it_was(found)
-        self.process = self._made()
+            self.initial_state = self._recovered_initial_state(found)
+        self.process = self._create_process()
         if found is None:
-            self.recovery.begin(self._base())
-        tell_of_compilation(self.get_logger().info)
-        self.outbox = Outbox(self, self._said, self._answered)
+            self.recovery.start_journal(self._journal_header())
+        report_compilation(self.get_logger().info)
+        self.outbox = Outbox(self, self._output_types, self._reset_number)
         self.inbox = Inbox(
             self,
-            HEARD_BY[self._name],
+            SUBSCRIPTIONS[self._name],
             self.deliver,
-            self.figures,
-            first=self.beginning.events,
-            begun=self._answered,
-            after=self.after,
+            self.diagnostics,
+            first_event=self.initial_state.events,
+            reset_number=self._reset_number,
+            resume_stamps=self.resume_stamps,
         )
-        self._part = Part(self, self._name) if self._name in PARTS else None
+        self._participant = RequestParticipant(self, self._name) if self._name in PARTICIPANTS else None
 
-    def take_part(self) -> None:
+    def activate_node(self) -> None:
         """Let the process hear what has come."""
-        self.recovery.heard(Active(True))
-        self.inbox.go_on()
+        self.recovery.record_input(ActivationChange(True))
+        self.inbox.release()
 
-    def stand_still(self) -> None:
+    def deactivate_node(self) -> None:
         """Let the process hear nothing, unless it hears on."""
-        self.recovery.heard(Active(False))
-        if not self.hears_on:
-            self.inbox.wait()
-        if self._part is not None:
-            self._part.look()
+        self.recovery.record_input(ActivationChange(False))
+        if not self.is_always_listening:
+            self.inbox.hold()
+        if self._participant is not None:
+            self._participant.answer_due_requests()
 
-    def give_up(self) -> None:
+    def clean_up_node(self) -> None:
         """Leave nothing behind: what the process knows is forgotten."""
-        self.recovery.clear()
+        self.recovery.discard()
         self.recovery = Recovery(self, self._recovery_folder)
 
-    def abandon(self) -> None:
+    def abandon_configuration(self) -> None:
         """As any managed node; what another node left behind stays for the next try."""
-        super().abandon()
-        if self.recovery.found is None:
-            self.recovery.clear()
+        super().abandon_configuration()
+        if self.recovery.recovered_state is None:
+            self.recovery.discard()
 
-    def leave(self) -> None:
+    def shut_down_node(self) -> None:
         """As when the node is told to end: after its part of the last map is saved, if one is to be."""
-        if not self.saves_at_end:
-            self.take_down()
+        if not self.save_on_shutdown:
+            self.tear_down()
             return
         begin = time.monotonic()
 
         def look() -> None:
-            if self.saved_last() or time.monotonic() - begin > SAVING_PATIENCE:
-                self.take_down()
+            if self.poll_final_save() or time.monotonic() - begin > SAVE_TIMEOUT:
+                self.tear_down()
 
-        self.create_timer(_POLL, look, clock=self.figures.steady_clock)
+        self.create_timer(_POLL, look, clock=self.diagnostics.steady_clock)
 
-    def depart(self) -> None:
+    def discard_recovery(self) -> None:
         """Leave nothing behind for a node of the same name, unless it was left by another one."""
-        if self.configured:
-            self.recovery.clear()
+        if self.is_configured:
+            self.recovery.discard()
 
-    def _made(self) -> Remembering:
+    def _create_process(self) -> Checkpointable:
         """The process, made from the beginning."""
-        process = self._make_process(self.configuration, self.beginning)
-        if self.beginning.carried and Arriving in HEARD_BY[self._name]:
+        process = self._make_process(self.configuration, self.initial_state)
+        if self.initial_state.lost and TrackingReset in SUBSCRIPTIONS[self._name]:
             # Slam says so too, but not before this node could say otherwise.
-            process.handle(Arriving(self.beginning.events, 0))
+            process.handle(TrackingReset(self.initial_state.events, 0))
         return process
 
-    def begin_anew(self, folder: str, request: int = 0) -> None:
+    def reset(self, folder: str, reset_number: int = 0) -> None:
         """Forget all, and go on from a map in which the robot may be anywhere, or from nothing.
 
         :param folder: of the map, empty for nothing.
-        :param request: number of the request that the node answers by that.
+        :param reset_number: number of the request that the node answers by that.
         :raises HmtSlamError: where it is damaged, or the node's parameters do not go with it.
         """
-        self.beginning = Beginning(self, folder, carried=True, scans=self.scans)
-        self.process = self._made()
-        self.inbox.begin_anew(self.beginning.events, request)
-        self._answered = self.outbox.begun = request
-        self.recovery.begin(self._base())
+        self.initial_state = InitialState(self, folder, lost=True, previous_scans=self.scans)
+        self.process = self._create_process()
+        self.inbox.reset(self.initial_state.events, reset_number)
+        self._reset_number = self.outbox.reset_number = reset_number
+        self.recovery.start_journal(self._journal_header())
 
-    def _base(self) -> Base:
+    def _journal_header(self) -> JournalHeader:
         """What the node is that begins anew."""
-        beginning = self.beginning
-        return Base(
+        beginning = self.initial_state
+        return JournalHeader(
             False,
             beginning.events,
             str(beginning.folder or ""),
-            beginning.carried,
-            beginning.scans,
-            self._answered,
-            received=dict(self.figures.received),
+            beginning.lost,
+            beginning.previous_scans,
+            self._reset_number,
+            received=dict(self.diagnostics.received),
             stamps=self.recovery.stamps,
         )
 
-    def _where_it_was(self, found: Found) -> Beginning:
+    def _recovered_initial_state(self, recovered: RecoveredState) -> InitialState:
         """The beginning of a node that goes on for another one that was killed."""
-        base = found.base
-        self._answered = base.request
-        self.figures.received.update(base.received)
-        if base.checkpoint:
-            return Beginning.at_checkpoint(self, found.state, base)
-        return Beginning(self, base.folder, carried=base.carried, scans=base.scans)
+        base = recovered.header
+        self._reset_number = base.reset_number
+        self.diagnostics.received.update(base.received)
+        if base.has_checkpoint:
+            return InitialState.from_checkpoint(self, recovered.checkpoint_folder, base)
+        return InitialState(self, base.folder, lost=base.lost, previous_scans=base.previous_scans)
 
     @property
-    def after(self) -> Mapping[str, int]:
+    def resume_stamps(self) -> Mapping[str, int]:
         """{kind of measurement: stamp from which on the node wants them, ns}, also of the past; else the next ones."""
         return {}
 
     @property
-    def answered(self) -> int:
+    def reset_number(self) -> int:
         """Number of the last request to begin anew that was answered."""
-        return self._answered
+        return self._reset_number
 
     @property
-    def recovering(self) -> bool:
+    def is_recovering(self) -> bool:
         """Whether the node hears again what another one of its name heard that was killed."""
-        return self._recovering
+        return self._is_recovering
 
     def _configure(self) -> None:
         """As any managed node, up to where a node of the same name was killed, if one was."""
         super()._configure()
-        if self.recovery.found is not None:
-            self._recover(self.recovery.found)
-        if not self.hears_on:
-            self.inbox.wait()
+        if self.recovery.recovered_state is not None:
+            self._recover(self.recovery.recovered_state)
+        if not self.is_always_listening:
+            self.inbox.hold()
 
-    def _recover(self, found: Found) -> None:
+    def _recover(self, recovered: RecoveredState) -> None:
         begin = time.monotonic()
-        if found.base.checkpoint:
-            self.remember(found.state)
-        self.outbox.sent.update(found.base.sent)
-        for message in found.said:
-            self.outbox.repeat(message)
-        for value in found.heard:
-            self.hear_again(value)
-        self._recovering = False
-        self.recovery.resume()
+        if recovered.header.has_checkpoint:
+            self.restore_node_state(recovered.checkpoint_folder)
+        self.outbox.sent.update(recovered.header.sent)
+        for message in recovered.outputs:
+            self.outbox.resend(message)
+        for value in recovered.inputs:
+            self.replay_input(value)
+        self._is_recovering = False
+        self.recovery.resume_journal()
         self.get_logger().warning(
-            f"{self._name} was killed and goes on where it was: at keyframe event {found.base.events} and "
-            f"{len(found.heard)} messages, {time.monotonic() - begin:.1f} s"
+            f"{self._name} was killed and goes on where it was: at keyframe event {recovered.header.events} and "
+            f"{len(recovered.inputs)} messages, {time.monotonic() - begin:.1f} s"
         )
 
-    def hear_again(self, value: Message | Told) -> None:
+    def replay_input(self, value: Message | ControlEvent) -> None:
         """Do what was done with what was heard."""
-        if isinstance(value, Setting):
+        if isinstance(value, ParameterChange):
             self.set_parameters([Parameter(value.name, value=json.loads(value.value))])
-        elif not isinstance(value, Told):
+        elif not isinstance(value, ControlEvent):
             self.inbox.receive(value)
 
-    def memory(self) -> dict[str, object]:
+    def node_state(self) -> dict[str, object]:
         """{name: document} of what the node remembers beside its process."""
         return {}
 
-    def remember(self, state: Path) -> None:
+    def restore_node_state(self, state: Path) -> None:
         """Take over what :meth:`memory` gave.
 
         :param state: the folder in which it is.
         """
 
     @property
-    def at_rest(self) -> bool:
+    def is_quiescent(self) -> bool:
         """Whether process and memory are all that there is."""
         return True
 
-    def configuration_changed(self, configuration: Configuration) -> None:
+    def on_configuration_changed(self, configuration: Configuration) -> None:
         """Take note of new values, also for one that goes on where this node is killed."""
         before, now = as_flat(self.configuration), as_flat(configuration)
-        super().configuration_changed(configuration)
-        if not self.configured:
+        super().on_configuration_changed(configuration)
+        if not self.is_configured:
             return
         for name in now:
             if now[name] != before[name]:
-                self.recovery.heard(Setting(name, json.dumps(now[name])))
+                self.recovery.record_input(ParameterChange(name, json.dumps(now[name])))
 
     def deliver(self, message: Message) -> None:
         """Let the process handle a message and publish its answers."""
-        if isinstance(message, Arriving) and not self._recovering and self.recovery.is_past(message):
+        if isinstance(message, TrackingReset) and not self._is_recovering and self.recovery.is_repeated_reset(message):
             return
-        self.recovery.heard(message)
+        self.recovery.record_input(message)
         said: list[Message] = []
         begin = time.perf_counter()
-        with self.figures.timed(message, said):
+        with self.diagnostics.measure(message, said):
             said += self.process.handle(message)
-        self.recovery.worked(time.perf_counter() - begin)
+        self.recovery.add_busy_time(time.perf_counter() - begin)
         for answer in said:
-            self._say(answer)
-        self.show(message, said)
-        if self._part is not None:
-            self._part.delivered(message)
-        self._keep_checkpoint()
+            self._publish_output(answer)
+        self.publish_views(message, said)
+        if self._participant is not None:
+            self._participant.on_delivered(message)
+        self._write_due_checkpoint()
 
-    def _say(self, answer: Message) -> None:
-        if isinstance(answer, RealTimePose) and not self.active:
+    def _publish_output(self, answer: Message) -> None:
+        if isinstance(answer, RealTimePose) and not self.is_active:
             return  # neither of a moment that is over, nor of a node that takes no part
         self.outbox.send(answer)
-        self.recovery.said(answer)
-        self.figures.sent[type(answer).__name__] += 1
+        self.recovery.record_output(answer)
+        self.diagnostics.sent[type(answer).__name__] += 1
         if isinstance(answer, Notice):
-            self.figures.warn(answer.text)
+            self.diagnostics.warn(answer.text)
 
-    def _keep_checkpoint(self) -> None:
+    def _write_due_checkpoint(self) -> None:
         """Write a checkpoint where one is due and the state is a whole."""
         events = self.inbox.events
-        if not self.recovery.due or events is None or not self.at_rest:
+        if not self.recovery.is_checkpoint_due or events is None or not self.is_quiescent:
             return
-        base = Base(
+        base = JournalHeader(
             True,
             events,
-            str(self.beginning.folder or ""),
+            str(self.initial_state.folder or ""),
             False,
             0,
-            self._answered,
-            dict(self.figures.received),
+            self._reset_number,
+            dict(self.diagnostics.received),
             dict(self.outbox.sent),
             self.recovery.stamps,
-            self.recovery.arriving,
+            self.recovery.tracking_reset,
         )
         begin = time.perf_counter()
-        self.recovery.checkpoint(base, {self._name: self.process.state, **self.memory()})
-        self._checkpoints += 1
-        self.figures.state["checkpoints"] = f"{self._checkpoints}, the last in {time.perf_counter() - begin:.3f} s"
+        self.recovery.write_checkpoint(base, {self._name: self.process.state, **self.node_state()})
+        self._checkpoint_count += 1
+        self.diagnostics.values["checkpoints"] = (
+            f"{self._checkpoint_count}, the last in {time.perf_counter() - begin:.3f} s"
+        )
 
     @property
     def scans(self) -> int:
         """Scans that have a pose, as far as the node gives it."""
         return 0
 
-    def saved_last(self) -> bool:
+    def poll_final_save(self) -> bool:
         """Whether the node's part of the last map is saved, and the others had time to hear of it.
 
         So that all come to the same keyframe event, an inactive node goes on for that.
         """
-        if not self.configured:
+        if not self.is_configured:
             return True
-        self.inbox.go_on()
-        return self._part is not None and self._part.gave_last(_LINGER)
+        self.inbox.release()
+        return self._participant is not None and self._participant.has_saved_final_part(_LINGER)
 
-    def show(self, _heard: Message, _said: list[Message]) -> None:
+    def publish_views(self, _heard: Message, _said: list[Message]) -> None:
         """Publish what is for people to see; nothing, unless a node has something."""

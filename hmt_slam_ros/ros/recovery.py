@@ -29,9 +29,9 @@ from rclpy.node import Node
 
 from hmt_slam_ros.configuration.documents import ros_yaml
 from hmt_slam_ros.errors import HmtSlamError
-from hmt_slam_ros.messages.messages import Arriving, Message, RealTimePose
-from hmt_slam_ros.plain_data import Values, plain
-from hmt_slam_ros.saved_map.arrays import ReadArrays, WrittenArrays
+from hmt_slam_ros.messages.messages import Message, RealTimePose, TrackingReset
+from hmt_slam_ros.plain_data import PlainDataReader, to_plain
+from hmt_slam_ros.saved_map.arrays import ArrayReader, ArrayWriter
 from hmt_slam_ros.saved_map.folder import CONFIGURATION, VERSION, FolderWriter
 from hmt_slam_ros.sensors import Odometry, Scan
 
@@ -39,10 +39,10 @@ if TYPE_CHECKING:
     from hmt_slam_ros.ros.process_node import ProcessNode
 
 _LINES, _ARRAYS = "jsonl", "bin"
-_DESCRIBED = "docs/architecture.md"
+_FORMAT_DOC = "docs/architecture.md"
 
 
-class Entry(NamedTuple):
+class JournalEntry(NamedTuple):
     """A value in a journal.
 
     :ivar role: what it is there for.
@@ -67,14 +67,14 @@ class Journal:
         self.size = 0
         self._lines = (folder / f"{stem}.{_LINES}").open("xb", buffering=0)
         self._bytes = (folder / f"{stem}.{_ARRAYS}").open("xb")
-        self._arrays = WrittenArrays(self._bytes)
+        self._arrays = ArrayWriter(self._bytes)
 
     def append(self, role: str, value: object) -> None:
         """Write a value.
 
         :raises OSError: where it cannot be written.
         """
-        content = plain(value, {np.ndarray: self._arrays.plain})
+        content = to_plain(value, {np.ndarray: self._arrays.store})
         self._bytes.flush()
         entry = {"role": role, "kind": type(value).__name__, "value": content}
         line = json.dumps(entry, separators=(",", ":")).encode() + b"\n"
@@ -89,14 +89,14 @@ class Journal:
             self._bytes.close()
 
 
-def journal_entries(folder: Path, stem: str, kinds: Mapping[str, type]) -> Iterator[Entry]:
+def read_journal(folder: Path, stem: str, kinds: Mapping[str, type]) -> Iterator[JournalEntry]:
     """The values of a journal in their order.
 
     :param kinds: {name: type} of those that it may hold.
     :raises HmtSlamError: where it holds something else.
     """
-    arrays = ReadArrays((folder / f"{stem}.{_ARRAYS}").read_bytes())
-    values = Values(_DESCRIBED, {np.ndarray: arrays.reader})
+    arrays = ArrayReader((folder / f"{stem}.{_ARRAYS}").read_bytes())
+    values = PlainDataReader(_FORMAT_DOC, {np.ndarray: arrays.reader})
     content = (folder / f"{stem}.{_LINES}").read_bytes()
     for number, line in enumerate(content.split(b"\n")[:-1]):
         path = f"{folder / stem}.{_LINES}[{number}]"
@@ -105,7 +105,7 @@ def journal_entries(folder: Path, stem: str, kinds: Mapping[str, type]) -> Itera
             role, kind = entry["role"], kinds[entry["kind"]]
         except (ValueError, KeyError) as fault:
             raise HmtSlamError(f"{path} is damaged ({fault}): remove {folder.parent}, and restart all nodes") from fault
-        yield Entry(role, values.value(entry["value"], kind, path))
+        yield JournalEntry(role, values.read(entry["value"], kind, path))
 
 
 CHECKPOINT = "hmt_checkpoint"
@@ -113,46 +113,46 @@ CHECKPOINT = "hmt_checkpoint"
 
 # A checkpoint is due when the node computed this many times as long as the last one took, which bounds what checkpoints
 # cost, and how long another node takes to catch up.
-_WORTH = 20.0
+_CHECKPOINT_RATIO = 20.0
 _FIRST_COST = 0.05  # s, before one was written
 _LARGEST = 64_000_000  # bytes of a journal, for a robot that stands still
 # What the node said last may not have reached the others when it was killed: it is said again. More than DDS has under
 # way at any time.
-_SAID_AGAIN = 64
-_BASE, _SAID, _HEARD = "base", "said", "heard"
+_RESENT_MESSAGES = 64
+_HEADER, _OUTPUT, _INPUT = "base", "said", "heard"
 _STATE, _PARTIAL = "state", ".partial"
 
 
 @dataclass(frozen=True, eq=False)
-class Base:
+class JournalHeader:
     """What a node was when its journal began.
 
-    :ivar checkpoint: whether its state is beside the journal; else the process began with ``folder``.
+    :ivar has_checkpoint: whether its state is beside the journal; else the process began with ``folder``.
     :ivar events: keyframe events that it had heard to the end.
     :ivar folder: of the map that it began with, empty without.
-    :ivar carried: whether the robot may be anywhere in that.
-    :ivar scans: scans that had a pose before.
-    :ivar request: number of the last request to begin anew that it answered.
+    :ivar lost: whether the robot may be anywhere in that.
+    :ivar previous_scans: scans that had a pose before.
+    :ivar reset_number: number of the last request to begin anew that it answered.
     :ivar received: {kind of message: how many it heard}.
     :ivar sent: {kind of message: how many it said}, of those that are counted for the others.
     :ivar stamps: {kind of measurement: stamp of the last one that it heard, ns}.
-    :ivar arriving: the last such message that it heard, if any.
+    :ivar tracking_reset: the last such message that it heard, if any.
     """
 
-    checkpoint: bool = False
+    has_checkpoint: bool = False
     events: int = 0
     folder: str = ""
-    carried: bool = False
-    scans: int = 0
-    request: int = 0
+    lost: bool = False
+    previous_scans: int = 0
+    reset_number: int = 0
     received: Mapping[str, int] = field(default_factory=dict)
     sent: Mapping[str, int] = field(default_factory=dict)
     stamps: Mapping[str, int] = field(default_factory=dict)
-    arriving: Arriving | None = None
+    tracking_reset: TrackingReset | None = None
 
 
 @dataclass(frozen=True)
-class Setting:
+class ParameterChange:
     """A parameter that was changed while the node ran.
 
     :ivar name: of the parameter.
@@ -164,62 +164,71 @@ class Setting:
 
 
 @dataclass(frozen=True)
-class Paused:
+class PauseChange:
     """Slam was told to pass scans over, or to go on.
 
-    :ivar on: whether it passes them over.
+    :ivar paused: whether it passes them over.
     """
 
-    on: bool
+    paused: bool
 
 
 @dataclass(frozen=True)
-class Active:
+class ActivationChange:
     """The node was activated, or deactivated.
 
-    :ivar on: whether it takes part.
+    :ivar active: whether it takes part.
     """
 
-    on: bool
+    active: bool
 
 
 @dataclass(frozen=True, eq=False)
-class Mounted:
+class FrameMounting:
     """Slam heard where a laser is on the robot.
 
-    :ivar name: of the frame of its scans.
+    :ivar frame: of the frame of its scans.
     :ivar laser_pose: shape (3,), ``base_T_laser`` as (x, y, theta) in m and rad.
-    :ivar side: 1.0, or -1.0 for a laser mounted upside down.
+    :ivar angle_sign: 1.0, or -1.0 for a laser mounted upside down.
     """
 
-    name: str
+    frame: str
     laser_pose: NDArray[np.float64]
-    side: float
+    angle_sign: float
 
 
 # What a node is told beside messages, and knows until it is told otherwise.
-Told = Setting | Paused | Active | Mounted
+ControlEvent = ParameterChange | PauseChange | ActivationChange | FrameMounting
 
 
 @dataclass(frozen=True, eq=False)
-class Found:
+class RecoveredState:
     """What a node of the same name left behind.
 
-    :ivar base: what it was when its journal began.
-    :ivar state: the folder of its checkpoint.
-    :ivar said: what it said last before that.
-    :ivar heard: what it heard since, in its order.
-    :ivar active: whether it took part when it was killed, None where nobody had told it so far.
+    :ivar header: what it was when its journal began.
+    :ivar checkpoint_folder: the folder of its checkpoint.
+    :ivar outputs: what it said last before that.
+    :ivar inputs: what it heard since, in its order.
+    :ivar was_active: whether it took part when it was killed, None where nobody had told it so far.
     """
 
-    base: Base
-    state: Path
-    said: list[Message]
-    heard: list[Message | Told]
-    active: bool | None
+    header: JournalHeader
+    checkpoint_folder: Path
+    outputs: list[Message]
+    inputs: list[Message | ControlEvent]
+    was_active: bool | None
 
 
-_KINDS: dict[str, type] = {kind.__name__: kind for kind in (Base, *get_args(Told), *get_args(Message))}
+_JOURNAL_TYPES: dict[str, type] = {
+    kind.__name__: kind for kind in (JournalHeader, *get_args(ControlEvent), *get_args(Message))
+}
+
+
+def _subject(event: ControlEvent) -> str:
+    """What a control event is about: the parameter, the frame, or the node itself."""
+    if isinstance(event, ParameterChange):
+        return event.name
+    return event.frame if isinstance(event, FrameMounting) else ""
 
 
 class Recovery:
@@ -228,7 +237,7 @@ class Recovery:
     A generation is a folder with a journal and mostly the checkpoint that it goes on from. The newest one that is
     complete counts; it gets its name when it is.
 
-    :ivar found: what a node of the same name left behind, None where this one is the first.
+    :ivar recovered_state: what a node of the same name left behind, None where this one is the first.
     """
 
     def __init__(self, node: ProcessNode, folder: str) -> None:
@@ -242,40 +251,40 @@ class Recovery:
         self._folder = Path(folder).absolute() / name if folder else None
         self._generation = self._segment = 0
         self._journal: Journal | None = None
-        self._said: deque[Message] = deque(maxlen=_SAID_AGAIN)
-        self._told: dict[tuple[type, str], Told] = {}
+        self._recent_outputs: deque[Message] = deque(maxlen=_RESENT_MESSAGES)
+        self._control_state: dict[tuple[type, str], ControlEvent] = {}
         self._stamps: dict[str, int] = {}
-        self._arriving: Arriving | None = None
-        self._cost, self._worked = _FIRST_COST, 0.0
-        self.found = None if self._folder is None else self._find(self._folder)
+        self._tracking_reset: TrackingReset | None = None
+        self._checkpoint_seconds, self._busy_seconds = _FIRST_COST, 0.0
+        self.recovered_state = None if self._folder is None else self._read_recovered_state(self._folder)
 
-    def _find(self, folder: Path) -> Found | None:
+    def _read_recovered_state(self, folder: Path) -> RecoveredState | None:
         folders = {int(path.name): path for path in folder.glob("*") if path.name.isdecimal()}
         if not folders:
             return None
         self._generation = max(folders)
         newest = folders[self._generation]
         self._segment = len(list(newest.glob("*.jsonl")))
-        entries = [e for number in range(self._segment) for e in journal_entries(newest, str(number), _KINDS)]
+        entries = [e for number in range(self._segment) for e in read_journal(newest, str(number), _JOURNAL_TYPES)]
         base = entries[0].value
-        assert isinstance(base, Base)
-        self._stamps, self._arriving = dict(base.stamps), base.arriving
+        assert isinstance(base, JournalHeader)
+        self._stamps, self._tracking_reset = dict(base.stamps), base.tracking_reset
         for entry in entries:
-            self._follow(entry)
-        heard = [e.value for e in entries if e.role == _HEARD]
-        told = self._told.get((Active, ""))
-        active = told.on if isinstance(told, Active) else None
-        return Found(base, newest / _STATE, list(self._said), heard, active)  # type: ignore[arg-type]
+            self._track(entry)
+        heard = [e.value for e in entries if e.role == _INPUT]
+        told = self._control_state.get((ActivationChange, ""))
+        active = told.active if isinstance(told, ActivationChange) else None
+        return RecoveredState(base, newest / _STATE, list(self._recent_outputs), heard, active)  # type: ignore[arg-type]
 
-    def _follow(self, entry: Entry) -> None:
+    def _track(self, entry: JournalEntry) -> None:
         """Keep what the next generation begins with."""
         value = entry.value
-        if isinstance(value, Told):
-            self._told[type(value), "" if isinstance(value, Paused | Active) else value.name] = value
-        elif entry.role == _SAID:
-            self._said.append(value)  # type: ignore[arg-type]
-        elif isinstance(value, Arriving):
-            self._arriving = value
+        if isinstance(value, ControlEvent):
+            self._control_state[type(value), _subject(value)] = value
+        elif entry.role == _OUTPUT:
+            self._recent_outputs.append(value)  # type: ignore[arg-type]
+        elif isinstance(value, TrackingReset):
+            self._tracking_reset = value
         elif isinstance(value, Scan | Odometry):
             self._stamps[type(value).__name__] = value.stamp
 
@@ -285,45 +294,50 @@ class Recovery:
         return dict(self._stamps)
 
     @property
-    def arriving(self) -> Arriving | None:
+    def tracking_reset(self) -> TrackingReset | None:
         """The last such message that was heard, if any."""
-        return self._arriving
+        return self._tracking_reset
 
-    def is_past(self, arriving: Arriving) -> bool:
+    def is_repeated_reset(self, tracking_reset: TrackingReset) -> bool:
         """Whether the robot arrived so before: slam says it again when it was killed, and DDS when this node was."""
-        last = self._arriving
-        return last is not None and (arriving.scans, arriving.event) <= (last.scans, last.event)
+        last = self._tracking_reset
+        return last is not None and (tracking_reset.scans_before, tracking_reset.event) <= (
+            last.scans_before,
+            last.event,
+        )
 
-    def heard(self, value: Message | Told) -> None:
+    def record_input(self, value: Message | ControlEvent) -> None:
         """Write down what the process is about to hear."""
-        entry = Entry(_HEARD, value)
-        self._follow(entry)
-        self._write(entry)
+        entry = JournalEntry(_INPUT, value)
+        self._track(entry)
+        self._append(entry)
 
-    def said(self, message: Message) -> None:
+    def record_output(self, message: Message) -> None:
         """Keep what the process says; a pose by dead reckoning is past when it is said again."""
         if not isinstance(message, RealTimePose):
-            self._said.append(message)
+            self._recent_outputs.append(message)
 
-    def worked(self, seconds: float) -> None:
+    def add_busy_time(self, seconds: float) -> None:
         """Count the time of computing."""
-        self._worked += seconds
+        self._busy_seconds += seconds
 
     @property
-    def due(self) -> bool:
+    def is_checkpoint_due(self) -> bool:
         """Whether a checkpoint is worth what it costs."""
-        return self._journal is not None and (self._worked > _WORTH * self._cost or self._journal.size > _LARGEST)
+        return self._journal is not None and (
+            self._busy_seconds > _CHECKPOINT_RATIO * self._checkpoint_seconds or self._journal.size > _LARGEST
+        )
 
-    def begin(self, base: Base) -> None:
+    def start_journal(self, header: JournalHeader) -> None:
         """Begin a journal without a checkpoint; what was heard and said before is of no use any more."""
-        self._said.clear()
-        self._arriving = None
+        self._recent_outputs.clear()
+        self._tracking_reset = None
         try:
-            self._next(base, lambda _: None)
+            self._start_generation(header, lambda _: None)
         except OSError as fault:
-            self._give_up(fault)
+            self._disable(fault)
 
-    def checkpoint(self, base: Base, documents: Mapping[str, object]) -> None:
+    def write_checkpoint(self, header: JournalHeader, documents: Mapping[str, object]) -> None:
         """Write the state of the node and go on with a new journal.
 
         :param documents: {name: value} of which the state consists.
@@ -338,10 +352,10 @@ class Recovery:
             writer.finish(CHECKPOINT, VERSION)
 
         with suppress(OSError):  # the journal goes on; where there is no room for that either, it tells
-            self._next(base, write)
-        self._cost, self._worked = time.perf_counter() - begin, 0.0
+            self._start_generation(header, write)
+        self._checkpoint_seconds, self._busy_seconds = time.perf_counter() - begin, 0.0
 
-    def resume(self) -> None:
+    def resume_journal(self) -> None:
         """Go on with the journal that was found."""
         assert self._folder is not None
         newest = self._folder / str(self._generation)
@@ -351,9 +365,9 @@ class Recovery:
         try:
             self._journal = Journal(newest, str(self._segment))
         except OSError as fault:
-            self._give_up(fault)
+            self._disable(fault)
 
-    def clear(self) -> None:
+    def discard(self) -> None:
         """Leave nothing behind, as the node ends in good order."""
         if self._journal is not None:
             self._journal.close()
@@ -361,7 +375,7 @@ class Recovery:
         if self._folder is not None:
             shutil.rmtree(self._folder, ignore_errors=True)
 
-    def _next(self, base: Base, write: Callable[[Path], None]) -> None:
+    def _start_generation(self, base: JournalHeader, write: Callable[[Path], None]) -> None:
         """Begin the next generation, and remove the one before.
 
         :raises OSError: where it cannot be written; the one before is as it was.
@@ -374,11 +388,11 @@ class Recovery:
         partial.mkdir(parents=True)
         write(partial)
         journal = Journal(partial, "0")
-        journal.append(_BASE, base)
-        for told in self._told.values():
-            journal.append(_HEARD, told)
-        for message in self._said:
-            journal.append(_SAID, message)
+        journal.append(_HEADER, base)
+        for told in self._control_state.values():
+            journal.append(_INPUT, told)
+        for message in self._recent_outputs:
+            journal.append(_OUTPUT, message)
         partial.rename(made)
         before, self._journal = self._journal, journal
         if before is not None:
@@ -386,18 +400,18 @@ class Recovery:
         shutil.rmtree(self._folder / str(self._generation), ignore_errors=True)
         self._generation, self._segment = self._generation + 1, 1
 
-    def _write(self, entry: Entry) -> None:
+    def _append(self, entry: JournalEntry) -> None:
         if self._journal is None:
             return
         try:
             self._journal.append(*entry)
         except OSError as fault:
-            self._give_up(fault)
+            self._disable(fault)
 
-    def _give_up(self, fault: OSError) -> None:
+    def _disable(self, fault: OSError) -> None:
         """Go on without; what is there would lack what comes now."""
-        self.clear()
-        self._node.figures.warn(
+        self.discard()
+        self._node.diagnostics.warn(
             f"{self._folder} cannot be written ({fault.strerror}): the node goes on, but if it is killed all have to "
             "be restarted; make room there, or set recovery to another folder"
         )

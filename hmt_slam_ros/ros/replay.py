@@ -26,25 +26,25 @@ from hmt_slam_ros.configuration.documents import ros_yaml, yaml_value
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.logs import Log
 from hmt_slam_ros.open_log import is_simulated, open_log
-from hmt_slam_ros.results.final_map import corrected_scans, final_map
-from hmt_slam_ros.results.output_folder import replacing, write_output
+from hmt_slam_ros.results.final_map import deskewed_scans, final_map
+from hmt_slam_ros.results.output_folder import atomic_output, write_output
 from hmt_slam_ros.results.recorder import Recording
-from hmt_slam_ros.results.report import RunFigures
+from hmt_slam_ros.results.report import RunMetrics
 from hmt_slam_ros.ros.diagnostics import peak_rss
 from hmt_slam_ros.ros.domain import own_domain
-from hmt_slam_ros.ros.execution import PARENT_VARIABLE, await_departures
+from hmt_slam_ros.ros.execution import PARENT_VARIABLE, wait_until_alone
 from hmt_slam_ros.ros.recorder_node import RecorderNode
 from hmt_slam_ros.ros.transforms import TFMessage
 from hmt_slam_ros.sensors import Scan
 
-_PATIENCE = 5.0  # s for a node to end when it is told to
+_STOP_TIMEOUT = 5.0  # s for a node to end when it is told to
 # A node that is killed more often within a minute would be so for ever.
-_RESTARTS, _MINUTE = 3, 60.0
+_RESTARTS, _RESTART_WINDOW = 3, 60.0
 _TAIL = 3  # lines of a node's stderr that go into a message
 
 
 @dataclass(frozen=True)
-class Usage:
+class ResourceUsage:
     """What an OS process used so far.
 
     :ivar peak_rss: largest resident memory, bytes.
@@ -55,29 +55,29 @@ class Usage:
     cpu_seconds: float
 
 
-class Children:
+class NodeProcesses:
     """Node processes; as a context, all of them are gone at its end.
 
     :ivar processes: {node: process}.
     """
 
-    def __init__(self, folder: Path, restartable: Collection[str], tell: Callable[[str], None]) -> None:
+    def __init__(self, folder: Path, restartable: Collection[str], notify: Callable[[str], None]) -> None:
         """Start nothing yet.
 
         :param folder: for what the nodes write to stderr.
         :param restartable: nodes that are started again where a signal killed them.
-        :param tell: called with one sentence where that is done.
+        :param notify: called with one sentence where that is done.
         """
         self.processes: dict[str, subprocess.Popen[bytes]] = {}
-        self._folder, self._restartable, self._tell = folder, restartable, tell
-        self._begun: dict[str, tuple[Sequence[str], Mapping[str, str]]] = {}
-        self._restarts: dict[str, deque[float]] = defaultdict(lambda: deque(maxlen=_RESTARTS))
+        self._folder, self._restartable, self._notify = folder, restartable, notify
+        self._start_arguments: dict[str, tuple[Sequence[str], Mapping[str, str]]] = {}
+        self._restart_times: dict[str, deque[float]] = defaultdict(lambda: deque(maxlen=_RESTARTS))
 
     def start(self, name: str, arguments: Sequence[str], environment: Mapping[str, str]) -> None:
         """Start the node ``name`` with arguments for ROS."""
-        self._begun[name] = arguments, environment
+        self._start_arguments[name] = arguments, environment
         command = [sys.executable, "-m", f"hmt_slam_ros.ros.{name}_node", "--ros-args", *arguments]
-        with self._stderr(name, "ab") as stderr:
+        with self._open_log(name, "ab") as stderr:
             self.processes[name] = subprocess.Popen(
                 command,
                 stdin=subprocess.DEVNULL,
@@ -88,10 +88,10 @@ class Children:
                 env={**environment, PARENT_VARIABLE: str(os.getpid())},
             )
 
-    def _stderr(self, name: str, mode: str) -> IO[bytes]:
+    def _open_log(self, name: str, mode: str) -> IO[bytes]:
         return (self._folder / f"{name}.log").open(mode)
 
-    def check(self) -> None:
+    def restart_killed(self) -> None:
         """See whether all are alive; start those again that were killed.
 
         :raises HmtSlamError: for one that ended by itself or is killed again and again, with what it said last.
@@ -100,30 +100,31 @@ class Children:
             if (status := process.poll()) is None:
                 continue
             if status >= 0 or name not in self._restartable:
-                raise HmtSlamError(f"the node {name} ended with status {status}, it said: {self.last_words(name)}")
+                raise HmtSlamError(f"the node {name} ended with status {status}, it said: {self.log_tail(name)}")
             self._restart(name, -status)
 
     def _restart(self, name: str, number: int) -> None:
-        now, before = time.monotonic(), self._restarts[name]
-        if len(before) == _RESTARTS and now - before[0] < _MINUTE:
+        now, before = time.monotonic(), self._restart_times[name]
+        if len(before) == _RESTARTS and now - before[0] < _RESTART_WINDOW:
             raise HmtSlamError(
                 f"the node {name} was killed by signal {number} for the {_RESTARTS + 1}th time within a minute and is "
-                f"not started again, it said: {self.last_words(name)}"
+                f"not started again, it said: {self.log_tail(name)}"
             )
         before.append(now)
-        self._tell(f"the node {name} was killed by signal {number}: it is started again and goes on where it was")
-        self.start(name, *self._begun[name])
+        self._notify(f"the node {name} was killed by signal {number}: it is started again and goes on where it was")
+        self.start(name, *self._start_arguments[name])
 
-    def last_words(self, name: str) -> str:
+    def log_tail(self, name: str) -> str:
         """The last lines that a node wrote, as one."""
-        with self._stderr(name, "rb") as stderr:
+        with self._open_log(name, "rb") as stderr:
             lines = stderr.read().decode(errors="replace").strip().splitlines()
         return " | ".join(line.strip() for line in lines[-_TAIL:]) or "nothing"
 
-    def usage(self) -> dict[str, Usage]:
+    def usage(self) -> dict[str, ResourceUsage]:
         """What each node used so far."""
         return {
-            name: Usage(peak_rss(process.pid), _cpu_seconds(process.pid)) for name, process in self.processes.items()
+            name: ResourceUsage(peak_rss(process.pid), _cpu_seconds(process.pid))
+            for name, process in self.processes.items()
         }
 
     def stop(self) -> None:
@@ -131,7 +132,7 @@ class Children:
         alive = [process for process in self.processes.values() if process.poll() is None]
         for process in alive:
             process.send_signal(signal.SIGINT)
-        deadline = time.monotonic() + _PATIENCE
+        deadline = time.monotonic() + _STOP_TIMEOUT
         for process in alive:
             try:
                 process.wait(max(0.0, deadline - time.monotonic()))
@@ -139,7 +140,7 @@ class Children:
                 process.kill()
                 process.wait()
 
-    def __enter__(self) -> Children:
+    def __enter__(self) -> NodeProcesses:
         """Nothing runs yet."""
         return self
 
@@ -163,15 +164,15 @@ def _cpu_seconds(pid: int) -> float:
 
 PROCESSES = ("slam", "aam", "tsbi", "tlca", "rtl")
 # On a slow computer the first run compiles for a while before anything is said.
-STALL = 180.0  # s
-_LISTENERS_PATIENCE = 60.0  # s
+STALL_TIMEOUT = 180.0  # s
+_DISCOVERY_TIMEOUT = 60.0  # s
 _SPIN = 0.05  # s
-_LAST_FIGURES = 3.0  # s
-_DEPARTURES = 2.0  # s
+_DIAGNOSTICS_TIMEOUT = 3.0  # s
+_SHUTDOWN_TIMEOUT = 2.0  # s
 
 
 @dataclass(frozen=True, eq=False)
-class Replay:
+class ReplayResult:
     """What a replay came to.
 
     :ivar recording: the map and the trajectories.
@@ -187,16 +188,16 @@ def replay(
     output: Path,
     configuration: Configuration,
     progress: Callable[[int], None] | None = None,
-    stall: float = STALL,
-    view: int | None = None,
-) -> Replay:
+    stall_timeout: float = STALL_TIMEOUT,
+    view_port: int | None = None,
+) -> ReplayResult:
     """Run a log through the nodes, in a domain of their own, and write the output folder.
 
     :param log: any log; ``configuration.robot`` says which part, and how fast.
     :param output: the folder; nothing is left there unless all goes well.
     :param progress: called with the number of scans that are worked off.
-    :param stall: seconds without any message after which the run is given up.
-    :param view: port on which the live page is served, None for no page.
+    :param stall_timeout: seconds without any message after which the run is given up.
+    :param view_port: port on which the live page is served, None for no page.
     :raises HmtSlamError: for a log that cannot be read, a node that dies, or a run that stands still.
     """
     if configuration.robot.drive == "commands":
@@ -206,29 +207,29 @@ def replay(
     opened = open_log(log, start=configuration.robot.start, duration=configuration.robot.duration or None)
     if not opened.scan_count:
         raise HmtSlamError(f"{log} has no scans in the part asked for: check --start and --duration")
-    contents = _contents(opened)
-    with replacing(output) as folder:
-        run = _Run(configuration, progress or (lambda _: None), stall, view)
-        run.play(log, _slam_settings(contents.laser_poses))
+    contents = _read_contents(opened)
+    with atomic_output(output) as folder:
+        run = _ReplayRun(configuration, progress or (lambda _: None), stall_timeout, view_port)
+        run.run(log, _slam_arguments(contents.laser_poses))
         begin = time.process_time()
-        recording = run.node.recorder.finish(contents.stamps)
-        final = final_map(recording, corrected_scans(opened, configuration), configuration)
+        recording = run.recorder_node.recorder.finish(contents.stamps)
+        final = final_map(recording, deskewed_scans(opened, configuration), configuration)
         refinement = time.process_time() - begin
-        figures = RunFigures(
+        figures = RunMetrics(
             log=opened.name,
             runtime="nodes",
-            seconds_per_scan=run.node.seconds_per_scan(contents.stamps),
+            seconds_per_scan=run.recorder_node.seconds_per_scan(contents.stamps),
             peak_rss={name: usage.peak_rss for name, usage in run.usage.items()},
             wall_seconds=run.wall_seconds,
             cpu_seconds=sum(usage.cpu_seconds for usage in run.usage.values()) + refinement,
             refinement_seconds=refinement,
         )
         write_output(folder, final, contents.source_stamps, figures, configuration)
-    return Replay(final.recording, run.wall_seconds)
+    return ReplayResult(final.recording, run.wall_seconds)
 
 
 @dataclass(frozen=True, eq=False)
-class _Contents:
+class _LogContents:
     """What has to be known of a log beforehand; finding it out also shows whether the log is whole.
 
     :ivar stamps: shape (n,), of every scan on the log's running clock, ns.
@@ -241,7 +242,7 @@ class _Contents:
     laser_poses: list[list[float]]
 
 
-def _contents(log: Log) -> _Contents:
+def _read_contents(log: Log) -> _LogContents:
     stamps: list[tuple[int, int]] = []
     lasers: dict[bytes, list[float]] = {}
     for record in log.records():
@@ -249,10 +250,10 @@ def _contents(log: Log) -> _Contents:
             stamps.append((scan.stamp, record.source_stamp))
             lasers.setdefault(scan.laser_pose.tobytes(), scan.laser_pose.tolist())
     running, source = np.array(stamps, dtype=np.int64).T
-    return _Contents(running, source, list(lasers.values()))
+    return _LogContents(running, source, list(lasers.values()))
 
 
-def _slam_settings(laser_poses: list[list[float]]) -> list[str]:
+def _slam_arguments(laser_poses: list[list[float]]) -> list[str]:
     """Where there is no tf2_msgs to say it on /tf_static, a parameter tells slam where the laser is."""
     if TFMessage is not None:
         return []
@@ -261,24 +262,29 @@ def _slam_settings(laser_poses: list[list[float]]) -> list[str]:
     return ["-p", f"laser_pose:={laser_poses[0]}"]
 
 
-class _Run:
+class _ReplayRun:
     """One run of the nodes, and the recorder that listens.
 
-    :ivar node: the recorder's node.
+    :ivar recorder_node: the recorder's node.
     :ivar usage: {node: what it used}.
     :ivar wall_seconds: from the start of the nodes to the last answer.
     """
 
-    node: RecorderNode
-    usage: dict[str, Usage]
+    recorder_node: RecorderNode
+    usage: dict[str, ResourceUsage]
     wall_seconds: float
 
     def __init__(
-        self, configuration: Configuration, progress: Callable[[int], None], stall: float, view: int | None
+        self, configuration: Configuration, progress: Callable[[int], None], stall_timeout: float, view_port: int | None
     ) -> None:
-        self._configuration, self._progress, self._stall, self._view = configuration, progress, stall, view
+        self._configuration, self._progress, self._stall_timeout, self._view_port = (
+            configuration,
+            progress,
+            stall_timeout,
+            view_port,
+        )
 
-    def play(self, log: Path, slam_settings: list[str]) -> None:
+    def run(self, log: Path, slam_settings: list[str]) -> None:
         """Start the nodes, listen until the end, stop them.
 
         :param slam_settings: arguments for the node slam.
@@ -287,41 +293,43 @@ class _Run:
         with (
             tempfile.TemporaryDirectory(prefix="hmt_slam_replay_") as scratch,
             own_domain() as domain,
-            self._listening(domain) as executor,
-            Children(Path(scratch), (*PROCESSES, "view"), _tell) as children,
+            self._recorder_executor(domain) as executor,
+            NodeProcesses(Path(scratch), (*PROCESSES, "view"), _print_notice) as children,
         ):
             begin = time.monotonic()
-            self._start(children, log, slam_settings, domain, Path(scratch))
-            self._listen(executor, children)
+            self._start_nodes(children, log, slam_settings, domain, Path(scratch))
+            self._record(executor, children)
             self.wall_seconds = time.monotonic() - begin
-            self._await_figures(executor)
+            self._await_diagnostics(executor)
             self.usage = {name: used for name, used in children.usage().items() if name != "view"}
 
     @contextmanager
-    def _listening(self, domain: int) -> Iterator[SingleThreadedExecutor]:
+    def _recorder_executor(self, domain: int) -> Iterator[SingleThreadedExecutor]:
         """The recorder's node, in a context of its own: the signals stay with whoever called."""
         with _local_discovery():
             context = Context()
             context.init(domain_id=domain)
         try:
-            self.node = RecorderNode(self._configuration, context)
+            self.recorder_node = RecorderNode(self._configuration, context)
             executor = SingleThreadedExecutor(context=context)
-            executor.add_node(self.node)
+            executor.add_node(self.recorder_node)
             try:
                 yield executor
             finally:
                 executor.shutdown()
-                await_departures(self.node, _DEPARTURES)
-                self.node.destroy_node()
+                wait_until_alone(self.recorder_node, _SHUTDOWN_TIMEOUT)
+                self.recorder_node.destroy_node()
         finally:
             context.try_shutdown()
 
-    def _start(self, children: Children, log: Path, slam_settings: list[str], domain: int, scratch: Path) -> None:
+    def _start_nodes(
+        self, children: NodeProcesses, log: Path, slam_settings: list[str], domain: int, scratch: Path
+    ) -> None:
         parameters = scratch / "parameters.yaml"
         parameters.write_text(ros_yaml(self._configuration), encoding="utf-8")
         environment = {**os.environ, "ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
-        if self._view is not None:
-            children.start("view", ["-p", f"port:={self._view}"], environment)
+        if self._view_port is not None:
+            children.start("view", ["-p", f"port:={self._view_port}"], environment)
         shared = ["--params-file", str(parameters)]
         recovery = ["-p", f"recovery:={scratch / 'recovery'}"]
         for name in PROCESSES:
@@ -329,44 +337,46 @@ class _Run:
         own = {
             "log": yaml_value(str(log if is_simulated(log) else log.absolute())),
             "robot.odometry_listeners": 2,  # slam and rtl
-            "robot.patience": _LISTENERS_PATIENCE,
+            "robot.patience": _DISCOVERY_TIMEOUT,
         }
         settings = [word for name, value in own.items() for word in ("-p", f"{name}:={value}")]
         children.start("robot", [*shared, *settings], environment)
 
-    def _listen(self, executor: SingleThreadedExecutor, children: Children) -> None:
+    def _record(self, executor: SingleThreadedExecutor, children: NodeProcesses) -> None:
         heard, last = 0, time.monotonic()
         checked = last
-        while not self.node.complete:
+        while not self.recorder_node.is_complete:
             executor.spin_once(timeout_sec=_SPIN)
             now = time.monotonic()
-            if self.node.messages > heard:
-                heard, last = self.node.messages, now
+            if self.recorder_node.message_count > heard:
+                heard, last = self.recorder_node.message_count, now
             if now - checked > _SPIN:
                 checked = now
-                self._progress(len(self.node.recorder.estimates))
-                self._check(children, now - last)
-        self._progress(len(self.node.recorder.estimates))
+                self._progress(len(self.recorder_node.recorder.estimates))
+                self._check_progress(children, now - last)
+        self._progress(len(self.recorder_node.recorder.estimates))
 
-    def _check(self, children: Children, silence: float) -> None:
-        children.check()
-        if self.node.fault is not None:
-            raise HmtSlamError(self.node.fault)
-        if silence > self._stall:
-            name = self.node.stage()
+    def _check_progress(self, children: NodeProcesses, silence: float) -> None:
+        children.restart_killed()
+        if self.recorder_node.fault is not None:
+            raise HmtSlamError(self.recorder_node.fault)
+        if silence > self._stall_timeout:
+            name = self.recorder_node.awaited_node()
             raise HmtSlamError(
-                f"nothing happened for {self._stall:g} s, the run waits for the node {name}, which last said: "
-                f"{children.last_words(name)}"
+                f"nothing happened for {self._stall_timeout:g} s, the run waits for the node {name}, which last said: "
+                f"{children.log_tail(name)}"
             )
 
-    def _await_figures(self, executor: SingleThreadedExecutor) -> None:
+    def _await_diagnostics(self, executor: SingleThreadedExecutor) -> None:
         """Hear once more from every process what it cost, which each tells every second."""
-        asked, deadline = time.time_ns(), time.monotonic() + _LAST_FIGURES
-        while time.monotonic() < deadline and any(self.node.told.get(name, 0) < asked for name in PROCESSES):
+        asked, deadline = time.time_ns(), time.monotonic() + _DIAGNOSTICS_TIMEOUT
+        while time.monotonic() < deadline and any(
+            self.recorder_node.diagnostics_stamps.get(name, 0) < asked for name in PROCESSES
+        ):
             executor.spin_once(timeout_sec=_SPIN)
 
 
-def _tell(sentence: str) -> None:
+def _print_notice(sentence: str) -> None:
     print(sentence, file=sys.stderr, flush=True)
 
 

@@ -10,9 +10,9 @@ from sensor_msgs.msg import LaserScan
 
 from hmt_slam_ros.ros import conversions
 from hmt_slam_ros.ros.diagnostics import PERIOD
-from hmt_slam_ros.ros.sensor_input import SensorSubscription, SensorWatch
+from hmt_slam_ros.ros.sensor_input import SensorMonitor, SensorSubscription
 from hmt_slam_ros.ros.topics import SCAN
-from hmt_slam_ros.ros.transforms import LaserMounting
+from hmt_slam_ros.ros.transforms import LaserMountings
 
 if TYPE_CHECKING:
     from hmt_slam_ros.ros.slam_node import SlamNode
@@ -24,110 +24,110 @@ _LIVE_QUEUE = 200
 class ScanIntake:
     """Subscription to the scans, and what becomes of them before the process hears them.
 
-    :ivar watch: what the stamps of the sensors tell.
-    :ivar dropped: scans that the process does not hear.
-    :ivar paused: whether they are passed over.
-    :ivar last: when the last one came, by the monotonic clock, s.
+    :ivar monitor: what the stamps of the sensors tell.
+    :ivar dropped_count: scans that the process does not hear.
+    :ivar is_paused: whether they are passed over.
+    :ivar last_scan_at: when the last one came, by the monotonic clock, s.
     """
 
-    def __init__(self, node: SlamNode, mounting: LaserMounting, after: int | None) -> None:
+    def __init__(self, node: SlamNode, mounting: LaserMountings, resume_stamp: int | None) -> None:
         """Listen to nothing yet.
 
         :param mounting: where the lasers are.
-        :param after: stamp of the last scan that was heard before, ns, as of ``SensorSubscription``.
+        :param resume_stamp: stamp of the last scan that was heard before, ns, as of ``SensorSubscription``.
         """
-        self._node, self._mounting = node, mounting
-        self.watch = SensorWatch(node.figures)
-        self.dropped, self.paused = 0, False
-        self.last = self._waiting_since = time.monotonic()
+        self._node, self._mountings = node, mounting
+        self.monitor = SensorMonitor(node.diagnostics)
+        self.dropped_count, self.is_paused = 0, False
+        self.last_scan_at = self._waiting_since = time.monotonic()
         self._waiting: deque[LaserScan] = deque()
         self._skipped: LaserScan | None = None
-        self._complained = False
-        self._laser = SensorSubscription(node, node.figures, LaserScan, SCAN, self._hear, after)
+        self._has_warned = False
+        self._subscription = SensorSubscription(node, node.diagnostics, LaserScan, SCAN, self._on_scan, resume_stamp)
 
     @property
-    def waiting(self) -> int:
+    def waiting_count(self) -> int:
         """Scans whose laser's place is not known yet."""
         return len(self._waiting)
 
-    def begin(self) -> None:
+    def start(self) -> None:
         """Listen, first to what was missed since :meth:`end`, where the publisher kept it."""
-        self.last = time.monotonic()
-        self.watch.begin()
-        self._laser.begin()
+        self.last_scan_at = time.monotonic()
+        self.monitor.start()
+        self._subscription.start()
 
-    def end(self) -> None:
+    def stop(self) -> None:
         """Listen no more."""
-        self._laser.end()
+        self._subscription.stop()
 
-    def forget(self) -> None:
+    def discard_waiting(self) -> None:
         """What waits is of no use any more."""
         self._waiting.clear()
 
-    def forget_time(self) -> None:
+    def reset_stamp_order(self) -> None:
         """What comes next may be of any time."""
-        self.watch.forget()
-        self._laser.forget()
+        self.monitor.reset()
+        self._subscription.reset_order()
 
     def pause(self, *, on: bool) -> None:
         """Pass scans over, but for the last, by which the robot is found when it goes on; or go on."""
-        self.paused = on
-        self._node.figures.state["paused"] = "yes, scans are passed over" if on else "no"
+        self.is_paused = on
+        self._node.diagnostics.values["paused"] = "yes, scans are passed over" if on else "no"
 
-    def take_skipped(self) -> None:
+    def process_skipped(self) -> None:
         """Work on the last scan that was passed over, if none is any more."""
         skipped, self._skipped = self._skipped, None
-        if skipped is not None and not self.paused:
-            self._take(skipped)
+        if skipped is not None and not self.is_paused:
+            self._enqueue(skipped)
 
-    def count(self) -> None:
+    def count_scan(self) -> None:
         """A scan has come."""
-        self.last = time.monotonic()
-        self.watch.hear_scan()
-        self._node.figures.received["Scan"] += 1
+        self.last_scan_at = time.monotonic()
+        self.monitor.note_scan()
+        self._node.diagnostics.received["Scan"] += 1
 
-    def _hear(self, message: LaserScan) -> None:
-        self.count()
-        if self.paused:
-            self._drop(self._skipped is not None)
+    def _on_scan(self, message: LaserScan) -> None:
+        self.count_scan()
+        if self.is_paused:
+            self._count_dropped(self._skipped is not None)
             self._skipped = message
             return
-        self._take(message)
+        self._enqueue(message)
 
-    def _take(self, message: LaserScan) -> None:
+    def _enqueue(self, message: LaserScan) -> None:
         """Work on a scan as soon as its laser's place is known."""
-        if self._laser.live and self._node.process.waiting_scans + self.waiting >= _LIVE_QUEUE:
-            self._drop(1)
-            self._node.figures.warn(
+        if self._subscription.is_best_effort and self._node.process.queued_scans + self.waiting_count >= _LIVE_QUEUE:
+            self._count_dropped(1)
+            self._node.diagnostics.warn(
                 "scans come faster than they can be worked off: some are dropped, lower filter.particles"
             )
             return
         if not self._waiting:
-            self._waiting_since, self._complained = time.monotonic(), False
+            self._waiting_since, self._has_warned = time.monotonic(), False
         self._waiting.append(message)
-        self._node.work_off()
+        self._node.deliver_ready_scans()
 
-    def _drop(self, count: int) -> None:
-        self.dropped += count
-        self._node.figures.state["dropped scans"] = self.dropped
+    def _count_dropped(self, count: int) -> None:
+        self.dropped_count += count
+        self._node.diagnostics.values["dropped scans"] = self.dropped_count
 
-    def work_off(self) -> None:
+    def deliver_ready(self) -> None:
         """Deliver the scans whose laser's place is known."""
         while self._waiting:
             message = self._waiting[0]
-            mounted = self._mounting.of(message.header.frame_id)
+            mounted = self._mountings.mounting_of(message.header.frame_id)
             if mounted is None:
                 return
             self._waiting.popleft()
-            self._node.deliver(conversions.scan_from(message, mounted.laser_pose, mounted.side))
+            self._node.deliver(conversions.scan_from_message(message, mounted.laser_pose, mounted.angle_sign))
 
-    def complain(self) -> None:
+    def warn_if_waiting(self) -> None:
         """Tell of scans that wait for long."""
         now = time.monotonic()
         if not self._waiting or now - self._waiting_since <= 2 * PERIOD:
             return
         # Amid a start of many nodes DDS may take that long to bring what is latched: an error where it stays so.
-        tell = self._node.figures.fail if self._complained else self._node.figures.warn
-        tell(self._mounting.complaint(self._waiting[0], self.waiting))
-        self._complained = True
+        tell = self._node.diagnostics.fail if self._has_warned else self._node.diagnostics.warn
+        tell(self._mountings.missing_transform_text(self._waiting[0], self.waiting_count))
+        self._has_warned = True
         self._waiting_since = now + 10 * PERIOD

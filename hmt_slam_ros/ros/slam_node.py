@@ -20,30 +20,30 @@ from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.messages.documents import RobotStatus, decode
-from hmt_slam_ros.messages.map_changes import AreaPose, Place
+from hmt_slam_ros.messages.map_changes import AreaPose, InitialPose
 from hmt_slam_ros.messages.messages import (
-    Accepted,
-    Arriving,
-    Carried,
+    ClosureDecision,
     EndOfLog,
-    Finished,
+    EndOfRun,
     Keyframe,
     LocalEstimate,
     Message,
-    Trail,
+    PoseReset,
+    ScanPoses,
+    TrackingReset,
 )
 from hmt_slam_ros.messages.replica import FIRST_AREA
 from hmt_slam_ros.ros import conversions, topics
 from hmt_slam_ros.ros.diagnostics import PERIOD
 from hmt_slam_ros.ros.execution import run
-from hmt_slam_ros.ros.initial_state import Beginning, declare_initial_pose, place_of
-from hmt_slam_ros.ros.map_services import Listeners, MapChanger, MapSaver, declare_target, spin
+from hmt_slam_ros.ros.initial_state import InitialState, declare_initial_pose, locate_in_map
+from hmt_slam_ros.ros.map_services import MapLoader, MapSaver, StaleSubscribers, declare_save_to, spin
 from hmt_slam_ros.ros.parameters import declare_frame, declare_laser_pose
 from hmt_slam_ros.ros.process_node import ProcessNode
-from hmt_slam_ros.ros.recovery import CHECKPOINT, Mounted, Paused, Told
+from hmt_slam_ros.ros.recovery import CHECKPOINT, ControlEvent, FrameMounting, PauseChange
 from hmt_slam_ros.ros.scan_intake import ScanIntake
 from hmt_slam_ros.ros.topics import INITIAL_POSE, PARTICLES, ROBOT_STATUS
-from hmt_slam_ros.ros.transforms import LaserMounting
+from hmt_slam_ros.ros.transforms import LaserMountings
 from hmt_slam_ros.saved_map.folder import VERSION, FolderReader
 from hmt_slam_ros.sensors import Odometry, Scan
 
@@ -53,24 +53,24 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False)
-class SlamMemory:
+class SlamNodeState:
     """As a value.
 
-    :ivar areas: of the most probable hypothesis, in the map.
+    :ivar area_poses: of the most probable hypothesis, in the map.
     :ivar estimate: the last one that was said.
-    :ivar unchanged: whether the map is as it was loaded.
-    :ivar dropped: scans that the node did not let the process hear.
+    :ivar map_unchanged: whether the map is as it was loaded.
+    :ivar dropped_scans: scans that the node did not let the process hear.
     """
 
-    areas: tuple[AreaPose, ...]
+    area_poses: tuple[AreaPose, ...]
     estimate: LocalEstimate | None
-    unchanged: bool
-    dropped: int
+    map_unchanged: bool
+    dropped_scans: int
 
 
-_MEMORY = "node"
+_NODE_STATE = "node"
 # The last scans of a log are awaited this long, since status and scans are separate topics.
-_END_PATIENCE = 5.0  # s
+_END_TIMEOUT = 5.0  # s
 
 
 class SlamNode(ProcessNode):
@@ -78,144 +78,148 @@ class SlamNode(ProcessNode):
 
     process: MetricSlam
     # What it took in is worked off while it is inactive; only scans are not listened to.
-    hears_on = True
+    is_always_listening = True
 
     def __init__(self) -> None:
-        super().__init__("slam", _make_process, (Arriving, Keyframe, Trail, LocalEstimate, Finished), ("mode",))
-        self._listeners = Listeners(self)
+        super().__init__(
+            "slam", _make_process, (TrackingReset, Keyframe, ScanPoses, LocalEstimate, EndOfRun), ("mode",)
+        )
+        self._stale_subscribers = StaleSubscribers(self)
 
-    def declare(self) -> None:
+    def declare_own_parameters(self) -> None:
         """Declare what slam alone has too.
 
         :raises HmtSlamError: for what is no pose, or a pose in no map.
         """
-        super().declare()
+        super().declare_own_parameters()
         self.map_frame, self._base_frame = declare_frame(self, "map", "map"), declare_frame(self, "base", "base_link")
-        self._laser_pose, self.save_to = declare_laser_pose(self), declare_target(self)
+        self._laser_pose, self.save_to = declare_laser_pose(self), declare_save_to(self)
         self._initial_pose = declare_initial_pose(self)
         if self._initial_pose is not None and not self.start_from:
             raise HmtSlamError("initial_pose is set, but no map that it is a pose in: set start_from, or leave it away")
 
-    def set_up(self) -> None:
+    def configure_node(self) -> None:
         """As any process node, and say where the robot is in the map that it begins with.
 
         :raises HmtSlamError: for a map that cannot be, or one that the others do not have.
         """
-        self._listeners.check()
-        super().set_up()
-        self._mounting = LaserMounting(self, self._base_frame, self._laser_pose, self.work_off, self.recovery.heard)
-        self._scans = ScanIntake(self, self._mounting, self.after.get("Scan"))
-        self._end: RobotStatus | None = None
+        self._stale_subscribers.check_gone()
+        super().configure_node()
+        self._mountings = LaserMountings(
+            self, self._base_frame, self._laser_pose, self.deliver_ready_scans, self.recovery.record_input
+        )
+        self._scan_intake = ScanIntake(self, self._mountings, self.resume_stamps.get("Scan"))
+        self._end_status: RobotStatus | None = None
         self._scans_at_end = -1
-        self._areas: dict[int, AreaPose] = {}
+        self._area_poses: dict[int, AreaPose] = {}
         self.estimate: LocalEstimate | None = None
-        self._unchanged = True
-        self._take_over_map()
+        self._is_map_unchanged = True
+        self._adopt_map()
         self._held: deque[Message] = deque()
-        self._saver = MapSaver(self, self._release)
-        self._changer = MapChanger(self, self._release)
+        self._saver = MapSaver(self, self._deliver_held)
+        self._loader = MapLoader(self, self._deliver_held)
         self._particles = self.create_publisher(PoseArray, PARTICLES, topics.STREAM)
-        self.create_subscription(String, ROBOT_STATUS, self._hear_status, topics.LATCHED)
-        self.create_service(Trigger, "~/carried", self._hear_carried)
+        self.create_subscription(String, ROBOT_STATUS, self._on_robot_status, topics.LATCHED)
+        self.create_service(Trigger, "~/carried", self._relocalize)
         self.create_service(SetBool, "~/pause", self._pause)
-        self.create_timer(PERIOD, self._look_around, clock=self.figures.steady_clock)
-        self.create_subscription(PoseWithCovarianceStamped, INITIAL_POSE, self._hear_initial_pose, topics.STREAM)
-        self._begin()
+        self.create_timer(PERIOD, self._check_inputs, clock=self.diagnostics.steady_clock)
+        self.create_subscription(PoseWithCovarianceStamped, INITIAL_POSE, self._on_initial_pose, topics.STREAM)
+        self._deliver_initial_pose()
 
-    def take_part(self) -> None:
+    def activate_node(self) -> None:
         """As any process node, and listen to scans; those that were missed come first where the robot kept them."""
-        super().take_part()
-        self._scans.begin()
-        self.work_off()
+        super().activate_node()
+        self._scan_intake.start()
+        self.deliver_ready_scans()
 
-    def stand_still(self) -> None:
+    def deactivate_node(self) -> None:
         """As any process node, and listen to scans no more."""
-        super().stand_still()
-        self._scans.end()
+        super().deactivate_node()
+        self._scan_intake.stop()
 
     def check_clean_up(self) -> None:
         """See whether nothing is under way.
 
         :raises HmtSlamError: amid a save, or an exchange of the map.
         """
-        if self.busy:
+        if self.is_busy:
             raise HmtSlamError("a map is being saved or loaded: clean up again after that")
-        if self.saves_at_end and self.estimate is not None:
-            self.figures.note("the map is given up; save_at_end saves it at the end alone, and slam/save before")
+        if self.save_on_shutdown and self.estimate is not None:
+            self.diagnostics.note("the map is given up; save_at_end saves it at the end alone, and slam/save before")
 
-    def give_up(self) -> None:
+    def clean_up_node(self) -> None:
         """As any process node; from then on the others have a map that slam does not."""
-        super().give_up()
-        if self.process.events > self.beginning.events or self.answered:
-            self._listeners.remember()
+        super().clean_up_node()
+        if self.process.keyframe_events > self.initial_state.events or self.reset_number:
+            self._stale_subscribers.mark_current()
 
-    def _take_over_map(self) -> None:
+    def _adopt_map(self) -> None:
         """What the node shows of the map that it begins with."""
-        known = self.beginning.map
-        self._areas = {FIRST_AREA: AreaPose(FIRST_AREA, PoseGaussian(np.zeros(3), np.zeros((3, 3))))}
-        self._areas |= {entry.area: entry for entry in known.area_poses} if known else {}
-        self.estimate = known.robot if known else None
-        self._unchanged = not self.process.mapping
+        known = self.initial_state.map
+        self._area_poses = {FIRST_AREA: AreaPose(FIRST_AREA, PoseGaussian(np.zeros(3), np.zeros((3, 3))))}
+        self._area_poses |= {entry.area: entry for entry in known.area_poses} if known else {}
+        self.estimate = known.last_estimate if known else None
+        self._is_map_unchanged = not self.process.is_mapping
 
-    def configuration_changed(self, configuration: Configuration) -> None:
+    def on_configuration_changed(self, configuration: Configuration) -> None:
         """Take note of another mode, from the next keyframe on."""
-        super().configuration_changed(configuration)
-        if self.configured:
+        super().on_configuration_changed(configuration)
+        if self.is_configured:
             self.process.mode = configuration.mode
-            self._unchanged = self._unchanged and not self.process.mapping
+            self._is_map_unchanged = self._is_map_unchanged and not self.process.is_mapping
 
     @property
-    def unchanged_map(self) -> Path | None:
+    def unchanged_map_folder(self) -> Path | None:
         """The folder of the map that the node began with, where nothing but localization was done since."""
-        return self.beginning.folder if self._unchanged else None
+        return self.initial_state.folder if self._is_map_unchanged else None
 
     @property
     def scans(self) -> int:
         """Scans that have a pose."""
-        return self.process.scans
+        return self.process.processed_scans
 
     @property
-    def busy(self) -> bool:
+    def is_busy(self) -> bool:
         """Whether a map is being saved or exchanged."""
-        return self._saver.busy or self._changer.busy
+        return self._saver.is_busy or self._loader.is_busy
 
     @property
-    def holding(self) -> bool:
+    def is_blocking(self) -> bool:
         """Whether what is heard has to wait for that."""
-        return self._saver.holding or self._changer.holding
+        return self._saver.is_blocking or self._loader.is_blocking
 
-    def begin_anew(self, folder: str, request: int = 0) -> None:
+    def reset(self, folder: str, reset_number: int = 0) -> None:
         """As any process node; what waits was of before, and scans are numbered on."""
-        super().begin_anew(folder, request)
-        self._scans.forget()
-        self._take_over_map()
-        self._held.appendleft(Carried())
+        super().reset(folder, reset_number)
+        self._scan_intake.discard_waiting()
+        self._adopt_map()
+        self._held.appendleft(PoseReset())
 
     def _pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         """Scans are passed over, or no more."""
-        self.recovery.heard(Paused(request.data))
-        self._scans.pause(on=request.data)
-        self._scans.take_skipped()
-        self.work_off()
+        self.recovery.record_input(PauseChange(request.data))
+        self._scan_intake.pause(on=request.data)
+        self._scan_intake.process_skipped()
+        self.deliver_ready_scans()
         response.success, response.message = True, "paused, scans are passed over" if request.data else "mapping"
         self.get_logger().info(response.message)
         return response
 
-    def _begin(self) -> None:
+    def _deliver_initial_pose(self) -> None:
         """Say where the robot is in the map that the node starts from."""
-        if self.recovering:
+        if self.is_recovering:
             return
-        if not self.process.mapping and self.beginning.map is None:
-            self.figures.warn("mode = localization, but there is no map: call load_map, or set start_from or mode")
+        if not self.process.is_mapping and self.initial_state.map is None:
+            self.diagnostics.warn("mode = localization, but there is no map: call load_map, or set start_from or mode")
         if self._initial_pose is not None:
-            self.deliver(Carried(self._place(self._initial_pose)))
-        elif self.beginning.carried:
-            self.deliver(Carried())
+            self.deliver(PoseReset(self._locate_in_map(self._initial_pose)))
+        elif self.initial_state.lost:
+            self.deliver(PoseReset())
 
-    def _place(self, belief: PoseGaussian) -> Place:
-        return place_of(self.process, self._areas, belief, self.configuration.tsbi.place_radius)
+    def _locate_in_map(self, belief: PoseGaussian) -> InitialPose:
+        return locate_in_map(self.process, self._area_poses, belief, self.configuration.tsbi.place_radius)
 
-    def _hear_initial_pose(self, message: PoseWithCovarianceStamped) -> None:
+    def _on_initial_pose(self, message: PoseWithCovarianceStamped) -> None:
         """Somebody says where the robot is; scans whose laser is not known yet were taken before."""
         try:
             if message.header.frame_id != self.map_frame:
@@ -223,32 +227,32 @@ class SlamNode(ProcessNode):
                     f"the pose is in the frame '{message.header.frame_id}', not in '{self.map_frame}': set the fixed "
                     "frame of RViz, or map_frame"
                 )
-            place = self._place(conversions.belief_from(message.pose))
+            place = self._locate_in_map(conversions.gaussian_from_message(message.pose))
         except HmtSlamError as fault:
-            self.figures.warn(f"{INITIAL_POSE} is left out: {fault}")
+            self.diagnostics.warn(f"{INITIAL_POSE} is left out: {fault}")
             return
-        self._scans.forget()
-        self.deliver(Carried(place))
+        self._scan_intake.discard_waiting()
+        self.deliver(PoseReset(place))
 
-    def work_off(self) -> None:
+    def deliver_ready_scans(self) -> None:
         """Deliver the scans whose laser's place is known, and the end behind the last."""
-        self._scans.work_off()
-        self._end_if_all_came()
+        self._scan_intake.deliver_ready()
+        self._end_log_if_complete()
 
-    def _hear_status(self, message: String) -> None:
+    def _on_robot_status(self, message: String) -> None:
         try:
             status = decode(message.data, RobotStatus)
         except HmtSlamError as error:
-            self.figures.fail(f"{ROBOT_STATUS}: {error}")
+            self.diagnostics.fail(f"{ROBOT_STATUS}: {error}")
             return
-        if status.state == "ended" and self.figures.received["Scan"] != self._scans_at_end:
-            self._end = status
-            self._end_if_all_came()
+        if status.state == "ended" and self.diagnostics.received["Scan"] != self._scans_at_end:
+            self._end_status = status
+            self._end_log_if_complete()
 
-    def _hear_carried(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    def _relocalize(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """The robot may be anywhere; scans whose laser is not known yet were taken before."""
-        self._scans.forget()
-        self.deliver(Carried())
+        self._scan_intake.discard_waiting()
+        self.deliver(PoseReset())
         response.success, response.message = True, "the next scan may be from anywhere"
         return response
 
@@ -257,126 +261,143 @@ class SlamNode(ProcessNode):
 
         While the other nodes save their parts of a map, what comes is held.
         """
-        if self.holding:
+        if self.is_blocking:
             self._held.append(message)
             return
-        if isinstance(message, Carried):
-            self._scans.forget_time()
-            self.inbox.forget_odometry()
-        elif isinstance(message, Scan | Odometry) and self._scans.watch.is_back(message) and not self.recovering:
-            super().deliver(Carried())
+        if isinstance(message, PoseReset):
+            self._scan_intake.reset_stamp_order()
+            self.inbox.reset_odometry_order()
+        elif (
+            isinstance(message, Scan | Odometry)
+            and self._scan_intake.monitor.detect_backward_jump(message)
+            and not self.is_recovering
+        ):
+            super().deliver(PoseReset())
         super().deliver(message)
-        if self._end is not None:
-            self._end_if_all_came()
-        self._saver.look()
-        self._changer.look()
+        if self._end_status is not None:
+            self._end_log_if_complete()
+        self._saver.start_if_ready()
+        self._loader.start_if_ready()
 
-    def _release(self) -> None:
+    def _deliver_held(self) -> None:
         """Go on with what was held."""
-        while self._held and not self.holding:
+        while self._held and not self.is_blocking:
             self.deliver(self._held.popleft())
 
-    def hear_again(self, value: Message | Told) -> None:
+    def replay_input(self, value: Message | ControlEvent) -> None:
         """As any process node; scans have come by another way."""
-        if isinstance(value, Paused):
-            self._scans.pause(on=value.on)
-        elif isinstance(value, Mounted):
-            self._mounting.remember(value)
-        elif isinstance(value, Scan | Carried | EndOfLog):
+        if isinstance(value, PauseChange):
+            self._scan_intake.pause(on=value.paused)
+        elif isinstance(value, FrameMounting):
+            self._mountings.restore(value)
+        elif isinstance(value, Scan | PoseReset | EndOfLog):
             if isinstance(value, Scan):
-                self._scans.count()
+                self._scan_intake.count_scan()
             self.deliver(value)
         else:
-            super().hear_again(value)
+            super().replay_input(value)
 
     @property
-    def after(self) -> Mapping[str, int]:
+    def resume_stamps(self) -> Mapping[str, int]:
         """Slam that was killed wants all scans and all odometry since, where somebody has them."""
-        return self.recovery.stamps if self.recovering else {}
+        return self.recovery.stamps if self.is_recovering else {}
 
     @property
-    def at_rest(self) -> bool:
+    def is_quiescent(self) -> bool:
         """Whether no scan waits for its laser's place, and nothing for the other nodes."""
-        return not (self._scans.waiting or self._held or self.holding or self.busy)
+        return not (self._scan_intake.waiting_count or self._held or self.is_blocking or self.is_busy)
 
-    def memory(self) -> dict[str, object]:
+    def node_state(self) -> dict[str, object]:
         """What the node knows beside its process."""
-        return {_MEMORY: SlamMemory(tuple(self._areas.values()), self.estimate, self._unchanged, self._scans.dropped)}
+        return {
+            _NODE_STATE: SlamNodeState(
+                tuple(self._area_poses.values()), self.estimate, self._is_map_unchanged, self._scan_intake.dropped_count
+            )
+        }
 
-    def remember(self, state: Path) -> None:
+    def restore_node_state(self, state: Path) -> None:
         """Take it over."""
-        known = FolderReader(state, CHECKPOINT, VERSION).read(_MEMORY, SlamMemory)
-        self._areas = {entry.area: entry for entry in known.areas}
-        self.estimate, self._unchanged, self._scans.dropped = known.estimate, known.unchanged, known.dropped
+        known = FolderReader(state, CHECKPOINT, VERSION).read(_NODE_STATE, SlamNodeState)
+        self._area_poses = {entry.area: entry for entry in known.area_poses}
+        self.estimate, self._is_map_unchanged, self._scan_intake.dropped_count = (
+            known.estimate,
+            known.map_unchanged,
+            known.dropped_scans,
+        )
 
-    def saved_last(self) -> bool:
+    def poll_final_save(self) -> bool:
         """Whether the last map is saved, or cannot be."""
-        return not self.configured or self._saver.saved_last()
+        return not self.is_configured or self._saver.poll_final_save()
 
     def write_map(self, writer: MapWriter) -> None:
         """Write the map as it is known now."""
-        from hmt_slam_ros.results.recorder import placed_areas  # noqa: PLC0415  only where something is saved
+        from hmt_slam_ros.results.recorder import complete_area_poses  # noqa: PLC0415  only where something is saved
 
         assert self.estimate is not None
         replica = self.process.replica
-        poses = placed_areas(replica.maps[replica.best], tuple(self._areas.values()))
+        poses = complete_area_poses(replica.maps[replica.best_hypothesis], tuple(self._area_poses.values()))
         writer.write_map(replica, poses, self.estimate)
 
-    def _end_if_all_came(self, *, give_up: bool = False) -> None:
-        end = self._end
-        if end is None or self._scans.waiting or self._scans.paused or not self.active:
+    def _end_log_if_complete(self, *, force: bool = False) -> None:
+        end = self._end_status
+        if end is None or self._scan_intake.waiting_count or self._scan_intake.is_paused or not self.is_active:
             return
-        complete = self.figures.received["Scan"] >= end.scans and self.figures.received["Odometry"] >= end.odometry
-        if complete or give_up:
-            self._end, self._scans_at_end = None, self.figures.received["Scan"]
+        complete = (
+            self.diagnostics.received["Scan"] >= end.scans
+            and self.diagnostics.received["Odometry"] >= end.odometry_readings
+        )
+        if complete or force:
+            self._end_status, self._scans_at_end = None, self.diagnostics.received["Scan"]
             self.deliver(EndOfLog())
 
-    def _look_around(self) -> None:
+    def _check_inputs(self) -> None:
         """Once a second: tell what is missing, and stop waiting for scans that were lost."""
-        self.figures.state["waiting scans"] = self.process.waiting_scans + self._scans.waiting
-        self._scans.complain()
-        if not self.active:
+        self.diagnostics.values["waiting scans"] = self.process.queued_scans + self._scan_intake.waiting_count
+        self._scan_intake.warn_if_waiting()
+        if not self.is_active:
             return
-        self._scans.watch.look(self.figures.received["Odometry"])
-        if self._end is not None and time.monotonic() - self._scans.last > _END_PATIENCE:
-            came = self.figures.received["Scan"]
-            self.figures.warn(f"the log ended, but only {came} of its {self._end.scans} scans came")
-            self._end_if_all_came(give_up=True)
+        self._scan_intake.monitor.check_silence(self.diagnostics.received["Odometry"])
+        if self._end_status is not None and time.monotonic() - self._scan_intake.last_scan_at > _END_TIMEOUT:
+            came = self.diagnostics.received["Scan"]
+            self.diagnostics.warn(f"the log ended, but only {came} of its {self._end_status.scans} scans came")
+            self._end_log_if_complete(force=True)
 
-    def show(self, heard: Message, said: list[Message]) -> None:
+    def publish_views(self, heard: Message, said: list[Message]) -> None:
         """Publish the particles of the most probable hypothesis in the map, at keyframes."""
-        if isinstance(heard, Accepted) and heard.global_poses:
-            self._areas = {area.area: area for area in heard.global_poses}
+        if isinstance(heard, ClosureDecision) and heard.global_poses:
+            self._area_poses = {area.area: area for area in heard.global_poses}
         for message in said:
             if isinstance(message, LocalEstimate):
                 self.estimate = message
             if isinstance(message, Keyframe):
-                self._tell_effective_samples(message)
+                self._report_effective_samples(message)
                 self._publish_particles(message.scan.stamp)
 
-    def _tell_effective_samples(self, keyframe: Keyframe) -> None:
-        best = self.process.replica.best
-        for leaf in keyframe.leaves:
+    def _report_effective_samples(self, keyframe: Keyframe) -> None:
+        best = self.process.replica.best_hypothesis
+        for leaf in keyframe.estimates:
             if leaf.hypothesis == best:
                 particles = len(self.process.particles[1])
-                self.figures.state["effective samples"] = f"{leaf.effective_samples:.1f} of {particles}"
+                self.diagnostics.values["effective samples"] = f"{leaf.effective_samples:.1f} of {particles}"
 
     def _publish_particles(self, stamp: int) -> None:
         area, poses = self.process.particles
-        if area in self._areas and self._particles.get_subscription_count():
-            placed = se2.compose(self._areas[area].pose.mean, poses)
-            header = conversions.header(stamp, self.map_frame)
+        if area in self._area_poses and self._particles.get_subscription_count():
+            placed = se2.compose(self._area_poses[area].pose.mean, poses)
+            header = conversions.header_message(stamp, self.map_frame)
             self._particles.publish(PoseArray(header=header, poses=[conversions.pose_message(pose) for pose in placed]))
 
 
-def _make_process(configuration: Configuration, beginning: Beginning) -> MetricSlam:
+def _make_process(configuration: Configuration, beginning: InitialState) -> MetricSlam:
     # It takes time, in which a signal has to be heard.
     from hmt_slam_ros import composition  # noqa: PLC0415
     from hmt_slam_ros.metric_slam.slam import SlamState  # noqa: PLC0415
 
-    state = beginning.part("slam", SlamState) or SlamState()
-    more = max(0, beginning.scans - state.scans)
-    numbered_on = replace(state, scans=state.scans + more, first_of_trail=state.first_of_trail + more)
+    state = beginning.read_part("slam", SlamState) or SlamState()
+    more = max(0, beginning.previous_scans - state.processed_scans)
+    numbered_on = replace(
+        state, processed_scans=state.processed_scans + more, first_unpublished_scan=state.first_unpublished_scan + more
+    )
     return composition.metric_slam(configuration, numbered_on)
 
 

@@ -11,20 +11,20 @@ from rclpy.publisher import Publisher
 from visualization_msgs.msg import MarkerArray
 
 from hmt_slam_ros.configuration import Configuration
-from hmt_slam_ros.messages.messages import Accepted, Message
-from hmt_slam_ros.messages.routing import Remembering
+from hmt_slam_ros.messages.messages import ClosureDecision, Message
+from hmt_slam_ros.messages.routing import Checkpointable
 from hmt_slam_ros.ros import topics
 from hmt_slam_ros.ros.execution import run
-from hmt_slam_ros.ros.initial_state import Beginning
+from hmt_slam_ros.ros.initial_state import InitialState
 from hmt_slam_ros.ros.map_services import spin
-from hmt_slam_ros.ros.map_view import MapView, Seen
+from hmt_slam_ros.ros.map_view import MapRenderer, MapRendererState
 from hmt_slam_ros.ros.parameters import declare_frame
 from hmt_slam_ros.ros.process_node import ProcessNode
 from hmt_slam_ros.ros.recovery import CHECKPOINT
 from hmt_slam_ros.ros.topics import GRAPH, MAP
 from hmt_slam_ros.saved_map.folder import VERSION, FolderReader
 
-_VIEW = "view"
+_RENDERER_STATE = "view"
 _PERIOD = 3.0  # s between two looks at whether the map has to be drawn anew
 
 
@@ -32,69 +32,73 @@ class TlcaNode(ProcessNode):
     """The node ``tlca``."""
 
     def __init__(self) -> None:
-        super().__init__("tlca", _make_process, (Accepted,))
+        super().__init__("tlca", _make_process, (ClosureDecision,))
 
-    def declare(self) -> None:
+    def declare_own_parameters(self) -> None:
         """Declare the name of the frame too."""
-        super().declare()
-        self._map = declare_frame(self, "map", "map")
+        super().declare_own_parameters()
+        self._map_frame = declare_frame(self, "map", "map")
 
-    def set_up(self) -> None:
+    def configure_node(self) -> None:
         """As any process node, and what people see of the map."""
-        super().set_up()
-        self._view = MapView(self.configuration, self._map, Seen.of(self.beginning.map))
+        super().configure_node()
+        self._renderer = MapRenderer(
+            self.configuration, self._map_frame, MapRendererState.from_document(self.initial_state.map)
+        )
         self._grids = self.create_publisher(OccupancyGrid, MAP, topics.LATCHED)
         self._graphs = self.create_publisher(MarkerArray, GRAPH, topics.LATCHED)
-        self._drawn = {GRAPH: 0, MAP: 0}
-        self.create_timer(_PERIOD, self._draw, clock=self.figures.steady_clock)
+        self._published_versions = {GRAPH: 0, MAP: 0}
+        self.create_timer(_PERIOD, self._publish_if_changed, clock=self.diagnostics.steady_clock)
         self.create_service(GetMap, "~/get_map", self._get_map)
 
-    def begin_anew(self, folder: str, request: int = 0) -> None:
+    def reset(self, folder: str, reset_number: int = 0) -> None:
         """As any process node, and draw what is known then."""
-        super().begin_anew(folder, request)
-        self._view = MapView(self.configuration, self._map, Seen.of(self.beginning.map))
-        self._drawn = {GRAPH: -1, MAP: -1}
+        super().reset(folder, reset_number)
+        self._renderer = MapRenderer(
+            self.configuration, self._map_frame, MapRendererState.from_document(self.initial_state.map)
+        )
+        self._published_versions = {GRAPH: -1, MAP: -1}
 
-    def memory(self) -> dict[str, object]:
+    def node_state(self) -> dict[str, object]:
         """What people see."""
-        return {_VIEW: self._view.seen}
+        return {_RENDERER_STATE: self._renderer.state}
 
-    def remember(self, state: Path) -> None:
+    def restore_node_state(self, state: Path) -> None:
         """Go on showing it."""
-        seen = FolderReader(state, CHECKPOINT, VERSION).read(_VIEW, Seen)
-        self._view = MapView(self.configuration, self._map, seen)
+        seen = FolderReader(state, CHECKPOINT, VERSION).read(_RENDERER_STATE, MapRendererState)
+        self._renderer = MapRenderer(self.configuration, self._map_frame, seen)
 
     def _get_map(self, _request: GetMap.Request, response: GetMap.Response) -> GetMap.Response:
         """The grid as it would be published now, an empty one where nothing is mapped."""
-        response.map = self._view.grid() or response.map
+        response.map = self._renderer.occupancy_grid() or response.map
         return response
 
-    def show(self, heard: Message, said: list[Message]) -> None:
+    def publish_views(self, heard: Message, said: list[Message]) -> None:
         """Follow what is heard and said."""
         for message in (heard, *said):
-            self._view.hear(message)
+            self._renderer.update(message)
 
-    def _draw(self) -> None:
+    def _publish_if_changed(self) -> None:
         """Publish map and graph where something changed and someone looks."""
-        if not self.active:
+        if not self.is_active:
             return
-        if self._due(GRAPH, self._graphs):
-            self._graphs.publish(self._view.graph())
-        if self._due(MAP, self._grids) and (grid := self._view.grid()) is not None:
+        if self._is_due(GRAPH, self._graphs):
+            self._graphs.publish(self._renderer.graph_markers())
+        if self._is_due(MAP, self._grids) and (grid := self._renderer.occupancy_grid()) is not None:
             self._grids.publish(grid)
 
-    def _due(self, topic: str, publisher: Publisher) -> bool:
-        due = self._drawn[topic] != self._view.version and publisher.get_subscription_count() > 0
+    def _is_due(self, topic: str, publisher: Publisher) -> bool:
+        due = self._published_versions[topic] != self._renderer.version and publisher.get_subscription_count() > 0
         if due:
-            self._drawn[topic] = self._view.version
+            self._published_versions[topic] = self._renderer.version
         return due
 
 
-def _make_process(configuration: Configuration, beginning: Beginning) -> Remembering:
+def _make_process(configuration: Configuration, beginning: InitialState) -> Checkpointable:
     # It takes time, in which a signal has to be heard.
     from hmt_slam_ros.loop_closure.tlca import Tlca, TlcaState  # noqa: PLC0415
 
-    return Tlca(configuration, beginning.part("tlca", TlcaState))
+    return Tlca(configuration, beginning.read_part("tlca", TlcaState))
 
 
 def main() -> None:

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
-from hmt_slam_ros.messages.messages import Accepted, AreaEvents, Arriving, Hypotheses, LocalEstimate, Notice
+from hmt_slam_ros.messages.messages import AreaEvents, ClosureDecision, Hypotheses, LocalEstimate, Notice, TrackingReset
 
 # Scans and odometry between the robot node and the processes: nothing is lost, however fast the replay runs.
 # A reader that falls behind makes the writer wait, since the history of a reliable KEEP_ALL topic is bounded (5000).
 SENSOR = QoSProfile(history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.RELIABLE)
 
 # The same where what was sent is kept: of the robot node, and for slam that was killed and missed something.
-KEPT_SENSOR = QoSProfile(
+LATCHED_SENSOR = QoSProfile(
     history=HistoryPolicy.KEEP_ALL,
     reliability=ReliabilityPolicy.RELIABLE,
     durability=DurabilityPolicy.TRANSIENT_LOCAL,
@@ -29,7 +29,7 @@ CHAIN = QoSProfile(
 )
 
 # A reader of a chain topic that has no use for the past.
-CHAIN_FROM_NOW = QoSProfile(history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.RELIABLE)
+VOLATILE_CHAIN = QoSProfile(history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.RELIABLE)
 
 # Maps, graphs, statuses: the newest one, also for who comes late.
 LATCHED = QoSProfile(
@@ -55,7 +55,7 @@ STREAM = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=100, reliability=Reli
 NEWEST = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 # A reader of a chain topic that wants to know its past, and for which nobody waits: what is too much is lost.
-LOOK_BACK = QoSProfile(
+CHAIN_HISTORY = QoSProfile(
     history=HistoryPolicy.KEEP_LAST,
     depth=1000,
     reliability=ReliabilityPolicy.RELIABLE,
@@ -64,16 +64,16 @@ LOOK_BACK = QoSProfile(
 
 
 SCAN, ODOM, CLOCK = "scan", "odom", "/clock"
-COMMANDS, GROUND_TRUTH = "cmd_vel", "ground_truth"
-ERRANDS = {"explorer": "explorer/errand", "pilot": "pilot/errand"}
-OUTCOMES = {"explorer": "explorer/outcome", "pilot": "pilot/outcome"}
-GOALS, PLACE = "goal_pose", "pilot/place"
+CMD_VEL, GROUND_TRUTH = "cmd_vel", "ground_truth"
+TASK_GOALS = {"explorer": "explorer/errand", "pilot": "pilot/errand"}
+TASK_RESULTS = {"explorer": "explorer/outcome", "pilot": "pilot/outcome"}
+GOAL_POSE, PLACE = "goal_pose", "pilot/place"
 KEYFRAMES, KEYFRAME_SCANS = "hmt/keyframes", "hmt/keyframe_scans"
-TRAIL = "hmt/trail"
+SCAN_POSES = "hmt/trail"
 FINISHED = "hmt/finished"
 ROBOT_STATUS = "hmt/robot_status"
-SAVE, SAVED = "hmt/save", "hmt/saved"
-BEGIN, BEGUN = "hmt/begin", "hmt/begun"
+SAVE_REQUEST, SAVE_RESPONSE = "hmt/save", "hmt/saved"
+RESET_REQUEST, RESET_RESPONSE = "hmt/begin", "hmt/begun"
 COST = "hmt/cost"
 HMT_POSE, POSE = "hmt/pose", "pose"
 MAP, GRAPH, PARTICLES, PMF = "map", "hmt/graph", "hmt/particles", "hmt/pmf"
@@ -84,8 +84,8 @@ DIAGNOSTICS = "diagnostics"
 DOCUMENTS: dict[type, str] = {
     AreaEvents: "hmt/area_events",
     Hypotheses: "hmt/hypotheses",
-    Accepted: "hmt/accepted",
+    ClosureDecision: "hmt/accepted",
     LocalEstimate: "hmt/local_pose",
-    Arriving: "hmt/arriving",
+    TrackingReset: "hmt/arriving",
     Notice: "hmt/notices",
 }

@@ -13,8 +13,8 @@ from sensor_msgs.msg import LaserScan
 
 from hmt_slam_ros.logs.mounting import FrameTree, frame_name, planar_mounting
 from hmt_slam_ros.ros import topics
-from hmt_slam_ros.ros.conversions import stamp_of
-from hmt_slam_ros.ros.recovery import Mounted
+from hmt_slam_ros.ros.conversions import stamp_from_time
+from hmt_slam_ros.ros.recovery import FrameMounting
 
 try:
     from tf2_msgs.msg import TFMessage as TFMessage  # noqa: PLC0414  re-exported
@@ -33,65 +33,65 @@ def transform_publisher(node: Node, topic: str) -> Callable[[list[TransformStamp
     return lambda transforms: publisher.publish(TFMessage(transforms=transforms))
 
 
-class LaserMounting:
+class LaserMountings:
     """The poses of the lasers, where they are given or from what came last on /tf_static."""
 
     def __init__(
         self,
         node: Node,
         base: str,
-        given: NDArray[np.float64] | None,
-        changed: Callable[[], None],
-        learned: Callable[[Mounted], None],
+        fixed_pose: NDArray[np.float64] | None,
+        on_change: Callable[[], None],
+        on_new_mounting: Callable[[FrameMounting], None],
     ) -> None:
         """Listen.
 
         :param base: the robot's frame.
-        :param given: ``base_T_laser`` (3,) of all lasers, None where transforms tell.
-        :param changed: called when transforms have come.
-        :param learned: called with what is new of a laser.
+        :param fixed_pose: ``base_T_laser`` (3,) of all lasers, None where transforms tell.
+        :param on_change: called when transforms have come.
+        :param on_new_mounting: called with what is new of a laser.
         """
-        self._base, self._given = base, given
+        self._base_frame, self._fixed_pose = base, fixed_pose
         self._frames = FrameTree(newest=True)
-        self._known: dict[str, Mounted] = {}
-        self._changed, self._learned = changed, learned
-        if self._given is None and TFMessage is not None:
-            node.create_subscription(TFMessage, "tf_static", self._hear, topics.TF_STATIC)
+        self._mountings: dict[str, FrameMounting] = {}
+        self._on_change, self._on_new_mounting = on_change, on_new_mounting
+        if self._fixed_pose is None and TFMessage is not None:
+            node.create_subscription(TFMessage, "tf_static", self._on_transforms, topics.TF_STATIC)
 
-    def _hear(self, message: Any) -> None:  # noqa: ANN401  a TFMessage, where there is one
+    def _on_transforms(self, message: Any) -> None:  # noqa: ANN401  a TFMessage, where there is one
         self._frames.add(message)
-        for frame in self._known:
+        for frame in self._mountings:
             self._look_up(frame)
-        self._changed()
+        self._on_change()
 
     def _look_up(self, frame: str) -> None:
-        transform = self._frames.pose(frame_name(self._base), frame_name(frame))
+        transform = self._frames.lookup_transform(frame_name(self._base_frame), frame_name(frame))
         if transform is None:
             return
-        mounting, known = planar_mounting(transform, f"the laser '{frame}'"), self._known.get(frame)
-        if known is None or (*known.laser_pose, known.side) != (*mounting.laser_pose, mounting.side):
-            self._known[frame] = Mounted(frame, mounting.laser_pose, mounting.side)
-            self._learned(self._known[frame])
+        mounting, known = planar_mounting(transform, f"the laser '{frame}'"), self._mountings.get(frame)
+        if known is None or (*known.laser_pose, known.angle_sign) != (*mounting.laser_pose, mounting.angle_sign):
+            self._mountings[frame] = FrameMounting(frame, mounting.laser_pose, mounting.angle_sign)
+            self._on_new_mounting(self._mountings[frame])
 
-    def remember(self, mounted: Mounted) -> None:
+    def restore(self, mounted: FrameMounting) -> None:
         """Take over what a node that was killed had heard; its transforms may not come again."""
-        self._known[mounted.name] = mounted
+        self._mountings[mounted.frame] = mounted
 
-    def of(self, frame: str) -> Mounted | None:
+    def mounting_of(self, frame: str) -> FrameMounting | None:
         """Where the laser of a frame is, None as long as no transform tells.
 
         :raises HmtSlamError: for a laser that is tilted.
         """
-        if self._given is not None:
-            return Mounted(frame, self._given, 1.0)
-        if frame not in self._known:
+        if self._fixed_pose is not None:
+            return FrameMounting(frame, self._fixed_pose, 1.0)
+        if frame not in self._mountings:
             self._look_up(frame)
-        return self._known.get(frame)
+        return self._mountings.get(frame)
 
-    def complaint(self, scan: LaserScan, waiting: int) -> str:
+    def missing_transform_text(self, scan: LaserScan, waiting: int) -> str:
         """One sentence for a scan whose transform is missing."""
         cause = "" if TFMessage is not None else " (tf2_msgs is not installed)"
         return (
-            f"no transform from '{self._base}' to '{scan.header.frame_id}' on /tf_static{cause}, so {waiting} scans "
-            f"wait, the first of stamp {stamp_of(scan.header.stamp)} ns: publish it, or set the parameter laser_pose"
+            f"no transform from '{self._base_frame}' to '{scan.header.frame_id}' on /tf_static{cause}, so {waiting} scans "
+            f"wait, the first of stamp {stamp_from_time(scan.header.stamp)} ns: publish it, or set the parameter laser_pose"
         )

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING
 from std_msgs.msg import Bool, Float64, Float64MultiArray, MultiArrayDimension, MultiArrayLayout
 
 from hmt_slam_ros.configuration import Configuration
-from hmt_slam_ros.messages.messages import Accepted, Arriving, Hypotheses, Message
+from hmt_slam_ros.messages.messages import ClosureDecision, Hypotheses, Message, TrackingReset
 from hmt_slam_ros.ros import topics
-from hmt_slam_ros.ros.conversions import rows_message_data
+from hmt_slam_ros.ros.conversions import flatten_rows
 from hmt_slam_ros.ros.execution import run
-from hmt_slam_ros.ros.initial_state import Beginning
+from hmt_slam_ros.ros.initial_state import InitialState
 from hmt_slam_ros.ros.map_services import spin
 from hmt_slam_ros.ros.process_node import ProcessNode
 from hmt_slam_ros.ros.topics import ENTROPY, IS_LOCALIZED, PMF
@@ -29,52 +29,52 @@ class TsbiNode(ProcessNode):
     def __init__(self) -> None:
         super().__init__("tsbi", _make_process, (Hypotheses,))
 
-    def set_up(self) -> None:
+    def configure_node(self) -> None:
         """As any process node, and say whether the robot's place is known."""
-        super().set_up()
+        super().configure_node()
         self._pmf = self.create_publisher(Float64MultiArray, PMF, topics.LATCHED)
-        self._localized = self.create_publisher(Bool, IS_LOCALIZED, topics.LATCHED)
-        self._entropy = self.create_publisher(Float64, ENTROPY, topics.LATCHED)
-        self._tell_whether_localized()
+        self._localized_publisher = self.create_publisher(Bool, IS_LOCALIZED, topics.LATCHED)
+        self._entropy_publisher = self.create_publisher(Float64, ENTROPY, topics.LATCHED)
+        self._publish_localization()
 
-    def show(self, heard: Message, said: list[Message]) -> None:
+    def publish_views(self, heard: Message, said: list[Message]) -> None:
         """Publish the distribution over the topological paths, Eq. (14), and whether the robot's place is known."""
-        if said or isinstance(heard, Accepted | Arriving):
-            self._tell_whether_localized()
+        if said or isinstance(heard, ClosureDecision | TrackingReset):
+            self._publish_localization()
         for message in said:
             if isinstance(message, Hypotheses):
                 self._pmf.publish(pmf_message(message))
 
-    def begin_anew(self, folder: str, request: int = 0) -> None:
+    def reset(self, folder: str, reset_number: int = 0) -> None:
         """As any process node, and say that the robot's place is not known."""
-        super().begin_anew(folder, request)
-        self._tell_whether_localized()
+        super().reset(folder, reset_number)
+        self._publish_localization()
 
-    def _tell_whether_localized(self) -> None:
+    def _publish_localization(self) -> None:
         found = self.process.localization
-        self._localized.publish(Bool(data=found.localized))
-        self._entropy.publish(Float64(data=found.entropy))
-        self.figures.state["localized"] = "yes" if found.localized else "no, the robot may be anywhere in the map"
-        self.figures.state["entropy of the area"] = f"{found.entropy:.3f} nats"
+        self._localized_publisher.publish(Bool(data=found.localized))
+        self._entropy_publisher.publish(Float64(data=found.entropy))
+        self.diagnostics.values["localized"] = "yes" if found.localized else "no, the robot may be anywhere in the map"
+        self.diagnostics.values["entropy of the area"] = f"{found.entropy:.3f} nats"
 
 
 def pmf_message(hypotheses: Hypotheses) -> Float64MultiArray:
     """Rows of (hypothesis, area, probability), the most probable first; the last is (-1, -1, what was not examined)."""
-    leaves = sorted(hypotheses.leaves, key=lambda leaf: (-leaf.probability, leaf.hypothesis))
-    rows = [(leaf.hypothesis, leaf.area, leaf.probability) for leaf in leaves] + [(-1, -1, hypotheses.unexamined)]
+    leaves = sorted(hypotheses.hypotheses, key=lambda leaf: (-leaf.probability, leaf.id))
+    rows = [(leaf.id, leaf.area, leaf.probability) for leaf in leaves] + [(-1, -1, hypotheses.unexamined)]
     layout = [
         MultiArrayDimension(label="leaf", size=len(rows), stride=3 * len(rows)),
         MultiArrayDimension(label="hypothesis,area,probability", size=3, stride=3),
     ]
-    return Float64MultiArray(layout=MultiArrayLayout(dim=layout), data=rows_message_data(rows))
+    return Float64MultiArray(layout=MultiArrayLayout(dim=layout), data=flatten_rows(rows))
 
 
-def _make_process(configuration: Configuration, beginning: Beginning) -> Tsbi:
+def _make_process(configuration: Configuration, beginning: InitialState) -> Tsbi:
     # It takes time, in which a signal has to be heard.
     from hmt_slam_ros import composition  # noqa: PLC0415
     from hmt_slam_ros.topological_inference.tsbi import TsbiState  # noqa: PLC0415
 
-    return composition.topological_inference(configuration, beginning.part("tsbi", TsbiState))
+    return composition.topological_inference(configuration, beginning.read_part("tsbi", TsbiState))
 
 
 def main() -> None:

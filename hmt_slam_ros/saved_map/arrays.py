@@ -23,7 +23,7 @@ class Sink(Protocol):
         """Take some."""
 
 
-class WrittenArrays:
+class ArrayWriter:
     """Takes the arrays of a document that is written: there they are {"type", "shape", "at"}, an offset in bytes."""
 
     def __init__(self, file: Sink) -> None:
@@ -31,17 +31,17 @@ class WrittenArrays:
         self._file = file
         self._size = 0
 
-    def plain(self, value: NDArray[Any]) -> object:
+    def store(self, value: NDArray[Any]) -> object:
         """Where an array is."""
         content = np.asarray(value, dtype=value.dtype.newbyteorder("<")).tobytes()
         at = self._size
         missing = -len(content) % _ALIGNED
         self._file.write(content + bytes(missing))
         self._size += len(content) + missing
-        return {"type": _name(value.dtype), "shape": list(value.shape), "at": at}
+        return {"type": _dtype_name(value.dtype), "shape": list(value.shape), "at": at}
 
 
-class ReadArrays:
+class ArrayReader:
     """Finds the arrays of a document that is read."""
 
     def __init__(self, content: bytes) -> None:
@@ -51,7 +51,7 @@ class ReadArrays:
     def reader(self, field: str, kind: Hashable) -> Reader:  # noqa: ARG002  the annotation tells all
         """What finds an array of the type that is annotated; each is a copy of its own."""
         wanted = np.dtype(get_args(get_args(kind)[1])[0])
-        name, size = _name(wanted), wanted.itemsize
+        name, size = _dtype_name(wanted), wanted.itemsize
 
         def read(content: object, path: str) -> NDArray[Any]:
             match content:
@@ -66,5 +66,5 @@ class ReadArrays:
 
 
 @cache
-def _name(dtype: np.dtype[Any]) -> str:
+def _dtype_name(dtype: np.dtype[Any]) -> str:
     return str(dtype.newbyteorder("="))

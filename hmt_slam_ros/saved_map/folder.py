@@ -21,9 +21,9 @@ from typing import Any, BinaryIO, TypeVar
 import numpy as np
 
 from hmt_slam_ros.errors import HmtSlamError
-from hmt_slam_ros.plain_data import ReaderOf, Values, plain
-from hmt_slam_ros.saved_map.arrays import ReadArrays, WrittenArrays
-from hmt_slam_ros.saved_map.scans import ReadScans, ScanTable, WrittenScans
+from hmt_slam_ros.plain_data import PlainDataReader, ReaderFactory, to_plain
+from hmt_slam_ros.saved_map.arrays import ArrayReader, ArrayWriter
+from hmt_slam_ros.saved_map.scans import ScanReader, ScanTable, ScanWriter
 from hmt_slam_ros.sensors import Scan
 
 FORMAT, VERSION = "hmt_map", 17
@@ -35,11 +35,11 @@ CONFIGURATION = "configuration.yaml"
 """The file of its parameters."""
 
 
-_HERE = -100  # AT_FDCWD: paths are relative to the working directory
-_EXCHANGE = 2  # RENAME_EXCHANGE
+_AT_FDCWD = -100  # AT_FDCWD: paths are relative to the working directory
+_RENAME_EXCHANGE = 2  # RENAME_EXCHANGE
 
 
-def put_in_place(new: Path, target: Path) -> None:
+def replace_folder(new: Path, target: Path) -> None:
     """Make a folder stand at ``target``; what stood there before then stands at ``new``.
 
     :param new: on the same file system, written to the end.
@@ -48,7 +48,7 @@ def put_in_place(new: Path, target: Path) -> None:
     _flush(new)
     if not target.exists():
         new.rename(target)
-    elif not _exchanged(new, target):
+    elif not _exchange(new, target):
         # A file system that cannot exchange two names: for a moment there is none.
         aside = new.with_name(f"{new.name}.old")
         target.rename(aside)
@@ -57,12 +57,12 @@ def put_in_place(new: Path, target: Path) -> None:
     _flush_folder(target.parent)
 
 
-def _exchanged(one: Path, other: Path) -> bool:
+def _exchange(one: Path, other: Path) -> bool:
     """Whether two names were exchanged; not every file system can."""
     libc = ctypes.CDLL(None, use_errno=True)
     if not hasattr(libc, "renameat2"):
         return False
-    if libc.renameat2(_HERE, os.fsencode(one), _HERE, os.fsencode(other), _EXCHANGE) == 0:
+    if libc.renameat2(_AT_FDCWD, os.fsencode(one), _AT_FDCWD, os.fsencode(other), _RENAME_EXCHANGE) == 0:
         return True
     fault = ctypes.get_errno()
     if fault in (errno.EINVAL, errno.ENOSYS, errno.ENOTSUP):
@@ -90,7 +90,7 @@ def _flush_folder(folder: Path) -> None:
 
 
 MANIFEST = "manifest.json"
-DESCRIBED = "docs/map_format.md"
+FORMAT_DOC = "docs/map_format.md"
 SCANS = "scans"
 _REMEDY = "take a copy that is whole, or map the log again"
 
@@ -98,20 +98,20 @@ Document = TypeVar("Document")
 
 
 @dataclass(frozen=True)
-class File:
+class FileRecord:
     """A file as it was written.
 
     :ivar name: its name in the folder.
-    :ivar bytes: its size.
+    :ivar size: its size.
     :ivar sha256: its hash, hexadecimal.
     """
 
     name: str
-    bytes: int
+    size: int
     sha256: str
 
 
-class _Hashed:
+class _HashingFile:
     """A file that counts and hashes what is written to it."""
 
     def __init__(self, file: BinaryIO) -> None:
@@ -124,8 +124,8 @@ class _Hashed:
         self._digest.update(content)
         self._size += len(content)
 
-    def as_file(self, name: str) -> File:
-        return File(name, self._size, self._digest.hexdigest())
+    def to_record(self, name: str) -> FileRecord:
+        return FileRecord(name, self._size, self._digest.hexdigest())
 
 
 class FolderWriter:
@@ -135,32 +135,32 @@ class FolderWriter:
         """:param directory: made where it is missing."""
         directory.mkdir(exist_ok=True)
         self._directory = directory
-        self._scans = WrittenScans()
-        self._files: dict[str, File] = {}
+        self._scans = ScanWriter()
+        self._files: dict[str, FileRecord] = {}
 
     @property
-    def files(self) -> tuple[File, ...]:
+    def files(self) -> tuple[FileRecord, ...]:
         """What was written."""
         return tuple(self._files.values())
 
-    def join(self, files: Iterable[File]) -> None:
+    def add_files(self, files: Iterable[FileRecord]) -> None:
         """Take in what another process wrote into the folder; the scans of that are among one's own."""
         self._files |= {file.name: file for file in files}
 
     def write(self, name: str, document: object) -> None:
         """Write a document, the same byte for byte for the same content."""
-        with (self._directory / f"{name}.bin").open("wb") as file, _no_collection():
-            hashed = _Hashed(file)
-            content = plain(document, {np.ndarray: WrittenArrays(hashed).plain, Scan: self._scans.plain})
-        self.join([hashed.as_file(f"{name}.bin")])
+        with (self._directory / f"{name}.bin").open("wb") as file, _without_garbage_collection():
+            hashed = _HashingFile(file)
+            content = to_plain(document, {np.ndarray: ArrayWriter(hashed).store, Scan: self._scans.store})
+        self.add_files([hashed.to_record(f"{name}.bin")])
         self.write_text(f"{name}.json", json.dumps(content, allow_nan=False, separators=(",", ":")) + "\n")
 
     def write_text(self, name: str, text: str) -> None:
         """Write a file of text."""
         with (self._directory / name).open("wb") as file:
-            hashed = _Hashed(file)
+            hashed = _HashingFile(file)
             hashed.write(text.encode())
-        self.join([hashed.as_file(name)])
+        self.add_files([hashed.to_record(name)])
 
     def finish(self, kind: str, version: int) -> None:
         """Write the scans and the manifest.
@@ -169,9 +169,9 @@ class FolderWriter:
         :param version: of the form of its documents, likewise.
         """
         self.write(SCANS, self._scans.table)
-        files = {name: {"bytes": file.bytes, "sha256": file.sha256} for name, file in sorted(self._files.items())}
+        files = {name: {"bytes": file.size, "sha256": file.sha256} for name, file in sorted(self._files.items())}
         content: dict[str, object] = {"format": kind, "version": version, "files": files}
-        content["sha256"] = _own_digest(content)
+        content["sha256"] = _manifest_digest(content)
         text = json.dumps(content, indent=1, allow_nan=False) + "\n"
         (self._directory / MANIFEST).write_text(text, encoding="utf-8")
 
@@ -190,13 +190,13 @@ class FolderReader:
         :raises HmtSlamError: where it holds something else, of another version, or a file is missing or damaged.
         """
         self._directory = directory
-        manifest = self._manifest(kind, version)
+        manifest = self._read_manifest(kind, version)
         self.names = frozenset(manifest["files"])
         for name, entry in manifest["files"].items():
-            self._check(name, entry["bytes"], entry["sha256"])
-        self._scans = ReadScans(self._read(SCANS, ScanTable, {}))
+            self._check_file(name, entry["bytes"], entry["sha256"])
+        self._scans = ScanReader(self._read_document(SCANS, ScanTable, {}))
 
-    def _manifest(self, kind: str, version: int) -> dict[str, Any]:
+    def _read_manifest(self, kind: str, version: int) -> dict[str, Any]:
         path = self._directory / MANIFEST
         try:
             manifest = json.loads(path.read_text(encoding="utf-8"))
@@ -214,11 +214,11 @@ class FolderReader:
                 f"{self._directory} is a {kind} of version {manifest.get('version')}, this program reads version "
                 f"{version}: map the log again"
             )
-        if manifest.get("sha256") != _own_digest(manifest):
+        if manifest.get("sha256") != _manifest_digest(manifest):
             raise HmtSlamError(f"{path} is damaged, it is not as it was written: {_REMEDY}")
         return manifest
 
-    def _check(self, name: str, size: int, digest: str) -> None:
+    def _check_file(self, name: str, size: int, digest: str) -> None:
         path = self._directory / name
         try:
             found = path.stat().st_size
@@ -236,17 +236,17 @@ class FolderReader:
 
         :raises HmtSlamError: where it is not of this form.
         """
-        return self._read(name, kind, {Scan: self._scans.reader})
+        return self._read_document(name, kind, {Scan: self._scans.reader})
 
-    def _read(self, name: str, kind: type[Document], forms: Mapping[type, ReaderOf]) -> Document:
-        arrays = ReadArrays((self._directory / f"{name}.bin").read_bytes())
-        with _no_collection():
+    def _read_document(self, name: str, kind: type[Document], forms: Mapping[type, ReaderFactory]) -> Document:
+        arrays = ArrayReader((self._directory / f"{name}.bin").read_bytes())
+        with _without_garbage_collection():
             content = json.loads((self._directory / f"{name}.json").read_text(encoding="utf-8"))
-            return Values(DESCRIBED, {np.ndarray: arrays.reader, **forms}).value(content, kind, name)
+            return PlainDataReader(FORMAT_DOC, {np.ndarray: arrays.reader, **forms}).read(content, kind, name)
 
 
 @contextmanager
-def _no_collection() -> Iterator[None]:
+def _without_garbage_collection() -> Iterator[None]:
     """The garbage collector need not look again and again through much that is made at once and stays."""
     enabled = gc.isenabled()
     gc.disable()
@@ -257,7 +257,7 @@ def _no_collection() -> Iterator[None]:
             gc.enable()
 
 
-def _own_digest(manifest: Mapping[str, object]) -> str:
+def _manifest_digest(manifest: Mapping[str, object]) -> str:
     """SHA-256 of all that a manifest holds besides it."""
     content = {name: value for name, value in manifest.items() if name != "sha256"}
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()

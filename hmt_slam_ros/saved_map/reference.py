@@ -11,7 +11,7 @@ from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 
-from hmt_slam_ros.plain_data import is_record, names_in
+from hmt_slam_ros.plain_data import field_names, is_record
 from hmt_slam_ros.sensors import Scan
 
 _SCALARS = {int: "whole number", float: "number", bool: "true or false", str: "text"}
@@ -19,25 +19,25 @@ _IVAR = re.compile(r":ivar (\w+): (.*?)(?=\n:|\n\n|\Z)", re.S)
 _ROLE = re.compile(r":\w+:`~?(?:[\w.]+\.)?(\w+)`")
 
 
-def described(kinds: Mapping[str, type]) -> list[str]:
+def document_reference(kinds: Mapping[str, type]) -> list[str]:
     """Lines of Markdown: a section for every document, and one for every object that they hold.
 
     :param kinds: {name of a document: what it holds}.
     """
-    objects = {inner for kind in kinds.values() for inner in _inside(kind)} - set(kinds.values())
+    objects = {inner for kind in kinds.values() for inner in _nested_records(kind)} - set(kinds.values())
     written = Counter(kind.__name__ for kind in objects)
     names = {kind: kind.__name__ for kind in objects}
-    names |= {kind: f"{_module(kind)}.{name}" for kind, name in names.items() if written[name] > 1}
-    sections = [line for name, kind in kinds.items() for line in _section(kind, f"Document `{name}`", names)]
+    names |= {kind: f"{_module_name(kind)}.{name}" for kind, name in names.items() if written[name] > 1}
+    sections = [line for name, kind in kinds.items() for line in _section_lines(kind, f"Document `{name}`", names)]
     ordered = sorted(objects, key=names.__getitem__)
-    return sections + [line for kind in ordered for line in _section(kind, names[kind], names)]
+    return sections + [line for kind in ordered for line in _section_lines(kind, names[kind], names)]
 
 
-def _module(kind: type) -> str:
+def _module_name(kind: type) -> str:
     return kind.__module__.rsplit(".", 1)[-1]
 
 
-def _inside(kind: type) -> Iterator[type]:
+def _nested_records(kind: type) -> Iterator[type]:
     """The objects that one of some kind holds, at any depth."""
     waiting: list[Any] = [kind]
     seen: set[Any] = set()
@@ -49,16 +49,16 @@ def _inside(kind: type) -> Iterator[type]:
         if is_record(found):
             yield found
             hints = get_type_hints(found)
-            waiting += [hints[name] for name in names_in(found)]
+            waiting += [hints[name] for name in field_names(found)]
         else:
             waiting += get_args(found)
 
 
-def _section(kind: type, title: str, names: Mapping[type, str]) -> list[str]:
+def _section_lines(kind: type, title: str, names: Mapping[type, str]) -> list[str]:
     text = inspect.getdoc(kind) or ""
     meanings = {name: _plain_text(meaning) for name, meaning in _IVAR.findall(text)}
     hints = get_type_hints(kind)
-    rows = [f"| `{name}` | {_type(hints[name], names)} | {meanings.get(name, '')} |" for name in names_in(kind)]
+    rows = [f"| `{name}` | {_type_text(hints[name], names)} | {meanings.get(name, '')} |" for name in field_names(kind)]
     about = _plain_text(text.split(":ivar", 1)[0].split("\n\n", 1)[0])
     return [f"### {title}", "", about, "", "| field | type | meaning |", "|---|---|---|", *rows, ""]
 
@@ -67,7 +67,7 @@ def _plain_text(text: str) -> str:
     return " ".join(_ROLE.sub(r"`\1`", text).replace("``", "`").split())
 
 
-def _type(kind: Any, names: Mapping[type, str]) -> str:  # noqa: ANN401  any annotation
+def _type_text(kind: Any, names: Mapping[type, str]) -> str:  # noqa: ANN401  any annotation
     origin, arguments = get_origin(kind), get_args(kind)
     if origin is np.ndarray:
         return f"array of {np.dtype(get_args(arguments[1])[0])}"
@@ -76,14 +76,14 @@ def _type(kind: Any, names: Mapping[type, str]) -> str:  # noqa: ANN401  any ann
     if kind in _SCALARS or is_record(kind):
         return _SCALARS.get(kind) or f"`{names[kind]}`"
     if origin in (Union, types.UnionType):
-        return f"{_type(arguments[0], names)}, or null"
-    return _collection(origin, arguments, names)
+        return f"{_type_text(arguments[0], names)}, or null"
+    return _collection_text(origin, arguments, names)
 
 
-def _collection(origin: Any, arguments: tuple[Any, ...], names: Mapping[type, str]) -> str:  # noqa: ANN401  likewise
+def _collection_text(origin: Any, arguments: tuple[Any, ...], names: Mapping[type, str]) -> str:  # noqa: ANN401  likewise
     if origin is Literal:
         return " or ".join(f'"{word}"' for word in arguments)
-    items = [_type(argument, names) for argument in arguments if argument is not Ellipsis]
+    items = [_type_text(argument, names) for argument in arguments if argument is not Ellipsis]
     if isinstance(origin, type) and issubclass(origin, Mapping):
         return f"list of [{', '.join(items)}]"
     if origin is tuple and Ellipsis not in arguments:

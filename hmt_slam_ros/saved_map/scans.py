@@ -28,8 +28,8 @@ class ScanTable:
         smallest valid range and smallest range that means "no return", m, time from one beam to the next, s.
     :ivar laser_poses: shape (n, 3), ``base_T_laser``, m and rad.
     :ivar motions: shape (n, 3), the base's motion from the first beam to the last as a twist, m, m, rad.
-    :ivar cut: shape (c,), beams of all scans, counted through as in ``ranges``, that do not hold from the laser on.
-    :ivar starts: shape (c,), from where on each of these holds, m.
+    :ivar partial_beams: shape (c,), beams of all scans, counted through as in ``ranges``, that do not hold from the laser on.
+    :ivar partial_starts: shape (c,), from where on each of these holds, m.
     """
 
     names: Int64
@@ -39,11 +39,11 @@ class ScanTable:
     geometry: Float64
     laser_poses: Float64
     motions: Float64
-    cut: Int64
-    starts: Float32
+    partial_beams: Int64
+    partial_starts: Float32
 
     @classmethod
-    def of(cls, names: Iterable[int], scans: Iterable[Scan]) -> ScanTable:
+    def from_scans(cls, names: Iterable[int], scans: Iterable[Scan]) -> ScanTable:
         """Of some scans."""
         rows = list(scans)
         starts = [np.zeros_like(scan.ranges) if scan.starts is None else scan.starts for scan in rows]
@@ -61,11 +61,11 @@ class ScanTable:
             begins[cut],
         )
 
-    def scans(self) -> dict[int, Scan]:
+    def to_scans(self) -> dict[int, Scan]:
         """{name: scan}."""
         ends = np.cumsum(self.beams)
         begins = np.zeros(self.ranges.size, dtype=np.float32)
-        begins[self.cut] = self.starts
+        begins[self.partial_beams] = self.partial_starts
         rows = zip(
             self.names.tolist(),
             self.stamps.tolist(),
@@ -89,7 +89,7 @@ class ScanTable:
         }
 
 
-class WrittenScans:
+class ScanWriter:
     """Takes the scans of documents that are written; there they have names."""
 
     def __init__(self) -> None:
@@ -100,9 +100,9 @@ class WrittenScans:
     @property
     def table(self) -> ScanTable:
         """All that were named."""
-        return ScanTable.of(self._scans.keys(), self._scans.values())
+        return ScanTable.from_scans(self._scans.keys(), self._scans.values())
 
-    def plain(self, value: Scan) -> object:
+    def store(self, value: Scan) -> object:
         """The name of a scan, the same for one and the same object."""
         name = self._names.get(id(value), value.stamp)
         while id(value) not in self._names:
@@ -113,12 +113,12 @@ class WrittenScans:
         return name
 
 
-class ReadScans:
+class ScanReader:
     """Finds the scans of documents that are read, one and the same object for a name."""
 
     def __init__(self, table: ScanTable) -> None:
         """:param table: of all scans."""
-        self._scans = table.scans()
+        self._scans = table.to_scans()
 
     def reader(self, field: str, kind: Hashable) -> Reader:  # noqa: ARG002  all are of one kind
         """What finds a scan by its name."""

@@ -13,12 +13,12 @@ from collections import deque
 from dataclasses import dataclass, replace
 from statistics import median
 
-from hmt_slam_ros.configuration.robot import RealTimeLocalization
+from hmt_slam_ros.configuration.robot import RealTimeParameters
 from hmt_slam_ros.sensors.odometry import OdometryBuffer
 from hmt_slam_ros.sensors.scan import Scan
 
-_LONGEST_SWEEP = 1.0  # s; scanners turn ten times faster
-_FEWEST_PERIODS, _PERIODS = 5, 9
+_MAX_SWEEP = 1.0  # s; scanners turn ten times faster
+_MIN_PERIODS, _PERIODS = 5, 9
 # Stamps jitter; a sweep may seem to be this much longer than the time from one scan to the next.
 _JITTER = 1.2
 _NANOSECOND = 1e-9
@@ -53,7 +53,7 @@ class SweepCheck:
         """All that is known."""
         return SweepState(tuple(self._periods), self._last_stamp)
 
-    def checked(self, scan: Scan) -> tuple[Scan, str | None]:
+    def check(self, scan: Scan) -> tuple[Scan, str | None]:
         """The scan, and what is wrong with its ``time_increment``; where something is, the scan is without one."""
         if self._last_stamp is not None:
             self._periods.append((scan.stamp - self._last_stamp) * _NANOSECOND)
@@ -69,25 +69,25 @@ class SweepCheck:
     def _fault(self, scan: Scan) -> str | None:
         if not (math.isfinite(scan.time_increment) and scan.time_increment >= 0.0):
             return "which is no time from one beam to the next"
-        if scan.sweep > _LONGEST_SWEEP:
-            return f"so that its {scan.ranges.size} beams would take {scan.sweep:.2f} s, more than {_LONGEST_SWEEP:g} s"
-        if len(self._periods) < _FEWEST_PERIODS or scan.sweep <= _JITTER * median(self._periods):
+        if scan.sweep_duration > _MAX_SWEEP:
+            return f"so that its {scan.ranges.size} beams would take {scan.sweep_duration:.2f} s, more than {_MAX_SWEEP:g} s"
+        if len(self._periods) < _MIN_PERIODS or scan.sweep_duration <= _JITTER * median(self._periods):
             return None
         return (
-            f"so that its {scan.ranges.size} beams would take {scan.sweep:.3f} s, longer than the "
+            f"so that its {scan.ranges.size} beams would take {scan.sweep_duration:.3f} s, longer than the "
             f"{median(self._periods):.3f} s from one scan to the next"
         )
 
 
-def deskewed(scan: Scan, odometry: OdometryBuffer, limits: RealTimeLocalization) -> Scan:
+def deskew_scan(scan: Scan, odometry: OdometryBuffer, limits: RealTimeParameters) -> Scan:
     """The scan with the motion that odometry has for its sweep.
 
     :param limits: odometry that moves faster was reset, and says nothing of the motion.
     """
-    if scan.end == scan.stamp:
+    if scan.end_stamp == scan.stamp:
         return scan
-    motion = odometry.motion(scan.stamp, scan.end)
-    seconds = (scan.end - scan.stamp) * _NANOSECOND
+    motion = odometry.twist_between(scan.stamp, scan.end_stamp)
+    seconds = (scan.end_stamp - scan.stamp) * _NANOSECOND
     reset = (
         math.hypot(motion[0], motion[1]) > limits.max_speed * seconds
         or abs(motion[2]) > math.radians(limits.max_turn_rate) * seconds

@@ -37,7 +37,7 @@ class OdometryBuffer:
         return tuple(self._readings)
 
     @property
-    def empty(self) -> bool:
+    def is_empty(self) -> bool:
         """Whether no reading ever came."""
         return not self._readings
 
@@ -51,7 +51,7 @@ class OdometryBuffer:
         """Whether a reading at or after ``stamp`` (ns) has come."""
         return bool(self._readings) and self._readings[-1].stamp >= stamp
 
-    def at(self, stamp: int) -> tuple[NDArray[np.float64], float] | None:
+    def pose_at(self, stamp: int) -> tuple[NDArray[np.float64], float] | None:
         """``odom_T_base`` (3,) at ``stamp`` (ns), interpolated, or None where no two readings enclose it.
 
         With it comes half the product of the times to both readings, s^2: the factor on a constant acceleration by
@@ -61,10 +61,10 @@ class OdometryBuffer:
             self._readings.popleft()
         if not self._readings or not self._readings[0].stamp <= stamp <= self._readings[-1].stamp:
             return None
-        first, second = self._enclosing(stamp)
-        return self._pose(stamp), 0.5e-18 * (stamp - first.stamp) * (second.stamp - stamp)
+        first, second = self._enclosing_readings(stamp)
+        return self._extrapolated_pose(stamp), 0.5e-18 * (stamp - first.stamp) * (second.stamp - stamp)
 
-    def motion(self, start: int, end: int) -> NDArray[np.float64]:
+    def twist_between(self, start: int, end: int) -> NDArray[np.float64]:
         """The motion of the base from ``start`` to ``end`` (ns) as a twist (3,); zeros where nothing is known of it.
 
         After the newest reading the speed between the last two goes on, for as long as they lie apart.
@@ -74,11 +74,13 @@ class OdometryBuffer:
         if len(self._readings) < 2:
             return np.zeros(3)
         limit = 2 * self._readings[-1].stamp - self._readings[-2].stamp
-        return se2.log(se2.between(self._pose(min(start, limit)), self._pose(min(end, limit))))
+        return se2.log(
+            se2.between(self._extrapolated_pose(min(start, limit)), self._extrapolated_pose(min(end, limit)))
+        )
 
-    def _pose(self, stamp: int) -> NDArray[np.float64]:
+    def _extrapolated_pose(self, stamp: int) -> NDArray[np.float64]:
         """``odom_T_base`` (3,): held before the first reading, interpolated, carried on after the last."""
-        first, second = self._enclosing(stamp)
+        first, second = self._enclosing_readings(stamp)
         if stamp == second.stamp:
             return second.pose
         if stamp <= first.stamp:
@@ -86,7 +88,7 @@ class OdometryBuffer:
         fraction = (stamp - first.stamp) / (second.stamp - first.stamp)
         return se2.interpolate(first.pose, second.pose, fraction)
 
-    def _enclosing(self, stamp: int) -> tuple[Odometry, Odometry]:
+    def _enclosing_readings(self, stamp: int) -> tuple[Odometry, Odometry]:
         """The reading at or before ``stamp`` and the one after it; else the two first or the two last."""
         first = second = self._readings[0]
         for reading in self._readings:

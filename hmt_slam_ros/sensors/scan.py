@@ -24,7 +24,7 @@ def _directions(count: int, first: float, increment: float) -> NDArray[np.float6
 
 
 @njit(cache=True)
-def _ends(ranges: Float32, directions: Float64, laser: Float64, valid: Bool) -> Float64:
+def _beam_ends(ranges: Float32, directions: Float64, laser: Float64, valid: Bool) -> Float64:
     """Where the valid beams of a laser at ``laser`` end, (k, 2)."""
     ends, k = np.empty((valid.sum(), 2)), 0
     for n in range(ranges.size):
@@ -36,7 +36,7 @@ def _ends(ranges: Float32, directions: Float64, laser: Float64, valid: Bool) -> 
 
 
 @njit(cache=True)
-def _with_return(ranges: Float32, nearest: np.float32, farthest: np.float32) -> Bool:
+def _valid_mask(ranges: Float32, nearest: np.float32, farthest: np.float32) -> Bool:
     """Which ranges are from ``nearest`` on and below ``farthest``; NaN is not."""
     valid = np.empty(ranges.size, np.bool_)
     for n in range(ranges.size):
@@ -48,16 +48,16 @@ def _zeros() -> NDArray[np.float64]:
     return np.zeros(3)
 
 
-class Revision(NamedTuple):
+class BeamRevision(NamedTuple):
     """What a scan does not say any more, because the world changed.
 
-    :ivar gone: numbers of the beams whose end is gone; they say nothing.
-    :ivar cut: numbers of the beams in whose way something came to stand.
+    :ivar removed: numbers of the beams whose end is gone; they say nothing.
+    :ivar occluded: numbers of the beams in whose way something came to stand.
     :ivar starts: from where on each of these still holds, m from the laser.
     """
 
-    gone: tuple[int, ...]
-    cut: tuple[int, ...]
+    removed: tuple[int, ...]
+    occluded: tuple[int, ...]
     starts: tuple[float, ...]
 
 
@@ -96,47 +96,47 @@ class Scan:
     time_increment: float = 0.0
     motion: NDArray[np.float64] = field(default_factory=_zeros)
     starts: NDArray[np.float32] | None = None
-    _revised: tuple[Revision, Scan] | None = field(default=None, init=False, repr=False)
+    _revised: tuple[BeamRevision, Scan] | None = field(default=None, init=False, repr=False)
 
     def __post_init__(self) -> None:
         for name in ("angle_min", "angle_increment", "range_min", "range_max", "time_increment"):
             object.__setattr__(self, name, float(np.float32(getattr(self, name))))
 
     @property
-    def sweep(self) -> float:
+    def sweep_duration(self) -> float:
         """Seconds from the first beam to the last."""
         return max(0, self.ranges.size - 1) * self.time_increment
 
     @property
-    def end(self) -> int:
+    def end_stamp(self) -> int:
         """Time of the last beam, ns, to the microsecond that float32 is good for; needs a finite ``time_increment``."""
-        return self.stamp + 1000 * round(self.sweep * _MICROSECONDS)
+        return self.stamp + 1000 * round(self.sweep_duration * _MICROSECONDS)
 
     @cached_property
     def valid(self) -> NDArray[np.bool_]:
         """Beams with a return, shape (n,)."""
-        return _with_return(self.ranges, np.float32(max(self.range_min, 1e-3)), np.float32(self.range_max))
+        return _valid_mask(self.ranges, np.float32(max(self.range_min, 1e-3)), np.float32(self.range_max))
 
     @cached_property
     def points(self) -> NDArray[np.float64]:
         """End points of the beams with a return, shape (k, 2), metres, robot base frame."""
-        return self._carried_back(self._at(self.ranges))
+        return self._deskew(self._points_along_beams(self.ranges))
 
-    def _at(self, ranges: NDArray[np.float32]) -> NDArray[np.float64]:
+    def _points_along_beams(self, ranges: NDArray[np.float32]) -> NDArray[np.float64]:
         """Places on the beams with a return, shape (k, 2), from the base at each beam.
 
         :param ranges: shape (n,), how far from the laser, m.
         """
         first = self.angle_min + float(self.laser_pose[2])
         directions = _directions(self.ranges.size, first, self.angle_increment)
-        return _ends(ranges, directions, self.laser_pose, self.valid)
+        return _beam_ends(ranges, directions, self.laser_pose, self.valid)
 
-    def revised(self, revision: Revision) -> Scan:
+    def revise(self, revision: BeamRevision) -> Scan:
         """The same scan with beams that say less; one and the same object for the same revision."""
         if self._revised is None or self._revised[0] != revision:
             ranges = self.ranges.copy()
-            ranges[list(revision.gone)] = np.nan
-            starts, cut = self.starts, list(revision.cut)
+            ranges[list(revision.removed)] = np.nan
+            starts, cut = self.starts, list(revision.occluded)
             if cut:
                 starts = np.zeros_like(ranges) if starts is None else starts.copy()
                 starts[cut] = np.maximum(starts[cut], np.array(revision.starts, dtype=np.float32))
@@ -151,17 +151,17 @@ class Scan:
         That is where the laser was, but for ``starts``.
         """
         if self.starts is not None:
-            return self._carried_back(self._at(self.starts))
+            return self._deskew(self._points_along_beams(self.starts))
         origins = np.empty((len(self.points), 2))
         origins[:] = self.laser_pose[:2]
-        return self._carried_back(origins)
+        return self._deskew(origins)
 
     @property
     def beams(self) -> NDArray[np.float64]:
         """From there to the end point, for each of those beams, shape (k, 2), metres, robot base frame."""
         return self.points - self.origins
 
-    def _carried_back(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _deskew(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """One point (k, 2) for each beam with a return, from the base at that beam to the base at the first."""
         if not self.motion.any():
             return points

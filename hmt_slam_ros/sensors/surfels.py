@@ -25,25 +25,25 @@ _FLAT = 0.03
 # A point lies on the surface of those around it within so much, m, and within so many of their deviations across it.
 _OFF, _DEVIATIONS = 0.03, 3.0
 # A point and one in front of it show two things if they are farther apart than this, in m and as a share of the range.
-_APART, _APART_SHARE = 0.1, 0.05
+_DEPTH_STEP, _DEPTH_STEP_SHARE = 0.1, 0.05
 
 
-class Wall(NamedTuple):
+class FlatnessLimits(NamedTuple):
     """What points are taken for a wall.
 
-    :ivar least_along: deviation of the points along it at least, m.
-    :ivar most_across: that across it at most, as a share of that along it.
+    :ivar min_along: deviation of the points along it at least, m.
+    :ivar max_across_ratio: that across it at most, as a share of that along it.
     """
 
-    least_along: float
-    most_across: float
+    min_along: float
+    max_across_ratio: float
 
 
-_WALL = Wall(0.1, 0.2)
+_FLATNESS = FlatnessLimits(0.1, 0.2)
 
 
 @njit(cache=True)
-def surfels(points: Float64, origins: Float64, stride: int = 1) -> Float64:
+def extract_surfels(points: Float64, origins: Float64, stride: int = 1) -> Float64:
     """Every so many of the points, with their normals, which all points show.
 
     :param points: shape (n, 2), m, in the order of the beams.
@@ -57,7 +57,7 @@ def surfels(points: Float64, origins: Float64, stride: int = 1) -> Float64:
     return found[_find_normals(beams, np.hypot(beams[:, 0], beams[:, 1]), stride, found)]
 
 
-def moved(a_T_b: Float64, surfels: Float64) -> Float64:
+def transform_surfels(a_T_b: Float64, surfels: Float64) -> Float64:
     """Surfels (n, 4) of frame b in frame a, for one pose (3,)."""
     turned = se2.transform((0.0, 0.0, a_T_b[2]), surfels[:, 2:])
     return np.concatenate((se2.transform(a_T_b, surfels[:, :2]), turned), axis=1)
@@ -74,14 +74,14 @@ def _find_normals(beams: Float64, ranges: Float64, stride: int, found: Float64) 
     for k in range(len(found)):
         i, normal = k * stride, found[k, 2:]
         low, high = _last_within(beams, ranges, i, -1, 1), _last_within(beams, ranges, i, 1, 1)
-        if low < i < high and fit(beams, sums, low, i, high, _WALL, normal):
+        if low < i < high and fit_surface(beams, sums, low, i, high, _FLATNESS, normal):
             continue
         low, high = _last_within(beams, ranges, i, -1, 2), _last_within(beams, ranges, i, 1, 2)
-        if i - low >= 2 and fit(beams, sums, low, i, i, _WALL, normal):
+        if i - low >= 2 and fit_surface(beams, sums, low, i, i, _FLATNESS, normal):
             continue
-        if high - i >= 2 and fit(beams, sums, i, i, high, _WALL, normal):
+        if high - i >= 2 and fit_surface(beams, sums, i, i, high, _FLATNESS, normal):
             continue
-        shown[k] = not _shadowed(beams, ranges, i)
+        shown[k] = not _is_shadow_edge(beams, ranges, i)
     return shown
 
 
@@ -117,7 +117,9 @@ def running_sums(beams: Float64, ranges: Float64) -> Float64:
 
 
 @njit(cache=True)
-def fit(beams: Float64, sums: Float64, low: int, own: int, high: int, wall: Wall, normal: Float64) -> bool:
+def fit_surface(
+    beams: Float64, sums: Float64, low: int, own: int, high: int, wall: FlatnessLimits, normal: Float64
+) -> bool:
     """Fit a line to the points from ``low`` to ``high``; False where they, or the point itself, do not lie on one.
 
     On a line the inverse of the range is linear in the direction of the beam. The fit takes the ranges for uncertain
@@ -129,38 +131,46 @@ def fit(beams: Float64, sums: Float64, low: int, own: int, high: int, wall: Wall
     :param sums: of :func:`running_sums`.
     :param normal: (2,), written to.
     """
-    xx, xy, yy = _total(sums, 0, low, own, high), _total(sums, 1, low, own, high), _total(sums, 2, low, own, high)
-    x, y = _total(sums, 3, low, own, high), _total(sums, 4, low, own, high)
+    xx, xy, yy = (
+        _sum_without(sums, 0, low, own, high),
+        _sum_without(sums, 1, low, own, high),
+        _sum_without(sums, 2, low, own, high),
+    )
+    x, y = _sum_without(sums, 3, low, own, high), _sum_without(sums, 4, low, own, high)
     across_x, across_y = yy * x - xy * y, xx * y - xy * x
     length = np.hypot(across_x, across_y)
     if length == 0.0:
         return False
     across_x, across_y, distance = across_x / length, across_y / length, (xx * yy - xy * xy) / length
     share = 1.0 / (high - low)
-    x, y = share * _total(sums, 5, low, own, high), share * _total(sums, 6, low, own, high)
-    xx, xy = share * _total(sums, 7, low, own, high), share * _total(sums, 8, low, own, high)
-    yy = share * _total(sums, 9, low, own, high)
+    x, y = share * _sum_without(sums, 5, low, own, high), share * _sum_without(sums, 6, low, own, high)
+    xx, xy = share * _sum_without(sums, 7, low, own, high), share * _sum_without(sums, 8, low, own, high)
+    yy = share * _sum_without(sums, 9, low, own, high)
     square = across_x * across_x * xx + 2.0 * across_x * across_y * xy + across_y * across_y * yy
     off = np.sqrt(max(0.0, square - 2.0 * distance * (across_x * x + across_y * y) + distance * distance))
     square = across_x * across_x * yy - 2.0 * across_x * across_y * xy + across_y * across_y * xx
     spread = np.sqrt(max(0.0, square - (across_x * y - across_y * x) ** 2))
     own_off = abs(across_x * beams[own, 0] + across_y * beams[own, 1] - distance)
-    if spread < wall.least_along or off > min(_FLAT, wall.most_across * spread) or own_off > _OFF + _DEVIATIONS * off:
+    if (
+        spread < wall.min_along
+        or off > min(_FLAT, wall.max_across_ratio * spread)
+        or own_off > _OFF + _DEVIATIONS * off
+    ):
         return False
     normal[0], normal[1] = across_x, across_y
     return True
 
 
 @njit(cache=True)
-def _total(sums: Float64, column: int, low: int, own: int, high: int) -> float:
+def _sum_without(sums: Float64, column: int, low: int, own: int, high: int) -> float:
     """The sum over the points from ``low`` to ``high`` without ``own``, which is one of them."""
     return sums[high + 1, column] - sums[low, column] - (sums[own + 1, column] - sums[own, column])
 
 
 @njit(cache=True)
-def _shadowed(beams: Float64, ranges: Float64, i: int) -> bool:
+def _is_shadow_edge(beams: Float64, ranges: Float64, i: int) -> bool:
     """Whether a point is beside one in front of it, so that the two do not show where it ends but where that does."""
-    limit = _APART + _APART_SHARE * ranges[i]
+    limit = _DEPTH_STEP + _DEPTH_STEP_SHARE * ranges[i]
     for j in (i - 1, i + 1):
         if not 0 <= j < len(beams) or ranges[j] >= ranges[i]:
             continue

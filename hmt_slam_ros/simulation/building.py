@@ -64,7 +64,7 @@ def _no_doors() -> NDArray[np.float64]:
     return np.empty((0, 4))
 
 
-class States(NamedTuple):
+class TopologicalStates(NamedTuple):
     """Where a robot in the hallways passes what topological localization has to tell apart.
 
     After Tomatis, Nourbakhsh and Siegwart (2003), section 2.1: openings from a hallway to an open room, and crossings.
@@ -88,8 +88,8 @@ class States(NamedTuple):
         return se2.compose(self.poses, np.stack((self.ahead, zeros, zeros), axis=1))
 
 
-def _no_states() -> States:
-    return States(np.empty((0, 3)), np.empty(0), np.empty(0), np.empty(0, dtype=np.bool_))
+def _no_states() -> TopologicalStates:
+    return TopologicalStates(np.empty((0, 3)), np.empty(0), np.empty(0), np.empty(0, dtype=np.bool_))
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,7 +101,7 @@ class Building:
     :ivar furniture: shape (m, 5), x, y, heading, length and width of each piece that may be moved.
     :ivar doors: shape (d, 4), x and y of both ends of each door that may be closed; they are open.
     :ivar rooms: shape (r, 5), likewise x, y, heading, length and width of each room beside the corridors that is open.
-    :ivar places: {name: shape (3,)}, frames in which parts of the building that are the same look the same.
+    :ivar twin_frames: {name: shape (3,)}, frames in which parts of the building that are the same look the same.
     :ivar states: the topological states of the hallways, of a building in which they are counted.
     """
 
@@ -110,26 +110,28 @@ class Building:
     furniture: NDArray[np.float64] = field(default_factory=_no_pieces)
     doors: NDArray[np.float64] = field(default_factory=_no_doors)
     rooms: NDArray[np.float64] = field(default_factory=_no_pieces)
-    places: dict[str, NDArray[np.float64]] = field(default_factory=dict)
-    states: States = field(default_factory=_no_states)
+    twin_frames: dict[str, NDArray[np.float64]] = field(default_factory=dict)
+    states: TopologicalStates = field(default_factory=_no_states)
 
-    def placed(self, pose: NDArray[np.float64]) -> Building:
+    def transform(self, pose: NDArray[np.float64]) -> Building:
         """The same building, its origin at a pose (3,)."""
         pieces, rooms = (
             np.concatenate((se2.compose(pose, own[:, :3]), own[:, 3:]), axis=1) for own in (self.furniture, self.rooms)
         )
-        places = {name: se2.compose(pose, place) for name, place in self.places.items()}
+        places = {name: se2.compose(pose, place) for name, place in self.twin_frames.items()}
         states = self.states._replace(poses=se2.compose(pose, self.states.poses))
         route = se2.transform(pose, self.route)
-        return Building(_placed(pose, self.walls), route, pieces, _placed(pose, self.doors), rooms, places, states)
+        return Building(
+            _transform_lines(pose, self.walls), route, pieces, _transform_lines(pose, self.doors), rooms, places, states
+        )
 
 
-def _placed(pose: NDArray[np.float64], lines: NDArray[np.float64]) -> NDArray[np.float64]:
+def _transform_lines(pose: NDArray[np.float64], lines: NDArray[np.float64]) -> NDArray[np.float64]:
     ends = [se2.transform(pose, lines[:, :2]), se2.transform(pose, lines[:, 2:])]
     return np.concatenate(ends, axis=1)
 
 
-def boxes(pieces: NDArray[np.float64]) -> NDArray[np.float64]:
+def furniture_walls(pieces: NDArray[np.float64]) -> NDArray[np.float64]:
     """The walls (4 n, 4), m, of pieces of furniture (n, 5) as in `Building`."""
     signs = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])
     corners = [se2.transform(piece[:3], signs * piece[3:]) for piece in pieces]
@@ -166,26 +168,26 @@ class FloorPlan:
     """A floor plan that is made by cutting free rectangles out of solid stone; they may overlap."""
 
     def __init__(self) -> None:
-        self._free: list[tuple[float, float, float, float]] = []
+        self._rectangles: list[tuple[float, float, float, float]] = []
 
-    def free(self, x0: float, y0: float, x1: float, y1: float) -> None:
+    def cut_rectangle(self, x0: float, y0: float, x1: float, y1: float) -> None:
         """Cut out a rectangle, m."""
-        self._free.append((x0, y0, x1, y1))
+        self._rectangles.append((x0, y0, x1, y1))
 
-    def corridor(self, start: Point, end: Point, width: float) -> None:
+    def cut_corridor(self, start: Point, end: Point, width: float) -> None:
         """Cut out a corridor along the x or the y axis; its ends are half a width beyond both points of its middle."""
         (x0, x1), (y0, y1) = sorted((start[0], end[0])), sorted((start[1], end[1]))
-        self.free(x0 - 0.5 * width, y0 - 0.5 * width, x1 + 0.5 * width, y1 + 0.5 * width)
+        self.cut_rectangle(x0 - 0.5 * width, y0 - 0.5 * width, x1 + 0.5 * width, y1 + 0.5 * width)
 
-    def ring(self, half_x: float, half_y: float, width: float) -> None:
+    def cut_ring(self, half_x: float, half_y: float, width: float) -> None:
         """Cut out a ring of corridors around the origin; its middle is a rectangle of the half sides given."""
         corners = [(-half_x, -half_y), (half_x, -half_y), (half_x, half_y), (-half_x, half_y)]
         for start, end in zip(corners, corners[1:] + corners[:1], strict=True):
-            self.corridor(start, end, width)
+            self.cut_corridor(start, end, width)
 
     def walls(self) -> NDArray[np.float64]:
         """The walls around all that is free, shape (n, 4), m."""
-        return outline_of_rectangles(np.array(self._free))
+        return outline_of_rectangles(np.array(self._rectangles))
 
 
 def sides_of_ring(half_x: float, half_y: float, width: float, *, outer: bool) -> list[Side]:

@@ -49,7 +49,7 @@ class Ring(NamedTuple):
             return x - (along - second), y
         return -x, y - (along - third)
 
-    def walk(self, start: float, end: float) -> list[Point]:
+    def waypoints(self, start: float, end: float) -> list[Point]:
         """Way-points counter-clockwise from one place to a later one, the first corner being at 0; m."""
         laps = range(int(start // self.length), int(end // self.length) + 1)
         corners = [lap * self.length + corner for lap in laps for corner in self.corners]
@@ -92,7 +92,7 @@ class Room(NamedTuple):
     door: tuple[float, float, float, float]
 
 
-def rooms_along(
+def cut_rooms(
     draw: np.random.Generator, plan: FloorPlan, side: Side, length: float, depths: tuple[float, float], width: float
 ) -> list[Room]:
     """Cut rooms with doors out of one side of a corridor.
@@ -119,19 +119,19 @@ def cut_room(plan: FloorPlan, side: Side, plot: Plot, width: float, *, is_open: 
     left, right = plot.left, plot.left + plot.door
     floor = side.rectangle((plot.begin, plot.end), (WALL, WALL + plot.depth))
     if is_open:
-        plan.free(*floor)
-    plan.free(*side.rectangle((left, right), (-_OVERLAP, WALL + _OVERLAP if is_open else 0.4 * WALL)))
+        plan.cut_rectangle(*floor)
+    plan.cut_rectangle(*side.rectangle((left, right), (-_OVERLAP, WALL + _OVERLAP if is_open else 0.4 * WALL)))
     middle = left + 0.5 * plot.door
     leaf = (*side.point(left, 0.5 * WALL), *side.point(right, 0.5 * WALL))
     inside = side.point(middle, WALL + 0.5 * plot.depth)
     return Room(floor, middle, side.point(middle, -0.5 * width), inside, is_open, leaf)
 
 
-def niches_along(draw: np.random.Generator, plan: FloorPlan, side: Side, length: float) -> None:
+def cut_niches(draw: np.random.Generator, plan: FloorPlan, side: Side, length: float) -> None:
     """Cut niches out of one side of a corridor, some metres apart, no two alike."""
     begin = draw.uniform(1.5, 6.0)
     while (end := begin + draw.uniform(0.5, 1.5)) <= length - 1.5:
-        plan.free(*side.rectangle((begin, end), (-_OVERLAP, draw.uniform(0.1, 0.4))))
+        plan.cut_rectangle(*side.rectangle((begin, end), (-_OVERLAP, draw.uniform(0.1, 0.4))))
         begin = end + draw.uniform(2.0, 8.0)
 
 
@@ -140,15 +140,15 @@ def office(draw: np.random.Generator, settings: Settings) -> Building:
     ring = Ring(settings.size * draw.uniform(10.0, 14.0), settings.size * draw.uniform(6.0, 8.0))
     width = draw.uniform(1.8, 2.4)
     plan = FloorPlan()
-    plan.ring(*ring, width)
+    plan.cut_ring(*ring, width)
     lengths = [2.0 * half + width for half in (ring.half_x, ring.half_y) * 2]
     outer = [
-        rooms_along(draw, plan, side, length, (3.0, 5.0), width)
+        cut_rooms(draw, plan, side, length, (3.0, 5.0), width)
         for side, length in zip(sides_of_ring(*ring, width, outer=True), lengths, strict=True)
     ]
     depth = ring.half_y - 0.5 * width - 1.5 * WALL
     inner = [
-        rooms_along(draw, plan, side, 2.0 * ring.half_x - width, (0.8 * depth, depth), width)
+        cut_rooms(draw, plan, side, 2.0 * ring.half_x - width, (0.8 * depth, depth), width)
         for side in sides_of_ring(*ring, width, outer=False)[::2]
     ]
     route: list[Point] = []
@@ -176,37 +176,37 @@ def nested(draw: np.random.Generator, settings: Settings) -> Building:
     rings = [Ring(1.3 * unit * (1 + k), 0.9 * unit * (1 + k)) for k in range(settings.count)]
     plan = FloorPlan()
     for ring in rings:
-        plan.ring(*ring, width)
+        plan.cut_ring(*ring, width)
         for outer in (False, True):
             sides = sides_of_ring(*ring, width, outer=outer)
             for side, half in zip(sides, (ring.half_x, ring.half_y) * 2, strict=True):
-                niches_along(draw, plan, side, 2.0 * half + (width if outer else -width))
+                cut_niches(draw, plan, side, 2.0 * half + (width if outer else -width))
     # Where the passages leave each ring, from the middle of its sides, m.
     below, above = (draw.uniform(-0.6, 0.6, len(rings)) * [ring.half_x for ring in rings] for _ in range(2))
     for k, (ring, next_ring) in enumerate(pairwise(rings)):
-        plan.corridor((below[k], -ring.half_y), (below[k], -next_ring.half_y), width)
-        plan.corridor((above[k], ring.half_y), (above[k], next_ring.half_y), width)
-    return Building(plan.walls(), np.array(_inside_out(rings, below, above)))
+        plan.cut_corridor((below[k], -ring.half_y), (below[k], -next_ring.half_y), width)
+        plan.cut_corridor((above[k], ring.half_y), (above[k], next_ring.half_y), width)
+    return Building(plan.walls(), np.array(_nested_route(rings, below, above)))
 
 
-def _inside_out(rings: list[Ring], below: NDArray[np.float64], above: NDArray[np.float64]) -> list[Point]:
+def _nested_route(rings: list[Ring], below: NDArray[np.float64], above: NDArray[np.float64]) -> list[Point]:
     """Around each ring, out by the passages below, and from the outermost back in by those above."""
     route: list[Point] = []
     entry = 0.0
     for ring, leave in zip(rings, below.tolist(), strict=True):
         start = ring.half_x + entry
         out = ring.half_x + leave
-        route += ring.walk(start, start + ring.length)
+        route += ring.waypoints(start, start + ring.length)
         # The last ring has no passage to the outside; there the way goes on to the top.
         if ring is not rings[-1]:
-            route += ring.walk(start, out) if out >= start else [ring.point(out)]
+            route += ring.waypoints(start, out) if out >= start else [ring.point(out)]
         entry = leave
     at = rings[-1].half_x + (below[-2] if len(rings) > 1 else 0.0)
     for k in reversed(range(len(rings))):
         ring = rings[k]
         top = ring.corners[1] + ring.half_x
         down = top - above[k - 1] if k else ring.length + ring.half_x
-        route += ring.walk(at, down) if down >= at else [ring.point(at), ring.point(down)]
+        route += ring.waypoints(at, down) if down >= at else [ring.point(at), ring.point(down)]
         at = rings[k - 1].corners[1] + rings[k - 1].half_x - above[k - 1] if k else at
     return route
 
@@ -216,8 +216,8 @@ def grid(draw: np.random.Generator, settings: Settings) -> Building:
     pitch, last = 9.0 * settings.size, settings.count
     plan = FloorPlan()
     for k in range(last + 1):
-        plan.corridor((k * pitch, 0.0), (k * pitch, last * pitch), 2.0)
-        plan.corridor((0.0, k * pitch), (last * pitch, k * pitch), 2.0)
+        plan.cut_corridor((k * pitch, 0.0), (k * pitch, last * pitch), 2.0)
+        plan.cut_corridor((0.0, k * pitch), (last * pitch, k * pitch), 2.0)
     here, before = (0, 0), (0, 0)
     crossings = [here]
     for _ in range(2 * (last + 1) ** 2):
@@ -233,22 +233,22 @@ def symmetric_ring(_draw: np.random.Generator, settings: Settings) -> Building:
     """A square ring of corridors, each side like the others: a quarter turn changes nothing."""
     half, width = 7.0 * settings.size, 2.0
     plan = FloorPlan()
-    plan.ring(half, half, width)
+    plan.cut_ring(half, half, width)
     for side in sides_of_ring(half, half, width, outer=True):
-        plan.free(*side.rectangle((half + 0.4, half + 1.6), (-_OVERLAP, 0.5)))
+        plan.cut_rectangle(*side.rectangle((half + 0.4, half + 1.6), (-_OVERLAP, 0.5)))
     quarter = 0.5 * np.pi
     places = {f"side {k}": np.array([0.0, 0.0, k * quarter]) for k in range(4)}
-    return Building(plan.walls(), np.array(Ring(half, half).walk(half, 9.0 * half)), places=places)
+    return Building(plan.walls(), np.array(Ring(half, half).waypoints(half, 9.0 * half)), twin_frames=places)
 
 
 def straight(draw: np.random.Generator, settings: Settings) -> Building:
     """Two long halls with nothing in them, joined at both ends by short corridors with niches."""
     ring, width = Ring(25.0 * settings.size, 4.0), 2.5
     plan = FloorPlan()
-    plan.ring(*ring, width)
+    plan.cut_ring(*ring, width)
     for side in sides_of_ring(*ring, width, outer=True)[1::2]:
-        niches_along(draw, plan, side, 2.0 * ring.half_y + width)
-    return Building(plan.walls(), np.array(ring.walk(ring.half_x, ring.half_x + ring.length)))
+        cut_niches(draw, plan, side, 2.0 * ring.half_y + width)
+    return Building(plan.walls(), np.array(ring.waypoints(ring.half_x, ring.half_x + ring.length)))
 
 
 _ROOM = 4.0  # m, side of a twin room
@@ -262,11 +262,11 @@ def hall(draw: np.random.Generator, settings: Settings) -> Building:
     """An open hall in whose middle the laser reaches no wall; the robot crosses it between two corners."""
     half_x, half_y = 22.0 * settings.size, 18.0 * settings.size
     plan = FloorPlan()
-    plan.free(-half_x, -half_y, half_x, half_y)
+    plan.cut_rectangle(-half_x, -half_y, half_x, half_y)
     corners = [(-half_x, -half_y), (half_x, -half_y), (half_x, half_y), (-half_x, half_y)]
     ways = [((1.0, 0.0), (0.0, -1.0)), ((0.0, 1.0), (1.0, 0.0)), ((-1.0, 0.0), (0.0, 1.0)), ((0.0, -1.0), (-1.0, 0.0))]
     for corner, (along, out), half in zip(corners, ways, (half_x, half_y) * 2, strict=True):
-        niches_along(draw, plan, Side(corner, along, out), 2.0 * half)
+        cut_niches(draw, plan, Side(corner, along, out), 2.0 * half)
     x, y = half_x - 2.5, half_y - 2.5
     middle_x, middle_y = half_x - 11.0, half_y - 11.0
     route = [
@@ -295,15 +295,15 @@ def twins(draw: np.random.Generator, settings: Settings) -> Building:
     """
     depth = 68.0 * settings.size
     plan = FloorPlan()
-    plan.free(-_OFF - 9.0, 0.0, _OFF + 9.0, depth)
+    plan.cut_rectangle(-_OFF - 9.0, 0.0, _OFF + 9.0, depth)
     back = -_ROOM - 2.0 * _WALL
     for x in (-_OFF, _OFF):
-        plan.free(x - 0.5 * _ROOM, -_WALL - _ROOM, x + 0.5 * _ROOM, -_WALL)
-        plan.free(x - _HALF_DOOR, back - 0.1, x + _HALF_DOOR, 0.1)
+        plan.cut_rectangle(x - 0.5 * _ROOM, -_WALL - _ROOM, x + 0.5 * _ROOM, -_WALL)
+        plan.cut_rectangle(x - _HALF_DOOR, back - 0.1, x + _HALF_DOOR, 0.1)
         # A niche on one side only, so that the room has no symmetry of its own.
-        plan.free(x + 0.5 * _ROOM - 0.1, -2.0, x + 0.5 * _ROOM + 0.4, -1.0)
-    plan.free(-_OFF - 5.0, back - _BACK, _OFF + 5.0, back)
-    niches_along(draw, plan, Side((-_OFF - 5.0, back - _BACK), (1.0, 0.0), (0.0, -1.0)), 2.0 * _OFF + 10.0)
+        plan.cut_rectangle(x + 0.5 * _ROOM - 0.1, -2.0, x + 0.5 * _ROOM + 0.4, -1.0)
+    plan.cut_rectangle(-_OFF - 5.0, back - _BACK, _OFF + 5.0, back)
+    cut_niches(draw, plan, Side((-_OFF - 5.0, back - _BACK), (1.0, 0.0), (0.0, -1.0)), 2.0 * _OFF + 10.0)
     far, behind = depth - 8.0, back - 0.5 * _BACK
     again = _OFF if draw.random() < 0.5 else -_OFF
     route = [
@@ -323,4 +323,4 @@ def twins(draw: np.random.Generator, settings: Settings) -> Building:
         (-_OFF, 3.0),
     ]
     places = {name: np.array([x, 0.0, -0.5 * np.pi]) for name, x in (("first", -_OFF), ("second", _OFF))}
-    return Building(plan.walls(), np.array(route), places=places)
+    return Building(plan.walls(), np.array(route), twin_frames=places)

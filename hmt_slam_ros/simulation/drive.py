@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry import se2
 
-_SHARPEST = math.radians(120.0)  # beyond it the robot stops and turns on the spot
-_NOTHING = 1e-9
+_MAX_ROUNDED_TURN = math.radians(120.0)  # beyond it the robot stops and turns on the spot
+_EPSILON = 1e-9
 
 
-class Path(NamedTuple):
+class DrivePath(NamedTuple):
     """Stretches of constant curvature, one after the other.
 
     :ivar starts: shape (n, 3), ``world_T_base`` where each begins, m and rad.
@@ -29,23 +29,23 @@ class Path(NamedTuple):
     turns: NDArray[np.float64]
 
     @property
-    def on_the_spot(self) -> NDArray[np.bool_]:
+    def is_turn_in_place(self) -> NDArray[np.bool_]:
         """Stretches on which the robot only turns, shape (n,)."""
         return self.lengths == 0.0
 
     @property
     def sizes(self) -> NDArray[np.float64]:
         """How far to go on each stretch, shape (n,): m, or rad on the spot."""
-        return np.where(self.on_the_spot, np.abs(self.turns), self.lengths)
+        return np.where(self.is_turn_in_place, np.abs(self.turns), self.lengths)
 
-    def pose(self, stretch: NDArray[np.intp], gone: NDArray[np.float64]) -> NDArray[np.float64]:
+    def poses_at(self, stretch: NDArray[np.intp], gone: NDArray[np.float64]) -> NDArray[np.float64]:
         """``world_T_base`` (k, 3) after going a part of a stretch, in the unit of `sizes`; both of shape (k,)."""
         share = gone / self.sizes[stretch]
         twists = np.stack((self.lengths[stretch], np.zeros(stretch.size), self.turns[stretch]), axis=1)
         return se2.compose(self.starts[stretch], se2.exp(share[:, None] * twists))
 
 
-def path_through(points: NDArray[np.float64], rounding: float) -> Path:
+def path_through(points: NDArray[np.float64], rounding: float) -> DrivePath:
     """The way through way-points.
 
     :param points: shape (k, 2), m.
@@ -54,7 +54,7 @@ def path_through(points: NDArray[np.float64], rounding: float) -> Path:
     """
     legs = np.diff(points, axis=0)
     lengths = np.hypot(legs[:, 0], legs[:, 1])
-    apart = lengths > _NOTHING
+    apart = lengths > _EPSILON
     if not apart.any():
         raise HmtSlamError("the route has no two different way-points: give at least two.")
     lengths, headings = lengths[apart], np.arctan2(legs[apart, 1], legs[apart, 0])
@@ -64,26 +64,28 @@ def path_through(points: NDArray[np.float64], rounding: float) -> Path:
     for k, length in enumerate(lengths.tolist()):
         before, after = (cuts[k - 1] if k else 0.0), (cuts[k] if k < turns.size else 0.0)
         stretches.append((length - before - after, 0.0))
-        if k < turns.size and abs(turns[k]) > _NOTHING:
+        if k < turns.size and abs(turns[k]) > _EPSILON:
             radius = after / math.tan(0.5 * abs(turns[k])) if after else 0.0
             stretches.append((radius * abs(turns[k]), turns[k]))
-    return _joined(np.array([*points[0], headings[0]]), [part for part in stretches if max(map(abs, part)) > _NOTHING])
+    return _chain_segments(
+        np.array([*points[0], headings[0]]), [part for part in stretches if max(map(abs, part)) > _EPSILON]
+    )
 
 
 def _cuts(lengths: NDArray[np.float64], turns: NDArray[np.float64], rounding: float) -> NDArray[np.float64]:
     """How far before and behind each corner its arc begins and ends, m; 0 for a turn on the spot."""
     room = 0.5 * np.minimum(lengths[:-1], lengths[1:])
-    sharp = np.abs(turns) > _SHARPEST
+    sharp = np.abs(turns) > _MAX_ROUNDED_TURN
     half = 0.5 * np.where(sharp, 0.0, np.abs(turns))
     return np.where(sharp, 0.0, np.minimum(rounding * np.tan(half), room))
 
 
-def _joined(start: NDArray[np.float64], stretches: list[tuple[float, float]]) -> Path:
+def _chain_segments(start: NDArray[np.float64], stretches: list[tuple[float, float]]) -> DrivePath:
     starts = [start]
     for length, turn in stretches:
         starts.append(se2.compose(starts[-1], se2.exp(np.array([length, 0.0, turn]))))
     lengths, turns = np.array(stretches).T
-    return Path(np.array(starts[:-1]), lengths, turns)
+    return DrivePath(np.array(starts[:-1]), lengths, turns)
 
 
 ACCELERATION = 0.5
@@ -100,15 +102,15 @@ class Drive:
     :ivar path: the way.
     :ivar stretches: shape (n,), stretch of the path of each phase.
     :ivar times: shape (n + 1,), s, when each phase begins, and the end of the last.
-    :ivar gone: shape (n,), what lies behind the robot on the stretch when the phase begins, m or rad.
+    :ivar offsets: shape (n,), what lies behind the robot on the stretch when the phase begins, m or rad.
     :ivar speeds: shape (n,), when the phase begins, m/s or rad/s.
     :ivar accelerations: shape (n,), m/s^2 or rad/s^2.
     """
 
-    path: Path
+    path: DrivePath
     stretches: NDArray[np.intp]
     times: NDArray[np.float64]
-    gone: NDArray[np.float64]
+    offsets: NDArray[np.float64]
     speeds: NDArray[np.float64]
     accelerations: NDArray[np.float64]
 
@@ -122,17 +124,17 @@ class Drive:
         within = np.clip(seconds, 0.0, self.duration)
         phase = np.clip(np.searchsorted(self.times, within, side="right") - 1, 0, self.stretches.size - 1)
         passed = within - self.times[phase]
-        gone = self.gone[phase] + (self.speeds[phase] + 0.5 * self.accelerations[phase] * passed) * passed
-        return self.path.pose(self.stretches[phase], gone)
+        gone = self.offsets[phase] + (self.speeds[phase] + 0.5 * self.accelerations[phase] * passed) * passed
+        return self.path.poses_at(self.stretches[phase], gone)
 
 
-def drive_along(path: Path, speed: float, turn_rate: float) -> Drive:
+def drive_along(path: DrivePath, speed: float, turn_rate: float) -> Drive:
     """Drive a path from standstill to standstill.
 
     :param speed: at most, m/s.
     :param turn_rate: at most, rad/s.
     """
-    sizes, spots = path.sizes, path.on_the_spot
+    sizes, spots = path.sizes, path.is_turn_in_place
     limits = np.minimum(speed, turn_rate * path.lengths / np.maximum(np.abs(path.turns), 1e-12))
     limits = np.where(spots, turn_rate, limits)
     accelerations = np.where(spots, TURN_ACCELERATION, ACCELERATION)

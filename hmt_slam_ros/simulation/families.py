@@ -20,12 +20,12 @@ class Family:
 
     :ivar build: draws one.
     :ivar description: one sentence.
-    :ivar own: settings that differ from the defaults where nobody sets them.
+    :ivar default_settings: settings that differ from the defaults where nobody sets them.
     """
 
     build: Callable[[np.random.Generator, Settings], Building]
     description: str
-    own: Mapping[str, Value] = field(default_factory=dict)
+    default_settings: Mapping[str, Value] = field(default_factory=dict)
 
 
 FAMILIES: dict[str, Family] = {

@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.random_streams import Purpose, stream
-from hmt_slam_ros.simulation.building import Building, boxes
+from hmt_slam_ros.random_streams import Purpose, random_stream
+from hmt_slam_ros.simulation.building import Building, furniture_walls
 from hmt_slam_ros.simulation.drive import Drive
-from hmt_slam_ros.simulation.laser import WallIndex, clear_between, clearance, wall_index
+from hmt_slam_ros.simulation.laser import WallIndex, clearance, has_line_of_sight, wall_index
 from hmt_slam_ros.simulation.settings import Settings
 
 Rectangle = tuple[float, float, float, float]
@@ -26,7 +26,7 @@ _LOOK = 0.5  # s, between two looks of the robot around
 _GAP = 5.0  # s, that nobody sees a piece while it is moved, at least
 
 
-class Furnishing(NamedTuple):
+class FurnitureSchedule(NamedTuple):
     """Where the furniture stands over time.
 
     :ivar times: shape (k,), s, increasing from 0; at each one piece has been moved.
@@ -44,17 +44,17 @@ def furnish(draw: np.random.Generator, rooms: Sequence[Rectangle], route: NDArra
     :param route: shape (k, 2), m.
     :returns: shape (m, 5), as in `Building`.
     """
-    way = _along(route)
+    way = _sample_route(route)
     pieces = []
     for room in rooms:
         for _ in range(draw.integers(1, 5)):
-            piece = _along_a_wall(draw, room)
-            if clearance(boxes(piece[None]), way).min() > _BERTH:
+            piece = _draw_piece_at_wall(draw, room)
+            if clearance(furniture_walls(piece[None]), way).min() > _BERTH:
                 pieces.append(piece)
     return np.array(pieces).reshape(-1, 5)
 
 
-def _along(route: NDArray[np.float64]) -> NDArray[np.float64]:
+def _sample_route(route: NDArray[np.float64]) -> NDArray[np.float64]:
     """Points of the lines between way-points, 0.1 m apart at most, shape (n, 2)."""
     parts = [
         start + np.linspace(0.0, 1.0, 2 + int(np.hypot(*(end - start)) / 0.1))[:, None] * (end - start)
@@ -63,7 +63,7 @@ def _along(route: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.concatenate(parts)
 
 
-def _along_a_wall(draw: np.random.Generator, room: Rectangle) -> NDArray[np.float64]:
+def _draw_piece_at_wall(draw: np.random.Generator, room: Rectangle) -> NDArray[np.float64]:
     length, width = draw.uniform(0.6, 1.6), draw.uniform(0.4, 0.8)
     low, high = np.array(room[:2]), np.array(room[2:])
     axis, far = draw.integers(2), draw.random() < 0.5
@@ -75,22 +75,22 @@ def _along_a_wall(draw: np.random.Generator, room: Rectangle) -> NDArray[np.floa
     return np.array([*middle, 0.5 * np.pi * axis, length, width])
 
 
-def revisited(building: Building, settings: Settings) -> Building:
+def change_since_first_visit(building: Building, settings: Settings) -> Building:
     """The building as it is at a later visit: pieces moved, doors that are not on the way closed, some of both."""
     if not settings.visit:
         return building
-    way, walls = _along(building.route), wall_index(building.walls)
-    draw = stream(settings.run_seed, Purpose.CHANGES, 0)
+    way, walls = _sample_route(building.route), wall_index(building.walls)
+    draw = random_stream(settings.run_seed, Purpose.CHANGES, 0)
     pieces = building.furniture.copy()
     for k in np.flatnonzero(draw.random(len(pieces)) < settings.changed):
-        moved = _somewhere_near(draw, walls, way, pieces[k], pieces[k])
+        moved = _draw_moved_piece(draw, walls, way, pieces[k], pieces[k])
         pieces[k] = pieces[k] if moved is None else moved
     aside = np.array([clearance(door[None], way).min() > _BERTH for door in building.doors], dtype=np.bool_)
     closed = building.doors[aside & (draw.random(len(aside)) < settings.changed)]
     return replace(building, walls=np.concatenate((building.walls, closed)), furniture=pieces)
 
 
-def furnishing(building: Building, walls: WallIndex, drive: Drive, settings: Settings) -> Furnishing:
+def schedule_furniture(building: Building, walls: WallIndex, drive: Drive, settings: Settings) -> FurnitureSchedule:
     """Move pieces at random between two visits of the robot: out of its sight, not far, and never into its way.
 
     :param walls: of the building, without its furniture.
@@ -99,38 +99,40 @@ def furnishing(building: Building, walls: WallIndex, drive: Drive, settings: Set
     eyes = drive.poses(times)[:, :2]
     moves: list[tuple[float, int, NDArray[np.float64]]] = []
     for k, piece in enumerate(building.furniture if settings.moved > 0.0 else ()):
-        draw = stream(settings.run_seed, Purpose.FURNITURE, k)
+        draw = random_stream(settings.run_seed, Purpose.FURNITURE, k)
         at = piece
-        for gap in _unseen(_seen(walls, eyes, piece, settings.range)):
+        for gap in _unseen_gaps(_is_visible(walls, eyes, piece, settings.range)):
             time, there = times[gap], draw.random() < settings.moved
-            found = _somewhere_near(draw, walls, eyes, at, piece) if there else None
-            if found is not None and not _seen(walls, eyes[gap : gap + 1], found, settings.range)[0]:
+            found = _draw_moved_piece(draw, walls, eyes, at, piece) if there else None
+            if found is not None and not _is_visible(walls, eyes[gap : gap + 1], found, settings.range)[0]:
                 moves.append((float(time), k, found))
                 at = found
     pieces = [building.furniture]
     for _, k, piece in sorted(moves, key=lambda move: move[:2]):
         pieces.append(pieces[-1].copy())
         pieces[-1][k] = piece
-    return Furnishing(np.array([0.0, *sorted(time for time, _, _ in moves)]), np.array(pieces))
+    return FurnitureSchedule(np.array([0.0, *sorted(time for time, _, _ in moves)]), np.array(pieces))
 
 
-def _seen(walls: WallIndex, eyes: NDArray[np.float64], piece: NDArray[np.float64], reach: float) -> NDArray[np.bool_]:
+def _is_visible(
+    walls: WallIndex, eyes: NDArray[np.float64], piece: NDArray[np.float64], reach: float
+) -> NDArray[np.bool_]:
     """Whether any corner of a piece is in reach and in sight from each of some points (n, 2), shape (n,)."""
     seen = np.zeros(len(eyes), dtype=np.bool_)
-    for corner in boxes(piece[None])[:, :2]:
+    for corner in furniture_walls(piece[None])[:, :2]:
         near = np.hypot(*(eyes - corner).T) <= reach
-        seen |= near & clear_between(walls, eyes, np.broadcast_to(corner, eyes.shape).copy())
+        seen |= near & has_line_of_sight(walls, eyes, np.broadcast_to(corner, eyes.shape).copy())
     return seen
 
 
-def _unseen(seen: NDArray[np.bool_]) -> NDArray[np.intp]:
+def _unseen_gaps(seen: NDArray[np.bool_]) -> NDArray[np.intp]:
     """The middle of every gap that is long enough between two stretches in which something is seen."""
     looks = np.flatnonzero(seen)
     gaps = np.flatnonzero(np.diff(looks) * _LOOK > _GAP)
     return (looks[gaps] + looks[gaps + 1]) // 2
 
 
-def _somewhere_near(
+def _draw_moved_piece(
     draw: np.random.Generator,
     walls: WallIndex,
     way: NDArray[np.float64],
@@ -141,8 +143,8 @@ def _somewhere_near(
     for _ in range(_TRIES):
         pose = se2.compose(home[:3], _MOVE * draw.standard_normal(3))
         moved = np.array([*pose, *home[3:]])
-        sides = np.concatenate((boxes(moved[None]), [[*piece[:2], *pose[:2]]]))
-        free = clear_between(walls, sides[:, :2].copy(), sides[:, 2:].copy()).all()
-        if free and clearance(boxes(moved[None]), way).min() > _BERTH:
+        sides = np.concatenate((furniture_walls(moved[None]), [[*piece[:2], *pose[:2]]]))
+        free = has_line_of_sight(walls, sides[:, :2].copy(), sides[:, 2:].copy()).all()
+        if free and clearance(furniture_walls(moved[None]), way).min() > _BERTH:
             return moved
     return None

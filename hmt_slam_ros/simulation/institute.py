@@ -13,8 +13,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hmt_slam_ros.random_streams import Purpose, stream
-from hmt_slam_ros.simulation.building import Building, FloorPlan, Point, Side, States
+from hmt_slam_ros.random_streams import Purpose, random_stream
+from hmt_slam_ros.simulation.building import Building, FloorPlan, Point, Side, TopologicalStates
 from hmt_slam_ros.simulation.corridors import WALL, Plot, Room, cut_room, doors_and_floors
 from hmt_slam_ros.simulation.furniture import furnish
 from hmt_slam_ros.simulation.settings import Settings
@@ -29,7 +29,7 @@ _FROM_END = 2.0  # m, likewise to the end of a hallway
 _TURN = 1.0  # m, before the end of a hallway, where the robot turns
 
 
-class Floor(NamedTuple):
+class HallwayLayout(NamedTuple):
     """Two hallways from end to end, along x, and two passages that join them, along y.
 
     :ivar end: x of the hallways' ends, and of the other ones with the sign turned, m.
@@ -71,13 +71,13 @@ def institute(draw: np.random.Generator, settings: Settings) -> Building:
 
     The robot drives all hallways and enters all open rooms.
     """
-    floor, sites = _drawn(draw, settings.size)
-    opened = _opened(draw, floor, sites, settings)
+    floor, sites = _draw_layout(draw, settings.size)
+    opened = _draw_open_doors(draw, floor, sites, settings)
     plan = FloorPlan()
     for y, width in zip(floor.ys, floor.hallways, strict=True):
-        plan.free(-floor.end, y - 0.5 * width, floor.end, y + 0.5 * width)
+        plan.cut_rectangle(-floor.end, y - 0.5 * width, floor.end, y + 0.5 * width)
     for x, width in zip(floor.xs, floor.passages, strict=True):
-        plan.free(x - 0.5 * width, floor.ys[0], x + 0.5 * width, floor.ys[1])
+        plan.cut_rectangle(x - 0.5 * width, floor.ys[0], x + 0.5 * width, floor.ys[1])
     rooms = [
         cut_room(plan, site.side, site.plot, floor.hallways[site.hallway], is_open=k in opened)
         for k, site in enumerate(sites)
@@ -91,12 +91,12 @@ def institute(draw: np.random.Generator, settings: Settings) -> Building:
     return Building(plan.walls(), route, furniture.reshape(-1, 5), *doors_and_floors(entered), states=states)
 
 
-def _drawn(draw: np.random.Generator, size: float) -> tuple[Floor, list[Site]]:
+def _draw_layout(draw: np.random.Generator, size: float) -> tuple[HallwayLayout, list[Site]]:
     """Hallways and all rooms, open or not."""
     y0, y1 = -size * draw.uniform(4.6, 5.2), size * draw.uniform(4.6, 5.2)
     x0, x1 = -size * draw.uniform(12.0, 16.0), size * draw.uniform(12.0, 16.0)
     (w0, w1), (p0, p1) = draw.uniform(1.8, 2.4, 2).tolist(), draw.uniform(1.8, 2.4, 2).tolist()
-    floor = Floor(size * _HALF_X, (y0, y1), (x0, x1), (w0, w1), (p0, p1))
+    floor = HallwayLayout(size * _HALF_X, (y0, y1), (x0, x1), (w0, w1), (p0, p1))
     inner = 0.5 * (y1 - y0 - 0.5 * (w0 + w1) - 3.0 * WALL)
     blocks = [(-floor.end, x0 - 0.5 * p0), (x0 + 0.5 * p0, x1 - 0.5 * p1), (x1 + 0.5 * p1, floor.end)]
     sites: list[Site] = []
@@ -104,14 +104,14 @@ def _drawn(draw: np.random.Generator, size: float) -> tuple[Floor, list[Site]]:
         middle, half = floor.ys[hallway], 0.5 * floor.hallways[hallway]
         outer = size * _HALF_Y - abs(middle) - half - WALL
         side = Side((-floor.end, middle + out * half), (1.0, 0.0), (0.0, out))
-        sites += _sites(draw, hallway, side, 2.0 * floor.end, outer, int(draw.integers(1, 6)))
+        sites += _draw_sites(draw, hallway, side, 2.0 * floor.end, outer, int(draw.integers(1, 6)))
         for begin, end in blocks:
             side = Side((begin, middle - out * half), (1.0, 0.0), (0.0, -out))
-            sites += _sites(draw, hallway, side, end - begin, inner, None)
+            sites += _draw_sites(draw, hallway, side, end - begin, inner, None)
     return floor, sites
 
 
-def _sites(
+def _draw_sites(
     draw: np.random.Generator, hallway: int, side: Side, length: float, depth: float, meeting: int | None
 ) -> list[Site]:
     """Rooms one beside the other along a side.
@@ -133,21 +133,25 @@ def _sites(
         begin = end + WALL
 
 
-def _opened(draw: np.random.Generator, floor: Floor, sites: Sequence[Site], settings: Settings) -> set[int]:
+def _draw_open_doors(
+    draw: np.random.Generator, floor: HallwayLayout, sites: Sequence[Site], settings: Settings
+) -> set[int]:
     """Which doors are open: the meeting rooms' first, and at a later visit some others in the stead of some."""
     wanted = round(_OPEN * settings.size)
     order = sorted(draw.permutation(len(sites)).tolist(), key=lambda k: not sites[k].meeting)
-    opened = _filled(floor, sites, [], order, wanted)
+    opened = _open_doors(floor, sites, [], order, wanted)
     if settings.visit:
-        change = stream(settings.run_seed, Purpose.CHANGES, 1)
+        change = random_stream(settings.run_seed, Purpose.CHANGES, 1)
         closed = change.random(len(opened)) < settings.changed
         stay = [k for k, is_closed in zip(opened, closed.tolist(), strict=True) if not is_closed]
         others = [k for k in change.permutation(len(sites)).tolist() if k not in opened]
-        opened = _filled(floor, sites, stay, others, wanted)
+        opened = _open_doors(floor, sites, stay, others, wanted)
     return set(opened)
 
 
-def _filled(floor: Floor, sites: Sequence[Site], opened: Sequence[int], order: Sequence[int], wanted: int) -> list[int]:
+def _open_doors(
+    floor: HallwayLayout, sites: Sequence[Site], opened: Sequence[int], order: Sequence[int], wanted: int
+) -> list[int]:
     """Open more doors in an order, none near to another, a crossing or the end of its hallway, up to as many."""
     filled = list(opened)
     for k in order:
@@ -159,7 +163,7 @@ def _filled(floor: Floor, sites: Sequence[Site], opened: Sequence[int], order: S
     return filled
 
 
-def _route(floor: Floor, sites: Sequence[Site], rooms: Sequence[Room]) -> list[Point]:
+def _route(floor: HallwayLayout, sites: Sequence[Site], rooms: Sequence[Room]) -> list[Point]:
     """East along the southern hallway, over to the northern one, west along it and back, into rooms on the way."""
     end = floor.end - _TURN
     (x0, x1), (y0, y1) = floor.xs, floor.ys
@@ -181,7 +185,7 @@ def _route(floor: Floor, sites: Sequence[Site], rooms: Sequence[Room]) -> list[P
     ]
 
 
-def _states(floor: Floor, sites: Sequence[Site], rooms: Sequence[Room]) -> States:
+def _states(floor: HallwayLayout, sites: Sequence[Site], rooms: Sequence[Room]) -> TopologicalStates:
     """The four crossings, then the doors of open rooms."""
     up = 0.5 * math.pi
     rows = [
@@ -193,7 +197,7 @@ def _states(floor: Floor, sites: Sequence[Site], rooms: Sequence[Room]) -> State
         heading = math.copysign(up, site.side.out[1])
         rows.append((*room.front, heading, 0.5 * floor.hallways[site.hallway], site.plot.door, False))
     table = np.array(rows, dtype=np.float64)
-    return States(table[:, :3], table[:, 3], table[:, 4], table[:, 5].astype(np.bool_))
+    return TopologicalStates(table[:, :3], table[:, 3], table[:, 4], table[:, 5].astype(np.bool_))
 
 
 def _contains(room: Room, piece: NDArray[np.float64]) -> bool:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from hmt_slam_ros.arrays import Bool, Float64, Int32, Int64
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.random_streams import Purpose, stream
+from hmt_slam_ros.random_streams import Purpose, random_stream
 from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.simulation.settings import Settings
 
@@ -52,15 +52,15 @@ def wall_index(walls: NDArray[np.float64], cell: float = _CELL) -> WallIndex:
     corner = ends.min(axis=0) - cell
     shape = np.ceil((ends.max(axis=0) - corner) / cell).astype(np.int64) + 1
     counts = np.zeros(shape[0] * shape[1] + 1, dtype=np.int32)
-    _sort(walls, corner, shape, cell, counts, np.empty(0, dtype=np.int32))
+    _fill_cells(walls, corner, shape, cell, counts, np.empty(0, dtype=np.int32))
     starts = np.cumsum(counts, dtype=np.int32)
     members = np.empty(starts[-1], dtype=np.int32)
-    _sort(walls, corner, shape, cell, starts[:-1].copy(), members)
+    _fill_cells(walls, corner, shape, cell, starts[:-1].copy(), members)
     return WallIndex(walls, corner, shape, cell, starts, members)
 
 
 @njit(cache=True)
-def _sort(walls: Float64, corner: Float64, shape: Int64, cell: float, at: Int32, members: Int32) -> None:
+def _fill_cells(walls: Float64, corner: Float64, shape: Int64, cell: float, at: Int32, members: Int32) -> None:
     """Count the walls of every cell, in the place behind it; or, given where each cell begins, fill the cells in."""
     for k in range(walls.shape[0]):
         ax, ay = (walls[k, 0] - corner[0]) / cell, (walls[k, 1] - corner[1]) / cell
@@ -81,7 +81,7 @@ def _sort(walls: Float64, corner: Float64, shape: Int64, cell: float, at: Int32,
 
 
 @njit(cache=True)
-def cast(index: WallIndex, origins: Float64, angles: Float64, reach: float) -> Float64:
+def cast_rays(index: WallIndex, origins: Float64, angles: Float64, reach: float) -> Float64:
     """Distance to the nearest wall along each beam.
 
     :param origins: shape (n, 2), m.
@@ -91,12 +91,12 @@ def cast(index: WallIndex, origins: Float64, angles: Float64, reach: float) -> F
     """
     distances = np.empty(angles.shape[0])
     for n in range(angles.shape[0]):
-        distances[n] = _cast_one(index, origins[n, 0], origins[n, 1], math.cos(angles[n]), math.sin(angles[n]), reach)
+        distances[n] = _cast_ray(index, origins[n, 0], origins[n, 1], math.cos(angles[n]), math.sin(angles[n]), reach)
     return distances
 
 
 @njit(cache=True)
-def clear_between(index: WallIndex, starts: Float64, ends: Float64) -> Bool:
+def has_line_of_sight(index: WallIndex, starts: Float64, ends: Float64) -> Bool:
     """Whether there is no wall between two points, for each of n pairs (n, 2), m; shape (n,)."""
     clear = np.empty(starts.shape[0], dtype=np.bool_)
     for n in range(starts.shape[0]):
@@ -105,16 +105,16 @@ def clear_between(index: WallIndex, starts: Float64, ends: Float64) -> Bool:
         if away == 0.0:
             clear[n] = True
         else:
-            clear[n] = _cast_one(index, starts[n, 0], starts[n, 1], dx / away, dy / away, away) == math.inf
+            clear[n] = _cast_ray(index, starts[n, 0], starts[n, 1], dx / away, dy / away, away) == math.inf
     return clear
 
 
 @njit(cache=True)
-def _cast_one(index: WallIndex, x: float, y: float, cos: float, sin: float, reach: float) -> float:
+def _cast_ray(index: WallIndex, x: float, y: float, cos: float, sin: float, reach: float) -> float:
     columns, rows = index.shape[0], index.shape[1]
     gx, gy = (x - index.corner[0]) / index.cell, (y - index.corner[1]) / index.cell
-    enter, leave_x = _crossing(gx, cos, columns)
-    other, leave_y = _crossing(gy, sin, rows)
+    enter, leave_x = _clip_to_grid(gx, cos, columns)
+    other, leave_y = _clip_to_grid(gy, sin, rows)
     enter, leave = max(enter, other), min(leave_x, leave_y, reach / index.cell)
     if enter > leave:
         return math.inf
@@ -129,7 +129,7 @@ def _cast_one(index: WallIndex, x: float, y: float, cos: float, sin: float, reac
     while True:
         number = row * columns + column
         for place in range(index.starts[number], index.starts[number + 1]):
-            nearest = min(nearest, _meeting(index.walls, index.members[place], x, y, cos, sin))
+            nearest = min(nearest, _distance_to_wall(index.walls, index.members[place], x, y, cos, sin))
         border = min(next_x, next_y)
         if nearest <= border * index.cell or border > leave:
             break
@@ -145,7 +145,7 @@ def _cast_one(index: WallIndex, x: float, y: float, cos: float, sin: float, reac
 
 
 @njit(cache=True)
-def _crossing(start: float, direction: float, size: int) -> tuple[float, float]:
+def _clip_to_grid(start: float, direction: float, size: int) -> tuple[float, float]:
     """Where a beam enters the stretch from 0 to ``size``, not before its start, and where it leaves it."""
     if direction == 0.0:
         return (0.0, math.inf) if 0.0 <= start <= size else (math.inf, 0.0)
@@ -154,7 +154,7 @@ def _crossing(start: float, direction: float, size: int) -> tuple[float, float]:
 
 
 @njit(cache=True)
-def _meeting(walls: Float64, k: int, x: float, y: float, cos: float, sin: float) -> float:
+def _distance_to_wall(walls: Float64, k: int, x: float, y: float, cos: float, sin: float) -> float:
     """Distance along a beam to a wall, inf where it passes; a wall along the beam is not seen."""
     ox, oy = walls[k, 0] - x, walls[k, 1] - y
     dx, dy = walls[k, 2] - walls[k, 0], walls[k, 3] - walls[k, 1]
@@ -167,7 +167,7 @@ def _meeting(walls: Float64, k: int, x: float, y: float, cos: float, sin: float)
 
 
 @njit(cache=True)
-def cast_discs(discs: Float64, origins: Float64, angles: Float64, distances: Float64) -> None:
+def shorten_at_discs(discs: Float64, origins: Float64, angles: Float64, distances: Float64) -> None:
     """Shorten distances (n,), m, to those discs that stand before them; a beam from within a disc does not see it.
 
     :param discs: shape (k, 3), x, y and radius, m.
@@ -233,8 +233,8 @@ class Laser:
         lasers = se2.compose(poses, self.pose)
         origins = np.ascontiguousarray(np.broadcast_to(lasers[:, :2], (self.angles.size, 2)))
         angles = lasers[:, 2] + self.angles
-        distances = cast(walls, origins, angles, self.reach)
-        cast_discs(discs, origins, angles, distances)
+        distances = cast_rays(walls, origins, angles, self.reach)
+        shorten_at_discs(discs, origins, angles, distances)
         return distances
 
     def scan(self, number: int, stamp: int, distances: NDArray[np.float64]) -> Scan:
@@ -243,7 +243,7 @@ class Laser:
         :param number: of the scan, which determines its noise.
         """
         settings = self._settings
-        draw = stream(settings.run_seed, Purpose.LASER, number)
+        draw = random_stream(settings.run_seed, Purpose.LASER, number)
         ranges = distances + settings.range_noise * draw.standard_normal(distances.size)
         lost = (draw.random(distances.size) < settings.dropout) | (ranges >= settings.range)
         kept = np.where(lost, np.inf, np.maximum(ranges, 0.0))

@@ -10,64 +10,66 @@ from numpy.typing import NDArray
 
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.random_streams import Purpose, stream
+from hmt_slam_ros.random_streams import Purpose, random_stream
 from hmt_slam_ros.sensors import Scan
-from hmt_slam_ros.simulation.building import Building, boxes
+from hmt_slam_ros.simulation.building import Building, furniture_walls
 from hmt_slam_ros.simulation.drive import Drive, drive_along, path_through
-from hmt_slam_ros.simulation.furniture import furnishing, revisited
+from hmt_slam_ros.simulation.furniture import change_since_first_visit, schedule_furniture
 from hmt_slam_ros.simulation.laser import Laser, WallIndex, clearance, wall_index
-from hmt_slam_ros.simulation.people import people_on
+from hmt_slam_ros.simulation.people import draw_people
 from hmt_slam_ros.simulation.settings import Settings
-from hmt_slam_ros.simulation.wheels import noisy_increments, readings_between, slips
+from hmt_slam_ros.simulation.wheels import draw_slips, noisy_increments, odometry_readings
 
 
 @dataclass(frozen=True)
-class CarriedDrive:
+class KidnappedDrive:
     """A drive of which a part is left out or driven once more; where it goes on, the robot first turns to its way.
 
     :ivar drive: without that.
-    :ivar at: s, when the robot is carried, in no time.
-    :ivar to: s, the time at which the drive passes where it is put.
-    :ivar turned: rad, by how much more than there it is turned to the left when it is put down.
-    :ivar turning: s, that it takes to turn back.
+    :ivar kidnap_time: s, when the robot is carried, in no time.
+    :ivar resume_time: s, the time at which the drive passes where it is put.
+    :ivar heading_offset: rad, by how much more than there it is turned to the left when it is put down.
+    :ivar turn_duration: s, that it takes to turn back.
     """
 
     drive: Drive
-    at: float
-    to: float
-    turned: float
-    turning: float
+    kidnap_time: float
+    resume_time: float
+    heading_offset: float
+    turn_duration: float
 
     @property
     def duration(self) -> float:
         """Seconds from start to end."""
-        return self.at + self.turning + self.drive.duration - self.to
+        return self.kidnap_time + self.turn_duration + self.drive.duration - self.resume_time
 
     def poses(self, seconds: NDArray[np.float64]) -> NDArray[np.float64]:
         """``world_T_base`` (k, 3), m and rad, at times (k,), s."""
-        since = seconds - self.at
-        poses = self.drive.poses(np.where(since < 0.0, seconds, self.to + np.maximum(0.0, since - self.turning)))
-        left = 1.0 - np.clip(since / max(self.turning, 1e-9), 0.0, 1.0)
-        poses[:, 2] = se2.wrap(poses[:, 2] + np.where(since < 0.0, 0.0, left * self.turned))
+        since = seconds - self.kidnap_time
+        poses = self.drive.poses(
+            np.where(since < 0.0, seconds, self.resume_time + np.maximum(0.0, since - self.turn_duration))
+        )
+        left = 1.0 - np.clip(since / max(self.turn_duration, 1e-9), 0.0, 1.0)
+        poses[:, 2] = se2.wrap(poses[:, 2] + np.where(since < 0.0, 0.0, left * self.heading_offset))
         return poses
 
-    def rolled(self, seconds: NDArray[np.float64]) -> NDArray[np.float64]:
+    def wheel_poses(self, seconds: NDArray[np.float64]) -> NDArray[np.float64]:
         """The same as exact wheels have it, (k, 3): nothing happened when it was carried."""
         poses = self.poses(seconds)
-        before = self.drive.poses(np.array([self.at]))[0]
-        jump = se2.compose(before, se2.inverse(self.poses(np.array([self.at]))[0]))
-        late = seconds >= self.at
+        before = self.drive.poses(np.array([self.kidnap_time]))[0]
+        jump = se2.compose(before, se2.inverse(self.poses(np.array([self.kidnap_time]))[0]))
+        late = seconds >= self.kidnap_time
         poses[late] = se2.compose(jump, poses[late])
         return poses
 
 
-def carried(drive: Drive, settings: Settings) -> CarriedDrive | None:
+def kidnapped_drive(drive: Drive, settings: Settings) -> KidnappedDrive | None:
     """The drive with what settings say of a robot that is carried, None where it never is."""
     if settings.carried == 0.0:
         return None
     turned = math.radians(settings.turned)
     turning = abs(settings.turned) / settings.turn_rate
-    return CarriedDrive(drive, settings.carried * drive.duration, settings.to * drive.duration, turned, turning)
+    return KidnappedDrive(drive, settings.carried * drive.duration, settings.to * drive.duration, turned, turning)
 
 
 START = 1_000_000_000_000
@@ -96,28 +98,33 @@ class Scenario:
     """
 
     def __init__(self, building: Building, settings: Settings) -> None:
-        building = revisited(building, settings)
+        building = change_since_first_visit(building, settings)
         self.settings, self.building = settings, building
         route = driven_route(building.route, settings.laps)
         path = path_through(route, settings.rounding)
         self.drive: Drive = drive_along(path, settings.speed, math.radians(settings.turn_rate))
         self.laser = Laser(settings)
         self.walls: WallIndex = wall_index(building.walls)
-        self._furnishing = furnishing(building, self.walls, self.drive, settings)
-        self._check_clear()
-        self._furnished = [
-            wall_index(np.concatenate((building.walls, boxes(pieces)))) for pieces in self._furnishing.pieces
+        self._furniture_schedule = schedule_furniture(building, self.walls, self.drive, settings)
+        self._check_clearance()
+        self._wall_indices = [
+            wall_index(np.concatenate((building.walls, furniture_walls(pieces))))
+            for pieces in self._furniture_schedule.pieces
         ]
-        self.people = people_on(self.drive, settings.people, settings.run_seed)
-        self._carried = carried(self.drive, settings)
-        self._driven = self._carried or self.drive
-        scans = 1 + math.floor(self._driven.duration * settings.rate)
+        self.people = draw_people(self.drive, settings.people, settings.run_seed)
+        self._kidnapped_drive = kidnapped_drive(self.drive, settings)
+        self._executed_drive = self._kidnapped_drive or self.drive
+        scans = 1 + math.floor(self._executed_drive.duration * settings.rate)
         ticks = np.arange((scans - 1) * settings.readings + 1)
         period = 1.0 / (settings.rate * settings.readings)
         self.stamps: NDArray[np.int64] = START + np.round(_SECOND * period * ticks).astype(np.int64)
         self.poses = self.true_poses(self.stamps)
-        self._rolled = self.poses if self._carried is None else self._carried.rolled(self._seconds(self.stamps))
-        self.slips = self._slips()
+        self._wheel_poses = (
+            self.poses
+            if self._kidnapped_drive is None
+            else self._kidnapped_drive.wheel_poses(self._seconds(self.stamps))
+        )
+        self.slips = self._draw_slips()
         self.odometry = self._odometry()
 
     @property
@@ -128,11 +135,11 @@ class Scenario:
     @property
     def surfaces(self) -> WallIndex:
         """Walls, closed doors and furniture as they are at first."""
-        return self._furnished[0]
+        return self._wall_indices[0]
 
     def true_poses(self, stamps: NDArray[np.int64]) -> NDArray[np.float64]:
         """``world_T_base`` (n, 3), m and rad, at any stamps (n,), ns."""
-        return self._driven.poses(self._seconds(stamps))
+        return self._executed_drive.poses(self._seconds(stamps))
 
     def scan(self, number: int) -> Scan:
         """A scan by its number, from 0."""
@@ -141,36 +148,38 @@ class Scenario:
     def distances(self, number: int) -> NDArray[np.float64]:
         """What the beams of a scan truly meet, shape (n,), m from the laser; inf where that is nothing."""
         seconds = float(self._seconds(self.scan_stamps[number : number + 1])[0])
-        poses = self._driven.poses(seconds + self.laser.times)
-        epoch = int(np.searchsorted(self._furnishing.times, seconds, side="right")) - 1
-        return self.laser.distances(poses, self._furnished[epoch], self.people.discs(seconds, poses[0]))
+        poses = self._executed_drive.poses(seconds + self.laser.times)
+        epoch = int(np.searchsorted(self._furniture_schedule.times, seconds, side="right")) - 1
+        return self.laser.distances(poses, self._wall_indices[epoch], self.people.discs_at(seconds, poses[0]))
 
     def furniture(self, stamp: int) -> NDArray[np.float64]:
         """Where the furniture stands at a stamp, ns, (m, 5) as in `Building`."""
         seconds = self._seconds(np.array([stamp]))[0]
-        return self._furnishing.pieces[int(np.searchsorted(self._furnishing.times, seconds, side="right")) - 1]
+        return self._furniture_schedule.pieces[
+            int(np.searchsorted(self._furniture_schedule.times, seconds, side="right")) - 1
+        ]
 
     def _seconds(self, stamps: NDArray[np.int64]) -> NDArray[np.float64]:
         return (stamps - START) / _SECOND
 
-    def _slips(self) -> NDArray[np.float64]:
+    def _draw_slips(self) -> NDArray[np.float64]:
         settings = self.settings
-        steps = np.diff(self._rolled[:: settings.readings, :2], axis=0)
-        random = stream(settings.run_seed, Purpose.WHEELS, 1)
-        return slips(np.hypot(steps[:, 0], steps[:, 1]), 1.0 / settings.rate, settings.slips, random)
+        steps = np.diff(self._wheel_poses[:: settings.readings, :2], axis=0)
+        random = random_stream(settings.run_seed, Purpose.WHEELS, 1)
+        return draw_slips(np.hypot(steps[:, 0], steps[:, 1]), 1.0 / settings.rate, settings.slips, random)
 
     def _odometry(self) -> NDArray[np.float64]:
         settings = self.settings
-        at_scans = self._rolled[:: settings.readings]
+        at_scans = self._wheel_poses[:: settings.readings]
         true = se2.between(at_scans[:-1], at_scans[1:])
-        random = stream(settings.run_seed, Purpose.WHEELS, 0)
+        random = random_stream(settings.run_seed, Purpose.WHEELS, 0)
         measured = noisy_increments(true, settings.odometry, random) if settings.odometry > 0.0 else true
-        return readings_between(self._rolled, settings.readings, se2.compose(measured, se2.exp(self.slips)))
+        return odometry_readings(self._wheel_poses, settings.readings, se2.compose(measured, se2.exp(self.slips)))
 
-    def _check_clear(self) -> None:
+    def _check_clearance(self) -> None:
         points = self.drive.poses(np.arange(0.0, self.drive.duration + _STEP, _STEP))[:, :2].copy()
-        pieces = self._furnishing.pieces.reshape(-1, 5)
-        for name, walls in (("a wall", self.building.walls), ("furniture", boxes(np.unique(pieces, axis=0)))):
+        pieces = self._furniture_schedule.pieces.reshape(-1, 5)
+        for name, walls in (("a wall", self.building.walls), ("furniture", furniture_walls(np.unique(pieces, axis=0)))):
             free = clearance(walls, points)
             nearest = int(np.argmin(free))
             if free[nearest] < self.settings.radius:

@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from hmt_slam_ros.configuration.flat import Value, changed_one_by_one, parse_setting
+from hmt_slam_ros.configuration.flat import Value, apply_changes, parse_setting
 from hmt_slam_ros.configuration.parameter import parameter
-from hmt_slam_ros.logs.records import SIMULATED
+from hmt_slam_ros.logs.records import SIMULATION_PREFIX
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ def parse_name(log: str | Path) -> tuple[str, dict[str, Value]]:
 
     :raises HmtSlamError: for a setting without ``=``; names and values are checked by `chosen_settings`.
     """
-    world, *settings = str(log).removeprefix(SIMULATED).split(",")
+    world, *settings = str(log).removeprefix(SIMULATION_PREFIX).split(",")
     return world, dict(parse_setting(setting, Settings()) for setting in settings)
 
 
@@ -86,4 +86,4 @@ def chosen_settings(own: Mapping[str, Value], given: Mapping[str, Value]) -> Set
 
     :raises HmtSlamError: for an unknown name, a value of the wrong type or out of range.
     """
-    return changed_one_by_one(Settings(), {**own, **given}, "docs/simulation.md")
+    return apply_changes(Settings(), {**own, **given}, "docs/simulation.md")

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.simulation.laser import Laser, WallIndex, clear_between
+from hmt_slam_ros.simulation.laser import Laser, WallIndex, has_line_of_sight
 
 _SHORT_OF_WALL = 0.01  # m, where the view of a point on a wall ends
 _SLACK = 1e-9  # rad, that the outermost beam is counted in
@@ -28,7 +28,7 @@ def same_place(
     one, other = poses[:, :2], others[:, :2]
     near = np.hypot(*(one[:, None] - other[None]).transpose(2, 0, 1)) <= radius
     rows, columns = np.nonzero(near)
-    near[rows, columns] = clear_between(walls, one[rows], other[columns])
+    near[rows, columns] = has_line_of_sight(walls, one[rows], other[columns])
     return near
 
 
@@ -45,18 +45,18 @@ def shared_view(
     :returns: shape (n, m), from 0 to 1.
     """
     lasers, other_lasers = se2.compose(poses, laser.pose), se2.compose(others, laser.pose)
-    points, other_points = (_points(walls, laser, p) for p in (poses, others))
+    points, other_points = (_visible_wall_points(walls, laser, p) for p in (poses, others))
     shares = np.zeros((len(poses), len(others)))
     near = np.hypot(*(lasers[:, None, :2] - other_lasers[None, :, :2]).transpose(2, 0, 1)) < 2.0 * laser.reach
     for i, k in zip(*np.nonzero(near), strict=True):
         if len(points[i]) and len(other_points[k]):
-            there = _visible(walls, laser, other_lasers[k], points[i])
-            here = _visible(walls, laser, lasers[i], other_points[k])
+            there = _is_visible(walls, laser, other_lasers[k], points[i])
+            here = _is_visible(walls, laser, lasers[i], other_points[k])
             shares[i, k] = 0.5 * (there.mean() + here.mean())
     return shares
 
 
-def _points(walls: WallIndex, laser: Laser, poses: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+def _visible_wall_points(walls: WallIndex, laser: Laser, poses: NDArray[np.float64]) -> list[NDArray[np.float64]]:
     """Where the beams of each pose end on walls, (k, 2) each, m, in the world."""
     ends = []
     for pose in poses:
@@ -68,7 +68,7 @@ def _points(walls: WallIndex, laser: Laser, poses: NDArray[np.float64]) -> list[
     return ends
 
 
-def _visible(
+def _is_visible(
     walls: WallIndex, laser: Laser, eye: NDArray[np.float64], points: NDArray[np.float64]
 ) -> NDArray[np.bool_]:
     """Which points on walls (k, 2) a laser at ``world_T_laser`` (3,) sees, shape (k,)."""
@@ -76,4 +76,4 @@ def _visible(
     away = np.hypot(local[:, 0], local[:, 1])
     ahead = np.abs(np.arctan2(local[:, 1], local[:, 0])) <= laser.half_field + _SLACK
     short = points + (eye[:2] - points) * np.minimum(1.0, _SHORT_OF_WALL / np.maximum(away, 1e-9))[:, None]
-    return ahead & (away < laser.reach) & clear_between(walls, np.tile(eye[:2], (len(points), 1)), short)
+    return ahead & (away < laser.reach) & has_line_of_sight(walls, np.tile(eye[:2], (len(points), 1)), short)

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmt_slam_ros.errors import HmtSlamError
-from hmt_slam_ros.logs.records import SIMULATED, LogRecord, Window, require_scans
+from hmt_slam_ros.logs.records import SIMULATION_PREFIX, LogRecord, TimeWindow, require_scans
 from hmt_slam_ros.logs.stamps import NANOSECONDS
-from hmt_slam_ros.random_streams import Purpose, stream
+from hmt_slam_ros.random_streams import Purpose, random_stream
 from hmt_slam_ros.sensors import Odometry
 from hmt_slam_ros.simulation import sight
 from hmt_slam_ros.simulation.families import FAMILIES
@@ -26,11 +26,11 @@ class SimulatedLog:
     :ivar scenario: the world behind it.
     """
 
-    def __init__(self, name: str, scenario: Scenario, window: Window) -> None:
+    def __init__(self, name: str, scenario: Scenario, window: TimeWindow) -> None:
         self.scenario = scenario
         self._name = name
         stamps, readings = scenario.stamps, scenario.settings.readings
-        self._part = window.among(stamps)
+        self._part = window.select(stamps)
         in_part = np.arange(stamps.size)[self._part] % readings == 0
         self._scan_count = int(in_part.sum())
         require_scans(name, self._scan_count, stamps.size)
@@ -83,7 +83,7 @@ class SimulatedLog:
                 yield LogRecord(stamp, scenario.scan(scan), truth)
 
 
-def open_simulated(log: str | Path, window: Window | None = None) -> SimulatedLog:
+def open_simulated(log: str | Path, window: TimeWindow | None = None) -> SimulatedLog:
     """Make the drive that ``sim:WORLD,name=value,...`` names.
 
     :param log: WORLD is the name of a family or the path of a world file (.yaml).
@@ -93,11 +93,11 @@ def open_simulated(log: str | Path, window: Window | None = None) -> SimulatedLo
     world, given = parse_name(log)
     if world in FAMILIES:
         family = FAMILIES[world]
-        settings = chosen_settings(family.own, given)
-        draw = stream(settings.seed, Purpose.BUILDING, 0)
+        settings = chosen_settings(family.default_settings, given)
+        draw = random_stream(settings.seed, Purpose.BUILDING, 0)
         building = family.build(draw, settings)
         # So that neither the world's axes nor its origin are the map's.
-        building = building.placed(np.array([*draw.uniform(-50.0, 50.0, 2), draw.uniform(-np.pi, np.pi)]))
+        building = building.transform(np.array([*draw.uniform(-50.0, 50.0, 2), draw.uniform(-np.pi, np.pi)]))
     elif Path(world).suffix in {".yaml", ".yml"}:
         building, own = read_world(Path(world))
         settings = chosen_settings(own, given)
@@ -105,4 +105,4 @@ def open_simulated(log: str | Path, window: Window | None = None) -> SimulatedLo
         raise HmtSlamError(
             f"there is no simulated world {world!r}: choose one of {', '.join(FAMILIES)}, or give a .yaml file."
         )
-    return SimulatedLog(str(log).removeprefix(SIMULATED), Scenario(building, settings), window or Window())
+    return SimulatedLog(str(log).removeprefix(SIMULATION_PREFIX), Scenario(building, settings), window or TimeWindow())

@@ -7,9 +7,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from hmt_slam_ros.configuration.metric_slam import Motion
+from hmt_slam_ros.configuration.metric_slam import MotionParameters
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.sensors.motion_model import path_deviations
+from hmt_slam_ros.sensors.motion_model import path_standard_deviations
 
 _SLIP = np.array([0.3, 0.0, math.radians(15.0)])  # deviation of a slip, m, m, rad
 _ITERATIONS = 40
@@ -28,12 +28,14 @@ def noisy_increments(
     :param factor: on all deviations.
     :returns: shape (n, 3).
     """
-    return noised(increments, factor, random.standard_normal(increments.shape))
+    return add_odometry_noise(increments, factor, random.standard_normal(increments.shape))
 
 
-def noised(increments: NDArray[np.float64], factor: float, draws: NDArray[np.float64]) -> NDArray[np.float64]:
+def add_odometry_noise(
+    increments: NDArray[np.float64], factor: float, draws: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """What `noisy_increments` makes of standard normal draws (n, 3)."""
-    motion = Motion()
+    motion = MotionParameters()
     measured = increments
     for _ in range(_ITERATIONS):
         deviations = factor * _deviations(measured, motion)
@@ -42,14 +44,14 @@ def noised(increments: NDArray[np.float64], factor: float, draws: NDArray[np.flo
     return measured
 
 
-def _deviations(increments: NDArray[np.float64], motion: Motion) -> NDArray[np.float64]:
+def _deviations(increments: NDArray[np.float64], motion: MotionParameters) -> NDArray[np.float64]:
     """Deviations (n, 3) of x, y and heading, m, m, rad, that the motion model states for increments (n, 3)."""
     distances = np.hypot(increments[:, 0], increments[:, 1])
-    translation, rotation = path_deviations(distances, np.abs(increments[:, 2]), motion)
+    translation, rotation = path_standard_deviations(distances, np.abs(increments[:, 2]), motion)
     return np.stack((translation, translation, rotation), axis=1)
 
 
-def slips(
+def draw_slips(
     distances: NDArray[np.float64], period: float, per_100_m: float, random: np.random.Generator
 ) -> NDArray[np.float64]:
     """Errors (n, 3) that wheels which slip add to the increments, m, m, rad; each slip lasts about a second.
@@ -66,7 +68,7 @@ def slips(
     return spread / steps
 
 
-def readings_between(poses: NDArray[np.float64], per_scan: int, measured: NDArray[np.float64]) -> NDArray[np.float64]:
+def odometry_readings(poses: NDArray[np.float64], per_scan: int, measured: NDArray[np.float64]) -> NDArray[np.float64]:
     """Odometry readings with given motions from scan to scan, whose errors grow evenly between two scans.
 
     :param poses: shape (n, 3), true poses at the readings, the first of them and every ``per_scan``-th at a scan.
@@ -76,14 +78,14 @@ def readings_between(poses: NDArray[np.float64], per_scan: int, measured: NDArra
     starts = poses[::per_scan]
     errors = se2.log(se2.between(se2.between(starts[:-1], starts[1:]), measured))
     odometry = np.empty_like(poses)
-    odometry[::per_scan] = chained(measured)
+    odometry[::per_scan] = integrate_increments(measured)
     for k in range(1, per_scan):
         true = se2.between(starts[:-1], poses[k::per_scan])
         odometry[k::per_scan] = se2.compose(odometry[:-1:per_scan], se2.compose(true, se2.exp(k / per_scan * errors)))
     return odometry
 
 
-def chained(increments: NDArray[np.float64]) -> NDArray[np.float64]:
+def integrate_increments(increments: NDArray[np.float64]) -> NDArray[np.float64]:
     """Poses (n + 1, 3) that begin at the origin and follow increments (n, 3)."""
     poses = [np.zeros(3)]
     for increment in increments:

@@ -65,7 +65,7 @@ class Marks(NamedTuple):
         return self._replace(common=common)
 
 
-NO_MARKS = Marks(np.zeros((0, 3)), np.zeros((0, 3, 3)))
+NO_CLONES = Marks(np.zeros((0, 3)), np.zeros((0, 3, 3)))
 """Of a map that begins."""
 
 
@@ -89,15 +89,15 @@ class LineMapState(NamedTuple):
     :ivar mean: shape (3 + 2 n,), x and y in m, theta in rad, then alpha in rad and r in m of each line.
     :ivar covariance: shape (3 + 2 n, 3 + 2 n).
     :ivar walls: the n lines, in the order of the state.
-    :ivar names: how many lines were given one.
-    :ivar marks: poses where the robot was.
+    :ivar next_number: how many lines were given one.
+    :ivar clones: poses where the robot was.
     """
 
     mean: Float64
     covariance: Float64
     walls: tuple[Wall, ...]
-    names: int
-    marks: Marks
+    next_number: int
+    clones: Marks
 
 
 # A line this near to the robot may be on its other side, in deviations of r.

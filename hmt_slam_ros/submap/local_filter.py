@@ -10,14 +10,14 @@ from hmt_slam_ros.arrays import Float64, Int32
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.registration.match_covariance import MatchError
 from hmt_slam_ros.sensors import Scan
-from hmt_slam_ros.sensors.motion_model import Prediction, Step
+from hmt_slam_ros.sensors.motion_model import Prediction, RelativeMotion
 from hmt_slam_ros.submap.line_map_state import LineMapState
-from hmt_slam_ros.submap.local_mapping import Sighting
-from hmt_slam_ros.submap.scan_evidence import Compared, Experience
+from hmt_slam_ros.submap.local_mapping import PreparedScan
+from hmt_slam_ros.submap.scan_evidence import ClutterEstimate, MapAgreement
 
 
 @dataclass(frozen=True, eq=False)
-class FilterState:
+class ParticleFilterState:
     """M particles of one hypothesis in one area; the map frame is that of the area.
 
     :ivar hypothesis: id of the hypothesis.
@@ -29,13 +29,13 @@ class FilterState:
     :ivar keyframe_poses: shape (M, K, 3), ``map_T_base`` of each under each particle.
     :ivar tables: shape (M, T, T), of each particle's map the numbers of its patches, [row, column], -1 for one never
         seen; the origin lies at the corner between the four middle ones.
-    :ivar priors: shape (M, 3), the poses as predicted by odometry and inertia since the last filter step.
+    :ivar predicted_poses: shape (M, 3), the poses as predicted by odometry and inertia since the last filter step.
     :ivar last_poses: shape (M, 3), those at the last filter step.
-    :ivar since_update: the predicted motion since then.
+    :ivar motion_since_update: the predicted motion since then.
     :ivar leader: the particle whose pose is the filter's.
     :ivar tracking_covariance: of the leader's motion since the last filter step, shape (3, 3), right tangent frame.
-    :ivar left_open: covariance of the leader's pose that the scans since the last filter step leave, likewise.
-    :ivar experience: of the scans so far.
+    :ivar residual_covariance: covariance of the leader's pose that the scans since the last filter step leave, likewise.
+    :ivar clutter_estimate: of the scans so far.
     """
 
     hypothesis: int
@@ -46,13 +46,13 @@ class FilterState:
     keyframe_areas: tuple[int, ...]
     keyframe_poses: Float64
     tables: Int32
-    priors: Float64
+    predicted_poses: Float64
     last_poses: Float64
-    since_update: Step
+    motion_since_update: RelativeMotion
     leader: int
     tracking_covariance: Float64
-    left_open: Float64
-    experience: Experience
+    residual_covariance: Float64
+    clutter_estimate: ClutterEstimate
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,28 +61,28 @@ class LineFilterState:
 
     :ivar hypothesis: id of the hypothesis.
     :ivar area: the current area.
-    :ivar room: over the robot's pose and the lines; its marks are the pose at the last filter step, and the keyframes'.
+    :ivar line_map: over the robot's pose and the lines; its marks are the pose at the last filter step, and the keyframes'.
     :ivar keyframes: the local map's keyframes, ids.
     :ivar keyframe_areas: their areas.
-    :ivar told: shape (K, 3), ``map_T_base`` of each as it was told, m and rad.
+    :ivar reported_poses: shape (K, 3), ``map_T_base`` of each as it was told, m and rad.
     :ivar last_covariance: of the robot's pose at the last filter step, shape (3, 3), right tangent frame.
-    :ivar since_update: the predicted motion since then.
+    :ivar motion_since_update: the predicted motion since then.
     :ivar information: of the newest scan's known lines alone, in the frame of the pose, shape (3, 3).
     :ivar tracking_covariance: of the motion since the last filter step, shape (3, 3), right tangent frame.
-    :ivar experience: of the scans so far.
+    :ivar clutter_estimate: of the scans so far.
     """
 
     hypothesis: int
     area: int
-    room: LineMapState
+    line_map: LineMapState
     keyframes: tuple[int, ...]
     keyframe_areas: tuple[int, ...]
-    told: Float64
+    reported_poses: Float64
     last_covariance: Float64
-    since_update: Step
+    motion_since_update: RelativeMotion
     information: Float64
     tracking_covariance: Float64
-    experience: Experience
+    clutter_estimate: ClutterEstimate
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,35 +95,35 @@ class PlacedKeyframe:
     pose: Float64
 
 
-class Tracked(NamedTuple):
+class TrackedMotion(NamedTuple):
     """What tracking made of a prediction.
 
-    :ivar moved: the matched motion, ``start_T_end``, shape (3,).
+    :ivar increment: the matched motion, ``start_T_end``, shape (3,).
     :ivar information: of the match, for correlated beams, in the frame of its end, shape (3, 3).
-    :ivar contradicted: whether there was odometry and the scan contradicts it.
+    :ivar contradicts_odometry: whether there was odometry and the scan contradicts it.
     """
 
-    moved: Float64
+    increment: Float64
     information: Float64
-    contradicted: bool
+    contradicts_odometry: bool
 
 
 @dataclass(frozen=True, eq=False)
 class FilterStep:
     """What a filter step found.
 
-    :ivar moved: the motion of what leads since the last step, ``start_T_end``, shape (3,).
-    :ivar error: of that motion.
+    :ivar increment: the motion of what leads since the last step, ``start_T_end``, shape (3,).
+    :ivar match_error: of that motion.
     :ivar information: of the match alone, for correlated beams, in the frame of the pose, shape (3, 3).
     :ivar effective_samples: ESS before resampling.
-    :ivar history_changed: whether keyframe poses differ from those told.
+    :ivar keyframes_moved: whether keyframe poses differ from those told.
     """
 
-    moved: Float64
-    error: MatchError
+    increment: Float64
+    match_error: MatchError
     information: Float64
     effective_samples: float
-    history_changed: bool
+    keyframes_moved: bool
 
 
 class LocalFilter(Protocol):
@@ -134,7 +134,7 @@ class LocalFilter(Protocol):
     :ivar keyframes: the local map's keyframes, ids.
     :ivar keyframe_areas: their areas.
     :ivar tracking_covariance: of the motion since the last filter step, shape (3, 3), right tangent frame.
-    :ivar experience: of the scans so far.
+    :ivar clutter_estimate: of the scans so far.
     """
 
     hypothesis: int
@@ -142,10 +142,10 @@ class LocalFilter(Protocol):
     keyframes: list[int]
     keyframe_areas: list[int]
     tracking_covariance: Float64
-    experience: Experience
+    clutter_estimate: ClutterEstimate
 
     @property
-    def state(self) -> FilterState | LineFilterState:
+    def state(self) -> ParticleFilterState | LineFilterState:
         """All that the filter remembers."""
         ...
 
@@ -171,22 +171,22 @@ class LocalFilter(Protocol):
         """Give up the map; the filter is not used any more."""
         ...
 
-    def stand(self, pose: PoseGaussian) -> None:
+    def initialize(self, pose: PoseGaussian) -> None:
         """The robot stands at ``map_T_base``, known so well, and is predicted from there."""
         ...
 
-    def track(self, sighting: Sighting, prediction: Prediction) -> Tracked:
+    def track(self, prepared: PreparedScan, prediction: Prediction) -> TrackedMotion:
         """A pose for a scan between two keyframes."""
         ...
 
-    def update(self, sighting: Sighting, step: int) -> FilterStep:
+    def update(self, prepared: PreparedScan, step: int) -> FilterStep:
         """The filter step with a keyframe's scan, which was tracked before.
 
         :param step: number of the keyframe event, for the random streams.
         """
         ...
 
-    def compared(self, sighting: Sighting) -> Compared:
+    def compare_scan(self, prepared: PreparedScan) -> MapAgreement:
         """A scan in the map, where that has the robot."""
         ...
 
@@ -194,7 +194,7 @@ class LocalFilter(Protocol):
         """Enter a scan into the map where the robot is."""
         ...
 
-    def drop(self, keyframes: Collection[int]) -> None:
+    def drop_keyframes(self, keyframes: Collection[int]) -> None:
         """Forget keyframes, but not what the map holds of them."""
         ...
 
@@ -223,7 +223,7 @@ class FilterFactory(Protocol):
         """A filter that knows nothing yet."""
         ...
 
-    def restored(self, state: FilterState | LineFilterState) -> LocalFilter:
+    def restored(self, state: ParticleFilterState | LineFilterState) -> LocalFilter:
         """The filter of a state; the patches of grids are in the pool.
 
         :raises HmtSlamError: for a state of a kind that this factory does not make.

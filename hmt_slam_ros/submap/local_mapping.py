@@ -12,13 +12,13 @@ from numba import njit
 
 from hmt_slam_ros.arrays import Float64, Int32
 from hmt_slam_ros.configuration.tree import Configuration
-from hmt_slam_ros.grids.insertion import InverseModel
-from hmt_slam_ros.grids.patch_pool import Beams, PatchPool
+from hmt_slam_ros.grids.insertion import InverseSensorModel
+from hmt_slam_ros.grids.patch_pool import MappedBeams, PatchPool
 from hmt_slam_ros.grids.patches import FAR, PATCH
 from hmt_slam_ros.registration import scan_to_map
 from hmt_slam_ros.registration.match_covariance import MatchNoise
 from hmt_slam_ros.sensors import Scan
-from hmt_slam_ros.sensors.surfels import surfels
+from hmt_slam_ros.sensors.surfels import extract_surfels
 
 _ODDS_PER_NAT = 20.0
 
@@ -33,38 +33,38 @@ class LocalMapping:
         local_map, match = configuration.local_map, configuration.matching
         patch = PATCH * local_map.cell
         self.pool = PatchPool(2 * math.ceil(local_map.extent / patch), local_map.cell, local_map.field_radius)
-        self.model = scan_to_map.beam_model(
+        self.beam_model = scan_to_map.make_beam_model(
             local_map.field_radius, match.sigma_hit, match.unknown_range, match.random_returns
         )
-        self.alignment = scan_to_map.Alignment(
+        self.alignment = scan_to_map.AlignmentSettings(
             match.sigma_match, match.robust_scale, configuration.filter.covariance_inflation, match.iterations
         )
-        self.noise = MatchNoise(match.beam_noise, match.block_noise, match.map_age)
-        self._inverse_model = InverseModel(
+        self.match_noise = MatchNoise(match.beam_noise, match.block_noise, match.map_age)
+        self._inverse_sensor_model = InverseSensorModel(
             round(local_map.log_odds_hit * _ODDS_PER_NAT),
             round(-local_map.log_odds_miss * _ODDS_PER_NAT),
             round(local_map.log_odds_limit * _ODDS_PER_NAT),
         )
-        self.near = int(match.matched_distance / local_map.field_radius * FAR)
+        self.hit_distance = int(match.matched_distance / local_map.field_radius * FAR)
 
-    def matching_points(self, scan: Scan) -> Float64:
+    def matching_surfels(self, scan: Scan) -> Float64:
         """The surfels that are matched: within the map's range, evenly thinned; shape (n, 4), base frame."""
         beams = self.mapped_beams(scan)
-        count = len(beams.points)
+        count = len(beams.hits)
         stride = -(-count // self.configuration.matching.max_points)
-        return surfels(beams.points, beams.origins[:count], max(1, stride))
+        return extract_surfels(beams.hits, beams.origins[:count], max(1, stride))
 
-    def mapped_beams(self, scan: Scan) -> Beams:
+    def mapped_beams(self, scan: Scan) -> MappedBeams:
         """The part of a scan within the map's range."""
-        return Beams(*_cut_off(scan.points, scan.origins, self.configuration.local_map.max_range))
+        return MappedBeams(*_split_at_range(scan.points, scan.origins, self.configuration.local_map.max_range))
 
-    def insert(self, tables: Int32, poses: Float64, scan: Scan) -> None:
+    def insert_scan(self, tables: Int32, poses: Float64, scan: Scan) -> None:
         """Enter a scan into maps (m, T, T), into each at its own ``map_T_base`` (m, 3)."""
-        self.pool.insert(tables, poses, self.mapped_beams(scan), self._inverse_model)
+        self.pool.insert(tables, poses, self.mapped_beams(scan), self._inverse_sensor_model)
 
 
 @njit(cache=True)
-def _cut_off(points: Float64, origins: Float64, limit: float) -> tuple[Float64, Float64, Float64]:
+def _split_at_range(points: Float64, origins: Float64, limit: float) -> tuple[Float64, Float64, Float64]:
     """Those of the points (n, 2) within a limit of their origins (n, 2), the others at the limit, and their origins."""
     distance = np.hypot(points[:, 0] - origins[:, 0], points[:, 1] - origins[:, 1])
     near = (distance <= limit).sum()
@@ -83,7 +83,7 @@ def _cut_off(points: Float64, origins: Float64, limit: float) -> tuple[Float64, 
     return within, beyond, ordered
 
 
-class Sighting:
+class PreparedScan:
     """A scan and what filters of either kind make of it, once for all of them and only where one asks for it.
 
     :ivar scan: the scan.
@@ -97,7 +97,7 @@ class Sighting:
     @cached_property
     def surfels(self) -> Float64:
         """What is matched with a grid, shape (n, 4), base frame."""
-        return self._mapping.matching_points(self.scan)
+        return self._mapping.matching_surfels(self.scan)
 
     def derived(self, make: Callable[[Scan, Configuration], T]) -> T:
         """What a function makes of the scan, worked out once for all filters that ask for it."""
@@ -107,6 +107,6 @@ class Sighting:
         return found
 
     @property
-    def laser(self) -> Float64:
+    def laser_position(self) -> Float64:
         """Where the beams begin, shape (2,), likewise."""
         return self.scan.laser_pose[:2]

@@ -13,32 +13,32 @@ import numpy as np
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.geometry.covariance import inverse, turned
+from hmt_slam_ros.geometry.covariance import inverse, rotate_covariance
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.grids.patches import MapView
-from hmt_slam_ros.random_streams import Purpose, stream
+from hmt_slam_ros.grids.patches import GridView
+from hmt_slam_ros.random_streams import Purpose, random_stream
 from hmt_slam_ros.registration import scan_to_map
-from hmt_slam_ros.registration.match_covariance import match_error
+from hmt_slam_ros.registration.match_covariance import estimate_match_error
 from hmt_slam_ros.registration.scan_to_map import Prior
 from hmt_slam_ros.sensors import Scan
-from hmt_slam_ros.sensors.motion_model import NO_STEP, Prediction
+from hmt_slam_ros.sensors.motion_model import NO_MOTION, Prediction
 from hmt_slam_ros.submap.local_filter import (
-    FilterState,
     FilterStep,
     LineFilterState,
     LocalFilter,
+    ParticleFilterState,
     PlacedKeyframe,
-    Tracked,
+    TrackedMotion,
 )
-from hmt_slam_ros.submap.local_mapping import LocalMapping, Sighting
-from hmt_slam_ros.submap.scan_evidence import Compared, Experience, compared
+from hmt_slam_ros.submap.local_mapping import LocalMapping, PreparedScan
+from hmt_slam_ros.submap.scan_evidence import ClutterEstimate, MapAgreement, compare_with_map
 from hmt_slam_ros.submap.scan_matcher import ScanMatcher, map_information
 
 # Another particle takes the lead when it is more likely by this much, nats.
-_CLEARLY = 3.0
+_LEAD_MARGIN = 3.0
 
 
-class AreaFilter:
+class ParticleFilter:
     """M particles of one hypothesis in one area.
 
     :ivar hypothesis: id of the hypothesis.
@@ -50,8 +50,8 @@ class AreaFilter:
     :ivar keyframe_poses: shape (M, K, 3), ``map_T_base`` of each under each particle.
     :ivar leader: the particle whose pose is the filter's.
     :ivar tracking_covariance: of the leader's motion since the last filter step, shape (3, 3), right tangent frame.
-    :ivar left_open: covariance of the leader's pose that the scans since the last filter step leave, likewise.
-    :ivar experience: of the scans so far.
+    :ivar residual_covariance: covariance of the leader's pose that the scans since the last filter step leave, likewise.
+    :ivar clutter_estimate: of the scans so far.
     """
 
     def __init__(self, mapping: LocalMapping, hypothesis: int, area: int) -> None:
@@ -65,32 +65,32 @@ class AreaFilter:
         self.keyframe_areas: list[int] = []
         self.keyframe_poses = np.zeros((count, 0, 3))
         self._tables = np.stack([mapping.pool.empty_table()] * count)
-        self._priors = self.poses.copy()
+        self._predicted_poses = self.poses.copy()
         self._last_poses = self.poses.copy()
-        self._since_update = NO_STEP
+        self._motion_since_update = NO_MOTION
         self.leader = 0
         self._matcher = ScanMatcher(mapping)
         self.tracking_covariance = np.zeros((3, 3))
-        self.left_open = NO_STEP.covariance
-        self.experience = Experience()
+        self.residual_covariance = NO_MOTION.covariance
+        self.clutter_estimate = ClutterEstimate()
 
     @classmethod
-    def of(cls, mapping: LocalMapping, state: FilterState) -> AreaFilter:
+    def from_state(cls, mapping: LocalMapping, state: ParticleFilterState) -> ParticleFilter:
         """The filter of a state, whose patches are in the pool and count its tables already."""
         found = cls(mapping, state.hypothesis, state.area)
         found.poses, found.log_weights = state.poses, state.log_weights
         found.keyframes, found.keyframe_areas = list(state.keyframes), list(state.keyframe_areas)
         found.keyframe_poses, found._tables = state.keyframe_poses, state.tables
-        found._priors, found._last_poses = state.priors, state.last_poses
-        found._since_update = state.since_update
+        found._predicted_poses, found._last_poses = state.predicted_poses, state.last_poses
+        found._motion_since_update = state.motion_since_update
         found.leader, found.tracking_covariance = state.leader, state.tracking_covariance
-        found.left_open, found.experience = state.left_open, state.experience
+        found.residual_covariance, found.clutter_estimate = state.residual_covariance, state.clutter_estimate
         return found
 
     @property
-    def state(self) -> FilterState:
+    def state(self) -> ParticleFilterState:
         """All but the patches, to which the tables refer by their numbers in the pool."""
-        return FilterState(
+        return ParticleFilterState(
             self.hypothesis,
             self.area,
             self.poses,
@@ -99,13 +99,13 @@ class AreaFilter:
             tuple(self.keyframe_areas),
             self.keyframe_poses,
             self._tables,
-            self._priors,
+            self._predicted_poses,
             self._last_poses,
-            self._since_update,
+            self._motion_since_update,
             self.leader,
             self.tracking_covariance,
-            self.left_open,
-            self.experience,
+            self.residual_covariance,
+            self.clutter_estimate,
         )
 
     @property
@@ -117,18 +117,18 @@ class AreaFilter:
         """``map_T_base`` of the local map's keyframes under the leading particle, shape (K, 3)."""
         return self.keyframe_poses[self.leader]
 
-    def branch(self, hypothesis: int) -> AreaFilter:
+    def branch(self, hypothesis: int) -> ParticleFilter:
         """A filter of the same state for a child hypothesis; maps are shared until written to."""
-        child = AreaFilter(self.mapping, hypothesis, self.area)
+        child = ParticleFilter(self.mapping, hypothesis, self.area)
         child.poses, child.log_weights = self.poses.copy(), self.log_weights.copy()
         child.keyframes, child.keyframe_areas = list(self.keyframes), list(self.keyframe_areas)
         child.keyframe_poses = self.keyframe_poses.copy()
         child._tables = np.stack([self.mapping.pool.share(table) for table in self._tables])
-        child._priors, child._last_poses = self._priors.copy(), self._last_poses.copy()
-        child._since_update = self._since_update
+        child._predicted_poses, child._last_poses = self._predicted_poses.copy(), self._last_poses.copy()
+        child._motion_since_update = self._motion_since_update
         child.leader, child.tracking_covariance = self.leader, self.tracking_covariance
-        child.left_open = self.left_open
-        child.experience = self.experience
+        child.residual_covariance = self.residual_covariance
+        child.clutter_estimate = self.clutter_estimate
         return child
 
     def release(self) -> None:
@@ -136,107 +136,109 @@ class AreaFilter:
         for table in self._tables:
             self.mapping.pool.release(table)
 
-    def track(self, sighting: Sighting, prediction: Prediction) -> Tracked:
+    def track(self, prepared: PreparedScan, prediction: Prediction) -> TrackedMotion:
         """Move all particles by the leader's matched increment: a pose for a scan between two keyframes."""
-        points = sighting.surfels
-        before, view = PoseGaussian(self.pose, self.left_open), self._leading_view()
+        points = prepared.surfels
+        before, view = PoseGaussian(self.pose, self.residual_covariance), self._leading_view()
         match = self._matcher.match(points, before, prediction, view)
-        self._priors = se2.compose(self._priors, match.step.increment)
-        self._since_update = self._since_update.then(match.step)
-        leg = PoseGaussian(self._priors[self.leader], self._since_update.covariance)
-        match = self._matcher.over_leg(points, match, leg, self._since_update, view)
+        self._predicted_poses = se2.compose(self._predicted_poses, match.predicted_motion.increment)
+        self._motion_since_update = self._motion_since_update.compose(match.predicted_motion)
+        leg = PoseGaussian(self._predicted_poses[self.leader], self._motion_since_update.covariance)
+        match = self._matcher.check_since_keyframe(points, match, leg, self._motion_since_update, view)
         moved = se2.between(before.mean, match.pose)
         self.poses = se2.compose(self.poses, moved)
-        information = map_information(self._since_update.covariance, match.pose[2])
+        information = map_information(self._motion_since_update.covariance, match.pose[2])
         information = information + match.hessian / self.mapping.alignment.inflation
-        self.left_open = self._matcher.covariance(match)
-        self.tracking_covariance = turned(inverse(information), -match.pose[2])
-        return Tracked(moved, self._matcher.information(match), match.contradicted)
+        self.residual_covariance = self._matcher.covariance(match)
+        self.tracking_covariance = rotate_covariance(inverse(information), -match.pose[2])
+        return TrackedMotion(moved, self._matcher.information(match), match.contradicts_odometry)
 
-    def _leading_view(self) -> MapView:
+    def _leading_view(self) -> GridView:
         return self.mapping.pool.view(self._tables[self.leader])
 
-    def update(self, sighting: Sighting, step: int) -> FilterStep:
+    def update(self, prepared: PreparedScan, step: int) -> FilterStep:
         """Draw every particle from its optimal proposal, weigh it, resample where ESS fell below its bound.
 
-        :param sighting: of the keyframe's scan.
+        :param prepared: of the keyframe's scan.
         :param step: number of the keyframe event, for the random streams.
         """
-        points, settings = sighting.surfels, self.mapping.configuration
-        prior = map_information(self._since_update.covariance, self.pose[2])
-        view, predicted = self._leading_view(), Prior(self._priors[self.leader], prior)
-        still = self._matcher.still(points, predicted, self._since_update.covariance, view)
+        points, settings = prepared.surfels, self.mapping.configuration
+        prior = map_information(self._motion_since_update.covariance, self.pose[2])
+        view, predicted = self._leading_view(), Prior(self._predicted_poses[self.leader], prior)
+        still = self._matcher.static_points(points, predicted, self._motion_since_update.covariance, view)
         drawn = scan_to_map.propose_all(
             points,
             still,
             self.poses,
-            self._priors,
+            self._predicted_poses,
             prior,
             self._tables,
             view,
             self.mapping.alignment,
-            self.mapping.model,
+            self.mapping.beam_model,
             settings.matching.sharpness,
             settings.matching.temper,
         )
         self.log_weights = self.log_weights + drawn.evidences
         self.log_weights -= self.log_weights.max()
-        leader = self._elected()
-        random = stream(settings.seed, Purpose.PARTICLES, step).standard_normal(drawn.modes.shape)
+        leader = self._elect_leader()
+        random = random_stream(settings.seed, Purpose.PARTICLES, step).standard_normal(drawn.modes.shape)
         self.poses = drawn.modes + np.einsum("mij,mj->mi", np.linalg.cholesky(drawn.covariances), random)
         # The leader keeps the mode, so that the published path has no sampling noise.
         self.poses[leader] = drawn.modes[leader]
         self.poses[:, 2] = se2.wrap(self.poses[:, 2])
-        error = match_error(
+        error = estimate_match_error(
             still,
             self.poses[leader],
             drawn.hessians[leader],
             prior,
             self.mapping.pool.view(self._tables[leader]),
             self.mapping.alignment,
-            self.mapping.noise,
+            self.mapping.match_noise,
         )
-        information = turned(settings.matching.temper * drawn.hessians[leader], -self.poses[leader, 2])
-        effective = 1.0 / float(np.sum(_normalised(self.log_weights) ** 2))
+        information = rotate_covariance(settings.matching.temper * drawn.hessians[leader], -self.poses[leader, 2])
+        effective = 1.0 / float(np.sum(_normalize_weights(self.log_weights) ** 2))
         moved = se2.between(self._last_poses[leader], self.poses[leader])
         changed, self.leader = leader != self.leader, leader
         if effective < settings.filter.ess_fraction * len(self.poses):
             self._resample(step)
-        self._restart()
+        self._restart_prediction()
         return FilterStep(moved, error, information, effective, changed)
 
-    def compared(self, sighting: Sighting) -> Compared:
+    def compare_scan(self, prepared: PreparedScan) -> MapAgreement:
         """A scan in the map of the leader, where that has the robot."""
-        return compared(sighting.surfels, sighting.laser, self.pose, self._leading_view(), self.mapping.near)
+        return compare_with_map(
+            prepared.surfels, prepared.laser_position, self.pose, self._leading_view(), self.mapping.hit_distance
+        )
 
-    def _elected(self) -> int:
+    def _elect_leader(self) -> int:
         """The particle of largest weight; where none is clearly more likely, the one that led before.
 
         Along a corridor nothing tells the particles apart, and the pose would jump from one to the other.
         """
         heaviest = int(np.argmax(self.log_weights))
         lead = self.log_weights[heaviest] - self.log_weights[self.leader]
-        return heaviest if lead > _CLEARLY else self.leader
+        return heaviest if lead > _LEAD_MARGIN else self.leader
 
-    def _restart(self) -> None:
+    def _restart_prediction(self) -> None:
         """Predict from here."""
-        self._priors = self.poses.copy()
+        self._predicted_poses = self.poses.copy()
         self._last_poses = self.poses.copy()
-        self._since_update = NO_STEP
-        self.left_open = NO_STEP.covariance
+        self._motion_since_update = NO_MOTION
+        self.residual_covariance = NO_MOTION.covariance
 
-    def stand(self, pose: PoseGaussian) -> None:
+    def initialize(self, pose: PoseGaussian) -> None:
         """All particles stand at the mean of ``map_T_base``, and predict from there; its covariance is left open."""
         self.poses = np.repeat(pose.mean[None], len(self.poses), axis=0)
         self.log_weights = np.zeros(len(self.poses))
         self.tracking_covariance = np.zeros((3, 3))
-        self._restart()
-        self.left_open = pose.covariance
+        self._restart_prediction()
+        self.residual_covariance = pose.covariance
 
     def _resample(self, step: int) -> None:
         """Systematic resampling; the leader is kept, and stands first afterwards."""
-        weights = _normalised(self.log_weights)
-        offset = stream(self.mapping.configuration.seed, Purpose.RESAMPLING, step).random()
+        weights = _normalize_weights(self.log_weights)
+        offset = random_stream(self.mapping.configuration.seed, Purpose.RESAMPLING, step).random()
         positions = (np.arange(len(weights)) + offset) / len(weights)
         ancestors = np.minimum(np.searchsorted(np.cumsum(weights), positions), len(weights) - 1)
         leader = self.leader
@@ -252,12 +254,12 @@ class AreaFilter:
 
     def add_keyframe(self, keyframe: int, scan: Scan) -> None:
         """Enter the scan into every particle's map at that particle's pose."""
-        self.mapping.insert(self._tables, self.poses, scan)
+        self.mapping.insert_scan(self._tables, self.poses, scan)
         self.keyframes.append(keyframe)
         self.keyframe_areas.append(self.area)
         self.keyframe_poses = np.concatenate((self.keyframe_poses, self.poses[:, None]), axis=1)
 
-    def drop(self, keyframes: Collection[int]) -> None:
+    def drop_keyframes(self, keyframes: Collection[int]) -> None:
         """Forget keyframes, but not what the maps hold of them."""
         kept = [k for k, keyframe in enumerate(self.keyframes) if keyframe not in keyframes]
         self.keyframes = [self.keyframes[k] for k in kept]
@@ -273,9 +275,9 @@ class AreaFilter:
         """
         self.area = area
         self.poses = se2.compose(area_T_previous, self.poses)
-        self._priors = se2.compose(area_T_previous, self._priors)
+        self._predicted_poses = se2.compose(area_T_previous, self._predicted_poses)
         self._last_poses = se2.compose(area_T_previous, self._last_poses)
-        self._load(content)
+        self._load_submap(content)
 
     def reload(self, content: Sequence[PlacedKeyframe], anchor: int) -> None:
         """Build the local map anew after its keyframes moved; all particles stay where they are from one of them.
@@ -284,16 +286,16 @@ class AreaFilter:
         :param anchor: the keyframe by which the robot's place is known.
         """
         before = self.keyframe_poses[:, self.keyframes.index(anchor)]
-        seen = [se2.between(before, poses) for poses in (self.poses, self._priors, self._last_poses)]
-        self._load(content)
+        seen = [se2.between(before, poses) for poses in (self.poses, self._predicted_poses, self._last_poses)]
+        self._load_submap(content)
         after = self.keyframe_poses[:, self.keyframes.index(anchor)]
-        self.poses, self._priors, self._last_poses = (se2.compose(after, poses) for poses in seen)
+        self.poses, self._predicted_poses, self._last_poses = (se2.compose(after, poses) for poses in seen)
 
-    def _load(self, content: Sequence[PlacedKeyframe]) -> None:
+    def _load_submap(self, content: Sequence[PlacedKeyframe]) -> None:
         self.release()
         table = self.mapping.pool.empty_table()
         for placed in content:
-            self.mapping.insert(table[None], placed.pose[None], placed.scan)
+            self.mapping.insert_scan(table[None], placed.pose[None], placed.scan)
         count = len(self.poses)
         self._tables = np.stack([table] + [self.mapping.pool.share(table) for _ in range(count - 1)])
         self.keyframes = [placed.keyframe for placed in content]
@@ -302,7 +304,7 @@ class AreaFilter:
         self.keyframe_poses = np.repeat(poses[None], count, axis=0)
 
 
-def _normalised(log_weights: Float64) -> Float64:
+def _normalize_weights(log_weights: Float64) -> Float64:
     weights = np.exp(log_weights - log_weights.max())
     return weights / weights.sum()
 
@@ -319,16 +321,16 @@ class ParticleFilters:
 
     def new(self, hypothesis: int, area: int) -> LocalFilter:
         """A filter that knows nothing yet."""
-        return AreaFilter(self._mapping, hypothesis, area)
+        return ParticleFilter(self._mapping, hypothesis, area)
 
-    def restored(self, state: FilterState | LineFilterState) -> LocalFilter:
+    def restored(self, state: ParticleFilterState | LineFilterState) -> LocalFilter:
         """The filter of a state; the patches of its grids are in the pool.
 
         :raises HmtSlamError: where its local map is one of lines.
         """
         if isinstance(state, LineFilterState):
             raise HmtSlamError("the saved map has local maps of lines: go on from it with its own local_map.kind")
-        return AreaFilter.of(self._mapping, state)
+        return ParticleFilter.from_state(self._mapping, state)
 
     def entering(self, own: LocalFilter, area: int, content: Sequence[PlacedKeyframe]) -> LocalFilter:  # noqa: ARG002
         """The filter to go on with, which is ``own`` in every area."""

@@ -5,13 +5,13 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from hmt_slam_ros.arrays import Float64
-from hmt_slam_ros.grids.free_space import met_and_passed
-from hmt_slam_ros.grids.patches import MapView
-from hmt_slam_ros.registration.consistency import SCAN, SIGHT, Agreement, Clutter, Usual
-from hmt_slam_ros.registration.scan_to_map import agreement
+from hmt_slam_ros.grids.free_space import count_hits_and_violations
+from hmt_slam_ros.grids.patches import GridView
+from hmt_slam_ros.registration.consistency import SCAN_IN_SUBMAP, WALLS_OF_SUBMAP, Agreement, Clutter, OutlierRate
+from hmt_slam_ros.registration.scan_to_map import count_agreement
 
 
-class Compared(NamedTuple):
+class MapAgreement(NamedTuple):
     """A scan in a map.
 
     :ivar ends: of its beams, on surfaces and in free space.
@@ -22,46 +22,51 @@ class Compared(NamedTuple):
     walls: Agreement
 
 
-class Judgement(NamedTuple):
+class ScanEvidence(NamedTuple):
     """What a scan says of whether the robot is there.
 
     :ivar log_evidence: log p(scan | it is) / p(scan | it is in a place that looks alike), nats.
-    :ivar doubt: log p(scan | it was displaced before it) / p(scan | it was not), nats.
+    :ivar log_kidnapping_ratio: log p(scan | it was displaced before it) / p(scan | it was not), nats.
     """
 
     log_evidence: float
-    doubt: float
+    log_kidnapping_ratio: float
 
 
-NOTHING_SAID = Judgement(0.0, 0.0)
+NO_EVIDENCE = ScanEvidence(0.0, 0.0)
 
 
-class Experience(NamedTuple):
+class ClutterEstimate(NamedTuple):
     """What scans were like so far where a hypothesis has the robot.
 
-    :ivar ends: what contradicted its map.
-    :ivar walls: which of its walls the beams passed.
+    :ivar beam_outliers: what contradicted its map.
+    :ivar wall_outliers: which of its walls the beams passed.
     """
 
-    ends: Usual = Usual()
-    walls: Usual = Usual()
+    beam_outliers: OutlierRate = OutlierRate()
+    wall_outliers: OutlierRate = OutlierRate()
 
     @property
     def clutter(self) -> Clutter:
         """What contradicts usually."""
-        return Clutter(self.ends.share, self.walls.share)
+        return Clutter(self.beam_outliers.rate, self.wall_outliers.rate)
 
-    def judge(self, found: Compared) -> Judgement:
+    def evaluate(self, found: MapAgreement) -> ScanEvidence:
         """What a scan says."""
-        log_evidence = SCAN.log_ratio(found.ends, self.ends.share)
-        return Judgement(log_evidence, -log_evidence - SIGHT.log_ratio(found.walls, self.walls.share))
+        log_evidence = SCAN_IN_SUBMAP.log_likelihood_ratio(found.ends, self.beam_outliers.rate)
+        return ScanEvidence(
+            log_evidence, -log_evidence - WALLS_OF_SUBMAP.log_likelihood_ratio(found.walls, self.wall_outliers.rate)
+        )
 
-    def after(self, found: Compared) -> Experience:
+    def update(self, found: MapAgreement) -> ClutterEstimate:
         """With one more scan."""
-        return Experience(self.ends.after(found.ends, SCAN.stretch), self.walls.after(found.walls, SIGHT.stretch))
+        return ClutterEstimate(
+            self.beam_outliers.update(found.ends, SCAN_IN_SUBMAP.correlated_samples),
+            self.wall_outliers.update(found.walls, WALLS_OF_SUBMAP.correlated_samples),
+        )
 
 
-def compared(points: Float64, laser: Float64, pose: Float64, view: MapView, near: int) -> Compared:
+def compare_with_map(points: Float64, laser: Float64, pose: Float64, view: GridView, near: int) -> MapAgreement:
     """Lay a scan into a map.
 
     :param points: surfels of the scan, shape (n, 4), m, base frame.
@@ -69,6 +74,6 @@ def compared(points: Float64, laser: Float64, pose: Float64, view: MapView, near
     :param pose: ``map_T_base``, shape (3,).
     :param near: quantised distance to a surface below which a beam ends on it.
     """
-    met, passed = met_and_passed(points, laser, pose, view, near)
-    ends = Agreement(len(points), *agreement(points, pose, view, near, 2 * near))
-    return Compared(ends, Agreement(met + passed, met, passed))
+    met, passed = count_hits_and_violations(points, laser, pose, view, near)
+    ends = Agreement(len(points), *count_agreement(points, pose, view, near, 2 * near))
+    return MapAgreement(ends, Agreement(met + passed, met, passed))

@@ -21,17 +21,17 @@ from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
-from hmt_slam_ros.hybrid_map.shortest_path import beside, reachable, telling_arc
-from hmt_slam_ros.hybrid_map.surroundings import gap, positions
-from hmt_slam_ros.messages.map_changes import Arc, ArcEnds, Merged, Relabelled
-from hmt_slam_ros.messages.messages import Leaf
+from hmt_slam_ros.hybrid_map.shortest_path import connected_neighbors, informative_arc, shortest_path_beliefs
+from hmt_slam_ros.hybrid_map.surroundings import keyframe_positions, min_distance
+from hmt_slam_ros.messages.map_changes import Arc, ArcEnds, AreaMerge, MovedKeyframe
+from hmt_slam_ros.messages.messages import Hypothesis
 from hmt_slam_ros.messages.replica import FIRST_AREA, Replica
 from hmt_slam_ros.registration.consistency import NO_CLUTTER, Clutter
 from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.topological_inference.admission import Query
-from hmt_slam_ros.topological_inference.closure_search import ClosureSearch, Comparison, Fit, SearchState
-from hmt_slam_ros.topological_inference.global_localization import Told, Whereabouts
-from hmt_slam_ros.topological_inference.hypothesis_tree import LeafNotes, relative_covariance
+from hmt_slam_ros.topological_inference.closure_search import AreaComparison, ClosureSearch, Fit, SearchState
+from hmt_slam_ros.topological_inference.global_localization import PoseDistribution, PoseHint
+from hmt_slam_ros.topological_inference.hypothesis_tree import HypothesisState, relative_covariance
 from hmt_slam_ros.topological_inference.landmark_evidence import LandmarkEvidence
 
 
@@ -40,25 +40,25 @@ class Parent:
     """A hypothesis before the event.
 
     :ivar log_weight: log of its probability, the newest scan's evidence included.
-    :ivar share: its probability before, by which hypotheses share the areas that are examined at an event.
+    :ivar probability: its probability before, by which hypotheses share the areas that are examined at an event.
     :ivar clutter: what contradicts its map usually.
     """
 
     hypothesis: int
     area: int
     hybrid_map: HybridMap
-    notes: LeafNotes
+    state: HypothesisState
     log_weight: float
-    share: float = 1.0
+    probability: float = 1.0
     clutter: Clutter = NO_CLUTTER
 
-    def around(self) -> dict[int, NDArray[np.float64]]:
+    def local_area_poses(self) -> dict[int, NDArray[np.float64]]:
         """{area: ``area_T_other``} of the local map's other areas."""
-        return {area: pose for area, pose in self.notes.local.items() if self.hybrid_map.has_area(area)}
+        return {area: pose for area, pose in self.state.local_area_poses.items() if self.hybrid_map.has_area(area)}
 
     def covariance(self, keyframe: int) -> NDArray[np.float64]:
         """Of a keyframe's pose in the robot's area, shape (3, 3)."""
-        return self.notes.covariances.get(keyframe, np.zeros((3, 3)))
+        return self.state.covariances.get(keyframe, np.zeros((3, 3)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,39 +67,39 @@ class Child:
 
     :ivar parent: id of the hypothesis that it continues.
     :ivar log_weight: log of its weight, unnormalised.
-    :ivar reload: whether the local map has to be loaded anew.
+    :ivar reload_local_map: whether the local map has to be loaded anew.
     """
 
     parent: int
     log_weight: float
     area: int
-    notes: LeafNotes
-    rebase: PoseGaussian | None = None
-    relabelled: tuple[Relabelled, ...] = ()
+    state: HypothesisState
+    frame_change: PoseGaussian | None = None
+    moved_keyframes: tuple[MovedKeyframe, ...] = ()
     arcs: tuple[Arc, ...] = ()
-    reload: bool = False
-    withdrawn: tuple[ArcEnds, ...] = ()
-    merged: Merged | None = None
+    reload_local_map: bool = False
+    removed_arcs: tuple[ArcEnds, ...] = ()
+    area_merge: AreaMerge | None = None
 
 
 class Branches(NamedTuple):
     """All continuations of one hypothesis.
 
-    :ivar looked: whether known areas were looked for.
-    :ivar log_skipped: log of the weight of those that were not looked at.
-    :ivar where: where in the map a robot may be of which nothing told how it came there, if that was asked.
+    :ivar closures_searched: whether known areas were looked for.
+    :ivar log_skipped_weight: log of the weight of those that were not looked at.
+    :ivar pose_distribution: where in the map a robot may be of which nothing told how it came there, if that was asked.
     """
 
     children: list[Child]
-    looked: bool = False
-    log_skipped: float = -math.inf
-    where: Whereabouts | None = None
+    closures_searched: bool = False
+    log_skipped_weight: float = -math.inf
+    pose_distribution: PoseDistribution | None = None
 
 
-PROBABLE = 0.5
+MIN_HYPOTHESIS_PROBABILITY = 0.5
 """Hypotheses of this probability are asked for loops that landmarks propose."""
 
-FEWEST = 4
+MIN_EXAMINED_AREAS = 4
 """Known areas that every hypothesis may examine at a cut, however improbable it is."""
 
 # Factor on the covariance of an arc along other arcs, where no match confirms it: it adds next to nothing to those.
@@ -110,14 +110,14 @@ _UNCONFIRMED = 100.0
 class BranchingState:
     """What is known of areas beside the maps of the hypotheses.
 
-    :ivar areas: the largest number that an area was given.
+    :ivar largest_area: the largest number that an area was given.
     :ivar search: what was learnt by comparing areas.
-    :ivar recent: {keyframe event: scan} of those that no map holds and that may be looked for.
+    :ivar unstored_scans: {keyframe event: scan} of those that no map holds and that may be looked for.
     """
 
-    areas: int = FIRST_AREA
+    largest_area: int = FIRST_AREA
     search: SearchState = field(default_factory=SearchState)
-    recent: Mapping[int, Scan] = field(default_factory=dict)
+    unstored_scans: Mapping[int, Scan] = field(default_factory=dict)
 
 
 class Branching:
@@ -125,7 +125,7 @@ class Branching:
 
     :ivar search: finds and compares known areas.
     :ivar landmarks: what they say of places and loops, where they are asked.
-    :ivar recent: {keyframe event: scan} of those that no map holds and that may be looked for.
+    :ivar unstored_scans: {keyframe event: scan} of those that no map holds and that may be looked for.
     """
 
     def __init__(
@@ -140,54 +140,54 @@ class Branching:
         """
         if landmarks is None and (configuration.places.prior or configuration.places.loops):
             raise HmtSlamError("places.prior and places.loops need landmarks: give them to topological inference")
-        self.recent: dict[int, Scan] = {}
-        scans = ChainMap(self.recent, replica.scans)
+        self.unstored_scans: dict[int, Scan] = {}
+        scans = ChainMap(self.unstored_scans, replica.scans)
         self.search = ClosureSearch(configuration, scans)
         self.landmarks = None if landmarks is None else landmarks(configuration, scans)
         self._options = configuration.tsbi
         self._replica = replica
         sigma, angle = configuration.tlca.arc_sigma_floor, math.radians(configuration.tlca.arc_angle_floor)
-        self._floor = np.diag([sigma**2, sigma**2, angle**2])
-        self._areas = FIRST_AREA
-        self._named: dict[tuple[int, ...], int] = {}
+        self._covariance_floor = np.diag([sigma**2, sigma**2, angle**2])
+        self._largest_area = FIRST_AREA
+        self._new_areas: dict[tuple[int, ...], int] = {}
 
     @property
     def state(self) -> BranchingState:
         """All that is known between two events."""
-        return BranchingState(self._areas, self.search.state, dict(self.recent))
+        return BranchingState(self._largest_area, self.search.state, dict(self.unstored_scans))
 
-    def go_on_from(self, state: BranchingState) -> None:
+    def restore(self, state: BranchingState) -> None:
         """Take over what was known before the first event."""
-        self._areas = state.areas
-        self.search.go_on_from(state.search)
-        self.recent.update(state.recent)
+        self._largest_area = state.largest_area
+        self.search.restore(state.search)
+        self.unstored_scans.update(state.unstored_scans)
 
-    def everywhere(
-        self, parent: Parent, poses: Mapping[int, NDArray[np.float64]], before: int, told: Told | None = None
-    ) -> Whereabouts:
+    def localize_globally(
+        self, parent: Parent, poses: Mapping[int, NDArray[np.float64]], before: int, pose_hint: PoseHint | None = None
+    ) -> PoseDistribution:
         """Where in the map keyframes lie of which the arcs tell nothing.
 
         Landmarks are asked after a look that found a place: one look alone finds nobody, and by then they are gathered.
 
         :param poses: {keyframe: ``reference_T_base``}.
         :param before: the map is that of the keyframes before this one.
-        :param told: where the reference is, if somebody says so.
+        :param pose_hint: where the reference is, if somebody says so.
         """
-        where = self.search.everywhere(parent.hybrid_map, poses, before, parent.clutter, told)
-        if self.landmarks is None or parent.notes.sighted is None:
+        where = self.search.localize_globally(parent.hybrid_map, poses, before, parent.clutter, pose_hint)
+        if self.landmarks is None or parent.state.relocalization_candidate is None:
             return where
         return self.landmarks.weigh(where, parent.hybrid_map, poses, before)
 
     def look_ahead(self, parents: Sequence[Parent]) -> None:
         """At an event at which nothing was looked for, prepare what the next look will ask for."""
         self.search.look_ahead(max(parents, key=lambda parent: parent.log_weight).hybrid_map)
-        lost = [(one.hybrid_map, one.notes.lost) for one in parents if one.notes.lost is not None]
+        lost = [(one.hybrid_map, one.state.lost_since) for one in parents if one.state.lost_since is not None]
         if lost and self.landmarks is not None:
             self.landmarks.prepare_places(lost)
 
-    def found(self) -> None:
+    def end_global_localization(self) -> None:
         """It is known where the robot is."""
-        self.search.found()
+        self.search.end_global_localization()
         if self.landmarks is not None:
             self.landmarks.localized()
 
@@ -197,18 +197,18 @@ class Branching:
         if self.landmarks is not None:
             self.landmarks.forget_scans()
 
-    def remember(self, event: int, scan: Scan, wanted: Collection[int]) -> None:
+    def keep_scans(self, event: int, scan: Scan, wanted: Collection[int]) -> None:
         """Keep the scan of a keyframe event, and of those that were kept the ones that are wanted."""
-        for late in self.recent.keys() - set(wanted):
-            del self.recent[late]
+        for late in self.unstored_scans.keys() - set(wanted):
+            del self.unstored_scans[late]
         if event in wanted:
-            self.recent[event] = scan
+            self.unstored_scans[event] = scan
 
     def begin_event(self) -> None:
         """Forget which new areas were named; within one event hypotheses share the ids of the same new area."""
-        self._named = {}
+        self._new_areas = {}
 
-    def recognized(
+    def reweight_by_known_ground(
         self, parent: Parent, pose: NDArray[np.float64], points: NDArray[np.float64], keyframe: int
     ) -> Parent:
         """The hypothesis weighed by what the newest scan says for the known ground that it has the robot in.
@@ -217,8 +217,8 @@ class Branching:
         :param pose: ``area_T_base`` of the scan.
         :param keyframe: its number.
         """
-        poses = {parent.area: np.zeros(3), **parent.around()}
-        log_ratio = self.search.recognized(parent.hybrid_map, poses, points, pose, keyframe)
+        poses = {parent.area: np.zeros(3), **parent.local_area_poses()}
+        log_ratio = self.search.known_ground_log_ratio(parent.hybrid_map, poses, points, pose, keyframe)
         return replace(parent, log_weight=parent.log_weight + log_ratio)
 
     def cut(self, parent: Parent, keyframes: Sequence[int]) -> Branches:
@@ -228,70 +228,90 @@ class Branching:
         pose there, and "new" would be the same metric map under another name.
         """
         query = self.query(parent, keyframes)
-        tracked = self.search.tracked_area(parent.hybrid_map, parent.area, parent.around(), query.in_area)
+        tracked = self.search.tracked_area(
+            parent.hybrid_map, parent.area, parent.local_area_poses(), query.poses_in_area
+        )
         if tracked is not None:
             return Branches([self._enter_tracked(parent, query, tracked)])
-        excluded = {parent.area, *parent.around()}
+        excluded = {parent.area, *parent.local_area_poses()}
         supposed = parent
-        if self.landmarks is not None and parent.share >= PROBABLE:
+        if self.landmarks is not None and parent.probability >= MIN_HYPOTHESIS_PROBABILITY:
             supposed = replace(parent, hybrid_map=self.landmarks.propose_loop(parent.hybrid_map, parent.area))
-        found = self._compared(supposed, query, excluded)
-        noted = replace(parent, notes=parent.notes.checked(found.examined, keyframes, found.beside))
+        found = self._compare_areas(supposed, query, excluded)
+        noted = replace(
+            parent, state=parent.state.after_matching(found.examined_areas, keyframes, found.pending_candidates)
+        )
         children = [self._enter_new(noted, query, math.log(found.transition.new))]
         children += [self._enter_known(noted, query, fit) for fit in found.fits]
-        return Branches(children, True, _log(found.skipped) + parent.log_weight)
+        return Branches(children, True, _log(found.skipped_weight) + parent.log_weight)
 
     def recheck(self, parent: Parent, only: Collection[int] = ()) -> Branches:
         """Stay as it is, or join the robot's area to a known one by a further arc; no keyframe changes its area.
 
         :param only: known areas beside which keyframes fitted: whether the newest are in one of them now.
         """
-        newest = sorted(parent.notes.covariances)[-self._options.recheck_keyframes :]
+        newest = sorted(parent.state.covariances)[-self._options.recheck_keyframes :]
         placed = parent.hybrid_map.keyframes(parent.area)
-        keyframes = [k for k in (newest if only else parent.notes.unchecked) if k in placed]
+        keyframes = [k for k in (newest if only else parent.state.unmatched_keyframes) if k in placed]
         query = self.query(parent, keyframes)
-        excluded = {parent.area, *parent.around(), *beside(parent.hybrid_map, parent.area)}
-        if self.landmarks is not None and parent.share >= PROBABLE:
+        excluded = {parent.area, *parent.local_area_poses(), *connected_neighbors(parent.hybrid_map, parent.area)}
+        if self.landmarks is not None and parent.probability >= MIN_HYPOTHESIS_PROBABILITY:
             self.landmarks.prepare_loops(parent.hybrid_map, parent.area)
-        found = self._compared(parent, query, excluded, only)
-        notes = parent.notes.checked(found.examined, keyframes, found.beside, all_areas=not only)
-        noted = replace(parent, notes=notes)
+        found = self._compare_areas(parent, query, excluded, only)
+        notes = parent.state.after_matching(
+            found.examined_areas, keyframes, found.pending_candidates, all_areas=not only
+        )
+        noted = replace(parent, state=notes)
         # That none is in the place was weighed when they fitted beside it.
         log_new = 0.0 if only and not found.fits else math.log(found.transition.new)
         stay = parent.log_weight + log_new
-        children = [Child(parent.hypothesis, stay, parent.area, noted.notes)]
+        children = [Child(parent.hypothesis, stay, parent.area, noted.state)]
         children += [self._join(noted, query, fit) for fit in found.fits]
-        return Branches(children, True, _log(found.skipped) + parent.log_weight)
+        return Branches(children, True, _log(found.skipped_weight) + parent.log_weight)
 
-    def _compared(
+    def _compare_areas(
         self, parent: Parent, query: Query, excluded: Collection[int], only: Collection[int] = ()
-    ) -> Comparison:
+    ) -> AreaComparison:
         """The comparison with known areas, of which a hypothesis may examine the more the more probable it is."""
-        most = min(self._options.max_candidates, max(FEWEST, math.ceil(self._options.max_comparisons * parent.share)))
-        return self.search.compare(parent.hybrid_map, parent.area, query, parent.notes.compared, excluded, most, only)
+        most = min(
+            self._options.max_candidates,
+            max(MIN_EXAMINED_AREAS, math.ceil(self._options.max_comparisons * parent.probability)),
+        )
+        return self.search.compare(
+            parent.hybrid_map, parent.area, query, parent.state.matched_keyframes, excluded, most, only
+        )
 
     def move(self, parent: Parent, area: int) -> Branches:
         """The robot went into a known area; the keyframes stay where they are."""
-        belief, notes = self._belief(parent, area), parent.notes.entered({})
+        belief, notes = self._belief(parent, area), parent.state.after_area_change({})
         return Branches(
-            [Child(parent.hypothesis, parent.log_weight, area, notes, rebase=belief.inverse(), reload=True)]
+            [
+                Child(
+                    parent.hypothesis,
+                    parent.log_weight,
+                    area,
+                    notes,
+                    frame_change=belief.inverse(),
+                    reload_local_map=True,
+                )
+            ]
         )
 
-    def astray(self, parent: Parent, pose: NDArray[np.float64]) -> int | None:
+    def find_unlinked_overlap(self, parent: Parent, pose: NDArray[np.float64]) -> int | None:
         """The area of the local map in whose place the robot is, where no arc joins that to the robot's own area.
 
         Area abstraction looks along the arcs and would not notice.
 
         :param pose: ``area_T_base``.
         """
-        joined = beside(parent.hybrid_map, parent.area)
-        around = {area: at for area, at in parent.around().items() if area not in joined}
+        joined = connected_neighbors(parent.hybrid_map, parent.area)
+        around = {area: at for area, at in parent.local_area_poses().items() if area not in joined}
         found = self.search.tracked_area(parent.hybrid_map, parent.area, around, pose[None])
         if found is None:
             return None
-        here = positions(parent.hybrid_map, parent.area, np.zeros(3))
-        there = positions(parent.hybrid_map, found, around[found])
-        return found if gap(pose[None, :2], there) < gap(pose[None, :2], here) else None
+        here = keyframe_positions(parent.hybrid_map, parent.area, np.zeros(3))
+        there = keyframe_positions(parent.hybrid_map, found, around[found])
+        return found if min_distance(pose[None, :2], there) < min_distance(pose[None, :2], here) else None
 
     def link(self, parent: Parent, area: int, scan: Scan, pose: PoseGaussian) -> Branches:
         """Join the robot's area to one in which it is tracked by the arc that the newest scan measures.
@@ -299,9 +319,9 @@ class Branching:
         :param pose: belief over ``area_T_base`` of the scan, in the robot's area.
         """
         belief = self._belief(parent, area)
-        prior = belief.inverse().compose(PoseGaussian(pose.mean, pose.covariance + self._floor))
-        found = self.search.measured(parent.hybrid_map, area, parent.area, scan, prior)
-        notes = parent.notes.seen_in(None)
+        prior = belief.inverse().compose(PoseGaussian(pose.mean, pose.covariance + self._covariance_floor))
+        found = self.search.measure_pose(parent.hybrid_map, area, parent.area, scan, prior)
+        notes = parent.state.after_overlap(None)
         if found is None:
             return Branches([Child(parent.hypothesis, parent.log_weight, parent.area, notes)])
         arc = Arc(parent.area, area, pose.compose(found.inverse()), closure=True)
@@ -309,30 +329,30 @@ class Branching:
 
     def _belief(self, parent: Parent, area: int) -> PoseGaussian:
         """The belief over ``area_T_other``, its mean as the local map has it, so that the robot does not jump."""
-        arc = telling_arc(parent.hybrid_map, parent.area, area)
-        found = arc or reachable(parent.hybrid_map, parent.area, until=(area,))[area]
-        return PoseGaussian(parent.notes.local.get(area, found.mean), found.covariance)
+        arc = informative_arc(parent.hybrid_map, parent.area, area)
+        found = arc or shortest_path_beliefs(parent.hybrid_map, parent.area, targets=(area,))[area]
+        return PoseGaussian(parent.state.local_area_poses.get(area, found.mean), found.covariance)
 
     def query(self, parent: Parent, keyframes: Sequence[int]) -> Query:
         """Keyframes of a hypothesis as TSBI asks for them."""
         placed = parent.hybrid_map.keyframes(parent.area)
         reference = placed[keyframes[0]]
-        covariance = parent.covariance(keyframes[0]) + self._floor
+        covariance = parent.covariance(keyframes[0]) + self._covariance_floor
         poses = {keyframe: se2.between(reference, placed[keyframe]) for keyframe in keyframes}
         return Query(PoseGaussian(reference, covariance), poses)
 
     def _enter_new(self, parent: Parent, query: Query, log_factor: float) -> Child:
         """New ground: the reference keyframe becomes the frame of a new area."""
-        origin = PoseGaussian.exactly(np.zeros(3))
-        return self.entered(parent, query, self.new_area(parent, query), origin, query.belief, log_factor)
+        origin = PoseGaussian.from_pose(np.zeros(3))
+        return self.enter_area(parent, query, self.new_area(parent, query), origin, query.belief, log_factor)
 
     def new_area(self, parent: Parent, query: Query) -> int:
         """The number of an area that keyframes begin, the same for all hypotheses of an event."""
         keyframes = tuple(query.poses)
-        if keyframes not in self._named:
-            self._areas = max(self._areas, parent.hybrid_map.largest_area) + 1
-            self._named[keyframes] = self._areas
-        return self._named[keyframes]
+        if keyframes not in self._new_areas:
+            self._largest_area = max(self._largest_area, parent.hybrid_map.max_area_id) + 1
+            self._new_areas[keyframes] = self._largest_area
+        return self._new_areas[keyframes]
 
     def _enter_tracked(self, parent: Parent, query: Query, area: int) -> Child:
         """A known area in whose place the robot is known to be.
@@ -341,15 +361,15 @@ class Branching:
         """
         belief = self._belief(parent, area)
         entry = belief.inverse().compose(query.belief)
-        joined = telling_arc(parent.hybrid_map, parent.area, area) is not None
-        arc = None if joined else self._measured_arc(parent, query, area, belief)
-        return self.entered(parent, query, area, entry, arc, 0.0)
+        joined = informative_arc(parent.hybrid_map, parent.area, area) is not None
+        arc = None if joined else self._measure_arc(parent, query, area, belief)
+        return self.enter_area(parent, query, area, entry, arc, 0.0)
 
-    def _measured_arc(self, parent: Parent, query: Query, area: int, belief: PoseGaussian) -> PoseGaussian:
+    def _measure_arc(self, parent: Parent, query: Query, area: int, belief: PoseGaussian) -> PoseGaussian:
         newest, pose = list(query.poses.items())[-1]
         here = query.belief.compose(PoseGaussian(pose, np.zeros((3, 3))))
         scan, prior = self._replica.scans[newest], belief.inverse().compose(here)
-        found = self.search.measured(parent.hybrid_map, area, parent.area, scan, prior)
+        found = self.search.measure_pose(parent.hybrid_map, area, parent.area, scan, prior)
         if found is None:
             return PoseGaussian(belief.mean, _UNCONFIRMED * belief.covariance)
         return here.compose(found.inverse())
@@ -357,37 +377,38 @@ class Branching:
     def _enter_known(self, parent: Parent, query: Query, fit: Fit) -> Child:
         """A known area, recognised."""
         arc = query.belief.compose(fit.mode.measured.inverse())
-        return self.entered(parent, query, fit.area, fit.mode.pose, arc, fit.log_weight)
+        return self.enter_area(parent, query, fit.area, fit.mode.pose, arc, fit.log_weight)
 
-    def entered(
+    def enter_area(
         self, parent: Parent, query: Query, area: int, entry: PoseGaussian, arc: PoseGaussian | None, log_factor: float
     ) -> Child:
         """The robot and the query's keyframes are in ``area``, at ``entry`` = ``area_T_reference``."""
         relabelled = tuple(
-            Relabelled(keyframe, parent.area, area, se2.compose(entry.mean, pose))
+            MovedKeyframe(keyframe, parent.area, area, se2.compose(entry.mean, pose))
             for keyframe, pose in query.poses.items()
         )
         covariances = {
-            keyframe: entry.compose(self._step(parent, query, keyframe)).covariance for keyframe in query.poses
+            keyframe: entry.compose(self._keyframe_belief(parent, query, keyframe)).covariance
+            for keyframe in query.poses
         }
         return Child(
             parent.hypothesis,
             parent.log_weight + log_factor,
             area,
-            parent.notes.entered(covariances),
-            _rebase(query, entry, covariances),
+            parent.state.after_area_change(covariances),
+            _frame_change(query, entry, covariances),
             relabelled,
-            () if arc is None else (self._arc(parent, area, arc),),
-            reload=True,
+            () if arc is None else (self._make_arc(parent, area, arc),),
+            reload_local_map=True,
         )
 
-    def _step(self, parent: Parent, query: Query, keyframe: int) -> PoseGaussian:
+    def _keyframe_belief(self, parent: Parent, query: Query, keyframe: int) -> PoseGaussian:
         """The belief over ``reference_T_base`` of a keyframe."""
-        pose, reference = query.poses[keyframe], query.belief.covariance - self._floor
+        pose, reference = query.poses[keyframe], query.belief.covariance - self._covariance_floor
         return PoseGaussian(pose, relative_covariance(parent.covariance(keyframe), reference, pose, np.zeros((3, 3))))
 
     @staticmethod
-    def _arc(parent: Parent, area: int, belief: PoseGaussian) -> Arc:
+    def _make_arc(parent: Parent, area: int, belief: PoseGaussian) -> Arc:
         """The arc from the robot's area; it closes a loop where it joins two known areas that no arc joined."""
         known = parent.hybrid_map.arc_value(parent.area, area)
         revisited = parent.hybrid_map.has_area(area)
@@ -398,68 +419,70 @@ class Branching:
         """The robot stays in its area, which an arc now joins to a known one."""
         arc = Arc(parent.area, fit.area, query.belief.compose(fit.mode.measured.inverse()), closure=True)
         log_weight = parent.log_weight + fit.log_weight
-        return Child(parent.hypothesis, log_weight, parent.area, parent.notes, arcs=(arc,), reload=True)
+        return Child(parent.hypothesis, log_weight, parent.area, parent.state, arcs=(arc,), reload_local_map=True)
 
 
-def _rebase(query: Query, entry: PoseGaussian, covariances: Mapping[int, NDArray[np.float64]]) -> PoseGaussian:
+def _frame_change(query: Query, entry: PoseGaussian, covariances: Mapping[int, NDArray[np.float64]]) -> PoseGaussian:
     """``area_T_previous``, as uncertain as the newest of the keyframes is in the area, so that its drift goes on."""
     newest, pose = list(query.poses.items())[-1]
     belief = PoseGaussian(se2.compose(entry.mean, pose), covariances[newest])
-    return belief.compose(PoseGaussian.exactly(se2.inverse(se2.compose(query.belief.mean, pose))))
+    return belief.compose(PoseGaussian.from_pose(se2.inverse(se2.compose(query.belief.mean, pose))))
 
 
 def _log(value: float) -> float:
     return math.log(value) if value > 0.0 else -math.inf
 
 
-def merged(parent: Parent, area: int, into: int, search: ClosureSearch) -> Child:
+def merge_areas(parent: Parent, area: int, into: int, search: ClosureSearch) -> Child:
     """The child in which ``area`` is part of ``into``, or which stays as it is where their surfaces contradict.
 
     :param search: which compares them.
     """
-    child = Child(parent.hypothesis, parent.log_weight, parent.area, parent.notes)
+    child = Child(parent.hypothesis, parent.log_weight, parent.area, parent.state)
     belief = parent.hybrid_map.arc(into, area)
-    if belief is None or not search.agree(parent.hybrid_map, into, area, belief.mean):
+    if belief is None or not search.is_same_place(parent.hybrid_map, into, area, belief.mean):
         return child
-    child = replace(child, reload=True, merged=Merged(area, into, belief))
+    child = replace(child, reload_local_map=True, area_merge=AreaMerge(area, into, belief))
     if parent.area != area:
         return child
     placed = parent.hybrid_map.keyframes(area)
     covariances = {
         k: belief.compose(PoseGaussian(placed[k], covariance)).covariance
-        for k, covariance in parent.notes.covariances.items()
+        for k, covariance in parent.state.covariances.items()
         if k in placed
     }
-    return replace(child, area=into, notes=parent.notes.entered(covariances), rebase=belief)
+    return replace(child, area=into, state=parent.state.after_area_change(covariances), frame_change=belief)
 
 
-def reopened(parent: Parent, leaf: Leaf, newest: int) -> Child:
+def apply_revision(parent: Parent, leaf: Hypothesis, newest: int) -> Child:
     """The child that believes one of TLCA's explanations; all areas may be compared again.
 
     :param leaf: the explanation; of the keyframes that came since TLCA spoke it does not know.
     :param newest: the newest keyframe.
     """
-    relabelled = leaf.relabelled
-    if leaf.rebase is not None and newest in parent.hybrid_map.keyframes(parent.area):
-        pose = se2.compose(leaf.rebase.mean, parent.hybrid_map.keyframes(parent.area)[newest])
-        relabelled += (Relabelled(newest, parent.area, leaf.area, pose),)
+    relabelled = leaf.moved_keyframes
+    if leaf.frame_change is not None and newest in parent.hybrid_map.keyframes(parent.area):
+        pose = se2.compose(leaf.frame_change.mean, parent.hybrid_map.keyframes(parent.area)[newest])
+        relabelled += (MovedKeyframe(newest, parent.area, leaf.area, pose),)
     return Child(
         parent.hypothesis,
         parent.log_weight + math.log(leaf.probability),
         leaf.area,
-        _notes(parent, leaf, {r.keyframe for r in relabelled if r.area == leaf.area}),
-        leaf.rebase,
+        _state_after_revision(parent, leaf, {r.keyframe for r in relabelled if r.area == leaf.area}),
+        leaf.frame_change,
         relabelled,
         leaf.arcs,
-        reload=True,
-        withdrawn=leaf.withdrawn,
+        reload_local_map=True,
+        removed_arcs=leaf.removed_arcs,
     )
 
 
-def _notes(parent: Parent, leaf: Leaf, moved: set[int]) -> LeafNotes:
+def _state_after_revision(parent: Parent, leaf: Hypothesis, moved: set[int]) -> HypothesisState:
     """Without what was compared; where the robot is in another area now, of the keyframes that it took along."""
-    notes = replace(parent.notes, compared={}, astray=None)
+    notes = replace(parent.state, matched_keyframes={}, unlinked_overlap=None)
     if leaf.area == parent.area:
         return notes
     covariances = {keyframe: covariance for keyframe, covariance in notes.covariances.items() if keyframe in moved}
-    return LeafNotes(covariances, unchecked=tuple(keyframe for keyframe in notes.unchecked if keyframe in moved))
+    return HypothesisState(
+        covariances, unmatched_keyframes=tuple(keyframe for keyframe in notes.unmatched_keyframes if keyframe in moved)
+    )

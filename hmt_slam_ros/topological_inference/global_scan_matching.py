@@ -22,40 +22,49 @@ from numpy.typing import NDArray
 from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.grids.free_space import met_and_passed
+from hmt_slam_ros.grids.free_space import count_hits_and_violations
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
-from hmt_slam_ros.hybrid_map.surroundings import Nearness, Place, Views, areas_around, gap, owner_at, positions, stacked
-from hmt_slam_ros.registration.area_to_area import MatchSettings, Mode, match
-from hmt_slam_ros.registration.branch_and_bound import ground_around
+from hmt_slam_ros.hybrid_map.surroundings import (
+    AreaPlace,
+    GridCache,
+    Neighborhood,
+    areas_around,
+    containing_area,
+    keyframe_positions,
+    min_distance,
+    stack_poses,
+)
+from hmt_slam_ros.registration.area_to_area import MatchMode, MatchSettings, match_areas
+from hmt_slam_ros.registration.branch_and_bound import constrain_around
 from hmt_slam_ros.registration.consistency import Agreement
 from hmt_slam_ros.registration.likelihood_grid import AreaGrid
 from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.submap.local_mapping import LocalMapping
 
 # Deviation of an answer's position at most, m.
-_SHARP = 0.2
+_MAX_DEVIATION = 0.2
 
 
-class Located(NamedTuple):
+class PoseCandidate(NamedTuple):
     """Where keyframes are.
 
     :ivar area: in whose place.
     :ivar mode: how they lie there.
-    :ivar found: their surfaces in the map of the place.
+    :ivar agreement: their surfaces in the map of the place.
     """
 
     area: int
-    mode: Mode
-    found: Agreement
+    mode: MatchMode
+    agreement: Agreement
 
 
-def is_certain(located: Located) -> bool:
+def is_certain(candidate: PoseCandidate) -> bool:
     """Whether the surfaces alone say where, also along corridors."""
-    variance = float(np.linalg.eigvalsh(located.mode.measured.covariance[:2, :2])[-1])
-    return variance <= _SHARP**2
+    variance = float(np.linalg.eigvalsh(candidate.mode.measured.covariance[:2, :2])[-1])
+    return variance <= _MAX_DEVIATION**2
 
 
-def reach_of(
+def query_bounds(
     positions: NDArray[np.float64], query: AreaGrid, poses: Mapping[int, NDArray[np.float64]], radius: float
 ) -> NDArray[np.float64]:
     """The smallest and the largest (x, y) of the middle of the query's points where a keyframe of it is near one of
@@ -66,7 +75,7 @@ def reach_of(
     :param radius: how near, m.
     """
     middle = query.points.mean(axis=0) if len(query.points) else np.zeros(2)
-    lever = float(np.hypot(*(stacked(poses)[:, :2] - middle).T).max())
+    lever = float(np.hypot(*(stack_poses(poses)[:, :2] - middle).T).max())
     reach = radius + lever
     return np.array([positions.min(axis=0) - reach, positions.max(axis=0) + reach])
 
@@ -74,10 +83,10 @@ def reach_of(
 Pose = NDArray[np.float64]
 
 # Keyframes see each other's walls where they are this near, m.
-_NEAR = 12.0
+_WALL_RADIUS = 12.0
 
 
-class Walls:
+class FreeSpaceCheck:
     """Lays keyframes into each other's maps.
 
     :param scans: {keyframe: scan}, which may grow.
@@ -86,7 +95,7 @@ class Walls:
     def __init__(self, scans: Mapping[int, Scan], configuration: Configuration) -> None:
         self._scans, self._configuration = scans, configuration
 
-    def between(self, known: Mapping[int, Pose], seen: Mapping[int, Pose]) -> Agreement:
+    def compare(self, known: Mapping[int, Pose], seen: Mapping[int, Pose]) -> Agreement:
         """Samples of the walls of either on which beams of the other end (on), and which they pass (free).
 
         :param known: {keyframe: ``map_T_base`` (3,)}, of which those count that are near to the others.
@@ -94,31 +103,35 @@ class Walls:
         """
         if not known or not seen:
             return Agreement(0, 0, 0)
-        middle = np.append(stacked(seen)[:, :2].mean(axis=0), 0.0)
-        here = stacked(seen) - middle
-        there = stacked(known) - middle
+        middle = np.append(stack_poses(seen)[:, :2].mean(axis=0), 0.0)
+        here = stack_poses(seen) - middle
+        there = stack_poses(known) - middle
         apart = np.hypot(*(there[:, None, :2] - here[None, :, :2]).transpose(2, 0, 1)).min(axis=1)
-        near = apart <= _NEAR
+        near = apart <= _WALL_RADIUS
         scans = [self._scans[k] for k, is_near in zip(known, near, strict=True) if is_near]
         own = [self._scans[k] for k in seen]
         mapping = LocalMapping(self._configuration)
         there = there[near]
-        found = _seen_in(mapping, scans, there, own, here) + _seen_in(mapping, own, here, scans, there)
+        found = _count_hits_and_violations(mapping, scans, there, own, here) + _count_hits_and_violations(
+            mapping, own, here, scans, there
+        )
         met, passed = found.tolist()
         return Agreement(met + passed, met, passed)
 
 
-def _seen_in(mapping: LocalMapping, scans: list[Scan], poses: Pose, seeing: list[Scan], at: Pose) -> NDArray[np.int64]:
+def _count_hits_and_violations(
+    mapping: LocalMapping, scans: list[Scan], poses: Pose, seeing: list[Scan], at: Pose
+) -> NDArray[np.int64]:
     """Samples that beams of some scans end on, and that they pass, in a map of others, shape (2,).
 
     :param poses: shape (len(scans), 3), where the map's were taken; ``at`` is where the others were.
     """
     table = mapping.pool.empty_table()
     for scan, pose in zip(scans, poses, strict=True):
-        mapping.insert(table[None], pose[None], scan)
+        mapping.insert_scan(table[None], pose[None], scan)
     view = mapping.pool.view(table)
     found = [
-        met_and_passed(mapping.matching_points(scan), scan.laser_pose[:2], pose, view, mapping.near)
+        count_hits_and_violations(mapping.matching_surfels(scan), scan.laser_pose[:2], pose, view, mapping.hit_distance)
         for scan, pose in zip(seeing, at, strict=True)
     ]
     mapping.pool.release(table)
@@ -131,14 +144,14 @@ _WIDE = 1.0
 # Flat over a region and all headings, m, m, rad.
 _FLAT = PoseGaussian(np.zeros(3), np.diag([100.0, 100.0, 20.0]) ** 2)
 # Of the samples, one of so many is looked for.
-_EVERY = 3
+_SAMPLE_STRIDE = 3
 # Of the log-ratio of a sample on a surface, as much on average at least: what the robot sees is in the map, or it is
 # not. That little of the map is where it sees free space is not asked, as what moved left its traces there.
-_SURE = math.log(3.0)
-_HALF = 0.5 * _SURE
+_SURFACE_LOG_RATIO = math.log(3.0)
+_MIN_LOG_RATIO = 0.5 * _SURFACE_LOG_RATIO
 # Where so much less of the surfaces is known than in the best place, a place does not matter; and the fits of a region
 # that are worked out at most.
-_WORSE, _FITS = 0.15, 40
+_SHARE_MARGIN, _MAX_FITS = 0.15, 40
 
 
 class Region(NamedTuple):
@@ -146,46 +159,58 @@ class Region(NamedTuple):
 
     :ivar reference: one of them.
     :ivar poses: {area: ``reference_T_area``} of all that the region's map holds.
-    :ivar own: the areas that are looked for here; the others are in the map, but belong to other regions.
+    :ivar own_areas: the areas that are looked for here; the others are in the map, but belong to other regions.
     """
 
     reference: int
     poses: dict[int, Pose]
-    own: frozenset[int]
+    own_areas: frozenset[int]
 
 
-class WholeMap:
+class GlobalScanMatcher:
     """Looks for keyframes in the whole map.
 
     :param radius: farthest distance to a keyframe of a place, m.
     :param reach: as far as that from an area's keyframes, m, others are part of what is seen there.
     """
 
-    def __init__(self, views: Views, walls: Walls, settings: MatchSettings, radius: float, reach: float) -> None:
-        self._views, self._walls, self._settings, self._radius, self._reach = views, walls, settings, radius, reach
+    def __init__(
+        self, views: GridCache, walls: FreeSpaceCheck, settings: MatchSettings, radius: float, reach: float
+    ) -> None:
+        self._grid_cache, self._free_space_check, self._settings, self._radius, self._reach = (
+            views,
+            walls,
+            settings,
+            radius,
+            reach,
+        )
 
-    def fits(
+    def match_regions(
         self, hybrid_map: HybridMap, poses: Mapping[int, Pose], before: float, shares: Mapping[int, float]
-    ) -> list[Located]:
+    ) -> list[PoseCandidate]:
         """How the keyframes lie in some areas: the ways that matter beside the best.
 
         :param poses: {keyframe: ``reference_T_base``}.
         :param before: the map is that of the keyframes before this one.
         :param shares: {area: probability by its look} of the areas; where it is most probable is looked first.
         """
-        found: list[Located] = []
-        query = replace(self._views.grid(poses), points=self._views.lasting(poses))
+        found: list[PoseCandidate] = []
+        query = replace(self._grid_cache.grid(poses), points=self._grid_cache.static_points(poses))
         known = [area for area in hybrid_map.area_ids() if min(hybrid_map.keyframes(area), default=before) < before]
-        parts = [part for part in regions(hybrid_map, known, self._reach) if part.own & shares.keys()]
-        for part in sorted(parts, key=lambda part: (-sum(shares.get(a, 0.0) for a in part.own), part.reference)):
-            best = max((fit.found.share for fit in found), default=0.0)
-            place = self._views.place_of(hybrid_map, part.reference, part.poses, before)
-            own = part.own & shares.keys()
-            here = self._fits(place, query, poses, own, max(_HALF, (best - _WORSE) * _SURE))
-            found += [fit._replace(mode=_seen_from(fit.mode, part.poses[fit.area])) for fit in here]
+        parts = [part for part in regions(hybrid_map, known, self._reach) if part.own_areas & shares.keys()]
+        for part in sorted(parts, key=lambda part: (-sum(shares.get(a, 0.0) for a in part.own_areas), part.reference)):
+            best = max((fit.agreement.matched_share for fit in found), default=0.0)
+            place = self._grid_cache.place_among(hybrid_map, part.reference, part.poses, before)
+            own = part.own_areas & shares.keys()
+            here = self._match_region(
+                place, query, poses, own, max(_MIN_LOG_RATIO, (best - _SHARE_MARGIN) * _SURFACE_LOG_RATIO)
+            )
+            found += [fit._replace(mode=_mode_in_frame(fit.mode, part.poses[fit.area])) for fit in here]
         return found
 
-    def walls(self, hybrid_map: HybridMap, located: Located, poses: Mapping[int, Pose], before: float) -> Agreement:
+    def check_walls(
+        self, hybrid_map: HybridMap, candidate: PoseCandidate, poses: Mapping[int, Pose], before: float
+    ) -> Agreement:
         """Walls of the map and of the keyframes that beams of the other end on or pass, if these lie there.
 
         :param poses: {keyframe: ``reference_T_base``}.
@@ -193,35 +218,41 @@ class WholeMap:
         """
         known = {
             keyframe: se2.compose(belief.mean, pose)
-            for area, belief in areas_around(hybrid_map, located.area, Nearness(_WIDE, 2.0 * self._reach)).items()
+            for area, belief in areas_around(hybrid_map, candidate.area, Neighborhood(_WIDE, 2.0 * self._reach)).items()
             for keyframe, pose in hybrid_map.keyframes(area).items()
             if keyframe < before
         }
-        return self._walls.between(known, {k: se2.compose(located.mode.pose.mean, pose) for k, pose in poses.items()})
+        return self._free_space_check.compare(
+            known, {k: se2.compose(candidate.mode.pose.mean, pose) for k, pose in poses.items()}
+        )
 
     def forget(self) -> None:
         """Forget the maps of the regions, which take as much memory as a large building's local maps."""
-        self._views.forget()
+        self._grid_cache.forget()
 
-    def _fits(
-        self, place: Place, query: AreaGrid, poses: Mapping[int, Pose], own: Collection[int], least: float
-    ) -> Iterator[Located]:
+    def _match_region(
+        self, place: AreaPlace, query: AreaGrid, poses: Mapping[int, Pose], own: Collection[int], least: float
+    ) -> Iterator[PoseCandidate]:
         """How the keyframes lie in areas of a region, in the frame of its reference.
 
         :param query: what the keyframes saw.
         :param own: the areas.
         :param least: log-ratio of the samples on average, nats.
         """
-        some, known = (replace(grid, points=grid.points[::_EVERY]) for grid in (query, place.grid))
-        temper = _EVERY * self._settings.temper
-        margin = max(self._settings.margin, _WORSE * _SURE * temper * len(some.points))
-        settings = replace(self._settings, temper=temper, margin=margin, least=least, max_modes=_FITS, reverse=False)
-        near = place.positions[np.isin(place.owners, list(own))]
-        ground = ground_around(near, stacked(poses)[:, :2], self._radius, place.grid.cell)
-        for mode in match(some, known, _FLAT, settings, reach_of(near, query, poses, self._radius), ground).modes:
-            area = owner_at(place, se2.compose(mode.pose.mean, stacked(poses)), self._radius)
+        some, known = (replace(grid, points=grid.points[::_SAMPLE_STRIDE]) for grid in (query, place.grid))
+        temper = _SAMPLE_STRIDE * self._settings.temper
+        margin = max(self._settings.margin, _SHARE_MARGIN * _SURFACE_LOG_RATIO * temper * len(some.points))
+        settings = replace(
+            self._settings, temper=temper, margin=margin, min_log_ratio=least, max_modes=_MAX_FITS, check_reverse=False
+        )
+        near = place.positions[np.isin(place.keyframe_areas, list(own))]
+        ground = constrain_around(near, stack_poses(poses)[:, :2], self._radius, place.grid.cell)
+        for mode in match_areas(
+            some, known, _FLAT, settings, query_bounds(near, query, poses, self._radius), ground
+        ).modes:
+            area = containing_area(place, se2.compose(mode.pose.mean, stack_poses(poses)), self._radius)
             if area is not None and area in own:
-                yield Located(area, mode, place.grid.agreement(query.points, mode.pose.mean))
+                yield PoseCandidate(area, mode, place.grid.compare(query.points, mode.pose.mean))
 
 
 def regions(hybrid_map: HybridMap, areas: Collection[int], reach: float) -> list[Region]:
@@ -233,16 +264,20 @@ def regions(hybrid_map: HybridMap, areas: Collection[int], reach: float) -> list
     for area in sorted(areas):
         if area not in left:
             continue
-        around = areas_around(hybrid_map, area, Nearness(_WIDE, 2.0 * reach))
+        around = areas_around(hybrid_map, area, Neighborhood(_WIDE, 2.0 * reach))
         poses = {other: belief.mean for other, belief in around.items() if other in areas}
-        here = positions(hybrid_map, area, np.zeros(3))
-        own = {other for other in left & poses.keys() if gap(here, positions(hybrid_map, other, poses[other])) <= reach}
+        here = keyframe_positions(hybrid_map, area, np.zeros(3))
+        own = {
+            other
+            for other in left & poses.keys()
+            if min_distance(here, keyframe_positions(hybrid_map, other, poses[other])) <= reach
+        }
         left -= own
         found.append(Region(area, poses, frozenset(own)))
     return found
 
 
-def _seen_from(mode: Mode, pose: Pose) -> Mode:
+def _mode_in_frame(mode: MatchMode, pose: Pose) -> MatchMode:
     """A mode in the frame of an area that stands at ``pose``, shape (3,), of the frame that it is in."""
-    back = PoseGaussian.exactly(se2.inverse(pose))
-    return Mode(back.compose(mode.pose), back.compose(mode.measured), mode.log_mass)
+    back = PoseGaussian.from_pose(se2.inverse(pose))
+    return MatchMode(back.compose(mode.pose), back.compose(mode.measured), mode.log_mass)

@@ -12,17 +12,17 @@ from numpy.typing import NDArray
 
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.topological_inference.global_localization import Told
+from hmt_slam_ros.topological_inference.global_localization import PoseHint
 
 
 class Reduction(NamedTuple):
     """The hypotheses that stay.
 
-    :ivar kept: shape (n,), int64, ascending indices, each once.
+    :ivar indices: shape (n,), int64, ascending indices, each once.
     :ivar weights: shape (n,), their new weights, with the sum of all the old ones.
     """
 
-    kept: NDArray[np.int64]
+    indices: NDArray[np.int64]
     weights: NDArray[np.float64]
 
 
@@ -44,7 +44,7 @@ def reduce_hypotheses(weights: NDArray[np.float64], most: int, generator: np.ran
     heavy = weights[alive] >= c
     light = alive[~heavy]
     draws = most - int(heavy.sum())
-    drawn = light[_stratified(weights[light], draws, float(generator.random()))]
+    drawn = light[_draw_stratified(weights[light], draws, float(generator.random()))]
     kept = np.sort(np.concatenate((alive[heavy], drawn)))
     return Reduction(kept, np.where(weights[kept] >= c, weights[kept], weights[light].sum() / max(1, draws)))
 
@@ -61,7 +61,7 @@ def threshold(weights: NDArray[np.float64], most: int) -> float:
     return float(falling[most - 1])
 
 
-def _stratified(weights: NDArray[np.float64], count: int, offset: float) -> NDArray[np.int64]:
+def _draw_stratified(weights: NDArray[np.float64], count: int, offset: float) -> NDArray[np.int64]:
     """``count`` different indices, each drawn in proportion to its weight, none of which exceeds the stride."""
     edges = np.cumsum(weights) / weights.sum() * count
     edges[-1] = count
@@ -71,17 +71,17 @@ def _stratified(weights: NDArray[np.float64], count: int, offset: float) -> NDAr
 Covariance = NDArray[np.float64]
 
 # Log-probability per keyframe that wheels and scans both lose the robot: once in 50 km.
-_DISPLACED = math.log(1e-5)
+_LOG_KIDNAPPING_PRIOR = math.log(1e-5)
 # Of the nats by which a scan contradicts, so many are no news: who stands there does so at the next keyframe too.
-_LASTING = 1.0
+_CUSUM_DRIFT = 1.0
 # Keyframe events for which a doubt is kept.
-_KEPT = 30
+_CUSUM_WINDOW = 30
 # What contradicted less than so much of the most is another matter, of before the robot was displaced.
-_MATTER = 0.2
+_ONSET_SHARE = 0.2
 
 
 @dataclass(frozen=True, eq=False)
-class Spot:
+class PoseInArea:
     """Where in the map a robot that may be anywhere seems to be.
 
     :ivar area: a known area.
@@ -95,127 +95,142 @@ class Spot:
 
 
 @dataclass(frozen=True, eq=False)
-class Stay:
+class FalseAlarm:
     """That a robot that takes itself for lost was not displaced: furniture that was moved contradicts, too.
 
-    :ivar spot: where it is then.
+    :ivar tracked_pose: where it is then.
     :ivar probability: of that, by the scans for which it takes itself for lost.
     """
 
-    spot: Spot
+    tracked_pose: PoseInArea
     probability: float
 
 
 @dataclass(frozen=True, eq=False)
-class LeafNotes:
+class HypothesisState:
     """What TSBI remembers of a leaf beside its map; children inherit it.
 
     :ivar covariances: {keyframe: covariance (3, 3) of ``area_T_base``, right tangent} of the unsettled keyframes: those
         stored in the robot's area since it was entered, and those that came over with it.
-    :ivar compared: {known area: unsettled keyframes that were compared with it}. A keyframe speaks for or against a
+    :ivar matched_keyframes: {known area: unsettled keyframes that were compared with it}. A keyframe speaks for or against a
         known area once.
-    :ivar local: {area: ``current_T_area``} of the areas in the local map besides the robot's own.
-    :ivar unchecked: the unsettled keyframes that no re-check has looked at.
-    :ivar beside: known areas that the newest of them fitted beside, and in which the robot may be soon.
-    :ivar astray: the area of the local map, joined to the robot's own by no arc, in whose place the robot seems to be,
+    :ivar local_area_poses: {area: ``current_T_area``} of the areas in the local map besides the robot's own.
+    :ivar unmatched_keyframes: the unsettled keyframes that no re-check has looked at.
+    :ivar pending_candidates: known areas that the newest of them fitted beside, and in which the robot may be soon.
+    :ivar unlinked_overlap: the area of the local map, joined to the robot's own by no arc, in whose place the robot seems to be,
         and for how many keyframe events in a row; or None.
-    :ivar doubts: {keyframe event: nats by which its scan contradicted what the robot should have seen}, of the latest
+    :ivar kidnapping_evidence: {keyframe event: nats by which its scan contradicted what the robot should have seen}, of the latest
         events since the robot may have been displaced.
-    :ivar spots: {event of these: where the robot was}, where the map stays as it is and does not hold them.
-    :ivar lost: the keyframe at which the robot arrived it is not known where, until that is recognized; else None.
-    :ivar stay: where it was then if it was not displaced, where nothing is mapped and nobody carried it; else None.
-    :ivar told: where one of the keyframes since then is, as somebody says; else None.
-    :ivar sighted: where it was recognized at the last look, if it was.
-    :ivar found: the known area in which it was recognized, until it goes over into another one; else None.
-    :ivar claim: where it was at ``lost`` if it was not displaced, as another hypothesis says; else None.
-    :ivar credit: nats by which what it saw since then speaks for a place elsewhere, as far as that is in the
+    :ivar unstored_poses: {event of these: where the robot was}, where the map stays as it is and does not hold them.
+    :ivar lost_since: the keyframe at which the robot arrived it is not known where, until that is recognized; else None.
+    :ivar false_alarm: where it was then if it was not displaced, where nothing is mapped and nobody carried it; else None.
+    :ivar pose_hint: where one of the keyframes since then is, as somebody says; else None.
+    :ivar relocalization_candidate: where it was recognized at the last look, if it was.
+    :ivar relocalized_area: the known area in which it was recognized, until it goes over into another one; else None.
+    :ivar tracked_pose: where it was at ``lost`` if it was not displaced, as another hypothesis says; else None.
+    :ivar counted_evidence: nats by which what it saw since then speaks for a place elsewhere, as far as that is in the
         hypothesis's weight; None where another one has it there since.
     """
 
     covariances: Mapping[int, Covariance] = field(default_factory=dict)
-    compared: Mapping[int, frozenset[int]] = field(default_factory=dict)
-    local: Mapping[int, NDArray[np.float64]] = field(default_factory=dict)
-    unchecked: tuple[int, ...] = ()
-    beside: tuple[int, ...] = ()
-    astray: tuple[int, int] | None = None
-    doubts: Mapping[int, float] = field(default_factory=dict)
-    spots: Mapping[int, Spot] = field(default_factory=dict)
-    lost: int | None = None
-    stay: Stay | None = None
-    told: Told | None = None
-    sighted: Spot | None = None
-    found: int | None = None
-    claim: Spot | None = None
-    credit: float | None = 0.0
+    matched_keyframes: Mapping[int, frozenset[int]] = field(default_factory=dict)
+    local_area_poses: Mapping[int, NDArray[np.float64]] = field(default_factory=dict)
+    unmatched_keyframes: tuple[int, ...] = ()
+    pending_candidates: tuple[int, ...] = ()
+    unlinked_overlap: tuple[int, int] | None = None
+    kidnapping_evidence: Mapping[int, float] = field(default_factory=dict)
+    unstored_poses: Mapping[int, PoseInArea] = field(default_factory=dict)
+    lost_since: int | None = None
+    false_alarm: FalseAlarm | None = None
+    pose_hint: PoseHint | None = None
+    relocalization_candidate: PoseInArea | None = None
+    relocalized_area: int | None = None
+    tracked_pose: PoseInArea | None = None
+    counted_evidence: float | None = 0.0
 
-    def heard(self, event: int, doubt: float, spot: Spot | None = None) -> LeafNotes:
+    def after_scan(
+        self, event: int, log_kidnapping_ratio: float, unstored_pose: PoseInArea | None = None
+    ) -> HypothesisState:
         """After the scan of a keyframe event.
 
-        :param spot: where the robot was, if the map does not hold that.
-        :param doubt: log p(scan | the robot was displaced before it) / p(scan | the robot is there), nats, by the map
+        :param unstored_pose: where the robot was, if the map does not hold that.
+        :param log_kidnapping_ratio: log p(scan | the robot was displaced before it) / p(scan | the robot is there), nats, by the map
             of what is around.
         """
-        told = doubt - _LASTING
-        doubts = {k: nats for k, nats in self.doubts.items() if k > event - _KEPT}
+        told = log_kidnapping_ratio - _CUSUM_DRIFT
+        doubts = {k: nats for k, nats in self.kidnapping_evidence.items() if k > event - _CUSUM_WINDOW}
         if doubts or told > 0.0:
             doubts[event] = told
         if sum(doubts.values()) <= 0.0:
             doubts = {}
-        if not doubts and not self.doubts:
+        if not doubts and not self.kidnapping_evidence:
             return self
-        spots = self.spots if spot is None else {**self.spots, event: spot}
-        return replace(self, doubts=doubts, spots={k: at for k, at in spots.items() if k in doubts})
+        spots = self.unstored_poses if unstored_pose is None else {**self.unstored_poses, event: unstored_pose}
+        return replace(
+            self, kidnapping_evidence=doubts, unstored_poses={k: at for k, at in spots.items() if k in doubts}
+        )
 
     @property
-    def displaced(self) -> tuple[float, int]:
+    def kidnapping_test(self) -> tuple[float, int]:
         """Log-odds that the robot was displaced of late, and the first keyframe event after that.
 
         The events since then speak for that together (the test of Page 1954).
         """
-        if not self.doubts:
+        if not self.kidnapping_evidence:
             return -math.inf, 0
-        most = max(self.doubts.values())
-        first = min(event for event, nats in self.doubts.items() if nats >= _MATTER * most)
-        return _DISPLACED + sum(nats for event, nats in self.doubts.items() if event >= first), first
+        most = max(self.kidnapping_evidence.values())
+        first = min(event for event, nats in self.kidnapping_evidence.items() if nats >= _ONSET_SHARE * most)
+        return _LOG_KIDNAPPING_PRIOR + sum(
+            nats for event, nats in self.kidnapping_evidence.items() if event >= first
+        ), first
 
-    def stored(self, keyframe: int, covariance: Covariance) -> LeafNotes:
+    def after_keyframe(self, keyframe: int, covariance: Covariance) -> HypothesisState:
         """After a keyframe entered the robot's area."""
         return replace(
-            self, covariances={**self.covariances, keyframe: covariance}, unchecked=(*self.unchecked, keyframe)
+            self,
+            covariances={**self.covariances, keyframe: covariance},
+            unmatched_keyframes=(*self.unmatched_keyframes, keyframe),
         )
 
-    def checked(
-        self, areas: Sequence[int], keyframes: Sequence[int], beside: tuple[int, ...] = (), *, all_areas: bool = True
-    ) -> LeafNotes:
+    def after_matching(
+        self, areas: Sequence[int], keyframes: Sequence[int], pending: tuple[int, ...] = (), *, all_areas: bool = True
+    ) -> HypothesisState:
         """After keyframes were compared with known areas.
 
-        :param beside: others, beside which they fitted.
+        :param pending: others, beside which they fitted.
         :param all_areas: whether they were compared with all that come into question.
         """
-        added = {area: self.compared.get(area, frozenset()) | set(keyframes) for area in areas}
-        unchecked = () if all_areas else self.unchecked
-        return replace(self, compared={**self.compared, **added}, unchecked=unchecked, beside=beside)
+        added = {area: self.matched_keyframes.get(area, frozenset()) | set(keyframes) for area in areas}
+        unchecked = () if all_areas else self.unmatched_keyframes
+        return replace(
+            self,
+            matched_keyframes={**self.matched_keyframes, **added},
+            unmatched_keyframes=unchecked,
+            pending_candidates=pending,
+        )
 
-    def seen_in(self, area: int | None) -> LeafNotes:
+    def after_overlap(self, area: int | None) -> HypothesisState:
         """After a keyframe event at which the robot seemed to be in ``area`` of the local map, or in none such."""
-        times = self.astray[1] if self.astray is not None and self.astray[0] == area else 0
-        return replace(self, astray=None if area is None else (area, times + 1))
+        times = (
+            self.unlinked_overlap[1] if self.unlinked_overlap is not None and self.unlinked_overlap[0] == area else 0
+        )
+        return replace(self, unlinked_overlap=None if area is None else (area, times + 1))
 
-    def entered(self, covariances: Mapping[int, Covariance]) -> LeafNotes:
+    def after_area_change(self, covariances: Mapping[int, Covariance]) -> HypothesisState:
         """After the robot entered another area together with the keyframes of ``covariances``."""
-        kept = {area: keyframes & covariances.keys() for area, keyframes in self.compared.items()}
+        kept = {area: keyframes & covariances.keys() for area, keyframes in self.matched_keyframes.items()}
         compared = {area: keyframes for area, keyframes in kept.items() if keyframes}
-        return LeafNotes(
+        return HypothesisState(
             covariances,
             compared,
-            doubts=self.doubts,
-            spots=self.spots,
-            lost=self.lost,
-            stay=self.stay,
-            told=self.told,
-            sighted=self.sighted,
-            claim=self.claim,
-            credit=self.credit,
+            kidnapping_evidence=self.kidnapping_evidence,
+            unstored_poses=self.unstored_poses,
+            lost_since=self.lost_since,
+            false_alarm=self.false_alarm,
+            pose_hint=self.pose_hint,
+            relocalization_candidate=self.relocalization_candidate,
+            tracked_pose=self.tracked_pose,
+            counted_evidence=self.counted_evidence,
         )
 
 
@@ -233,27 +248,27 @@ def relative_covariance(
     return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T + floor, dtype=np.float64)
 
 
-class Settled(NamedTuple):
+class ReducedDistribution(NamedTuple):
     """The distribution over topological paths after a reduction, Eq. (14).
 
-    :ivar kept: shape (n,), int64, ascending: the hypotheses that stay.
+    :ivar indices: shape (n,), int64, ascending: the hypotheses that stay.
     :ivar probabilities: shape (n,); they sum to 1 less ``unexamined``.
     :ivar unexamined: probability of what was not looked at or was dropped for its smallness.
     """
 
-    kept: NDArray[np.int64]
+    indices: NDArray[np.int64]
     probabilities: NDArray[np.float64]
     unexamined: float
 
 
-def settle(
+def normalize_and_reduce(
     log_weights: NDArray[np.float64],
     log_skipped: float,
     unexamined: float,
     most: int,
     least: float,
     generator: np.random.Generator,
-) -> Settled:
+) -> ReducedDistribution:
     """Normalise, drop what is tiny, reduce to N.
 
     :param log_weights: shape (m,), nats, of all hypotheses.
@@ -269,4 +284,4 @@ def settle(
     reduction = reduce_hypotheses(probabilities, most, generator)
     # What the sum lacks is the skipped, the dropped and what was unexamined before.
     total = float(reduction.weights.sum())
-    return Settled(reduction.kept, reduction.weights, max(0.0, 1.0 - total))
+    return ReducedDistribution(reduction.indices, reduction.weights, max(0.0, 1.0 - total))

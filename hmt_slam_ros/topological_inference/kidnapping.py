@@ -17,28 +17,33 @@ import numpy as np
 
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.hybrid_map.shortest_path import reachable, unknown
+from hmt_slam_ros.hybrid_map.shortest_path import shortest_path_beliefs, uninformative_belief
 from hmt_slam_ros.topological_inference.branching import Branches, Branching, Child, Parent
-from hmt_slam_ros.topological_inference.hypothesis_tree import Spot, Stay
-from hmt_slam_ros.topological_inference.relocalization import UNKNOWN, credit_of, is_rather, sighted_in
+from hmt_slam_ros.topological_inference.hypothesis_tree import FalseAlarm, PoseInArea
+from hmt_slam_ros.topological_inference.relocalization import (
+    KIDNAPPED_UNMAPPED_PRIOR,
+    decisive_candidate,
+    log_bayes_factor,
+    prefers_tracked_pose,
+)
 
 # Log-odds of a displacement from which on it is a hypothesis, of hypotheses of at least such a probability, with at
 # least so many keyframes.
 _LOG_ODDS, _PROBABILITY, _KEYFRAMES = math.log(3e-5), 0.05, 3
 
 
-def with_displaced(branching: Branching, parent: Parent) -> Branches | None:
+def spawn_kidnapped_hypothesis(branching: Branching, parent: Parent) -> Branches | None:
     """To go on, or to have been displaced; None where that is not probable enough to be asked."""
-    log_odds, since = parent.notes.displaced
-    late = _since(parent, since)
-    if log_odds < _LOG_ODDS or parent.share < _PROBABILITY or len(late) < _KEYFRAMES:
+    log_odds, since = parent.state.kidnapping_test
+    late = _keyframes_since(parent, since)
+    if log_odds < _LOG_ODDS or parent.probability < _PROBABILITY or len(late) < _KEYFRAMES:
         return None
-    child = _displaced(branching, parent, late, log_odds)
-    noted = replace(parent.notes, doubts={})
+    child = _kidnapped_child(branching, parent, late, log_odds)
+    noted = replace(parent.state, kidnapping_evidence={})
     return Branches([Child(parent.hypothesis, parent.log_weight, parent.area, noted), child], True)
 
 
-def displaced_or_not(branching: Branching, parent: Parent, event: int) -> Child:
+def decide_without_mapping(branching: Branching, parent: Parent, event: int) -> Child:
     """To go on, or, where that is less probable, to be lost: no keyframe is stored that could tell which.
 
     Furniture that was moved contradicts as a wrong place does; but then what is seen beside it is where the robot has
@@ -46,47 +51,56 @@ def displaced_or_not(branching: Branching, parent: Parent, event: int) -> Child:
 
     :param event: the newest; metric SLAM arrives at the next one then.
     """
-    log_odds, since = parent.notes.displaced
-    notes = parent.notes
+    log_odds, since = parent.state.kidnapping_test
+    notes = parent.state
     if log_odds > 0.0:
-        if _recognized(branching, parent, since):
-            notes = replace(notes, doubts={}, spots={})
+        if _confirms_tracked_pose(branching, parent, since):
+            notes = replace(notes, kidnapping_evidence={}, unstored_poses={})
         else:
-            stay = Stay(notes.spots[event], 1.0 / (1.0 + math.exp(log_odds)))
-            notes = replace(notes, doubts={}, spots={}, lost=event + 1, stay=stay)
+            stay = FalseAlarm(notes.unstored_poses[event], 1.0 / (1.0 + math.exp(log_odds)))
+            notes = replace(notes, kidnapping_evidence={}, unstored_poses={}, lost_since=event + 1, false_alarm=stay)
     return Child(parent.hypothesis, parent.log_weight, parent.area, notes)
 
 
-def _recognized(branching: Branching, parent: Parent, since: int) -> bool:
+def _confirms_tracked_pose(branching: Branching, parent: Parent, since: int) -> bool:
     """Whether the scans since an event, which the map does not hold, lie in it where the robot has them."""
-    spots = [spot for event, spot in sorted(parent.notes.spots.items()) if event >= since]
-    frames = reachable(parent.hybrid_map, parent.area, until={spot.area for spot in spots})
+    spots = [spot for event, spot in sorted(parent.state.unstored_poses.items()) if event >= since]
+    frames = shortest_path_beliefs(parent.hybrid_map, parent.area, targets={spot.area for spot in spots})
     seen = {spot.keyframe: se2.compose(frames[spot.area].mean, spot.pose) for spot in spots if spot.area in frames}
     if not seen:
         return False
     first = min(seen)
     poses = {keyframe: se2.between(seen[first], pose) for keyframe, pose in seen.items()}
-    where = branching.everywhere(parent, poses, first)
-    return is_rather(parent.hybrid_map, where, Spot(parent.area, first, seen[first]), poses)
+    where = branching.localize_globally(parent, poses, first)
+    return prefers_tracked_pose(parent.hybrid_map, where, PoseInArea(parent.area, first, seen[first]), poses)
 
 
-def _since(parent: Parent, event: int) -> list[int]:
+def _keyframes_since(parent: Parent, event: int) -> list[int]:
     """The keyframes of the robot's area since an event; an area is not left without any."""
     return sorted(k for k in parent.hybrid_map.keyframes(parent.area) if k >= event)[
         0 if min(parent.hybrid_map.keyframes(parent.area), default=0) < event else 1 :
     ]
 
 
-def _displaced(branching: Branching, parent: Parent, keyframes: Sequence[int], log_odds: float) -> Child:
+def _kidnapped_child(branching: Branching, parent: Parent, keyframes: Sequence[int], log_odds: float) -> Child:
     """The robot was displaced before the first of some keyframes of its area, which are a new one."""
     query = branching.query(parent, keyframes)
-    where = branching.everywhere(parent, query.poses, keyframes[0])
-    where = where.with_unmapped(UNKNOWN)
-    claim = Spot(parent.area, keyframes[0], query.belief.mean)
-    credit = credit_of(parent.hybrid_map, where, claim, query.poses)
-    origin = PoseGaussian.exactly(np.zeros(3))
+    where = branching.localize_globally(parent, query.poses, keyframes[0])
+    where = where.with_unmapped_prior(KIDNAPPED_UNMAPPED_PRIOR)
+    claim = PoseInArea(parent.area, keyframes[0], query.belief.mean)
+    credit = log_bayes_factor(parent.hybrid_map, where, claim, query.poses)
+    origin = PoseGaussian.from_pose(np.zeros(3))
     area = branching.new_area(parent, query)
-    child = branching.entered(parent, query, area, origin, unknown(query.belief.mean), log_odds + credit)
-    sighted = sighted_in(where, query.poses)
-    notes = replace(child.notes, doubts={}, lost=keyframes[0], claim=claim, credit=credit, sighted=sighted)
-    return replace(child, notes=notes)
+    child = branching.enter_area(
+        parent, query, area, origin, uninformative_belief(query.belief.mean), log_odds + credit
+    )
+    sighted = decisive_candidate(where, query.poses)
+    notes = replace(
+        child.state,
+        kidnapping_evidence={},
+        lost_since=keyframes[0],
+        tracked_pose=claim,
+        counted_evidence=credit,
+        relocalization_candidate=sighted,
+    )
+    return replace(child, state=notes)

@@ -12,15 +12,15 @@ from typing import Protocol
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.messages.messages import Notice
-from hmt_slam_ros.topological_inference.global_localization import Whereabouts
+from hmt_slam_ros.topological_inference.global_localization import PoseDistribution
 
 
 class LandmarkEvidence(Protocol):
     """Weighs places of a map by landmarks, and proposes loops."""
 
     def weigh(
-        self, where: Whereabouts, hybrid_map: HybridMap, poses: Mapping[int, Float64], before: int
-    ) -> Whereabouts:
+        self, where: PoseDistribution, hybrid_map: HybridMap, poses: Mapping[int, Float64], before: int
+    ) -> PoseDistribution:
         """Places with what landmarks say of them.
 
         :param poses: {keyframe: ``reference_T_base`` (3,)} of what the robot saw, m and rad.

@@ -7,13 +7,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hmt_slam_ros.topological_inference.global_localization import UNMAPPED, Whereabouts
+from hmt_slam_ros.topological_inference.global_localization import UNMAPPED_PRIOR, PoseDistribution
 
 # Probability that the robot may be anywhere in the map, up to which it is said to know its place.
-_DOUBT = 0.1
+_MAX_LOST_PROBABILITY = 0.1
 
 
-class Localization(NamedTuple):
+class LocalizationStatus(NamedTuple):
     """What is known of the robot's place.
 
     :ivar localized: whether it is known in all probability.
@@ -24,7 +24,7 @@ class Localization(NamedTuple):
     entropy: float
 
 
-class Standing(NamedTuple):
+class HypothesisSummary(NamedTuple):
     """A live hypothesis.
 
     :ivar probability: its own.
@@ -37,33 +37,33 @@ class Standing(NamedTuple):
     lost: bool
 
 
-def localization(
-    standings: Iterable[Standing], unexamined: float, known: int, where: Whereabouts | None
-) -> Localization:
+def summarize_localization(
+    summaries: Iterable[HypothesisSummary], unexamined: float, known: int, distribution: PoseDistribution | None
+) -> LocalizationStatus:
     """What hypotheses say together.
 
     :param unexamined: probability that none of them is right.
     :param known: number of areas in which a robot that may be anywhere can be.
-    :param where: what is known of the place of such a robot, None before it was looked for.
+    :param distribution: what is known of the place of such a robot, None before it was looked for.
     """
     areas: dict[int, float] = {}
     lost = 0.0
-    for standing in standings:
+    for standing in summaries:
         if standing.lost:
             lost += standing.probability
         else:
             areas[standing.area] = areas.get(standing.area, 0.0) + standing.probability
-    open_places = [lost * share for share in _anywhere(known, where)]
+    open_places = [lost * share for share in _lost_distribution(known, distribution)]
     shares = np.array([*areas.values(), *open_places, unexamined])
     shares = shares[shares > 0.0]
-    return Localization(lost <= _DOUBT, abs(float(shares @ np.log(shares))))
+    return LocalizationStatus(lost <= _MAX_LOST_PROBABILITY, abs(float(shares @ np.log(shares))))
 
 
-def _anywhere(known: int, where: Whereabouts | None) -> list[float]:
+def _lost_distribution(known: int, distribution: PoseDistribution | None) -> list[float]:
     """The probability of every area and, last, of ground that the map does not hold."""
-    if where is None:
-        return [*[(1.0 - UNMAPPED) / max(1, known)] * known, UNMAPPED if known else 1.0]
+    if distribution is None:
+        return [*[(1.0 - UNMAPPED_PRIOR) / max(1, known)] * known, UNMAPPED_PRIOR if known else 1.0]
     areas: dict[int, float] = {}
-    for located, probability in zip(where.found, where.probabilities.tolist(), strict=True):
+    for located, probability in zip(distribution.candidates, distribution.probabilities.tolist(), strict=True):
         areas[located.area] = areas.get(located.area, 0.0) + probability
     return [*areas.values(), max(0.0, 1.0 - sum(areas.values()))]

@@ -31,7 +31,7 @@ from hmt_slam_ros.registration.area_to_area import MatchSettings, best_pose
 from hmt_slam_ros.registration.likelihood_grid import AreaGrid
 from hmt_slam_ros.sensors import Scan
 
-SIZE = 32
+DESCRIPTOR_SIZE = 32
 """Numbers that a look takes: quantiles of the logarithm of the range."""
 
 # Ranges are told apart between these, m; a beam without a return counts as the farthest.
@@ -42,31 +42,31 @@ _SAME = 1e-3
 RATIO_AT_MEDIAN, RATIO_SLOPE = -0.3, 1.44
 
 
-def look(scan: Scan) -> Float64:
+def describe_scan(scan: Scan) -> Float64:
     """The look of a scan: quantiles of log(range / 1 m) over all beams, shape (SIZE,)."""
     ranges = np.where(scan.valid, scan.ranges, _FARTHEST).astype(np.float64)
     ordered = np.sort(np.clip(ranges, _NEAREST, _FARTHEST)) if ranges.size else np.array([_FARTHEST])
-    return np.log(ordered[((np.arange(SIZE) + 0.5) / SIZE * ordered.size).astype(np.int64)])
+    return np.log(ordered[((np.arange(DESCRIPTOR_SIZE) + 0.5) / DESCRIPTOR_SIZE * ordered.size).astype(np.int64)])
 
 
-def log_ratio(likeness: Float64) -> Float64:
+def descriptor_log_ratio(similarity: Float64) -> Float64:
     """log p(phi | the area) / p(phi | another area of the building), nats, from a likeness, of any shape."""
-    return np.asarray(RATIO_AT_MEDIAN + RATIO_SLOPE * likeness, dtype=np.float64)
+    return np.asarray(RATIO_AT_MEDIAN + RATIO_SLOPE * similarity, dtype=np.float64)
 
 
-class Looks:
+class ScanDescriptors:
     """The looks of keyframes, each worked out once."""
 
     def __init__(self, scans: Mapping[int, Scan]) -> None:
         """:param scans: {keyframe: scan}, which may grow."""
         self._scans = scans
-        self._known: dict[int, Float64] = {}
+        self._descriptors: dict[int, Float64] = {}
 
     def clear(self) -> None:
         """Keep no look, as scans have changed."""
-        self._known.clear()
+        self._descriptors.clear()
 
-    def likeness(self, keyframes: Collection[int], areas: Sequence[Collection[int]]) -> Float64:
+    def similarity(self, keyframes: Collection[int], areas: Sequence[Collection[int]]) -> Float64:
         """How much more areas look like some keyframes than the median of them does, shape (len(areas),).
 
         :param keyframes: those in question.
@@ -76,25 +76,25 @@ class Looks:
         if not areas:
             return np.zeros(0)
         first = np.cumsum([0, *map(len, areas)])
-        distances = _distances(self._of(keyframes), self._of([k for area in areas for k in area]), first)
+        distances = _distances(self._stack(keyframes), self._stack([k for area in areas for k in area]), first)
         logarithms = np.log(np.maximum(distances, _SAME))
         return np.asarray(np.median(logarithms) - logarithms, dtype=np.float64)
 
-    def shares(self, keyframes: Collection[int], areas: Mapping[int, Collection[int]]) -> dict[int, float]:
+    def area_probabilities(self, keyframes: Collection[int], areas: Mapping[int, Collection[int]]) -> dict[int, float]:
         """p(gamma | phi): the probability of every area by its look alone; they sum to 1.
 
         :param keyframes: those in question.
         :param areas: {area: its keyframes, at least one}.
         """
-        likeness = self.likeness(keyframes, list(areas.values()))
-        weights = softmax(log_ratio(likeness)) if areas else likeness
+        likeness = self.similarity(keyframes, list(areas.values()))
+        weights = softmax(descriptor_log_ratio(likeness)) if areas else likeness
         return dict(zip(areas, weights.tolist(), strict=True))
 
-    def _of(self, keyframes: Collection[int]) -> Float64:
+    def _stack(self, keyframes: Collection[int]) -> Float64:
         for keyframe in keyframes:
-            if keyframe not in self._known:
-                self._known[keyframe] = look(self._scans[keyframe])
-        return np.array([self._known[keyframe] for keyframe in keyframes]).reshape(-1, SIZE)
+            if keyframe not in self._descriptors:
+                self._descriptors[keyframe] = describe_scan(self._scans[keyframe])
+        return np.array([self._descriptors[keyframe] for keyframe in keyframes]).reshape(-1, DESCRIPTOR_SIZE)
 
 
 @njit(cache=True)
@@ -118,61 +118,64 @@ def _distances(asked: Float64, known: Float64, first: Float64) -> Float64:
 
 
 # Where a robot would be that drives where another drove before, or the other way: 1.5 m along, 0.7 m across, 6 degrees.
-_ALIKE = np.diag([1.5, 0.7, math.radians(6.0)]) ** 2
+_DRIVEN_COVARIANCE = np.diag([1.5, 0.7, math.radians(6.0)]) ** 2
 _HEADINGS = (np.zeros(3), np.array([0.0, 0.0, math.pi]))
 # Squared Mahalanobis distance up to which is searched: 90 % of 3 degrees of freedom.
 _GATE = 6.25
 # Only the best is asked for, and that not where a quarter of the samples at most is on surfaces: so much fits anywhere.
-_MARGIN, _LEAST = 1.0, 0.25 * math.log(3.0)  # nat
+_MARGIN, _MIN_LOG_RATIO = 1.0, 0.25 * math.log(3.0)  # nat
 # As much as so many places counts what is believed before any was tried; so many are kept.
-_TRIED, _KEPT = 2.0, 64
+_PRIOR_COUNT, _MAX_NEGATIVES = 2.0, 64
 # What looks like another place at one spot does so in so many cases, at most, at the next.
-_ALIKE_NEXT = 0.4
+_ALIASING_PERSISTENCE = 0.4
 # How far the share of one and the same place varies.
-_SAME_SHARE = 0.02
+_SHARE_TOLERANCE = 0.02
 
 
-class Elsewhere(NamedTuple):
+class NegativeSample(NamedTuple):
     """A place in which the keyframes do not lie: its map, and ``map_T_base`` of a robot there, shape (3,)."""
 
     grid: AreaGrid
     pose: NDArray[np.float64]
 
 
-def best_shares(query: AreaGrid, elsewhere: Iterable[Elsewhere], settings: MatchSettings) -> list[float]:
+def best_shares(query: AreaGrid, negatives: Iterable[NegativeSample], settings: MatchSettings) -> list[float]:
     """How large a share of the keyframes' surfaces is on known ones, where they fit best in each of the places.
 
     :param query: map of the keyframes, in the frame of the first of them.
     """
-    near = replace(settings, gate=_GATE, margin=_MARGIN, least=_LEAST)
+    near = replace(settings, gate=_GATE, margin=_MARGIN, min_log_ratio=_MIN_LOG_RATIO)
     found = []
-    for place in elsewhere:
-        poses = [best_pose(query, place.grid, PoseGaussian(place.pose + turn, _ALIKE), near) for turn in _HEADINGS]
+    for place in negatives:
+        poses = [
+            best_pose(query, place.grid, PoseGaussian(place.pose + turn, _DRIVEN_COVARIANCE), near)
+            for turn in _HEADINGS
+        ]
         best = max((pose for pose in poses if pose is not None), key=lambda pose: pose[1], default=None)
-        found.append(0.0 if best is None else place.grid.agreement(query.points, best[0]).share)
+        found.append(0.0 if best is None else place.grid.compare(query.points, best[0]).matched_share)
     return found
 
 
 @dataclass
-class Likeness:
+class PerceptualAliasing:
     """What was counted so far.
 
-    :ivar alike: probability that keyframes fit into a place where they do not lie, before any was tried.
-    :ivar shares: of the places that were tried last.
+    :ivar prior: probability that keyframes fit into a place where they do not lie, before any was tried.
+    :ivar negative_shares: of the places that were tried last.
     """
 
-    alike: float
-    shares: deque[float] = field(default_factory=partial(deque, maxlen=_KEPT))
+    prior: float
+    negative_shares: deque[float] = field(default_factory=partial(deque, maxlen=_MAX_NEGATIVES))
 
-    def count(self, shares: Iterable[float]) -> None:
+    def add_negatives(self, shares: Iterable[float]) -> None:
         """Keep what keyframes found in places where they do not lie."""
-        self.shares.extend(shares)
+        self.negative_shares.extend(shares)
 
-    def log_rarity(self, share: float, *, foretold: bool) -> float:
+    def log_distinctiveness(self, share: float, *, already_expected: bool) -> float:
         """-log of the probability that keyframes elsewhere fit as well or better, nats.
 
-        :param foretold: whether earlier keyframes fitted, from which it follows that these lie in the place.
+        :param already_expected: whether earlier keyframes fitted, from which it follows that these lie in the place.
         """
-        as_well = sum(other > share - _SAME_SHARE for other in self.shares)
-        rarity = math.log((_TRIED + len(self.shares)) / (_TRIED * self.alike + as_well))
-        return min(rarity, -math.log(_ALIKE_NEXT)) if foretold else rarity
+        as_well = sum(other > share - _SHARE_TOLERANCE for other in self.negative_shares)
+        rarity = math.log((_PRIOR_COUNT + len(self.negative_shares)) / (_PRIOR_COUNT * self.prior + as_well))
+        return min(rarity, -math.log(_ALIASING_PERSISTENCE)) if already_expected else rarity

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
-from hmt_slam_ros.messages.documents import KeyframeHead
+from hmt_slam_ros.messages.documents import KeyframeHeader
 from hmt_slam_ros.messages.messages import Hypotheses
 
 _SECOND = 1e9
@@ -19,23 +19,23 @@ _SECOND = 1e9
 _MOST_BARS = 12
 
 
-class History:
+class KeyframeHistory:
     """Joins keyframes, which know the time, with the answers to them; the two come on topics of their own."""
 
     def __init__(self, board: Board) -> None:
         self._board = board
-        self._heads: dict[int, KeyframeHead] = {}
+        self._heads: dict[int, KeyframeHeader] = {}
         self._answers: dict[int, Hypotheses] = {}
-        self._told: dict[int, int] = {}
+        self._published_stamps: dict[int, int] = {}
 
-    def hear(self, message: KeyframeHead | Hypotheses) -> None:
+    def add(self, message: KeyframeHeader | Hypotheses) -> None:
         """Take in one of the two."""
-        kept: dict[int, Any] = self._heads if isinstance(message, KeyframeHead) else self._answers
+        kept: dict[int, Any] = self._heads if isinstance(message, KeyframeHeader) else self._answers
         kept[message.sequence] = message
-        while len(kept) > HISTORY:
+        while len(kept) > HISTORY_LENGTH:
             del kept[min(kept)]
 
-    def tell(self) -> None:
+    def publish_complete(self) -> None:
         """Put what is complete on the board.
 
         What a node that was started again repeats is passed over; an event that was there before, but at another time,
@@ -43,46 +43,46 @@ class History:
         """
         for sequence in sorted(self._heads.keys() & self._answers.keys()):
             head, answer = self._heads.pop(sequence), self._answers.pop(sequence)
-            if self._told.get(sequence) == head.scan.stamp:
+            if self._published_stamps.get(sequence) == head.scan.stamp:
                 continue
-            if self._told and sequence <= max(self._told):
-                self._told = {}
-                self._board.forget_history()
-            self._told[sequence] = head.scan.stamp
-            while len(self._told) > HISTORY:
-                del self._told[min(self._told)]
-            self._board.append(_event(head, answer))
+            if self._published_stamps and sequence <= max(self._published_stamps):
+                self._published_stamps = {}
+                self._board.clear_history()
+            self._published_stamps[sequence] = head.scan.stamp
+            while len(self._published_stamps) > HISTORY_LENGTH:
+                del self._published_stamps[min(self._published_stamps)]
+            self._board.append_event(_event_entry(head, answer))
 
 
-def _event(head: KeyframeHead, answer: Hypotheses) -> dict[str, Any]:
+def _event_entry(head: KeyframeHeader, answer: Hypotheses) -> dict[str, Any]:
     """Time (s), way (m), and (hypothesis, area, probability, whether it is lost), the most probable first."""
-    leaves = sorted(answer.leaves, key=lambda leaf: (-leaf.probability, leaf.hypothesis))[:_MOST_BARS]
+    leaves = sorted(answer.hypotheses, key=lambda leaf: (-leaf.probability, leaf.id))[:_MOST_BARS]
     return {
         "event": head.sequence,
         "time": round(head.scan.stamp / _SECOND, 3),
-        "way": round(head.travelled, 2),
-        "leaves": [[leaf.hypothesis, leaf.area, round(leaf.probability, 5), leaf.lost] for leaf in leaves],
-        "live": len(answer.leaves),
+        "way": round(head.path_length, 2),
+        "leaves": [[leaf.id, leaf.area, round(leaf.probability, 5), leaf.lost] for leaf in leaves],
+        "live": len(answer.hypotheses),
     }
 
 
 # Some ten minutes of a robot that drives; older probabilities leave the picture.
-HISTORY = 1000
+HISTORY_LENGTH = 1000
 # A browser that was here so many seconds ago may come back: it reconnects by itself.
-_ABSENCE = 10.0
+_RECONNECT_TIME = 10.0
 
 
 @dataclass
-class Seen:
+class ClientState:
     """What one browser knows.
 
-    :ivar sections: {section: its number when it was sent}.
-    :ivar events: number of the next event to send.
+    :ivar section_versions: {section: its number when it was sent}.
+    :ivar next_event: number of the next event to send.
     :ivar generation: of the history that these belong to.
     """
 
-    sections: dict[str, int] = field(default_factory=dict)
-    events: int = 0
+    section_versions: dict[str, int] = field(default_factory=dict)
+    next_event: int = 0
     generation: int = -1
 
 
@@ -93,85 +93,87 @@ class Board:
     """
 
     def __init__(self) -> None:
-        self._changed = threading.Condition()
+        self._condition = threading.Condition()
         self._sections: dict[str, tuple[int, Any]] = {}
-        self._number = 0
-        self._history: deque[Any] = deque(maxlen=HISTORY)
-        self._events, self._generation = 0, 0
-        self._watchers, self._last_watched = 0, -_ABSENCE
-        self._picture, self._tag = b"", ""
+        self._version = 0
+        self._history: deque[Any] = deque(maxlen=HISTORY_LENGTH)
+        self._event_count, self._generation = 0, 0
+        self._watchers, self._last_watched = 0, -_RECONNECT_TIME
+        self._map_image, self._map_tag = b"", ""
 
     def put(self, section: str, content: Any) -> None:  # noqa: ANN401  any JSON value
         """Replace a section, where it is not the same."""
-        with self._changed:
+        with self._condition:
             known = self._sections.get(section)
             if known is None or known[1] != content:
-                self._number += 1
-                self._sections[section] = (self._number, content)
-                self._changed.notify_all()
+                self._version += 1
+                self._sections[section] = (self._version, content)
+                self._condition.notify_all()
 
-    def append(self, event: Any) -> None:  # noqa: ANN401  any JSON value
+    def append_event(self, event: Any) -> None:  # noqa: ANN401  any JSON value
         """Add to the history."""
-        with self._changed:
+        with self._condition:
             self._history.append(event)
-            self._events += 1
-            self._changed.notify_all()
+            self._event_count += 1
+            self._condition.notify_all()
 
-    def forget_history(self) -> None:
+    def clear_history(self) -> None:
         """Begin the history anew."""
-        with self._changed:
+        with self._condition:
             self._history.clear()
             self._generation += 1
-            self._changed.notify_all()
+            self._condition.notify_all()
 
-    def put_picture(self, picture: bytes) -> str:
+    def put_map_image(self, picture: bytes) -> str:
         """Replace the map's picture; return the tag by which a browser knows whether it has it."""
-        with self._changed:
-            self._picture, self._tag = picture, hashlib.sha256(picture).hexdigest()[:16]
-            return self._tag
+        with self._condition:
+            self._map_image, self._map_tag = picture, hashlib.sha256(picture).hexdigest()[:16]
+            return self._map_tag
 
-    def picture(self) -> tuple[bytes, str]:
+    def map_image(self) -> tuple[bytes, str]:
         """The map's picture, empty where there is none, and its tag."""
-        with self._changed:
-            return self._picture, self._tag
+        with self._condition:
+            return self._map_image, self._map_tag
 
-    def news(self, seen: Seen, patience: float = 0.0) -> dict[str, Any]:
+    def wait_for_changes(self, client: ClientState, timeout: float = 0.0) -> dict[str, Any]:
         """What a browser does not know yet; it is noted that it does now.
 
-        :param patience: how long news is waited for, s.
+        :param timeout: how long news is waited for, s.
         """
-        with self._changed:
-            self._changed.wait_for(lambda: self._is_news(seen), patience)
-            news = {name: content for name, (n, content) in self._sections.items() if n != seen.sections.get(name)}
-            seen.sections = {name: number for name, (number, _) in self._sections.items()}
-            if self._is_news(seen):
-                anew = seen.generation != self._generation
-                missed = len(self._history) if anew else min(self._events - seen.events, len(self._history))
+        with self._condition:
+            self._condition.wait_for(lambda: self._has_changes(client), timeout)
+            news = {
+                name: content for name, (n, content) in self._sections.items() if n != client.section_versions.get(name)
+            }
+            client.section_versions = {name: number for name, (number, _) in self._sections.items()}
+            if self._has_changes(client):
+                anew = client.generation != self._generation
+                missed = len(self._history) if anew else min(self._event_count - client.next_event, len(self._history))
                 news["history"] = {"anew": anew, "events": list(self._history)[len(self._history) - missed :]}
-                seen.generation, seen.events = self._generation, self._events
+                client.generation, client.next_event = self._generation, self._event_count
             return news
 
-    def _is_news(self, seen: Seen) -> bool:
+    def _has_changes(self, client: ClientState) -> bool:
         return (
-            seen.generation != self._generation
-            or seen.events != self._events
-            or any(number != seen.sections.get(name) for name, (number, _) in self._sections.items())
+            client.generation != self._generation
+            or client.next_event != self._event_count
+            or any(number != client.section_versions.get(name) for name, (number, _) in self._sections.items())
         )
 
     @contextmanager
-    def watching(self) -> Iterator[None]:
+    def count_watcher(self) -> Iterator[None]:
         """Within this, somebody looks."""
-        with self._changed:
+        with self._condition:
             self._watchers += 1
         try:
             yield
         finally:
-            with self._changed:
+            with self._condition:
                 self._watchers -= 1
                 self._last_watched = time.monotonic()
 
     @property
-    def watched(self) -> bool:
+    def is_watched(self) -> bool:
         """Whether somebody looks, or did a moment ago."""
-        with self._changed:
-            return self._watchers > 0 or time.monotonic() - self._last_watched < _ABSENCE
+        with self._condition:
+            return self._watchers > 0 or time.monotonic() - self._last_watched < _RECONNECT_TIME

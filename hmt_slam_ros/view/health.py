@@ -9,14 +9,14 @@ from typing import Any, Literal
 Level = Literal["good", "waiting", "attention", "fault"]
 
 # Nodes speak once a second; a kernel that is compiled, or a computer that has too much to do, takes longer.
-_SILENCE = 10.0  # s
-_POSE_SILENCE = 3.0  # s
+_NODE_TIMEOUT = 10.0  # s
+_POSE_TIMEOUT = 3.0  # s
 # A node's level never falls again: a warning is news for so long.
-_NEWS = 60.0  # s
+_WARNING_LIFETIME = 60.0  # s
 _WARN = 1
 _ACTIVE = "active"
 # From a state of a managed node towards the one in which it takes part.
-_NEXT = {"unconfigured": "configure", "inactive": "activate"}
+_NEXT_TRANSITION = {"unconfigured": "configure", "inactive": "activate"}
 
 
 @dataclass
@@ -26,59 +26,59 @@ class NodeHealth:
     :ivar level: 0 all is well, 1 a warning, 2 an error, as in diagnostic_msgs/DiagnosticStatus.
     :ivar message: "running", or the last warning or error.
     :ivar values: {name: value}.
-    :ivar heard: when that was, seconds.
-    :ivar changed: when the message was heard first, seconds.
+    :ivar heard_at: when that was, seconds.
+    :ivar changed_at: when the message was heard first, seconds.
     :ivar load: share of the time that it computed between the last two times, None before the second.
     """
 
     level: int
     message: str
     values: Mapping[str, str]
-    heard: float
-    changed: float
+    heard_at: float
+    changed_at: float
     load: float | None = None
 
 
 @dataclass
-class Health:
+class SystemHealth:
     """Of all nodes.
 
-    :ivar expected: the nodes without which there is no mapping.
+    :ivar expected_nodes: the nodes without which there is no mapping.
     :ivar nodes: {node: what it said last}.
-    :ivar pose_heard: when the last pose came, None before the first, seconds.
-    :ivar localized: whether the robot's place is known, None before somebody said.
+    :ivar last_pose_at: when the last pose came, None before the first, seconds.
+    :ivar is_localized: whether the robot's place is known, None before somebody said.
     :ivar robot_state: of the node that replays a log, None where there is none.
     """
 
-    expected: Sequence[str]
+    expected_nodes: Sequence[str]
     nodes: dict[str, NodeHealth] = field(default_factory=dict)
-    pose_heard: float | None = None
-    localized: bool | None = None
+    last_pose_at: float | None = None
+    is_localized: bool | None = None
     robot_state: str | None = None
 
-    def hear(self, node: str, level: int, message: str, values: Mapping[str, str], now: float) -> None:
+    def update(self, node: str, level: int, message: str, values: Mapping[str, str], now: float) -> None:
         """Take note of what a node says of itself.
 
         :param now: seconds of a clock that runs evenly.
         """
         before, load, changed = self.nodes.get(node), None, now
-        if before is not None and now > before.heard:
-            load = max(0.0, _busy(values) - _busy(before.values)) / (now - before.heard)
+        if before is not None and now > before.heard_at:
+            load = max(0.0, _busy_seconds(values) - _busy_seconds(before.values)) / (now - before.heard_at)
         if before is not None and before.message == message:
-            changed = before.changed
+            changed = before.changed_at
         self.nodes[node] = NodeHealth(level, message, values, now, changed, load)
 
     def rows(self, now: float) -> list[dict[str, Any]]:
         """A row of the page for every node, the expected ones first."""
-        names = [*self.expected, *sorted(self.nodes.keys() - set(self.expected))]
+        names = [*self.expected_nodes, *sorted(self.nodes.keys() - set(self.expected_nodes))]
         return [self._row(name, now) for name in names]
 
     def _row(self, name: str, now: float) -> dict[str, Any]:
         node = self.nodes.get(name)
         if node is None:
             return {"name": name, "level": "waiting", "message": "not heard yet", "values": {}}
-        age = now - node.heard
-        if age > _SILENCE:
+        age = now - node.heard_at
+        if age > _NODE_TIMEOUT:
             return {"name": name, "level": "fault", "message": f"silent for {age:.0f} s", "values": dict(node.values)}
         level = _level(node, now)
         row = {"name": name, "level": level, "message": node.message, "values": dict(node.values)}
@@ -86,19 +86,26 @@ class Health:
 
     def verdict(self, now: float) -> dict[str, str]:
         """All of it in one sentence, the worst first, and what to do."""
-        said, pose = self._said(now), self._pose(now)
-        halted = self._halted()
-        for sentence in (self._nothing(), self._silent(now), said.get("fault"), halted, pose, said.get("attention")):
+        said, pose = self._complaint_verdicts(now), self._pose_verdict(now)
+        halted = self._inactive_nodes_verdict()
+        for sentence in (
+            self._no_nodes_verdict(),
+            self._silent_nodes_verdict(now),
+            said.get("fault"),
+            halted,
+            pose,
+            said.get("attention"),
+        ):
             if sentence is not None:
                 return sentence
-        if self.localized is False:
+        if self.is_localized is False:
             return _verdict("attention", "The robot's place is not known yet: it may be anywhere in the map.")
         if self.robot_state == "ended":
             return _verdict("good", "The log has ended; the nodes are well.")
         return _verdict("good", "All is well.")
 
-    def _nothing(self) -> dict[str, str] | None:
-        if any(name in self.nodes for name in self.expected):
+    def _no_nodes_verdict(self) -> dict[str, str] | None:
+        if any(name in self.nodes for name in self.expected_nodes):
             return None
         return _verdict(
             "waiting",
@@ -107,29 +114,29 @@ class Health:
             "the same as here?",
         )
 
-    def _silent(self, now: float) -> dict[str, str] | None:
-        never = [name for name in self.expected if name not in self.nodes]
+    def _silent_nodes_verdict(self, now: float) -> dict[str, str] | None:
+        never = [name for name in self.expected_nodes if name not in self.nodes]
         if never:
             verb = "is" if len(never) == 1 else "are"
-            return _verdict("fault", f"{_and(never)} {verb} not running.", f"ros2 run hmt_slam_ros {never[0]}")
-        silent = [name for name in self.expected if now - self.nodes[name].heard > _SILENCE]
+            return _verdict("fault", f"{_join_names(never)} {verb} not running.", f"ros2 run hmt_slam_ros {never[0]}")
+        silent = [name for name in self.expected_nodes if now - self.nodes[name].heard_at > _NODE_TIMEOUT]
         if not silent:
             return None
-        age = now - min(self.nodes[name].heard for name in silent)
+        age = now - min(self.nodes[name].heard_at for name in silent)
         verb, advice = "says", "Did it end? Its log tells; a first run compiles long."
         if len(silent) > 1:
             verb, advice = "say", "Did they end? Their logs tell; a first run compiles long."
-        return _verdict("fault", f"{_and(silent)} {verb} nothing, for {age:.0f} s.", advice)
+        return _verdict("fault", f"{_join_names(silent)} {verb} nothing, for {age:.0f} s.", advice)
 
-    def _halted(self) -> dict[str, str] | None:
+    def _inactive_nodes_verdict(self) -> dict[str, str] | None:
         for name in self.nodes:
             if (state := _state(self.nodes[name])) != _ACTIVE:
-                transition = _NEXT.get(state, "")
+                transition = _NEXT_TRANSITION.get(state, "")
                 advice = f"ros2 lifecycle set /{name} {transition}" if transition else "Start it anew."
                 return _verdict("waiting", f"{name} is {state}.", advice)
         return None
 
-    def _said(self, now: float) -> dict[Level, dict[str, str]]:
+    def _complaint_verdicts(self, now: float) -> dict[Level, dict[str, str]]:
         """{level: what a node complains of}."""
         levels = {name: _level(node, now) for name, node in self.nodes.items()}
         verbs: dict[Level, str] = {"fault": "has a fault", "attention": "warns"}
@@ -139,14 +146,14 @@ class Health:
             if level in verbs
         }
 
-    def _pose(self, now: float) -> dict[str, str] | None:
+    def _pose_verdict(self, now: float) -> dict[str, str] | None:
         if self.robot_state in ("ended", "paused"):
             return None
         advice = "Do scans and odometry arrive? ros2 topic hz scan, ros2 topic hz odom"
-        if self.pose_heard is None:
+        if self.last_pose_at is None:
             return _verdict("waiting", "The nodes run; no pose came yet.", advice)
-        if now - self.pose_heard > _POSE_SILENCE:
-            return _verdict("fault", f"No pose for {now - self.pose_heard:.0f} s.", advice)
+        if now - self.last_pose_at > _POSE_TIMEOUT:
+            return _verdict("fault", f"No pose for {now - self.last_pose_at:.0f} s.", advice)
         return None
 
 
@@ -159,7 +166,7 @@ def _level(node: NodeHealth, now: float) -> Level:
         return "fault"
     if _state(node) != _ACTIVE:
         return "waiting"
-    return "attention" if node.level == _WARN and now - node.changed < _NEWS else "good"
+    return "attention" if node.level == _WARN and now - node.changed_at < _WARNING_LIFETIME else "good"
 
 
 def _state(node: NodeHealth) -> str:
@@ -167,11 +174,11 @@ def _state(node: NodeHealth) -> str:
     return node.values.get("state", _ACTIVE)
 
 
-def _and(names: Sequence[str]) -> str:
+def _join_names(names: Sequence[str]) -> str:
     return " and ".join((", ".join(names[:-1]), names[-1])) if len(names) > 1 else names[0]
 
 
-def _busy(values: Mapping[str, str]) -> float:
+def _busy_seconds(values: Mapping[str, str]) -> float:
     """Seconds of computing since the start, as /diagnostics has them."""
     try:
         return float(values.get("busy", "0").removesuffix(" s"))

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmt_slam_ros.errors import HmtSlamError
-from hmt_slam_ros.view.board import Board, Seen
+from hmt_slam_ros.view.board import Board, ClientState
 
 _UNKNOWN, _FREE, _OCCUPIED = 0, 1, 3
 # Grayscale of two bits, without interlacing: see section 11.2.2 of the PNG specification, ISO/IEC 15948.
@@ -84,7 +84,7 @@ class PageServer:
             raise HmtSlamError(f"address = {address} is no IP address: give 127.0.0.1, or 0.0.0.0 for all") from None
         own = {"board": board, "local": local, "streams": threading.Semaphore(_MOST_STREAMS)}
         handler = type("_OwnHandler", (_Handler,), own)
-        self._server = _bound(address, port, handler)
+        self._server = _bind_server(address, port, handler)
         self.url = f"http://{address}:{self._server.server_address[1]}/"
         threading.Thread(target=self._server.serve_forever, name="page", daemon=True).start()
 
@@ -99,10 +99,10 @@ def check_port(port: int) -> None:
 
     :raises HmtSlamError: where it cannot.
     """
-    _bound(LOCAL, port, _Handler).server_close()
+    _bind_server(LOCAL, port, _Handler).server_close()
 
 
-def _bound(address: str, port: int, handler: type[BaseHTTPRequestHandler]) -> _Server:
+def _bind_server(address: str, port: int, handler: type[BaseHTTPRequestHandler]) -> _Server:
     try:
         return _Server((address, port), handler)
     except (OSError, OverflowError) as fault:
@@ -138,17 +138,17 @@ class _Handler(BaseHTTPRequestHandler):
             name, kind = _FILES[path]
             self._answer(HTTPStatus.OK, kind, (PAGE / name).read_bytes())
         elif path == "/map.png":
-            self._send_picture()
+            self._send_map_image()
         elif path == "/snapshot.json":
-            content = json.dumps(self.board.news(Seen()), allow_nan=False).encode()
+            content = json.dumps(self.board.wait_for_changes(ClientState()), allow_nan=False).encode()
             self._answer(HTTPStatus.OK, "application/json", content)
         elif path == "/news":
             self._stream()
         else:
             self._answer(HTTPStatus.NOT_FOUND, "text/plain", b"there is no such page")
 
-    def _send_picture(self) -> None:
-        picture, tag = self.board.picture()
+    def _send_map_image(self) -> None:
+        picture, tag = self.board.map_image()
         if not picture:
             self._answer(HTTPStatus.NOT_FOUND, "text/plain", b"there is no map yet")
         elif self.headers.get("If-None-Match") == f'"{tag}"':
@@ -162,13 +162,13 @@ class _Handler(BaseHTTPRequestHandler):
             self._answer(HTTPStatus.SERVICE_UNAVAILABLE, "text/plain", b"too many pages look on: close some")
             return
         try:
-            self._head(HTTPStatus.OK, "text/event-stream")
+            self._send_header(HTTPStatus.OK, "text/event-stream")
             self.send_header("Connection", "close")
             self.end_headers()
-            seen = Seen()
-            with self.board.watching():
+            seen = ClientState()
+            with self.board.count_watcher():
                 while True:
-                    news = self.board.news(seen, _HEARTBEAT)
+                    news = self.board.wait_for_changes(seen, _HEARTBEAT)
                     text = f"data: {json.dumps(news, allow_nan=False, separators=(',', ':'))}" if news else ":"
                     self.wfile.write(f"{text}\n\n".encode())
                     self.wfile.flush()
@@ -179,7 +179,7 @@ class _Handler(BaseHTTPRequestHandler):
             self.streams.release()
 
     def _answer(self, status: HTTPStatus, kind: str, content: bytes, tag: str = "") -> None:
-        self._head(status, kind)
+        self._send_header(status, kind)
         if tag:
             self.send_header("ETag", f'"{tag}"')
         if status is not HTTPStatus.NOT_MODIFIED:
@@ -187,7 +187,7 @@ class _Handler(BaseHTTPRequestHandler):
         self.end_headers()
         self.wfile.write(content)
 
-    def _head(self, status: HTTPStatus, kind: str) -> None:
+    def _send_header(self, status: HTTPStatus, kind: str) -> None:
         self.send_response(status)
         self.send_header("Content-Type", kind)
         self.send_header("Cache-Control", "no-cache")
