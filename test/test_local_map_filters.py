@@ -44,7 +44,7 @@ def test_by_class_hallways_get_grids_and_rooms_lines_and_the_robot_goes_on_where
     mapping, new_T_old = mapping_of("by_class"), np.array([-1.0, 0.5, 0.2])
     kinds, own, here = FilterSelector(mapping), before(mapping, 3, 0), np.array([0.4, 0.1, 0.1])
     own.initialize(PoseGaussian.from_pose(se2.compose(se2.inverse(new_T_old), here)))
-    own.clutter_estimate = own.clutter_estimate.after(MapAgreement(Agreement(9, 3, 1), Agreement(4, 2, 1)))
+    own.clutter_estimate = own.clutter_estimate.update(MapAgreement(Agreement(9, 3, 1), Agreement(4, 2, 1)))
     experience, loaded = own.clutter_estimate, content(WALLS[after], 7)
     elsewhere = content(WALLS[before], 0)
     entered = kinds.select(own, 7, [*elsewhere, *loaded])

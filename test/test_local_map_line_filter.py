@@ -56,28 +56,28 @@ def test_the_robot_is_found_though_odometry_drifts_and_knows_how_well(mapping):
     error = se2.log(se2.between(own.pose, truth))
     assert np.hypot(*error[:2]) < 0.02
     assert abs(error[2]) < np.radians(0.3)
-    assert error @ np.linalg.solve(own.room.pose.covariance, error) < 16.0
+    assert error @ np.linalg.solve(own.line_map.pose.covariance, error) < 16.0
 
 
 def test_a_step_tells_what_the_match_determines(mapping):
     own, truth, _ = driven(mapping, steps=9)
     scan = PreparedScan(mapping, scan_in(ROOM, se2.compose(truth, STEP), noise=0.01, seed=90))
     tracked = own.track(scan, predicted(STEP))
-    assert not tracked.contradicted
+    assert not tracked.contradicts_odometry
     assert np.linalg.eigvalsh(tracked.information)[0] > 1e4
     before = own.pose
     step = own.update(scan, 9)
     np.testing.assert_allclose(own.pose, before)
-    np.testing.assert_allclose(step.error.gain, np.eye(3), atol=0.1)
-    assert np.sqrt(np.diag(step.error.matched)[:2]).max() < 0.01
-    assert np.linalg.eigvalsh(step.error.lasting).min() > -1e-12
+    np.testing.assert_allclose(step.match_error.gain, np.eye(3), atol=0.1)
+    assert np.sqrt(np.diag(step.match_error.pose_covariance)[:2]).max() < 0.01
+    assert np.linalg.eigvalsh(step.match_error.drift_covariance).min() > -1e-12
     # Without a line nothing is known but the prediction.
     blank = PreparedScan(mapping, blank_scan())
     own.track(blank, predicted(STEP))
     step = own.update(blank, 10)
-    np.testing.assert_allclose(step.error.gain, 0.0, atol=1e-12)
-    np.testing.assert_allclose(step.error.matched, SURE, atol=1e-12)
-    assert np.sqrt(np.diag(step.error.lasting)[:2]).min() > 0.02
+    np.testing.assert_allclose(step.match_error.gain, 0.0, atol=1e-12)
+    np.testing.assert_allclose(step.match_error.pose_covariance, SURE, atol=1e-12)
+    assert np.sqrt(np.diag(step.match_error.drift_covariance)[:2]).min() > 0.02
 
 
 @pytest.mark.parametrize("slip", [-35.0, 35.0])
@@ -86,7 +86,7 @@ def test_a_heading_slip_is_found_by_inertia_and_told(mapping, slip):
     truth = se2.compose(truth, STEP)
     slipped = se2.compose(STEP, (0.0, 0.0, np.radians(slip)))
     tracked = own.track(PreparedScan(mapping, scan_in(ROOM, truth, noise=0.01)), predicted(slipped))
-    assert tracked.contradicted
+    assert tracked.contradicts_odometry
     error = se2.between(truth, own.pose)
     assert np.hypot(*error[:2]) < 0.03
     assert abs(error[2]) < np.radians(0.5)
@@ -97,10 +97,10 @@ def test_a_change_of_area_is_one_of_the_frame_and_loads_its_lines(mapping):
     new_T_old = np.array([2.0, -1.0, 0.7])
     own.change_area(7, new_T_old, placed(own, scans, new_T_old, 7))
     assert (own.area, own.keyframe_areas) == (7, [7] * 7)
-    assert len(own.room) >= 6
+    assert len(own.line_map) >= 6
     truth = se2.compose(truth, STEP)
     tracked = own.track(PreparedScan(mapping, scan_in(ROOM, truth, noise=0.01, seed=77)), predicted(STEP))
-    assert not tracked.contradicted
+    assert not tracked.contradicts_odometry
     np.testing.assert_allclose(own.pose, se2.compose(new_T_old, truth), atol=0.02)
 
 
@@ -115,28 +115,28 @@ def test_where_keyframes_moved_the_robot_moves_with_one_of_them(mapping):
 
 def test_a_branch_goes_its_own_way_and_a_state_goes_on_to_the_bit(mapping):
     parent, truth, _ = driven(mapping, steps=20)
-    before, child = parent.room.covariance.copy(), parent.branch(1)
-    again = FilterSelector(mapping).restored(parent.state)
+    before, child = parent.line_map.covariance.copy(), parent.branch(1)
+    again = FilterSelector(mapping).restore(parent.state)
     sighting = PreparedScan(mapping, scan_in(ROOM, se2.compose(truth, STEP), noise=0.01, seed=3))
     child.track(sighting, predicted(STEP))
     child.add_keyframe(99, sighting.scan)
-    np.testing.assert_array_equal(parent.room.covariance, before)
+    np.testing.assert_array_equal(parent.line_map.covariance, before)
     assert (child.hypothesis, parent.hypothesis) == (1, 0)
     assert 99 not in parent.keyframes
     again.track(sighting, predicted(STEP))
-    np.testing.assert_array_equal(again.room.covariance, child.room.covariance)
+    np.testing.assert_array_equal(again.line_map.covariance, child.line_map.covariance)
     np.testing.assert_array_equal(again.pose, child.pose)
 
 
 def test_walls_are_met_where_the_robot_is_and_passed_where_it_is_not(mapping):
     own, truth, _ = driven(mapping)
-    found = own.compared(PreparedScan(mapping, scan_in(ROOM, truth, noise=0.01, seed=5)))
-    assert found.ends.share > 0.7
-    assert found.ends.free == found.walls.free == 0
-    assert found.walls.on > 30
-    elsewhere = own.compared(PreparedScan(mapping, scan_in(box(-9.0, -9.0, 12.0, 9.0), np.zeros(3), noise=0.01)))
-    assert elsewhere.walls.free > 30
-    assert WALLS_OF_SUBMAP.log_likelihood_ratio(elsewhere.walls, own.clutter_estimate.walls.share) < -10.0
+    found = own.compare_scan(PreparedScan(mapping, scan_in(ROOM, truth, noise=0.01, seed=5)))
+    assert found.ends.matched_share > 0.7
+    assert found.ends.in_free_space == found.walls.in_free_space == 0
+    assert found.walls.on_surface > 30
+    elsewhere = own.compare_scan(PreparedScan(mapping, scan_in(box(-9.0, -9.0, 12.0, 9.0), np.zeros(3), noise=0.01)))
+    assert elsewhere.walls.in_free_space > 30
+    assert WALLS_OF_SUBMAP.log_likelihood_ratio(elsewhere.wall_outliers, own.clutter_estimate.wall_outliers.rate) < -10.0
 
 
 def test_keyframes_are_dropped_and_what_was_known_is_forgotten(mapping):
@@ -146,10 +146,10 @@ def test_keyframes_are_dropped_and_what_was_known_is_forgotten(mapping):
     assert own.keyframes == [0, 2, 4]
     np.testing.assert_array_equal(own.leading_keyframe_poses(), kept)
     own.initialize(PoseGaussian.from_pose(own.pose))
-    np.testing.assert_array_equal(own.room.pose.covariance, 0.0)
+    np.testing.assert_array_equal(own.line_map.pose.covariance, 0.0)
     np.testing.assert_array_equal(own.tracking_covariance, 0.0)
     own.track(PreparedScan(mapping, blank_scan()), predicted(STEP))
-    np.testing.assert_allclose(own.room.pose.covariance, SURE, atol=1e-12)
+    np.testing.assert_allclose(own.line_map.pose.covariance, SURE, atol=1e-12)
 
 
 def test_keyframes_of_a_drift_are_corrected_and_told(mapping):

@@ -28,7 +28,7 @@ def mapped():
 
 def counted(area_filter, walls, pose=HERE, laser_pose=(0.0, 0.0, 0.0)):
     scan = scan_in(walls, pose, noise=0.01, seed=9, laser_pose=laser_pose, **ALL_ROUND)
-    found = area_filter.compared(PreparedScan(area_filter.mapping, scan)).walls
+    found = area_filter.compare_scan(PreparedScan(area_filter.mapping, scan)).walls
     return found, WALLS_OF_SUBMAP.log_likelihood_ratio(found, area_filter.clutter_estimate.walls.share)
 
 

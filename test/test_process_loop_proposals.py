@@ -33,7 +33,7 @@ class Told(LoopProposer):
 
 def frame(run, poses, area):
     """The true pose of an area."""
-    keyframe, pose = next(iter(run.replica.maps[run.replica.best].keyframes(area).items()))
+    keyframe, pose = next(iter(run.replica.maps[run.replica.best_hypothesis].keyframes(area).items()))
     return se2.compose(poses[keyframe], se2.inverse(pose))
 
 
@@ -53,7 +53,7 @@ def twice_into_the_first_corridor(shift, proposing=GATED):
             branching.landmarks = PlaceEvidence(GATED, run.tsbi._replica.scans)
             branching.landmarks.loops = Told(loop, proposing, branching.landmarks.views)
         run.keyframe(pose, cut=7 if k and k % 14 == 0 else 0)
-        if len(run.answers[-1].leaves) > 1:
+        if len(run.answers[-1].hypotheses) > 1:
             run.accept(run.replica.best_hypothesis)
     best = run.replica.maps[run.replica.best_hypothesis]
     return run, poses, [(a, b, arc) for a, b, arc in best.all_arcs() if arc.closure]

@@ -73,25 +73,25 @@ def test_a_view_of_a_laser_that_hangs_upside_down_or_moves_in_the_sweep_is_the_s
 
 def test_an_unchanged_room_is_no_news():
     found = news(room(CUPBOARD), room(CUPBOARD))
-    assert (found.new, found.changed) == (False, False)
-    assert not any(late.gone.any() or late.starts.any() for late in found.stale_beams.values())
+    assert (found.has_new_surface, found.has_changed_surface) == (False, False)
+    assert not any(late.seen_through.any() or late.starts.any() for late in found.stale_beams.values())
 
 
 def test_furniture_that_came_is_stored_and_beams_that_pass_it_are_out_of_date():
     found = news(room(), room(CUPBOARD))
-    assert found.changed
+    assert found.has_changed_surface
     for keyframe in keyframes(room()):
         late = found.stale_beams[keyframe.keyframe]
         passed = ends(keyframe, late.starts > 0.0)
         assert len(passed) > 5
         assert (passed[:, 0] > 2.3).all()
-        assert not late.gone.any()
+        assert not late.seen_through.any()
 
 
 def test_of_furniture_that_is_gone_every_beam_is_out_of_date():
     found = news(room(CUPBOARD), room())
     for keyframe in keyframes(room(CUPBOARD)):
-        gone = found.stale_beams[keyframe.keyframe].gone
+        gone = found.stale_beams[keyframe.keyframe].seen_through
         on = np.zeros(361, dtype=bool)
         on[keyframe.scan.valid] = np.abs(keyframe.scan.points + keyframe.pose[:2] - [2.3, 1.1]).max(axis=1) < 0.61
         assert on.sum() > 10
@@ -102,13 +102,13 @@ def test_who_walks_through_is_no_news():
     """A person as wide as the cupboard, elsewhere at every look."""
     at = [box(x, -1.0, x + 0.4, -0.6) for x in (1.0, 1.6, 2.2)]
     found = news(room(), room(box(2.8, -1.0, 3.2, -0.6)), looks_in(*(room(person) for person in at)))
-    assert (found.new, found.changed) == (False, False)
-    assert not any(late.gone.any() or late.starts.any() for late in found.stale_beams.values())
+    assert (found.has_new_surface, found.has_changed_surface) == (False, False)
+    assert not any(late.seen_through.any() or late.starts.any() for late in found.stale_beams.values())
 
 
 def test_a_robot_that_is_elsewhere_takes_nothing_for_out_of_date():
     found = news(room(), room() * [0.6, 0.4, 0.6, 0.4])
-    assert not found.changed
+    assert not found.has_changed_surface
     assert not found.stale_beams
 
 
@@ -131,8 +131,8 @@ def test_hypotheses_have_to_agree_on_what_is_out_of_date():
 
 def test_beams_are_left_out_of_a_scan_once_for_all_who_hold_it():
     scan = scan_in(room(), NOW, beams=361)
-    less = scan.revised(BeamRevision((3, 4), (180,), (1.5,)))
-    assert less is scan.revised(BeamRevision((3, 4), (180,), (1.5,)))
+    less = scan.revise(BeamRevision((3, 4), (180,), (1.5,)))
+    assert less is scan.revise(BeamRevision((3, 4), (180,), (1.5,)))
     assert np.flatnonzero(scan.valid & ~less.valid).tolist() == [3, 4]
     assert len(less.points) == len(scan.points) - 2
 
@@ -144,7 +144,7 @@ def test_what_is_behind_a_thing_that_came_stays_in_the_map_and_what_is_before_it
     thing = np.array([[2.0, 0.0], [2.0, 0.1]])
     starts = occlusion_starts(to_polar_scan(scan), thing)
     cut = np.flatnonzero(starts)
-    less = scan.revised(BeamRevision((), tuple(cut.tolist()), tuple(starts[cut].tolist())))
+    less = scan.revise(BeamRevision((), tuple(cut.tolist()), tuple(starts[cut].tolist())))
     assert (less.points == scan.points).all()
     places = np.array([[5.0, 0.0], [2.0, 0.05], [4.0, 0.1], [1.0, -1.0]])
     assert classify_points(to_polar_scan(scan), places).tolist() == [SURFACE, FREE, FREE, FREE]
@@ -163,7 +163,7 @@ MIDDLE, END = 70, 110
 def read(run, records):
     """What a run says of keyframes meanwhile, and its state then."""
     for record in records:
-        run.read(record)
+        run.process_record(record)
     return [run.recorder.keyframes[k] for k in sorted(run.recorder.keyframes)], run.state
 
 

@@ -77,7 +77,7 @@ def drive_with(*found, areas=8, area=7):
 
 def doubt_of(account, event):
     return ClosureConsistencyCheck(account, BOUND, 100).find_inconsistency(
-        [c.name for c in account.closures if c.name[0] == event], 0.01
+        [c.closure_id for c in account.closures if c.closure_id[0] == event], 0.01
     )
 
 
@@ -92,16 +92,16 @@ def test_a_false_closure_is_found_when_true_ones_contradict_it():
     assert doubt_of(account, 80) is None
     account = drive_with((80, 6, 0, FALSE), (81, 7, 1, TRUE))
     doubt = doubt_of(account, 81)
-    assert doubt.closure.name[0] == 81
+    assert doubt.closure.closure_id[0] == 81
     assert doubt.excess_chi2 > BOUND
-    assert [c.name[0] for c in doubt.explanations[0].false] == [80]
+    assert [c.closure_id[0] for c in doubt.explanations[0].false_closures] == [80]
     assert doubt.explanations[0].probability > 0.9
 
 
 def test_where_two_closures_contradict_each_other_both_may_be_false():
     account = drive_with((80, 6, 0, FALSE), (81, 7, 1, (-2.2, 0.0, 0.0)))
     doubt = doubt_of(account, 81)
-    assert sorted(c.name[0] for e in doubt.explanations for c in e.false) == [80, 81]
+    assert sorted(c.closure_id[0] for e in doubt.explanations for c in e.false_closures) == [80, 81]
     assert [e.probability for e in doubt.explanations] == pytest.approx([0.5, 0.5], abs=0.01)
 
 
@@ -109,7 +109,7 @@ def test_the_odds_at_which_a_closure_was_accepted_speak_for_it():
     account = drive_with((80, 6, 0, FALSE), (81, 7, 1, (-2.2, 0.0, 0.0)))
     closures = (account.closures[0], replace(account.closures[1], log_odds=10.0))
     doubt = doubt_of(replace(account, closures=closures), 81)
-    assert [[c.name[0] for c in e.false] for e in doubt.explanations] == [[80]]
+    assert [[c.closure_id[0] for c in e.false_closures] for e in doubt.explanations] == [[80]]
 
 
 def test_closures_that_were_accepted_because_of_a_false_one_go_with_it_and_true_ones_stay():
@@ -117,9 +117,9 @@ def test_closures_that_were_accepted_because_of_a_false_one_go_with_it_and_true_
     account = drive_with((79, 3, 0, TRUE), *shifted, (90, 5, 3, TRUE), (91, 7, 4, TRUE))
     doubt = doubt_of(account, 91)
     best = doubt.explanations[0]
-    assert [c.name[0] for c in best.false] == [80, 81, 82]
+    assert [c.closure_id[0] for c in best.false_closures] == [80, 81, 82]
     assert best.probability > 0.99
-    assert [c.name[0] for c in best.path.closures] == [79, 90, 91]
+    assert [c.closure_id[0] for c in best.path.closures] == [79, 90, 91]
 
 
 def joined():
@@ -127,11 +127,11 @@ def joined():
     leaves it for area 4, which is new."""
     hybrid_map, history = corridor(4)
     closure = closed(hybrid_map, 40, 3, 0)
-    hybrid_map.place(39, 0, np.array([0.2, 0.1, 0.0]))
-    hybrid_map.place(41, 0, np.array([0.5, 0.1, 0.0]))
-    hybrid_map.place(42, 0, np.array([1.0, 0.1, 0.0]))
-    hybrid_map.place(45, 1, np.array([0.5, 0.1, 0.0]))
-    hybrid_map.place(50, 4, np.zeros(3))
+    hybrid_map.set_keyframe(39, 0, np.array([0.2, 0.1, 0.0]))
+    hybrid_map.set_keyframe(41, 0, np.array([0.5, 0.1, 0.0]))
+    hybrid_map.set_keyframe(42, 0, np.array([1.0, 0.1, 0.0]))
+    hybrid_map.set_keyframe(45, 1, np.array([0.5, 0.1, 0.0]))
+    hybrid_map.set_keyframe(50, 4, np.zeros(3))
     hybrid_map.set_arc(1, 4, PoseGaussian(np.array([0.0, 3.0, 1.5]), ODOMETRY), closure=False)
     for step in (
         PathStep(40, 3, 0, ((0, 3),), frozenset({39})),
@@ -152,7 +152,7 @@ def in_frame_of(hybrid_map, *areas):
 
 def test_what_was_stored_in_areas_that_were_entered_falsely_becomes_an_area_of_its_own():
     before = joined()
-    found = withdraw_closure(before, before.closures[0].name, 9)
+    found = withdraw_closure(before, before.closures[0].closure_id, 9)
     hybrid_map = found.hybrid_map
     assert {a: sorted(hybrid_map.keyframes(a)) for a in hybrid_map.area_ids()} == {
         0: [0, 1],
@@ -185,7 +185,7 @@ def test_a_robot_that_is_in_an_area_falsely_is_then_in_the_new_one():
     hybrid_map = before.hybrid_map.branch()
     hybrid_map.remove_arc(1, 4)
     found = withdraw_closure(
-        replace(before, hybrid_map=hybrid_map, history=earlier, area=1), before.closures[0].name, 9
+        replace(before, hybrid_map=hybrid_map, history=earlier, area=1), before.closures[0].closure_id, 9
     )
     assert found.area == 9
     np.testing.assert_allclose(found.frame_change, NEXT, atol=1e-12)
@@ -194,7 +194,7 @@ def test_a_robot_that_is_in_an_area_falsely_is_then_in_the_new_one():
 
 def test_a_link_that_the_robot_never_crossed_is_only_taken_out():
     before = drive_with((80, 6, 0, FALSE))
-    found = withdraw_closure(before, before.closures[0].name, 100)
+    found = withdraw_closure(before, before.closures[0].closure_id, 100)
     assert 100 not in found.hybrid_map.area_ids()
     assert found.hybrid_map.arc(0, 6) is None
     assert (found.area, found.frame_change) == (7, None)
@@ -208,16 +208,16 @@ def test_what_a_refinement_moved_goes_back_and_what_was_stored_since_goes_with_i
     former = {k: (3, hybrid_map.keyframes(3)[k].copy()) for k in (30, 31)}
     undo = MapSnapshot(former, {(2, 3): ArcValue(PoseGaussian(NEXT, ODOMETRY), closure=False)})
     for k in (30, 31):
-        hybrid_map.place(k, 3, se2.compose(bent, former[k][1]))
+        hybrid_map.set_keyframe(k, 3, se2.compose(bent, former[k][1]))
     hybrid_map.set_arc(2, 3, PoseGaussian(NEXT + 0.1, ODOMETRY), closure=False)
     stored, reached = np.array([1.5, 0.0, 0.0]), np.array([3.0, 0.0, 0.2])
-    hybrid_map.place(41, 3, se2.compose(bent, stored))
-    hybrid_map.place(45, 4, np.zeros(3))
+    hybrid_map.set_keyframe(41, 3, se2.compose(bent, stored))
+    hybrid_map.set_keyframe(45, 4, np.zeros(3))
     hybrid_map.set_arc(3, 4, PoseGaussian(se2.compose(bent, reached), ODOMETRY), closure=False)
     history = history, PathStep(40, 3, 3, ((0, 3),))
     history = history, PathStep(45, 3, 4, ((3, 4),), frozenset({45}))
-    account = account_of(hybrid_map, history, [replace(closure, undo=undo)], 4)
-    found = undo_refinements(account, closure.name)
+    account = account_of(hybrid_map, history, [replace(closure, snapshot=undo)], 4)
+    found = undo_refinements(account, closure.closure_id)
     placed = found.hybrid_map.keyframes(3)
     for k in (30, 31):
         np.testing.assert_array_equal(placed[k], former[k][1])
@@ -269,9 +269,9 @@ def test_what_a_refinement_moved_goes_back_after_an_area_became_part_of_another(
     bent = np.array([0.3, 0.2, 0.05])
     former = {k: (k // 10, hybrid_map.keyframes(k // 10)[k].copy()) for k in (20, 21, 30, 31)}
     for k, (area, pose) in former.items():
-        hybrid_map.place(k, area, se2.compose(bent, pose))
+        hybrid_map.set_keyframe(k, area, se2.compose(bent, pose))
     arcs = {pair: hybrid_map.arc_value(*pair) for pair in ((1, 2), (2, 3))}
-    closure = replace(closed(hybrid_map, 40, 2, 0), undo=MapSnapshot(former, arcs))
+    closure = replace(closed(hybrid_map, 40, 2, 0), snapshot=MapSnapshot(former, arcs))
     account = account_of(hybrid_map, history, [closure], 2)
     history, closures = apply_area_merge(account, AreaMerge(3, 2, account.hybrid_map.arc(2, 3)))
     assert set(closures[0].snapshot.keyframes) == {20, 21}
@@ -300,16 +300,16 @@ def test_tsbi_goes_on_with_the_explanations_as_live_hypotheses():
         Hypothesis(0, 0, 0.3, 1, None, (), (Arc(0, 1, link, closure=True),)),
     )
     run.accept(0, reopened=explanations)
-    one, two = run.keyframe(ring_drive(9)[8]).leaves
-    assert (one.parent, two.parent, one.hypothesis == two.hypothesis) == (0, 0, False)
+    one, two = run.keyframe(ring_drive(9)[8]).hypotheses
+    assert (one.parent, two.parent, one.id == two.id) == (0, 0, False)
     assert (one.probability, two.probability) == pytest.approx((0.7, 0.3))
-    assert run.replica.maps[one.hypothesis].arc(0, 1) is None
-    np.testing.assert_array_equal(run.replica.maps[two.hypothesis].arc(0, 1).mean, link.mean)
+    assert run.replica.maps[one.id].arc(0, 1) is None
+    np.testing.assert_array_equal(run.replica.maps[two.id].arc(0, 1).mean, link.mean)
     # The keyframe that came since goes with the robot.
     assert sorted(r.keyframe for r in one.moved_keyframes) == [5, 6, 7, 8]
-    assert sorted(run.replica.maps[one.hypothesis].keyframes(0)) == list(range(9))
-    assert one.local[0].area == 0
-    assert [leaf.withdrawn for leaf in run.keyframe(ring_drive(10)[9]).leaves] == [(), ()]
+    assert sorted(run.replica.maps[one.id].keyframes(0)) == list(range(9))
+    assert one.local_areas[0].area == 0
+    assert [leaf.removed_arcs for leaf in run.keyframe(ring_drive(10)[9]).hypotheses] == [(), ()]
 
 
 LOG = "sim:ring,seed=3,size=1.5"

@@ -50,7 +50,7 @@ def test_each_odometry_reading_is_answered_with_the_estimate_carried_on(rtl):
     (said,) = rtl.handle(odometry(0.1, 5, 5.3, math.pi / 2))
     assert said.stamp == SECOND // 10
     assert said.area == 0
-    assert np.allclose(said.local.mean, (1.3, 2, 0))
+    assert np.allclose(said.pose_in_area.mean, (1.3, 2, 0))
 
 
 def test_the_odometry_that_came_while_metric_slam_was_busy_counts(rtl):
@@ -58,7 +58,7 @@ def test_the_odometry_that_came_while_metric_slam_was_busy_counts(rtl):
         rtl.handle(odometry(0.1 * k, 0.1 * k, 0, 0))
     rtl.handle(estimate(0.2, (7, 0, math.pi / 2), (0.2, 0, 0)))
     (said,) = rtl.handle(odometry(1.1, 1.1, 0, 0))
-    assert np.allclose(said.local.mean, (7, 0.9, math.pi / 2))
+    assert np.allclose(said.pose_in_area.mean, (7, 0.9, math.pi / 2))
 
 
 def test_an_estimate_between_two_readings_starts_at_its_own_odometry(rtl):
@@ -66,7 +66,7 @@ def test_an_estimate_between_two_readings_starts_at_its_own_odometry(rtl):
     rtl.handle(odometry(1.0, 1, 0, 0))
     rtl.handle(estimate(0.5, (0, 0, 0), (0.5, 0, 0)))
     (said,) = rtl.handle(odometry(2.0, 2, 0, 0))
-    assert np.allclose(said.local.mean, (1.5, 0, 0))
+    assert np.allclose(said.pose_in_area.mean, (1.5, 0, 0))
 
 
 def test_the_map_pose_is_the_areas_pose_and_the_pose_in_the_area(rtl):
@@ -77,7 +77,7 @@ def test_the_map_pose_is_the_areas_pose_and_the_pose_in_the_area(rtl):
     assert said.area == 3
     assert np.allclose(said.map_pose.mean, (10, 1.5, math.pi / 2))
     assert np.allclose(se2.compose(said.map_T_odom, (0.5, 0, 0)), said.map_pose.mean)
-    assert np.linalg.eigvalsh(said.map_pose.covariance - said.local.covariance).min() > 0
+    assert np.linalg.eigvalsh(said.map_pose.covariance - said.pose_in_area.covariance).min() > 0
 
 
 def test_a_new_area_waits_for_its_place_in_the_map(rtl):
@@ -108,10 +108,10 @@ def test_the_robots_area_keeps_its_place_when_a_hypothesis_without_it_takes_the_
 def test_the_uncertainty_grows_with_the_path_and_shrinks_with_the_next_estimate(rtl):
     rtl.handle(odometry(0.0, 0, 0, 0))
     rtl.handle(estimate(0.0, (0, 0, 0), (0, 0, 0)))
-    spread = [np.linalg.det(rtl.handle(odometry(k, k, 0, 0))[0].local.covariance) for k in (1, 2, 3)]
+    spread = [np.linalg.det(rtl.handle(odometry(k, k, 0, 0))[0].pose_in_area.covariance) for k in (1, 2, 3)]
     assert spread[0] < spread[1] < spread[2]
     rtl.handle(estimate(3, (3, 0, 0), (3, 0, 0)))
-    assert np.linalg.det(rtl.handle(odometry(4, 4, 0, 0))[0].local.covariance) < spread[1]
+    assert np.linalg.det(rtl.handle(odometry(4, 4, 0, 0))[0].pose_in_area.covariance) < spread[1]
 
 
 def test_driving_to_and_fro_does_not_make_the_robot_sure_again(rtl):
@@ -119,8 +119,8 @@ def test_driving_to_and_fro_does_not_make_the_robot_sure_again(rtl):
     rtl.handle(estimate(0, (0, 0, 0), (0, 0, 0)))
     (there,) = rtl.handle(odometry(1, 3, 0, 0))
     (back,) = rtl.handle(odometry(2, 0, 0, 0))
-    assert np.allclose(back.local.mean, 0)
-    assert back.local.covariance[0, 0] > there.local.covariance[0, 0]
+    assert np.allclose(back.pose_in_area.mean, 0)
+    assert back.pose_in_area.covariance[0, 0] > there.pose_in_area.covariance[0, 0]
 
 
 def test_an_odometry_reset_is_told_once_and_the_robot_stays_where_it_was(rtl):
@@ -131,8 +131,8 @@ def test_an_odometry_reset_is_told_once_and_the_robot_stays_where_it_was(rtl):
     (later,) = rtl.handle(odometry(0.3, 0.2, 0, 0))
     assert isinstance(notice, Notice)
     assert "41.23 m" in notice.text
-    assert np.allclose(said.local.mean, (2, 0, 0))
-    assert np.allclose(later.local.mean, (2.2, 0, 0))
+    assert np.allclose(said.pose_in_area.mean, (2, 0, 0))
+    assert np.allclose(later.pose_in_area.mean, (2.2, 0, 0))
 
 
 def test_an_estimate_from_before_a_reset_still_serves(rtl):
@@ -141,7 +141,7 @@ def test_an_estimate_from_before_a_reset_still_serves(rtl):
     rtl.handle(odometry(0.2, 0, 0, 0))
     rtl.handle(estimate(0.0, (0, 0, 0), (40, 0, 0)))
     (said,) = rtl.handle(odometry(0.3, 0.1, 0, 0))
-    assert np.allclose(said.local.mean, (0.2, 0, 0))
+    assert np.allclose(said.pose_in_area.mean, (0.2, 0, 0))
 
 
 def test_a_reading_that_is_not_newer_is_passed_over(rtl):
@@ -150,7 +150,7 @@ def test_a_reading_that_is_not_newer_is_passed_over(rtl):
     assert rtl.handle(odometry(1.0, 3, 0, 0)) == []
     assert rtl.handle(odometry(0.5, 3, 0, 0)) == []
     (said,) = rtl.handle(odometry(1.1, 0.1, 0, 0))
-    assert np.allclose(said.local.mean, (0.1, 0, 0))
+    assert np.allclose(said.pose_in_area.mean, (0.1, 0, 0))
 
 
 def test_an_older_estimate_does_not_replace_a_newer_one(rtl):
@@ -158,7 +158,7 @@ def test_an_older_estimate_does_not_replace_a_newer_one(rtl):
     rtl.handle(estimate(1.0, (1, 0, 0), (1, 0, 0)))
     rtl.handle(estimate(0.5, (9, 9, 0), (0.5, 0, 0)))
     (said,) = rtl.handle(odometry(1.1, 1.1, 0, 0))
-    assert np.allclose(said.local.mean, (1.1, 0, 0))
+    assert np.allclose(said.pose_in_area.mean, (1.1, 0, 0))
 
 
 STEPS = st.lists(st.tuples(st.floats(-0.4, 0.4), st.floats(-0.4, 0.4), st.floats(-0.4, 0.4)), min_size=2, max_size=12)

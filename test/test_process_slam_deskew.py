@@ -33,7 +33,7 @@ def true_pose(seconds):
         corners.append(se2.compose(corners[-1], se2.exp(twist(second))))
     whole = np.floor(seconds).astype(int)
     part = np.asarray(seconds) - whole
-    return se2.compose(np.array(corners)[whole], se2.exp(part[..., None] * np.array([twist(s) for s in whole.is_flat])))
+    return se2.compose(np.array(corners)[whole], se2.exp(part[..., None] * np.array([twist(s) for s in whole.flat])))
 
 
 def twist(second):
@@ -110,18 +110,18 @@ def sweeping_scan(index):
 
 def test_a_scan_waits_until_odometry_covers_its_last_beam():
     dialogue = Dialogue().tell(Odometry(SECOND, np.zeros(3)), sweeping_scan(0))
-    dialogue.publish_complete(Odometry(SECOND + SECOND * 8 // 100, np.array([0.08, 0.0, 0.0])))
+    dialogue.tell(Odometry(SECOND + SECOND * 8 // 100, np.array([0.08, 0.0, 0.0])))
     assert not dialogue.said
-    dialogue.publish_complete(Odometry(SECOND + SECOND * 9 // 100, np.array([0.09, 0.0, 0.0])))
+    dialogue.tell(Odometry(SECOND + SECOND * 9 // 100, np.array([0.09, 0.0, 0.0])))
     (keyframe,) = dialogue.of(Keyframe)
     np.testing.assert_allclose(keyframe.scan.motion, (0.09, 0.0, 0.0), atol=1e-9)
 
 
 def test_at_the_end_of_a_log_the_last_sweep_goes_on_as_the_odometry_did():
     dialogue = Dialogue().tell(Odometry(SECOND - SECOND // 10, np.array([-0.1, 0.0, 0.0])))
-    dialogue.publish_complete(Odometry(SECOND, np.zeros(3)), sweeping_scan(0))
+    dialogue.tell(Odometry(SECOND, np.zeros(3)), sweeping_scan(0))
     assert not dialogue.said
-    dialogue.publish_complete(EndOfLog())
+    dialogue.tell(EndOfLog())
     np.testing.assert_allclose(dialogue.of(Keyframe)[0].scan.motion, (0.09, 0.0, 0.0), atol=1e-9)
 
 

@@ -18,9 +18,9 @@ from hmt_slam_ros.messages.messages import AreaEvents, Hypotheses, Hypothesis
 def test_without_an_event_the_hypothesis_stays():
     run = Run(RING)
     answer = run.keyframe(np.array([3.0, 1.0, 0.0]))
-    assert answer.leaves == (answer.leaves[0],)
-    leaf = answer.leaves[0]
-    assert (leaf.hypothesis, leaf.parent, leaf.probability, leaf.area, leaf.local) == (0, 0, 1.0, 0, ())
+    assert answer.hypotheses == (answer.hypotheses[0],)
+    leaf = answer.hypotheses[0]
+    assert (leaf.id, leaf.parent, leaf.probability, leaf.area, leaf.local_areas) == (0, 0, 1.0, 0, ())
 
 
 def test_a_cut_in_unknown_ground_makes_a_new_area():
@@ -28,8 +28,8 @@ def test_a_cut_in_unknown_ground_makes_a_new_area():
     poses = ring_drive(8)
     for pose in poses[:-1]:
         run.keyframe(pose)
-    (leaf,) = run.keyframe(poses[-1], cut=3).leaves
-    assert (leaf.hypothesis, leaf.area, leaf.probability) == (0, 1, 1.0)
+    (leaf,) = run.keyframe(poses[-1], cut=3).hypotheses
+    assert (leaf.id, leaf.area, leaf.probability) == (0, 1, 1.0)
     assert [r.keyframe for r in leaf.moved_keyframes] == [5, 6, 7]
     assert np.allclose(leaf.moved_keyframes[0].pose, 0.0)
     assert np.allclose(leaf.moved_keyframes[2].pose, se2.between(poses[5], poses[7]))
@@ -46,7 +46,7 @@ def test_the_new_arc_has_the_uncertainty_of_the_reference_keyframe_and_the_floor
     at_reference = run.covariances[0].copy()
     for pose in ring_drive(9)[7:8]:
         run.keyframe(pose)
-    (leaf,) = run.keyframe(ring_drive(9)[8], cut=3).leaves
+    (leaf,) = run.keyframe(ring_drive(9)[8], cut=3).hypotheses
     floor = np.diag([0.01, 0.01, math.radians(0.2)]) ** 2
     assert np.allclose(leaf.arcs[0].pose.covariance, at_reference + floor)
 
@@ -55,10 +55,10 @@ def test_the_local_map_holds_the_area_and_those_that_are_surely_near():
     run = Run(RING)
     for pose in ring_drive(7):
         run.keyframe(pose)
-    (leaf,) = run.keyframe(ring_drive(8)[7], cut=3).leaves
-    assert [local.area for local in leaf.local] == [1, 0]
-    assert np.allclose(leaf.local[0].pose, 0.0)
-    assert np.allclose(leaf.local[1].pose, leaf.frame_change.mean)
+    (leaf,) = run.keyframe(ring_drive(8)[7], cut=3).hypotheses
+    assert [local.area for local in leaf.local_areas] == [1, 0]
+    assert np.allclose(leaf.local_areas[0].pose, 0.0)
+    assert np.allclose(leaf.local_areas[1].pose, leaf.frame_change.mean)
 
 
 @pytest.mark.parametrize("mapping", [True, False])
@@ -69,9 +69,9 @@ def test_a_move_goes_to_the_known_area_and_no_keyframe_changes(mapping):
         run.keyframe(pose)
     run.keyframe(poses[-1], cut=3)
     before = run.poses[0]
-    (leaf,) = run.keyframe(poses[-1], moved=0, mapping=mapping).leaves
-    assert (leaf.hypothesis, leaf.area, leaf.moved_keyframes, leaf.arcs) == (0, 0, (), ())
-    assert [local.area for local in leaf.local] == [0, 1]
+    (leaf,) = run.keyframe(poses[-1], moved=0, mapping=mapping).hypotheses
+    assert (leaf.id, leaf.area, leaf.moved_keyframes, leaf.arcs) == (0, 0, (), ())
+    assert [local.area for local in leaf.local_areas] == [0, 1]
     assert np.allclose(se2.compose(leaf.frame_change.mean, before), se2.between(poses[0], poses[-1]))
 
 
@@ -88,10 +88,10 @@ def test_an_area_becomes_part_of_another_and_the_robot_goes_on_there():
     run, pose = two_areas()
     into = run.replica.maps[0].arc(0, 1)
     before = {k: se2.compose(into.mean, at) for k, at in run.replica.maps[0].keyframes(1).items()}
-    (leaf,) = run.keyframe(pose, merged=(1, 0)).leaves
-    assert (leaf.hypothesis, leaf.probability, leaf.area, leaf.moved_keyframes, leaf.arcs) == (0, 1.0, 0, (), ())
+    (leaf,) = run.keyframe(pose, merged=(1, 0)).hypotheses
+    assert (leaf.id, leaf.probability, leaf.area, leaf.moved_keyframes, leaf.arcs) == (0, 1.0, 0, (), ())
     assert (leaf.area_merge.area, leaf.area_merge.into) == (1, 0)
-    assert [local.area for local in leaf.local] == [0]
+    assert [local.area for local in leaf.local_areas] == [0]
     np.testing.assert_allclose(leaf.frame_change.mean, into.mean, atol=1e-12)
     np.testing.assert_allclose(leaf.area_merge.pose.covariance, into.covariance, atol=1e-12)
     hybrid_map = run.replica.maps[0]
@@ -102,7 +102,7 @@ def test_an_area_becomes_part_of_another_and_the_robot_goes_on_there():
     # And is then left as any other.
     for further in ring_drive(16)[11:]:
         run.keyframe(further)
-    (leaf,) = run.keyframe(ring_drive(17)[16], cut=3).leaves
+    (leaf,) = run.keyframe(ring_drive(17)[16], cut=3).hypotheses
     assert (leaf.area, leaf.arcs[0].source) == (2, 0)
 
 
@@ -111,18 +111,18 @@ def test_a_robot_that_is_in_neither_of_two_areas_stays_where_it_is():
     for further in ring_drive(20)[10:]:
         run.keyframe(further)
     run.keyframe(ring_drive(21)[20], cut=3)
-    (leaf,) = run.keyframe(ring_drive(22)[21], merged=(1, 0)).leaves
+    (leaf,) = run.keyframe(ring_drive(22)[21], merged=(1, 0)).hypotheses
     assert (leaf.area, leaf.frame_change, leaf.area_merge.into) == (2, None, 0)
-    assert leaf.local[0].area == 2
-    assert 1 not in [local.area for local in leaf.local]
+    assert leaf.local_areas[0].area == 2
+    assert 1 not in [local.area for local in leaf.local_areas]
     assert run.replica.maps[0].neighbors(2) == [0]
 
 
 def test_areas_whose_surfaces_contradict_each_other_stay_two():
     wrong = PoseGaussian(se2.compose(se2.between(*ring_drive(7)[[0, 6]]), [0.0, 0.6, 0.0]), STEP)
     run, pose = two_areas(arcs=(Arc(0, 1, wrong, closure=True),))
-    (leaf,) = run.keyframe(pose, merged=(1, 0)).leaves
-    assert (leaf.area, leaf.frame_change, leaf.area_merge, leaf.local) == (1, None, None, ())
+    (leaf,) = run.keyframe(pose, merged=(1, 0)).hypotheses
+    assert (leaf.area, leaf.frame_change, leaf.area_merge, leaf.local_areas) == (1, None, None, ())
 
 
 def test_turning_back_into_tracked_ground_is_no_new_area():
@@ -134,7 +134,7 @@ def test_turning_back_into_tracked_ground_is_no_new_area():
     for pose in poses[2:6][::-1]:
         turned = np.array([pose[0], pose[1], math.pi])
         run.keyframe(turned)
-    (leaf,) = run.keyframe(np.array([*poses[1][:2], math.pi]), cut=5).leaves
+    (leaf,) = run.keyframe(np.array([*poses[1][:2], math.pi]), cut=5).hypotheses
     assert (leaf.area, leaf.probability, leaf.arcs) == (0, 1.0, ())
     assert {r.area for r in leaf.moved_keyframes} == {0}
 
@@ -168,7 +168,7 @@ def ring_with_two_leaves(apart=1.0):
 
 def split_in_two(run, apart):
     """Leaf 1 where the robot is, leaf 2 at the pose ``apart`` from there."""
-    split = Hypotheses(len(run.histories) - 1, (Hypothesis(1, 0, 0.6, 0), Hypothesis(2, 0, 0.4, 0)))
+    split = Hypotheses(len(run.answers) - 1, (Hypothesis(1, 0, 0.6, 0), Hypothesis(2, 0, 0.4, 0)))
     for replica in (run.replica, run.tsbi._replica):
         replica.apply_hypotheses(split)
     run.tsbi._hypothesis_states = dict.fromkeys((1, 2), run.tsbi._hypothesis_states[0])
@@ -236,8 +236,8 @@ def test_the_local_map_takes_the_poses_of_the_global_map_where_they_agree():
     run.accept(
         0, global_poses=(AreaPose(0, PoseGaussian(np.zeros(3), certain)), AreaPose(1, PoseGaussian(placed, certain)))
     )
-    (leaf,) = run.keyframe(poses[-1], moved=0).leaves
-    assert np.allclose(leaf.local[1].pose, placed)
+    (leaf,) = run.keyframe(poses[-1], moved=0).hypotheses
+    assert np.allclose(leaf.local_areas[1].pose, placed)
 
 
 def test_events_of_another_keyframe_are_refused():

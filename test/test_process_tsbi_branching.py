@@ -47,7 +47,7 @@ def rooms_apart(rooms, offsets, sigma, configuration=None, last=PATH):
 def known_through_another(hybrid_map):
     """Let area 0 be known only by way of area 1, where it is a neighbour of the robot's area 2."""
     arc_1_0 = hybrid_map.arc(2, 1).inverse().compose(hybrid_map.arc(2, 0))
-    del hybrid_map.arcs[0, 2]
+    del hybrid_map.changed_arcs[0, 2]
     hybrid_map.set_arc(1, 0, arc_1_0, closure=False)
 
 
@@ -104,7 +104,7 @@ def test_a_recognised_area_is_entered_at_the_pose_of_the_match():
 def test_the_robot_is_told_to_be_as_uncertain_in_the_area_as_its_newest_keyframe():
     parent, branching, newest = rooms_apart((ROOM, ROOM), ((0.4, 0.3),), 0.7)
     grown = {k: (1.0 + k - newest[0]) * np.diag([1e-3, 2e-3, 1e-4]) for k in newest}
-    parent = replace(parent, notes=replace(parent.notes, covariances=grown))
+    parent = replace(parent, state=replace(parent.state, covariances=grown))
     exact = PoseGaussian(parent.hybrid_map.keyframes(parent.area)[newest[-1]], np.zeros((3, 3)))
     children = branching.cut(parent, newest[1:]).children
     assert {child.area for child in children} == {0, 2}
@@ -140,7 +140,7 @@ def test_a_re_check_joins_areas_by_an_arc_and_moves_nothing():
 
 def test_a_keyframe_speaks_for_or_against_an_area_once():
     parent, branching, newest = rooms_apart((ROOM, ROOM), ((0.6, -0.4),), 1.0)
-    stay = replace(parent, notes=parent.notes.checked([0], newest))
+    stay = replace(parent, state=parent.state.after_matching([0], newest))
     branches = branching.cut(stay, newest[1:])
     assert [child.area for child in branches.children] == [parent.area + 1]
 
@@ -163,7 +163,7 @@ def test_keyframes_that_see_an_area_but_are_not_in_its_place_yet_are_asked_again
 
 def test_whether_the_robot_is_in_known_ground_now_is_asked_of_the_newest_keyframes():
     parent, branching, _ = approaching((6.2, 5.6, 5.0, 4.4, 3.8, 3.2))
-    parent = replace(parent, notes=replace(parent.notes, unchecked=(), beside=(0,)))
+    parent = replace(parent, state=replace(parent.state, unmatched_keyframes=(), pending_candidates=(0,)))
     stay, joined = branching.recheck(parent, (0,)).children
     assert [arc.target for arc in joined.arcs] == [0]
     assert joined.log_weight > stay.log_weight
@@ -202,7 +202,7 @@ def test_an_improbable_hypothesis_examines_few_areas_and_counts_the_others():
     parent, branching, newest = rooms_apart((ROOM,) * 7, offsets, 1.0)
     examined = {}
     for share in (1.0, 1e-3):
-        branches = branching.cut(replace(parent, share=share), newest[1:])
+        branches = branching.cut(replace(parent, probability=share), newest[1:])
         examined[share] = {area for child in branches.children for area in child.notes.compared}
         assert (branches.log_skipped_weight > -math.inf) == (share < 1.0)
     assert (len(examined[1.0]), len(examined[1e-3])) == (6, 4)

@@ -43,8 +43,8 @@ def asked(rooms, doubts, first=FAR, hall=2):
         branching._replica.scans[keyframe] = scan_in(
             HALL, PATH[k], noise=0.01, seed=keyframe, field_of_view=2 * np.pi, beams=361
         )
-    notes = replace(parent.notes, doubts={newest[n]: nats for n, nats in doubts.items()})
-    return spawn_kidnapped_hypothesis(branching, replace(parent, notes=notes))
+    notes = replace(parent.state, kidnapping_evidence={newest[n]: nats for n, nats in doubts.items()})
+    return spawn_kidnapped_hypothesis(branching, replace(parent, state=notes))
 
 
 def test_the_keyframes_since_then_begin_an_area_of_which_nothing_tells_where_it_is():
@@ -73,8 +73,8 @@ def test_that_the_place_is_known_elsewhere_speaks_for_it_and_one_look_has_found_
 
 def test_it_is_believed_to_be_where_two_looks_find_it():
     parent, branching, newest = rooms_apart((ROOM, OTHER, ROOM), [FAR, FAR], 0.1)
-    notes = replace(parent.notes, lost=newest[0], claim=PoseInArea(2, newest[0], np.zeros(3)), credit=None)
-    (still,) = relocalization.update_relocalization(branching, replace(parent, notes=notes)).children
+    notes = replace(parent.state, lost_since=newest[0], tracked_pose=PoseInArea(2, newest[0], np.zeros(3)), counted_evidence=None)
+    (still,) = relocalization.update_relocalization(branching, replace(parent, state=notes)).children
     assert still.state.relocalization_candidate.area == 0
     looked = relocalization.update_relocalization(branching, replace(parent, notes=still.state))
     _, found = looked.children
@@ -91,7 +91,7 @@ def test_where_nothing_is_stored_it_goes_over_into_the_area_where_it_was_recogni
         run.keyframe(pose)
     run.keyframe(poses[-1], cut=3)
     run.tsbi._hypothesis_states[0] = replace(run.tsbi._hypothesis_states[0], relocalized_area=0)
-    (leaf,) = run.keyframe(poses[-1], mapping=mapping).leaves
+    (leaf,) = run.keyframe(poses[-1], mapping=mapping).hypotheses
     assert leaf.area == area
     assert run.tsbi._hypothesis_states[0].relocalized_area is None
 
@@ -125,8 +125,8 @@ def test_an_area_is_not_left_without_keyframes():
 def test_where_nothing_is_stored_it_is_lost_from_the_next_keyframe_on_if_that_is_more_probable(nats, lost):
     parent, branching, _ = rooms_apart((ROOM,), [], 0.1)
     spot = PoseInArea(0, 17, PATH[3])
-    doubtful = replace(parent, notes=replace(parent.notes, doubts={17: nats}, spots={17: spot}))
-    branching.remember(17, scan_in(OTHER, PATH[3], field_of_view=2 * np.pi, beams=361), {17})
+    doubtful = replace(parent, state=replace(parent.state, kidnapping_evidence={17: nats}, unstored_poses={17: spot}))
+    branching.keep_scans(17, scan_in(OTHER, PATH[3], field_of_view=2 * np.pi, beams=361), {17})
     child = decide_without_mapping(branching, doubtful, 17)
     assert child.state.lost_since == lost
     assert bool(child.state.kidnapping_evidence) == (lost is None)
@@ -142,13 +142,13 @@ def test_where_nothing_is_stored_it_is_lost_from_the_next_keyframe_on_if_that_is
 )
 def test_where_nothing_is_stored_it_is_lost_if_it_is_rather_in_another_place(world, off, lost):
     parent, branching, _ = rooms_apart((OTHER, BEFORE), [FAR], 0.1)
-    notes = parent.notes
+    notes = parent.state
     for event, pose in enumerate(PATH[:4], start=12):
         scan = scan_in(world, pose, noise=0.01, seed=event, field_of_view=2 * np.pi, beams=361)
         claimed = se2.between(PATH[0], pose) + np.array([off, 0.0, 0.0])
-        notes = notes.heard(event, 6.0, PoseInArea(1, event, claimed))
-        branching.remember(event, scan, notes.unstored_poses)
-    child = decide_without_mapping(branching, replace(parent, notes=notes), 15)
+        notes = notes.after_scan(event, 6.0, PoseInArea(1, event, claimed))
+        branching.keep_scans(event, scan, notes.unstored_poses)
+    child = decide_without_mapping(branching, replace(parent, state=notes), 15)
     assert child.state.lost_since == lost
     assert not child.state.kidnapping_evidence
     assert not child.state.unstored_poses
@@ -157,10 +157,10 @@ def test_where_nothing_is_stored_it_is_lost_if_it_is_rather_in_another_place(wor
 @pytest.mark.parametrize(("lost", "stays"), [(11, True), (9, False)], ids=["takes itself for lost", "was carried"])
 def test_where_it_would_be_if_it_had_not_been_displaced_is_where_odometry_has_it_when_it_is_lost(lost, stays):
     parent, branching, _ = rooms_apart((ROOM, OTHER), [FAR], 0.1)
-    notes = replace(parent.notes, lost=lost, stay=FalseAlarm(PoseInArea(1, 10, PATH[2]), 0.4))
+    notes = replace(parent.state, lost_since=lost, false_alarm=FalseAlarm(PoseInArea(1, 10, PATH[2]), 0.4))
     scan = scan_in(ROOM, PATH[3], field_of_view=2 * np.pi, beams=361)
     keyframe = Keyframe(11, scan, 1.0, (), motion_unknown=True, mapping=False)
-    (child,) = relocalization.begin_relocalization(branching, replace(parent, notes=notes), keyframe, PATH[3]).children
+    (child,) = relocalization.begin_relocalization(branching, replace(parent, state=notes), keyframe, PATH[3]).children
     assert child.state.lost_since == 11
     if not stays:
         assert child.state.false_alarm is None
@@ -179,8 +179,8 @@ def test_a_place_is_believed_sooner_where_it_would_be_if_it_had_not_been_displac
     looked = {}
     for probability in (0.0, 0.4):
         stay = FalseAlarm(PoseInArea(0, newest[0], np.array([at, 0.0, 0.0])), probability)
-        notes = replace(parent.notes, lost=newest[0], stay=stay)
-        where = relocalization.update_relocalization(branching, replace(parent, notes=notes)).pose_distribution
+        notes = replace(parent.state, lost_since=newest[0], false_alarm=stay)
+        where = relocalization.update_relocalization(branching, replace(parent, state=notes)).pose_distribution
         looked[probability] = max(
             p for p, fit in zip(where.probabilities, where.candidates, strict=True) if fit.area == 0
         )
@@ -189,11 +189,11 @@ def test_a_place_is_believed_sooner_where_it_would_be_if_it_had_not_been_displac
 
 def test_who_says_where_it_is_knows_better_than_where_it_would_be_if_it_had_not_been_displaced():
     parent, branching, newest = rooms_apart((ROOM, OTHER, ROOM), [FAR, FAR], 0.1)
-    notes = replace(parent.notes, lost=newest[0], stay=FalseAlarm(PoseInArea(1, newest[0], np.zeros(3)), 0.4))
+    notes = replace(parent.state, lost_since=newest[0], false_alarm=FalseAlarm(PoseInArea(1, newest[0], np.zeros(3)), 0.4))
     told = InitialPose(0, PoseGaussian(se2.between(PATH[0], PATH[5]), np.diag([0.3, 0.3, 0.2]) ** 2))
     pose = parent.hybrid_map.keyframes(2)[newest[-1]]
     keyframe = Keyframe(newest[-1], branching._replica.scans[newest[-1]], 1.0, (), initial_pose=told, mapping=False)
-    looked = relocalization.begin_relocalization(branching, replace(parent, notes=notes), keyframe, pose)
+    looked = relocalization.begin_relocalization(branching, replace(parent, state=notes), keyframe, pose)
     assert all(child.state.false_alarm is None for child in looked.children)
 
 
@@ -258,7 +258,7 @@ def test_what_a_displaced_robot_saw_is_not_forgotten_at_the_same_event():
         run.keyframe(pose)
     run.evidence[0] = -6.0
     for pose in poses[12:14]:
-        assert len(run.keyframe(pose).leaves) == 1
+        assert len(run.keyframe(pose).hypotheses) == 1
     run._answer = lambda sequence, _events: run.tsbi.handle(AreaEvents(sequence, (), (PrunedKeyframe(sequence, 0),)))
     (answer,) = run.keyframe(poses[14])
     assert [leaf.lost for leaf in answer.leaves] == [False, True]

@@ -17,7 +17,7 @@ def around_the_ring():
     poses = ring_drive(112)
     for k, pose in enumerate(poses):
         answer = run.keyframe(pose, cut=7 if k and k % 14 == 0 else 0)
-        if k <= 95 and len(answer.leaves) > 1:
+        if k <= 95 and len(answer.hypotheses) > 1:
             run.accept(run.replica.best_hypothesis)
     return run, poses
 
@@ -64,7 +64,7 @@ def test_the_arc_that_closes_the_ring_is_precise(ring):
 def test_two_runs_say_the_same_to_the_bit(ring):
     run, _ = ring
     again, _ = around_the_ring()
-    for a, b in zip(run.histories, again.histories, strict=True):
+    for a, b in zip(run.answers, again.histories, strict=True):
         assert [(x.hypothesis, x.probability, x.area) for x in a.leaves] == [
             (x.hypothesis, x.probability, x.area) for x in b.leaves
         ]
@@ -73,7 +73,7 @@ def test_two_runs_say_the_same_to_the_bit(ring):
 def test_a_hypothesis_that_branched_has_children_with_new_ids(ring):
     run, _ = ring
     seen = set()
-    for answer in run.histories:
+    for answer in run.answers:
         parents = [leaf.parent for leaf in answer.leaves]
         for leaf in answer.leaves:
             if leaf.hypothesis != leaf.parent:

@@ -48,11 +48,11 @@ def test_the_place_itself_looks_most_alike(looks):
 
 def test_no_area_has_no_likeness(looks):
     assert looks.similarity([9], []).shape == (0,)
-    assert looks.shares([9], {}) == {}
+    assert looks.area_probabilities([9], {}) == {}
 
 
 def test_the_looks_share_the_probability_among_areas(looks):
-    shares = looks.shares([9], {4: (3, 4, 5), 7: (0, 1, 2)})
+    shares = looks.area_probabilities([9], {4: (3, 4, 5), 7: (0, 1, 2)})
     assert sum(shares.values()) == pytest.approx(1.0)
     assert shares[7] > 0.6
 

@@ -33,7 +33,7 @@ def claimed(error, covariance=LOOSE):
 
 @pytest.mark.parametrize("error", [[0.08, -0.06, 0.02], [-0.15, 0.1, -0.03], [0.0, 0.2, 0.0], [0.6, -0.5, 0.1]])
 def test_a_displaced_group_of_scans_is_moved_back(alignment, error):
-    found = alignment.measured(placed(ROOMS, KNOWN), placed(ROOMS, JOINED), claimed(error)).mean
+    found = alignment.align(placed(ROOMS, KNOWN), placed(ROOMS, JOINED), claimed(error)).mean
     np.testing.assert_allclose(found[:2], 0.0, atol=0.03)
     assert abs(np.degrees(found[2])) < 0.3
 
@@ -50,7 +50,7 @@ def test_what_was_seen_since_decides_along_a_wall():
 
 def test_a_motion_outside_the_gate_of_the_closure_is_not_searched(alignment):
     tight = np.diag([0.01**2, 0.01**2, 0.002**2])
-    found = alignment.measured(placed(ROOMS, KNOWN), placed(ROOMS, JOINED), claimed([0.3, 0.0, 0.0], tight))
+    found = alignment.align(placed(ROOMS, KNOWN), placed(ROOMS, JOINED), claimed([0.3, 0.0, 0.0], tight))
     assert found is None or abs(found.mean[0] - 0.3) < 0.1
 
 
@@ -66,13 +66,13 @@ def test_along_a_corridor_the_closure_decides_and_across_it_the_walls():
 
 def test_scans_in_unknown_space_are_left_where_they_are(alignment):
     far = claimed([60.0, 0.0, 0.0])
-    assert alignment.measured(placed(ROOMS, KNOWN), placed(ROOMS, JOINED), far) is None
+    assert alignment.align(placed(ROOMS, KNOWN), placed(ROOMS, JOINED), far) is None
     assert alignment.measured(placed(ROOMS, KNOWN), [], claimed([0.0, 0.0, 0.0])) is None
 
 
 def test_one_alignment_leaves_nothing_behind_for_the_next(alignment):
     closure = claimed([0.05, 0.02, 0.01])
-    first = alignment.measured(placed(ROOMS, KNOWN), placed(ROOMS, JOINED), closure)
+    first = alignment.align(placed(ROOMS, KNOWN), placed(ROOMS, JOINED), closure)
     alignment.measured(placed(CORRIDOR, KNOWN), placed(CORRIDOR, JOINED), closure)
     again = alignment.measured(placed(ROOMS, KNOWN), placed(ROOMS, JOINED), closure)
     np.testing.assert_array_equal(again.mean, first.mean)

@@ -78,7 +78,7 @@ def test_scans_without_a_return_give_a_blank_grid():
 
 
 def test_a_moved_grid_says_the_same_of_the_same_place(room):
-    moved = room.moved(np.array([1.0, -2.0]))
+    moved = room.shift_origin(np.array([1.0, -2.0]))
     assert log_ratio_at(moved, 5.0, 4.0) == log_ratio_at(room, 6.0, 2.0)
 
 

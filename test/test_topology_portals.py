@@ -87,8 +87,8 @@ def test_a_step_over_unknown_ground_is_no_path():
 def test_two_passages_are_of_one_portal():
     hybrid_map = driven()
     for k, x in enumerate((4.2, 3.7, 3.2, 2.7), start=10):
-        hybrid_map.place(k, 1, se2.between(ARC, np.array([x, 0.1, np.pi])))
+        hybrid_map.set_keyframe(k, 1, se2.between(ARC, np.array([x, 0.1, np.pi])))
     for k, x in enumerate((1.9, 1.4, 0.9), start=14):
-        hybrid_map.place(k, 0, np.array([x, 0.1, np.pi]))
+        hybrid_map.set_keyframe(k, 0, np.array([x, 0.1, np.pi]))
     (portal,) = find_portals(hybrid_map, {0: [opening(2.2)], 1: [opening(2.35, heading=np.pi, frame=ARC)]}, FEATURES)
     assert portal.crossing_count == 2

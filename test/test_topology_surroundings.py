@@ -113,7 +113,7 @@ def views():
 
 def test_a_place_has_the_keyframes_of_the_areas_around_in_its_frame(views):
     place = views.place(chain(0.05, 0.05), 1, ())
-    assert sorted(zip(place.owners.tolist(), place.positions[:, 0].tolist(), strict=True)) == [
+    assert sorted(zip(place.keyframe_areas.tolist(), place.positions[:, 0].tolist(), strict=True)) == [
         (0, -4.0),
         (1, 0.0),
         (2, 4.0),

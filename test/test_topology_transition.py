@@ -75,7 +75,7 @@ def test_without_overlap_the_probability_is_exactly_zero(corridor):
 @pytest.mark.parametrize("x", [1.0, 4.0, 5.6, 9.0, 14.0, 18.0])
 @pytest.mark.parametrize("sigma", [0.05, 1.0, 4.0])
 def test_the_bound_from_positions_alone_is_a_bound_and_zero_where_nothing_is_near(corridor, x, sigma):
-    own = corridor.positions[corridor.owners == 3]
+    own = corridor.positions[corridor.keyframe_areas == 3]
     bound = sampled_entry_bound(own, belief(sigma), keyframes(x), RADIUS)
     assert entry_prior(corridor, belief(sigma), keyframes(x), RADIUS).probability <= bound
     assert bound == 0.0 or x < 9.0 or sigma > 0.05
@@ -94,7 +94,7 @@ def test_the_probability_is_that_of_the_gaussian():
 
 
 def test_neighbouring_areas_share_the_probability(corridor):
-    other = AreaPlace(7, corridor.owners, corridor.positions, corridor.grid)
+    other = AreaPlace(7, corridor.keyframe_areas, corridor.positions, corridor.grid)
     prior = PoseGaussian(np.array([4.0, 0.0, 0.0]), np.diag([0.5, 0.1, 0.003]) ** 2)
     shares = [entry_prior(p, prior, keyframes(0.5), RADIUS).probability for p in (corridor, other)]
     assert min(shares) > 0.1

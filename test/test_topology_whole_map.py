@@ -45,7 +45,7 @@ def laid(asked):
     """Lays the keyframes of ``asked`` into areas of the map."""
     hybrid_map, poses, scans = asked
     whole = whole_map(scans)
-    return lambda areas: whole.fits(hybrid_map, poses, 1000, dict.fromkeys(areas, 1.0 / len(areas)))
+    return lambda areas: whole.match_regions(hybrid_map, poses, 1000, dict.fromkeys(areas, 1.0 / len(areas)))
 
 
 def off(fit):
@@ -63,10 +63,10 @@ def test_a_room_is_recognised_from_anywhere_in_it(laid):
 def test_what_came_after_is_no_part_of_the_map(asked):
     hybrid_map, poses, scans = asked
     whole = whole_map(scans)
-    assert whole.fits(hybrid_map, poses, 0, {0: 1.0}) == []
+    assert whole.match_regions(hybrid_map, poses, 0, {0: 1.0}) == []
     for keyframe, pose in poses.items():
-        hybrid_map.place(keyframe, 2, pose)
-    assert {fit.area for fit in whole.fits(hybrid_map, poses, 12, {0: 0.5, 2: 0.5})} == {0}
+        hybrid_map.set_keyframe(keyframe, 2, pose)
+    assert {fit.area for fit in whole.match_regions(hybrid_map, poses, 12, {0: 0.5, 2: 0.5})} == {0}
 
 
 def test_a_room_in_which_the_map_has_traces_of_people_is_recognised(asked, laid):
@@ -76,7 +76,7 @@ def test_a_room_in_which_the_map_has_traces_of_people_is_recognised(asked, laid)
     walls = np.concatenate((ROOM, crowd))
     for k, pose in enumerate(PATH):
         scans[20 + k] = seen(walls, pose, 20 + k)
-        hybrid_map.place(20 + k, 0, se2.between(PATH[0], pose))
+        hybrid_map.set_keyframe(20 + k, 0, se2.between(PATH[0], pose))
     best = max(laid([0, 1]), key=lambda fit: fit.mode.log_mass)
     assert best.area == 0
     assert off(best) < 0.1
@@ -100,7 +100,7 @@ def test_all_areas_are_looked_at_however_many_there_are(asked, laid):
         for k, pose in enumerate(PATH):
             keyframe = 100 + 6 * area + k
             scans[keyframe] = seen(OTHER, pose, keyframe)
-            hybrid_map.place(keyframe, area, se2.between(PATH[0], pose))
+            hybrid_map.set_keyframe(keyframe, area, se2.between(PATH[0], pose))
     assert max(laid(range(24)), key=lambda fit: fit.mode.log_mass).area == 0
 
 
@@ -126,7 +126,7 @@ def test_a_fit_is_told_in_the_frame_of_its_area_wherever_that_lies_in_its_region
     hybrid_map, _, scans = asked
     for k, pose in enumerate(PATH):
         scans[30 + k] = seen(ROOM, pose, 30 + k)
-        hybrid_map.place(30 + k, 2, se2.between(PATH[0], pose))
+        hybrid_map.set_keyframe(30 + k, 2, se2.between(PATH[0], pose))
     hybrid_map.set_arc(1, 2, PoseGaussian(np.array([1.0, -5.5, 2.0]), 1e-4 * np.eye(3)), closure=False)
     found = laid([2])
     assert {fit.area for fit in found} == {2}

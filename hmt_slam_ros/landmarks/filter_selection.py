@@ -27,13 +27,13 @@ class FilterSelector:
         kind = LineFilter if self._kind == "lines" else ParticleFilter
         return kind(self._mapping, hypothesis, area)
 
-    def restored(self, state: ParticleFilterState | LineFilterState) -> LocalFilter:
+    def restore(self, state: ParticleFilterState | LineFilterState) -> LocalFilter:
         """The filter of a state; the patches of grids are in the pool."""
         if isinstance(state, LineFilterState):
             return LineFilter.from_state(self._mapping, state)
         return ParticleFilter.from_state(self._mapping, state)
 
-    def entering(self, own: LocalFilter, area: int, content: Sequence[PlacedKeyframe]) -> LocalFilter:
+    def select(self, own: LocalFilter, area: int, content: Sequence[PlacedKeyframe]) -> LocalFilter:
         """The filter to go on with: ``own``, or one of another kind that has the robot where ``own`` has it.
 
         It knows nothing of what is around the robot until it changes to the area. ``own`` is given up if it is not it.

@@ -135,7 +135,7 @@ class LiveHypothesis:
         own = state.particle_filter or state.line_filter
         assert own is not None
         return cls(
-            filters.restored(own),
+            filters.restore(own),
             settings,
             state.event_pose,
             state.event_motion,
@@ -375,7 +375,7 @@ class LiveHypothesis:
         """
         entered = leaf.area != self.filter.area
         if entered:
-            self.filter = filters.entering(self.filter, leaf.area, content)
+            self.filter = filters.select(self.filter, leaf.area, content)
         area_T_previous = np.zeros(3) if leaf.frame_change is None else leaf.frame_change.mean
         self.filter.change_area(leaf.area, area_T_previous, content)
         self.event_pose = se2.compose(area_T_previous, self.event_pose)

@@ -223,14 +223,14 @@ class FilterFactory(Protocol):
         """A filter that knows nothing yet."""
         ...
 
-    def restored(self, state: ParticleFilterState | LineFilterState) -> LocalFilter:
+    def restore(self, state: ParticleFilterState | LineFilterState) -> LocalFilter:
         """The filter of a state; the patches of grids are in the pool.
 
         :raises HmtSlamError: for a state of a kind that this factory does not make.
         """
         ...
 
-    def entering(self, own: LocalFilter, area: int, content: Sequence[PlacedKeyframe]) -> LocalFilter:
+    def select(self, own: LocalFilter, area: int, content: Sequence[PlacedKeyframe]) -> LocalFilter:
         """The filter to go on with: ``own``, or one of another kind that has the robot where ``own`` has it.
 
         It knows nothing of what is around the robot until it changes to the area. ``own`` is given up if it is not it.

@@ -323,7 +323,7 @@ class ParticleFilters:
         """A filter that knows nothing yet."""
         return ParticleFilter(self._mapping, hypothesis, area)
 
-    def restored(self, state: ParticleFilterState | LineFilterState) -> LocalFilter:
+    def restore(self, state: ParticleFilterState | LineFilterState) -> LocalFilter:
         """The filter of a state; the patches of its grids are in the pool.
 
         :raises HmtSlamError: where its local map is one of lines.
@@ -332,6 +332,6 @@ class ParticleFilters:
             raise HmtSlamError("the saved map has local maps of lines: go on from it with its own local_map.kind")
         return ParticleFilter.from_state(self._mapping, state)
 
-    def entering(self, own: LocalFilter, area: int, content: Sequence[PlacedKeyframe]) -> LocalFilter:  # noqa: ARG002
+    def select(self, own: LocalFilter, area: int, content: Sequence[PlacedKeyframe]) -> LocalFilter:  # noqa: ARG002
         """The filter to go on with, which is ``own`` in every area."""
         return own
