@@ -18,10 +18,10 @@ PACKAGES = ("geometry", "sensing", "local_map")
 """Whose kernels run for every scan, for every particle and for every beam."""
 
 ARRAYS = {
-    "geometry.covariance.carried": (2, "the result, half of the product"),
+    "geometry.covariance.propagate_covariance": (2, "the result, half of the product"),
     "geometry.covariance.inverse": (1, "the result"),
-    "geometry.covariance.of_inverse": (2, "the result, half of the product"),
-    "geometry.covariance.turned": (2, "the result, half of the product"),
+    "geometry.covariance.inverse_pose_covariance": (2, "the result, half of the product"),
+    "geometry.covariance.rotate_covariance": (2, "the result, half of the product"),
     "geometry.se2._compose_each": (1, "the results"),
     "sensing.scan._ends": (1, "the result"),
     "sensing.scan._with_return": (1, "the result"),

@@ -214,10 +214,10 @@ def _drive(
         "log": log,
         "robot.duration": seconds,
         "robot.rate": rate,
-        "robot.paced": str(paced).lower(),
+        "robot.flow_control": str(paced).lower(),
         "robot.scan_listeners": 1 + (heard == SCAN),
         "robot.odometry_listeners": 2 + (heard == ODOM),
-        "robot.patience": 120.0,
+        "robot.discovery_timeout": 120.0,
     }
     with listener.running("robot", parameters):
         listener.until(lambda: bool(statuses) and statuses[-1].state == "ended", _PATIENCE)

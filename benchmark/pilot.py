@@ -273,7 +273,7 @@ class Errands:
             "robot.rate": RATE,
             "robot.scan_listeners": 2,
             "robot.odometry_listeners": 3,
-            "robot.patience": _PATIENCE,
+            "robot.discovery_timeout": _PATIENCE,
         }
         stack.enter_context(listener.running("robot", robot))
         listener.until(lambda: bool(self._truths), _PATIENCE)

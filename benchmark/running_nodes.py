@@ -123,7 +123,7 @@ def until_first_pose() -> Start:
 
 def _waiting(log: Path) -> Parameters:
     """Parameters of a robot that waits for whoever listens."""
-    return {"log": str(log), "robot.patience": 3600.0, "robot.rate": 0.0}
+    return {"log": str(log), "robot.discovery_timeout": 3600.0, "robot.rate": 0.0}
 
 
 def _cpu_seconds(process: subprocess.Popen[bytes]) -> float:

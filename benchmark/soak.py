@@ -145,7 +145,7 @@ def soaked(minutes: float) -> Soak:
             for node in PROCESSES:
                 words = ["-p", f"recovery:={scratch}/recovery", *(own if node == "slam" else [])]
                 children.start(node, words, environment)
-            robot = {"log": name, "robot.rate": RATE, "robot.odometry_listeners": 2, "robot.patience": 600.0}
+            robot = {"log": name, "robot.rate": RATE, "robot.odometry_listeners": 2, "robot.discovery_timeout": 600.0}
             children.start("robot", [w for k, v in robot.items() for w in ("-p", f"{k}:={v}")], environment)
             _watch(executor, children, found, 60.0 * minutes)
         found.statuses = {node: process.returncode for node, process in children.processes.items()}

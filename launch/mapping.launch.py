@@ -30,9 +30,9 @@ def _arguments() -> list[DeclareLaunchArgument]:
             choices=["", "mapping", "localization", "lifelong"],
             description="What is done with known ground; empty for what the YAML file says.",
         ),
-        _switch("start_carried", "true", "Whether the robot may be anywhere in that map; else it is where it was."),
+        _switch("start_lost", "true", "Whether the robot may be anywhere in that map; else it is where it was."),
         DeclareLaunchArgument("save_to", default_value="hmt_map", description="Folder for the service slam/save."),
-        _switch("save_at_end", "false", "Whether the map is saved there before the nodes end."),
+        _switch("save_on_shutdown", "false", "Whether the map is saved there before the nodes end."),
         _switch("autostart", "true", "Whether the nodes begin by themselves; else a lifecycle manager leads them."),
         _switch("view", "false", "Whether the live page is served."),
         DeclareLaunchArgument("view_port", default_value="8800", description="Port of the live page on 127.0.0.1."),
@@ -52,8 +52,8 @@ def _value(name: str, kind: type) -> ParameterValue:
 
 
 def _processes(context: LaunchContext) -> list[Node]:
-    kinds = {"use_sim_time": bool, "start_from": str, "start_carried": bool}
-    kinds |= {"save_to": str, "save_at_end": bool, "recovery": str, "autostart": bool}
+    kinds = {"use_sim_time": bool, "start_from": str, "start_lost": bool}
+    kinds |= {"save_to": str, "save_on_shutdown": bool, "recovery": str, "autostart": bool}
     chosen = LaunchConfiguration("mode").perform(context)
     mode = {"mode": chosen} if chosen else {}
     return [

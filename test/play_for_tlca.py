@@ -57,7 +57,9 @@ class Play:
     def _with_first_keyframe(self, leaf, replica):
         if leaf.moved_keyframes or leaf.area in (0, *replica.maps[leaf.parent].area_ids()):
             return leaf
-        return replace(leaf, moved_keyframes=(MovedKeyframe(self.k, replica.robot_areas[leaf.parent], leaf.area, np.zeros(3)),))
+        return replace(
+            leaf, moved_keyframes=(MovedKeyframe(self.k, replica.robot_areas[leaf.parent], leaf.area, np.zeros(3)),)
+        )
 
     def start(self):
         return self.step(places=[(0, 0, np.zeros(3))])

@@ -195,7 +195,7 @@ def test_where_others_drive_it_says_where_the_robot_is_and_what_a_door_tells_onc
 
 
 def test_it_finds_out_where_it_is_and_stops_when_told_or_when_it_takes_too_long(saved):
-    missions = PilotProcess(with_changes(CONFIGURATION, {"pilot.patience": 2.0}), saved)
+    missions = PilotProcess(with_changes(CONFIGURATION, {"pilot.task_timeout": 2.0}), saved)
     robot = Robot(missions, (14.0, 0.0, math.pi), rtl="never")
     assert robot.do("find").text == "find: given up after 2 s"
     np.testing.assert_array_equal(robot.velocity, 0.0)

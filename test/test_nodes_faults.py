@@ -127,7 +127,7 @@ def test_rtl_that_is_killed_goes_on_with_the_pose_and_the_parameters_that_it_had
 
 def test_a_process_that_was_dead_while_the_others_began_anew_begins_anew_too(corridor, listener, start, tmp_path):
     log, out = corridor
-    parameters = {"start_from": out, "start_carried": False, "recovery": tmp_path}
+    parameters = {"start_from": out, "start_lost": False, "recovery": tmp_path}
     nodes = Nodes(start, listener, **parameters)
     nodes.drive(log, first=90, robot__duration=3.0)
     nodes.until(lambda: len(nodes.estimates) == 15)
@@ -352,7 +352,7 @@ def test_two_robots_that_drive_at_once_under_namespaces_share_nothing_but_a_tf_t
         nodes.until(lambda heard=statuses: len(heard) >= 8)
         awaited = len(nodes.diagnostics) + 2 * len(NODES)
         nodes.until(lambda nodes=nodes, awaited=awaited: len(nodes.diagnostics) > awaited)
-        assert nodes.diagnosis("slam")["sent Finished"] == "1"
+        assert nodes.diagnosis("slam")["sent EndOfRun"] == "1"
     assert {message.header.frame_id for message in [*one.poses, *maps[one]]} == {"map"}
     assert {message.header.frame_id for message in [*two.poses, *maps[two]]} == {"two/map"}
     assert joints(tf["/one/tf"] + tf["/one/tf_static"]) == {

@@ -106,7 +106,7 @@ def test_a_lost_message_of_the_chain_is_told(listener, start):
     accepted.publish(String(data=encode(ClosureDecision(0))))
     accepted.publish(String(data=encode(ClosureDecision(2))))
     listener.until(lambda: (status := level(told, "rtl")) and status.level == DiagnosticStatus.ERROR, alive=[process])
-    assert "Accepted 1 never came, 2 did" in level(told, "rtl").message
+    assert "ClosureDecision 1 never came, 2 did" in level(told, "rtl").message
 
 
 def test_a_node_that_starts_late_catches_up(listener, start):
@@ -125,7 +125,7 @@ def test_a_node_that_starts_late_catches_up(listener, start):
         status = level(told, "rtl")
         return {entry.key: entry.value for entry in status.values} if status else {}
 
-    listener.until(lambda: received().get("received Accepted") == "3", alive=[process])
+    listener.until(lambda: received().get("received ClosureDecision") == "3", alive=[process])
     listener.until(lambda: received().get("received Hypotheses") == "3", alive=[process])
     listener.until(lambda: received().get("waiting for their turn") == "0", alive=[process])
 

@@ -43,7 +43,7 @@ def message(name, value):
 
 
 def test_every_parameter_has_its_default_its_description_and_its_range(robot):
-    leaves = [leaf for leaf in flat_parameters(Configuration()) if leaf.name != "robot.patience"]
+    leaves = [leaf for leaf in flat_parameters(Configuration()) if leaf.name != "robot.discovery_timeout"]
     names = [leaf.name for leaf in leaves]
     values = robot(GetParameters, "get_parameters", names=names).values
     descriptors = robot(DescribeParameters, "describe_parameters", names=names).descriptors
@@ -97,9 +97,13 @@ def test_a_change_within_reason_reaches_the_configuration(make):
 
 REFUSED = [
     ("robot.rate", -1.0, "robot.rate = -1.0 is out of range: use a number from 0 to 1000"),
-    ("robot.window", 0, "robot.window = 0 is out of range: use a whole number from 1 to 10000"),
+    (
+        "robot.max_unacknowledged_scans",
+        0,
+        "robot.max_unacknowledged_scans = 0 is out of range: use a whole number from 1 to 10000",
+    ),
     ("robot.rate", 2, "robot.rate = 2 has the wrong type for ROS: write 2.0"),
-    ("robot.paced", "no", "robot.paced = 'no' is not true or false: use true or false"),
+    ("robot.flow_control", "no", "robot.flow_control = 'no' is not true or false: use true or false"),
     ("robot.rat", 2.0, "there is no parameter 'robot.rat': did you mean robot.rate"),
     ("filter.particles", 20, "filter.particles is fixed while the node runs: set it in the parameter file"),
     ("local_map.field_radius", 0.06, "contradicts itself"),
@@ -113,10 +117,10 @@ def test_a_running_node_refuses_a_change_that_cannot_be_with_advice(robot):
     for (name, _, sentence), result in zip(REFUSED, results, strict=True):
         assert not result.successful, name
         assert sentence in result.reason
-    mixed = [message("robot.rate", 4.0), message("robot.window", 0)]
+    mixed = [message("robot.rate", 4.0), message("robot.max_unacknowledged_scans", 0)]
     result = robot(SetParametersAtomically, "set_parameters_atomically", parameters=mixed).result
-    assert "robot.window = 0 is out of range: use" in result.reason
-    values = robot(GetParameters, "get_parameters", names=["robot.rate", "robot.window"]).values
+    assert "robot.max_unacknowledged_scans = 0 is out of range: use" in result.reason
+    values = robot(GetParameters, "get_parameters", names=["robot.rate", "robot.max_unacknowledged_scans"]).values
     assert [parameter_value_to_python(value) for value in values] == [1.0, 20]
 
 

@@ -182,7 +182,7 @@ def mapped(folder, *options):
 def first(tmp_path_factory):
     """The map of the first seconds, with parameters of its own."""
     folder = tmp_path_factory.mktemp("maps") / "first"
-    done = mapped(folder, "--duration", "6", "--seed", "3", "--set", "aam.persistence=3")
+    done = mapped(folder, "--duration", "6", "--seed", "3", "--set", "aam.confirmations=3")
     assert done.returncode == 0, done.stderr
     return folder
 
@@ -190,7 +190,7 @@ def first(tmp_path_factory):
 def test_the_command_goes_on_with_the_parameters_of_the_map_which_it_may_replace(first, tmp_path):
     shutil.copytree(first, tmp_path / "on")
     for folder, options in {
-        "whole": ("--seed", "3", "--set", "aam.persistence=3"),
+        "whole": ("--seed", "3", "--set", "aam.confirmations=3"),
         "on": ("--from", str(tmp_path / "on")),
     }.items():
         done = mapped(tmp_path / folder, "--duration", "12", *options)

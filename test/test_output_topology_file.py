@@ -72,7 +72,7 @@ def test_portals_stand_at_their_arcs_and_landmarks_in_a_file_of_their_own(
     door = Landmark(OPENING, belief, 0.9, 0.05, Existence(0.8, detections=4, misses=1))
     corner = Landmark(CONCAVE_CORNER, belief, 0.0, 0.0, Existence(0.7))
     monkeypatch.setattr(LandmarkMap, "observe", lambda found, *_, **__: setattr(found, "landmarks", [door, corner]))
-    monkeypatch.setattr(export, "portals_of", lambda *_: (portal,))
+    monkeypatch.setattr(export, "find_portals", lambda *_: (portal,))
     graph_file, landmarks_file, _ = export_topology(folder)
     attributes = nx.read_graphml(graph_file, node_type=int).edges[0, 1]
     assert [attributes[f"portal_{name}"] for name in NUMBERS] == of(belief)

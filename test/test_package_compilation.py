@@ -7,15 +7,15 @@ import sys
 
 TELLING = """
 import sys
-from hmt_slam_ros.compilation import tell_of_compilation
+from hmt_slam_ros.compilation import report_compilation
 {load}
 for _ in range(2):
-    tell_of_compilation(print)
+    report_compilation(print)
 {use}
 """
 """It asks twice, as a node does that is taken down and brought up again."""
-LOAD = "import numpy as np; from hmt_slam_ros.grids.distance_field import any_set"
-USE = "any_set(np.zeros(3, np.uint32)); any_set(np.zeros((1, 3), np.uint32)[0, ::2])"
+LOAD = "import numpy as np; from hmt_slam_ros.grids.distance_field import has_bits"
+USE = "has_bits(np.zeros(3, np.uint32)); has_bits(np.zeros((1, 3), np.uint32)[0, ::2])"
 
 
 def said(cache, load=LOAD, use=USE):

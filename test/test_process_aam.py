@@ -23,7 +23,7 @@ from hmt_slam_ros.registration.consistency import Clutter
 
 WORLD = worlds.two_rooms()
 THERE = worlds.drive((1.0, 2.0), (4.0, 3.0), (8.0, 3.0), (10.5, 3.5), (10.5, 5.0), (7.5, 5.0), (7.5, 2.0))
-OPTIONS = {"aam.ncut_threshold": 0.8, "aam.overlap_radius": 0.15, "aam.persistence": 1}
+OPTIONS = {"aam.ncut_threshold": 0.8, "aam.overlap_radius": 0.15, "aam.confirmations": 1}
 
 
 def aam(**changes):

@@ -25,7 +25,7 @@ def by_policy(policy, **changes):
 
 
 def configured(policy, **changes):
-    own = {"area_policy": policy, "ncut_threshold": 0.0, "min_cluster": 3, "persistence": 2} | changes
+    own = {"area_policy": policy, "ncut_threshold": 0.0, "min_cluster": 3, "confirmations": 2} | changes
     return with_changes(Configuration(), OPTIONS | {f"aam.{name}": value for name, value in own.items()})
 
 

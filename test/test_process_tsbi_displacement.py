@@ -73,7 +73,9 @@ def test_that_the_place_is_known_elsewhere_speaks_for_it_and_one_look_has_found_
 
 def test_it_is_believed_to_be_where_two_looks_find_it():
     parent, branching, newest = rooms_apart((ROOM, OTHER, ROOM), [FAR, FAR], 0.1)
-    notes = replace(parent.state, lost_since=newest[0], tracked_pose=PoseInArea(2, newest[0], np.zeros(3)), counted_evidence=None)
+    notes = replace(
+        parent.state, lost_since=newest[0], tracked_pose=PoseInArea(2, newest[0], np.zeros(3)), counted_evidence=None
+    )
     (still,) = relocalization.update_relocalization(branching, replace(parent, state=notes)).children
     assert still.state.relocalization_candidate.area == 0
     looked = relocalization.update_relocalization(branching, replace(parent, notes=still.state))
@@ -189,7 +191,9 @@ def test_a_place_is_believed_sooner_where_it_would_be_if_it_had_not_been_displac
 
 def test_who_says_where_it_is_knows_better_than_where_it_would_be_if_it_had_not_been_displaced():
     parent, branching, newest = rooms_apart((ROOM, OTHER, ROOM), [FAR, FAR], 0.1)
-    notes = replace(parent.state, lost_since=newest[0], false_alarm=FalseAlarm(PoseInArea(1, newest[0], np.zeros(3)), 0.4))
+    notes = replace(
+        parent.state, lost_since=newest[0], false_alarm=FalseAlarm(PoseInArea(1, newest[0], np.zeros(3)), 0.4)
+    )
     told = InitialPose(0, PoseGaussian(se2.between(PATH[0], PATH[5]), np.diag([0.3, 0.3, 0.2]) ** 2))
     pose = parent.hybrid_map.keyframes(2)[newest[-1]]
     keyframe = Keyframe(newest[-1], branching._replica.scans[newest[-1]], 1.0, (), initial_pose=told, mapping=False)

@@ -34,7 +34,11 @@ def test_the_arrays_hold_what_the_arcs_hold_also_after_one_was_replaced(star):
     star.set_arc((7, 40), arc(99.0))
     table = star.table
     for (a, b), value in star.arcs.items():
-        sides = [side for side in range(2 * len(star.arcs)) if {table.opposite_area[side], table.opposite_area[side ^ 1]} == {a, b}]
+        sides = [
+            side
+            for side in range(2 * len(star.arcs))
+            if {table.opposite_area[side], table.opposite_area[side ^ 1]} == {a, b}
+        ]
         (lower, upper) = sides
         assert (table.opposite_area[lower], table.opposite_area[upper]) == (b, a)
         assert np.array_equal(table.means[lower // 2], value.pose.mean)

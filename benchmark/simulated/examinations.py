@@ -181,7 +181,7 @@ class Row(NamedTuple):
     :ivar mode_x: deviation of the mode from the match alone; likewise ``mode_y`` (m), ``mode_turn`` (rad).
     :ivar log_volume: half the log determinant of its covariance.
     :ivar samples: to ``free``: the keyframes' samples in the area's map at the mode, as :class:`Match`.
-    :ivar back_samples: to ``back_free``: the area's samples in the keyframes' map there.
+    :ivar reverse_samples: to ``back_free``: the area's samples in the keyframes' map there.
     :ivar true_score: to ``true_free``: as ``score``, at the true pose; NaN where the places are not the same.
     :ivar right: 1 where the claim is true, 0 where it is false.
     :ivar apart: to ``error_turn``: of the claim, m, m, degrees.

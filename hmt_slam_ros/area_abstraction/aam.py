@@ -56,7 +56,7 @@ class Aam:
     by the hypotheses that branch off. It is not measured again when metric SLAM or TLCA corrects poses: a correction
     within an area is small against the radius of overlap. Between two areas it is when the arc between them moved.
 
-    A cut and a move have to be found at ``aam.persistence`` evaluations in a row, so that one poor scan does nothing.
+    A cut and a move have to be found at ``aam.confirmations`` evaluations in a row, so that one poor scan does nothing.
 
     Two areas that a definite closure joins are one if nothing in what both hold together separates, so that an area of
     all of it would not be cut. This is asked when the closure becomes definite, when it is refined again, and when the
@@ -100,7 +100,7 @@ class Aam:
         return AamState(self._replica.state, tuple(graphs.values()), watches, asked, left)
 
     def handle(self, message: Message) -> list[Message]:
-        """Answer a ``Keyframe`` with its ``AreaEvents``; learn from ``Hypotheses`` and ``Accepted``."""
+        """Answer a ``Keyframe`` with its ``AreaEvents``; learn from ``Hypotheses`` and ``ClosureDecision``."""
         if isinstance(message, Keyframe):
             return [self._examine(message)]
         if isinstance(message, Hypotheses):

@@ -2,7 +2,7 @@
 
 A portal of a finished map lies on an arc; a passage is for area abstraction. The openings around the robot are
 landmarks of its way: what keyframes before a door show of it counts for one behind it too, from where a laser that
-looks ahead sees nothing of the door. A passage begins a chamber; passing the same opening again leads back. Openings
+looks ahead sees nothing of the door. A passage begins a segment; passing the same opening again leads back. Openings
 are seen by the landmarks of Tomatis, Nourbakhsh and Siegwart (2003), which come in by the protocols below.
 """
 
@@ -144,7 +144,7 @@ class Way:
         return Way(passages=self.passages)
 
     def chambers(self, keyframes: Collection[int]) -> dict[int, int]:
-        """{keyframe: number of its chamber}, of keyframes since the robot entered its area, in chamber 0."""
+        """{keyframe: number of its segment}, of keyframes since the robot entered its area, in segment 0."""
         numbers, begins = [0], [0]
         for k, passage in enumerate(self.passages):
             back = _last_crossing_at(self.passages[:k], passage.pose)

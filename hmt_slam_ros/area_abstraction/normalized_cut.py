@@ -1,4 +1,4 @@
-"""Normalised cut of a similarity graph, by spectral bisection and a sweep (Shi and Malik, PAMI 2000).
+"""Normalized cut of a similarity graph, by spectral bisection and a sweep (Shi and Malik, PAMI 2000).
 
 With similarities A, cut(P1, P2) the sum of A over the pairs between the parts, and assoc(P, V) the sum over all pairs
 from P to the whole graph, pairs within P counting in both directions:
@@ -18,7 +18,7 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.linalg import eigh
 
-# Similarity of neighbours in the order of the nodes, relative to the largest, that joins what is not connected.
+# Similarity of neighbors in the order of the nodes, relative to the largest, that joins what is not connected.
 _CHAIN = 1e-6
 
 
@@ -62,7 +62,7 @@ def normalized_cut(
     """The best bipartition found: every prefix of every leading eigenvector's order is tried (a sweep cut).
 
     :param similarity: shape (n, n), symmetric, not negative. The order of the nodes is that of time: only where the
-        graph falls apart does it decide, then a node without similarities stays with its neighbours in time.
+        graph falls apart does it decide, then a node without similarities stays with its neighbors in time.
     :param min_size: smallest part allowed, in units of ``sizes``.
     :param sizes: shape (n,), what each node counts; None for one each.
     :returns: None where no bipartition has parts large enough.

@@ -1,7 +1,7 @@
 """Overlap of sensed space: how much of what one scan saw another saw too, given where both were taken.
 
 The overlap of scans i and j is the mean of two shares: of the points of i that have a point of j within a radius, and
-of the points of j that have one of i (Blanco, Gonzalez, Fernandez-Madrigal, IROS 2006, symmetrised by averaging).
+of the points of j that have one of i (Blanco, Gonzalez, Fernandez-Madrigal, IROS 2006, symmetrized by averaging).
 
 Scans in the middle of a hall, where the laser reaches nothing, saw free space only: that of two overlaps the less, the
 farther apart they were taken.

@@ -35,9 +35,9 @@ class OverlapGraph:
         return self.subgraph(set(self.keyframes).difference(gone))
 
     def weaken_across_doors(self, segment_labels: Mapping[int, int], factor: float) -> OverlapGraph:
-        """The graph with the similarities of keyframes in different chambers multiplied by a factor.
+        """The graph with the similarities of keyframes in different segments multiplied by a factor.
 
-        :param segment_labels: {keyframe: number of its chamber}, 0 of those that are not in it.
+        :param segment_labels: {keyframe: number of its segment}, 0 of those that are not in it.
         """
         own = np.array([segment_labels.get(keyframe, 0) for keyframe in self.keyframes])
         return OverlapGraph(self.keyframes, np.where(own[:, None] == own, 1.0, factor) * self.similarity)
@@ -83,7 +83,7 @@ def synchronize_graph(
 
 
 class Separation(NamedTuple):
-    """Keyframes that separate from their area, ascending, and the normalised cut that sets them apart."""
+    """Keyframes that separate from their area, ascending, and the normalized cut that sets them apart."""
 
     keyframes: tuple[int, ...]
     ncut: float

@@ -32,7 +32,7 @@ class JoinedGraph(NamedTuple):
     :ivar arc: ``a_T_b``, shape (3,), by which overlaps between the two were measured.
     :ivar graph: of the keyframes of both.
     :ivar second_keyframes: keyframes of area b.
-    :ivar min_ncut: least normalised cut of the graph.
+    :ivar min_ncut: least normalized cut of the graph.
     """
 
     arc: NDArray[np.float64]
@@ -77,7 +77,7 @@ class JoinedGraphState:
     :ivar arc: ``a_T_b``, shape (3,), by which overlaps between the two were measured, m and rad.
     :ivar graph: number of the overlap graph of the keyframes of both in ``AamState.graphs``.
     :ivar second_keyframes: keyframes of area b.
-    :ivar min_ncut: least normalised cut of the graph.
+    :ivar min_ncut: least normalized cut of the graph.
     """
 
     arc: NDArray[np.float64]

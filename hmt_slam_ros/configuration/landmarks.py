@@ -81,7 +81,7 @@ class FeatureParameters:
     )
     opening_bias: float = parameter(
         3.3,
-        "Log-odds of an opening of which a metre of the wall, a metre at either jamb and all behind is seen.",
+        "Log-odds of an opening of which a meter of the wall, a meter at either jamb and all behind is seen.",
         unit="nat",
         low=-100.0,
         high=100.0,
@@ -137,7 +137,7 @@ class FeatureParameters:
         0.3, "Deviation of walls from being parallel or square to each other.", unit="deg", low=0.0, high=10.0
     )
     hallway_bias: float = parameter(
-        -25.3, "Log-odds of a hallway as wide and as long as one metre.", unit="nat", low=-100.0, high=100.0
+        -25.3, "Log-odds of a hallway as wide and as long as one meter.", unit="nat", low=-100.0, high=100.0
     )
     hallway_width: float = parameter(
         7.8, "How they change with the logarithm of the width.", unit="nat", low=-100.0, high=100.0

@@ -12,13 +12,13 @@ class MotionParameters:
     """Odometry motion model: noise of the increment between two readings."""
 
     translation_from_translation: float = parameter(
-        0.1, "Deviation of the travelled distance per metre travelled.", unit="m/m", low=0.0, high=2.0
+        0.1, "Deviation of the traveled distance per meter traveled.", unit="m/m", low=0.0, high=2.0
     )
     translation_from_rotation: float = parameter(
-        0.001, "Deviation of the travelled distance per degree turned.", unit="m/deg", low=0.0, high=0.1
+        0.001, "Deviation of the traveled distance per degree turned.", unit="m/deg", low=0.0, high=0.1
     )
     rotation_from_translation: float = parameter(
-        2.0, "Deviation of the heading per metre travelled.", unit="deg/m", low=0.0, high=90.0
+        2.0, "Deviation of the heading per meter traveled.", unit="deg/m", low=0.0, high=90.0
     )
     rotation_from_rotation: float = parameter(
         0.1, "Deviation of the heading per degree turned.", unit="deg/deg", low=0.0, high=2.0
@@ -74,7 +74,7 @@ class LocalMapParameters:
         0.4, "Evidence of free space where beams of a scan pass.", unit="nat", low=0.05, high=3.0
     )
     log_odds_limit: float = parameter(
-        3.5, "Bound of a cell's evidence, so that a changed world is learnt again.", unit="nat", low=0.5, high=6.0
+        3.5, "Bound of a cell's evidence, so that a changed world is learned again.", unit="nat", low=0.5, high=6.0
     )
 
 
@@ -108,7 +108,7 @@ class MatchingParameters:
     )
     temper: float = parameter(
         0.05,
-        "Exponent on a scan's likelihood in the weights, since neighbouring beams are correlated.",
+        "Exponent on a scan's likelihood in the weights, since neighboring beams are correlated.",
         low=1e-4,
         high=1.0,
     )
@@ -119,7 +119,7 @@ class MatchingParameters:
         high=100.0,
     )
     block_noise: float = parameter(
-        1.5, "Factor on the variance that neighbouring beams, taken together, show in a match.", low=0.0, high=100.0
+        1.5, "Factor on the variance that neighboring beams, taken together, show in a match.", low=0.0, high=100.0
     )
     map_age: float = parameter(
         2.0,
@@ -162,7 +162,7 @@ class FilterParameters:
         0.5, "Resample when the effective sample size falls below this share of the particles.", low=0.0, high=1.0
     )
     keyframe_distance: float = parameter(
-        0.5, "A keyframe is taken after this distance travelled.", unit="m", low=0.05, high=10.0
+        0.5, "A keyframe is taken after this distance traveled.", unit="m", low=0.05, high=10.0
     )
     keyframe_angle: float = parameter(
         20.0, "A keyframe is taken after this angle turned.", unit="deg", low=1.0, high=180.0

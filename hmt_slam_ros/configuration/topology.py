@@ -172,7 +172,7 @@ class LoopClosureParameters:
 class RefinementParameters:
     """Refinement of the poses by registering the scans with each other, when a path is accepted and at the end."""
 
-    iterations: int = parameter(4, "Linearisations of all pairs of keyframes.", low=0, high=100)
+    iterations: int = parameter(4, "Linearizations of all pairs of keyframes.", low=0, high=100)
     neighbors: int = parameter(15, "Keyframes that a keyframe is registered with at most.", low=1, high=1000)
     scan_neighbors: int = parameter(
         4, "Keyframes that a scan between keyframes is registered with at most.", low=1, high=100
@@ -182,9 +182,9 @@ class RefinementParameters:
     )
     max_points: int = parameter(360, "Points of a scan that are registered; evenly thinned.", low=10, high=5000)
     first_gate: float = parameter(
-        0.4, "A point and a wall meet within this distance at the first linearisation.", unit="m", low=0.01, high=5.0
+        0.4, "A point and a wall meet within this distance at the first linearization.", unit="m", low=0.01, high=5.0
     )
-    last_gate: float = parameter(0.15, "The same at the last linearisation.", unit="m", low=0.01, high=5.0)
+    last_gate: float = parameter(0.15, "The same at the last linearization.", unit="m", low=0.01, high=5.0)
     min_share: float = parameter(
         0.1, "Two scans overlap when at least this share of their points meet.", low=0.01, high=1.0
     )

@@ -102,7 +102,7 @@ def _count_beams(
     """The row of `BeamCounts` of a scan; where it has as many beams as the others, each beam is noted, too.
 
     :param ranges: shape (n,), m.
-    :param returns: shape (b,), ``least`` and ``most`` (b,), m: those of `EachBeam`, written to.
+    :param returns: shape (b,), ``least`` and ``most`` (b,), m: those of `BeamStatistics`, written to.
     """
     valid = nan = infinite = near = far = 0
     same = ranges.size == returns.size

@@ -166,7 +166,7 @@ def _check_slip(comparison: OdometryComparison) -> list[Finding]:
     text = (
         f"Odometry and scans contradict each other in {100.0 * comparison.slip_share:.0f} % of the time in which the "
         "robot moves: wheels slip, or the odometry is poor; the scans are believed, so keep to places that they "
-        "show well, and raise motion.rotation_from_rotation and its neighbours."
+        "show well, and raise motion.rotation_from_rotation and its neighbors."
     )
     return [Finding(severity, "slip", text)]
 

@@ -223,7 +223,7 @@ def _check_clock(running: RunningSystem) -> list[Finding]:
         if abs(away) >= _CLOCK_OFFSETS[0]:
             text = (
                 f"The stamps of {name} are {abs(away):.2f} s {'before' if away > 0.0 else 'after'} the clock of this "
-                "computer when they arrive: synchronise the clocks of both computers (chrony), or, where a bag is "
+                "computer when they arrive: synchronize the clocks of both computers (chrony), or, where a bag is "
                 "played, use ros2 bag play --clock and use_sim_time."
             )
             found.append(Finding(severity, "stamps against clock", text))

@@ -88,7 +88,7 @@ def _clock_offset_finding(offset: float) -> Finding:
         severity,
         "clock offset",
         f"The scans' stamps are {abs(offset):.2f} s {late} against the odometry's, by the turns that both show: "
-        "synchronise the clocks (chrony, PTP), or correct the stamp in the driver of the one that is off.",
+        "synchronize the clocks (chrony, PTP), or correct the stamp in the driver of the one that is off.",
     )
 
 

@@ -57,7 +57,7 @@ class RelationScore:
     :ivar matched: relations with a pose at both ends.
     :ivar missed: all others.
     :ivar extrapolated: matched relations of which one end or both were reached along the odometry.
-    :ivar translation: norm of the difference of the two translations, metres.
+    :ivar translation: norm of the difference of the two translations, meters.
     :ivar rotation: absolute difference of heading, degrees.
     """
 
@@ -81,7 +81,7 @@ class RelationErrors:
 class PairErrors:
     """Error of every relation; arrays of shape (n,).
 
-    :ivar translation: norm of the difference of the two translations, metres.
+    :ivar translation: norm of the difference of the two translations, meters.
     :ivar rotation: absolute difference of heading, degrees.
     :ivar span: time between the two poses, ns, int64.
     :ivar is_matched: whether there is a pose at both ends; where not, the errors mean nothing.
@@ -230,7 +230,7 @@ _NEAR = 3.0  # m, within which a place is the same
 
 
 def true_relations(truth: StampedPoses) -> Relations:
-    """Relations of every metre of a drive: to the next, to the tenth, and to where the robot was before.
+    """Relations of every meter of a drive: to the next, to the tenth, and to where the robot was before.
 
     The third kind joins each pose to the nearest one, within 3 m, of more than 60 s before; over these a missed loop
     shows.

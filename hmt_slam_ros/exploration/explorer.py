@@ -35,7 +35,7 @@ _STAND = (0.0, 0.0)
 
 
 class Explorer:
-    """The explorer as a process. Consumes Errand, Scan, RealTimePose and the chain; says what tasks.py has.
+    """The explorer as a process. Consumes Task, Scan, RealTimePose and the chain; says what tasks.py has.
 
     :ivar exploration_map: what it knows.
     """

@@ -6,7 +6,7 @@ global dynamic window approach, this is what keeps the dynamic window out of dea
 
 Fox, Burgard and Thrun (1997), The dynamic window approach to collision avoidance. Of the velocities that can be reached
 until the next command, those are admissible from which the robot can stop before it touches anything; of these the one
-is taken that turns best towards the goal, is fast, and has far to go. The goal is what `local_path` finds.
+is taken that turns best towards the goal, is fast, and has far to go. The goal is what `local_goal` finds.
 """
 
 from __future__ import annotations
@@ -265,7 +265,7 @@ def _heading_and_progress(ahead: Float64, v: float, omega: float) -> tuple[float
 
 @njit(cache=True)
 def _free_distance(points: Float64, v: float, omega: float, radius: float) -> float:
-    """How far a disc goes on an arc before it touches any of the points, m, `_FAR` at most."""
+    """How far a disc goes on an arc before it touches any of the points, m, `_MAX_FREE_DISTANCE` at most."""
     free = _MAX_FREE_DISTANCE
     if v <= 0.0:
         return free

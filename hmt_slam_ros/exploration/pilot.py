@@ -109,7 +109,7 @@ _TIME_JUMP = NANOSECONDS
 
 
 class PilotProcess:
-    """The pilot as a process. Consumes Errand, Odometry, Scan, RealTimePose and the chain; says Carried, and what
+    """The pilot as a process. Consumes Task, Odometry, Scan, RealTimePose and the chain; says PoseReset, and what
     tasks.py has.
 
     :ivar rooms: {name: the place in it} to which it can be sent.
@@ -166,7 +166,7 @@ class PilotProcess:
         return said
 
     def _accept_task(self, errand: Task) -> list[Message]:
-        """Begin an errand in place of the one before."""
+        """Begin an task in place of the one before."""
         if not self._configuration.pilot.drives:
             return [TaskResult(errand, False, "pilot.drives is false, so others drive the robot: set it to true")]
         if errand.kind == "go" and errand.place not in self.rooms:
@@ -181,7 +181,7 @@ class PilotProcess:
         return [] if goal is None else [GoalPose(self._stamp, goal.opening.area, goal.pose)]
 
     def _stop(self) -> list[Message]:
-        """Let the robot stand, if it is on an errand."""
+        """Let the robot stand, if it is on an task."""
         if self._task is None:
             return []
         self.controller.stop()
@@ -322,7 +322,7 @@ class PilotProcess:
         return f"at {self._building.chart.name(facing[0])}, looking {DIRECTION_NAMES[facing[1]]}"
 
     def _task_result(self, errand: Task) -> TaskResult | None:
-        """How an errand ended, if it did."""
+        """How an task ended, if it did."""
         if self._task_start is None:
             self._task_start = self._stamp
         if self._is_localized_for(errand):

@@ -84,7 +84,7 @@ _SCAN_RADIUS = _UPDATE_RADIUS + KEYFRAME_RANGE
 _MAX_EDGE_LENGTH, _MAX_DRIVEN_STEP = 8.0, 1.5
 # Keyframes that are so near to one, m, may stand for it.
 _BESIDE = 1.5
-# Where fewer keyframes are in a chamber, there is no room.
+# Where fewer keyframes are in a segment, there is no room.
 _MIN_ROOM_KEYFRAMES = 3
 
 
@@ -280,9 +280,9 @@ class Roadmap:
         return way
 
     def segments(self) -> list[set[int]]:
-        """The keyframes of hallways and of rooms, each one chamber.
+        """The keyframes of hallways and of rooms, each one segment.
 
-        Doors end a chamber, but for those behind which there is no hallway: what one gets to from a room alone, such as
+        Doors end a segment, but for those behind which there is no hallway: what one gets to from a room alone, such as
         by a gap between furniture, is part of that room.
         """
         parts = sorted(nx.connected_components(self._graph_without_doors()), key=min)
@@ -300,19 +300,19 @@ class Roadmap:
         return [set().union(*(parts[k] for k in group)) for group in nx.connected_components(whole)]
 
     def room_around(self, keyframe: int) -> tuple[int, ...]:
-        """The keyframes around one, the nearest first, if its chamber is a room; none where that is a hallway."""
+        """The keyframes around one, the nearest first, if its segment is a room; none where that is a hallway."""
         chamber = next((own for own in self.segments() if keyframe in own), set())
         return self._keyframes_beside(keyframe) if self.is_room(chamber) else ()
 
     def rooms(self) -> list[tuple[int, ...]]:
-        """Of every room that was entered, the first one first, the keyframes around its middle as in `room_of`."""
+        """Of every room that was entered, the first one first, the keyframes around its middle as in `room_around`."""
         rooms = sorted(
             (own for own in self.segments() if len(own) >= _MIN_ROOM_KEYFRAMES and self.is_room(own)), key=min
         )
         return [self._keyframes_beside(nx.barycenter(self.graph.subgraph(room), weight="length")[0]) for room in rooms]
 
     def is_room(self, chamber: Collection[int]) -> bool:
-        """Whether half of a chamber looks like a room: the end of a hallway does, but not all of the hallway."""
+        """Whether half of a segment looks like a room: the end of a hallway does, but not all of the hallway."""
         hallways = sum(self._classifications[keyframe].is_hallway for keyframe in chamber)
         return len(chamber) > 0 and hallways <= 0.5 * len(chamber)
 

@@ -65,7 +65,7 @@ def cell_coordinates(points: Float64, poses: Float64, cell: float, table_size: i
 
 @njit(cache=True)
 def patches_needed(tables: Int32, store: PatchStore, work: FieldWorkspace, origins: Float64, ends: Float64) -> int:
-    """How many new patches :func:`insert` may take at most, with the same arguments."""
+    """How many new patches :func:`insert_beams` may take at most, with the same arguments."""
     count = 0
     for i in range(tables.shape[0]):
         rows, columns = _patches_around(origins[i], ends[i], tables.shape[1])

@@ -41,7 +41,7 @@ def is_same_viewpoint(relative: NDArray[np.float64], settings: FilterParameters)
 
 
 def nearest_replacement(pose: Pose, others: Mapping[int, Pose]) -> ReplacementKeyframe:
-    """The nearest of other keyframes; a turn by one radian counts as much as a metre.
+    """The nearest of other keyframes; a turn by one radian counts as much as a meter.
 
     :param pose: shape (3,), ``area_T_base`` of a keyframe that is forgotten.
     :param others: {keyframe: ``area_T_base``} of those that stay, at least one.

@@ -214,7 +214,7 @@ def optimize(
 ) -> Solution:
     """Solve a pose graph.
 
-    A step costs one sparse factorisation. Marginals cost a solution of the factored system for each of 3 n columns,
+    A step costs one sparse factorization. Marginals cost a solution of the factored system for each of 3 n columns,
     so their time grows with n times the fill: milliseconds for hundreds of nodes, seconds for a few thousand.
 
     :param initial: shape (n, 3), poses to start from; that of ``fixed`` stays.

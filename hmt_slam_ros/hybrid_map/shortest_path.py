@@ -57,7 +57,7 @@ def shortest_path_beliefs(
     max_areas: int | None = None,
     targets: Collection[int] = (),
 ) -> dict[int, PoseGaussian]:
-    """{area: belief over ``start_T_area``} as :func:`reached` finds them, in their order."""
+    """{area: belief over ``start_T_area``} as :func:`shortest_paths` finds them, in their order."""
     found = shortest_paths(hybrid_map, area, cost_limit, max_areas, targets)
     beliefs = map(PoseGaussian, found.means, found.covariances)
     return dict(zip(found.areas.tolist(), beliefs, strict=True))
@@ -250,7 +250,7 @@ def connected_areas(hybrid_map: HybridMap, area: int) -> dict[int, PoseGaussian]
 
 
 def is_uninformative(belief: PoseGaussian) -> bool:
-    """Whether a belief is about as wide as :func:`unknown`."""
+    """Whether a belief is about as wide as :func:`uninformative_belief`."""
     return bool(np.trace(belief.covariance[:2, :2]) > _UNINFORMATIVE_SIGMA**2)
 
 

@@ -109,7 +109,7 @@ def entry_prior(place: AreaPlace, belief: PoseGaussian, poses: NDArray[np.float6
 def sampled_entry_bound(
     known: NDArray[np.float64], belief: PoseGaussian, poses: NDArray[np.float64], radius: float
 ) -> float:
-    """No less than the share of :func:`entry`, whatever is around the area, from its keyframes' positions (k, 2) alone.
+    """No less than the share of :func:`entry_prior`, whatever is around the area, from its keyframes' positions (k, 2) alone.
 
     One of the keyframes in question at least has to be near to one of the area's.
     """
@@ -159,7 +159,7 @@ def _any_near(positions: NDArray[np.float64], known: NDArray[np.float64], radius
 def _normal_points() -> NDArray[np.float64]:
     """Points of a low-discrepancy sequence made normal, shape (draws, 3), the first one 0; the same at every call.
 
-    They are the multiples of powers of the number g with g^4 = g + 1, which generalises the golden ratio.
+    They are the multiples of powers of the number g with g^4 = g + 1, which generalizes the golden ratio.
     """
     g = 1.2207440846057596
     steps = np.arange(_DRAWS)[:, None] / g ** np.arange(1, 4)

@@ -79,7 +79,7 @@ class AreaLandmarkExtractor:
         return tuple(found.landmarks)
 
     def observations(self, scans: Iterable[Scan], poses: Float64) -> Iterator[LandmarkObservation]:
-        """What each of an area's keyframes, as in `of`, shows of its landmarks.
+        """What each of an area's keyframes, as in `extract`, shows of its landmarks.
 
         A keyframe whose laser sees all around shows that itself; else a virtual scan from its place does, in the map of
         the keyframes of the same visit up to there: what earlier visits saw may be gone.
@@ -119,7 +119,7 @@ class GrowingArea:
         self._mapping.pool.release(self._table)
 
     def observe_keyframe(self, scan: Scan, pose: Float64) -> LandmarkObservation:
-        """What one more keyframe shows, as of `AreaLandmarks.sightings`.
+        """What one more keyframe shows, as of `AreaLandmarkExtractor.observations`.
 
         :param pose: its ``area_T_base``, shape (3,), m and rad.
         """

@@ -191,7 +191,7 @@ def _extract(beams: Beams, labels: Int32, count: int, min_beams: int, gate: Merg
     :param labels: shape (k,), the segment of each beam, -1 for none; written to: the line.
     :param count: of the segments.
     :param gate: of segments that are one line.
-    :returns: the lines (n, 5), as of `fit`, numbered as the labels.
+    :returns: the lines (n, 5), as of `fit_line`, numbered as the labels.
     """
     lines = np.empty((count, 5))
     count = _fit_all(beams, labels, lines, count, min_beams)

@@ -24,7 +24,7 @@ from hmt_slam_ros.submap.local_filter import PlacedKeyframe
 
 Points = NDArray[np.float64]
 
-# The last looks: how many, and ns from one to the next; within a second a person goes on by more than half a metre.
+# The last looks: how many, and ns from one to the next; within a second a person goes on by more than half a meter.
 _RECENT_SCANS, _MIN_INTERVAL = 3, 1_000_000_000
 # What is farther from the robot than this, m, is seen better when it has come nearer.
 _REACH = 8.0
@@ -45,7 +45,7 @@ _MIN_PROBABILITY = 0.9
 
 @dataclass(frozen=True, eq=False)
 class RecentScan:
-    """A scan of the last metres.
+    """A scan of the last meters.
 
     :ivar scan: the scan.
     :ivar pose: ``area_T_base`` when it was taken, shape (3,), m and rad.

@@ -25,7 +25,7 @@ _CROWD_RATIO = 10.0
 
 
 def no_return_threshold(ranges: NDArray[np.float32]) -> float:
-    """The smallest range that means "no return" in a log that does not say so, metres.
+    """The smallest range that means "no return" in a log that does not say so, meters.
 
     A sensor reports its maximum, or a few values close to it, for every beam that meets nothing. Real distances
     spread out as the robot moves, so the maximum stands out as a crowd at the far end. The rule: M is the largest
@@ -34,7 +34,7 @@ def no_return_threshold(ranges: NDArray[np.float32]) -> float:
     the same width below - and if they are not the whole log. Real returns in the last percent of the reach of such
     a sensor are lost with them.
 
-    :param ranges: shape (n,), metres, all readings of the log.
+    :param ranges: shape (n,), meters, all readings of the log.
     :returns: the smallest reading of that crowd; where there is none, just beyond the largest reading (inf for no
         finite reading at all).
     """
@@ -65,10 +65,10 @@ _SAME_OFFSET = 2e-3  # m and rad; the poses are written with six decimals
 class _Sweep:
     """A scan as a line tells it.
 
-    :ivar ranges: shape (n,), float32, metres.
+    :ivar ranges: shape (n,), float32, meters.
     :ivar angle_min: rad.
     :ivar increment: rad.
-    :ivar stated_max: the sensor's maximum where the line states it, metres, else inf.
+    :ivar stated_max: the sensor's maximum where the line states it, meters, else inf.
     :ivar robot_pose: shape (3,), ``odom_T_base``.
     :ivar laser_pose: shape (3,), the line's pose of the laser, in the frame of the odometry or a corrected one.
     :ivar is_front: a FLASER line, which tells less.
@@ -109,7 +109,7 @@ def open_carmen(path: Path, content: bytes, window: TimeWindow) -> InMemoryLog:
     Odometry is taken from the ODOM lines and from the ``odom_*`` fields of FLASER or the robot pose of ROBOTLASER1,
     which belong to the scan; the stamp is the ``ipc_timestamp``. FLASER does not state angles: the sweep begins at
     -90 degrees; an odd number of beams includes both ends of the half circle, an even one leaves out the last. Nor
-    does it state the sensor's maximum, which `smallest_saturated` finds from all scans together.
+    does it state the sensor's maximum, which `no_return_threshold` finds from all scans together.
 
     :param path: for the name.
     :param content: the file, decompressed.
@@ -211,7 +211,7 @@ def _numbers(tokens: list[bytes], begin: int, count: int) -> list[float]:
 
 
 def _range_limits(sweeps: Sequence[_Sweep]) -> dict[float, float]:
-    """The smallest range that means "no return", metres, by the maximum that the lines state (inf for none).
+    """The smallest range that means "no return", meters, by the maximum that the lines state (inf for none).
 
     Sensors that state a maximum often report a smaller value for a beam without a return, so that is looked for too.
     """

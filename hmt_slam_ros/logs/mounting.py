@@ -28,7 +28,7 @@ class Mounting(NamedTuple):
 def planar_mounting(base_T_laser: ArrayLike, laser_name: str) -> Mounting:
     """The planar pose of a laser whose scan plane is level, upright or upside down.
 
-    :param base_T_laser: shape (4, 4), homogeneous transform, metres.
+    :param base_T_laser: shape (4, 4), homogeneous transform, meters.
     :param laser_name: for the message.
     :raises HmtSlamError: where the scan plane is tilted by more than 10 degrees.
     """
@@ -47,7 +47,7 @@ def planar_mounting(base_T_laser: ArrayLike, laser_name: str) -> Mounting:
 def transform_from_quaternion(translation: ArrayLike, quaternion: ArrayLike) -> NDArray[np.float64]:
     """Homogeneous transform (4, 4).
 
-    :param translation: (x, y, z) in metres.
+    :param translation: (x, y, z) in meters.
     :param quaternion: (x, y, z, w), of any length but zero.
     """
     x, y, z, w = np.asarray(quaternion, dtype=np.float64) / np.linalg.norm(quaternion)
@@ -96,7 +96,7 @@ class FrameTree:
                 self._parents[child] = (frame_name(joint.header.frame_id), transform)
 
     def lookup_transform(self, base: str, frame: str) -> NDArray[np.float64] | None:
-        """``base_T_frame``, shape (4, 4), metres; None where no chain of transforms joins the two."""
+        """``base_T_frame``, shape (4, 4), meters; None where no chain of transforms joins the two."""
         to_frame, to_base = self._ancestor_transforms(frame), self._ancestor_transforms(base)
         for ancestor, ancestor_T_frame in to_frame.items():
             if ancestor in to_base:

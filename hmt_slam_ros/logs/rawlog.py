@@ -33,12 +33,12 @@ class RangeScan:
     """A planar scan.
 
     :ivar ticks: time in units of 100 ns since 1601.
-    :ivar ranges: shape (n,), float32, metres.
+    :ivar ranges: shape (n,), float32, meters.
     :ivar valid: shape (n,), uint8, 0 for a beam that the sensor or its driver declared faulty.
     :ivar aperture: angle from the first beam to the last, rad.
     :ivar right_to_left: True where angles increase from beam to beam.
-    :ivar max_range: largest range of the sensor, metres.
-    :ivar sensor_pose: ``base_T_laser``, shape (4, 4), metres.
+    :ivar max_range: largest range of the sensor, meters.
+    :ivar sensor_pose: ``base_T_laser``, shape (4, 4), meters.
     :ivar sweep_duration: seconds from the first beam to the last, 0 where unknown.
     """
 

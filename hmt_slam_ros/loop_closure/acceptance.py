@@ -98,7 +98,7 @@ class AcceptanceResult:
 
 
 class Acceptance:
-    """Closures are finely aligned, arcs that were travelled before are fused with what was known of them, and the
+    """Closures are finely aligned, arcs that were traveled before are fused with what was known of them, and the
     areas refined that closures joined.
     """
 

@@ -30,7 +30,7 @@ class AreaAlignment:
     """Lays several scans as one rigid body onto several others.
 
     First all poses are searched that the closure's own uncertainty admits: a step downhill from where it put the scans
-    ends at the next likeness, which along a bare wall or across a hall may be metres away. From the best of them,
+    ends at the next likeness, which along a bare wall or across a hall may be meters away. From the best of them,
     Gauss-Newton on the map's distance field with Cauchy weights goes on below the width of the search's cells.
     """
 

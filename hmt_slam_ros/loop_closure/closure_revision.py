@@ -69,7 +69,7 @@ class Inconsistency(NamedTuple):
 class ClosureConsistencyCheck:
     """Looks for contradictions in one account.
 
-    :param bound: the quantile of chi-square.
+    :param max_excess: the quantile of chi-square.
     :param new_area: the first number that no area has.
     """
 

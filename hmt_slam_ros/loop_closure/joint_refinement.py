@@ -2,7 +2,7 @@
 
 Where a way comes near no other, those of other ways that share most walls with it, however few.
 
-Iterates between two steps: every overlapping pair of scans is linearised at the present poses (point-to-line, so that
+Iterates between two steps: every overlapping pair of scans is linearized at the present poses (point-to-line, so that
 a pair in a bare corridor says nothing about the direction along it), which makes it an edge of a pose graph; the graph,
 with the edges of the motion, is solved (Lu and Milios 1997).
 """
@@ -67,7 +67,7 @@ def nearest_keyframes(
     :param linked: {area: areas whose keyframes may lie in the same place}; what is near by chance only is not matched.
     :param reach: largest distance, m.
     :param count: keyframes at most.
-    :returns: m arrays of rows of ``poses``, nearest first; a radian counts as a metre.
+    :returns: m arrays of rows of ``poses``, nearest first; a radian counts as a meter.
     """
     known = np.unique(np.concatenate((areas, query_areas)))
     allowed = np.array([[other in linked[area] for other in known.tolist()] for area in known.tolist()])
@@ -144,7 +144,7 @@ def _most_overlapping(
 def _nearest_rows(
     poses: Float64, areas: Int64, seen_from: Float64, seen_from_areas: Int64, allowed: Bool, reach: float, count: int
 ) -> Int64:
-    """:func:`neighbours` as an array (m, count), filled up with -1; ``allowed[a, b]`` where b is linked with a."""
+    """:func:`nearest_keyframes` as an array (m, count), filled up with -1; ``allowed[a, b]`` where b is linked with a."""
     rows, costs = np.full((len(seen_from), count), -1), np.empty(count)
     for i in range(len(seen_from)):
         held = 0
@@ -172,15 +172,15 @@ def scan_pairs(around: list[NDArray[np.int64]], least_share: float) -> ScanPairs
     return ScanPairs(np.array(sorted(pairs), dtype=np.int64).reshape(-1, 2), np.full(len(pairs), least_share))
 
 
-# The graph changes with the next linearisation: it need not be solved to the last digit.
+# The graph changes with the next linearization: it need not be solved to the last digit.
 _TOLERANCE = 1e-3
-# Before the last linearisation one out of so many points serves.
+# Before the last linearization one out of so many points serves.
 _EARLY_STRIDE = 2
 # Keeps the information of a pair regular: 3 m and 3 rad.
 _PRIOR_INFORMATION = 0.1 * np.eye(3)
 # The same where it is to say nothing, whatever the number of pairs: 1 km.
 _NEGLIGIBLE_INFORMATION = 1e-6 * np.eye(3)
-# A turn counts like the metres by which it moves a point 3 m away. Along a direction a pair tells something where its
+# A turn counts like the meters by which it moves a point 3 m away. Along a direction a pair tells something where its
 # information is at least this share of the largest: normals are off by some hundredths.
 _SCALE, _MIN_INFORMATION_SHARE = np.array([1.0, 1.0, 1.0 / 3.0]), 0.004
 

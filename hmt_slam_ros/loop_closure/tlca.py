@@ -145,11 +145,11 @@ class TlcaState:
 
 
 class Tlca:
-    """Answers every ``Hypotheses`` with an ``Accepted``.
+    """Answers every ``Hypotheses`` with an ``ClosureDecision``.
 
-    A path is accepted when it has dominated for some keyframes and metres since it parted from the last other one, and
+    A path is accepted when it has dominated for some keyframes and meters since it parted from the last other one, and
     at once when no other is left. Then the others are dropped, the areas that it joined are finely aligned, and arcs
-    that were travelled before are fused with what was known of them. Where accepted closures contradict each other,
+    that were traveled before are fused with what was known of them. Where accepted closures contradict each other,
     TSBI is asked anew instead.
     """
 

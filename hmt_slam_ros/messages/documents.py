@@ -181,7 +181,7 @@ class ResetRequest:
 
 @dataclass(frozen=True, eq=False)
 class ResetResponse:
-    """The answer to a :class:`BeginRequest`.
+    """The answer to a :class:`ResetRequest`.
 
     :ivar number: of the request.
     :ivar process: the process that answers.
@@ -205,15 +205,15 @@ _DOCUMENTS: dict[type, tuple[str, int]] = {
     FinalCounts: ("finished", 1),
     RobotStatus: ("robot_status", 1),
     SaveRequest: ("save_request", 1),
-    SaveResponse: ("saved_part", 1),
-    ResetRequest: ("begin_request", 1),
-    ResetResponse: ("begun_part", 1),
+    SaveResponse: ("save_response", 1),
+    ResetRequest: ("reset_request", 1),
+    ResetResponse: ("reset_response", 1),
     PlaceEstimate: ("place_estimate", 1),
 }
 
 
 def encode(message: object, reset_number: int = 0) -> str:
-    """The JSON document of a message, of a :class:`KeyframeHead`, :class:`Closing` or :class:`RobotStatus`.
+    """The JSON document of a message, of a :class:`KeyframeHeader`, :class:`FinalCounts` or :class:`RobotStatus`.
 
     :param reset_number: number of the request after which all began anew, 0 before the first.
     :raises HmtSlamError: where a float is NaN or infinite.

@@ -1,7 +1,7 @@
 """What the five processes say to each other, as immutable values.
 
 Scans and odometry enter as :class:`~hmt_slam_ros.sensors.Scan` and :class:`~hmt_slam_ros.sensors.Odometry`. One
-*keyframe event* k sets off the chain Keyframe(k) -> AreaEvents(k) -> Hypotheses(k) -> Accepted(k), after which metric
+*keyframe event* k sets off the chain Keyframe(k) -> AreaEvents(k) -> Hypotheses(k) -> ClosureDecision(k), after which metric
 SLAM takes up the scans that waited.
 """
 
@@ -40,7 +40,7 @@ class HypothesisEstimate:
     :ivar hypothesis: id of the live hypothesis.
     :ivar area: the robot's area, gamma_t.
     :ivar pose: belief over ``area_T_base`` at the keyframe. Its covariance is the drift since the area's origin, or
-        the uncertainty of localisation where the robot moves over ground that is already mapped.
+        the uncertainty of localization where the robot moves over ground that is already mapped.
     :ivar stored: whether the keyframe enters this hypothesis's map; False where it would add nothing new.
     :ivar log_evidence: log-likelihood of the keyframe's scan where it is in the place that this hypothesis has it in,
         relative to a place that looks alike; nats, not accumulated over keyframes.
@@ -96,8 +96,8 @@ class AreaEvent:
     :ivar keyframes: for "cut": the stored keyframes that leave, ascending, the newest among them; else empty.
     :ivar area: for "moved": the known area in which the robot is now; for "cut": the area that was left; for "merged":
         the area that becomes part of ``into``.
-    :ivar score: for "cut": the normalised cut; for "moved": the overlap with the new area; for "merged": the least
-        normalised cut of the two together.
+    :ivar score: for "cut": the normalized cut; for "moved": the overlap with the new area; for "merged": the least
+        normalized cut of the two together.
     :ivar into: for "merged": the area that stays, else None.
     """
 
@@ -232,7 +232,7 @@ class ScanPoses:
     :ivar first_scan: ``scan_index`` of the first row.
     :ivar stamps: shape (n,), int64, ns.
     :ivar keyframes: shape (n,), int64, the stored keyframe to which the scan's pose is relative.
-    :ivar poses: shape (n, 3), ``anchor_T_base``.
+    :ivar poses: shape (n, 3), ``keyframe_T_base``.
     """
 
     hypothesis: int
@@ -252,7 +252,7 @@ class RealTimePose:
     :ivar estimate: belief over ``area_T_base`` at the last estimate.
     :ivar motion: belief over the motion of the base since then, from the odometry.
     :ivar odometry: the reading, ``odom_T_base``, shape (3,).
-    :ivar ambiguity: of the newest ``Accepted``, shape (3, 3).
+    :ivar ambiguity: of the newest ``ClosureDecision``, shape (3, 3).
     """
 
     stamp: int
@@ -307,7 +307,7 @@ class TrackingReset:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class EndOfLog:
-    """robot -> slam: no more scans will come; slam answers with the last trails and ``Finished``."""
+    """robot -> slam: no more scans will come; slam answers with the last trails and ``EndOfRun``."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -177,7 +177,7 @@ class GlobalPoses(Mapping[int, PoseGaussian]):
     """{area: belief over ``map_T_area``}; taking over a message costs the same however many areas it has."""
 
     def __init__(self, areas: Sequence[AreaPose] = ()) -> None:
-        """:param areas: ordered by id, as ``Accepted.global_poses`` is."""
+        """:param areas: ordered by id, as ``ClosureDecision.global_poses`` is."""
         self._areas = areas
 
     @property

@@ -74,7 +74,7 @@ class LiveHypothesisState:
     :ivar step_covariances: what the step which led to a keyframe adds to the drift, of those stored since the area was entered.
     :ivar keyframe_covariances: of the poses of keyframes in their areas' frames, of all that are known.
     :ivar pose_covariance: covariance of the pose at the last keyframe event in the area's frame, right tangent, shape (3, 3).
-    :ivar scan_poses: (stamp, anchor, ``anchor_T_base``) of the scans since the last keyframe event.
+    :ivar scan_poses: (stamp, anchor, ``keyframe_T_base``) of the scans since the last keyframe event.
     :ivar contradicted: whether the scan of the last keyframe event contradicted what the robot should have seen.
     :ivar recent_scans: the scans that the next keyframe's is compared with, in mode lifelong.
     """
@@ -108,7 +108,7 @@ class LiveHypothesis:
         the area was entered.
     :ivar keyframe_covariances: {keyframe: covariance (3, 3) of its pose in its area's frame, right tangent}, of all that are known.
     :ivar pose_covariance: covariance of the pose at the last keyframe event in the area's frame, right tangent.
-    :ivar scan_poses: (stamp, anchor, ``anchor_T_base``) of the scans since the last keyframe event.
+    :ivar scan_poses: (stamp, anchor, ``keyframe_T_base``) of the scans since the last keyframe event.
     :ivar contradicted: whether the scan of the last keyframe event contradicted what the robot should have seen.
     :ivar recent_scans: the scans that the next keyframe's is compared with, in mode lifelong.
     """

@@ -147,7 +147,7 @@ class OdometryMonitor:
         return (
             f"odometry and scans differ {translation:.1f} times as much in distance and {rotation:.1f} times as much "
             "in heading as the noise model of odometry expects, so it is trusted less: raise "
-            "motion.rotation_from_rotation and its neighbours if it stays so."
+            "motion.rotation_from_rotation and its neighbors if it stays so."
         )
 
 

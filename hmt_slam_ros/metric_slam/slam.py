@@ -1,4 +1,4 @@
-"""Metric SLAM: localisation and mapping within the current area, for every live hypothesis.
+"""Metric SLAM: localization and mapping within the current area, for every live hypothesis.
 
 Section V of Blanco et al. 2008; the second step of Eq. (6). Scans wait in a queue while the topological processes
 answer a keyframe event.
@@ -94,8 +94,8 @@ class SlamState:
 class MetricSlam:
     """The metric SLAM process.
 
-    Consumes Scan, Odometry, Carried, Hypotheses, Accepted, EndOfLog; produces Arriving, Keyframe, Trail, LocalEstimate,
-    Notice, Finished.
+    Consumes Scan, Odometry, PoseReset, Hypotheses, ClosureDecision, EndOfLog; produces TrackingReset, Keyframe, ScanPoses, LocalEstimate,
+    Notice, EndOfRun.
 
     :ivar mode: what is done with known ground; but a robot that may be anywhere maps what is around it.
     """

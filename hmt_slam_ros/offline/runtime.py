@@ -28,7 +28,7 @@ from hmt_slam_ros.sensors import Scan
 class LockStep:
     """A deterministic scheduler.
 
-    :ivar processes: {name: process}, of those named in ``HEARD_BY``.
+    :ivar processes: {name: process}, of those named in ``SUBSCRIPTIONS``.
     :ivar seconds: {name: seconds spent since the last call of :meth:`take_seconds`}.
     """
 

@@ -1,7 +1,7 @@
 """What the keyframes around an area show of a building's floor, and which openings lead off a hallway.
 
 Tomatis, Nourbakhsh and Siegwart (2003), sections 2.1 and 3.3: a building is rectilinear, and four directions of travel
-are told apart, N, E, S, W. North is the same one in all areas: that which is next to the north of a neighbouring area.
+are told apart, N, E, S, W. North is the same one in all areas: that which is next to the north of a neighboring area.
 Areas that lie for certain beside each other are put into one frame, in which x is east and y is north; nothing is
 asked of how areas lie that are far from each other.
 
@@ -86,7 +86,7 @@ def deviation_from_axes(headings: Float64) -> Float64:
 def _north_headings(
     around: Mapping[int, Mapping[int, PoseGaussian]], views: Mapping[int, AreaView]
 ) -> dict[int, float]:
-    """{area: direction of north in its frame, rad}, one after the other from neighbour to neighbour."""
+    """{area: direction of north in its frame, rad}, one after the other from neighbor to neighbor."""
     found: dict[int, float] = {}
     for begin in around:
         pending = [] if begin in found else [(begin, 0.0)]

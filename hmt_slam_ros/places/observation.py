@@ -282,7 +282,7 @@ def _gaussian_density(off: float, variance: float) -> float:
 def visible_interval(track: int, form: float, reach: float) -> tuple[float, float]:
     """From where to where ahead of the robot a landmark is in sight, m.
 
-    :param form: as of `Landmarks`.
+    :param form: as of `LandmarkSequence`.
     """
     if track not in {CONVEX, CONVEX + 1}:
         return -reach, reach

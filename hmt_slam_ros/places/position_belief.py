@@ -3,7 +3,7 @@
 Eq. (1), in log space: ``SE_s'(k+1) = OS(o, s', a) sum_s T(s, a, s') SE_s(k) / P(o | a, SE(k))``, where the action a is
 to go on, to turn at a node, or to arrive at the next opening. The paper's T has 0.99 for the state that the action
 leads to, and 0.01 (``slip``) for all others; here these share it evenly, so that T is a probability. Which state an
-arrival leads to is no yes or no: the travelled distance d and the turn on the way are observed too, with
+arrival leads to is no yes or no: the traveled distance d and the turn on the way are observed too, with
 N(d; d_arc, sigma_arc^2 + sigma_d^2) for an arc of the map, and with what is usual in buildings for other transitions.
 
 One more state is ground that the map does not hold. It is where hallways lead that the map does not follow, and where

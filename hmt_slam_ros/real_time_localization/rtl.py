@@ -1,4 +1,4 @@
-"""Real-time localisation: the robot's pose at the rate of the odometry, whatever the other processes are doing.
+"""Real-time localization: the robot's pose at the rate of the odometry, whatever the other processes are doing.
 
 Section V of Blanco et al. 2008: while scans wait in metric SLAM's queue, the prior p(s_t+k | s_t, u) of the HMT pose
 is the last estimate carried on by the odometry since its scan.
@@ -65,7 +65,7 @@ class RtlState:
     :ivar base_estimate: the last one whose area's place in the map is known, on which the pose rests.
     :ivar base_reading: the reading at that estimate, None before the next reading.
     :ivar area_poses: ``map_T_area`` as TLCA told it last, ordered by area.
-    :ivar base_area_pose: that of the area of ``estimate``.
+    :ivar base_area_pose: that of the area of ``base_estimate``.
     :ivar ambiguity: of TLCA's last answer, shape (3, 3).
     """
 
@@ -79,7 +79,7 @@ class RtlState:
 
 
 class Rtl:
-    """The RTL process. Consumes Odometry, Arriving, LocalEstimate, Accepted; produces RealTimePose, Notice."""
+    """The RTL process. Consumes Odometry, TrackingReset, LocalEstimate, ClosureDecision; produces RealTimePose, Notice."""
 
     def __init__(self, configuration: Configuration, state: RtlState | None = None) -> None:
         """:param state: to go on from."""

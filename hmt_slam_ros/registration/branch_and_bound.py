@@ -43,7 +43,7 @@ class PositionConstraint(NamedTuple):
 class ConstraintPyramid(NamedTuple):
     """A ground, as a search asks for it.
 
-    :ivar levels: running maxima of its cells, as of :class:`area_bounds.Pyramid`, and their ``margin``.
+    :ivar levels: running maxima of its cells, as of :class:`search_bounds.Pyramid`, and their ``margin``.
     :ivar keyframes: shape (turns, m, 2), column and row of every keyframe without a shift.
     """
 
@@ -120,7 +120,7 @@ class ReverseCheck(NamedTuple):
 
 
 def make_reverse_check(window: SearchWindow, grid: LogRatioGrid, points: Float64) -> ReverseCheck:
-    """The reverse check of a window; the arguments are those of :func:`area_search.search`."""
+    """The reverse check of a window; the arguments are those of :func:`search_cells`."""
     reach = math.ceil(math.sqrt(0.5) * (BLOCK - 1) * window.cell / grid.cell) + 1
     return ReverseCheck(
         grid, points, _rotate_points(window, grid, points), _near_negative(grid.log_ratio, reach), reach
@@ -212,7 +212,7 @@ class SearchCells(NamedTuple):
 
 
 class _SearchProblem(NamedTuple):
-    """What is searched; the members are the arguments of :func:`search`.
+    """What is searched; the members are the arguments of :func:`search_cells`.
 
     :ivar cells: where the samples are, see :func:`sample_cells`.
     """

@@ -285,7 +285,7 @@ def _nearest_point(
 ) -> int:
     """The point of a scan nearest to (x, y) in its base frame, among those seen in that direction; -1 for none.
 
-    :param bins: see :class:`Surfaces`; those of the scan are ``count`` from ``first`` on.
+    :param bins: see :class:`ScanSurfaces`; those of the scan are ``count`` from ``first`` on.
     :param dx: from the laser to (x, y), ``dy``.
     """
     middle = bin_index(dx, dy, count)

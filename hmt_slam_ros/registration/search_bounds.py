@@ -188,7 +188,7 @@ def square_bound(level: Int8, margin: int, cells: Int32, i: int, j: int) -> int:
 def quarter_bounds(
     level: Int8, margin: int, cells: Int32, i: int, j: int, side: int
 ) -> tuple[tuple[int, int], tuple[int, int]]:
-    """:func:`bound_of_square` of the squares of edge ``side`` that begin at (i, j), right of it, and below both."""
+    """:func:`square_bound` of the squares of edge ``side`` that begin at (i, j), right of it, and below both."""
     rows, columns = np.uint32(level.shape[0] - side), np.uint32(level.shape[1] - side)
     beside = np.uint32(side)
     first, right, below, both = 0, 0, 0, 0

@@ -114,7 +114,7 @@ class FinalMap:
     """A run's map and trajectory at their best.
 
     :ivar recording: with the refined map and trajectory.
-    :ivar stages: {name: trajectory} before each step: ``filter`` with the areas as they were travelled through, no loop
+    :ivar stages: {name: trajectory} before each step: ``filter`` with the areas as they were traveled through, no loop
         closed, ``arcs`` with the areas where the arcs put them, ``keyframes`` with the refined keyframes.
     """
 

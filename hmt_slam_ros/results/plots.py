@@ -77,7 +77,7 @@ def _draw_grid(axes: Axes, image: OccupancyImage) -> None:
 
 
 class _GridArtist(Artist):
-    """The occupancy grid, which fills the axes; ``imshow`` takes 60 MB more, for colours and interpolation."""
+    """The occupancy grid, which fills the axes; ``imshow`` takes 60 MB more, for colors and interpolation."""
 
     def __init__(self, axes: Axes, pixels: NDArray[np.uint8]) -> None:
         super().__init__()
@@ -120,7 +120,7 @@ def _draw_arcs(axes: Axes, hybrid_map: HybridMap, area_poses: Mapping[int, PoseG
 
 
 def _draw_areas(axes: Axes, saved: SavedMap, visible: float) -> None:
-    """Origins with their ids and ellipses; ellipses too small to see are drawn larger by a round factor, in metres."""
+    """Origins with their ids and ellipses; ellipses too small to see are drawn larger by a round factor, in meters."""
     ellipses = {area: belief.position_ellipse() for area, belief in saved.area_poses.items()}
     largest = max(ellipse.semi_major for ellipse in ellipses.values())
     factor = 1 if largest <= 0.0 else int(10 ** np.clip(np.ceil(np.log10(visible / largest)), 0, 2))
@@ -184,7 +184,7 @@ def plot_probabilities(directory: Path) -> Path:
 def _draw_bars(
     axes: Axes, table: Mapping[str, NDArray[np.float64]], minutes: NDArray[np.float64], firsts: NDArray[np.intp]
 ) -> None:
-    """One stack a keyframe event, from it to the next, one colour a topology."""
+    """One stack a keyframe event, from it to the next, one color a topology."""
     counts = np.diff(np.append(firsts, minutes.size))
     tops = np.cumsum(table["probability"])
     tops -= np.repeat(tops[firsts] - table["probability"][firsts], counts)
@@ -231,7 +231,7 @@ def _read_columns(path: Path) -> dict[str, NDArray[np.float64]]:
 
 
 def _color_of(number: int) -> Color:
-    """Colours of neighbouring numbers are far apart: hues by the golden section, in two shades."""
+    """Colors of neighboring numbers are far apart: hues by the golden section, in two shades."""
     return colorsys.hsv_to_rgb((0.58 + number * _GOLDEN) % 1.0, 0.85, 0.85 if number % 2 else 0.65)
 
 

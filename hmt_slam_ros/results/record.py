@@ -142,7 +142,7 @@ class ScanPoseTable:
     :ivar sizes: shape (n,), how many scans each has.
     :ivar stamps: shape (sum of the sizes,), of the scans, ns.
     :ivar keyframes: shape (sum of the sizes,), the stored keyframe to which a scan's pose is relative.
-    :ivar poses: shape (sum of the sizes, 3), ``anchor_T_base``, m and rad.
+    :ivar poses: shape (sum of the sizes, 3), ``keyframe_T_base``, m and rad.
     """
 
     hypotheses: Int64

@@ -161,7 +161,7 @@ class Recorder:
         events = 1 + max([first - 1, *self.keyframes, *self.hypotheses, *self.decisions])
         keyframes = _ordered_messages("Keyframe", self.keyframes, first, events)
         hypotheses = _ordered_messages("Hypotheses", self.hypotheses, first, events)
-        accepted = _ordered_messages("Accepted", self.decisions, first, events)
+        accepted = _ordered_messages("ClosureDecision", self.decisions, first, events)
         replica, sizes, probabilities, successors = _replay(past, keyframes, hypotheses, accepted)
         branched = {leaf.id: leaf.parent for message in hypotheses for leaf in _new_branches(message)}
         given = [verdict.global_poses for verdict in accepted if verdict.global_poses]
@@ -265,7 +265,9 @@ def _new_branches(message: Hypotheses) -> list[Hypothesis]:
 def _ordered_messages(name: str, messages: dict[int, Numbered], first: int, events: int) -> list[Numbered]:
     missing = next((sequence for sequence in range(first, events) if sequence not in messages), None)
     if missing is not None:
-        raise HmtSlamError(f"the message {name} {missing} was lost: run again, with robot.paced=true in a replay")
+        raise HmtSlamError(
+            f"the message {name} {missing} was lost: run again, with robot.flow_control=true in a replay"
+        )
     return [messages[sequence] for sequence in range(first, events)]
 
 

@@ -163,7 +163,7 @@ def pose_with_covariance_message(stamp: int, frame: str, belief: PoseGaussian) -
 
 
 def gaussian_from_message(message: PoseWithCovariance) -> PoseGaussian:
-    """The inverse of :func:`pose_with_covariance`."""
+    """The inverse of :func:`pose_with_covariance_message`."""
     mean = pose_from_message(message.pose)
     sin, cos = math.sin(mean[2]), math.cos(mean[2])
     axes = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
@@ -201,7 +201,7 @@ def keyframe_from_frame(frame: str) -> tuple[int, int]:
 
 
 def path_message(scan_poses: ScanPoses) -> Path:
-    """A trail as a path: every pose in the frame of its own keyframe."""
+    """Scan poses as a path: every pose in the frame of its own keyframe."""
     rows = zip(scan_poses.stamps.tolist(), scan_poses.keyframes.tolist(), scan_poses.poses, strict=True)
     poses = [
         PoseStamped(header=header_message(stamp, keyframe_frame(anchor)), pose=pose_message(pose))

@@ -30,7 +30,7 @@ _AGAIN = 10.0  # s, after which a fault is told again
 class DrivenRobotSource:
     """A driven robot as a log for the player: each record is made right after the one before it was sent.
 
-    So a command counts from the next odometry reading on, until `driven_robot.PATIENCE` of simulated time later.
+    So a command counts from the next odometry reading on, until `driven_robot.COMMAND_TIMEOUT` of simulated time later.
     """
 
     def __init__(self, node: Node, name: str, settings: RobotParameters) -> None:

@@ -1,7 +1,7 @@
 """From what comes in on the topics to messages, in the order in which a process has to hear them.
 
-DDS keeps the order within a topic, not across topics: Keyframe(k+1) may overtake Accepted(k). Every process gets
-Keyframe(k), AreaEvents(k), Hypotheses(k), Accepted(k), Keyframe(k+1), ... as far as it listens to them, so that a run
+DDS keeps the order within a topic, not across topics: Keyframe(k+1) may overtake ClosureDecision(k). Every process gets
+Keyframe(k), AreaEvents(k), Hypotheses(k), ClosureDecision(k), Keyframe(k+1), ... as far as it listens to them, so that a run
 of the nodes takes the same decisions as the lock-step run, and a node that starts late catches up.
 """
 

@@ -121,7 +121,7 @@ def declare_start_from(node: ConfiguredNode) -> str:
 
 def declare_initial_state(node: ConfiguredNode) -> tuple[str, bool]:
     """Path of the map, empty for none, and whether the robot may be anywhere in it."""
-    return declare_start_from(node), bool(node.declare_parameter("start_carried", True, _START_LOST).value)
+    return declare_start_from(node), bool(node.declare_parameter("start_lost", True, _START_LOST).value)
 
 
 # Nobody knows better where a robot is, m, m, rad: some programs send zeros.

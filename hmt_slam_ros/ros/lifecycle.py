@@ -70,7 +70,7 @@ class ManagedNode(LifecycleNodeMixin, ConfiguredNode):
         """
 
     def activate_node(self) -> None:
-        """Begin, or go on after :meth:`stand_still`."""
+        """Begin, or go on after :meth:`deactivate_node`."""
 
     def deactivate_node(self) -> None:
         """Do nothing new, and lose nothing."""
@@ -82,14 +82,14 @@ class ManagedNode(LifecycleNodeMixin, ConfiguredNode):
         """
 
     def clean_up_node(self) -> None:
-        """Forget what :meth:`set_up` made; publishers, subscriptions, services and timers vanish by themselves."""
+        """Forget what :meth:`configure_node` made; publishers, subscriptions, services and timers vanish by themselves."""
 
     def abandon_configuration(self) -> None:
-        """Forget what :meth:`set_up` made before it failed."""
+        """Forget what :meth:`configure_node` made before it failed."""
         self._destroy_configured_entities()
 
     def shut_down_node(self) -> None:
-        """Do what is left to do when the node is shut down, and :meth:`take_down` at its end."""
+        """Do what is left to do when the node is shut down, and :meth:`tear_down` at its end."""
         self.tear_down()
 
     @property

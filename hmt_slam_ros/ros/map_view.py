@@ -109,7 +109,7 @@ class MapRenderer:
         return grid_message(self.stamp, self._frame, image)
 
     def graph_markers(self) -> MarkerArray:
-        """Areas as labelled discs, arcs as lines, both with 95 % ellipses.
+        """Areas as labeled discs, arcs as lines, both with 95 % ellipses.
 
         The robot's area and the arcs that closed a loop stand out. An arc's ellipse, in its middle, is that of one
         area seen from the other; an area's, around it, that of its place in the map. Its text says it in words. There

@@ -60,7 +60,7 @@ class ProcessNode(ManagedNode):
     ) -> None:
         """Declare the parameters.
 
-        :param name: one of those in ``HEARD_BY``.
+        :param name: one of those in ``SUBSCRIPTIONS``.
         :param make_process: makes it from what the node begins with.
         :param output_types: kinds of messages that the process says.
         :param changeable: parameters that may change while the node runs.
@@ -73,7 +73,7 @@ class ProcessNode(ManagedNode):
 
         :raises HmtSlamError: where that is damaged.
         """
-        self.save_on_shutdown = bool(self.declare_parameter("save_at_end", False, _SAVE_ON_SHUTDOWN).value)
+        self.save_on_shutdown = bool(self.declare_parameter("save_on_shutdown", False, _SAVE_ON_SHUTDOWN).value)
         self.start_from, self._start_lost = declare_initial_state(self)
         self._recovery_folder = declare_recovery(self)
         self.recovery = Recovery(self, self._recovery_folder)
@@ -250,7 +250,7 @@ class ProcessNode(ManagedNode):
         return {}
 
     def restore_node_state(self, state: Path) -> None:
-        """Take over what :meth:`memory` gave.
+        """Take over what :meth:`node_state` gave.
 
         :param state: the folder in which it is.
         """

@@ -337,7 +337,7 @@ class _ReplayRun:
         own = {
             "log": yaml_value(str(log if is_simulated(log) else log.absolute())),
             "robot.odometry_listeners": 2,  # slam and rtl
-            "robot.patience": _DISCOVERY_TIMEOUT,
+            "robot.discovery_timeout": _DISCOVERY_TIMEOUT,
         }
         settings = [word for name, value in own.items() for word in ("-p", f"{name}:={value}")]
         children.start("robot", [*shared, *settings], environment)

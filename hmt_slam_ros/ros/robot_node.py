@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from hmt_slam_ros.ros.driving import DrivenRobotSource
 
 _ESTIMATES = DOCUMENTS[LocalEstimate]
-_CHANGEABLE = ("robot.rate", "robot.paced", "robot.window")
+_CHANGEABLE = ("robot.rate", "robot.flow_control", "robot.max_unacknowledged_scans")
 _STATUS_PERIOD = 0.2  # s
 _LONGEST_WAIT = 0.1  # s
 _BURST = 20  # measurements between two looks at services and acknowledgements
@@ -240,7 +240,7 @@ class RobotNode(ConfiguredNode):
             self._last_progress = time.monotonic()
             self.diagnostics.warn(
                 f"the robot waits: slam has not answered the last {self._settings.max_unacknowledged_scans} scans; start the slam node, "
-                "or set robot.paced to false to replay without it"
+                "or set robot.flow_control to false to replay without it"
             )
 
 

@@ -1,4 +1,4 @@
-"""Real-time localisation as a node: /hmt/pose, /pose and map -> odom at the rate of the odometry."""
+"""Real-time localization as a node: /hmt/pose, /pose and map -> odom at the rate of the odometry."""
 
 from __future__ import annotations
 

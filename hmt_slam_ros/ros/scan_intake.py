@@ -51,7 +51,7 @@ class ScanIntake:
         return len(self._waiting)
 
     def start(self) -> None:
-        """Listen, first to what was missed since :meth:`end`, where the publisher kept it."""
+        """Listen, first to what was missed since :meth:`stop`, where the publisher kept it."""
         self.last_scan_at = time.monotonic()
         self.monitor.start()
         self._subscription.start()

@@ -100,7 +100,7 @@ class SensorSubscription:
         self._subscription: Any = None
 
     def start(self) -> None:
-        """Listen; what was missed since :meth:`end` comes first, where the publisher kept it."""
+        """Listen; what was missed since :meth:`stop` comes first, where the publisher kept it."""
         self._resume_stamp, self._started_at = self._last_stamp, time.monotonic()
         wanted = topics.SENSOR if self._resume_stamp is None else topics.LATCHED_SENSOR
         self._subscription = self._subscribe(topics.LIVE_SENSOR if self.is_best_effort else wanted)

@@ -145,7 +145,9 @@ class SlamNode(ProcessNode):
         if self.is_busy:
             raise HmtSlamError("a map is being saved or loaded: clean up again after that")
         if self.save_on_shutdown and self.estimate is not None:
-            self.diagnostics.note("the map is given up; save_at_end saves it at the end alone, and slam/save before")
+            self.diagnostics.note(
+                "the map is given up; save_on_shutdown saves it at the end alone, and slam/save before"
+            )
 
     def clean_up_node(self) -> None:
         """As any process node; from then on the others have a map that slam does not."""

@@ -1,4 +1,4 @@
-"""What explorer and pilot share: they hear scans, poses and errands, drive the robot and say how errands end."""
+"""What explorer and pilot share: they hear scans, poses and tasks, drive the robot and say how tasks end."""
 
 from __future__ import annotations
 
@@ -35,10 +35,10 @@ _MISSING_TRANSFORMS = 20
 
 
 class TaskNode(ManagedNode):
-    """A node whose process drives the robot on errands.
+    """A node whose process drives the robot on tasks.
 
     :ivar map_frame: name of the frame.
-    :ivar area_poses: where in the map its areas are, from :meth:`set_up` on.
+    :ivar area_poses: where in the map its areas are, from :meth:`configure_node` on.
     """
 
     area_poses: GlobalPoses
@@ -47,7 +47,7 @@ class TaskNode(ManagedNode):
         """Declare the parameters.
 
         :param name: of the node.
-        :param kinds: of errands.
+        :param kinds: of tasks.
         :param message_types: of messages that it hears of the five processes and the robot, but for scans and poses.
         """
         self._name, self._task_kinds, self._message_types = name, kinds, message_types
@@ -65,7 +65,7 @@ class TaskNode(ManagedNode):
         raise NotImplementedError
 
     def make_process(self, beginning: InitialState) -> Process:
-        """The process that begins with a map or with nothing; :attr:`areas` are as they are then.
+        """The process that begins with a map or with nothing; :attr:`area_poses` are as they are then.
 
         :raises HmtSlamError: where it cannot.
         """
@@ -156,7 +156,7 @@ class TaskNode(ManagedNode):
         self.process_message(conversions.scan_from_message(message, mounted.laser_pose, mounted.angle_sign))
 
     def _on_reset_request(self, message: String) -> None:
-        """Begin anew with the map with which all others do; an errand ends with the map that it was in.
+        """Begin anew with the map with which all others do; a task ends with the map that it was in.
 
         :raises HmtSlamError: where the process cannot go on with that map.
         """

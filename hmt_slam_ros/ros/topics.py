@@ -21,7 +21,7 @@ LATCHED_SENSOR = QoSProfile(
 # change over to this profile when DDS reports such a writer. The depth bridges a second of a fast laser.
 LIVE_SENSOR = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)
 
-# The chain Keyframe -> AreaEvents -> Hypotheses -> Accepted and what belongs to it: who comes late catches up.
+# The chain Keyframe -> AreaEvents -> Hypotheses -> ClosureDecision and what belongs to it: who comes late catches up.
 CHAIN = QoSProfile(
     history=HistoryPolicy.KEEP_ALL,
     reliability=ReliabilityPolicy.RELIABLE,

@@ -63,7 +63,7 @@ def pmf_message(hypotheses: Hypotheses) -> Float64MultiArray:
     leaves = sorted(hypotheses.hypotheses, key=lambda leaf: (-leaf.probability, leaf.id))
     rows = [(leaf.id, leaf.area, leaf.probability) for leaf in leaves] + [(-1, -1, hypotheses.unexamined)]
     layout = [
-        MultiArrayDimension(label="leaf", size=len(rows), stride=3 * len(rows)),
+        MultiArrayDimension(label="hypothesis", size=len(rows), stride=3 * len(rows)),
         MultiArrayDimension(label="hypothesis,area,probability", size=3, stride=3),
     ]
     return Float64MultiArray(layout=MultiArrayLayout(dim=layout), data=flatten_rows(rows))

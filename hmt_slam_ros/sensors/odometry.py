@@ -69,7 +69,7 @@ class OdometryBuffer:
 
         After the newest reading the speed between the last two goes on, for as long as they lie apart.
 
-        :param start: not before the time for which :meth:`at` was asked last.
+        :param start: not before the time for which :meth:`pose_at` was asked last.
         """
         if len(self._readings) < 2:
             return np.zeros(3)

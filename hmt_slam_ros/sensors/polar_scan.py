@@ -62,7 +62,7 @@ def classify_points(scan: PolarScan, points: Float64) -> Int8:
     """What a scan says of places.
 
     :param points: shape (n, 2), base frame of the scan, m.
-    :returns: shape (n,), ``SURFACE``, ``FREE`` or ``UNSEEN``.
+    :returns: shape (n,), ``SURFACE``, ``FREE`` or ``UNKNOWN``.
     """
     return _classify_points(
         np.ascontiguousarray(points), scan.laser_pose, scan.first_angle, scan.angle_increment, scan.ranges, scan.starts
@@ -72,7 +72,7 @@ def classify_points(scan: PolarScan, points: Float64) -> Int8:
 def occlusion_starts(scan: PolarScan, points: Float64) -> Float64:
     """From where on the beams of a scan are behind the things whose faces are at some places that they pass.
 
-    :param points: as in :func:`seen`.
+    :param points: as in :func:`classify_points`.
     :returns: shape (number of beams,), m from the laser; 0 for beams that pass none.
     """
     return _occlusion_starts(

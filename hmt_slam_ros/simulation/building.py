@@ -159,7 +159,7 @@ class Side(NamedTuple):
         )
 
     def rectangle(self, along: Point, out: Point) -> tuple[float, float, float, float]:
-        """The rectangle between two distances along and two out of the side, m, as `FloorPlan.free` takes it."""
+        """The rectangle between two distances along and two out of the side, m, as `FloorPlan.cut_rectangle` takes it."""
         (ax, ay), (bx, by) = self.point(along[0], out[0]), self.point(along[1], out[1])
         return min(ax, bx), min(ay, by), max(ax, bx), max(ay, by)
 
@@ -191,7 +191,7 @@ class FloorPlan:
 
 
 def sides_of_ring(half_x: float, half_y: float, width: float, *, outer: bool) -> list[Side]:
-    """The four outer or inner sides of a ring as `FloorPlan.ring` makes it, counter-clockwise from the lower one.
+    """The four outer or inner sides of a ring as `FloorPlan.cut_ring` makes it, counter-clockwise from the lower one.
 
     Each begins at its corner; the lengths are 2 half_x and 2 half_y in turn, plus or minus a width.
     """

@@ -66,7 +66,7 @@ class Child:
     """One continuation of a hypothesis.
 
     :ivar parent: id of the hypothesis that it continues.
-    :ivar log_weight: log of its weight, unnormalised.
+    :ivar log_weight: log of its weight, unnormalized.
     :ivar reload_local_map: whether the local map has to be loaded anew.
     """
 
@@ -375,7 +375,7 @@ class Branching:
         return here.compose(found.inverse())
 
     def _enter_known(self, parent: Parent, query: Query, fit: Fit) -> Child:
-        """A known area, recognised."""
+        """A known area, recognized."""
         arc = query.belief.compose(fit.mode.measured.inverse())
         return self.enter_area(parent, query, fit.area, fit.mode.pose, arc, fit.log_weight)
 

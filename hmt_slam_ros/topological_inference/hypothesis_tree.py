@@ -127,7 +127,7 @@ class HypothesisState:
     :ivar pose_hint: where one of the keyframes since then is, as somebody says; else None.
     :ivar relocalization_candidate: where it was recognized at the last look, if it was.
     :ivar relocalized_area: the known area in which it was recognized, until it goes over into another one; else None.
-    :ivar tracked_pose: where it was at ``lost`` if it was not displaced, as another hypothesis says; else None.
+    :ivar tracked_pose: where it was at ``lost_since`` if it was not displaced, as another hypothesis says; else None.
     :ivar counted_evidence: nats by which what it saw since then speaks for a place elsewhere, as far as that is in the
         hypothesis's weight; None where another one has it there since.
     """
@@ -269,7 +269,7 @@ def normalize_and_reduce(
     least: float,
     generator: np.random.Generator,
 ) -> ReducedDistribution:
-    """Normalise, drop what is tiny, reduce to N.
+    """Normalize, drop what is tiny, reduce to N.
 
     :param log_weights: shape (m,), nats, of all hypotheses.
     :param log_skipped: log of the weight, on the same scale, of what was not looked at now.

@@ -89,7 +89,7 @@ class TsbiState:
 class Tsbi:
     """Answers the area events of every keyframe with the live hypotheses.
 
-    Consumes Arriving, Keyframe, AreaEvents, Accepted; produces Hypotheses, and Notices of loops that are looked for.
+    Consumes TrackingReset, Keyframe, AreaEvents, ClosureDecision; produces Hypotheses, and Notices of loops that are looked for.
     """
 
     def __init__(
@@ -153,7 +153,7 @@ class Tsbi:
         return summarize_localization(standings, self._unexamined, known, None if arriving else self._pose_distribution)
 
     def handle(self, message: Message) -> list[Message]:
-        """Learn from ``Keyframe`` and ``Accepted``; answer ``AreaEvents`` with ``Hypotheses``."""
+        """Learn from ``Keyframe`` and ``ClosureDecision``; answer ``AreaEvents`` with ``Hypotheses``."""
         if isinstance(message, Keyframe):
             self._add_keyframe(message)
         elif isinstance(message, AreaEvents):

@@ -28,7 +28,7 @@ _OCCUPIED_FROM = 50  # of 100
 
 
 def grid_png(cells: NDArray[np.int8]) -> bytes:
-    """Black where nothing is known, dark gray where free, white where occupied; the browser gives it its colours.
+    """Black where nothing is known, dark gray where free, white where occupied; the browser gives it its colors.
 
     :param cells: shape (height, width), -1 unknown, else 0 to 100; row 0 is the smallest y, and the picture's lowest.
     """
