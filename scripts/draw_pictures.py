@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Make the pictures of README.md and docs/tutorial.md anew, from runs; and all in docs/images small.
+"""Make the pictures of README.md and docs/guides/tutorial.md anew, from runs; and all in docs/images small.
 
 docs/images/malaga_map.png is the map of the bundled log, twins_pmf.png the probabilities of a simulated drive through
 two rooms that are alike. worlds.png and view.png have scripts of their own, which this one runs; for the latter a
