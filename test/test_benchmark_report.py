@@ -60,16 +60,16 @@ def test_the_memory_of_a_program_is_not_that_of_the_one_that_starts_it():
 
 def test_tables_are_written_between_their_marks_and_nowhere_else(tmp_path):
     document = tmp_path / "document.md"
-    (begin, end), (other, _) = marks("speed"), marks("steps")
+    (begin, end), (other, _) = marks("speed"), marks("sessions")
     document.write_text(f"before\n{begin}\nold\n{end}\nafter\n")
     write_between_marks(document, "speed", "| new |")
     assert document.read_text() == f"before\n{begin}\n| new |\n{end}\nafter\n"
-    with pytest.raises(HmtSlamError, match="steps"):
-        write_between_marks(document, "steps", "| new |")
+    with pytest.raises(HmtSlamError, match="sessions"):
+        write_between_marks(document, "sessions", "| new |")
     assert other not in document.read_text()
 
 
-@pytest.mark.parametrize("kind", ["accuracy", "steps", "robustness", "choices", "speed"])
+@pytest.mark.parametrize("kind", ["accuracy", "robustness", "sessions", "speed"])
 def test_the_document_has_a_place_for_every_measurement(kind):
     text = ACCURACY.read_text()
     assert all(text.count(mark) == 1 for mark in marks(kind))

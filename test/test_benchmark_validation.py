@@ -142,7 +142,7 @@ def test_a_figure_may_be_too_small():
     assert Requirement("error", 0.1, 1.0, "m").row[2:] == ["1 m", "pass"]
 
 
-@pytest.mark.parametrize("kind", ["calibration", "loops", "topology", "consistency", "evidence"])
+@pytest.mark.parametrize("kind", ["calibration", "loops", "topology", "consistency"])
 def test_the_document_has_a_place_for_every_measurement(kind):
     text = VALIDATION.read_text()
     assert all(text.count(mark) == 1 for mark in marks(kind))
