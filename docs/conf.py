@@ -8,10 +8,21 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 from sphinx.application import Sphinx
+from sphinx.config import Config
 
-ROOT = Path(__file__).resolve().parents[1]
+PACKAGE = "hmt_slam_ros"
 
-project = "hmt_slam_ros"
+
+def own_path() -> Path:
+    """Where this file is: rosdoc2 copies the pages elsewhere, and runs it from a file that names it."""
+    path = Path(__file__).resolve()
+    wrapped = re.search(r'exec\(open\("([^"]+)"\)', path.read_text(encoding="utf-8"))
+    return path if wrapped is None else Path(wrapped[1])
+
+
+ROOT = own_path().parents[1]
+
+project = PACKAGE
 author = "hmt_slam_ros contributors"
 project_copyright = author
 release = version = ElementTree.parse(ROOT / "package.xml").findtext("version", "")
@@ -23,16 +34,18 @@ myst_heading_anchors = 3
 myst_dmath_allow_digits = False
 
 # Static analysis: the API pages need neither ROS nor numba. Without the extension the site lacks these pages alone.
-if find_spec("autoapi"):
+HAS_API = find_spec("autoapi") is not None
+if HAS_API:
     extensions += ["sphinx.ext.autodoc", "autoapi.extension"]
-autoapi_dirs = [str(ROOT / "hmt_slam_ros")]
+autoapi_dirs = [str(ROOT / PACKAGE)]
 autoapi_root = "reference/api"
 autoapi_options = ["members", "undoc-members", "show-module-summary"]
 autoapi_add_toctree_entry = False
 autoapi_keep_files = False
 autoapi_python_class_content = "class"
 
-exclude_patterns = ["_build", "Thumbs.db", ".DS_Store"]
+# The last two are what rosdoc2 adds: an index of its own, pages by sphinx-apidoc, which imports, and a copy of README.
+exclude_patterns = ["_build", "Thumbs.db", ".DS_Store", "*.rst", "standard_docs"]
 suppress_warnings = [
     # Constants that are assigned several at a time are not found by the static analysis.
     "autoapi.python_import_resolution",
@@ -45,7 +58,7 @@ highlight_language = "none"
 html_theme = "alabaster"
 html_title = "hmt_slam_ros"
 html_show_sourcelink = False
-html_theme_options = {
+ALABASTER = {
     "description": "Hybrid metric-topological SLAM for ROS 2",
     "fixed_sidebar": True,
     "page_width": "1180px",
@@ -67,8 +80,15 @@ def escape_bars(_app: Sphinx, _kind: str, _name: str, _object: object, _options:
     lines[:] = [re.sub(r"\|(\w+)\|", r"\|\1\|", line) for line in lines]
 
 
+def choose_theme_options(_app: Sphinx, config: Config) -> None:
+    """Give Sphinx's own theme its options; rosdoc2 takes another one."""
+    if config.html_theme == "alabaster":
+        config.html_theme_options = ALABASTER
+
+
 def setup(app: Sphinx) -> None:
-    """Connect both with Sphinx."""
+    """Connect all of them with Sphinx."""
+    app.connect("config-inited", choose_theme_options)
     app.connect("source-read", drop_empty_globs)
-    if find_spec("autoapi"):
+    if HAS_API:
         app.connect("autodoc-process-docstring", escape_bars)
