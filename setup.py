@@ -11,6 +11,7 @@ from setuptools import find_packages, setup
 
 NAME = "hmt_slam_ros"
 NODES = ("slam", "aam", "tsbi", "tlca", "rtl", "robot", "view", "explorer", "pilot")
+DOCS = ("myst-parser>=4.0", "sphinx>=8.1", "sphinx-autoapi>=3.4")
 SHARED = ("launch", "config", "data/malaga_one_loop")
 
 
@@ -43,7 +44,7 @@ setup(
         "rosbags>=0.11",
         "scipy>=1.11",
     ],
-    extras_require={"test": ["hypothesis", "mypy", "pytest", "pytest-xdist", "ruff"]},
+    extras_require={"docs": [*DOCS], "test": ["hypothesis", "mypy", "pytest", "pytest-xdist", "ruff", *DOCS]},
     zip_safe=False,
     entry_points={
         "console_scripts": [

@@ -1,9 +1,9 @@
 #!/usr/bin/env python3
-"""Make the pictures of README.md and docs/tutorial.md anew, from runs; and all in docs/images small.
+"""Make the pictures of README.md and docs/guides/tutorial.md anew, from runs; and all in docs/images small.
 
 docs/images/malaga_map.png is the map of the bundled log, twins_pmf.png the probabilities of a simulated drive through
-two rooms that are alike. worlds.png and view.png have scripts of their own, which this one runs; for the latter a
-browser is needed, and without one the old picture stays.
+two rooms that are alike. worlds.png, view.png and concept_*.svg have scripts of their own, which this one runs; view.png
+needs a browser, and without one the old picture stays.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ PICTURES = {
     "malaga_map.png": ("data/malaga_one_loop", "map.png", 700),
     "twins_pmf.png": ("sim:twins,seed=1", "pmf.png", 900),
 }
-OTHERS = ("draw_worlds.py", "draw_view.py")
+OTHERS = ("draw_worlds.py", "draw_view.py", "draw_concepts.py")
 COLOURS = 128
 
 

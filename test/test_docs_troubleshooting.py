@@ -1,4 +1,4 @@
-"""Every message that the package prints has its entry in docs/troubleshooting.md, and every entry a message.
+"""Every message that the package prints has its entry in docs/guides/troubleshooting.md, and every entry a message.
 
 A message is what an `HmtSlamError` or `Notice` is made with, what a node warns of, and every sentence with a remedy
 behind a colon or semicolon that a function returns or keeps. Values in it are written as …, in the document too.
@@ -12,7 +12,7 @@ from pathlib import Path
 import hmt_slam_ros
 
 PACKAGE = Path(hmt_slam_ros.__file__).parent
-DOCUMENT = PACKAGE.parent / "docs" / "troubleshooting.md"
+DOCUMENT = PACKAGE.parent / "docs" / "guides" / "troubleshooting.md"
 SAID_BY = {"HmtSlamError", "Notice", "_notice", "warn", "warning", "fail", "_end"}
 # What these return or keep is findings, results, pictures and documents.
 OTHER = {"doctor", "view", "cli", "evaluation", "plots.py", "documents.py", "doctor_node.py"}
@@ -79,7 +79,7 @@ def test_messages_are_found():
 def test_every_message_has_an_entry():
     known = entries()
     missing = [message for message in messages() if not any(fits(entry, message) for entry in known)]
-    assert missing == [], "write entries in docs/troubleshooting.md"
+    assert missing == [], "write entries in docs/guides/troubleshooting.md"
 
 
 def test_every_entry_has_a_message():

@@ -27,7 +27,7 @@ from hmt_slam_ros.ros.transforms import TFMessage
 
 TRANSFORMS = {"tf", "tf_static"} if TFMessage else set()
 NAMED = {value for name, value in vars(topics).items() if name.isupper() and isinstance(value, str)}
-MESSAGES = Path(__file__).parent.parent / "docs" / "messages.md"
+MESSAGES = Path(__file__).parent.parent / "docs" / "reference" / "messages.md"
 SAID = {f"/{topic.lstrip('/')}" for topic in {*NAMED, *topics.DOCUMENTS.values(), *TRANSFORMS}} - {
     *("/initialpose", "/cmd_vel"),  # which are only heard
     "/ground_truth",  # of a robot that is driven
@@ -110,7 +110,7 @@ def test_after_a_reset_a_new_map_begins_where_the_robot_is_and_all_that_is_said_
 
 
 def assert_documented(offered):
-    """Type and profile of each topic, beside ROS's own, are those in docs/messages.md."""
+    """Type and profile of each topic, beside ROS's own, are those in docs/reference/messages.md."""
     row = re.compile(r"^\| (/?[\w/]+)[^|]*\| (\w+)/(\w+)[^|]*\| (?:\w+; robot: )?([A-Z_]+)[^|]*\|", re.MULTILINE)
     tables = {f"/{topic.lstrip('/')}": rest for topic, *rest in row.findall(MESSAGES.read_text())}
     for topic, (kind, profiles) in offered.items():

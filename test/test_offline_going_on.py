@@ -246,7 +246,7 @@ def test_the_configuration_of_a_map_serves_as_a_file_of_parameters(first):
 
 
 def test_no_field_of_a_saved_map_goes_undescribed():
-    text = (Path(__file__).parents[1] / "docs" / "map_format.md").read_text(encoding="utf-8")
+    text = (Path(__file__).parents[1] / "docs" / "reference" / "map_format.md").read_text(encoding="utf-8")
     rows = [line.split(" | ") for line in text.splitlines() if line.startswith("| `")]
     assert len(rows) > 200
     assert [row[0] for row in rows if len(row[2].strip(" |")) < 3] == []

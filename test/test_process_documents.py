@@ -186,7 +186,7 @@ def test_a_status_is_readable_by_people():
 
 
 def test_the_examples_in_the_documentation_are_documents_and_all_of_them():
-    text = (Path(__file__).resolve().parent.parent / "docs" / "messages.md").read_text()
+    text = (Path(__file__).resolve().parent.parent / "docs" / "reference" / "messages.md").read_text()
     examples = re.findall(r"```json\n(.*?)\n```", text, re.DOTALL)
     by_name = {json.loads(encode(decode_any(example)))["document"] for example in examples}
     assert len(examples) == len(by_name) == len(KINDS)

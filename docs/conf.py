@@ -1,0 +1,94 @@
+"""Settings of the site: `sphinx-build -W docs OUTPUT` makes it; no ROS and nothing of the package is imported."""
+
+from __future__ import annotations
+
+import re
+from importlib.util import find_spec
+from pathlib import Path
+from xml.etree import ElementTree
+
+from sphinx.application import Sphinx
+from sphinx.config import Config
+
+PACKAGE = "hmt_slam_ros"
+
+
+def own_path() -> Path:
+    """Where this file is: rosdoc2 copies the pages elsewhere, and runs it from a file that names it."""
+    path = Path(__file__).resolve()
+    wrapped = re.search(r'exec\(open\("([^"]+)"\)', path.read_text(encoding="utf-8"))
+    return path if wrapped is None else Path(wrapped[1])
+
+
+ROOT = own_path().parents[1]
+
+project = PACKAGE
+author = "hmt_slam_ros contributors"
+project_copyright = author
+release = version = ElementTree.parse(ROOT / "package.xml").findtext("version", "")
+
+extensions = ["myst_parser", "sphinx.ext.mathjax"]
+myst_enable_extensions = ["dollarmath", "deflist"]
+myst_heading_anchors = 3
+# A price is no formula: none in words that touch a digit.
+myst_dmath_allow_digits = False
+
+# Static analysis: the API pages need neither ROS nor numba. Without the extension the site lacks these pages alone.
+HAS_API = find_spec("autoapi") is not None
+if HAS_API:
+    extensions += ["sphinx.ext.autodoc", "autoapi.extension"]
+autoapi_dirs = [str(ROOT / PACKAGE)]
+autoapi_root = "reference/api"
+autoapi_options = ["members", "undoc-members", "show-module-summary"]
+autoapi_add_toctree_entry = False
+autoapi_keep_files = False
+autoapi_python_class_content = "class"
+
+# The last two are what rosdoc2 adds: an index of its own, pages by sphinx-apidoc, which imports, and a copy of README.
+exclude_patterns = ["_build", "Thumbs.db", ".DS_Store", "*.rst", "standard_docs"]
+suppress_warnings = [
+    # Constants that are assigned several at a time are not found by the static analysis.
+    "autoapi.python_import_resolution",
+    # Two classes of one name.
+    "ref.python",
+]
+# Blocks without a language are commands and their output.
+highlight_language = "none"
+
+html_theme = "alabaster"
+html_title = "hmt_slam_ros"
+html_show_sourcelink = False
+ALABASTER = {
+    "description": "Hybrid metric-topological SLAM for ROS 2",
+    "fixed_sidebar": True,
+    "page_width": "1180px",
+    "sidebar_width": "250px",
+    "show_powered_by": False,
+}
+
+
+def drop_empty_globs(app: Sphinx, page: str, source: list[str]) -> None:
+    """Leave patterns of tables of contents away that match nothing, of which Sphinx would warn."""
+    folder = (Path(app.srcdir) / page).parent
+    for pattern in re.findall(r"^([a-z]+/\S*\*\S*)\n", source[0], re.MULTILINE):
+        if not any(folder.glob(f"{pattern}.*")):
+            source[0] = source[0].replace(f"{pattern}\n", "")
+
+
+def escape_bars(_app: Sphinx, _kind: str, _name: str, _object: object, _options: object, lines: list[str]) -> None:
+    """Take |x| in a docstring for an absolute value, not for a substitution of reST."""
+    lines[:] = [re.sub(r"\|(\w+)\|", r"\|\1\|", line) for line in lines]
+
+
+def choose_theme_options(_app: Sphinx, config: Config) -> None:
+    """Give Sphinx's own theme its options; rosdoc2 takes another one."""
+    if config.html_theme == "alabaster":
+        config.html_theme_options = ALABASTER
+
+
+def setup(app: Sphinx) -> None:
+    """Connect all of them with Sphinx."""
+    app.connect("config-inited", choose_theme_options)
+    app.connect("source-read", drop_empty_globs)
+    if HAS_API:
+        app.connect("autodoc-process-docstring", escape_bars)
