@@ -24,7 +24,7 @@ PICTURES = {
     "twins_pmf.png": ("sim:twins,seed=1", "pmf.png", 900),
 }
 OTHERS = ("draw_worlds.py", "draw_view.py", "draw_concepts.py")
-COLOURS = 128
+COLORS = 128
 
 
 def draw(log: str, picture: str, width: int, to: Path) -> None:
@@ -38,7 +38,7 @@ def draw(log: str, picture: str, width: int, to: Path) -> None:
 
 
 def reduce(path: Path) -> None:
-    """Keep the nearest of a few colours, which nobody sees and a repository feels; only where that is smaller."""
+    """Keep the nearest of a few colors, which nobody sees and a repository feels; only where that is smaller."""
     before = path.stat().st_size
     with Image.open(path) as image:
         if image.mode == "P":
@@ -50,12 +50,12 @@ def reduce(path: Path) -> None:
 
 
 def _palette(image: Image.Image) -> Image.Image:
-    """The colours of large areas, and as many that lie far apart, for thin lines."""
-    colours, counts = np.unique(np.asarray(image).reshape(-1, 3), axis=0, return_counts=True)
-    frequent = colours[np.argsort(-counts, kind="stable")[: COLOURS // 2]].ravel().tolist()
-    apart = image.quantize(COLOURS // 2, Image.Quantize.MAXCOVERAGE).getpalette() or []
+    """The colors of large areas, and as many that lie far apart, for thin lines."""
+    colors, counts = np.unique(np.asarray(image).reshape(-1, 3), axis=0, return_counts=True)
+    frequent = colors[np.argsort(-counts, kind="stable")[: COLORS // 2]].ravel().tolist()
+    apart = image.quantize(COLORS // 2, Image.Quantize.MAXCOVERAGE).getpalette() or []
     palette = Image.new("P", (1, 1))
-    palette.putpalette([*frequent, *apart[: 3 * COLOURS // 2]])
+    palette.putpalette([*frequent, *apart[: 3 * COLORS // 2]])
     return palette
 
 
