@@ -144,13 +144,13 @@ def _processes(axis: Axes) -> None:
     arrow(axis, (7.65, 4.4), (9.75, 4.4), "Keyframe(k)", (0.0, 0.3))
     arrow(axis, (12.25, 4.4), (15.65, 4.4), "AreaEvents(k)", (0.0, 0.3))
     arrow(axis, (16.9, 3.82), (16.9, 1.78), "Hypotheses(k)", (-1.25, 0.0))
-    arrow(axis, (15.65, 1.35), (7.4, 3.82), "Accepted(k)", (1.9, 0.05))
+    arrow(axis, (15.65, 1.35), (7.4, 3.82), "ClosureDecision(k)", (1.9, 0.05))
     arrow(axis, (6.1, 3.82), (6.1, 1.78), "LocalEstimate", (1.3, -0.15))
     arrow(axis, (2.0, 3.82), (5.15, 1.35), "Odometry", (-0.75, -0.25), color=GREEN)
-    arrow(axis, (15.65, 1.05), (7.65, 1.05), "Accepted(k): map_T_area", (0.0, -0.3))
+    arrow(axis, (15.65, 1.05), (7.65, 1.05), "ClosureDecision(k): map_T_area", (0.0, -0.3))
     arrow(axis, (5.15, 1.05), (2.9, 1.05), color=GREEN)
     axis.text(2.8, 1.05, "pose,\nmap → odom", ha="right", va="center", color=GREEN, fontsize=8.0)
-    hear = "Hypotheses and Accepted also go to the other processes, which apply them to their replicas of the map"
+    hear = "Hypotheses and ClosureDecision also go to the other processes, which apply them to their replicas of the map"
     axis.text(9.5, 5.75, hear, ha="center", color=GRAY, fontsize=8.0)
 
 
@@ -167,7 +167,7 @@ def _event_over_time(axis: Axes) -> None:
     blocks = ((3.0, 0.55, 4, BLUE), (3.7, 0.8, 3, BLUE), (4.6, 1.6, 2, BLUE), (6.3, 0.7, 1, BLUE))
     for start, length, y, color in blocks:
         axis.add_patch(Rectangle((start, y - 0.22), length, 0.44, facecolor=color, alpha=0.85, zorder=2))
-    names = ("Keyframe", "AreaEvents", "Hypotheses", "Accepted")
+    names = ("Keyframe", "AreaEvents", "Hypotheses", "ClosureDecision")
     ends = ((3.55, 4, 3.7, 3), (4.5, 3, 4.6, 2), (6.2, 2, 6.3, 1), (7.0, 1, 7.15, 4))
     for name, (x0, y0, x1, y1) in zip(names, ends, strict=True):
         arrow(axis, (x0, y0 - 0.22 if y1 < y0 else y0 + 0.22), (x1, y1 + 0.22 if y1 < y0 else y1 - 0.22), color=DARK)
