@@ -1,0 +1,68 @@
+"""Names of the code in the documents exist: classes, files, measurements."""
+
+import ast
+import re
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+import hmt_slam_ros
+from benchmark.__main__ import _GROUPS, MEASUREMENTS
+
+PACKAGE = Path(hmt_slam_ros.__file__).parent
+ROOT = PACKAGE.parent
+DOCS = ROOT / "docs"
+PAGES = sorted(
+    path for folder in ("concepts", "decisions", "guides", "reference") for path in (DOCS / folder).rglob("*.md")
+)
+# ROS's own, and what is written in the same way.
+FOREIGN = {"GraphML", "LaserScan", "MathJax", "OccupancyGrid", "PoseArray", "TFMessage"}
+
+
+def attributes(node):
+    """Members of a class, by the names under which they are declared or assigned."""
+    for child in ast.walk(node):
+        if isinstance(child, ast.FunctionDef):
+            yield child.name
+        elif isinstance(child, ast.AnnAssign) and isinstance(child.target, ast.Name):
+            yield child.target.id
+        elif isinstance(child, ast.Attribute) and isinstance(child.value, ast.Name) and child.value.id == "self":
+            yield child.attr
+
+
+@cache
+def classes():
+    """{class of the package or the benchmark: its members}."""
+    return {
+        node.name: set(attributes(node))
+        for folder in (PACKAGE, ROOT / "benchmark")
+        for path in folder.rglob("*.py")
+        for node in ast.parse(path.read_text(encoding="utf-8")).body
+        if isinstance(node, ast.ClassDef)
+    }
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda path: path.name)
+def test_every_class_that_is_named_exists(page):
+    text = page.read_text(encoding="utf-8")
+    named = re.findall(r"`([A-Z][A-Za-z]*[a-z])(?:\.([a-z_]+))?(?:\([^`]*\))?`", text)
+    for name, member in named:
+        if name in FOREIGN or re.match("C[A-Z]", name):  # those of MRPT
+            continue
+        assert name in classes(), name
+        assert not member or member in classes()[name], f"{name}.{member}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda path: path.name)
+def test_every_file_that_is_named_exists(page):
+    text = page.read_text(encoding="utf-8")
+    for name in re.findall(r"`((?:[a-z_]+/)*[a-z_0-9]+\.py)`", text):
+        assert any((folder / name).is_file() for folder in (PACKAGE, ROOT)), name
+
+
+@pytest.mark.parametrize("page", [ROOT / "README.md", DOCS / "accuracy.md", DOCS / "validation.md", *PAGES], ids=str)
+def test_every_measurement_that_is_named_exists(page):
+    text = page.read_text(encoding="utf-8")
+    kinds = {kind for names in re.findall(r"-m benchmark ((?:[a-z]+ ?)+)", text) for kind in names.split()}
+    assert kinds <= {*MEASUREMENTS, *_GROUPS}
