@@ -150,7 +150,9 @@ def _processes(axis: Axes) -> None:
     arrow(axis, (15.65, 1.05), (7.65, 1.05), "ClosureDecision(k): map_T_area", (0.0, -0.3))
     arrow(axis, (5.15, 1.05), (2.9, 1.05), color=GREEN)
     axis.text(2.8, 1.05, "pose,\nmap → odom", ha="right", va="center", color=GREEN, fontsize=8.0)
-    hear = "Hypotheses and ClosureDecision also go to the other processes, which apply them to their replicas of the map"
+    hear = (
+        "Hypotheses and ClosureDecision also go to the other processes, which apply them to their replicas of the map"
+    )
     axis.text(9.5, 5.75, hear, ha="center", color=GRAY, fontsize=8.0)
 
 

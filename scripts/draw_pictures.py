@@ -2,8 +2,8 @@
 """Make the pictures of README.md and docs/guides/tutorial.md anew, from runs; and all in docs/images small.
 
 docs/images/malaga_map.png is the map of the bundled log, twins_pmf.png the probabilities of a simulated drive through
-two rooms that are alike. worlds.png, view.png and concept_*.svg have scripts of their own, which this one runs; view.png
-needs a browser, and without one the old picture stays.
+two rooms that are alike. worlds.png, view.png and concept_*.svg have scripts of their own, which this one runs.
+view.png needs a browser: without one the old picture stays.
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
 #!/usr/bin/env python3
-"""Write anew what follows from the code: config/hmt_slam.yaml; in docs/, parameters, settings and the map's form."""
+"""Write the files that follow from the code: config/hmt_slam.yaml, and in docs/ parameters, settings and map format."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from string import Template
 
@@ -22,7 +23,7 @@ ROOT = Path(__file__).resolve().parents[1]
 def simulation_settings(_configuration: Configuration) -> str:
     """docs/guides/simulation_settings.md: every family of buildings, and every setting."""
     families = [
-        f"| `{name}` | {family.description} | {', '.join(f'`{key}={value}`' for key, value in family.default_settings.items())} |"
+        f"| `{name}` | {family.description} | {_settings_text(family.default_settings)} |"
         for name, family in FAMILIES.items()
     ]
     lines = [
@@ -39,6 +40,10 @@ def simulation_settings(_configuration: Configuration) -> str:
         *parameter_table(flat_parameters(Settings())),
     ]
     return "\n".join(lines) + "\n"
+
+
+def _settings_text(settings: Mapping[str, object]) -> str:
+    return ", ".join(f"`{name}={value}`" for name, value in settings.items())
 
 
 def map_format(_configuration: Configuration) -> str:
@@ -61,7 +66,7 @@ GENERATED = {
 
 
 def main() -> None:
-    """Write every generated file below the repository's root."""
+    """Write every generated file below the root of the repository."""
     for name, text in GENERATED.items():
         (ROOT / name).parent.mkdir(exist_ok=True)
         (ROOT / name).write_text(text(Configuration()), encoding="utf-8")
