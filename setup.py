@@ -44,7 +44,10 @@ setup(
         "rosbags>=0.11",
         "scipy>=1.11",
     ],
-    extras_require={"docs": [*DOCS], "test": ["hypothesis", "mypy", "pytest", "pytest-xdist", "ruff", *DOCS]},
+    extras_require={
+        "docs": [*DOCS],
+        "test": ["hypothesis", "import-linter", "mypy", "pytest", "pytest-xdist", "ruff", *DOCS],
+    },
     zip_safe=False,
     entry_points={
         "console_scripts": [
