@@ -13,9 +13,8 @@ from benchmark.__main__ import _GROUPS, MEASUREMENTS
 PACKAGE = Path(hmt_slam_ros.__file__).parent
 ROOT = PACKAGE.parent
 DOCS = ROOT / "docs"
-PAGES = sorted(
-    path for folder in ("concepts", "decisions", "guides", "reference") for path in (DOCS / folder).rglob("*.md")
-)
+FOLDERS = ("concepts", "decisions", "guides", "reference")
+PAGES = [ROOT / "CONTRIBUTING.md", *sorted(path for folder in FOLDERS for path in (DOCS / folder).rglob("*.md"))]
 # ROS's own, and what is written in the same way.
 FOREIGN = {"GraphML", "LaserScan", "MathJax", "OccupancyGrid", "PoseArray", "TFMessage"}
 
@@ -33,14 +32,16 @@ def attributes(node):
 
 @cache
 def classes():
-    """{class of the package or the benchmark: its members}."""
-    return {
-        node.name: set(attributes(node))
-        for folder in (PACKAGE, ROOT / "benchmark")
-        for path in folder.rglob("*.py")
-        for node in ast.parse(path.read_text(encoding="utf-8")).body
-        if isinstance(node, ast.ClassDef)
-    }
+    """{class, or alias of a type, of the package or the benchmark: its members}."""
+    found = {}
+    for folder in (PACKAGE, ROOT / "benchmark"):
+        for path in folder.rglob("*.py"):
+            for node in ast.parse(path.read_text(encoding="utf-8")).body:
+                if isinstance(node, ast.ClassDef):
+                    found[node.name] = set(attributes(node))
+                elif isinstance(node, ast.Assign):
+                    found |= {target.id: set() for target in node.targets if isinstance(target, ast.Name)}
+    return found
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda path: path.name)
