@@ -302,7 +302,7 @@ class Errands:
         self._starts.append((stamp_from_time(message.header.stamp), pose_from_message(message.pose.pose)))
 
     def _hear_diagnostics(self, message: DiagnosticArray) -> None:
-        for status in message.robot_status:
+        for status in message.status:
             if status.name == "/robot":
                 self._reports += 1
                 # There are none before it drives.

@@ -217,7 +217,7 @@ def _listening(domain: int, found: Soak) -> Iterator[SingleThreadedExecutor]:
             found.scans, found.driven = status.acknowledged, 1e-9 * (status.stamp - begin)
 
     def hear_diagnostics(message: DiagnosticArray) -> None:
-        for status in message.robot_status:
+        for status in message.status:
             if status.level == DiagnosticStatus.ERROR:
                 found.errors[status.name] = status.message
             values = {entry.key: entry.value for entry in status.values}

@@ -29,7 +29,7 @@ def main(domain, scans):
         answer = listener.call(Trigger, "slam/save", Trigger.Request())
     finally:
         print(f"{len(estimates)} of {scans} estimates came")
-        for status in {message.robot_status[0].name: message.robot_status[0] for message in health}.values():
+        for status in {message.status[0].name: message.status[0] for message in health}.values():
             said = ", ".join(f"{entry.key} {entry.value}" for entry in status.values)
             print(f"{status.name}: {status.message}; {said}")
         listener.close()

@@ -130,7 +130,7 @@ def test_metric_slam_that_is_lost_begins_at_the_door_where_the_robot_stands_unti
     said = robot.estimate()
     assert (said.place, said.room, said.confident) == (room.replace("room", "door"), room, True)
     np.testing.assert_array_equal(robot.velocity, 0.0)
-    assert robot.do("find").text == f"find: the robot is in {room}"
+    assert robot.do("localize").text == f"localize: the robot is in {room}"
     assert robot.do(f"go {room}").succeeded
 
 
@@ -197,15 +197,15 @@ def test_where_others_drive_it_says_where_the_robot_is_and_what_a_door_tells_onc
 def test_it_finds_out_where_it_is_and_stops_when_told_or_when_it_takes_too_long(saved):
     missions = PilotProcess(with_changes(CONFIGURATION, {"pilot.task_timeout": 2.0}), saved)
     robot = Robot(missions, (14.0, 0.0, math.pi), rtl="never")
-    assert robot.do("find").text == "find: given up after 2 s"
+    assert robot.do("localize").text == "localize: given up after 2 s"
     np.testing.assert_array_equal(robot.velocity, 0.0)
-    robot.hear(parse_task("find", PILOT_TASKS))
+    robot.hear(parse_task("localize", PILOT_TASKS))
     robot.step()
     robot.hear(parse_task("stop", PILOT_TASKS))
     np.testing.assert_array_equal(robot.velocity, 0.0)
     assert not any(isinstance(message, VelocityCommand) for message in robot.step())
     robot = Robot(PilotProcess(CONFIGURATION, saved), (14.0, 0.0, math.pi), rtl="never")
-    outcome = robot.do("find")
+    outcome = robot.do("localize")
     assert outcome.succeeded
     assert outcome.text.startswith("find: the robot is at door ")
 
@@ -213,11 +213,11 @@ def test_it_finds_out_where_it_is_and_stops_when_told_or_when_it_takes_too_long(
 def test_where_time_goes_back_the_robot_may_be_anywhere(saved):
     missions = PilotProcess(CONFIGURATION, saved)
     robot = Robot(missions, (12.0, 0.0, math.pi), rtl="never")
-    assert robot.do("find").succeeded
-    robot.hear(parse_task("find", PILOT_TASKS))
+    assert robot.do("localize").succeeded
+    robot.hear(parse_task("localize", PILOT_TASKS))
     robot.stamp -= 3_000_000_000
     assert [answer.text for answer in robot.step() if isinstance(answer, TaskResult)] == [
-        "find: given up: time went back"
+        "localize: given up: time went back"
     ]
     robot.step()
     assert robot.estimate().place is None

@@ -70,7 +70,7 @@ def test_rtl_comes_before_what_computes_for_long_where_that_is_permitted(listene
     process = start("rtl", before=before)
 
     def answer():
-        values = [value for message in told for status in message.robot_status for value in status.values]
+        values = [value for message in told for status in message.status for value in status.values]
         return next((value.value for value in values if value.key == "real-time scheduling"), None)
 
     listener.until(answer, alive=[process])

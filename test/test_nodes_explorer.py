@@ -50,7 +50,7 @@ def system(tmp_path, start):
 
 
 def test_it_explores_and_goes_where_it_is_sent(listener, system):
-    outcomes = listener.hear(String, "explorer/outcome", topics.LATCHED)
+    outcomes = listener.hear(String, "explorer/task_result", topics.LATCHED)
     goals = listener.hear(PoseStamped, "goal_pose", topics.STREAM)
     truths = listener.hear(PoseStamped, "ground_truth", topics.STREAM)
     nodes = system()
@@ -60,7 +60,7 @@ def test_it_explores_and_goes_where_it_is_sent(listener, system):
     assert np.hypot(*(path - (2.0, 3.0)).T).min() < 2.0
     assert goals
     assert goals[0].header.frame_id == "map"
-    errands = listener.node.create_publisher(String, "explorer/errand", 10)
+    errands = listener.node.create_publisher(String, "explorer/task", 10)
     listener.until(lambda: errands.get_subscription_count() > 0)
     errands.publish(String(data="go cellar"))
     listener.until(lambda: len(outcomes) > 1, alive=nodes)
@@ -73,7 +73,7 @@ def test_it_explores_and_goes_where_it_is_sent(listener, system):
 def test_with_another_map_it_begins_anew_also_where_it_was_not_there_when_the_map_was_exchanged(
     listener, system, start
 ):
-    outcomes = listener.hear(String, "explorer/outcome", topics.LATCHED)
+    outcomes = listener.hear(String, "explorer/task_result", topics.LATCHED)
     nodes = system()
     *others, explorer, robot = nodes
     listener.until(lambda: outcomes, alive=nodes)

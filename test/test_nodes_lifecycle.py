@@ -86,7 +86,7 @@ def test_two_signals_in_a_row_do_no_harm(listener, start):
 
 
 def level(told, name):
-    levels = [status for message in told for status in message.robot_status if status.name == f"/{name}"]
+    levels = [status for message in told for status in message.status if status.name == f"/{name}"]
     return levels[-1] if levels else None
 
 

@@ -118,7 +118,7 @@ def test_a_robot_that_wakes_up_in_a_saved_map_says_so_until_it_is_recognized_whe
 
 
 def test_a_robot_that_stayed_where_it_was_is_localized_at_once_where_that_is_told(corridor, listener, start):
-    nodes = Nodes(start, listener, start_from=corridor[1], start_carried=False)
+    nodes = Nodes(start, listener, start_from=corridor[1], start_lost=False)
     nodes.until(lambda: nodes.localized and nodes.entropies)
     assert nodes.is_localized()
     assert nodes.entropies[-1].data == 0.0
@@ -126,9 +126,9 @@ def test_a_robot_that_stayed_where_it_was_is_localized_at_once_where_that_is_tol
 
 def test_a_robot_that_is_carried_while_the_nodes_run_is_recognized_elsewhere(corridor, listener, start):
     log, out = corridor
-    nodes = Nodes(start, listener, start_from=out, start_carried=False)
+    nodes = Nodes(start, listener, start_from=out, start_lost=False)
     nodes.until(nodes.is_localized)
-    answer = listener.call(Trigger, "slam/carried", Trigger.Request())
+    answer = listener.call(Trigger, "slam/relocalize", Trigger.Request())
     assert answer.success
     nodes.until(lambda: not nodes.is_localized())
     # Back in time, which an odometry and a clock that begin anew are.
@@ -136,7 +136,7 @@ def test_a_robot_that_is_carried_while_the_nodes_run_is_recognized_elsewhere(cor
     nodes.until(nodes.is_localized)
     nodes.until(lambda: len(nodes.estimates) == SCANS - 40)
     nodes.park()
-    again = listener.call(Trigger, "slam/carried", Trigger.Request())
+    again = listener.call(Trigger, "slam/relocalize", Trigger.Request())
     assert again.success
     nodes.until(lambda: not nodes.is_localized())
     said = len(nodes.poses)

@@ -40,7 +40,7 @@ def test_it_goes_to_a_room_and_has_slam_begin_at_the_door(mapped, listener, star
     world, out = mapped
     # Slam alone would not look for the robot before it is there.
     shared = {"start_from": out, "mode": "localization", "tsbi__recheck_keyframes": 100}
-    outcomes = listener.hear(String, "pilot/outcome", topics.LATCHED)
+    outcomes = listener.hear(String, "pilot/task_result", topics.LATCHED)
     places = listener.hear(String, PLACE, topics.LATCHED)
     starts = listener.hear(PoseWithCovarianceStamped, INITIAL_POSE, topics.STREAM)
     goals = listener.hear(PoseStamped, GOAL_POSE, topics.STREAM)
@@ -49,7 +49,7 @@ def test_it_goes_to_a_room_and_has_slam_begin_at_the_door(mapped, listener, star
     diagnostics = listener.hear(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
     pilot = start("pilot", **shared)
     others = [start(name, **shared) for name in PROCESSES]
-    errands = listener.node.create_publisher(String, "pilot/errand", topics.STREAM)
+    errands = listener.node.create_publisher(String, "pilot/task", topics.STREAM)
     listener.until(lambda: errands.get_subscription_count() == 1, alive=[pilot])
     errands.publish(String(data="go cellar"))
     errands.publish(String(data="dance"))

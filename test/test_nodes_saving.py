@@ -103,7 +103,7 @@ def test_a_map_is_saved_while_the_robot_drives_and_others_go_on_from_it_when_all
 
     # At the first scan that is not in the map.
     begin = (stopped["slam"].scan_queue.last_stamp - START) / 1e9 + 0.001
-    stayed = start_with(start, start_from=folder, start_carried=False)
+    stayed = start_with(start, start_from=folder, start_lost=False)
     second = Nodes(stayed, listener, log, folder, 0.0, robot__start=begin)
     second.until(lambda: second.estimates and second.last.scan_index == 79)
     heads = [decode(message.data, KeyframeHeader).sequence for message in second.keyframes]
@@ -121,7 +121,7 @@ def test_a_map_is_saved_while_the_robot_drives_and_others_go_on_from_it_when_all
 def test_nodes_that_are_told_to_end_save_their_map_first_if_that_is_wanted(tmp_path, listener, start):
     """All at once, twice, and the robot with them, as a launch does that is in a hurry."""
     log, folder = corridor_bag(tmp_path, scans=200), tmp_path / "hmt_map"
-    nodes = Nodes(start_with(start, save_at_end=True), listener, log, folder, 4.0)
+    nodes = Nodes(start_with(start, save_on_shutdown=True), listener, log, folder, 4.0)
     nodes.until(lambda: len(nodes.estimates) > 20)
     everybody = [*nodes.processes, nodes.robot]
     for process in everybody:
@@ -146,7 +146,7 @@ def test_nodes_show_a_map_of_the_command_line_at_once_and_go_on_from_it(tmp_path
     command = [sys.executable, "-m", "hmt_slam_ros.cli.main", "map", str(log), "--out", str(out), "--duration", "6"]
     subprocess.run(command, check=True, timeout=120)
     grids = listener.hear(OccupancyGrid, MAP, topics.LATCHED)
-    stayed = start_with(start, start_from=out, start_carried=False)
+    stayed = start_with(start, start_from=out, start_lost=False)
     nodes = Nodes(stayed, listener, log, tmp_path / "hmt_map", 0.0, robot__start=6.001)
     nodes.until(lambda: grids and nodes.estimates and nodes.last.scan_index == 59)
     known = (np.frombuffer(grids[0].data, dtype=np.int8) == 100).sum()

@@ -31,7 +31,7 @@ MESSAGES = Path(__file__).parent.parent / "docs" / "reference" / "messages.md"
 SAID = {f"/{topic.lstrip('/')}" for topic in {*NAMED, *topics.DOCUMENTS.values(), *TRANSFORMS}} - {
     *("/initialpose", "/cmd_vel"),  # which are only heard
     "/ground_truth",  # of a robot that is driven
-    *("/goal_pose", "/pilot/place"),  # of explorer and pilot
+    *("/goal_pose", "/pilot/place_estimate"),  # of explorer and pilot
     "/hmt/notices",  # as there is nothing to complain of
 }
 
@@ -88,7 +88,7 @@ def test_after_a_reset_a_new_map_begins_where_the_robot_is_and_all_that_is_said_
 ):
     log, out = corridor
     recording = Recording(listener, tmp_path / "bag")
-    nodes = Nodes(start, listener, start_from=out, start_carried=False, save_to=tmp_path / "saved")
+    nodes = Nodes(start, listener, start_from=out, start_lost=False, save_to=tmp_path / "saved")
     keyframes = listener.hear(String, KEYFRAMES, topics.CHAIN)
     nodes.until(lambda: {m.robot_status[0].name for m in nodes.diagnostics} == {f"/{name}" for name in NODES})
     answer = listener.call(Trigger, "slam/reset", Trigger.Request())

@@ -77,7 +77,7 @@ def estimates_of(nodes, since):
 
 def test_nodes_that_are_halted_and_taken_down_amid_a_drive_come_to_the_same_as_others(listener, start, tmp_path):
     log, saved = corridor_bag(tmp_path, scans=SCANS), tmp_path / "hmt_map"
-    manager, nodes = Manager(listener), Nodes(start, listener, autostart=False, save_to=saved, save_at_end=True)
+    manager, nodes = Manager(listener), Nodes(start, listener, autostart=False, save_to=saved, save_on_shutdown=True)
 
     def said(node):
         return nodes.diagnosis(node)["state"]
@@ -125,7 +125,7 @@ def test_nodes_that_are_halted_and_taken_down_amid_a_drive_come_to_the_same_as_o
     for name in UP:
         assert manager.change(name, SHUTDOWN["active"])
         assert manager.state(name) == "finalized"
-    nodes.until(lambda: listener.node.count_subscribers("hmt/accepted") == 0)
+    nodes.until(lambda: listener.node.count_subscribers("hmt/closure_decisions") == 0)
     FolderReader(saved, FORMAT, VERSION)
     nodes.until(lambda: all(said(name) == "finalized" for name in NODES))
 

@@ -109,8 +109,8 @@ def test_events_are_told_once_in_order_when_both_halves_are_there_and_a_new_run_
     assert event == {
         "event": 0,
         "time": 20.0,
-        "way": 0.0,
-        "leaves": [[1, 4, 0.75, True], [3, 5, 0.25, False]],
+        "path_length": 0.0,
+        "hypotheses": [[1, 4, 0.75, True], [3, 5, 0.25, False]],
         "live": 2,
     }
 

@@ -72,7 +72,7 @@ class ExplorerParameters:
         "such as nav2.",
         choices=("velocities", "goals"),
     )
-    explores: bool = parameter(True, "Explore from the start on; otherwise wait for an errand.")
+    explores: bool = parameter(True, "Explore from the start on; otherwise wait for a task.")
     backtracks: bool = parameter(
         False,
         "Go back along the robot's own path where the probability of topological paths has several peaks, until "
@@ -96,5 +96,5 @@ class ExplorerParameters:
 class PilotParameters:
     """The pilot, who goes by the belief over places: whether it drives the robot, and when it gives up."""
 
-    drives: bool = parameter(True, "Take errands and drive; otherwise only say where the robot is that others drive.")
-    task_timeout: float = parameter(300.0, "An errand is given up that takes longer.", unit="s", low=1.0, high=1e5)
+    drives: bool = parameter(True, "Take tasks and drive; otherwise only say where the robot is that others drive.")
+    task_timeout: float = parameter(300.0, "A task is given up that takes longer.", unit="s", low=1.0, high=1e5)

@@ -10,7 +10,7 @@ from hmt_slam_ros.doctor.finding import Finding, Severity, times_text
 
 OUR_NODES = ("slam", "aam", "tsbi", "tlca", "rtl")
 SCAN, ODOM, TF, TF_STATIC, CLOCK = "scan", "odom", "tf", "tf_static", "/clock"
-ESTIMATES = "hmt/local_pose"
+ESTIMATES = "hmt/local_estimate"
 SINGLE_PUBLISHER_TOPICS = (SCAN, ODOM, "map", "pose", CLOCK)
 """Topics that have one publisher."""
 

@@ -140,14 +140,14 @@ class Explorer:
         self._task = self._route = None
         return [outcome]
 
-    def _choose_goal(self, errand: Task, stamp: int) -> list[Message]:
+    def _choose_goal(self, task: Task, stamp: int) -> list[Message]:
         """Choose where to go."""
         here = self.exploration_map.update_roadmap()
         if here is None:
             return []
         self._is_backtracking = self._is_ambiguous
         choose = {"explore": self._plan_to_frontier, "go": self._plan_to_place, "backtrack": self._plan_backtracking}[
-            errand.kind
+            task.kind
         ]
         said = self._plan_backtracking(here) if self._is_backtracking else choose(here)
         if self._route is not None:

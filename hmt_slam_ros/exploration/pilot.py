@@ -165,23 +165,23 @@ class PilotProcess:
             said += self._process_scan(self._waiting.popleft())
         return said
 
-    def _accept_task(self, errand: Task) -> list[Message]:
-        """Begin an task in place of the one before."""
+    def _accept_task(self, task: Task) -> list[Message]:
+        """Begin a task in place of the one before."""
         if not self._configuration.pilot.drives:
-            return [TaskResult(errand, False, "pilot.drives is false, so others drive the robot: set it to true")]
-        if errand.kind == "go" and errand.place not in self.rooms:
+            return [TaskResult(task, False, "pilot.drives is false, so others drive the robot: set it to true")]
+        if task.kind == "go" and task.place not in self.rooms:
             choice = ", ".join(self.rooms) or "none, as the robot was in no room behind a door"
-            return [TaskResult(errand, False, f"there is no such room: choose from {choice}")]
-        if errand.kind == "stop":
+            return [TaskResult(task, False, f"there is no such room: choose from {choice}")]
+        if task.kind == "stop":
             return self._stop()
-        self._task, self._task_start = errand, None
-        goal = self.rooms.get(errand.place)
+        self._task, self._task_start = task, None
+        goal = self.rooms.get(task.place)
         if self.controller.room is None or goal is not None:
             self.controller.start_mission(goal)
         return [] if goal is None else [GoalPose(self._stamp, goal.opening.area, goal.pose)]
 
     def _stop(self) -> list[Message]:
-        """Let the robot stand, if it is on an task."""
+        """Let the robot stand, if it is on a task."""
         if self._task is None:
             return []
         self.controller.stop()
@@ -192,9 +192,9 @@ class PilotProcess:
         """Begin anew where time went back."""
         if stamp > self._stamp - _TIME_JUMP:
             return []
-        errand, stopped = self._task, self._stop()
+        task, stopped = self._task, self._stop()
         self._reset()
-        ended = [] if errand is None else [TaskResult(errand, False, "given up: time went back")]
+        ended = [] if task is None else [TaskResult(task, False, "given up: time went back")]
         return [*ended, *stopped]
 
     def _process_scan(self, scan: Scan) -> list[Message]:
@@ -304,13 +304,13 @@ class PilotProcess:
         room.release()
         self._reset_controller(certain_belief(self._building.graph, self._configuration.places, state))
 
-    def _is_localized_for(self, errand: Task) -> bool:
+    def _is_localized_for(self, task: Task) -> bool:
         """Whether it is known where the robot is, and that was asked."""
         estimator = self.controller.estimator
         known = (
             estimator.belief is not None and estimator.belief.is_confident and estimator.node_and_direction is not None
         )
-        return errand.kind == "find" and (known or self.controller.room is not None)
+        return task.kind == "localize" and (known or self.controller.room is not None)
 
     @property
     def _location_text(self) -> str:
@@ -321,16 +321,16 @@ class PilotProcess:
         assert facing is not None
         return f"at {self._building.chart.name(facing[0])}, looking {DIRECTION_NAMES[facing[1]]}"
 
-    def _task_result(self, errand: Task) -> TaskResult | None:
-        """How an task ended, if it did."""
+    def _task_result(self, task: Task) -> TaskResult | None:
+        """How a task ended, if it did."""
         if self._task_start is None:
             self._task_start = self._stamp
-        if self._is_localized_for(errand):
-            return TaskResult(errand, True, f"the robot is {self._location_text}")
-        if errand.kind == "go" and self.controller.phase is Phase.THERE:
-            return TaskResult(errand, True, "the robot is there")
+        if self._is_localized_for(task):
+            return TaskResult(task, True, f"the robot is {self._location_text}")
+        if task.kind == "go" and self.controller.phase is Phase.THERE:
+            return TaskResult(task, True, "the robot is there")
         if self.controller.phase is Phase.LOST:
-            return TaskResult(errand, False, "no way is known that leads there")
+            return TaskResult(task, False, "no way is known that leads there")
         if self._stamp - self._task_start > self._task_timeout:
-            return TaskResult(errand, False, f"given up after {self._configuration.pilot.task_timeout:g} s")
+            return TaskResult(task, False, f"given up after {self._configuration.pilot.task_timeout:g} s")
         return None

@@ -195,20 +195,20 @@ class ResetResponse:
 
 # Raise a document's version with every change of its dataclass: a receiver refuses any other.
 _DOCUMENTS: dict[type, tuple[str, int]] = {
-    KeyframeHeader: ("keyframe", 9),
-    AreaEvents: ("area_events", 3),
-    Hypotheses: ("hypotheses", 8),
-    ClosureDecision: ("accepted", 4),
+    KeyframeHeader: ("keyframe", 10),
+    AreaEvents: ("area_events", 4),
+    Hypotheses: ("hypotheses", 9),
+    ClosureDecision: ("closure_decision", 1),
     LocalEstimate: ("local_estimate", 1),
-    TrackingReset: ("arriving", 1),
+    TrackingReset: ("tracking_reset", 1),
     Notice: ("notice", 1),
-    FinalCounts: ("finished", 1),
-    RobotStatus: ("robot_status", 1),
-    SaveRequest: ("save_request", 1),
+    FinalCounts: ("finished", 2),
+    RobotStatus: ("robot_status", 2),
+    SaveRequest: ("save_request", 2),
     SaveResponse: ("save_response", 1),
     ResetRequest: ("reset_request", 1),
     ResetResponse: ("reset_response", 1),
-    PlaceEstimate: ("place_estimate", 1),
+    PlaceEstimate: ("place_estimate", 2),
 }
 
 
@@ -221,7 +221,7 @@ def encode(message: object, reset_number: int = 0) -> str:
     name, version = _DOCUMENTS[type(message)]
     content = {"document": name, "version": version, **to_plain(message, {np.ndarray: np.ndarray.tolist})}
     if reset_number:
-        content["begun"] = reset_number
+        content["reset"] = reset_number
     try:
         return json.dumps(content, allow_nan=False, separators=(",", ":"))
     except ValueError as error:
@@ -253,8 +253,8 @@ def decode_with_reset(text: str, kind: type[Document]) -> tuple[Document, int]:
         raise HmtSlamError(
             f"a {name} document has version {found}, not {version}: run the same version of hmt_slam_ros everywhere"
         )
-    begun = _VALUES.read(content.pop("begun", 0), int, f"{name}.begun")
-    return _VALUES.read(content, kind, name), begun
+    reset_number = _VALUES.read(content.pop("reset", 0), int, f"{name}.reset")
+    return _VALUES.read(content, kind, name), reset_number
 
 
 def _array_reader(field: str, kind: Hashable) -> Reader:  # noqa: ARG001  all are of one kind

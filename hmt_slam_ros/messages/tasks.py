@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 
 from hmt_slam_ros.errors import HmtSlamError
 
-TaskKind = Literal["explore", "go", "backtrack", "find", "stop"]
+TaskKind = Literal["explore", "go", "backtrack", "localize", "stop"]
 
 EXPLORER_TASKS: tuple[TaskKind, ...] = ("explore", "backtrack", "stop", "go")
-"""Errands of the explorer."""
+"""Tasks of the explorer."""
 
-PILOT_TASKS: tuple[TaskKind, ...] = ("find", "stop", "go")
-"""Errands of the pilot."""
+PILOT_TASKS: tuple[TaskKind, ...] = ("localize", "stop", "go")
+"""Tasks of the pilot."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,7 +25,7 @@ class Task:
     """to explorer or pilot: what to do from now on.
 
     :ivar kind: "explore" until the building is known, "go" to a place, "backtrack" along the robot's own path until
-        told otherwise, "find" out where the robot is, "stop".
+        told otherwise, "localize" the robot, "stop".
     :ivar place: name of the place to go to, such as "room 3" or "area 12".
     """
 
@@ -34,7 +34,7 @@ class Task:
 
 
 def parse_task(text: str, kinds: Sequence[TaskKind]) -> Task:
-    """The errand that is written as its kind and, where it has one, the name of the place.
+    """The task that is written as its kind and, where it has one, the name of the place.
 
     :param kinds: those that there are.
     :raises HmtSlamError: for anything else.
@@ -44,12 +44,12 @@ def parse_task(text: str, kinds: Sequence[TaskKind]) -> Task:
         if kind == word and bool(place) == (kind == "go"):
             return Task(kind, place)
     alone = ", ".join(kind for kind in kinds if kind != "go")
-    raise HmtSlamError(f"'{text}' is no errand: give one of {alone}, or go and the name of a place")
+    raise HmtSlamError(f"'{text}' is no task: give one of {alone}, or go and the name of a place")
 
 
 @dataclass(frozen=True, slots=True)
 class TaskResult:
-    """explorer or pilot -> who gave the errand: how it ended.
+    """explorer or pilot -> who gave the task: how it ended.
 
     :ivar task: which.
     :ivar succeeded: whether all was done that was to be done.
@@ -82,7 +82,7 @@ class GoalPose:
 
 @dataclass(frozen=True, slots=True)
 class VelocityCommand:
-    """explorer or pilot -> robot: the velocities until the next scan; one for every scan, of the pilot amid an errand.
+    """explorer or pilot -> robot: the velocities until the next scan; one for every scan, of the pilot amid a task.
 
     :ivar stamp: of the scan, ns.
     :ivar speed: m/s.

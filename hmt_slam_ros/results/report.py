@@ -21,6 +21,10 @@ from hmt_slam_ros.results.recorder import Recording
 from hmt_slam_ros.sensors import Scan
 
 
+# Columns of pmf.csv that are not called as the fields.
+_PROBABILITY_COLUMNS = {"path_length": "travelled"}
+
+
 def code_bytes() -> dict[str, int]:
     """Resident memory of this OS process, bytes, that is mapped from ``libraries``, and what compiled ``kernels`` take.
 
@@ -144,7 +148,8 @@ def write_cost(path: Path, seconds_per_scan: Mapping[str, NDArray[np.float64]]) 
 def write_probabilities(path: Path, probabilities: list[TopologyProbability]) -> None:
     """pmf.csv: Eq. (14), one line for every live topology at every keyframe event."""
     names = [entry.name for entry in fields(TopologyProbability)]
-    _write_table(path, names, [[_csv_value(getattr(row, name)) for name in names] for row in probabilities])
+    header = [_PROBABILITY_COLUMNS.get(name, name) for name in names]
+    _write_table(path, header, [[_csv_value(getattr(row, name)) for name in names] for row in probabilities])
 
 
 def _csv_value(value: float) -> float:

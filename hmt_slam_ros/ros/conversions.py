@@ -43,7 +43,7 @@ _PLANAR = np.ix_((0, 1, 5), (0, 1, 5))
 _NUDGES = ((0, 0), (1, 0), (-1, 0), (0, 1), (0, -1), (2, 0), (-2, 0), (0, 2), (0, -2))
 _SCAN_POSES_FRAME = re.compile(r"hypothesis_(\d+)/scan_(\d+)")
 _AREA_FRAME = re.compile(r"area_(\d+)")
-_KEYFRAME_FRAME = re.compile(r"keyframe_(\d+)(?:/begun_(\d+))?")
+_KEYFRAME_FRAME = re.compile(r"keyframe_(\d+)(?:/reset_(\d+))?")
 
 
 def time_message(stamp: int) -> Time:
@@ -188,7 +188,7 @@ def keyframe_frame(keyframe: int, reset_number: int = 0) -> str:
 
     :param reset_number: number of the request after which slam began anew, 0 before the first.
     """
-    return f"keyframe_{keyframe}/begun_{reset_number}" if reset_number else f"keyframe_{keyframe}"
+    return f"keyframe_{keyframe}/reset_{reset_number}" if reset_number else f"keyframe_{keyframe}"
 
 
 def keyframe_from_frame(frame: str) -> tuple[int, int]:

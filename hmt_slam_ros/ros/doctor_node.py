@@ -49,7 +49,7 @@ _BEST_EFFORT = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=1000, reliabili
 # Nodes that are there at all are found in this time, s.
 _DISCOVERY_TIMEOUT = 5.0
 _USE_SIM_TIME, _LASER_POSE = "use_sim_time", "laser_pose"
-_GRAPH_ONLY_TOPICS = ("map", "pose", "hmt/keyframes", "hmt/hypotheses", "hmt/accepted")
+_GRAPH_ONLY_TOPICS = ("map", "pose", "hmt/keyframes", "hmt/hypotheses", "hmt/closure_decisions")
 _ODOM_FRAME, _BASE_FRAME = "odom", "base_link"
 _MAP_TO_ODOM_NODE = "rtl"  # the node of ours that publishes that
 
@@ -164,7 +164,7 @@ class DoctorNode(Node):
         self._counts[running.ESTIMATES] += 1
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
-        for status in message.robot_status:
+        for status in message.status:
             level = status.level[0] if isinstance(status.level, bytes) else int(status.level)
             state = next((entry.value for entry in status.values if entry.key == STATE), "")
             self._node_statuses[status.name] = NodeStatus(status.name, level, status.message, state)

@@ -104,7 +104,7 @@ class RecorderNode(Node):
         self.robot_status = status
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
-        for status in message.robot_status:
+        for status in message.status:
             name = status.name.rsplit("/", 1)[-1]
             self.diagnostics_stamps[name] = stamp_from_time(message.header.stamp)
             if status.level == DiagnosticStatus.ERROR and self.fault is None:

@@ -120,7 +120,7 @@ class SlamNode(ProcessNode):
         self._loader = MapLoader(self, self._deliver_held)
         self._particles = self.create_publisher(PoseArray, PARTICLES, topics.STREAM)
         self.create_subscription(String, ROBOT_STATUS, self._on_robot_status, topics.LATCHED)
-        self.create_service(Trigger, "~/carried", self._relocalize)
+        self.create_service(Trigger, "~/relocalize", self._relocalize)
         self.create_service(SetBool, "~/pause", self._pause)
         self.create_timer(PERIOD, self._check_inputs, clock=self.diagnostics.steady_clock)
         self.create_subscription(PoseWithCovarianceStamped, INITIAL_POSE, self._on_initial_pose, topics.STREAM)

@@ -185,11 +185,11 @@ class TaskNode(ManagedNode):
 
     def _on_task(self, message: String) -> None:
         try:
-            errand = parse_task(message.data, self._task_kinds)
+            task = parse_task(message.data, self._task_kinds)
         except HmtSlamError as fault:
             self.diagnostics.warn(str(fault))
         else:
-            self.process_message(errand)
+            self.process_message(task)
 
 
 def _ignore(*_told: object) -> None:

@@ -65,15 +65,15 @@ CHAIN_HISTORY = QoSProfile(
 
 SCAN, ODOM, CLOCK = "scan", "odom", "/clock"
 CMD_VEL, GROUND_TRUTH = "cmd_vel", "ground_truth"
-TASK_GOALS = {"explorer": "explorer/errand", "pilot": "pilot/errand"}
-TASK_RESULTS = {"explorer": "explorer/outcome", "pilot": "pilot/outcome"}
-GOAL_POSE, PLACE = "goal_pose", "pilot/place"
+TASK_GOALS = {"explorer": "explorer/task", "pilot": "pilot/task"}
+TASK_RESULTS = {"explorer": "explorer/task_result", "pilot": "pilot/task_result"}
+GOAL_POSE, PLACE = "goal_pose", "pilot/place_estimate"
 KEYFRAMES, KEYFRAME_SCANS = "hmt/keyframes", "hmt/keyframe_scans"
-SCAN_POSES = "hmt/trail"
+SCAN_POSES = "hmt/scan_poses"
 FINISHED = "hmt/finished"
 ROBOT_STATUS = "hmt/robot_status"
-SAVE_REQUEST, SAVE_RESPONSE = "hmt/save", "hmt/saved"
-RESET_REQUEST, RESET_RESPONSE = "hmt/begin", "hmt/begun"
+SAVE_REQUEST, SAVE_RESPONSE = "hmt/save_request", "hmt/save_response"
+RESET_REQUEST, RESET_RESPONSE = "hmt/reset_request", "hmt/reset_response"
 COST = "hmt/cost"
 HMT_POSE, POSE = "hmt/pose", "pose"
 MAP, GRAPH, PARTICLES, PMF = "map", "hmt/graph", "hmt/particles", "hmt/pmf"
@@ -84,8 +84,8 @@ DIAGNOSTICS = "diagnostics"
 DOCUMENTS: dict[type, str] = {
     AreaEvents: "hmt/area_events",
     Hypotheses: "hmt/hypotheses",
-    ClosureDecision: "hmt/accepted",
-    LocalEstimate: "hmt/local_pose",
-    TrackingReset: "hmt/arriving",
+    ClosureDecision: "hmt/closure_decisions",
+    LocalEstimate: "hmt/local_estimate",
+    TrackingReset: "hmt/tracking_reset",
     Notice: "hmt/notices",
 }

@@ -219,7 +219,7 @@ class ViewNode(Node):
         self.board.put("replay", told)
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
-        for status in message.robot_status:
+        for status in message.status:
             if status.hardware_id == "hmt_slam_ros":
                 values = {entry.key: entry.value for entry in status.values}
                 name, level = status.name.rsplit("/", 1)[-1], int.from_bytes(status.level, "little")

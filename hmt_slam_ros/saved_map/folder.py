@@ -26,7 +26,7 @@ from hmt_slam_ros.saved_map.arrays import ArrayReader, ArrayWriter
 from hmt_slam_ros.saved_map.scans import ScanReader, ScanTable, ScanWriter
 from hmt_slam_ros.sensors import Scan
 
-FORMAT, VERSION = "hmt_map", 17
+FORMAT, VERSION = "hmt_map", 18
 
 HMT_MAP = "hmt_map"
 """The folder in an output folder."""

@@ -60,8 +60,8 @@ def _event_entry(head: KeyframeHeader, answer: Hypotheses) -> dict[str, Any]:
     return {
         "event": head.sequence,
         "time": round(head.scan.stamp / _SECOND, 3),
-        "way": round(head.path_length, 2),
-        "leaves": [[leaf.id, leaf.area, round(leaf.probability, 5), leaf.lost] for leaf in leaves],
+        "path_length": round(head.path_length, 2),
+        "hypotheses": [[leaf.id, leaf.area, round(leaf.probability, 5), leaf.lost] for leaf in leaves],
         "live": len(answer.hypotheses),
     }
 

@@ -239,7 +239,7 @@ export function drawCourse(canvas, events) {
   events.forEach((event, k) => {
     let top = height;
     // By number, so that the band of a hypothesis stays where it is.
-    for (const [hypothesis, , probability] of [...event.leaves].sort((one, other) => one[0] - other[0])) {
+    for (const [hypothesis, , probability] of [...event.hypotheses].sort((one, other) => one[0] - other[0])) {
       const size = probability * height;
       context.fillStyle = colour(hypothesis);
       context.fillRect(at(k), top - size, Math.max(at(k + 1) - at(k), 1), size);

@@ -126,9 +126,9 @@ function tellHypotheses() {
     $("bars").replaceChildren();
     return;
   }
-  text($("live"), `${event.live} live after ${event.way.toFixed(0)} m`);
-  const seen = event.leaves.reduce((sum, leaf) => sum + leaf[2], 0);
-  const rows = event.leaves.map(([hypothesis, area, probability, lost]) =>
+  text($("live"), `${event.live} live after ${event.path_length.toFixed(0)} m`);
+  const seen = event.hypotheses.reduce((sum, leaf) => sum + leaf[2], 0);
+  const rows = event.hypotheses.map(([hypothesis, area, probability, lost]) =>
     bar(lost ? "Anywhere" : `Area ${area}`, `#${hypothesis}`, probability, colour(hypothesis)));
   if (seen < 0.995) rows.push(bar("Not examined", "", 1 - seen, themed("--line")));
   $("bars").replaceChildren(...rows);
