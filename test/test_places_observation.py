@@ -150,7 +150,7 @@ def product(observed, expected, pairs, away, model):
     value = 1.0
     for i in range(len(expected.tracks)):
         seen = expected.probabilities[i] * model.detection
-        place, variance = expected.along[i] - away, expected.variances[i, 0] + model.along
+        place, variance = expected.position_variance[i] - away, expected.variances[i, 0] + model.position_variance
         scale = math.sqrt(2.0 * variance)
         low, high = -model.reach, model.reach
         if expected.tracks[i] == 2:
@@ -160,16 +160,16 @@ def product(observed, expected, pairs, away, model):
             value *= 1.0 - seen * within
             continue
         j = pairs[i]
-        if observed.tracks[j] != expected.tracks[i] or not low <= observed.along[j] <= high:
+        if observed.tracks[j] != expected.tracks[i] or not low <= observed.positions[j] <= high:
             return 0.0
         corner = expected.tracks[i] < OPENINGS
-        form_variance = expected.variances[i, 1] + observed.variances[j, 1] + (model.heading if corner else model.width)
+        form_variance = expected.variances[i, 1] + observed.variances[j, 1] + (model.heading_variance if corner else model.width_variance)
         off = observed.forms[j] - expected.forms[i]
         off = math.remainder(off, 2.0 * math.pi) if corner else off
         p = observed.probabilities[j]
-        false, there = model.false * (1.0 - p) / (1.0 - model.true_share), p / model.true_share
-        extra = (model.corner_form if corner else model.opening_form) * (false + model.new * there)
-        g = density(observed.along[j] - place, variance + observed.variances[j, 0]) * density(off, form_variance)
+        false, there = model.false_density * (1.0 - p) / (1.0 - model.true_share), p / model.true_share
+        extra = (model.corner_form if corner else model.opening_form) * (false + model.new_density * there)
+        g = density(observed.positions[j] - place, variance + observed.variances[j, 0]) * density(off, form_variance)
         value *= seen * g * there / extra
     return value
 
@@ -206,7 +206,7 @@ def mean_ratio(expected, model, draws=12000, variance=0.0, seed=1):
     state = one_state(expected)
     ratios = np.exp(
         [
-            log_observation_ratios(drawn_anywhere(random, model.new, model.false, model), state, 0.0, variance, model)[
+            log_observation_ratios(drawn_anywhere(random, model.new_density, model.false_density, model), state, 0.0, variance, model)[
                 0
             ]
             for _ in range(draws)
