@@ -56,7 +56,11 @@ def test_steps_and_what_they_add_up_to_are_as_far_off_as_they_say(walls, truth):
         poses, steps = driven(walls, truth, seed)
         of_drift.append(squared(drift(poses, steps), se2.between(truth[0], truth[-1])))
         for k, step in enumerate(steps):
-            of_steps.append(squared(PoseGaussian(step.increment, step.match_error.pose_covariance), se2.between(truth[k], truth[k + 1])))
+            of_steps.append(
+                squared(
+                    PoseGaussian(step.increment, step.match_error.pose_covariance), se2.between(truth[k], truth[k + 1])
+                )
+            )
     # 3 where all is right; of the drift there are only twelve.
     assert 1.0 < np.mean(of_steps) < 4.5
     assert 1.0 < np.mean(of_drift) < 6.0

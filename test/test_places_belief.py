@@ -107,7 +107,9 @@ def transition(graph, places, action):
             off = np.array(action[:2]) - graph.transitions.means[k]
             off[1] = math.remainder(off[1], 2 * math.pi)
             density = np.exp(-0.5 * off**2 / variance) / np.sqrt(2 * math.pi * variance)
-            table[s, graph.transitions.targets[k]] += (1 - places.slip) * graph.transitions.probabilities[k] * density.prod()
+            table[s, graph.transitions.targets[k]] += (
+                (1 - places.slip) * graph.transitions.probabilities[k] * density.prod()
+            )
             rest -= graph.transitions.probabilities[k]
         table[s, n] += (1 - places.slip) * rest * usual
     return table
@@ -261,7 +263,9 @@ def drawn_seen(random, graph, state):
     if state == graph.state_count:
         return drawn_anywhere(random, MODEL.usual_density, MODEL.false_density, MODEL)
     own = slice(*graph.expected_landmarks.starts[state : state + 2])
-    return drawn_observation(random, LandmarkSequence(*(f[own] for f in graph.expected_landmarks.landmarks)), 0.0, 0.01, MODEL)
+    return drawn_observation(
+        random, LandmarkSequence(*(f[own] for f in graph.expected_landmarks.landmarks)), 0.0, 0.01, MODEL
+    )
 
 
 def test_beliefs_about_robots_of_the_model_are_calibrated():

@@ -74,8 +74,8 @@ def test_a_hallway_that_the_map_holds_twice_is_a_loop_as_it_truly_lies(twice):
     hybrid_map, scans = twice
     loop = map_loops(scans).newest_loop(hybrid_map)
     assert loop is not None
-    assert (loop.area, loop.begin, loop.other in (0, 1)) == (3, 3, True)
-    off = se2.log(se2.between(loop.pose.mean, se2.between(THIRD, AREAS[loop.other])))
+    assert (loop.area, loop.first_area, loop.other_area in (0, 1)) == (3, 3, True)
+    off = se2.log(se2.between(loop.pose.mean, se2.between(THIRD, AREAS[loop.other_area])))
     assert math.hypot(off[0], off[1]) < 0.2
     assert abs(off[2]) < math.radians(2.0)
     assert off @ np.linalg.solve(loop.pose.covariance, off) < 16.3  # chi-square, 99.9 %

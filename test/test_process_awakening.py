@@ -91,10 +91,10 @@ def test_in_the_map_of_the_first_half_it_wakes_up_in_the_second_near_keyframes_o
     log, whole = maps["first half"], maps["whole"]
     scans = Replica.from_state(log.state.tsbi.replica).scans.values()
     stamps = {log.records[scan].measurement.stamp: n for n, scan in enumerate(log.scans)}
-    known = np.array([log.true_pose[stamps[scan.stamp], :2] for scan in scans])
+    known = np.array([log.truth[stamps[scan.stamp], :2] for scan in scans])
     assert max(stamps[scan.stamp] for scan in scans) < min(log.starts)
-    assert all(np.hypot(*(known - log.true_pose[start, :2]).T).min() < 2.1 for start in log.starts)
-    assert np.hypot(*(log.true_pose - whole.true_pose)[:, :2].T).max() < 0.5
+    assert all(np.hypot(*(known - log.truth[start, :2]).T).min() < 2.1 for start in log.starts)
+    assert np.hypot(*(log.truth - whole.truth)[:, :2].T).max() < 0.5
 
 
 def test_it_is_not_believed_to_be_where_one_look_alone_finds_it(office, begin, monkeypatch):
@@ -111,9 +111,9 @@ def test_it_is_not_believed_to_be_where_one_look_alone_finds_it(office, begin, m
         ]
         return looks[-1]._replace(candidates=tuple(moved))
 
-    monkeypatch.setattr(ClosureSearch, "everywhere", off_at_times)
+    monkeypatch.setattr(ClosureSearch, "localize_globally", off_at_times)
     run = carried(office, office.records[begin:], 150)
-    (leaf,) = run.recorder.hypotheses[max(run.recorder.hypotheses)].leaves
+    (leaf,) = run.recorder.hypotheses[max(run.recorder.hypotheses)].hypotheses
     assert sum(look.best is not None and look.best[1] > 0.9 for look in looks) >= 3
     assert leaf.lost
 

@@ -83,7 +83,12 @@ def test_what_is_forgotten_was_stored_before_and_is_gone_in_every_process(rounds
         assert replica.scans.keys() == state.slam.replica.scans.keys()
     assert not gone & rounds.placed
     for live in state.slam.live_hypotheses.values():
-        assert not gone & {*live.particle_filter.keyframes, *live.keyframe_covariances.to_dict(), *live.step_covariances.to_dict(), live.anchor}
+        assert not gone & {
+            *live.particle_filter.keyframes,
+            *live.keyframe_covariances.to_dict(),
+            *live.step_covariances.to_dict(),
+            live.anchor,
+        }
     assert not gone & {keyframe for graph in state.aam.graphs for keyframe in graph.keyframes}
 
 

@@ -299,7 +299,7 @@ def test_tsbi_goes_on_with_the_explanations_as_live_hypotheses():
         Hypothesis(0, 0, 0.7, 0, back, moved, (), removed_arcs=(ArcEnds(0, 1),)),
         Hypothesis(0, 0, 0.3, 1, None, (), (Arc(0, 1, link, closure=True),)),
     )
-    run.accept(0, reopened=explanations)
+    run.accept(0, revised_hypotheses=explanations)
     one, two = run.keyframe(ring_drive(9)[8]).hypotheses
     assert (one.parent, two.parent, one.id == two.id) == (0, 0, False)
     assert (one.probability, two.probability) == pytest.approx((0.7, 0.3))

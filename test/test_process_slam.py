@@ -41,7 +41,8 @@ def drive(count, start=0):
 def agree(keyframe):
     """The answer that changes nothing."""
     leaves = tuple(
-        Hypothesis(leaf.hypothesis, leaf.hypothesis, 1.0 / len(keyframe.estimates), leaf.area) for leaf in keyframe.estimates
+        Hypothesis(leaf.hypothesis, leaf.hypothesis, 1.0 / len(keyframe.estimates), leaf.area)
+        for leaf in keyframe.estimates
     )
     return [Hypotheses(keyframe.sequence, leaves), ClosureDecision(keyframe.sequence)]
 

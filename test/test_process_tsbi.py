@@ -219,9 +219,9 @@ def test_what_was_seen_just_before_is_no_known_ground():
 
 def test_acceptance_leaves_one_hypothesis():
     run = ring_with_two_leaves()
-    run.apply_decision(2)
-    (leaf,) = run.keyframe(run.true_pose).leaves
-    assert (leaf.hypothesis, leaf.parent, leaf.probability) == (2, 2, 1.0)
+    run.accept(2)
+    (leaf,) = run.keyframe(run.true_pose).hypotheses
+    assert (leaf.id, leaf.parent, leaf.probability) == (2, 2, 1.0)
 
 
 def test_the_local_map_takes_the_poses_of_the_global_map_where_they_agree():

@@ -168,7 +168,9 @@ def test_whether_the_robot_is_in_known_ground_now_is_asked_of_the_newest_keyfram
     assert [arc.target for arc in joined.arcs] == [0]
     assert joined.log_weight > stay.log_weight
     parent, branching, newest = approaching((8.7, 8.2, 7.7, 7.2, 6.7, 6.2))
-    parent = replace(parent, state=replace(parent.state, unmatched_keyframes=tuple(newest[-3:]), pending_candidates=(0,)))
+    parent = replace(
+        parent, state=replace(parent.state, unmatched_keyframes=tuple(newest[-3:]), pending_candidates=(0,))
+    )
     (stay,) = branching.recheck(parent, (0,)).children
     assert stay.log_weight == parent.log_weight
     assert (stay.state.unmatched_keyframes, stay.state.pending_candidates) == (tuple(newest[-3:]), (0,))

@@ -64,9 +64,9 @@ def test_the_arc_that_closes_the_ring_is_precise(ring):
 def test_two_runs_say_the_same_to_the_bit(ring):
     run, _ = ring
     again, _ = around_the_ring()
-    for a, b in zip(run.answers, again.histories, strict=True):
-        assert [(x.hypothesis, x.probability, x.area) for x in a.leaves] == [
-            (x.hypothesis, x.probability, x.area) for x in b.leaves
+    for a, b in zip(run.answers, again.answers, strict=True):
+        assert [(x.id, x.probability, x.area) for x in a.hypotheses] == [
+            (x.id, x.probability, x.area) for x in b.hypotheses
         ]
 
 
