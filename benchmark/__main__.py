@@ -50,6 +50,7 @@ MEASUREMENTS = {
     "scale": "time and memory in maps of up to 100,000 areas",
     "kernels": "CPU time and memory allocations of the inner loops",
     "soak": "memory of nodes that run for an hour, and what they leave behind",
+    "structure": "how large the package is, and how many files one scan, one keyframe and one closure pass",
     "identity": "byte-for-byte identity of results with those on record",
     "short": "accuracy against benchmark/expected.toml, for CI",
 }

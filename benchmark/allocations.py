@@ -14,7 +14,16 @@ from numba.core.runtime import _nrt_python, rtsys
 
 from benchmark.report import Requirement, table
 
-PACKAGES = ("geometry", "sensing", "local_map")
+PACKAGES = (
+    "geometry",
+    "sensors",
+    "grids",
+    "registration.scan_to_map",
+    "registration.dynamic_rejection",
+    "registration.correlative_search",
+    "registration.match_covariance",
+    "submap",
+)
 """Whose kernels run for every scan, for every particle and for every beam."""
 
 ARRAYS = {
@@ -23,15 +32,18 @@ ARRAYS = {
     "geometry.covariance.inverse_pose_covariance": (2, "the result, half of the product"),
     "geometry.covariance.rotate_covariance": (2, "the result, half of the product"),
     "geometry.se2._compose_each": (1, "the results"),
-    "sensing.scan._ends": (1, "the result"),
-    "sensing.scan._with_return": (1, "the result"),
-    "sensing.surfels.surfels": (6, "the result, the same with shadows, which those are, beams, ranges, running sums"),
-    "local_map.batch.propose_all": (4, "the results for all particles"),
-    "local_map.insertion.in_cells": (1, "the results for all particles"),
-    "local_map.local_mapping._cut_off": (7, "the results, distances and what leads to them"),
-    "local_map.matching.align": (2, "the results"),
-    "local_map.movers.standing": (9, "the result, what each thing tells, those in doubt"),
-    "local_map.search.correlative_search": (5, "the result, scores, a pose, the cells of the points"),
+    "sensors.scan._beam_ends": (1, "the result"),
+    "sensors.scan._valid_mask": (1, "the result"),
+    "sensors.surfels.extract_surfels": (
+        6,
+        "the result, the same with shadows, which those are, beams, ranges, running sums",
+    ),
+    "registration.scan_to_map.propose_all": (4, "the results for all particles"),
+    "grids.insertion.cell_coordinates": (1, "the results for all particles"),
+    "submap.local_mapping._split_at_range": (7, "the results, distances and what leads to them"),
+    "registration.scan_to_map.align": (2, "the results"),
+    "registration.dynamic_rejection.reject_dynamic": (9, "the result, what each thing tells, those in doubt"),
+    "registration.correlative_search.correlative_search": (5, "the result, scores, a pose, the cells of the points"),
 }
 """{kernel: (arrays that a call makes at most, what they are)}; all others make none."""
 

@@ -73,8 +73,8 @@ def mapped(kind: str, seed: int, laser: str, configuration: Configuration) -> Ma
             votes[line] += votes.pop(part)
         if number % _EVERY == _EVERY - 1:
             poses.append(_judged_pose(room, se2.between(start, scenario.poses[number * scenario.settings.readings])))
-    strays = sum(votes[known.name].most_common(1)[0][0] < 0 for known in room.walls)
-    stored = sum(8 + 8 * len(wall.pieces) for wall in room.walls)
+    strays = sum(votes[known.number].most_common(1)[0][0] < 0 for known in room.walls)
+    stored = sum(8 + 8 * len(wall.segments) for wall in room.walls)
     size = room.mean.size
     sizes = stored, stored + 4 * (size * (size + 1) // 2)
     pose_nees, sigmas, errors = (np.array(column) for column in zip(*poses, strict=True))

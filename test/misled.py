@@ -38,7 +38,7 @@ def misled(area, known, deviations):
             values, vectors = np.linalg.eigh(belief.covariance)
             wrong = se2.compose(belief.mean, se2.exp(deviations * np.sqrt(values[-1]) * vectors[:, -1]))
             arc = Arc(area, known, PoseGaussian(wrong, SIGMA), closure=True)
-            notes = parent.notes.checked((), ())
+            notes = parent.state.after_matching((), ())
             return Branches(
                 [Child(parent.hypothesis, parent.log_weight, area, notes, arcs=(arc,), reload_local_map=True)]
             )

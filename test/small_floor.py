@@ -57,7 +57,7 @@ def charted(crossing_driven=True, again=()):
     rng = np.random.default_rng(2)
     for x, barred in again:
         keyframe, area, pose = len(scans), int(x > 8.0), np.array([x, 0.1, 0.0])
-        hybrid_map.place(keyframe, area, se2.between(AREAS[area], pose))
+        hybrid_map.set_keyframe(keyframe, area, se2.between(AREAS[area], pose))
         scans[keyframe] = seen_at(pose, rng, barred)
     views = AreaViewCache(LocalMapping(CONFIGURATION), scans).views_of_map(hybrid_map)
     return build_chart(hybrid_map, views, CONFIGURATION.features), hybrid_map, views

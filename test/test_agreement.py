@@ -21,14 +21,14 @@ def grid(walls, poses, seed):
 @pytest.mark.parametrize("usual", [0.001, MAPS_OUTLIER_RATE, 0.03, 0.1])
 @pytest.mark.parametrize("samples", [100, 400])
 def test_the_ratio_falls_with_every_contradiction(model, usual, samples):
-    found = [model.log_ratio(Agreement(samples, samples - free, free), usual) for free in range(samples + 1)]
+    found = [model.log_likelihood_ratio(Agreement(samples, samples - free, free), usual) for free in range(samples + 1)]
     assert (np.diff(found) < 0.0).all()
     assert found[0] > 0.0 > found[samples // 4]
 
 
 @pytest.mark.parametrize("model", [MAP_IN_MAP, SCAN_IN_SUBMAP])
 def test_what_nothing_is_known_of_tells_nothing(model):
-    assert model.log_ratio(Agreement(300, 0, 0), 0.01) == 0.0
+    assert model.log_likelihood_ratio(Agreement(300, 0, 0), 0.01) == 0.0
 
 
 def test_where_clutter_is_usual_the_same_contradictions_tell_less():
@@ -47,12 +47,12 @@ def test_what_is_usual_is_learnt_in_the_course_of_the_scans():
 def test_a_room_agrees_with_itself_and_a_pillar_that_was_not_there_contradicts():
     known = grid(ROOM, PATH, 0)
     same = known.compare(grid(ROOM, PATH, 50).points, np.zeros(3))
-    assert same.free == 0
-    assert same.share > 0.98
+    assert same.in_free_space == 0
+    assert same.matched_share > 0.98
     pillar = grid(np.concatenate((ROOM, box(1.0, 1.0, 2.0, 2.0))), PATH, 50)
     other = known.compare(pillar.points, np.zeros(3))
-    assert other.free >= 5
-    assert other.share < same.share
+    assert other.in_free_space >= 5
+    assert other.matched_share < same.matched_share
 
 
 def test_points_outside_of_the_map_neither_agree_nor_contradict():

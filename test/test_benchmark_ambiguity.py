@@ -116,7 +116,7 @@ def twins():
 
 def in_room(log, name, x, y, turn=-0.5 * np.pi):
     """A pose by its place in front of a room: ``x`` m to the side of the door, ``y`` m before it."""
-    place = log.scenario.building.places[name]
+    place = log.scenario.building.twin_frames[name]
     return se2.compose(place, np.array([-y, x, turn + 0.5 * np.pi]))
 
 

@@ -57,8 +57,8 @@ def test_every_family_has_a_world_of_a_length_that_is_feasible(family):
 
 def second_lap(truth, keyframes):
     """An event of the second lap and one of the first in the same place."""
-    late = next(k.sequence for k in keyframes if k.travelled > 70.0)
-    early = [k.sequence for k in keyframes if k.travelled < 40.0]
+    late = next(k.sequence for k in keyframes if k.path_length > 70.0)
+    early = [k.sequence for k in keyframes if k.path_length < 40.0]
     distances = [np.hypot(*(truth.poses[k] - truth.poses[late])[:2]) for k in early]
     return early[int(np.argmin(distances))], late
 
@@ -92,7 +92,7 @@ def test_a_claim_is_true_where_the_places_meet_as_it_says(drive):
 
 def test_a_claim_that_joins_what_is_apart_is_false_however_right_its_pose(drive):
     truth, keyframes = drive
-    far = next(k.sequence for k in keyframes if k.travelled > 20.0)
+    far = next(k.sequence for k in keyframes if k.path_length > 20.0)
     claim = claim_with_error(truth, 0, far, (0.0, 0.0, 0.0))
     assert claim.translation == pytest.approx(0.0, abs=1e-9)
     assert not claim.same_place
@@ -103,11 +103,11 @@ def test_a_loop_is_found_where_the_second_lap_begins_and_closed_where_the_map_jo
     truth, keyframes = drive
     loops, separate, joined = Loops(truth), HybridMap(), HybridMap()
     for keyframe in keyframes:
-        area = 0 if keyframe.travelled < 28.0 else 1
+        area = 0 if keyframe.path_length < 28.0 else 1
         for hybrid_map in (separate, joined):
             hybrid_map.set_keyframe(keyframe.sequence, 2 * area, truth.poses[keyframe.sequence])
-        loops.note(keyframe.sequence, keyframe.travelled, separate, 2 * area)
-        if keyframe.travelled > 60.0 and joined.arc(0, 2) is None:
+        loops.note(keyframe.sequence, keyframe.path_length, separate, 2 * area)
+        if keyframe.path_length > 60.0 and joined.arc(0, 2) is None:
             loops.definite(keyframe.sequence, separate, 2)
             assert loops.found[-1].closed_at is None
             joined.set_arc(0, 2, PoseGaussian(np.zeros(3), TIGHT), closure=True)

@@ -60,7 +60,7 @@ def test_a_missing_file_is_one_sentence(tmp_path):
     st.lists(st.integers(-5, 35), min_size=1, max_size=12),
 )
 def test_the_nearest_pose_is_found_in_any_order_as_by_trying_all(stamps, wanted):
-    found = trajectory(stamps).nearest(np.array(wanted, dtype=np.int64))
+    found = trajectory(stamps).nearest_indices(np.array(wanted, dtype=np.int64))
     for index, stamp in zip(found.tolist(), wanted, strict=True):
         best = min(range(len(stamps)), key=lambda k: (abs(stamps[k] - stamp), stamps[k], k))
         assert index == best

@@ -53,7 +53,7 @@ def test_what_is_missed_once_in_ten_visits_stays():
 
 def test_visits_are_counted():
     existence = missed(visited(Existence(0.9), 3), 2)
-    assert (existence.seen, existence.missed) == (4, 2)
+    assert (existence.detections, existence.misses) == (4, 2)
 
 
 def test_one_look_suffices_for_what_is_gone_when_the_robot_comes_back():

@@ -150,8 +150,8 @@ def test_where_a_door_is_follows_from_how_far_its_sightings_are_apart(off, low, 
         believed = np.array([0.8, -0.5, 0.0]) + off * np.array([*rng.normal(size=2), 0.0])
         found.observe(PoseGaussian(believed, stated), *shown(DOOR, np.array([0.8, -0.5, 0.0]), k))
     (door,) = of_kind(found, OPENING)
-    assert door.existence.seen >= 10
-    across = np.sqrt(door.located(scatter_ratio(found.landmarks)).covariance[0, 0])
+    assert door.existence.detections >= 10
+    across = np.sqrt(door.pose_from_scatter(scatter_ratio(found.landmarks)).covariance[0, 0])
     assert low < across < high
     assert np.sqrt(door.pose.covariance[0, 0]) == pytest.approx(0.02, abs=0.002)
 
@@ -161,7 +161,7 @@ def test_errors_of_scans_average_out_those_of_their_places_do_not():
     for k in range(8):
         found.observe(PoseGaussian(np.zeros(3), np.diag([0.02, 0.02, 0.005]) ** 2), *shown(DOOR, PLACES[0], k))
     (door,) = of_kind(found, OPENING)
-    stated = door.located(8.0 * np.eye(3) - door.scatter).covariance
+    stated = door.pose_from_scatter(8.0 * np.eye(3) - door.scatter).covariance
     across, along = np.sqrt(np.diag(stated)[:2] / np.diag(door.pose.covariance)[:2])
     assert across == pytest.approx(1.0, abs=0.02)
     assert along < 0.95
@@ -176,5 +176,5 @@ def test_the_scatter_of_sightings_that_are_vague_in_different_ways_is_one_of_squ
         found.observe(PoseGaussian(np.array([0.8 + x, -0.5 + y, 0.0]), stated), *look)
     for door in of_kind(found, OPENING):
         assert np.linalg.eigvalsh(door.scatter).min() > -1e-9
-        assert np.linalg.eigvalsh(door.located(scatter_ratio(found.landmarks)).covariance).min() > 0.0
-    assert max(door.existence.seen for door in of_kind(found, OPENING)) > 2
+        assert np.linalg.eigvalsh(door.pose_from_scatter(scatter_ratio(found.landmarks)).covariance).min() > 0.0
+    assert max(door.existence.detections for door in of_kind(found, OPENING)) > 2

@@ -139,8 +139,8 @@ def test_pieces_of_one_wall_are_joined_when_their_distance_is_known():
         room.predict(RelativeMotion(np.zeros(3), np.zeros((3, 3))))
     assert len(joined) == 1
     assert joined[0][0] > 0
-    assert [wall.name for wall in room.walls] == [0]
-    np.testing.assert_allclose(room.walls[0].pieces, extents, atol=0.1)
+    assert [wall.number for wall in room.walls] == [0]
+    np.testing.assert_allclose(room.walls[0].segments, extents, atol=0.1)
     assert nees(error_of(room, 0, WALLS[0]), room.line_covariance(0)) < 9.0
 
 
@@ -163,9 +163,9 @@ def test_a_line_that_one_scan_shows_is_forgotten():
     room.observe(observed(np.zeros(3), WALLS))
     for _ in range(FEATURES.min_sightings - 1):
         room.observe(observed(np.zeros(3), WALLS[1:]))
-    assert [wall.name for wall in room.walls] == [1, 2, 3]
+    assert [wall.number for wall in room.walls] == [1, 2, 3]
     room.observe(observed(np.zeros(3), WALLS[:1]))
-    assert [wall.name for wall in room.walls] == [1, 2, 3, 4]
+    assert [wall.number for wall in room.walls] == [1, 2, 3, 4]
     assert room.mean.size == 3 + 2 * 4
 
 
@@ -218,11 +218,11 @@ def test_marks_are_as_far_off_as_the_state_says():
     room, step = LineMap(FEATURES), RelativeMotion(np.array([0.2, 0.0, 0.1]), np.diag([0.05, 0.02, 0.01]) ** 2)
     room.predict(step)
     room.clone_pose()
-    np.testing.assert_array_equal(room.clones.common[0], room.covariance[:3])
+    np.testing.assert_array_equal(room.clones.cross_covariances[0], room.covariance[:3])
     before = room.covariance.copy()
     room.predict(step)
-    np.testing.assert_allclose(room.clones.common[0][2, 2], before[2, 2])
+    np.testing.assert_allclose(room.clones.cross_covariances[0][2, 2], before[2, 2])
     # Its errors turn about where it was: theta moves the robot's x and y.
     lever = room.mean[:2] - room.clones.poses[0, :2]
     turned = before[2, 2] * np.array([-lever[1], lever[0]])
-    np.testing.assert_allclose(room.clones.common[0][2, :2] - before[2, :2], turned)
+    np.testing.assert_allclose(room.clones.cross_covariances[0][2, :2] - before[2, :2], turned)

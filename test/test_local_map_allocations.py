@@ -14,7 +14,12 @@ from hmt_slam_ros.open_log import open_log
 from hmt_slam_ros.registration import scan_to_map
 
 BAG = Path(__file__).resolve().parents[1] / "data" / "malaga_one_loop"
-FREE = {"insertion.insert", "insertion.patches_needed", "matching.evidence", "matching.log_prior"}
+FREE = {
+    "grids.insertion.insert_beams",
+    "grids.insertion.patches_needed",
+    "registration.scan_to_map.laplace_log_evidence",
+    "registration.scan_to_map.log_prior",
+}
 
 
 def test_mapping_takes_no_memory_but_for_the_arrays_that_kernels_are_said_to_make():
@@ -23,8 +28,8 @@ def test_mapping_takes_no_memory_but_for_the_arrays_that_kernels_are_said_to_mak
     with counted() as counts:
         run_log(log, Configuration())
     called = {kernel for kernel, taken in counts.items() if taken}
-    assert called >= {f"local_map.{kernel}" for kernel in FREE} | {"local_map.batch.propose_all"}
-    assert not ARRAYS.keys() & {f"local_map.{kernel}" for kernel in FREE}
+    assert called >= {kernel for kernel in FREE} | {"registration.scan_to_map.propose_all"}
+    assert not ARRAYS.keys() & {kernel for kernel in FREE}
     assert not [requirement.row for requirement in requirements_on(counts) if not requirement.met]
 
 
@@ -49,7 +54,7 @@ def test_proposals_take_their_results_alone_for_any_number_of_particles_and_beam
     scan_to_map.propose_all(*arguments)
     with counted() as counts:
         scan_to_map.propose_all(*arguments)
-    assert counts["local_map.batch.propose_all"] == [4]
+    assert counts["registration.scan_to_map.propose_all"] == [4]
 
 
 def test_a_kernel_that_takes_memory_is_found_out(monkeypatch):
@@ -64,6 +69,6 @@ def test_a_kernel_that_takes_memory_is_found_out(monkeypatch):
     log_prior(np.ones(3), prior)
     with counted() as counts:
         assert scan_to_map.log_prior(np.ones(3), prior) == -1.5
-    assert counts["local_map.matching.log_prior"] == [2]
+    assert counts["registration.scan_to_map.log_prior"] == [2]
     assert [requirement.met for requirement in requirements_on(counts)] == [False]
     assert scan_to_map.log_prior is log_prior

@@ -145,7 +145,7 @@ def test_the_motion_of_a_step_is_that_of_one_particle_also_where_the_lead_change
     area_filter.track(PreparedScan(area_filter.mapping, blank_scan()), predicted(STEP))
     step = area_filter.update(PreparedScan(area_filter.mapping, blank_scan()), 50)
     assert step.keyframes_moved
-    np.testing.assert_allclose(step.moved, STEP, atol=1e-9)
+    np.testing.assert_allclose(step.increment, STEP, atol=1e-9)
 
 
 def test_effective_samples_equal_the_particles_where_all_weigh_the_same():
@@ -222,4 +222,4 @@ def test_when_keyframes_move_the_map_is_built_anew_and_the_robot_stays_where_it_
     np.testing.assert_allclose(area_filter.leading_keyframe_poses(), poses)
     np.testing.assert_allclose(se2.between(poses[anchor], area_filter.poses), seen, atol=1e-9)
     points = area_filter.mapping.matching_surfels(scans[2])
-    assert matched_fraction(points, poses[anchor], area_filter._leading_view(), area_filter.mapping.near) > 0.9
+    assert matched_fraction(points, poses[anchor], area_filter._leading_view(), area_filter.mapping.hit_distance) > 0.9

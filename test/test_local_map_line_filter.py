@@ -136,9 +136,7 @@ def test_walls_are_met_where_the_robot_is_and_passed_where_it_is_not(mapping):
     assert found.walls.on_surface > 30
     elsewhere = own.compare_scan(PreparedScan(mapping, scan_in(box(-9.0, -9.0, 12.0, 9.0), np.zeros(3), noise=0.01)))
     assert elsewhere.walls.in_free_space > 30
-    assert (
-        WALLS_OF_SUBMAP.log_likelihood_ratio(elsewhere.wall_outliers, own.clutter_estimate.wall_outliers.rate) < -10.0
-    )
+    assert WALLS_OF_SUBMAP.log_likelihood_ratio(elsewhere.walls, own.clutter_estimate.wall_outliers.rate) < -10.0
 
 
 def test_keyframes_are_dropped_and_what_was_known_is_forgotten(mapping):

@@ -40,7 +40,7 @@ def drift(poses, steps):
     covariance = np.zeros((3, 3))
     for k, step in enumerate(steps):
         ad = se2.adjoint(se2.between(poses[k + 1], poses[k]))
-        covariance = ad @ covariance @ ad.T + step.error.lasting
+        covariance = ad @ covariance @ ad.T + step.match_error.drift_covariance
     return PoseGaussian(se2.between(poses[0], poses[-1]), covariance)
 
 
@@ -56,7 +56,11 @@ def test_steps_and_what_they_add_up_to_are_as_far_off_as_they_say(walls, truth):
         poses, steps = driven(walls, truth, seed)
         of_drift.append(squared(drift(poses, steps), se2.between(truth[0], truth[-1])))
         for k, step in enumerate(steps):
-            of_steps.append(squared(PoseGaussian(step.moved, step.error.matched), se2.between(truth[k], truth[k + 1])))
+            of_steps.append(
+                squared(
+                    PoseGaussian(step.increment, step.match_error.pose_covariance), se2.between(truth[k], truth[k + 1])
+                )
+            )
     # 3 where all is right; of the drift there are only twelve.
     assert 1.0 < np.mean(of_steps) < 4.5
     assert 1.0 < np.mean(of_drift) < 6.0
@@ -66,9 +70,9 @@ def test_along_a_bare_corridor_the_drift_is_that_of_odometry_and_across_it_the_m
     poses, steps = driven(CORRIDOR, ALONG, 0)
     deviations = np.sqrt(np.diag(drift(poses, steps).covariance))
     assert deviations[0] == pytest.approx(np.sqrt(len(steps) * ODOMETRY[0, 0]), rel=0.1)
-    assert np.sqrt(steps[-1].error.lasting[1, 1]) < 0.2 * np.sqrt(ODOMETRY[1, 1])
-    assert steps[-1].error.gain[0, 0] < 0.1
-    assert steps[-1].error.gain[1, 1] > 0.9
+    assert np.sqrt(steps[-1].match_error.drift_covariance[1, 1]) < 0.2 * np.sqrt(ODOMETRY[1, 1])
+    assert steps[-1].match_error.gain[0, 0] < 0.1
+    assert steps[-1].match_error.gain[1, 1] > 0.9
 
 
 def error_of(points, block=0.0):
@@ -92,7 +96,7 @@ def error_of(points, block=0.0):
 def test_beams_that_err_together_make_a_match_less_certain():
     points = LocalMapping(Configuration()).matching_surfels(scan_in(two_rooms(), (2.0, 2.0, 0.3)))
     as_seen, misled = error_of(points), error_of(points, block=0.1)
-    assert np.trace(misled.matched) > 1.5 * np.trace(as_seen.matched)
+    assert np.trace(misled.pose_covariance) > 1.5 * np.trace(as_seen.pose_covariance)
     np.testing.assert_array_equal(misled.gain, as_seen.gain)
 
 

@@ -43,7 +43,7 @@ def test_in_a_corridor_the_robot_goes_where_odometry_leads_and_not_with_a_person
         scan = scan_in(np.concatenate((CORRIDOR, person(3.0 + pace * k))), truth, beams=361, noise=0.01, seed=k)
         sighting = PreparedScan(mapping, scan)
         tracked = area_filter.track(sighting, predicted(step))
-        assert not tracked.contradicted
+        assert not tracked.contradicts_odometry
         if k % 4 == 0:
             area_filter.update(sighting, k)
             area_filter.add_keyframe(k, scan)

@@ -93,7 +93,7 @@ def test_odds_follow_from_the_cells_that_beams_pass_and_in_which_they_end(pool):
 
 @given(st.integers(1, 2**32 - 1))
 def test_the_lowest_bit_of_a_word_is_found(word):
-    assert lowest_bit(np.uint32(word)) == f"{word:b}"[::-1].index("1")
+    assert lowest(np.uint32(word)) == f"{word:b}"[::-1].index("1")
 
 
 def test_a_wall_is_occupied_the_room_is_free_and_what_lies_behind_is_unknown(pool):

@@ -29,54 +29,54 @@ def mapped():
 def counted(area_filter, walls, pose=HERE, laser_pose=(0.0, 0.0, 0.0)):
     scan = scan_in(walls, pose, noise=0.01, seed=9, laser_pose=laser_pose, **ALL_ROUND)
     found = area_filter.compare_scan(PreparedScan(area_filter.mapping, scan)).walls
-    return found, WALLS_OF_SUBMAP.log_likelihood_ratio(found, area_filter.clutter_estimate.walls.share)
+    return found, WALLS_OF_SUBMAP.log_likelihood_ratio(found, area_filter.clutter_estimate.wall_outliers.rate)
 
 
 @pytest.mark.parametrize("laser_pose", [(0.0, 0.0, 0.0), (0.4, -0.3, 1.0)], ids=["amid", "mounted aside"])
 def test_where_it_was_mapped_walls_are_met_and_none_is_passed(mapped, laser_pose):
     found, log_ratio = counted(mapped, ROOM, laser_pose=laser_pose)
-    assert found.on > 80  # of 24 m of walls, a sample every 0.2 m
-    assert found.free == 0
+    assert found.on_surface > 80  # of 24 m of walls, a sample every 0.2 m
+    assert found.in_free_space == 0
     assert log_ratio > 1.0
 
 
 def test_people_in_the_way_pass_no_wall(mapped):
     people = np.concatenate([ROOM, *(box(x, y, x + 0.4, y + 0.4) for x, y in ((1.0, 0.5), (-1.5, -1.2), (2.0, -1.0)))])
     found, log_ratio = counted(mapped, people)
-    assert found.free == 0
+    assert found.in_free_space == 0
     assert log_ratio > 0.5
 
 
 def test_from_elsewhere_walls_are_passed(mapped):
     found, log_ratio = counted(mapped, box(-2.0, -5.0, 3.0, 4.0))
-    assert found.free > 30  # 8 m of each long wall, of which the corners are too near to the beams' ends
+    assert found.in_free_space > 30  # 8 m of each long wall, of which the corners are too near to the beams' ends
     assert log_ratio < -10.0
 
 
 def test_a_door_that_was_opened_is_little(mapped):
     doorway = np.array([[-3.0, 2.0, 0.0, 2.0], [0.9, 2.0, 5.0, 2.0]])
     found, log_ratio = counted(mapped, np.concatenate((ROOM[[0, 1, 3]], doorway, box(-1.0, 2.1, 2.0, 6.0)[1:])))
-    assert 2 <= found.free <= 5
+    assert 2 <= found.in_free_space <= 5
     assert -4.0 < log_ratio < 0.0
 
 
 @pytest.mark.parametrize("shift", [(0.03, -0.03, 0.0), (0.0, 0.05, 0.01), (0.1, 0.0, -0.01)])
 def test_a_pose_that_is_a_little_off_passes_no_wall(mapped, shift):
-    assert counted(mapped, ROOM, pose=np.array(shift))[0].free == 0
+    assert counted(mapped, ROOM, pose=np.array(shift))[0].in_free_space == 0
 
 
 def test_unknown_ground_tells_nothing():
     area_filter = ParticleFilter(LocalMapping(Configuration()), 0, area=0)
     found, log_ratio = counted(area_filter, ROOM)
-    assert (found.on, found.free, log_ratio) == (0, 0, 0.0)
+    assert (found.on_surface, found.in_free_space, log_ratio) == (0, 0, 0.0)
 
 
 def test_doubt_is_what_ends_in_free_space_and_what_is_passed_less_what_is_usual(mapped):
     scan = scan_in(box(-2.0, -5.0, 3.0, 4.0), HERE, noise=0.01, seed=9, **ALL_ROUND)
-    found = mapped.compared(PreparedScan(mapped.mapping, scan))
-    first = mapped.clutter_estimate.judge(found)
+    found = mapped.compare_scan(PreparedScan(mapped.mapping, scan))
+    first = mapped.clutter_estimate.evaluate(found)
     assert first.log_evidence < -1.0  # the short walls stand in what was free
-    assert first.doubt > 10.0 - first.log_evidence
-    again = mapped.clutter_estimate.after(found).judge(found)
+    assert first.log_kidnapping_ratio > 10.0 - first.log_evidence
+    again = mapped.clutter_estimate.update(found).evaluate(found)
     assert first.log_evidence < again.log_evidence < 0.0
-    assert 0.0 < again.doubt < first.doubt
+    assert 0.0 < again.log_kidnapping_ratio < first.log_kidnapping_ratio

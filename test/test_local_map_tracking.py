@@ -58,14 +58,14 @@ def test_a_heading_slip_is_found_and_told(mapping, slip):
     distance, angle = error_of(area_filter.pose, truth)
     assert distance < 0.05
     assert angle < 1.0
-    assert tracked.contradicted
+    assert tracked.contradicts_odometry
 
 
 def test_odometry_that_the_scan_confirms_is_not_doubted(mapping):
     area_filter = mapped(mapping, ROOM, [(0, 0, 0)])
     truth = np.array([0.3, 0.1, 0.2])
     tracked = track(area_filter, ROOM, truth, RelativeMotion(truth + np.array([0.02, -0.02, 0.01]), SURE))
-    assert not tracked.contradicted
+    assert not tracked.contradicts_odometry
     np.testing.assert_allclose(area_filter.pose, truth, atol=0.02)
 
 
@@ -88,7 +88,7 @@ def test_in_a_corridor_that_looks_the_same_all_along_odometry_tells_how_far(mapp
         scan.ranges[60:120] = 0.9
         sighting = PreparedScan(mapping, scan)
         tracked = area_filter.track(sighting, predicted(RelativeMotion(np.array([0.3, 0.0, 0.0]), SURE)))
-        assert not tracked.contradicted
+        assert not tracked.contradicts_odometry
     assert area_filter.pose[0] == pytest.approx(3.0, abs=0.1)
 
 
@@ -100,7 +100,7 @@ def test_a_scan_that_shows_nothing_of_the_map_is_placed_by_odometry(mapping):
     tracked = area_filter.track(sighting, predicted(RelativeMotion(np.array([0.3, 0.0, 0.1]), SURE)))
     np.testing.assert_allclose(area_filter.pose, [40.3, 0.0, 0.1], atol=1e-6)
     np.testing.assert_allclose(tracked.information, 0.0, atol=1e-9)
-    assert not tracked.contradicted
+    assert not tracked.contradicts_odometry
     # Nothing proves odometry: with a probability of 1 % it is wrong.
     wider = np.diag(area_filter._motion_since_update.covariance - SURE)
     assert (wider[:2] >= 0.01 * np.diag(VAGUE)[:2]).all()
@@ -113,7 +113,7 @@ def test_without_odometry_the_scan_is_searched_for_around_what_the_velocity_pred
     distance, angle = error_of(area_filter.pose, truth)
     assert distance < 0.05
     assert angle < 1.0
-    assert not tracked.contradicted
+    assert not tracked.contradicts_odometry
 
 
 def test_a_certain_prediction_stands_where_there_is_nothing_to_match(mapping):
@@ -176,4 +176,4 @@ def test_a_turn_that_odometry_missed_in_a_pause_is_found_by_a_scan_that_fits_the
     distance, angle = error_of(area_filter.pose, truth)
     assert distance < 0.1
     assert angle < 2.0
-    assert tracked.contradicted
+    assert tracked.contradicts_odometry

@@ -34,7 +34,7 @@ def test_the_map_is_that_of_one_host(link, domain, start, tmp_path):
         assert listener.stdout.readline() == "listens\n"
         for name in PROCESSES:
             start(name, before=link.on(1), save_to=saved)
-        start("robot", before=link.on(0), log=log, robot__rate=0.0, robot__odometry_listeners=2, robot__patience=60.0)
+        start("robot", before=link.on(0), log=log, robot__rate=0.0, robot__odometry_listeners=2, robot__discovery_timeout=60.0)
         print(listener.communicate()[0])  # shown where the test fails
     assert listener.returncode == 0
     for file in DECIDED:

@@ -50,7 +50,7 @@ def texts(findings, *severities):
 
 
 def test_a_sound_robot_gets_a_clean_bill(listener, doctor, start):
-    parameters = {"robot__rate": 6.0, "robot__paced": False, "robot__scan_listeners": 0, "robot__odometry_listeners": 0}
+    parameters = {"robot__rate": 6.0, "robot__flow_control": False, "robot__scan_listeners": 0, "robot__odometry_listeners": 0}
     scans = listener.hear(LaserScan, "scan", BEST_EFFORT)
     robot = start("robot", log=WORLD, **parameters)
     listener.until(lambda: scans, alive=[robot])

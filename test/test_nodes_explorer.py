@@ -42,7 +42,7 @@ def system(tmp_path, start):
             robot__drive="commands",
             robot__rate=3.0,
             robot__scan_listeners=2,
-            robot__patience=60.0,
+            robot__discovery_timeout=60.0,
         )
         return [*nodes, explorer, robot]
 

@@ -236,7 +236,7 @@ def test_a_laser_falls_silent_a_disk_is_full_and_time_jumps_back(listener, start
     log = corridor_bag(tmp_path, scans=SCANS, silent=silent)
     nodes = Nodes(start, listener, save_to=tmp_path / "map", recovery=tmp_path / "recovery")
     slam = nodes.alive[0]
-    nodes.drive(log, first=0, rate=2.0, robot__paced=False)
+    nodes.drive(log, first=0, rate=2.0, robot__flow_control=False)
     nodes.until(lambda: len(nodes.estimates) == 10)
     nodes.until(lambda: "no scan came for 3 s, while odometry does" in nodes.diagnosis("slam")["last error"])
     nodes.until(lambda: len(nodes.estimates) == SCANS - len(silent))
@@ -284,7 +284,7 @@ def test_a_missing_transform_and_clocks_that_are_apart_are_told_with_the_remedy(
     scans = listener.node.create_publisher(LaserScan, SCAN, topics.SENSOR)
     odom = listener.node.create_publisher(OdometryMessage, "odom", topics.SENSOR)
     static = listener.node.create_publisher(TFMessage, "tf_static", topics.LATCHED)
-    process = start("slam", filter__patience=8)
+    process = start("slam", filter__max_scans_waiting_for_odometry=8)
     listener.until(lambda: scans.get_subscription_count() and odom.get_subscription_count(), alive=[process])
     hour = 3600 * SECOND
     measurements = [record.measurement for record in Corridor(55).records()]

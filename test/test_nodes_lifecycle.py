@@ -28,7 +28,7 @@ NODES = ("slam", "aam", "tsbi", "tlca", "rtl", "robot")
 
 
 def parameters(name, tmp_path):
-    return {"log": corridor_bag(tmp_path), "robot__patience": 3600.0} if name == "robot" else {}
+    return {"log": corridor_bag(tmp_path), "robot__discovery_timeout": 3600.0} if name == "robot" else {}
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=lambda number: number.name)

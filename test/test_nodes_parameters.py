@@ -33,7 +33,7 @@ def make(domain):
 @pytest.fixture
 def robot(tmp_path, listener, start):
     """A robot node that runs as a process of its own, and its services by their last name."""
-    start("robot", log=corridor_bag(tmp_path), robot__patience=3600.0)
+    start("robot", log=corridor_bag(tmp_path), robot__discovery_timeout=3600.0)
     return lambda kind, name, **request: listener.call(kind, f"robot/{name}", kind.Request(**request))
 
 

@@ -65,7 +65,7 @@ def test_it_goes_to_a_room_and_has_slam_begin_at_the_door(mapped, listener, star
         robot__start=in_hallway(world, 9.0),
         robot__scan_listeners=2,
         robot__odometry_listeners=3,
-        robot__patience=60.0,
+        robot__discovery_timeout=60.0,
     )
     listener.until(lambda: len(outcomes) == 2, alive=[pilot, robot, *others])
     assert outcomes[1].data == f"go {room}: the robot is there"

@@ -58,7 +58,7 @@ def ended(heard):
 
 
 def test_every_scan_and_odometry_reading_arrives_as_it_is_in_the_log(tmp_path, listener, start, heard):
-    robot = start("robot", log=corridor_bag(tmp_path), robot__rate=0.0, robot__paced=False)
+    robot = start("robot", log=corridor_bag(tmp_path), robot__rate=0.0, robot__flow_control=False)
     listener.until(lambda: ended(heard)() and len(heard["odom"]) == 45, alive=[robot])
     assert [conversions.stamp_from_time(message.header.stamp) for message in heard["scan"]] == [
         scan.stamp for scan in SCANS
@@ -77,7 +77,7 @@ def test_every_scan_and_odometry_reading_arrives_as_it_is_in_the_log(tmp_path, l
 @pytest.mark.skipif(TFMessage is None, reason="tf2_msgs is not installed: run scripts/test.sh, which builds it")
 def test_the_transforms_come_on_tf_and_tf_static(tmp_path, listener, start, heard):
     moving = heard["tf"]
-    start("robot", log=corridor_bag(tmp_path), robot__rate=0.0, robot__paced=False)
+    start("robot", log=corridor_bag(tmp_path), robot__rate=0.0, robot__flow_control=False)
     listener.until(lambda: len(moving) == 45)
     # The static ones are latched, for those who come later.
     static = listener.hear(TFMessage, "tf_static", topics.TF_STATIC)
@@ -93,7 +93,7 @@ def test_the_transforms_come_on_tf_and_tf_static(tmp_path, listener, start, hear
 
 
 def test_a_replay_in_real_time_takes_its_time(tmp_path, listener, start, heard):
-    start("robot", log=corridor_bag(tmp_path, 21), robot__rate=2.0, robot__paced=False)
+    start("robot", log=corridor_bag(tmp_path, 21), robot__rate=2.0, robot__flow_control=False)
     listener.until(lambda: heard["scan"])
     begin = time.monotonic()
     listener.until(ended(heard))
@@ -101,7 +101,7 @@ def test_a_replay_in_real_time_takes_its_time(tmp_path, listener, start, heard):
 
 
 def test_a_pause_stops_the_robot_and_its_end_lets_it_go_on(tmp_path, listener, start, heard):
-    start("robot", log=corridor_bag(tmp_path, 200), robot__rate=5.0, robot__paced=False)
+    start("robot", log=corridor_bag(tmp_path, 200), robot__rate=5.0, robot__flow_control=False)
     listener.until(lambda: heard["scan"])
     assert listener.call(SetBool, "robot/pause", SetBool.Request(data=True)).success
     listener.spin(0.3)
@@ -115,7 +115,7 @@ def test_a_pause_stops_the_robot_and_its_end_lets_it_go_on(tmp_path, listener, s
 
 def test_a_paced_robot_waits_for_the_acknowledgement(tmp_path, listener, start, heard):
     estimates = listener.node.create_publisher(String, DOCUMENTS[LocalEstimate], topics.CHAIN)
-    start("robot", log=corridor_bag(tmp_path), robot__rate=0.0, robot__window=4, filter__patience=3)
+    start("robot", log=corridor_bag(tmp_path), robot__rate=0.0, robot__max_unacknowledged_scans=4, filter__max_scans_waiting_for_odometry=3)
     listener.until(lambda: len(heard["scan"]) == 4)
     listener.spin(0.5)
     assert len(heard["scan"]) == 4
@@ -133,7 +133,7 @@ def test_a_paced_robot_waits_for_the_acknowledgement(tmp_path, listener, start, 
 def test_the_robot_waits_for_those_who_have_to_hear_it_and_answer(tmp_path, listener, start):
     listener.hear(LaserScan, "scan", topics.SENSOR)  # as a recorder does
     robot = start(
-        "robot", log=corridor_bag(tmp_path), robot__patience=3.0, robot__scan_listeners=1, robot__odometry_listeners=0
+        "robot", log=corridor_bag(tmp_path), robot__discovery_timeout=3.0, robot__scan_listeners=1, robot__odometry_listeners=0
     )
     error = robot.communicate(timeout=40)[1]
     assert robot.returncode == 2
@@ -143,7 +143,7 @@ def test_the_robot_waits_for_those_who_have_to_hear_it_and_answer(tmp_path, list
 
 
 def test_a_log_that_loops_goes_on_from_the_start_with_later_stamps(tmp_path, listener, start, heard):
-    start("robot", log=corridor_bag(tmp_path, 3), robot__rate=0.0, robot__paced=False, robot__loop=True)
+    start("robot", log=corridor_bag(tmp_path, 3), robot__rate=0.0, robot__flow_control=False, robot__loop=True)
     listener.until(lambda: len(heard["scan"]) > 10)
     stamps = [conversions.stamp_from_time(message.header.stamp) for message in heard["scan"]]
     assert all(a < b for a, b in pairwise(stamps))
@@ -152,7 +152,7 @@ def test_a_log_that_loops_goes_on_from_the_start_with_later_stamps(tmp_path, lis
 
 def test_start_and_duration_play_a_part(tmp_path, listener, start, heard):
     start(
-        "robot", log=corridor_bag(tmp_path), robot__rate=0.0, robot__paced=False, robot__start=0.5, robot__duration=1.0
+        "robot", log=corridor_bag(tmp_path), robot__rate=0.0, robot__flow_control=False, robot__start=0.5, robot__duration=1.0
     )
     listener.until(ended(heard))
     stamps = [(conversions.stamp_from_time(message.header.stamp) - START) / 1e9 for message in heard["scan"]]
@@ -163,7 +163,7 @@ def test_everything_but_the_clock_moves_into_a_namespace(tmp_path, listener, sta
     scans = listener.hear(LaserScan, "tower/scan", topics.SENSOR)
     listener.hear(OdometryMessage, "tower/odom", topics.SENSOR)
     times = listener.hear(Clock, "/clock", topics.STREAM)
-    start("robot", "-r", "__ns:=/tower", log=corridor_bag(tmp_path, 3), robot__rate=0.0, robot__paced=False)
+    start("robot", "-r", "__ns:=/tower", log=corridor_bag(tmp_path, 3), robot__rate=0.0, robot__flow_control=False)
     listener.until(lambda: len(scans) == 3)
     listener.until(lambda: times and conversions.stamp_from_time(times[-1].clock) == SCANS[2].stamp)
 
@@ -181,7 +181,7 @@ def test_a_log_that_is_not_there_is_one_sentence(domain, start, log, sentence):
 
 def test_a_simulated_robot_drives_live(listener, start, heard):
     name = "sim:ring,seed=3,people=2"
-    start("robot", log=name, robot__rate=0.0, robot__paced=False, robot__duration=3.0)
+    start("robot", log=name, robot__rate=0.0, robot__flow_control=False, robot__duration=3.0)
     listener.until(ended(heard))
     records = list(open_log(name, duration=3.0).records())
     scans = [record.measurement for record in records if isinstance(record.measurement, Scan)]
@@ -226,7 +226,7 @@ def driver(listener, heard):
 
 
 def start_driven(start, log="sim:institute,seed=3,people=0,beams=90", rate=2.0, **parameters):
-    return start("robot", log=log, robot__drive="commands", robot__rate=rate, robot__paced=False, **parameters)
+    return start("robot", log=log, robot__drive="commands", robot__rate=rate, robot__flow_control=False, **parameters)
 
 
 def test_commands_drive_the_robot_and_silence_stops_it(listener, start, heard, driver):

@@ -26,14 +26,14 @@ def shut_down_while_made():
 class ToldAtTheBeginning(Node):
     """A node that is told to end before it is spun, whether its map is then to be saved or not."""
 
-    def __init__(self, saves_at_end):
+    def __init__(self, save_on_shutdown):
         super().__init__("early")
-        self.saves_at_end = saves_at_end
+        self.save_on_shutdown = save_on_shutdown
 
-    def begin(self):
+    def enter_startup_states(self):
         rclpy.shutdown()
 
-    def depart(self):
+    def discard_recovery(self):
         assert not rclpy.ok()
 
 

@@ -84,7 +84,7 @@ def test_nodes_that_are_halted_and_taken_down_amid_a_drive_come_to_the_same_as_o
 
     nodes.until(lambda: all(said(name) == "unconfigured" for name in NODES))
     assert listener.node.count_subscribers(SCAN) == listener.node.count_publishers(KEYFRAMES) == 0
-    nodes.drive(log, first=0, rate=4.0, robot__patience=120.0)
+    nodes.drive(log, first=0, rate=4.0, robot__discovery_timeout=120.0)
     manager.lead(UP, "configure", "inactive")
     nodes.until(lambda: all(said(name) == "inactive" for name in NODES))
     assert listener.node.count_subscribers(SCAN) == 0

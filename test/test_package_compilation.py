@@ -80,7 +80,7 @@ def test_a_node_says_it_once_and_never_again(tmp_path, listener, start, monkeypa
     for times in (1, 0):
         heard = listener.hear(String, DOCUMENTS[LocalEstimate], CHAIN)
         slam = start("slam")
-        start("robot", log=log, robot__rate=0.0, robot__paced=False)
+        start("robot", log=log, robot__rate=0.0, robot__flow_control=False)
         listener.until(lambda heard=heard: heard, seconds=120.0, alive=[slam])
         slam.send_signal(signal.SIGINT)
         assert slam.communicate(timeout=60.0)[1].count("compiling kernels") == times

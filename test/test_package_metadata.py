@@ -69,7 +69,7 @@ def test_every_command_on_path_is_prefixed_and_every_node_has_one(console_script
 @pytest.mark.parametrize("command", ["hmt_slam", *(f"hmt_slam_{node}" for node in NODES)])
 def test_every_command_leads_to_a_function_that_can_be_called(console_scripts, command):
     module, function = console_scripts[command].split(":")
-    if ".nodes." in module:
+    if ".ros." in module:
         pytest.importorskip("rclpy", reason="the nodes need rclpy, which is not installed here")
     assert callable(getattr(import_module(module), function))
 
@@ -79,7 +79,7 @@ def test_ros2_run_finds_an_executable_that_runs_the_node_of_its_name(setup_argum
     installed = dict(setup_arguments["data_files"])["lib/hmt_slam_ros"]
     source = ROOT / next(file for file in installed if Path(file).name == node)
     assert os.access(source, os.X_OK)
-    package = tmp_path / "hmt_slam_ros" / "nodes"
+    package = tmp_path / "hmt_slam_ros" / "ros"
     package.mkdir(parents=True)
     (package.parent / "process_settings.py").symlink_to(ROOT / "hmt_slam_ros" / "process_settings.py")
     (package / f"{node}_node.py").write_text(f"def main():\n    print('this is {node}')\n")

@@ -229,12 +229,12 @@ import sys
 from pathlib import Path
 sys.path.insert(0, sys.argv[2])
 from test_persistence import written
-from hmt_slam_ros.saved_map.folder import put_in_place
+from hmt_slam_ros.saved_map.folder import replace_folder
 
 target, turn = Path(sys.argv[1]), 0
 while True:
     turn += 1
-    put_in_place(written(target.with_name(f"next-{turn}"), version=3), target)
+    replace_folder(written(target.with_name(f"next-{turn}"), version=3), target)
     print(turn, flush=True)
 """
 

@@ -35,7 +35,7 @@ def looked_up(monkeypatch):
         scans.append(scan)
         return sighting(own, scan, pose)
 
-    monkeypatch.setattr(GrowingArea, "sighting", noted)
+    monkeypatch.setattr(GrowingArea, "observe_keyframe", noted)
     return scans
 
 
@@ -44,7 +44,7 @@ def views(scans):
 
 
 def assert_same(one, other):
-    for name in ("keyframes", "poses", "around", "hallways"):
+    for name in ("keyframes", "poses", "sector_distances", "hallway_lengths"):
         np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
     assert [landmark.kind for landmark in one.landmarks] == [landmark.kind for landmark in other.landmarks]
     for mine, its in zip(one.landmarks, other.landmarks, strict=True):
@@ -56,12 +56,12 @@ def assert_same(one, other):
 def test_an_area_that_grew_shows_what_it_would_if_it_were_looked_up_at_once(area, looked_up):
     keyframes, scans = area
     grown = views(scans)
-    grown.of(0, dict(list(keyframes.items())[:5]))
+    grown.area_view(0, dict(list(keyframes.items())[:5]))
     before = len(looked_up)
-    found = grown.of(0, keyframes)
+    found = grown.area_view(0, keyframes)
     assert (before, len(looked_up)) == (5, 8)
-    assert grown.of(0, keyframes) is found
-    assert_same(found, views(scans).of(0, keyframes))
+    assert grown.area_view(0, keyframes) is found
+    assert_same(found, views(scans).area_view(0, keyframes))
 
 
 def test_areas_are_looked_at_ahead_so_many_keyframes_at_a_time(looked_up):
@@ -69,32 +69,32 @@ def test_areas_are_looked_at_ahead_so_many_keyframes_at_a_time(looked_up):
     areas = [(area, hybrid_map.keyframes(area)) for area in hybrid_map.area_ids()]
     own, counts, every = views(scans), [], sum(len(keyframes) for _, keyframes in areas)
     while len(counts) < 2 or counts[-1] > counts[-2]:
-        own.look_ahead(areas, 7)
+        own.prefetch(areas, 7)
         counts.append(len(looked_up))
     assert counts == [*range(7, every, 7), every, every]
     found = own.views_of_map(hybrid_map)
     assert len(looked_up) == every
     for area, keyframes in areas:
-        assert_same(found[area], views(scans).of(area, keyframes))
+        assert_same(found[area], views(scans).area_view(area, keyframes))
 
 
 def test_what_an_area_shows_in_two_maps_is_kept_for_both(area, looked_up):
     keyframes, scans = area
     own, other = views(scans), {k: se2.compose(np.array([0.5, 0.0, 0.0]), pose) for k, pose in keyframes.items()}
-    first = [own.of(0, each) for each in (keyframes, other)]
-    assert [own.of(0, each) for each in (keyframes, other)] == first
+    first = [own.area_view(0, each) for each in (keyframes, other)]
+    assert [own.area_view(0, each) for each in (keyframes, other)] == first
     assert len(looked_up) == 2 * len(keyframes)
 
 
 def test_where_keyframes_moved_or_were_taken_out_it_is_looked_up_anew(area, looked_up):
     keyframes, scans = area
     own = views(scans)
-    own.of(0, keyframes)
+    own.area_view(0, keyframes)
     moved = {k: se2.compose(np.array([1.0, 2.0, math.pi]), pose) for k, pose in keyframes.items()}
-    assert_same(own.of(0, moved), views(scans).of(0, moved))
+    assert_same(own.area_view(0, moved), views(scans).area_view(0, moved))
     without = dict(list(moved.items())[2:])
-    assert_same(own.of(0, without), views(scans).of(0, without))
-    own.forget()
+    assert_same(own.area_view(0, without), views(scans).area_view(0, without))
+    own.clear()
     before = len(looked_up)
-    own.of(0, without)
+    own.area_view(0, without)
     assert len(looked_up) - before == len(without)

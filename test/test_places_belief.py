@@ -34,7 +34,7 @@ def straight(start, end, length, landmarks=EMPTY, heading=EAST):
 def chain(lengths, existence=0.5, places=PLACES):
     """A hallway from west to east."""
     ways = [straight(k, k + 1, length, corner(1.0 + 0.1 * k)) for k, length in enumerate(lengths)]
-    edges = [edge for way in ways for edge in (way, way.back)]
+    edges = [edge for way in ways for edge in (way, way.reverse)]
     return build_place_graph([Node(existence, EMPTY, EMPTY)] * (len(lengths) + 1), edges, places)
 
 
@@ -45,22 +45,22 @@ def random_graph(seed, rows=1, columns=1, density=0.1):
 
 def test_the_next_opening_is_at_the_end_of_the_edge_or_behind_those_that_are_missed():
     graph = chain([3.0, 4.0, 5.0])
-    own = graph.arcs.sources == state_of(0, EAST)
+    own = graph.transitions.sources == state_of(0, EAST)
     seen = 0.5 * PLACES.noticed
-    assert list(graph.arcs.targets[own]) == [state_of(k, EAST) for k in (1, 2, 3)]
-    np.testing.assert_allclose(graph.arcs.probabilities[own], [seen, (1 - seen) * seen, (1 - seen) ** 2])
-    np.testing.assert_allclose(graph.arcs.means[own], [(3, 0), (7, 0), (12, 0)])
-    np.testing.assert_allclose(graph.arcs.variances[own, 0], [0.04, 0.08, 0.12])
-    assert graph.following[state_of(3, WEST)] == state_of(2, WEST)
-    assert graph.following[state_of(3, EAST)] == -1
+    assert list(graph.transitions.targets[own]) == [state_of(k, EAST) for k in (1, 2, 3)]
+    np.testing.assert_allclose(graph.transitions.probabilities[own], [seen, (1 - seen) * seen, (1 - seen) ** 2])
+    np.testing.assert_allclose(graph.transitions.means[own], [(3, 0), (7, 0), (12, 0)])
+    np.testing.assert_allclose(graph.transitions.variances[own, 0], [0.04, 0.08, 0.12])
+    assert graph.successors[state_of(3, WEST)] == state_of(2, WEST)
+    assert graph.successors[state_of(3, EAST)] == -1
 
 
 def test_a_state_sees_ahead_and_back_what_the_map_has_there():
     graph = chain([3.0, 4.0, 5.0], places=dataclasses.replace(PLACES, reach=6.0))
 
     def seen(state):
-        own = slice(*graph.expected.starts[state : state + 2])
-        return graph.expected.landmarks.tracks[own], graph.expected.landmarks.along[own]
+        own = slice(*graph.expected_landmarks.starts[state : state + 2])
+        return graph.expected_landmarks.landmarks.tracks[own], graph.expected_landmarks.landmarks.positions[own]
 
     tracks, along = seen(state_of(1, EAST))
     np.testing.assert_allclose(along, [-2.0, 1.1, 5.2])
@@ -88,7 +88,7 @@ def test_two_ways_in_one_direction_are_refused():
 
 def transition(graph, places, action):
     """T(s, a, s') times the density of what was travelled, by the book, shape (states + 1, states + 1)."""
-    n = graph.states
+    n = graph.state_count
     if not isinstance(action, Travel):
         quarters = action
         table = np.full((n + 1, n + 1), places.slip / n)
@@ -102,13 +102,15 @@ def transition(graph, places, action):
     table[n], table[n, n] = places.discovery / n * usual, (1 - places.discovery) * usual
     for s in range(n):
         table[s, s], rest = 0.0, 1.0
-        for k in np.flatnonzero(graph.arcs.sources == s):
-            variance = graph.arcs.variances[k] + action.variances
-            off = np.array(action[:2]) - graph.arcs.means[k]
+        for k in np.flatnonzero(graph.transitions.sources == s):
+            variance = graph.transitions.variances[k] + action.variances
+            off = np.array(action[:2]) - graph.transitions.means[k]
             off[1] = math.remainder(off[1], 2 * math.pi)
             density = np.exp(-0.5 * off**2 / variance) / np.sqrt(2 * math.pi * variance)
-            table[s, graph.arcs.targets[k]] += (1 - places.slip) * graph.arcs.probabilities[k] * density.prod()
-            rest -= graph.arcs.probabilities[k]
+            table[s, graph.transitions.targets[k]] += (
+                (1 - places.slip) * graph.transitions.probabilities[k] * density.prod()
+            )
+            rest -= graph.transitions.probabilities[k]
         table[s, n] += (1 - places.slip) * rest * usual
     return table
 
@@ -119,7 +121,7 @@ def test_the_belief_is_that_of_an_enumeration_of_all_paths(seed):
     places = dataclasses.replace(PLACES, slip=0.1, discovery=0.2, unmapped=0.3)
     lengths = random.uniform(2.0, 4.0, 2)
     edges = [straight(0, 1, lengths[0], corner(1.0)), straight(1, 2, lengths[1], corner(0.7, 1))]
-    edges += [edges[0].back] + ([edges[1].back] if seed % 2 else [])
+    edges += [edges[0].reverse] + ([edges[1].reverse] if seed % 2 else [])
     graph = build_place_graph([Node(0.7, EMPTY, corner(0.0, 5, 1.0))] * 3, edges, places)
     belief, factors = uniform_belief(graph, places), []
     for _ in range(3):
@@ -128,7 +130,7 @@ def test_the_belief_is_that_of_an_enumeration_of_all_paths(seed):
         away, variance = random.uniform(0.0, 1.0), 0.02
         graph_seen = drawn_anywhere(random, 0.1, 0.1, MODEL)
         if isinstance(action, Travel):
-            belief = belief.arrived(action)
+            belief = belief.predict_arrival(action)
         elif action:
             belief = belief.predict_turn(action)
         else:
@@ -151,8 +153,8 @@ def test_every_transition_is_a_probability():
     graph = random_graph(3)
     for action in (0, 1, 2):
         np.testing.assert_allclose(transition(graph, PLACES, action).sum(axis=1), 1.0, atol=1e-12)
-    for source in (0, 5, graph.states):
-        logs = np.full(graph.states + 1, -np.inf)
+    for source in (0, 5, graph.state_count):
+        logs = np.full(graph.state_count + 1, -np.inf)
         logs[source] = 0.0
         belief = dataclasses.replace(uniform_belief(graph, PLACES), log_probabilities=logs)
         for after in (
@@ -169,11 +171,11 @@ def test_entropy_says_whether_the_belief_is_confident():
     assert certain.entropy == 0.0
     assert certain.is_confident
     assert certain.most_likely_state == 7
-    states = int(graph.travelled.sum())
+    states = int(graph.has_hallway.sum())
     flat = uniform_belief(graph, dataclasses.replace(PLACES, unmapped=1.0 / (states + 1)))
     assert flat.entropy == pytest.approx(math.log(states + 1))
     assert not flat.is_confident
-    lost = dataclasses.replace(flat, log_probabilities=np.log(np.append(np.full(graph.states, 1e-9), 1.0)))
+    lost = dataclasses.replace(flat, log_probabilities=np.log(np.append(np.full(graph.state_count, 1e-9), 1.0)))
     assert lost.most_likely_state is None
 
 
@@ -204,7 +206,7 @@ def test_an_opening_far_from_where_the_map_has_one_is_none_of_it():
     assert [beyond.is_mapped_opening(Travel(d, 0.0, noise)) for d in (9.5, 12.1)] == [False, True]
     # A robot that may be anywhere takes it for one of the map.
     assert uniform_belief(graph, PLACES).is_mapped_opening(Travel(3.5, 0.0, noise))
-    assert certain_belief(graph, PLACES, graph.states).is_mapped_opening(Travel(1.5, 0.0, noise))
+    assert certain_belief(graph, PLACES, graph.state_count).is_mapped_opening(Travel(1.5, 0.0, noise))
 
 
 def test_where_the_map_ends_unknown_ground_begins():
@@ -226,7 +228,7 @@ def simulated(seed, places, steps=6):
     random = np.random.default_rng(seed)
     graph = random_graph(seed % 7, density=0.02)
     belief = uniform_belief(graph, places)
-    state = int(random.choice(graph.states + 1, p=belief.probabilities))
+    state = int(random.choice(graph.state_count + 1, p=belief.probabilities))
     for _ in range(steps):
         action = int(random.choice(4, p=(0.1, 0.1, 0.1, 0.7)))
         state, travel = drawn_transition(random, graph, places, state, action)
@@ -237,7 +239,7 @@ def simulated(seed, places, steps=6):
 
 
 def drawn_transition(random, graph, places, state, action):
-    n = graph.states
+    n = graph.state_count
     others = [s for s in range(n + 1) if s != state]
     if action < 3:
         target = n if state == n else state // 4 * 4 + (state % 4 + action) % 4
@@ -248,20 +250,22 @@ def drawn_transition(random, graph, places, state, action):
         return (int(random.integers(n)) if random.random() < places.discovery else n), usual
     if random.random() < places.slip:
         return int(random.choice(others)), usual
-    own = np.flatnonzero(graph.arcs.sources == state)
-    shares = np.cumsum(graph.arcs.probabilities[own])
+    own = np.flatnonzero(graph.transitions.sources == state)
+    shares = np.cumsum(graph.transitions.probabilities[own])
     k = int(np.searchsorted(shares, random.random()))
     if k == len(own):
         return n, usual
-    way = random.normal(graph.arcs.means[own[k]], np.sqrt(graph.arcs.variances[own[k]] + usual.variances))
-    return int(graph.arcs.targets[own[k]]), Travel(*way, usual.variances)
+    way = random.normal(graph.transitions.means[own[k]], np.sqrt(graph.transitions.variances[own[k]] + usual.variances))
+    return int(graph.transitions.targets[own[k]]), Travel(*way, usual.variances)
 
 
 def drawn_seen(random, graph, state):
-    if state == graph.states:
+    if state == graph.state_count:
         return drawn_anywhere(random, MODEL.usual_density, MODEL.false_density, MODEL)
-    own = slice(*graph.expected.starts[state : state + 2])
-    return drawn_observation(random, LandmarkSequence(*(f[own] for f in graph.expected.landmarks)), 0.0, 0.01, MODEL)
+    own = slice(*graph.expected_landmarks.starts[state : state + 2])
+    return drawn_observation(
+        random, LandmarkSequence(*(f[own] for f in graph.expected_landmarks.landmarks)), 0.0, 0.01, MODEL
+    )
 
 
 def test_beliefs_about_robots_of_the_model_are_calibrated():
@@ -281,7 +285,7 @@ def test_beliefs_about_robots_of_the_model_are_calibrated():
 def test_a_hallway_may_be_joined_from_lists_of_both_directions():
     there = merge_sequences((corner(1.0), corner(2.0, 3)))
     way = straight(0, 1, 3.0, there)
-    np.testing.assert_allclose(way.back.landmarks.along, [2.0, 1.0])
-    assert list(way.back.landmarks.tracks) == [1, 2]
-    for one, other in zip(way.back.back.landmarks, there, strict=True):
+    np.testing.assert_allclose(way.reverse.landmarks.positions, [2.0, 1.0])
+    assert list(way.reverse.landmarks.tracks) == [1, 2]
+    for one, other in zip(way.reverse.reverse.landmarks, there, strict=True):
         np.testing.assert_allclose(one, other, atol=1e-12)

@@ -57,13 +57,13 @@ def test_opposite_doors_are_one_node_with_an_opening_on_either_side(charts):
     assert directions[1] - directions[0] == 2
     assert len(single.openings) == 1
     assert single.openings[0].landmark.width == pytest.approx(1.0, abs=0.1)
-    assert not any(one.hallway for one in (*pair.openings, *single.openings))
+    assert not any(one.leads_to_hallway for one in (*pair.openings, *single.openings))
 
 
 def test_the_mouth_of_a_hallway_leads_to_a_hallway_and_so_does_what_is_on_both_sides_of_it(charts):
     crossing = charts[0].nodes[at(charts[0], 16.0)]
     assert len(crossing.openings) == 3
-    assert all(one.hallway for one in crossing.openings)
+    assert all(one.leads_to_hallway for one in crossing.openings)
 
 
 def test_edges_are_as_long_as_the_ways_between_their_nodes_and_lead_both_ways(charts):
@@ -84,12 +84,12 @@ def test_edges_are_as_long_as_the_ways_between_their_nodes_and_lead_both_ways(ch
 def test_a_node_shows_its_openings_to_the_side_on_which_they_are(charts):
     chart = charts[0]
     node = at(chart, 5.0)
-    seen = chart.seen[node]
+    seen = chart.graph_nodes[node]
     axis = seen.north if chart.nodes[node].openings[0].direction in {EAST, WEST} else seen.east
     openings = axis.tracks >= OPENINGS
     assert openings.sum() == 1
     assert axis.tracks[openings][0] in {OPENINGS + 1, OPENINGS + 3}
-    np.testing.assert_allclose(axis.along[openings], 0.0, atol=0.05)
+    np.testing.assert_allclose(axis.positions[openings], 0.0, atol=0.05)
 
 
 def test_a_hallway_that_leads_on_is_an_opening_of_its_crossing_to_both_sides(charts):
@@ -98,9 +98,9 @@ def test_a_hallway_that_leads_on_is_an_opening_of_its_crossing_to_both_sides(cha
     (mouth,) = {
         edge.start_direction for edge in chart.edges if (edge.start, edge.end) == (number, at(chart, 16.0, 11.0))
     }
-    seen = chart.seen[number].east if mouth in {EAST, WEST} else chart.seen[number].north
+    seen = chart.graph_nodes[number].east if mouth in {EAST, WEST} else chart.update[number].north
     for track in (OPENINGS + 1, OPENINGS + 3):
-        own = (seen.tracks == track) & (np.abs(seen.along) < 0.1)
+        own = (seen.tracks == track) & (np.abs(seen.positions) < 0.1)
         assert own.sum() == 1
         assert seen.probabilities[own][0] >= 0.9
         assert seen.forms[own][0] == pytest.approx(2.0, abs=0.15)
@@ -111,7 +111,7 @@ def test_landmarks_of_rooms_are_not_those_of_the_hallway(charts):
     listed = sum(len(edge.landmarks.tracks) for edge in chart.edges[::2])
     assert 0 < listed < sum(len(view.landmarks) for view in views.values())
     for edge in chart.edges:
-        assert np.all((edge.landmarks.along >= -1e-9) & (edge.landmarks.along <= edge.distance[0] + 1e-9))
+        assert np.all((edge.landmarks.positions >= -1e-9) & (edge.landmarks.positions <= edge.distance[0] + 1e-9))
 
 
 def test_a_wide_opening_behind_which_one_sees_far_is_a_crossing_before_anyone_drove_there():
@@ -128,8 +128,8 @@ def test_a_wide_opening_behind_which_one_sees_far_is_a_crossing_before_anyone_dr
 def test_the_chart_makes_a_graph_of_places(charts):
     chart = charts[0]
     graph = chart.graph(CONFIGURATION.places)
-    assert graph.states == 4 * len(chart.nodes)
-    assert (graph.following >= 0).sum() == len(chart.edges)
+    assert graph.state_count == 4 * len(chart.nodes)
+    assert (graph.successors >= 0).sum() == len(chart.edges)
 
 
 def test_areas_that_lie_anywhere_to_each_other_share_no_node(charts):
@@ -194,9 +194,9 @@ def test_the_end_of_a_hallway_is_in_the_hallway_where_a_room_behind_a_door_is_no
     end = [(11.0, 0.0, heading) for heading in np.arange(0.0, 6.0, 0.5)]
     room = [(x, y, 0.5 * math.pi) for x in (9.0, 10.0, 11.0) for y in (2.0, 3.0, 4.0)]
     floor = turning(np.concatenate((plan.walls(), person)), along + end + room)
-    lies = {bool(floor.along[k].any()) for k in range(len(along))}
-    ends = {bool(floor.along[k].any()) for k in range(len(along), len(along + end))}
-    rooms = {bool(floor.along[k].any()) for k in range(len(along + end), len(along + end + room))}
+    lies = {bool(floor.in_hallway[k].any()) for k in range(len(along))}
+    ends = {bool(floor.in_hallway[k].any()) for k in range(len(along), len(along + end))}
+    rooms = {bool(floor.in_hallway[k].any()) for k in range(len(along + end), len(along + end + room))}
     assert (lies, ends, rooms) == ({True}, {True}, {False})
 
 

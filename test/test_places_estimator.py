@@ -57,7 +57,7 @@ def drive(estimator, poses, seed=0):
     for before, after in zip([poses[0], *poses[:-1]], poses, strict=True):
         increment = se2.between(np.array(before), np.array(after))
         noisy = increment * (1.0 + rng.normal(0.0, 0.01, 3))
-        estimator.moved(RelativeMotion(noisy, increment_covariance(noisy, CONFIGURATION.motion)))
+        estimator.predict(RelativeMotion(noisy, increment_covariance(noisy, CONFIGURATION.motion)))
         yield estimator.observe(seen_at(np.array(after), rng))
 
 
@@ -130,7 +130,7 @@ def test_a_door_of_whose_wall_too_little_is_seen_tells_no_pose(chart, graph, mon
     assert estimator.openings.door_ahead() is not None
     hidden = estimator.openings.last_openings.covariances.copy()
     hidden[:, 2, 2] = math.radians(0.4) ** 2
-    monkeypatch.setattr(estimator.openings, "seen", estimator.openings.last_openings._replace(covariances=hidden))
+    monkeypatch.setattr(estimator.openings, "last_openings", estimator.openings.last_openings._replace(covariances=hidden))
     assert estimator.openings.door_ahead() is None
 
 
@@ -140,7 +140,7 @@ def test_a_door_that_someone_hid_is_noticed_by_the_turn_into_it(chart, graph, mo
     up = 0.5 * math.pi
     poses = line((1.0, 0.0), (5.0, 0.0)) + turn((5.0, 0.0), 0.0, up)
     hidden = extract_openings
-    monkeypatch.setattr("hmt_slam_ros.places.estimator.openings_of", lambda *args: without_sides(hidden(*args)))
+    monkeypatch.setattr("hmt_slam_ros.places.estimator.extract_openings", lambda *args: without_sides(hidden(*args)))
     list(drive(estimator, poses))
     assert estimator.arrivals == 1
     assert estimator.node_and_direction == (node_at(chart, 5.0), chart.nodes[node_at(chart, 5.0)].openings[0].direction)
@@ -156,7 +156,7 @@ def test_where_the_robot_turns_into_another_hallway_there_is_a_node_though_its_o
 ):
     start = state_of(node_at(chart, 10.0), eastwards(chart))
     estimator = PlaceEstimator(graph, CONFIGURATION, certain_belief(graph, CONFIGURATION.places, start))
-    monkeypatch.setattr(PositionBelief, "is_listed", lambda *_: False)
+    monkeypatch.setattr(PositionBelief, "is_mapped_opening", lambda *_: False)
     up = 0.5 * math.pi
     list(drive(estimator, line((10.0, 0.0), (16.0, 0.0)) + turn((16.0, 0.0), 0.0, up) + line((16.0, 0.0), (16.0, 4.0))))
     north = (eastwards(chart) - 1) % QUARTERS
@@ -181,7 +181,7 @@ def test_an_opening_that_is_none_of_the_map_hides_no_end_of_a_hallway(chart, gra
         )
         return Openings(*(np.concatenate(fields) for fields in zip(found, new, strict=True)))
 
-    monkeypatch.setattr("hmt_slam_ros.places.estimator.openings_of", and_a_new_one)
+    monkeypatch.setattr("hmt_slam_ros.places.estimator.extract_openings", and_a_new_one)
     list(drive(estimator, line((16.0, 0.0), (20.9, 0.0))))
     assert estimator.node_and_direction == (node_at(chart, 21.0), eastwards(chart))
 
@@ -211,7 +211,7 @@ def test_a_robot_that_turned_back_on_its_way_sees_what_it_saw_before(chart, grap
         state_of(node_at(chart, 10.0), heading) for heading in (eastwards(chart), opposite_direction(eastwards(chart)))
     )
     there, back = (
-        select_landmarks(graph.expected.landmarks, slice(*graph.expected.starts[state : state + 2].tolist()))
+        select_landmarks(graph.expected_landmarks.landmarks, slice(*graph.expected_landmarks.starts[state : state + 2].tolist()))
         for state in ways
     )
     assert np.abs(there.positions).max() > 5.0

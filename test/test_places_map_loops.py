@@ -72,10 +72,10 @@ def twice(request):
 
 def test_a_hallway_that_the_map_holds_twice_is_a_loop_as_it_truly_lies(twice):
     hybrid_map, scans = twice
-    loop = map_loops(scans).newest(hybrid_map)
+    loop = map_loops(scans).newest_loop(hybrid_map)
     assert loop is not None
-    assert (loop.area, loop.begin, loop.other in (0, 1)) == (3, 3, True)
-    off = se2.log(se2.between(loop.pose.mean, se2.between(THIRD, AREAS[loop.other])))
+    assert (loop.area, loop.first_area, loop.other_area in (0, 1)) == (3, 3, True)
+    off = se2.log(se2.between(loop.pose.mean, se2.between(THIRD, AREAS[loop.other_area])))
     assert math.hypot(off[0], off[1]) < 0.2
     assert abs(off[2]) < math.radians(2.0)
     assert off @ np.linalg.solve(loop.pose.covariance, off) < 16.3  # chi-square, 99.9 %
@@ -83,20 +83,20 @@ def test_a_hallway_that_the_map_holds_twice_is_a_loop_as_it_truly_lies(twice):
 
 def test_another_hallway_is_none():
     hybrid_map, scans = driven_twice(along(turned=False), other_hallway())
-    assert map_loops(scans).newest(hybrid_map) is None
+    assert map_loops(scans).newest_loop(hybrid_map) is None
 
 
 def test_a_robot_that_was_in_all_areas_of_late_has_no_map_of_before():
     hybrid_map, scans = driven_twice(along(turned=False))
     newest = max(scans)
-    hybrid_map.place(newest, 0, hybrid_map.keyframes(0)[0])
-    hybrid_map.place(newest, 2, hybrid_map.keyframes(2)[min(hybrid_map.keyframes(2))])
-    assert map_loops(scans).newest(hybrid_map) is None
+    hybrid_map.set_keyframe(newest, 0, hybrid_map.keyframes(0)[0])
+    hybrid_map.set_keyframe(newest, 2, hybrid_map.keyframes(2)[min(hybrid_map.keyframes(2))])
+    assert map_loops(scans).newest_loop(hybrid_map) is None
 
 
 def test_the_way_leads_from_node_to_node_as_the_robot_went(twice):
     hybrid_map, scans = twice
-    part = hybrid_map.part([3])
+    part = hybrid_map.subgraph([3])
     chart = build_chart(
         part, AreaViewCache(LocalMapping(CONFIGURATION), scans).views_of_map(part), CONFIGURATION.features
     )

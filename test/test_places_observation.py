@@ -67,7 +67,7 @@ def graph_at(pose, axis):
 def is_in(few, more):
     """Whether the landmarks of one list are in the other."""
     off = np.abs(few.forms[:, None] - more.forms)
-    near = (np.abs(few.along[:, None] - more.along) < 0.05) & (np.minimum(off, 2 * np.pi - off) < 0.15)
+    near = (np.abs(few.positions[:, None] - more.positions) < 0.05) & (np.minimum(off, 2 * np.pi - off) < 0.15)
     return len(few.tracks) > 2 and (near & (few.tracks[:, None] == more.tracks)).any(axis=1).all()
 
 
@@ -96,9 +96,9 @@ def test_a_hallway_is_seen_in_order_along_the_axis_whatever_the_robot_heads_for(
     assert list(straight.tracks) == sorted(straight.tracks)
     door = straight.tracks == OPENINGS + 1
     assert door.sum() == 1
-    assert straight.along[door][0] == pytest.approx(3.0, abs=0.05)
+    assert straight.positions[door][0] == pytest.approx(3.0, abs=0.05)
     assert straight.forms[door][0] == pytest.approx(1.0, abs=0.15)
-    np.testing.assert_allclose(straight.along[straight.tracks == 0], [-5.0], atol=0.05)
+    np.testing.assert_allclose(straight.positions[straight.tracks == 0], [-5.0], atol=0.05)
     np.testing.assert_allclose(straight.forms[straight.tracks == 0], [-0.25 * np.pi], atol=0.05)
     turned = graph_at((-1.0, 0.0, 0.7), -0.7)
     assert is_in(straight, turned)
@@ -150,7 +150,7 @@ def product(observed, expected, pairs, away, model):
     value = 1.0
     for i in range(len(expected.tracks)):
         seen = expected.probabilities[i] * model.detection
-        place, variance = expected.along[i] - away, expected.variances[i, 0] + model.along
+        place, variance = expected.positions[i] - away, expected.variances[i, 0] + model.position_variance
         scale = math.sqrt(2.0 * variance)
         low, high = -model.reach, model.reach
         if expected.tracks[i] == 2:
@@ -160,16 +160,20 @@ def product(observed, expected, pairs, away, model):
             value *= 1.0 - seen * within
             continue
         j = pairs[i]
-        if observed.tracks[j] != expected.tracks[i] or not low <= observed.along[j] <= high:
+        if observed.tracks[j] != expected.tracks[i] or not low <= observed.positions[j] <= high:
             return 0.0
         corner = expected.tracks[i] < OPENINGS
-        form_variance = expected.variances[i, 1] + observed.variances[j, 1] + (model.heading if corner else model.width)
+        form_variance = (
+            expected.variances[i, 1]
+            + observed.variances[j, 1]
+            + (model.heading_variance if corner else model.width_variance)
+        )
         off = observed.forms[j] - expected.forms[i]
         off = math.remainder(off, 2.0 * math.pi) if corner else off
         p = observed.probabilities[j]
-        false, there = model.false * (1.0 - p) / (1.0 - model.true_share), p / model.true_share
-        extra = (model.corner_form if corner else model.opening_form) * (false + model.new * there)
-        g = density(observed.along[j] - place, variance + observed.variances[j, 0]) * density(off, form_variance)
+        false, there = model.false_density * (1.0 - p) / (1.0 - model.true_share), p / model.true_share
+        extra = (model.corner_form if corner else model.opening_form) * (false + model.new_density * there)
+        g = density(observed.positions[j] - place, variance + observed.variances[j, 0]) * density(off, form_variance)
         value *= seen * g * there / extra
     return value
 
@@ -206,9 +210,9 @@ def mean_ratio(expected, model, draws=12000, variance=0.0, seed=1):
     state = one_state(expected)
     ratios = np.exp(
         [
-            log_observation_ratios(drawn_anywhere(random, model.new, model.false, model), state, 0.0, variance, model)[
-                0
-            ]
+            log_observation_ratios(
+                drawn_anywhere(random, model.new_density, model.false_density, model), state, 0.0, variance, model
+            )[0]
             for _ in range(draws)
         ]
     )

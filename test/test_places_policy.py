@@ -51,7 +51,7 @@ def test_a_way_that_is_closed_is_gone_only_where_no_other_leads_to_the_goal(squa
 
 def test_a_robot_that_is_sure_heads_for_its_goal_and_one_in_unknown_ground_for_none(square):
     assert next_turn(certain_belief(square, PLACES, state_of(0, WEST)), 1, MODEL, ahead=True) == 2
-    assert next_turn(certain_belief(square, PLACES, square.states), 1, MODEL, ahead=True) is None
+    assert next_turn(certain_belief(square, PLACES, square.state_count), 1, MODEL, ahead=True) is None
 
 
 def corners(along):
@@ -71,7 +71,7 @@ def test_a_robot_that_is_not_sure_goes_where_places_differ():
     one = [(0, EAST, 1, 8, EMPTY), (1, EAST, 2, 8, corners([6.0, 7.0]))]
     graph = graph_of([*one, (3, EAST, 4, 8, EMPTY), (4, EAST, 5, 8, EMPTY)], 6)
     for heading, expected in ((EAST, 0), (WEST, 2)):
-        logs = np.full(graph.states + 1, -50.0)
+        logs = np.full(graph.state_count + 1, -50.0)
         logs[[state_of(1, heading), state_of(4, heading)]] = math.log(0.5)
         belief = PositionBelief(graph, PLACES, logs)
         assert not belief.is_confident

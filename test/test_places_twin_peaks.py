@@ -60,15 +60,15 @@ def driven(random, belief, detector, edges, start, count):
     for k in range(start, start + count):
         own = edges[k % ROUND]
         length = random.normal(own.distance[0], 0.05)
-        belief = belief.arrived(Travel(length, random.normal(0.0, 0.02), NOISE))
+        belief = belief.predict_arrival(Travel(length, random.normal(0.0, 0.02), NOISE))
         ahead = edges[(k + 1) % ROUND].landmarks
         seen = drawn_of_present(random, ahead, np.ones(len(ahead.tracks), bool), 0.0, MODEL)
-        belief = belief.observed(ahead_only(seen), MODEL, 0.0, 0.01)
+        belief = belief.update(ahead_only(seen), MODEL, 0.0, 0.01)
         yield detector.update(belief), belief
 
 
 def ahead_only(seen):
-    return LandmarkSequence(*(field[seen.along > 0.0] for field in seen))
+    return LandmarkSequence(*(field[seen.positions > 0.0] for field in seen))
 
 
 @pytest.mark.parametrize(("turned", "missed"), [(0, 0.0), (1, 0.0), (0, 0.2)])
@@ -82,7 +82,7 @@ def test_a_loop_that_was_mapped_twice_is_proposed_with_the_places_that_are_one(t
         for loop, _ in driven(random, belief, TwoPeakTracker(), edges, 0, ROUND - 1):
             if loop is not None:
                 found += 1
-                assert abs(loop.node - loop.other) == ROUND
+                assert abs(loop.node - loop.other_node) == ROUND
                 assert loop.quarters in ((0,) if not turned else (1, 3))
                 break
     assert found >= 11
@@ -108,7 +108,7 @@ def test_no_loop_is_proposed_where_there_is_none():
 
 
 def two_peaks(graph, first, second, shares=(0.6, 0.4)):
-    logs = np.full(graph.states + 1, -60.0)
+    logs = np.full(graph.state_count + 1, -60.0)
     logs[[first, second]] = np.log(shares)
     return PositionBelief(graph, PLACES, logs)
 
@@ -132,7 +132,7 @@ def test_three_transitions_in_the_same_way_make_a_loop_whichever_peak_is_higher(
     found = proposals(hallway, [pair(0), pair(1), pair(2)[::-1], pair(3)])
     assert found[:3] == [None, None, None]
     assert found[3] is not None
-    assert (found[3].node, found[3].other, found[3].quarters) == (3, 9, 0)
+    assert (found[3].node, found[3].other_node, found[3].quarters) == (3, 9, 0)
 
 
 def test_peaks_may_head_for_different_sides_but_have_to_move_alike_and_apart(hallway):

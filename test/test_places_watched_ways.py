@@ -25,7 +25,7 @@ def ways():
 def looks(ways, *seen, state=FROM_WEST, aside=0.0):
     """From so far beyond the node, one sees so far ahead."""
     for away, ahead in seen:
-        ways.look(state, away, aside, np.array((ahead, NOWHERE, NOWHERE, NOWHERE)))
+        ways.observe(state, away, aside, np.array((ahead, NOWHERE, NOWHERE, NOWHERE)))
 
 
 BARRED = [(0.5, 4.2), (1.0, 3.7), (1.5, 3.2)]
@@ -66,8 +66,8 @@ def test_who_walks_there_closes_nothing(ways):
 def test_at_a_node_one_sees_along_all_its_ways_and_beside_it_along_none(ways):
     for _ in range(3):
         # Looking south.
-        ways.look(state_of(0, SOUTH), 0.2, 0.0, np.array((9.0, 9.0, 2.2, 3.2)))
+        ways.observe(state_of(0, SOUTH), 0.2, 0.0, np.array((9.0, 9.0, 2.2, 3.2)))
     assert ways.closed_states == {FROM_WEST, FROM_EAST, OFF, state_of(2, SOUTH)}
     for _ in range(2):
-        ways.look(FROM_WEST, 0.9, 0.9, np.full(4, 9.0))
+        ways.observe(FROM_WEST, 0.9, 0.9, np.full(4, 9.0))
     assert len(ways.closed_states) == 4

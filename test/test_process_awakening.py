@@ -58,10 +58,10 @@ def test_it_begins_a_new_area_to_which_an_arc_leads_that_tells_nothing(office, b
     before = Replica.from_state(office.state.tsbi.replica)
     run = carried(office, office.records[begin:], 10)
     replica = Replica.from_state(run.state.tsbi.replica)
-    (leaf,) = run.recorder.hypotheses[max(run.recorder.hypotheses)].leaves
+    (leaf,) = run.recorder.hypotheses[max(run.recorder.hypotheses)].hypotheses
     assert leaf.lost
     assert leaf.area not in before.maps[before.best_hypothesis].area_ids()
-    hybrid_map = replica.maps[leaf.hypothesis]
+    hybrid_map = replica.maps[leaf.id]
     (beside,) = hybrid_map.neighbors(leaf.area)
     assert is_uninformative(hybrid_map.arc(beside, leaf.area))
     for area in before.maps[before.best_hypothesis].area_ids():
@@ -91,10 +91,10 @@ def test_in_the_map_of_the_first_half_it_wakes_up_in_the_second_near_keyframes_o
     log, whole = maps["first half"], maps["whole"]
     scans = Replica.from_state(log.state.tsbi.replica).scans.values()
     stamps = {log.records[scan].measurement.stamp: n for n, scan in enumerate(log.scans)}
-    known = np.array([log.true_pose[stamps[scan.stamp], :2] for scan in scans])
+    known = np.array([log.truth[stamps[scan.stamp], :2] for scan in scans])
     assert max(stamps[scan.stamp] for scan in scans) < min(log.starts)
-    assert all(np.hypot(*(known - log.true_pose[start, :2]).T).min() < 2.1 for start in log.starts)
-    assert np.hypot(*(log.true_pose - whole.true_pose)[:, :2].T).max() < 0.5
+    assert all(np.hypot(*(known - log.truth[start, :2]).T).min() < 2.1 for start in log.starts)
+    assert np.hypot(*(log.truth - whole.truth)[:, :2].T).max() < 0.5
 
 
 def test_it_is_not_believed_to_be_where_one_look_alone_finds_it(office, begin, monkeypatch):
@@ -111,9 +111,9 @@ def test_it_is_not_believed_to_be_where_one_look_alone_finds_it(office, begin, m
         ]
         return looks[-1]._replace(candidates=tuple(moved))
 
-    monkeypatch.setattr(ClosureSearch, "everywhere", off_at_times)
+    monkeypatch.setattr(ClosureSearch, "localize_globally", off_at_times)
     run = carried(office, office.records[begin:], 150)
-    (leaf,) = run.recorder.hypotheses[max(run.recorder.hypotheses)].leaves
+    (leaf,) = run.recorder.hypotheses[max(run.recorder.hypotheses)].hypotheses
     assert sum(look.best is not None and look.best[1] > 0.9 for look in looks) >= 3
     assert leaf.lost
 
@@ -121,7 +121,7 @@ def test_it_is_not_believed_to_be_where_one_look_alone_finds_it(office, begin, m
 @pytest.mark.parametrize("seed", [4, 5, 6, 7])
 def test_in_a_building_that_it_does_not_know_it_stays_lost(office, seed):
     run = carried(office, open_log(f"sim:grid,seed={seed},size=0.7").records(), 150)
-    assert all(leaf.lost for leaf in run.recorder.hypotheses[max(run.recorder.hypotheses)].leaves)
+    assert all(leaf.lost for leaf in run.recorder.hypotheses[max(run.recorder.hypotheses)].hypotheses)
 
 
 def test_a_robot_that_stands_still_is_recognized_where_somebody_says_that_it_is(office, begin):
@@ -149,8 +149,8 @@ def test_a_robot_that_stands_still_is_recognized_where_somebody_says_that_it_is(
 
 def test_scans_are_counted_on_and_odometry_begins_anew(office, begin):
     run = carried(office, office.records[begin:], 25)
-    assert run.state.slam.scans == office.state.slam.scans + 25
-    assert run.state.slam.dropped == 0
+    assert run.state.slam.processed_scans == office.state.slam.processed_scans + 25
+    assert run.state.slam.dropped_scans == 0
 
 
 def test_one_that_is_carried_while_it_maps_notices_and_is_recognized():

@@ -124,13 +124,13 @@ def test_a_keyframe_is_whole_again_with_its_ranges():
 
 STATUS = RobotStatus("playing", "aces", 12, 3, 7374, 3, 1)
 EVENT = '{"hypothesis":1,"kind":"cut","keyframes":[1,2],"area":0,"score":0.5,"into":null}'
-EVENTS = f'{{"document":"area_events","version":3,"sequence":3,"events":[{EVENT}],"forgotten":[]}}'
+EVENTS = f'{{"document":"area_events","version":4,"sequence":3,"events":[{EVENT}],"redundant_keyframes":[]}}'
 
 
 @pytest.mark.parametrize(
     ("old", "new", "sentence"),
     [
-        ('"version":3', '"version":2', "has version 2, not 3"),
+        ('"version":4', '"version":2', "has version 2, not 4"),
         ("area_events", "hypotheses", "is no area_events"),
         ('"sequence":3', '"sequence":"3"', r"area_events\.sequence = 3 is not a whole number"),
         ('"sequence":3', '"sequence":true', r"area_events\.sequence = True is not a whole number"),

@@ -82,13 +82,18 @@ def test_what_is_forgotten_was_stored_before_and_is_gone_in_every_process(rounds
         assert not gone & replica.scans.keys()
         assert replica.scans.keys() == state.slam.replica.scans.keys()
     assert not gone & rounds.placed
-    for live in state.slam.live.values():
-        assert not gone & {*live.grid.keyframes, *live.placed.to_dict(), *live.fresh.to_dict(), live.anchor}
+    for live in state.slam.live_hypotheses.values():
+        assert not gone & {
+            *live.particle_filter.keyframes,
+            *live.keyframe_covariances.to_dict(),
+            *live.step_covariances.to_dict(),
+            live.anchor,
+        }
     assert not gone & {keyframe for graph in state.aam.graphs for keyframe in graph.keyframes}
 
 
 def test_every_scan_keeps_its_pose_relative_to_a_keyframe_that_is_there(rounds):
-    scans = rounds.recording.scans
+    scans = rounds.recording.relative_trajectory
     assert set(scans.keyframes.tolist()) <= rounds.placed
     known = scans.keyframes >= 0
     assert known.all()

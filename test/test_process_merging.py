@@ -34,16 +34,16 @@ def test_the_robots_own_area_may_be_the_one_that_is_no_more(drive, merged):
     assert left != []
     areas = drive[0].hybrid_map.area_ids()
     assert not set(left) & set(areas)
-    assert drive[0].last.area in areas
+    assert drive[0].last_estimate.area in areas
 
 
 def test_every_process_has_the_same_map_from_messages_alone(drive):
     recording, replicas = drive
     whole = recording.hybrid_map
     for replica in replicas:
-        assert list(replica.maps) == [recording.replica.best]
-        found = replica.maps[recording.replica.best]
-        assert replica.areas == recording.replica.areas
+        assert list(replica.maps) == [recording.replica.best_hypothesis]
+        found = replica.maps[recording.replica.best_hypothesis]
+        assert replica.robot_areas == recording.replica.robot_areas
         assert found.area_ids() == whole.area_ids()
         for area in found.area_ids():
             here, there = found.keyframes(area), whole.keyframes(area)
@@ -82,9 +82,9 @@ def test_a_log_may_end_when_the_robots_area_becomes_part_of_another(drive, merge
     k, after = next((k, after) for k, (before, after) in merged.items() if before != after)
     recording, _ = run(Until(stamps[k]), Configuration())
     assert recording.probabilities[-1].keyframe == k
-    assert recording.last.area == recording.replica.areas[recording.replica.best] == after
+    assert recording.last_estimate.area == recording.replica.robot_areas[recording.replica.best_hypothesis] == after
     assert after in recording.hybrid_map.area_ids()
-    in_map = recording.area_poses[after].compose(recording.last.pose)
+    in_map = recording.area_poses[after].compose(recording.last_estimate.pose)
     np.testing.assert_allclose(in_map.mean, recording.trajectory[-1], atol=0.05)
 
 
@@ -105,9 +105,9 @@ def test_loops_stay_closed(drive):
 def test_the_saved_map_has_the_areas_that_are_left(drive, tmp_path):
     recording, _ = drive
     writer = MapWriter(tmp_path / "hmt_map")
-    writer.write_map(recording.replica, recording.area_poses, recording.last)
+    writer.write_map(recording.replica, recording.area_poses, recording.last_estimate)
     writer.finish(Configuration())
     saved = read_saved_map(tmp_path / "hmt_map")
     best = saved.replica.maps[saved.replica.best_hypothesis]
     assert best.area_ids() == recording.hybrid_map.area_ids() == sorted(saved.area_poses)
-    assert saved.replica.robot_areas == recording.replica.areas
+    assert saved.replica.robot_areas == recording.replica.robot_areas

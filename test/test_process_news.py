@@ -188,7 +188,7 @@ def visits(tmp_path_factory):
 
 def test_every_process_leaves_the_same_beams_out_and_little_is_stored(visits):
     before, _, _, said, after = visits
-    stored = [any(leaf.stored for leaf in message.leaves) for message in said]
+    stored = [any(leaf.stored for leaf in message.estimates) for message in said]
     assert 0 < sum(stored) < 0.4 * len(stored)
     assert all(message.mapping for message in said)
     scans = after.slam.replica.scans
@@ -200,11 +200,11 @@ def test_every_process_leaves_the_same_beams_out_and_little_is_stored(visits):
     old = [one for one in told if one.keyframe in before.slam.replica.scans and one.keyframe in scans]
     assert len(old) > 10
     for one in old:
-        assert not scans[one.keyframe].valid[list(one.beams)].any()
-    cut = [one for one in old if one.cut]
+        assert not scans[one.keyframe].valid[list(one.removed)].any()
+    cut = [one for one in old if one.occluded]
     assert cut
     for one in cut:
-        starts = scans[one.keyframe].starts[list(one.cut)]
+        starts = scans[one.keyframe].starts[list(one.occluded)]
         assert (starts >= np.float32(one.starts)).all()
 
 

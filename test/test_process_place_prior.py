@@ -78,7 +78,7 @@ def test_what_speaks_against_places_weighs_them_with_an_exponent(drive):
     assert ratios[0] > 0.0 > ratios[1]
     weighed = prior.reweight(where, hybrid_map, seen, before)
     np.testing.assert_allclose(weighed.probabilities, expected / (expected.sum() + 1.0 - 0.8005), rtol=1e-9)
-    assert weighed.found is found
+    assert weighed.candidates is found
 
 
 def test_a_look_finds_the_landmarks_gathered_at_the_events_before(drive, monkeypatch):
@@ -86,7 +86,7 @@ def test_a_look_finds_the_landmarks_gathered_at_the_events_before(drive, monkeyp
     prior, found = place_prior(scans), (located(se2.compose(true, np.array([2.0, 0.0, 0.0]))),)
     where, sighting = PoseDistribution(found, np.array([0.8])), GrowingArea.observe_keyframe
     looked_at = []
-    monkeypatch.setattr(GrowingArea, "sighting", lambda *asked: looked_at.append(asked) or sighting(*asked))
+    monkeypatch.setattr(GrowingArea, "observe_keyframe", lambda *asked: looked_at.append(asked) or sighting(*asked))
     steps = CONFIGURATION.tsbi.recheck_keyframes - 1
     for _ in range(steps):
         known = len(looked_at)
@@ -105,7 +105,7 @@ def test_where_keyframes_of_the_map_moved_it_is_looked_at_anew(drive):
     (asked,) = prior.log_ratios(hybrid_map, seen, before, place)
     moved, shift = hybrid_map.branch(), np.array([3.0, -2.0, 0.0])
     for k, pose in hybrid_map.keyframes(0).items():
-        moved.place(k, 0, se2.compose(shift, pose))
+        moved.set_keyframe(k, 0, se2.compose(shift, pose))
     (off,) = prior.log_ratios(moved, seen, before, place)
     (there,) = prior.log_ratios(moved, seen, before, [located(se2.compose(shift, true))])
     assert there == pytest.approx(asked, abs=1.0)

@@ -225,7 +225,7 @@ def test_what_a_refinement_moved_goes_back_and_what_was_stored_since_goes_with_i
     np.testing.assert_allclose(found.hybrid_map.arc(3, 4).mean, reached, atol=1e-12)
     np.testing.assert_array_equal(found.hybrid_map.arc(2, 3).mean, NEXT)
     assert found.closures[0].snapshot is None
-    at_home = undo_refinements(replace(account, area=3, pose=se2.compose(bent, stored)), closure.name)
+    at_home = undo_refinements(replace(account, area=3, pose=se2.compose(bent, stored)), closure.closure_id)
     np.testing.assert_allclose(at_home.pose, stored, atol=1e-12)
     np.testing.assert_allclose(at_home.frame_change, se2.inverse(bent), atol=1e-12)
 
@@ -278,7 +278,7 @@ def test_what_a_refinement_moved_goes_back_after_an_area_became_part_of_another(
     assert set(closures[0].snapshot.arcs) == {(1, 2)}
     hybrid_map.merge(3, 2, hybrid_map.arc(2, 3))
     found = undo_refinements(
-        AcceptedPath(hybrid_map, history, closures, 2, np.zeros(3)), closure.name
+        AcceptedPath(hybrid_map, history, closures, 2, np.zeros(3)), closure.closure_id
     ).hybrid_map.keyframes(2)
     for k in (20, 21):
         np.testing.assert_array_equal(found[k], former[k][1])
@@ -299,7 +299,7 @@ def test_tsbi_goes_on_with_the_explanations_as_live_hypotheses():
         Hypothesis(0, 0, 0.7, 0, back, moved, (), removed_arcs=(ArcEnds(0, 1),)),
         Hypothesis(0, 0, 0.3, 1, None, (), (Arc(0, 1, link, closure=True),)),
     )
-    run.accept(0, reopened=explanations)
+    run.accept(0, revised_hypotheses=explanations)
     one, two = run.keyframe(ring_drive(9)[8]).hypotheses
     assert (one.parent, two.parent, one.id == two.id) == (0, 0, False)
     assert (one.probability, two.probability) == pytest.approx((0.7, 0.3))
@@ -337,7 +337,7 @@ def test_a_closure_that_was_accepted_falsely_is_withdrawn_when_the_true_one_come
     assert "of all closures 2-0 is taken for false" in told
     assert arcs(with_it) == arcs(without_it)
     assert with_it.hybrid_map.arc(0, 2) is None
-    assert with_it.replica.probabilities[with_it.replica.best] == 1.0
+    assert with_it.replica.probabilities[with_it.replica.best_hypothesis] == 1.0
 
 
 def test_afterwards_the_map_is_as_if_it_had_never_been_there(drives):
@@ -355,8 +355,8 @@ def test_afterwards_the_map_is_as_if_it_had_never_been_there(drives):
 def test_every_process_has_the_same_map_from_messages_alone(drives):
     for recording, replicas in drives:
         for replica in replicas:
-            assert list(replica.maps) == [recording.replica.best]
-            found = replica.maps[recording.replica.best]
+            assert list(replica.maps) == [recording.replica.best_hypothesis]
+            found = replica.maps[recording.replica.best_hypothesis]
             assert found.area_ids() == recording.hybrid_map.area_ids()
             for area in found.area_ids():
                 here, there = found.keyframes(area), recording.hybrid_map.keyframes(area)

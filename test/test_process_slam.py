@@ -41,7 +41,8 @@ def drive(count, start=0):
 def agree(keyframe):
     """The answer that changes nothing."""
     leaves = tuple(
-        Hypothesis(leaf.hypothesis, leaf.hypothesis, 1.0 / len(keyframe.leaves), leaf.area) for leaf in keyframe.leaves
+        Hypothesis(leaf.hypothesis, leaf.hypothesis, 1.0 / len(keyframe.estimates), leaf.area)
+        for leaf in keyframe.estimates
     )
     return [Hypotheses(keyframe.sequence, leaves), ClosureDecision(keyframe.sequence)]
 
@@ -86,7 +87,7 @@ def test_a_keyframe_comes_with_every_half_metre():
     keyframes = dialogue.of(Keyframe)
     assert [keyframe.sequence for keyframe in keyframes] == list(range(len(keyframes)))
     assert len(keyframes) in range(11, 14)
-    assert all(keyframe.leaves[0].stored for keyframe in keyframes)
+    assert all(keyframe.estimates[0].stored for keyframe in keyframes)
 
 
 def test_ground_that_is_mapped_already_stores_no_keyframe():
@@ -94,13 +95,13 @@ def test_ground_that_is_mapped_already_stores_no_keyframe():
     forward = list(drive(41))
     for odometry, scan, _ in forward:
         dialogue.tell(odometry, scan)
-    stored = sum(keyframe.leaves[0].stored for keyframe in dialogue.of(Keyframe))
+    stored = sum(keyframe.estimates[0].stored for keyframe in dialogue.of(Keyframe))
     for k, (odometry, scan, _) in enumerate(reversed(forward)):
         stamp = 10 * SECOND + k * SECOND // 10
         dialogue.tell(replace(odometry, stamp=stamp), replace(scan, stamp=stamp))
     keyframes = dialogue.of(Keyframe)
     assert len(keyframes) > stored + 5
-    assert sum(keyframe.leaves[0].stored for keyframe in keyframes) == stored
+    assert sum(keyframe.estimates[0].stored for keyframe in keyframes) == stored
 
 
 def test_scans_wait_while_a_keyframe_event_is_open_and_none_is_lost():
@@ -179,8 +180,8 @@ def test_the_trails_hold_every_scan_once_and_lead_to_its_pose():
     dialogue.tell(EndOfLog())
     poses = {0: np.zeros(3)}
     for keyframe in dialogue.of(Keyframe):
-        poses[keyframe.sequence] = keyframe.leaves[0].pose.mean
-        poses |= {r.keyframe: r.pose for r in keyframe.leaves[0].revised}
+        poses[keyframe.sequence] = keyframe.estimates[0].pose.mean
+        poses |= {r.keyframe: r.pose for r in keyframe.estimates[0].revised_keyframes}
     rows = [
         (trail.first_scan + k, se2.compose(poses[int(anchor)], pose))
         for trail in dialogue.of(ScanPoses)
@@ -199,7 +200,7 @@ def split_at(event):
     def answer(keyframe):
         if keyframe.sequence != event:
             return agree(keyframe)
-        (leaf,) = keyframe.leaves
+        (leaf,) = keyframe.estimates
         reference = PoseGaussian(np.array([3.0, 0.0, 0.0]), np.diag([1e-4, 1e-4, 1e-5]))
         moved = tuple(MovedKeyframe(k, 0, 1, np.array([0.5 * (k - 6), 0.0, 0.0])) for k in range(6, event + 1))
         change = Hypothesis(
@@ -228,7 +229,7 @@ def test_after_a_change_of_area_poses_are_in_the_new_frame_and_tracking_goes_on(
     for truth, estimate in zip(truths, estimates, strict=True):
         origin = np.array([3.0 if estimate.area == 1 else 0.0, 0.0, 0.0])
         assert np.abs(se2.between(truth, se2.compose(origin, estimate.pose.mean))[:2]).max() < 0.06
-    last = dialogue.of(Keyframe)[-1].leaves[0]
+    last = dialogue.of(Keyframe)[-1].estimates[0]
     assert last.hypothesis == 1
     assert last.area == 1
 
@@ -238,7 +239,7 @@ def test_a_robot_whose_area_becomes_part_of_another_goes_on_there():
     split = split_at(10)
 
     def answer(keyframe):
-        if keyframe.sequence == 0 or keyframe.leaves[0].hypothesis == 0 or keyframe.sequence != 13:
+        if keyframe.sequence == 0 or keyframe.estimates[0].hypothesis == 0 or keyframe.sequence != 13:
             return split(keyframe)
         leaf = Hypothesis(
             1, 1, 1.0, 0, back, local_areas=(LocalArea(0, np.zeros(3)),), area_merge=AreaMerge(1, 0, back)
@@ -260,7 +261,7 @@ def test_a_robot_whose_area_becomes_part_of_another_goes_on_there():
     assert sorted(hybrid_map.keyframes(0)) == [keyframe.sequence for keyframe in dialogue.of(Keyframe)]
     assert set(dialogue.slam._best_hypothesis.filter.keyframe_areas) == {0}
     # The drift goes on from what it was, with what is not known of how the two lie to each other.
-    before, after = (dialogue.of(Keyframe)[k].leaves[0].pose.covariance for k in (13, 14))
+    before, after = (dialogue.of(Keyframe)[k].estimates[0].pose.covariance for k in (13, 14))
     assert np.trace(after[:2, :2]) > np.trace(before[:2, :2]) + 1e-4
 
 
@@ -268,7 +269,7 @@ def test_the_drift_grows_from_the_origin_of_the_area():
     dialogue = Dialogue(answer=split_at(10))
     for odometry, scan, _ in drive(80):
         dialogue.tell(odometry, scan)
-    deviations = [np.sqrt(np.trace(k.leaves[0].pose.covariance[:2, :2])) for k in dialogue.of(Keyframe)]
+    deviations = [np.sqrt(np.trace(k.estimates[0].pose.covariance[:2, :2])) for k in dialogue.of(Keyframe)]
     assert (np.diff(deviations[:11]) > 0).all()
     assert deviations[11] < deviations[10]
 
@@ -284,12 +285,12 @@ def test_two_hypotheses_are_tracked_side_by_side():
     for odometry, scan, _ in drive(40):
         dialogue.tell(odometry, scan)
     keyframes = dialogue.of(Keyframe)
-    assert [leaf.hypothesis for leaf in keyframes[-1].leaves] == [1, 2]
+    assert [leaf.hypothesis for leaf in keyframes[-1].estimates] == [1, 2]
     assert sorted({trail.hypothesis for trail in dialogue.of(ScanPoses)}) == [0, 1, 2]
     dialogue.tell(ClosureDecision(keyframes[-1].sequence, 2))
     for odometry, scan, _ in drive(10, start=40):
         dialogue.tell(odometry, scan)
-    assert [leaf.hypothesis for leaf in dialogue.of(Keyframe)[-1].leaves] == [2]
+    assert [leaf.hypothesis for leaf in dialogue.of(Keyframe)[-1].estimates] == [2]
 
 
 def test_a_robot_that_takes_itself_for_lost_goes_on_by_odometry():
@@ -298,14 +299,14 @@ def test_a_robot_that_takes_itself_for_lost_goes_on_by_odometry():
     def lost_at_the_third(keyframe):
         lost = keyframe.sequence == 2
         answer, accepted = agree(keyframe)
-        leaves = tuple(replace(leaf, lost=lost, arriving=lost) for leaf in answer.leaves)
-        return [replace(answer, leaves=leaves), accepted]
+        leaves = tuple(replace(leaf, lost=lost, tracking_reset=lost) for leaf in answer.hypotheses)
+        return [replace(answer, hypotheses=leaves), accepted]
 
     dialogue = Dialogue(answer=lost_at_the_third)
     truths = []
     for odometry, scan, pose in drive(40):
         dialogue.tell(odometry, scan)
         truths.append(pose)
-    assert [keyframe.carried for keyframe in dialogue.of(Keyframe)[:5]] == [False, False, False, True, False]
+    assert [keyframe.motion_unknown for keyframe in dialogue.of(Keyframe)[:5]] == [False, False, False, True, False]
     off = np.array([se2.between(t, e.pose.mean) for t, e in zip(truths, dialogue.of(LocalEstimate), strict=True)])
     assert np.hypot(*off[:, :2].T).max() < 0.05

@@ -78,7 +78,7 @@ def driven(sweep, told):
     dialogue.tell(EndOfLog())
     assert not dialogue.of(Notice)
     estimates = np.array([estimate.pose.mean for estimate in dialogue.of(LocalEstimate)])
-    stored = [(k.scan, k.leaves[0].pose.mean) for k in dialogue.of(Keyframe) if k.leaves[0].stored]
+    stored = [(k.scan, k.estimates[0].pose.mean) for k in dialogue.of(Keyframe) if k.estimates[0].stored]
     image = occupancy_image([scan for scan, _ in stored], np.array([pose for _, pose in stored]), 0.05, 30.0)
     errors = se2.between(true_pose(np.arange(SCANS) * PERIOD), estimates)
     return Drive(errors, int(np.sum(image.pixels == OCCUPIED)))

@@ -47,7 +47,7 @@ def test_keyframes_that_closed_a_loop_are_finely_aligned_with_the_area_and_the_a
     play, verdict, first, truth, a_T_b = closing_play(error)
     assert [r.keyframe for r in verdict.moved_keyframes] == list(range(first, first + len(truth)))
     for r, true in zip(verdict.moved_keyframes, truth, strict=True):
-        assert (r.source, r.area) == (0, 0)
+        assert (r.previous_area, r.area) == (0, 0)
         assert np.hypot(*(r.pose[:2] - true[:2])) < 0.03
         np.testing.assert_array_equal(play.process._replica.maps[0].keyframes(0)[r.keyframe], r.pose)
     off = se2.between(a_T_b, play.arc(0, 1).mean)
@@ -60,7 +60,7 @@ def test_after_an_acceptance_the_keyframes_of_both_areas_are_refined_jointly_and
     play, verdict, first, truth, a_T_b = closing_play(np.array([0.1, -0.08, 0.02]), refinement=4)
     placed = play.process._replica.maps[0]
     assert {r.keyframe for r in verdict.moved_keyframes} == {*placed.keyframes(0), *placed.keyframes(1)}
-    assert all(r.source == r.area for r in verdict.moved_keyframes)
+    assert all(r.previous_area == r.area for r in verdict.moved_keyframes)
     for i, true in enumerate(truth):
         assert np.hypot(*(placed.keyframes(0)[first + i][:2] - true[:2])) < 0.02
     off = se2.between(a_T_b, play.arc(0, 1).mean)
@@ -162,7 +162,7 @@ def test_a_contradiction_is_told_to_tsbi_and_the_map_is_not_bent_by_it():
     assert before.hypothesis == 0
     assert before.global_poses == ()
     best = before.revised_hypotheses[0]
-    assert [(ends.source, ends.target) for ends in best.withdrawn] == [(0, 2)]
+    assert [(ends.source, ends.target) for ends in best.removed_arcs] == [(0, 2)]
     assert "of all closures 2-0 is taken for false" in play.notices[-1].text
     verdict = play.step(replace(best, probability=1.0))
     assert verdict.hypothesis == 0
@@ -179,8 +179,8 @@ def test_a_contradiction_is_told_to_tsbi_and_the_map_is_not_bent_by_it():
 def test_a_question_that_is_open_again_is_closed_as_any_other():
     play = Play(arc_sigma_floor=1e-4, arc_angle_floor=1e-3, accept_distance=0.0, accept_probability=0.98)
     best, second, *_ = two_loops(play, false_closure=True).revised_hypotheses
-    assert [(ends.source, ends.target) for ends in second.withdrawn] == [(0, 4)]
-    leaves = replace(best, hypothesis=1, probability=0.99), replace(second, hypothesis=2, probability=0.01)
+    assert [(ends.source, ends.target) for ends in second.removed_arcs] == [(0, 4)]
+    leaves = replace(best, id=1, probability=0.99), replace(second, id=2, probability=0.01)
     assert play.step(*leaves).hypothesis is None
     both = Hypothesis(1, 1, 0.99, 4), Hypothesis(2, 2, 0.01, 4)
     assert [play.step(*both).hypothesis for _ in range(2)] == [None, 1]

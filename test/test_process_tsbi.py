@@ -150,12 +150,12 @@ def test_ground_tracked_by_way_of_another_area_is_joined_by_a_measured_arc():
     assert run.replica.maps[0].arc(2, 0) is None
     run.stored = False
     answers = [run.keyframe(np.array([*poses[k][:2], math.pi])) for k in (14, 8, 2, 2, 2)]
-    (arc,) = [arc for answer in answers for leaf in answer.leaves for arc in leaf.arcs]
+    (arc,) = [arc for answer in answers for leaf in answer.hypotheses for arc in leaf.arcs]
     assert (arc.source, arc.target, arc.closure) == (2, 0, True)
     reference = min(run.replica.maps[0].keyframes(2))
     assert np.allclose(arc.pose.mean, se2.between(poses[reference], poses[0]), atol=0.03)
     assert np.sqrt(arc.pose.covariance[1, 1]) < 0.2
-    assert answers[-1].leaves[0].probability == 1.0
+    assert answers[-1].hypotheses[0].probability == 1.0
 
 
 def ring_with_two_leaves(apart=1.0):
@@ -182,15 +182,15 @@ def test_the_evidence_of_the_scans_shifts_the_weights():
     before = dict(run.replica.probabilities)
     run.evidence = {first: 0.0, second: 1.5}
     answer = run.keyframe(run.true_pose)
-    after = {leaf.hypothesis: leaf.probability for leaf in answer.leaves}
+    after = {leaf.id: leaf.probability for leaf in answer.hypotheses}
     assert after[second] / after[first] == pytest.approx(math.exp(1.5) * before[second] / before[first])
 
 
 def test_hypotheses_that_say_the_same_become_one_with_the_weight_of_both():
     run = ring_with_two_leaves(apart=0.2)
     run.evidence = {1: 0.0, 2: 1.5}
-    (leaf,) = run.keyframe(run.true_pose).leaves
-    assert leaf.hypothesis == 2
+    (leaf,) = run.keyframe(run.true_pose).hypotheses
+    assert leaf.id == 2
     assert leaf.probability == pytest.approx(1.0)
 
 
@@ -203,7 +203,7 @@ def odds_after_return(keyframes, apart):
         run.keyframe(pose)
     run.keyframe(poses[4])
     split_in_two(run, np.array(apart))
-    first, second = (leaf.probability for leaf in run.keyframe(poses[5]).leaves)
+    first, second = (leaf.probability for leaf in run.keyframe(poses[5]).hypotheses)
     return first / second / 1.5
 
 
@@ -219,9 +219,9 @@ def test_what_was_seen_just_before_is_no_known_ground():
 
 def test_acceptance_leaves_one_hypothesis():
     run = ring_with_two_leaves()
-    run.apply_decision(2)
-    (leaf,) = run.keyframe(run.true_pose).leaves
-    assert (leaf.hypothesis, leaf.parent, leaf.probability) == (2, 2, 1.0)
+    run.accept(2)
+    (leaf,) = run.keyframe(run.true_pose).hypotheses
+    assert (leaf.id, leaf.parent, leaf.probability) == (2, 2, 1.0)
 
 
 def test_the_local_map_takes_the_poses_of_the_global_map_where_they_agree():

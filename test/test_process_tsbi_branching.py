@@ -110,7 +110,7 @@ def test_the_robot_is_told_to_be_as_uncertain_in_the_area_as_its_newest_keyframe
     assert {child.area for child in children} == {0, 2}
     for child in children:
         carried = child.frame_change.compose(exact)
-        np.testing.assert_allclose(carried.covariance, child.notes.covariances[newest[-1]], atol=1e-12)
+        np.testing.assert_allclose(carried.covariance, child.state.covariances[newest[-1]], atol=1e-12)
         (moved,) = [r.pose for r in child.moved_keyframes if r.keyframe == newest[-1]]
         np.testing.assert_allclose(carried.mean, moved, atol=1e-9)
 
@@ -129,8 +129,8 @@ def test_a_re_check_joins_areas_by_an_arc_and_moves_nothing():
     known_through_another(parent.hybrid_map)
     children = branching.recheck(parent).children
     stay, *joined = children
-    assert (stay.area, stay.arcs, stay.reload) == (2, (), False)
-    assert stay.notes.unmatched_keyframes == ()
+    assert (stay.area, stay.arcs, stay.reload_local_map) == (2, (), False)
+    assert stay.state.unmatched_keyframes == ()
     assert joined
     for child in joined:
         assert (child.area, child.moved_keyframes, child.frame_change) == (2, (), None)
@@ -158,7 +158,7 @@ def test_keyframes_that_see_an_area_but_are_not_in_its_place_yet_are_asked_again
     parent, branching, newest = approaching((8.7, 8.2, 7.7, 7.2, 6.7, 6.2))
     branches = branching.cut(parent, newest)
     assert [child.area for child in branches.children] == [parent.area + 1]
-    assert 0 not in branches.children[0].notes.compared
+    assert 0 not in branches.children[0].state.matched_keyframes
 
 
 def test_whether_the_robot_is_in_known_ground_now_is_asked_of_the_newest_keyframes():
@@ -168,10 +168,12 @@ def test_whether_the_robot_is_in_known_ground_now_is_asked_of_the_newest_keyfram
     assert [arc.target for arc in joined.arcs] == [0]
     assert joined.log_weight > stay.log_weight
     parent, branching, newest = approaching((8.7, 8.2, 7.7, 7.2, 6.7, 6.2))
-    parent = replace(parent, notes=replace(parent.notes, unchecked=tuple(newest[-3:]), beside=(0,)))
+    parent = replace(
+        parent, state=replace(parent.state, unmatched_keyframes=tuple(newest[-3:]), pending_candidates=(0,))
+    )
     (stay,) = branching.recheck(parent, (0,)).children
     assert stay.log_weight == parent.log_weight
-    assert (stay.notes.unmatched_keyframes, stay.notes.beside) == (tuple(newest[-3:]), (0,))
+    assert (stay.state.unmatched_keyframes, stay.state.pending_candidates) == (tuple(newest[-3:]), (0,))
 
 
 def test_keyframes_most_of_which_are_in_its_place_are_recognized():
@@ -203,6 +205,6 @@ def test_an_improbable_hypothesis_examines_few_areas_and_counts_the_others():
     examined = {}
     for share in (1.0, 1e-3):
         branches = branching.cut(replace(parent, probability=share), newest[1:])
-        examined[share] = {area for child in branches.children for area in child.notes.compared}
+        examined[share] = {area for child in branches.children for area in child.state.matched_keyframes}
         assert (branches.log_skipped_weight > -math.inf) == (share < 1.0)
     assert (len(examined[1.0]), len(examined[1e-3])) == (6, 4)

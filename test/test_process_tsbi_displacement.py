@@ -51,7 +51,7 @@ def test_the_keyframes_since_then_begin_an_area_of_which_nothing_tells_where_it_
     stays, lost = asked((ROOM, OTHER, ROOM), {2: 8.0}).children
     assert (stays.area, stays.log_weight, stays.moved_keyframes) == (2, 0.0, ())
     assert lost.area == 3
-    assert lost.notes.lost == 14
+    assert lost.state.lost_since == 14
     (arc,) = lost.arcs
     assert (arc.source, arc.target) == (2, 3)
     assert is_uninformative(arc.pose)
@@ -59,16 +59,16 @@ def test_the_keyframes_since_then_begin_an_area_of_which_nothing_tells_where_it_
     assert sorted(poses) == [14, 15, 16, 17]  # what was stored before the displacement stays
     for keyframe, pose in poses.items():
         np.testing.assert_allclose(pose, se2.between(PATH[2], PATH[keyframe - 12]), atol=1e-9)
-    assert not stays.notes.kidnapping_evidence
-    assert not lost.notes.kidnapping_evidence
+    assert not stays.state.kidnapping_evidence
+    assert not lost.state.kidnapping_evidence
 
 
 def test_that_the_place_is_known_elsewhere_speaks_for_it_and_one_look_has_found_it():
     _, lost = asked((ROOM, OTHER, ROOM), {2: 8.0}).children
     assert lost.log_weight > PRIOR + 8.0 + 1.0
-    assert lost.notes.counted_evidence == pytest.approx(lost.log_weight - PRIOR - 8.0)
-    assert lost.notes.relocalization_candidate.area == 0
-    np.testing.assert_allclose(lost.notes.relocalization_candidate.pose, se2.between(PATH[0], PATH[5]), atol=0.05)
+    assert lost.state.counted_evidence == pytest.approx(lost.log_weight - PRIOR - 8.0)
+    assert lost.state.relocalization_candidate.area == 0
+    np.testing.assert_allclose(lost.state.relocalization_candidate.pose, se2.between(PATH[0], PATH[5]), atol=0.05)
 
 
 def test_it_is_believed_to_be_where_two_looks_find_it():
@@ -78,7 +78,7 @@ def test_it_is_believed_to_be_where_two_looks_find_it():
     )
     (still,) = relocalization.update_relocalization(branching, replace(parent, state=notes)).children
     assert still.state.relocalization_candidate.area == 0
-    looked = relocalization.update_relocalization(branching, replace(parent, notes=still.state))
+    looked = relocalization.update_relocalization(branching, replace(parent, state=still.state))
     _, found = looked.children
     assert relocalization.accept_relocalization(looked).children == [found]
     assert (found.state.lost_since, found.state.tracked_pose, found.state.relocalized_area) == (None, None, 0)
@@ -101,7 +101,7 @@ def test_where_nothing_is_stored_it_goes_over_into_the_area_where_it_was_recogni
 def test_on_ground_that_nobody_knows_the_doubts_alone_speak_for_it():
     _, lost = asked((OTHER, OTHER, ROOM), {2: 8.0}).children
     assert lost.log_weight == pytest.approx(PRIOR + 8.0 + math.log(KIDNAPPED_UNMAPPED_PRIOR), abs=0.5)
-    assert lost.notes.relocalization_candidate is None
+    assert lost.state.relocalization_candidate is None
 
 
 def test_that_the_place_is_known_where_the_robot_would_be_anyway_speaks_against_it():
@@ -265,5 +265,5 @@ def test_what_a_displaced_robot_saw_is_not_forgotten_at_the_same_event():
         assert len(run.keyframe(pose).hypotheses) == 1
     run._answer = lambda sequence, _events: run.tsbi.handle(AreaEvents(sequence, (), (PrunedKeyframe(sequence, 0),)))
     (answer,) = run.keyframe(poses[14])
-    assert [leaf.lost for leaf in answer.leaves] == [False, True]
-    assert not answer.forgotten
+    assert [leaf.lost for leaf in answer.hypotheses] == [False, True]
+    assert not answer.pruned_keyframes

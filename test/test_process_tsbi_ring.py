@@ -33,7 +33,7 @@ def closures(run, hypothesis):
 
 def test_the_ring_closes(ring):
     run, _ = ring
-    best = run.replica.best
+    best = run.replica.best_hypothesis
     assert run.replica.probabilities[best] > 0.95
     assert closures(run, best)
 
@@ -49,8 +49,8 @@ def test_the_drift_before_the_closure_was_too_large_for_the_local_map(ring):
 def test_the_arc_that_closes_the_ring_is_precise(ring):
     """From frame to frame: the first keyframes of both areas, whose true poses are known."""
     run, poses = ring
-    hybrid_map = run.replica.maps[run.replica.best]
-    a, b, value = closures(run, run.replica.best)[0]
+    hybrid_map = run.replica.maps[run.replica.best_hypothesis]
+    a, b, value = closures(run, run.replica.best_hypothesis)[0]
     keyframe_a, pose_a = next(iter(hybrid_map.keyframes(a).items()))
     keyframe_b, pose_b = next(iter(hybrid_map.keyframes(b).items()))
     truth = se2.between(
@@ -64,9 +64,9 @@ def test_the_arc_that_closes_the_ring_is_precise(ring):
 def test_two_runs_say_the_same_to_the_bit(ring):
     run, _ = ring
     again, _ = around_the_ring()
-    for a, b in zip(run.answers, again.histories, strict=True):
-        assert [(x.hypothesis, x.probability, x.area) for x in a.leaves] == [
-            (x.hypothesis, x.probability, x.area) for x in b.leaves
+    for a, b in zip(run.answers, again.answers, strict=True):
+        assert [(x.id, x.probability, x.area) for x in a.hypotheses] == [
+            (x.id, x.probability, x.area) for x in b.hypotheses
         ]
 
 
@@ -74,10 +74,10 @@ def test_a_hypothesis_that_branched_has_children_with_new_ids(ring):
     run, _ = ring
     seen = set()
     for answer in run.answers:
-        parents = [leaf.parent for leaf in answer.leaves]
-        for leaf in answer.leaves:
-            if leaf.hypothesis != leaf.parent:
-                assert leaf.hypothesis not in seen
-            elif leaf.hypothesis == leaf.parent:
+        parents = [leaf.parent for leaf in answer.hypotheses]
+        for leaf in answer.hypotheses:
+            if leaf.id != leaf.parent:
+                assert leaf.id not in seen
+            elif leaf.id == leaf.parent:
                 assert parents.count(leaf.parent) == 1
-        seen |= {leaf.hypothesis for leaf in answer.leaves}
+        seen |= {leaf.id for leaf in answer.hypotheses}

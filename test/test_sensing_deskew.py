@@ -117,8 +117,8 @@ def steady(*stamps):
 )
 def test_motion_is_interpolated_and_goes_on_for_a_while_after_the_last_reading(stamps, start, end, travelled):
     buffer = steady(*stamps)
-    buffer.at(start * MS)
-    np.testing.assert_allclose(buffer.motion(start * MS, end * MS), (travelled, 0.0, 0.0), atol=1e-12)
+    buffer.pose_at(start * MS)
+    np.testing.assert_allclose(buffer.twist_between(start * MS, end * MS), (travelled, 0.0, 0.0), atol=1e-12)
 
 
 def blank(stamp, increment, beams=101):

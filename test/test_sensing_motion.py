@@ -137,7 +137,7 @@ def test_the_noise_of_odometry_is_learnt(factor):
 def test_odometry_better_than_its_model_is_taken_as_the_model_says():
     np.testing.assert_array_equal(learnt(0.3).factors, 1.0)
     step, inertia = RelativeMotion(TURNING, np.diag([1.0, 2.0, 3.0])), RelativeMotion(np.zeros(3), 1e-6 * np.eye(3))
-    for said in (learnt(0.3).scale(step), learnt(0.3).together(step, inertia)):
+    for said in (learnt(0.3).scale(step), learnt(0.3).fuse(step, inertia)):
         np.testing.assert_array_equal(said.increment, step.increment)
         np.testing.assert_array_equal(said.covariance, step.covariance)
 
@@ -147,7 +147,7 @@ def test_inertia_reduces_noise_beyond_twice_the_models_and_no_more():
         RelativeMotion(np.array([0.1, 0.0, 0.0]), 1e-4 * np.eye(3)),
         RelativeMotion(np.zeros(3), 1e-12 * np.eye(3)),
     )
-    both = learnt(4.0).together(step, inertia)
+    both = learnt(4.0).fuse(step, inertia)
     np.testing.assert_allclose(both.increment, 0.0, atol=1e-3)
     np.testing.assert_allclose(both.covariance, 4.0 * step.covariance, rtol=1e-3, atol=1e-9)
 

@@ -114,7 +114,7 @@ def se2_frame(origin, heading, scenario):
 
 def test_a_quarter_turn_of_the_ring_changes_nothing():
     scenario = scenario_of("ring", 5)
-    places = scenario.building.places
+    places = scenario.building.twin_frames
     middle = [0.0, -7.0, 0.0]
     views = [view(scenario, se2.compose(places[f"side {k}"], middle), 30.0) for k in range(4)]
     for other in views[1:]:
@@ -142,7 +142,7 @@ def test_in_the_middle_of_the_hall_the_laser_sees_nothing_and_in_its_corners_it_
 @pytest.mark.parametrize("seed", SEEDS)
 def test_the_twins_are_alike_as_far_as_the_laser_sees_and_the_passage_behind_them_is_not(seed):
     scenario = scenario_of("twins", seed)
-    first, second = scenario.building.places["first"], scenario.building.places["second"]
+    first, second = scenario.building.twin_frames["first"], scenario.building.twin_frames["second"]
     reach = scenario.settings.range
     # All that is seen from the hall, and from inside up to where the passage behind the door comes into reach.
     for pose in ([-3.5, 0.5, 0.3], [-2.0, -1.0, -0.3], [-1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [2.2, 0.5, 2.0]):
@@ -157,7 +157,7 @@ def test_the_twins_are_alike_as_far_as_the_laser_sees_and_the_passage_behind_the
 def test_after_the_tour_of_the_hall_odometry_cannot_tell_the_twins_apart(seed):
     """From the last wall that is seen to the next, the deviation across is more than from room to room."""
     scenario = scenario_of("twins", seed, dropout=0)
-    first, second = scenario.building.places["first"], scenario.building.places["second"]
+    first, second = scenario.building.twin_frames["first"], scenario.building.twin_frames["second"]
     blind = np.array([not scenario.scan(k).valid.any() for k in range(scenario.scan_stamps.size)])
     edges = np.flatnonzero(np.diff(np.pad(blind.astype(int), 1)))
     begin, end = max(edges.reshape(-1, 2).tolist(), key=lambda stretch: stretch[1] - stretch[0])
@@ -180,7 +180,7 @@ def test_chance_decides_which_of_the_twins_is_entered_again():
     for seed in range(10):
         building = scenario_of("twins", seed).building
         entered = building.route[10]
-        distances = [np.hypot(*(entered - building.places[name][:2])) for name in ("first", "second")]
+        distances = [np.hypot(*(entered - building.twin_frames[name][:2])) for name in ("first", "second")]
         again.add(int(np.argmin(distances)))
     assert again == {0, 1}
 

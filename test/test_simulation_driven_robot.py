@@ -28,7 +28,7 @@ def robot_in(building=None, start=None, **settings):
 def drive(robot, speed, turn_rate, readings):
     for _ in range(readings):
         robot.set_velocity(speed, turn_rate)
-        robot.drive()
+        robot.advance()
 
 
 def test_it_begins_where_the_scripted_drive_does_and_sees_the_same():
@@ -54,7 +54,7 @@ def test_it_follows_an_exact_arc_once_it_is_as_fast_as_told():
 def test_accelerations_and_speeds_are_limited():
     robot = robot_in(speed=0.5, turn_rate=30.0)
     robot.set_velocity(3.0, -9.0)
-    robot.drive()
+    robot.advance()
     assert robot.velocity == pytest.approx((0.05, -math.radians(9.0)))
     drive(robot, 3.0, -9.0, 30)
     assert robot.velocity == pytest.approx((0.5, -math.radians(30.0)))
@@ -64,27 +64,27 @@ def test_accelerations_and_speeds_are_limited():
 
 def test_without_a_command_it_stands_still():
     robot = robot_in()
-    robot.drive()
-    assert robot.travelled == 0.0
+    robot.advance()
+    assert robot.distance_traveled == 0.0
     robot.set_velocity(0.2, 0.0)
     for _ in range(5):
-        robot.drive()
+        robot.advance()
     assert robot.velocity[0] == pytest.approx(0.2)
     for _ in range(4):  # it brakes with 0.5 m/s^2
-        robot.drive()
+        robot.advance()
     assert robot.velocity == (0.0, 0.0)
     still = robot.pose
-    robot.drive()
+    robot.advance()
     np.testing.assert_array_equal(robot.pose, still)
 
 
 def test_a_wall_that_is_put_up_is_seen_and_not_passed_until_it_is_gone():
     robot = robot_in(start=np.zeros(3), dropout=0.0)
-    robot.close(np.array([[2.0, -4.0, 2.0, 4.0]]))
+    robot.close_doors(np.array([[2.0, -4.0, 2.0, 4.0]]))
     assert robot.measure()[1].ranges[180] == pytest.approx(2.0, abs=0.1)
     drive(robot, 0.6, 0.0, 60)
     assert (robot.contacts, robot.pose[0]) == (1, pytest.approx(1.75, abs=0.013))
-    robot.close(np.empty((0, 4)))
+    robot.close_doors(np.empty((0, 4)))
     drive(robot, 0.6, 0.0, 30)
     assert robot.pose[0] > 2.5
 
@@ -123,19 +123,19 @@ def test_people_walk_wait_before_the_robot_and_turn_back_and_are_not_passed_thro
     robot = robot_in(people=8, seed=2, odometry=0.0)
     nearest, walked = math.inf, np.zeros(8)
     for _ in range(300):
-        before = robot.people
+        before = robot.people_discs
         robot.set_velocity(0.6 if robot.contacts % 2 == 0 else -0.6, 0.0)
-        robot.drive()
-        steps = np.hypot(*(robot.people - before)[:, :2].T)
+        robot.advance()
+        steps = np.hypot(*(robot.people_discs - before)[:, :2].T)
         # Where the robot's route turns back, its left side is another.
         assert steps.max() <= 0.1 * 1.4 + 0.5
         assert np.median(steps) <= 0.1 * 1.4
         walked += steps
-        nearest = min(nearest, np.hypot(*(robot.people[:, :2] - robot.pose[:2]).T).min())
+        nearest = min(nearest, np.hypot(*(robot.people_discs[:, :2] - robot.pose[:2]).T).min())
     assert robot.contacts > 0
     assert (walked > 3.0).all()
     # The discs of a person and the robot never overlap more than where the person stood when the drive began.
-    start = np.hypot(*(robot_in(people=8, seed=2).people[:, :2] - ROUTE[0]).T).min()
+    start = np.hypot(*(robot_in(people=8, seed=2).people_discs[:, :2] - ROUTE[0]).T).min()
     assert nearest >= min(start, 0.2 + 0.25)
 
 
@@ -156,7 +156,7 @@ def test_the_laser_sees_people_where_they_are():
     robot = robot_in(people=1, seed=1, range_noise=0.0, dropout=0.0, field_of_view=360.0, beams=720)
     scan = robot.measure()[1]
     points = se2.transform(robot.pose, scan.points)
-    x, y, radius = robot.people[0]
+    x, y, radius = robot.people_discs[0]
     on_disc = np.abs(np.hypot(points[:, 0] - x, points[:, 1] - y) - radius) < 1e-4
     assert on_disc.sum() >= 3
 
@@ -174,7 +174,7 @@ def test_odometry_at_scans_is_the_scripted_drives_model_of_the_same_draws(readin
         if k % 7 == 0:
             turn = turns.uniform(-0.7, 0.7)
         robot.set_velocity(0.4, turn)
-        robot.drive()
+        robot.advance()
     true = se2.between(np.array(poses[:-1]), np.array(poses[1:]))
     expected = integrate_increments(noisy_increments(true, 1.0, random_stream(4, Purpose.WHEELS, 0)))
     np.testing.assert_allclose(np.array(wheels), expected, atol=1e-12)
@@ -186,7 +186,7 @@ def test_odometry_between_scans_grows_evenly_on_an_even_way():
     start, wheels, errors = robot.pose, robot.measure()[0].pose, []
     for _ in range(4):
         robot.set_velocity(0.5, 0.0)
-        robot.drive()
+        robot.advance()
         measured = se2.between(wheels, robot.measure()[0].pose)
         errors.append(se2.log(se2.between(se2.between(start, robot.pose), measured)))
     np.testing.assert_allclose(errors, np.arange(1, 5)[:, None] / 4 * errors[-1], atol=1e-9)
@@ -197,7 +197,7 @@ def test_wheels_do_not_notice_that_it_is_carried():
     robot = robot_in(odometry=0.0, readings=2)
     drive(robot, 0.3, 0.1, 11)
     before, wheels = robot.pose, robot.measure()[0].pose
-    robot.carry(np.array([1.0, 2.0, 2.5]))
+    robot.kidnap(np.array([1.0, 2.0, 2.5]))
     assert robot.velocity == (0.0, 0.0)
     put = robot.pose
     drive(robot, 0.3, 0.1, 10)

@@ -14,7 +14,7 @@ CORNERS = np.array([[0.0, 0.0], [6.0, 0.0], [6.0, 5.0], [9.0, 8.0], [6.0, 5.0], 
 
 
 def end_of(path):
-    return path.pose(np.array([len(path.lengths) - 1]), path.sizes[-1:])[0]
+    return path.poses_at(np.array([len(path.lengths) - 1]), path.sizes[-1:])[0]
 
 
 def test_the_way_begins_and_ends_at_its_way_points_and_goes_on_without_a_jump():

@@ -110,7 +110,7 @@ def test_the_laser_sees_all_around_and_people_walk():
     scenario = scenario_of(2)
     angles = scenario.laser.angles
     assert np.ptp(angles) == pytest.approx(2.0 * np.pi * 719 / 720)
-    places = [scenario.people.discs(seconds, scenario.poses[0])[:, :2] for seconds in (0.0, 0.2)]
+    places = [scenario.people.discs_at(seconds, scenario.poses[0])[:, :2] for seconds in (0.0, 0.2)]
     assert len(places[0]) == 4
     assert (np.hypot(*(places[1] - places[0]).T) > 0.01).all()
 

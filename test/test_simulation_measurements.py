@@ -61,7 +61,7 @@ def test_beams_beyond_the_range_do_not_return():
 def test_during_a_sweep_the_robot_moves_on():
     scenario = noiseless(sweep=0.1, field_of_view=360.0, beams=360)
     scan = scenario.scan(25)
-    assert scan.sweep == pytest.approx(0.1, abs=1e-6)
+    assert scan.sweep_duration == pytest.approx(0.1, abs=1e-6)
     at_once = noiseless(field_of_view=360.0, beams=360).scan(25)
     ahead = 180
     assert at_once.ranges[ahead] - scan.ranges[ahead] == pytest.approx(0.6 * 0.1 * 180 / 359, abs=1e-4)
@@ -82,12 +82,12 @@ def test_people_walk_no_faster_than_people_keep_off_the_robot_and_are_seen():
     times = np.arange(0.0, scenario.drive.duration, 0.05)
     poses = scenario.drive.poses(times)
     # Far away from the robot nobody steps aside.
-    discs = np.array([scenario.people.discs(time, np.array([1e6, 0.0, 0.0])) for time in times])
+    discs = np.array([scenario.people.discs_at(time, np.array([1e6, 0.0, 0.0])) for time in times])
     speeds = np.hypot(*np.diff(discs[:, :, :2], axis=0).transpose(2, 0, 1)) / 0.05
     assert 0.5 < np.median(speeds) < 1.4
     assert (speeds < 1.4 + 1e-9).mean() > 0.99
     for time, pose in zip(times[::20], poses[::20], strict=True):
-        away = scenario.people.discs(time, pose)[:, :2] - pose[:2]
+        away = scenario.people.discs_at(time, pose)[:, :2] - pose[:2]
         assert np.hypot(*away.T).min() > 0.8 - 1e-9
     for k in range(scenario.scan_stamps.size):
         with_people, without = scenario.scan(k).ranges, empty.scan(k).ranges

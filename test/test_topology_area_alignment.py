@@ -67,13 +67,13 @@ def test_along_a_corridor_the_closure_decides_and_across_it_the_walls():
 def test_scans_in_unknown_space_are_left_where_they_are(alignment):
     far = claimed([60.0, 0.0, 0.0])
     assert alignment.align(placed(ROOMS, KNOWN), placed(ROOMS, JOINED), far) is None
-    assert alignment.measured(placed(ROOMS, KNOWN), [], claimed([0.0, 0.0, 0.0])) is None
+    assert alignment.align(placed(ROOMS, KNOWN), [], claimed([0.0, 0.0, 0.0])) is None
 
 
 def test_one_alignment_leaves_nothing_behind_for_the_next(alignment):
     closure = claimed([0.05, 0.02, 0.01])
     first = alignment.align(placed(ROOMS, KNOWN), placed(ROOMS, JOINED), closure)
-    alignment.measured(placed(CORRIDOR, KNOWN), placed(CORRIDOR, JOINED), closure)
-    again = alignment.measured(placed(ROOMS, KNOWN), placed(ROOMS, JOINED), closure)
+    alignment.align(placed(CORRIDOR, KNOWN), placed(CORRIDOR, JOINED), closure)
+    again = alignment.align(placed(ROOMS, KNOWN), placed(ROOMS, JOINED), closure)
     np.testing.assert_array_equal(again.mean, first.mean)
     np.testing.assert_array_equal(again.covariance, first.covariance)

@@ -27,9 +27,9 @@ def between(there, here, known=KNOWN, seen=SEEN):
 def test_in_the_same_room_no_wall_is_seen_through():
     found = between(OUTER, OUTER)
     # 24 m of walls, a sample every 0.2 m, in nearly all scans of both.
-    assert found.on > 600
-    assert found.free == 0
-    assert found.samples == found.on
+    assert found.on_surface > 600
+    assert found.in_free_space == 0
+    assert found.samples == found.on_surface
     assert WALLS_OF_MAP.log_likelihood_ratio(found, WALLS_OUTLIER_RATE) > 0.0
 
 
@@ -37,7 +37,7 @@ def test_in_the_same_room_no_wall_is_seen_through():
 def test_a_door_is_found_open_whichever_side_knows_it_closed(turned):
     rooms = (OUTER, OPEN)
     found = between(*rooms[::-1] if turned else rooms)
-    assert found.free >= 10  # five samples across, in scans that see it at all
+    assert found.in_free_space >= 10  # five samples across, in scans that see it at all
     assert WALLS_OF_MAP.log_likelihood_ratio(found, WALLS_OUTLIER_RATE) < -1.0
 
 
@@ -45,7 +45,7 @@ def test_a_shelf_speaks_against_the_room_and_people_do_little():
     """What only one side knows is seen through by the other; what is behind it is not."""
     shelf = between(np.concatenate((OUTER, SHELF)), OUTER)
     people = between(OUTER, np.concatenate([OUTER, *(box(x, 0.5, x + 0.3, 0.8) for x in (-1.0, 2.0))]))
-    assert shelf.free > 2 * people.free
+    assert shelf.in_free_space > 2 * people.in_free_space
     assert -1.0 < WALLS_OF_MAP.log_likelihood_ratio(people, WALLS_OUTLIER_RATE) < 0.0
     assert WALLS_OF_MAP.log_likelihood_ratio(people, 0.003) > WALLS_OF_MAP.log_likelihood_ratio(
         people, WALLS_OUTLIER_RATE

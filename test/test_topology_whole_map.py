@@ -91,7 +91,7 @@ def test_who_walks_through_what_the_robot_sees_speaks_against_no_place(asked, la
     best = max(laid([0, 1]), key=lambda fit: fit.mode.log_mass)
     assert best.area == 0
     assert off(best) < 0.05
-    assert best.found.free <= 1
+    assert best.agreement.in_free_space <= 1
 
 
 def test_all_areas_are_looked_at_however_many_there_are(asked, laid):
@@ -108,13 +108,13 @@ def test_walls_tell_where_keyframes_lie(asked, laid):
     """As they were found, no wall is seen through; half a metre aside, the robot would see through some."""
     hybrid_map, poses, scans = asked
     best = max(laid([0]), key=lambda fit: fit.mode.log_mass)
-    found = whole_map(scans).walls(hybrid_map, best, poses, 1000)
-    assert found.on > 100
-    assert found.free == 0
+    found = whole_map(scans).check_walls(hybrid_map, best, poses, 1000)
+    assert found.on_surface > 100
+    assert found.in_free_space == 0
     aside = PoseGaussian(best.mode.pose.mean + np.array([0.5, 0.5, 0.0]), best.mode.pose.covariance)
     moved = best._replace(mode=best.mode._replace(pose=aside))
-    assert whole_map(scans).walls(hybrid_map, moved, poses, 1000).free > 20
-    assert whole_map(scans).walls(hybrid_map, best, poses, 0).samples == 0
+    assert whole_map(scans).check_walls(hybrid_map, moved, poses, 1000).in_free_space > 20
+    assert whole_map(scans).check_walls(hybrid_map, best, poses, 0).samples == 0
 
 
 def test_none_but_the_areas_asked_for_are_looked_at(laid):

@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from hmt_slam_ros.area_abstraction.doors import OpeningDetector, Way
+from hmt_slam_ros.area_abstraction.doors import DoorTracker, OpeningDetector
 from hmt_slam_ros.area_abstraction.overlap import SensedSpace, overlaps, sensed_overlaps
 from hmt_slam_ros.area_abstraction.overlap_graph import OverlapGraph, Separation, min_ncut, synchronize_graph
 from hmt_slam_ros.area_abstraction.partition import (
@@ -308,7 +308,7 @@ class Aam:
         if leaf.area_merge is not None:
             return self._merge_in_partition(watch, leaf, leaf.area_merge)
         if leaf.area == watch.area:
-            return replace(watch, door_tracker=watch.door_tracker.interrupted()) if leaf.removed_arcs else watch
+            return replace(watch, door_tracker=watch.door_tracker.break_path()) if leaf.removed_arcs else watch
         moved = frozenset(r.keyframe for r in leaf.moved_keyframes if r.area == leaf.area)
         entered = self._graph(watch, leaf.id, leaf.area)
         left = watch.graphs.get(watch.area, OverlapGraph()).subgraph(self._keyframes(leaf.id, watch.area))
@@ -317,12 +317,12 @@ class Aam:
         self._prune_queue.add(watch.area)
         graphs = watch.graphs | {watch.area: left, leaf.area: entered}
         way, parted = (
-            Way() if leaf.frame_change is None else watch.door_tracker.in_frame(leaf.frame_change.mean),
+            DoorTracker() if leaf.frame_change is None else watch.door_tracker.transform(leaf.frame_change.mean),
             watch.pairs_split_by_door,
         )
-        if moved and watch.door_tracker.chambers(moved)[max(moved)] != 0:
+        if moved and watch.door_tracker.segment_labels(moved)[max(moved)] != 0:
             parted |= {(min(watch.area, leaf.area), max(watch.area, leaf.area))}
-        way = way.since(min(moved, default=None))
+        way = way.keep_crossings_after(min(moved, default=None))
         return Partition(
             leaf.area, graphs, moved, joined_graphs=watch.joined_graphs, door_tracker=way, pairs_split_by_door=parted
         )
@@ -335,7 +335,9 @@ class Aam:
         graphs[merged.into] = self._synchronize_graph(self._keyframes(leaf.id, merged.into), one, other)
         joints = {pair: joint for pair, joint in partition.joined_graphs.items() if merged.area not in pair}
         way = (
-            partition.door_tracker if leaf.area == partition.area else partition.door_tracker.in_frame(merged.pose.mean)
+            partition.door_tracker
+            if leaf.area == partition.area
+            else partition.door_tracker.transform(merged.pose.mean)
         )
         named = (
             {merged.into if area == merged.area else area for area in pair} for pair in partition.pairs_split_by_door
@@ -354,7 +356,7 @@ class Aam:
     def _interrupt_door_tracker(self, hypothesis: int) -> None:
         """Keyframes of a hypothesis moved, and the robot with them."""
         watch = self._partitions[hypothesis]
-        self._partitions[hypothesis] = replace(watch, door_tracker=watch.door_tracker.interrupted())
+        self._partitions[hypothesis] = replace(watch, door_tracker=watch.door_tracker.break_path())
 
     def _graph(self, partition: Partition, hypothesis: int, area: int) -> OverlapGraph:
         """The overlap graph of an area as it is now, from what the watch knows."""

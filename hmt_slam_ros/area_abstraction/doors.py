@@ -68,7 +68,7 @@ class OpeningDetector(Protocol):
 
 
 # Keyframe events over which a passage shows at the latest, where its opening was not known when the path passed it.
-_LATE = 6
+_MAX_DELAY = 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +84,7 @@ class DoorCrossing:
 
 
 @dataclass(frozen=True, eq=False)
-class Step:
+class PathPose:
     """Where the robot was.
 
     :ivar event: the keyframe event.
@@ -96,64 +96,64 @@ class Step:
 
 
 @dataclass(frozen=True, eq=False)
-class Way:
+class DoorTracker:
     """What is known of the openings that the path passes, in the frame of the robot's area; a value.
 
     :ivar openings: around the robot.
-    :ivar steps: the newest ones, in order.
-    :ivar passages: since the robot entered the area, in order.
+    :ivar path: the newest ones, in order.
+    :ivar crossings: since the robot entered the area, in order.
     """
 
     openings: tuple[Landmark, ...] = ()
-    steps: tuple[Step, ...] = ()
-    passages: tuple[DoorCrossing, ...] = ()
+    path: tuple[PathPose, ...] = ()
+    crossings: tuple[DoorCrossing, ...] = ()
 
-    def seen(self, event: int, pose: PoseGaussian, around: OpeningView) -> Way:
+    def update(self, event: int, pose: PoseGaussian, around: OpeningView) -> DoorTracker:
         """After a keyframe event.
 
         :param pose: the belief over ``area_T_base``.
         :param around: what the keyframe shows of openings.
         """
         openings = around.openings(self.openings, pose)
-        steps = (*self.steps, Step(event, pose.mean))[-_LATE - 1 :]
-        passages = list(self.passages)
-        for passage in _passed(steps, openings):
+        steps = (*self.path, PathPose(event, pose.mean))[-_MAX_DELAY - 1 :]
+        passages = list(self.crossings)
+        for passage in _find_door_crossings(steps, openings):
             before = _last_crossing_at(passages, passage.pose)
-            if before is None or not _alike(passages[before].pose, passage.pose):
+            if before is None or not _is_same_direction(passages[before].pose, passage.pose):
                 passages.append(passage)
-        return Way(openings, steps, tuple(sorted(passages, key=lambda passage: passage.event)))
+        return DoorTracker(openings, steps, tuple(sorted(passages, key=lambda passage: passage.event)))
 
-    def in_frame(self, frame: Float64) -> Way:
+    def transform(self, frame: Float64) -> DoorTracker:
         """The same in another area's frame.
 
         :param frame: shape (3,), ``other_T_area``.
         """
         by = PoseGaussian.from_pose(frame)
-        return Way(
+        return DoorTracker(
             tuple(replace(one, pose=by.compose(one.pose)) for one in self.openings),
-            tuple(replace(step, pose=se2.compose(frame, step.pose)) for step in self.steps),
-            tuple(replace(passage, pose=se2.compose(frame, passage.pose)) for passage in self.passages),
+            tuple(replace(step, pose=se2.compose(frame, step.pose)) for step in self.path),
+            tuple(replace(passage, pose=se2.compose(frame, passage.pose)) for passage in self.crossings),
         )
 
-    def since(self, event: int | None) -> Way:
+    def keep_crossings_after(self, event: int | None) -> DoorTracker:
         """The same with the passages behind an event alone, None for none of them."""
-        return replace(self, passages=tuple(one for one in self.passages if event is not None and one.event > event))
+        return replace(self, crossings=tuple(one for one in self.crossings if event is not None and one.event > event))
 
-    def interrupted(self) -> Way:
+    def break_path(self) -> DoorTracker:
         """The same where the robot, or what is around it, was moved: what comes next is no step from here."""
-        return Way(passages=self.passages)
+        return DoorTracker(crossings=self.crossings)
 
-    def chambers(self, keyframes: Collection[int]) -> dict[int, int]:
+    def segment_labels(self, keyframes: Collection[int]) -> dict[int, int]:
         """{keyframe: number of its segment}, of keyframes since the robot entered its area, in segment 0."""
         numbers, begins = [0], [0]
-        for k, passage in enumerate(self.passages):
-            back = _last_crossing_at(self.passages[:k], passage.pose)
+        for k, passage in enumerate(self.crossings):
+            back = _last_crossing_at(self.crossings[:k], passage.pose)
             numbers.append(max(numbers) + 1 if back is None else numbers[back])
             begins.append(passage.event)
         return {k: numbers[int(np.searchsorted(begins, k, side="right")) - 1] for k in keyframes}
 
 
-def _passed(steps: Sequence[Step], openings: Sequence[Landmark]) -> list[DoorCrossing]:
+def _find_door_crossings(steps: Sequence[PathPose], openings: Sequence[Landmark]) -> list[DoorCrossing]:
     """All passages of openings that are there, in the order of events."""
     path = np.array([step.pose[:2] for step in steps])
     found = []
@@ -174,7 +174,7 @@ def _last_crossing_at(passages: Sequence[DoorCrossing], pose: Float64) -> int | 
     return near[-1] if near else None
 
 
-def _alike(one: Float64, other: Float64) -> bool:
+def _is_same_direction(one: Float64, other: Float64) -> bool:
     """Whether two headings are less than a right angle apart."""
     return bool(np.cos(one[2] - other[2]) > 0.0)
 

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hmt_slam_ros.area_abstraction.doors import OpeningDetector, OpeningView, Way
+from hmt_slam_ros.area_abstraction.doors import DoorTracker, OpeningDetector, OpeningView
 from hmt_slam_ros.area_abstraction.overlap_graph import OverlapGraph, Separation, find_separation, min_ncut
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration import Configuration
@@ -66,7 +66,7 @@ class Partition:
     separation_count: int = 0
     overlap_candidate: tuple[int, int] | None = None
     joined_graphs: dict[AreaPair, JoinedGraph] = field(default_factory=dict)
-    door_tracker: Way = field(default_factory=Way)
+    door_tracker: DoorTracker = field(default_factory=DoorTracker)
     pairs_split_by_door: frozenset[AreaPair] = frozenset()
 
 
@@ -106,7 +106,7 @@ class PartitionState:
     separation_count: int = 0
     overlap_candidate: tuple[int, int] | None = None
     joined_graphs: Mapping[AreaPair, JoinedGraphState] = field(default_factory=dict)
-    door_tracker: Way = field(default_factory=Way)
+    door_tracker: DoorTracker = field(default_factory=DoorTracker)
     pairs_split_by_door: frozenset[AreaPair] = frozenset()
 
 
@@ -203,9 +203,9 @@ class AreaPolicy:
         found = {}
         for leaf in leaves:
             watch = partitions[leaf.hypothesis]
-            way = watch.door_tracker.interrupted() if keyframe.motion_unknown else watch.door_tracker
+            way = watch.door_tracker.break_path() if keyframe.motion_unknown else watch.door_tracker
             pose = PoseGaussian(leaf.pose.mean, around.pose.covariance)
-            way = way.seen(keyframe.sequence, pose, around)
+            way = way.update(keyframe.sequence, pose, around)
             found[leaf.hypothesis] = replace(watch, door_tracker=way)
         return found
 
@@ -227,7 +227,7 @@ class AreaPolicy:
         return detector.view(keyframe.scan, leaf.pose.mean, scans, poses)
 
     def find_separation(
-        self, graph: OverlapGraph, new_keyframes: Collection[int], newest: int, door_tracker: Way
+        self, graph: OverlapGraph, new_keyframes: Collection[int], newest: int, door_tracker: DoorTracker
     ) -> Separation | None:
         """The part of the robot's own keyframes, the newest among them, that separates from its area.
 
@@ -237,7 +237,7 @@ class AreaPolicy:
         :param door_tracker: of the robot.
         """
         if self._options.area_policy == "both":
-            graph = graph.weaken_across_doors(door_tracker.chambers(new_keyframes), self._door_factor)
+            graph = graph.weaken_across_doors(door_tracker.segment_labels(new_keyframes), self._door_factor)
         return find_separation(graph, new_keyframes, newest, self._options.ncut_threshold, self._options.min_cluster)
 
     def min_ncut(self, joined: JoinedGraph) -> float:

@@ -29,7 +29,7 @@ from hmt_slam_ros.registration.consistency import Agreement
 from hmt_slam_ros.registration.match_covariance import MatchError
 from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.sensors.motion_model import NO_MOTION, Prediction, RelativeMotion
-from hmt_slam_ros.submap.line_map_state import Marks
+from hmt_slam_ros.submap.line_map_state import PoseClones
 from hmt_slam_ros.submap.local_filter import FilterStep, LineFilterState, PlacedKeyframe, TrackedMotion
 from hmt_slam_ros.submap.local_mapping import LocalMapping, PreparedScan
 from hmt_slam_ros.submap.scan_evidence import ClutterEstimate, MapAgreement
@@ -72,7 +72,7 @@ def count_beams_at_walls(ends: Float64, laser: Float64, line_map: LineMap, near:
     :param laser: where they begin, shape (2,), likewise.
     :param near: distance, m, from a wall below which a beam ends on it.
     """
-    stretches = [(*line_map.lines[line], *piece) for line, wall in enumerate(line_map.walls) for piece in wall.pieces]
+    stretches = [(*line_map.lines[line], *piece) for line, wall in enumerate(line_map.walls) for piece in wall.segments]
     return BeamWallCounts(*_count_beams(ends, laser, _segment_array(stretches), near))
 
 
@@ -276,7 +276,7 @@ class LineFilter:
         self._last_covariance, self._motion_since_update = self.line_map.pose.covariance, NO_MOTION
         self.line_map.clone_pose()
         count = len(self.line_map.clones.poses)
-        self.line_map.clones = self.line_map.clones.only([count - 1, *range(1, count - 1)])
+        self.line_map.clones = self.line_map.clones.select([count - 1, *range(1, count - 1)])
 
     def compare_scan(self, prepared: PreparedScan) -> MapAgreement:
         """A scan in the map: what passes walls contradicts it."""
@@ -302,7 +302,7 @@ class LineFilter:
         kept = [k for k, keyframe in enumerate(self.keyframes) if keyframe not in keyframes]
         self.keyframes = [self.keyframes[k] for k in kept]
         self.keyframe_areas = [self.keyframe_areas[k] for k in kept]
-        self.line_map.clones = self.line_map.clones.only([0, *(1 + k for k in kept)])
+        self.line_map.clones = self.line_map.clones.select([0, *(1 + k for k in kept)])
         self._reported_poses = self._reported_poses[kept]
 
     def change_area(self, area: int, area_T_previous: Float64, content: Sequence[PlacedKeyframe]) -> None:
@@ -341,7 +341,9 @@ class LineFilter:
         self.keyframes = [placed.keyframe for placed in content]
         self.keyframe_areas = [placed.area for placed in content]
         self._reported_poses = np.array([placed.pose for placed in content]).reshape(-1, 3)
-        self.line_map.clones = Marks.fixed(np.concatenate((last[None], self._reported_poses)), self.line_map.mean.size)
+        self.line_map.clones = PoseClones.from_fixed_poses(
+            np.concatenate((last[None], self._reported_poses)), self.line_map.mean.size
+        )
 
 
 def _line_information(lines: Lines, observed: LineAssociations) -> Float64:

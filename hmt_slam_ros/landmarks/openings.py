@@ -198,7 +198,7 @@ def _select_openings(lines: Float64, covariances: Float64, rays: Rays, depth: fl
     found, room = np.empty((len(lines) * (beams // _BEAMS) + 1, _SIZE)), empty_beam_labels(beams)
     for own in range(len(lines)):
         last, end = -1, label_beams(lines[own], covariances[own], rays, depth, room)
-        told = BeamLabels(room.kinds[:end], room.along[:end], room.behind[:end], room.beams[:end])
+        told = BeamLabels(room.labels[:end], room.along[:end], room.behind[:end], room.beams[:end])
         while last + 1 < end:
             first = last + 1
             last = last_beam_behind(told, first, end)

@@ -37,7 +37,7 @@ from hmt_slam_ros.landmarks.data_association import Pairing, compatible_pairings
 from hmt_slam_ros.landmarks.line_extraction import Lines
 from hmt_slam_ros.landmarks.line_fit import MergeGate
 from hmt_slam_ros.sensors.motion_model import RelativeMotion
-from hmt_slam_ros.submap.line_map_state import NO_CLONES, LineMapState, Marks, Wall
+from hmt_slam_ros.submap.line_map_state import NO_CLONES, LineMapState, PoseClones, WallLine
 
 
 def overlap_ratio(pieces: Float64, others: Float64) -> float:
@@ -144,8 +144,8 @@ class LineMap:
         self.mean: Float64 = start.mean.copy()
         turn = _rotation(start.mean[2])
         self.covariance: Float64 = turn @ start.covariance @ turn.T
-        self.walls: list[Wall] = []
-        self.clones: Marks = NO_CLONES
+        self.walls: list[WallLine] = []
+        self.clones: PoseClones = NO_CLONES
         self._next_number = 0
 
     @classmethod
@@ -188,7 +188,7 @@ class LineMap:
         by_robot[:2, 2] = y - self.mean[1], self.mean[0] - x
         self.covariance[:3] = by_robot @ self.covariance[:3]
         self.covariance[:, :3] = self.covariance[:, :3] @ by_robot.T
-        self.clones = self.clones.after_motion(by_robot)
+        self.clones = self.clones.propagate(by_robot)
         turn = _rotation(self.mean[2])
         self.covariance[:3, :3] += turn @ step.covariance @ turn.T
 
@@ -198,11 +198,11 @@ class LineMap:
         self.mean[:3] = pose.mean
         self.covariance[:3], self.covariance[:, :3] = 0.0, 0.0
         self.covariance[:3, :3] = turn @ pose.covariance @ turn.T
-        self.clones = self.clones.without_robot()
+        self.clones = self.clones.decorrelate_robot()
 
     def clone_pose(self) -> None:
         """Note where the robot is."""
-        self.clones = self.clones.and_robot(self.mean, self.covariance)
+        self.clones = self.clones.add_robot_pose(self.mean, self.covariance)
 
     def observe(self, lines: Lines, *, keep_new: bool = False) -> LineAssociations:
         """Correct robot and lines by those that are known, take in those that are new, and join what is one.
@@ -218,7 +218,7 @@ class LineMap:
             self._extend_segments(
                 pairing.map_line, self._orient_line(lines, pairing.scan_line, self.lines[pairing.map_line, 0]).segments
             )
-        known = {pairing.scan_line: self.walls[pairing.map_line].name for pairing in chosen}
+        known = {pairing.scan_line: self.walls[pairing.map_line].number for pairing in chosen}
         # Against the lines that were there before the scan: its own lines have been told apart already.
         unknown = [k for k in range(len(lines)) if k not in known and not self._pairings(lines, k)]
         sightings = self._features.min_sightings if keep_new else 1
@@ -242,7 +242,7 @@ class LineMap:
         """An observed line as a re-observation of a line of the map, Eq. (12); None where other pieces were seen."""
         alpha, r = self.lines[line].tolist()
         placed = self._orient_line(lines, k, alpha)
-        if overlap_ratio(placed.segments, self.walls[line].pieces) < self._features.min_overlap:
+        if overlap_ratio(placed.segments, self.walls[line].segments) < self._features.min_overlap:
             return None
         x, y, theta = self.mean[:3].tolist()
         cos, sin = math.cos(alpha), math.sin(alpha)
@@ -285,7 +285,7 @@ class LineMap:
         self.mean = self.mean + gain @ difference
         self.mean[2] = se2.wrap(self.mean[2])
         kept = np.eye(self.mean.size) - gain @ jacobian
-        self.clones = self.clones.corrected(jacobian.T @ np.linalg.solve(spread, difference), kept)
+        self.clones = self.clones.correct(jacobian.T @ np.linalg.solve(spread, difference), kept)
         self.covariance = kept @ self.covariance @ kept.T + gain @ noise @ gain.T
 
     def _add_line(self, placed: _OrientedLine, sightings: int) -> int:
@@ -301,22 +301,24 @@ class LineMap:
         own = by_line @ placed.covariance @ by_line.T
         covariance[size:, size:] = by_robot @ self.covariance[:3, :3] @ by_robot.T + own
         self.mean, self.covariance = np.concatenate((self.mean, placed.line)), covariance
-        self.clones = self.clones.with_line(by_robot)
-        self.walls.append(Wall(self._next_number, sightings, join_segments(placed.segments, self._features.max_gap)))
+        self.clones = self.clones.add_line(by_robot)
+        self.walls.append(
+            WallLine(self._next_number, sightings, join_segments(placed.segments, self._features.max_gap))
+        )
         self._next_number += 1
-        return self.walls[-1].name
+        return self.walls[-1].number
 
     def _extend_segments(self, line: int, pieces: Float64) -> None:
         """Join what was seen of a line with what had been."""
         wall = self.walls[line]
-        pieces = join_segments(np.concatenate((wall.pieces, pieces)), self._features.max_gap)
-        self.walls[line] = wall._replace(pieces=pieces)
+        pieces = join_segments(np.concatenate((wall.segments, pieces)), self._features.max_gap)
+        self.walls[line] = wall._replace(segments=pieces)
 
     def _prune_lines(self, seen: Collection[int]) -> None:
         """Forget the lines that were seen too seldom and, by their names, not this time."""
         enough = self._features.min_sightings
         for line in reversed(range(len(self))):
-            if self.walls[line].sightings < enough and self.walls[line].name not in seen:
+            if self.walls[line].sightings < enough and self.walls[line].number not in seen:
                 self._remove_line(line)
 
     def _merge_lines(self) -> Iterator[tuple[int, int]]:
@@ -331,18 +333,18 @@ class LineMap:
             self._correct(jacobian, difference, np.zeros((2, 2)))
             wall, part = self.walls[one], self.walls[other]
             self.walls[one] = wall._replace(sightings=wall.sightings + part.sightings)
-            self._extend_segments(one, part.pieces)
+            self._extend_segments(one, part.segments)
             self._remove_line(other)
-            yield wall.name, part.name
+            yield wall.number, part.number
 
     def _mean_positions(self) -> Float64:
-        return np.array([mean_position(wall.pieces) for wall in self.walls])
+        return np.array([mean_position(wall.segments) for wall in self.walls])
 
     def _remove_line(self, line: int) -> None:
         """Take a line out of the state; what it told of the others stays."""
         left = np.delete(np.arange(self.mean.size), _state_slice(line))
         self.mean, self.covariance = self.mean[left], self.covariance[np.ix_(left, left)]
-        self.clones = self.clones.left(left)
+        self.clones = self.clones.select_columns(left)
         del self.walls[line]
 
 

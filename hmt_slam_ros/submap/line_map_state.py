@@ -11,76 +11,82 @@ from hmt_slam_ros.arrays import Float64, Int64
 from hmt_slam_ros.geometry import se2
 
 
-class Marks(NamedTuple):
+class PoseClones(NamedTuple):
     """Poses where the robot was; none of the arrays is ever written to.
 
     :ivar poses: shape (k, 3), ``map_T_base``, m and rad.
-    :ivar common: shape (k, 3, n), covariances of x, y and theta with the state of the map.
+    :ivar cross_covariances: shape (k, 3, n), covariances of x, y and theta with the state of the map.
     """
 
     poses: Float64
-    common: Float64
+    cross_covariances: Float64
 
     @classmethod
-    def fixed(cls, poses: Float64, size: int) -> Marks:
+    def from_fixed_poses(cls, poses: Float64, size: int) -> PoseClones:
         """Poses (k, 3) that nothing corrects, for a state of so many."""
         return cls(poses.copy(), np.zeros((len(poses), 3, size)))
 
-    def and_robot(self, mean: Float64, covariance: Float64) -> Marks:
+    def add_robot_pose(self, mean: Float64, covariance: Float64) -> PoseClones:
         """With one more where the robot is, by the mean (n,) and the covariance (n, n) of the state."""
-        return Marks(np.concatenate((self.poses, mean[None, :3])), np.concatenate((self.common, covariance[None, :3])))
+        return PoseClones(
+            np.concatenate((self.poses, mean[None, :3])), np.concatenate((self.cross_covariances, covariance[None, :3]))
+        )
 
-    def only(self, rows: Sequence[int]) -> Marks:
+    def select(self, rows: Sequence[int]) -> PoseClones:
         """Some of them, in this order."""
-        return Marks(self.poses[list(rows)], self.common[list(rows)])
+        return PoseClones(self.poses[list(rows)], self.cross_covariances[list(rows)])
 
-    def after_motion(self, by_robot: Float64) -> Marks:
+    def propagate(self, by_robot: Float64) -> PoseClones:
         """The robot moved, where its pose after that depends on the one before by (3, 3)."""
-        common = self.common.copy()
+        common = self.cross_covariances.copy()
         common[:, :, :3] = common[:, :, :3] @ by_robot.T
-        return self._replace(common=common)
+        return self._replace(cross_covariances=common)
 
-    def corrected(self, told: Float64, kept: Float64) -> Marks:
+    def correct(self, told: Float64, kept: Float64) -> PoseClones:
         """After an observation of the state.
 
         :param told: H^T S^-1 times the difference of observation and expectation, (n,).
         :param kept: what the state's errors are multiplied by, 1 - K H, (n, n).
         """
-        poses = self.poses + self.common @ told
+        poses = self.poses + self.cross_covariances @ told
         poses[:, 2] = se2.wrap(poses[:, 2])
-        return Marks(poses, self.common @ kept.T)
+        return PoseClones(poses, self.cross_covariances @ kept.T)
 
-    def with_line(self, by_robot: Float64) -> Marks:
+    def add_line(self, by_robot: Float64) -> PoseClones:
         """The state has one line more, which depends on the robot's pose by (2, 3)."""
-        return self._replace(common=np.concatenate((self.common, self.common[:, :, :3] @ by_robot.T), axis=2))
+        return self._replace(
+            cross_covariances=np.concatenate(
+                (self.cross_covariances, self.cross_covariances[:, :, :3] @ by_robot.T), axis=2
+            )
+        )
 
-    def left(self, columns: Int64) -> Marks:
+    def select_columns(self, columns: Int64) -> PoseClones:
         """Of the state only these are left."""
-        return self._replace(common=self.common[:, :, columns])
+        return self._replace(cross_covariances=self.cross_covariances[:, :, columns])
 
-    def without_robot(self) -> Marks:
+    def decorrelate_robot(self) -> PoseClones:
         """The robot is elsewhere."""
-        common = self.common.copy()
+        common = self.cross_covariances.copy()
         common[:, :, :3] = 0.0
-        return self._replace(common=common)
+        return self._replace(cross_covariances=common)
 
 
-NO_CLONES = Marks(np.zeros((0, 3)), np.zeros((0, 3, 3)))
+NO_CLONES = PoseClones(np.zeros((0, 3)), np.zeros((0, 3, 3)))
 """Of a map that begins."""
 
 
-class Wall(NamedTuple):
+class WallLine(NamedTuple):
     """What the map knows of a line beside its place in the state.
 
-    :ivar name: a number that no other line of the map ever has.
+    :ivar number: a number that no other line of the map ever has.
     :ivar sightings: scans that showed it.
-    :ivar pieces: where the stretches that were seen begin and end, (m, 2), m along its direction
+    :ivar segments: where the stretches that were seen begin and end, (m, 2), m along its direction
         (-sin(alpha), cos(alpha)) from the foot of the perpendicular.
     """
 
-    name: int
+    number: int
     sightings: int
-    pieces: Float64
+    segments: Float64
 
 
 class LineMapState(NamedTuple):
@@ -95,9 +101,9 @@ class LineMapState(NamedTuple):
 
     mean: Float64
     covariance: Float64
-    walls: tuple[Wall, ...]
+    walls: tuple[WallLine, ...]
     next_number: int
-    clones: Marks
+    clones: PoseClones
 
 
 # A line this near to the robot may be on its other side, in deviations of r.
