@@ -67,3 +67,18 @@ def test_every_measurement_that_is_named_exists(page):
     text = page.read_text(encoding="utf-8")
     kinds = {kind for names in re.findall(r"-m benchmark ((?:[a-z]+ ?)+)", text) for kind in names.split()}
     assert kinds <= {*MEASUREMENTS, *_GROUPS}
+
+
+def test_every_topic_and_every_document_is_in_the_reference():
+    text = (DOCS / "reference" / "messages.md").read_text(encoding="utf-8")
+    tree = ast.parse((PACKAGE / "ros" / "topics.py").read_text(encoding="utf-8"))
+    constants = {
+        node.value for node in ast.walk(tree) if isinstance(node, ast.Constant) and isinstance(node.value, str)
+    }
+    topics = {value for value in constants if re.fullmatch(r"[a-z_]+/[a-z_]+", value)}
+    assert len(topics) > 20
+    assert {topic for topic in topics if f"| {topic} |" not in text} == set()
+    tree = ast.parse((PACKAGE / "messages" / "documents.py").read_text(encoding="utf-8"))
+    (table,) = (node.value for node in tree.body if isinstance(node, ast.AnnAssign) and node.target.id == "_DOCUMENTS")
+    for name, version in map(ast.literal_eval, table.values):
+        assert f'{{"document":"{name}","version":{version},' in text, name
