@@ -45,7 +45,7 @@ def restart(nodes, name, before, **parameters):
     """Start a node that was killed; wait until it has taken over."""
     said = len(nodes.diagnostics)
     nodes.alive[before] = nodes.start(name, **parameters)
-    nodes.until(lambda: any(m.robot_status[0].name == f"/{name}" for m in nodes.diagnostics[said:]))
+    nodes.until(lambda: any(m.status[0].name == f"/{name}" for m in nodes.diagnostics[said:]))
 
 
 def corridor_measurements(scans):
@@ -162,7 +162,7 @@ def test_all_are_killed_with_what_said_where_the_laser_is_and_go_on_without_it(d
         kill(process)
     said = len(nodes.diagnostics)
     nodes.alive = [start(name, recovery=tmp_path / "recovery") for name in NODES]
-    nodes.until(lambda: {m.robot_status[0].name for m in nodes.diagnostics[said:]} >= {f"/{name}" for name in NODES})
+    nodes.until(lambda: {m.status[0].name for m in nodes.diagnostics[said:]} >= {f"/{name}" for name in NODES})
     driver = Driver(nodes, domain)
     for one in corridor_measurements(60)[150:]:
         driver.send(one)
@@ -297,7 +297,7 @@ def test_a_missing_transform_and_clocks_that_are_apart_are_told_with_the_remedy(
             odom.publish(conversions.odometry_message(one, "odom", "base_link"))
 
     def said():
-        return next((m.robot_status[0].message for m in reversed(told) if m.robot_status[0].name == "/slam"), "")
+        return next((m.status[0].message for m in reversed(told) if m.status[0].name == "/slam"), "")
 
     listener.until(lambda: "no transform" in said(), alive=[process])
     assert said() == (

@@ -81,9 +81,9 @@ class Nodes:
     def diagnosis(self, node):
         """What a node said of itself last, {name: value}; values are empty while it said nothing."""
         said = (
-            m.robot_status[0]
+            m.status[0]
             for m in reversed(self.diagnostics)
-            if m.robot_status[0].name == f"{self.namespace}/{node}"
+            if m.status[0].name == f"{self.namespace}/{node}"
         )
         return defaultdict(str, {value.key: value.value for status in islice(said, 1) for value in status.values})
 
@@ -169,7 +169,7 @@ def test_a_person_says_where_the_robot_is_and_where_it_cannot_be(corridor, liste
     nodes = Nodes(start, listener, start_from=out)
     publisher = listener.node.create_publisher(PoseWithCovarianceStamped, "initialpose", topics.STREAM)
     listener.until(lambda: publisher.get_subscription_count() == 1)
-    nodes.until(lambda: nodes.localized and any(m.robot_status[0].name == "/slam" for m in nodes.diagnostics))
+    nodes.until(lambda: nodes.localized and any(m.status[0].name == "/slam" for m in nodes.diagnostics))
     publisher.publish(initial_pose(np.array([100.0, 50.0, 0.0])))
     nodes.until(lambda: "outside of the map" in nodes.diagnosis("slam")["last error"])
     complaint = nodes.diagnosis("slam")["last error"]

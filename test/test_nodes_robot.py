@@ -257,7 +257,7 @@ def test_commands_drive_the_robot_and_silence_stops_it(listener, start, heard, d
 def test_the_driven_robot_does_not_pass_a_wall(listener, start, driver):
     # It begins a metre before the end of a hallway, with its back to it.
     reports = listener.hear(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
-    contacts = lambda: [v.value for r in reports[-1:] for v in r.robot_status[0].values if v.key == "contacts"]  # noqa: E731
+    contacts = lambda: [v.value for r in reports[-1:] for v in r.status[0].values if v.key == "contacts"]  # noqa: E731
     robot = start_driven(start)
     listener.until(driver.stands, alive=[robot])
     begin = driver.poses[-1]

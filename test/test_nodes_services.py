@@ -90,7 +90,7 @@ def test_after_a_reset_a_new_map_begins_where_the_robot_is_and_all_that_is_said_
     recording = Recording(listener, tmp_path / "bag")
     nodes = Nodes(start, listener, start_from=out, start_lost=False, save_to=tmp_path / "saved")
     keyframes = listener.hear(String, KEYFRAMES, topics.CHAIN)
-    nodes.until(lambda: {m.robot_status[0].name for m in nodes.diagnostics} == {f"/{name}" for name in NODES})
+    nodes.until(lambda: {m.status[0].name for m in nodes.diagnostics} == {f"/{name}" for name in NODES})
     answer = listener.call(Trigger, "slam/reset", Trigger.Request())
     assert (answer.success, answer.message) == (True, "the map is forgotten, a new one begins")
     assert listener.call(GetMap, "tlca/get_map", GetMap.Request()).map.info.width == 0

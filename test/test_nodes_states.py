@@ -201,4 +201,4 @@ def test_a_node_that_is_killed_comes_back_in_the_state_in_which_it_was(listener,
     heard = len(told)
     node = start("rtl", recovery=tmp_path)
     listener.until(lambda: len(told) > heard, alive=[node])
-    assert told[-1].robot_status[0].message == "inactive"
+    assert told[-1].status[0].message == "inactive"

@@ -150,13 +150,13 @@ def assert_graph(graph):
 
 def assert_health(health):
     told = {
-        status.name.strip("/"): {v.key: v.value for v in status.values} for a in health for status in a.robot_status
+        status.name.strip("/"): {v.key: v.value for v in status.values} for a in health for status in a.status
     }
     assert set(told) == {*PROCESSES, "robot", "view"}
     assert {"memory", "peak memory", "busy", "last error"} <= set.intersection(*map(set, told.values()))
     assert float(told["slam"]["effective samples"].removesuffix(" of 12")) >= 1.0
     assert float(told["slam"]["memory"].removesuffix(" MB")) > 20.0
-    values = [value for array in health for status in array.robot_status for value in status.values]
+    values = [value for array in health for status in array.status for value in status.values]
     assert max(float(value.value) for value in values if value.key == "sent Scan a second") > 1.0
 
 

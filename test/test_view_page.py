@@ -141,7 +141,7 @@ def test_the_map_is_sent_to_those_who_do_not_have_it(board, server):
     assert status_of(Request(server.url + "map.png", headers={"If-None-Match": f'"{tag}"'})) == 304
     board.put_map_image(grid_png(np.full((5, 5), 100, dtype=np.int8)))
     with urlopen(Request(server.url + "map.png", headers={"If-None-Match": f'"{tag}"'}), timeout=10) as answer:
-        assert answer.robot_status == 200
+        assert answer.status == 200
 
 
 def test_news_stream_and_somebody_who_looks_is_noticed(board, server):

@@ -11,7 +11,6 @@ from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from rclpy.qos import QoSProfile
 from rclpy.task import Future
@@ -24,12 +23,9 @@ from hmt_slam_ros.messages.routing import SUBSCRIPTIONS
 from hmt_slam_ros.ros import topics
 from hmt_slam_ros.ros.diagnostics import PERIOD
 from hmt_slam_ros.ros.inbox import CHAIN
+from hmt_slam_ros.ros.node_interfaces import CoordinatorNode, ParticipantNode
 from hmt_slam_ros.ros.topics import RESET_REQUEST, RESET_RESPONSE, SAVE_REQUEST, SAVE_RESPONSE
 from hmt_slam_ros.saved_map.folder import FileRecord, FolderWriter
-
-if TYPE_CHECKING:
-    from hmt_slam_ros.ros.process_node import ProcessNode
-    from hmt_slam_ros.ros.slam_node import SlamNode
 
 PARTICIPANTS = ("aam", "tsbi", "tlca", "rtl")
 """The nodes that slam asks."""
@@ -38,7 +34,7 @@ PARTICIPANTS = ("aam", "tsbi", "tlca", "rtl")
 class RequestParticipant:
     """Answers slam when the node's process has heard as many keyframe events as slam says."""
 
-    def __init__(self, node: ProcessNode, name: str) -> None:
+    def __init__(self, node: ParticipantNode, name: str) -> None:
         """Listen to slam.
 
         :param name: of the process.
@@ -149,7 +145,7 @@ class RequestCoordinator(ABC):
 
     def __init__(
         self,
-        node: SlamNode,
+        node: CoordinatorNode,
         on_release: Callable[[], None],
         topic_names: tuple[str, str],
         kind: type[SaveResponse | ResetResponse],

@@ -6,7 +6,7 @@ import math
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,7 @@ from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from hmt_slam_ros.configuration import load_configuration
+from hmt_slam_ros.configuration import Configuration, load_configuration
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
@@ -42,6 +42,17 @@ _START_LOST = ParameterDescriptor(
 )
 
 
+class ConfigurationSource(Protocol):
+    """A node with parameters, as a map is compared with them."""
+
+    @property
+    def configuration(self) -> Configuration:
+        """The parameters of the node."""
+
+    def get_logger(self) -> Any:  # noqa: ANN401  rclpy's
+        """The logger of the node."""
+
+
 class InitialState:
     """A saved map, or nothing.
 
@@ -51,7 +62,7 @@ class InitialState:
     :ivar previous_scans: scans that had a pose before; those to come are numbered on, so that they are told from these.
     """
 
-    def __init__(self, node: ConfiguredNode, path: str, *, lost: bool, previous_scans: int = 0) -> None:
+    def __init__(self, node: ConfigurationSource, path: str, *, lost: bool, previous_scans: int = 0) -> None:
         """Check the map.
 
         :param path: its folder or the output folder around it, empty for nothing.
@@ -67,7 +78,7 @@ class InitialState:
             self.events = self._chain_events()
 
     @classmethod
-    def from_checkpoint(cls, node: ConfiguredNode, state: Path, header: JournalHeader) -> InitialState:
+    def from_checkpoint(cls, node: ConfigurationSource, state: Path, header: JournalHeader) -> InitialState:
         """Where a node that was killed goes on.
 
         :param state: the folder of its checkpoint.
@@ -80,7 +91,7 @@ class InitialState:
         made.map = None  # what was shown of it is part of the checkpoint
         return made
 
-    def _open(self, node: ConfiguredNode, folder: Path, kind: str) -> None:
+    def _open(self, node: ConfigurationSource, folder: Path, kind: str) -> None:
         self._reader = FolderReader(folder, kind, VERSION)
         saved = load_configuration(folder / CONFIGURATION)
         told = describe_parameter_changes(saved, replace(node.configuration, robot=saved.robot))

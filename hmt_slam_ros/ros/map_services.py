@@ -31,13 +31,13 @@ from hmt_slam_ros.ros.coordinated_request import PARTICIPANTS, RequestCoordinato
 from hmt_slam_ros.ros.execution import force_exit_after, spin_until
 from hmt_slam_ros.ros.initial_state import InitialState
 from hmt_slam_ros.ros.map_view import MapRenderer, MapRendererState
+from hmt_slam_ros.ros.node_interfaces import MapServicesNode
 from hmt_slam_ros.ros.process_node import SAVE_TIMEOUT, ProcessNode
 from hmt_slam_ros.ros.topics import RESET_REQUEST, RESET_RESPONSE, SAVE_REQUEST, SAVE_RESPONSE
 from hmt_slam_ros.saved_map.folder import HMT_MAP, MANIFEST, replace_folder
 
 if TYPE_CHECKING:
     from hmt_slam_ros.results.hmt_map import MapWriter
-    from hmt_slam_ros.ros.slam_node import SlamNode
 
 _REMEDY = "the map of before stays; make room, or set save_to of slam to another folder"
 
@@ -60,7 +60,9 @@ class _PendingSave(NamedTuple):
 class MapSaver(RequestCoordinator):
     """Answers the service ``save``."""
 
-    def __init__(self, node: SlamNode, on_release: Callable[[], None]) -> None:
+    _node: MapServicesNode
+
+    def __init__(self, node: MapServicesNode, on_release: Callable[[], None]) -> None:
         """Offer the service.
 
         :param on_release: called when slam need not wait any more.
@@ -146,7 +148,9 @@ _FILE = "file://"
 class MapLoader(RequestCoordinator):
     """Answers the services ``load_map`` and ``reset``."""
 
-    def __init__(self, node: SlamNode, on_release: Callable[[], None]) -> None:
+    _node: MapServicesNode
+
+    def __init__(self, node: MapServicesNode, on_release: Callable[[], None]) -> None:
         """Offer the services.
 
         :param on_release: called when slam need not wait any more.

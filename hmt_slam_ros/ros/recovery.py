@@ -20,7 +20,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple, get_args
+from typing import NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,12 +31,10 @@ from hmt_slam_ros.configuration.documents import ros_yaml
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.messages.messages import Message, RealTimePose, TrackingReset
 from hmt_slam_ros.plain_data import PlainDataReader, to_plain
+from hmt_slam_ros.ros.lifecycle import ManagedNode
 from hmt_slam_ros.saved_map.arrays import ArrayReader, ArrayWriter
 from hmt_slam_ros.saved_map.folder import CONFIGURATION, VERSION, FolderWriter
 from hmt_slam_ros.sensors import Odometry, Scan
-
-if TYPE_CHECKING:
-    from hmt_slam_ros.ros.process_node import ProcessNode
 
 _LINES, _ARRAYS = "jsonl", "bin"
 _FORMAT_DOC = "docs/architecture.md"
@@ -240,7 +238,7 @@ class Recovery:
     :ivar recovered_state: what a node of the same name left behind, None where this one is the first.
     """
 
-    def __init__(self, node: ProcessNode, folder: str) -> None:
+    def __init__(self, node: ManagedNode, folder: str) -> None:
         """Look for what was left behind.
 
         :param folder: of all nodes, empty for none.

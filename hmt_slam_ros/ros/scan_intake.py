@@ -4,18 +4,15 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from typing import TYPE_CHECKING
 
 from sensor_msgs.msg import LaserScan
 
 from hmt_slam_ros.ros import conversions
 from hmt_slam_ros.ros.diagnostics import PERIOD
+from hmt_slam_ros.ros.node_interfaces import ScanReceiver
 from hmt_slam_ros.ros.sensor_input import SensorMonitor, SensorSubscription
 from hmt_slam_ros.ros.topics import SCAN
 from hmt_slam_ros.ros.transforms import LaserMountings
-
-if TYPE_CHECKING:
-    from hmt_slam_ros.ros.slam_node import SlamNode
 
 # Live, scans beyond this many in the queue are dropped; a replay never drops one.
 _LIVE_QUEUE = 200
@@ -30,7 +27,7 @@ class ScanIntake:
     :ivar last_scan_at: when the last one came, by the monotonic clock, s.
     """
 
-    def __init__(self, node: SlamNode, mounting: LaserMountings, resume_stamp: int | None) -> None:
+    def __init__(self, node: ScanReceiver, mounting: LaserMountings, resume_stamp: int | None) -> None:
         """Listen to nothing yet.
 
         :param mounting: where the lasers are.
