@@ -130,7 +130,9 @@ def test_a_door_of_whose_wall_too_little_is_seen_tells_no_pose(chart, graph, mon
     assert estimator.openings.door_ahead() is not None
     hidden = estimator.openings.last_openings.covariances.copy()
     hidden[:, 2, 2] = math.radians(0.4) ** 2
-    monkeypatch.setattr(estimator.openings, "last_openings", estimator.openings.last_openings._replace(covariances=hidden))
+    monkeypatch.setattr(
+        estimator.openings, "last_openings", estimator.openings.last_openings._replace(covariances=hidden)
+    )
     assert estimator.openings.door_ahead() is None
 
 
@@ -211,7 +213,9 @@ def test_a_robot_that_turned_back_on_its_way_sees_what_it_saw_before(chart, grap
         state_of(node_at(chart, 10.0), heading) for heading in (eastwards(chart), opposite_direction(eastwards(chart)))
     )
     there, back = (
-        select_landmarks(graph.expected_landmarks.landmarks, slice(*graph.expected_landmarks.starts[state : state + 2].tolist()))
+        select_landmarks(
+            graph.expected_landmarks.landmarks, slice(*graph.expected_landmarks.starts[state : state + 2].tolist())
+        )
         for state in ways
     )
     assert np.abs(there.positions).max() > 5.0
