@@ -171,12 +171,12 @@ def _recorded(keyframes: Sequence[int]) -> dict[str, Any]:
     return {
         "events": len(keyframes),
         "probabilities": ProbabilityTable.from_rows(rows),
-        "trails": ScanPoseTable.from_messages(
+        "scan_poses": ScanPoseTable.from_messages(
             ScanPoses(FIRST_HYPOTHESIS, int(own[0]), moments, np.full(own.size, keyframe), np.zeros((own.size, 3)))
             for own, moments, keyframe in each
         ),
         "estimates": EstimateTable(scans, stamps, np.zeros_like(scans), poses, poses),
-        "online": poses,
+        "online_trajectory": poses,
     }
 
 

@@ -22,7 +22,8 @@ ROOT = Path(__file__).resolve().parents[1]
 def simulation_settings(_configuration: Configuration) -> str:
     """docs/simulation_settings.md: every family of buildings, and every setting."""
     families = [
-        f"| `{name}` | {family.description} | {', '.join(f'`{key}={value}`' for key, value in family.default_settings.items())} |"
+        f"| `{name}` | {family.description} | "
+        f"{', '.join(f'`{key}={value}`' for key, value in family.default_settings.items())} |"
         for name, family in FAMILIES.items()
     ]
     lines = [

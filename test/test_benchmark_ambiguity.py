@@ -161,7 +161,7 @@ def test_in_the_ring_odometry_decides_and_views_never_do():
 
 
 def test_a_world_without_identical_places_has_no_rivalry():
-    log = SimpleNamespace(scenario=SimpleNamespace(building=SimpleNamespace(places={})))
+    log = SimpleNamespace(scenario=SimpleNamespace(building=SimpleNamespace(twin_frames={})))
     assert rivalries(log, None, [Loop(1, 0.0, 0.0, 1.0, {1: (0,)})], {}) == []
 
 

@@ -56,7 +56,7 @@ def test_the_enumeration_gives_every_way_its_share(drive):
 
 def test_with_enough_hypotheses_tsbi_says_what_the_enumeration_says(monkeypatch):
     """Where hypotheses that say the same stay apart, as they do in the enumeration."""
-    monkeypatch.setattr(tsbi, "merged", lambda _, log_weights: dict(enumerate(log_weights)))
+    monkeypatch.setattr(tsbi, "merge_equivalent", lambda _, log_weights: dict(enumerate(log_weights)))
     monkeypatch.setattr(oracle, "HYPOTHESES", (1, 2, 32))
     distances = compared(VAGUE, WORLD, SEED, NOISE, ()).distances
     assert len(distances[1]) >= 4

@@ -66,7 +66,7 @@ def second_lap(truth, keyframes):
 def claim_with_error(truth, known, asked, error, covariance=TIGHT):
     """The claim that joins the frames of two keyframes, moved by an error."""
     pose = se2.compose(se2.between(truth.poses[known], truth.poses[asked]), np.array(error))
-    return truth.tracked_pose({known: np.zeros(3)}, {asked: pose}, covariance, pose)
+    return truth.claim({known: np.zeros(3)}, {asked: pose}, covariance, pose)
 
 
 def test_the_long_world_is_2_km_of_nested_loops_and_no_family():

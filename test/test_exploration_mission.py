@@ -47,7 +47,7 @@ class Robot:
 
     def go(self, goal, barred=None):
         """The phases on the way, the hallway being barred there, m along it, where it is."""
-        self.pilot.go(goal)
+        self.pilot.start_mission(goal)
         for _ in range(STEPS):
             scan = seen_at(self.pose, self.rng, barred)
             self.stamp += 200_000_000
@@ -58,7 +58,7 @@ class Robot:
             increment = se2.exp(0.2 * np.array([command.speed, 0.0, command.turn_rate]))
             self.pose = se2.compose(self.pose, increment)
             noisy = increment * (1.0 + self.rng.normal(0.0, 0.01, 3))
-            self.pilot.moved(RelativeMotion(noisy, increment_covariance(noisy, CONFIGURATION.motion)))
+            self.pilot.predict(RelativeMotion(noisy, increment_covariance(noisy, CONFIGURATION.motion)))
 
 
 def test_the_only_place_is_where_the_robot_was_in_the_room(known):
@@ -116,7 +116,7 @@ def test_a_lost_robot_turns_at_the_end_of_the_hallway_and_is_confident_before_it
     for phase in robot.go(goal):
         phases.append(phase)
         belief = robot.pilot.estimator.belief
-        assert phase is not Phase.ROOM or belief.confident
+        assert phase is not Phase.ROOM or belief.is_confident
     assert phases[0] is Phase.HALLWAY
     assert phases[-1] is Phase.THERE
     assert math.dist(robot.pose[:2], (5.0, 3.0)) < 0.3
@@ -183,18 +183,18 @@ def test_a_robot_that_left_a_room_looks_where_the_metric_filter_says(known):
         assert next(out) is Phase.LEAVING
     increment = np.array((0.0, 0.0, -robot.pose[2]))
     robot.pose = robot.pose + increment
-    robot.pilot.moved(RelativeMotion(increment, increment_covariance(increment, CONFIGURATION.motion)))
+    robot.pilot.predict(RelativeMotion(increment, increment_covariance(increment, CONFIGURATION.motion)))
     while robot.pilot.room is not None or robot.pilot.estimator.belief is None:
         next(out)
     looks = (eastwards(known) - round(float(robot.pose[2]) / (0.5 * math.pi))) % 4
     assert looks != opposite_direction(goal.opening.direction)
-    assert robot.pilot.estimator.facing == (goal.node, looks)
+    assert robot.pilot.estimator.node_and_direction == (goal.node, looks)
 
 
 def test_a_robot_that_is_out_of_a_room_where_it_went_in_has_got_on_and_turns_as_it_should(known, monkeypatch):
     # In the time and the way of a visit to the room it would not have got anywhere.
     monkeypatch.setattr(mission_controller, "_PROGRESS", 2.0)
-    monkeypatch.setattr(mission_controller, "_ELSEWHERE", np.array((2.0, 0.0, 0.0)))
+    monkeypatch.setattr(mission_controller, "_INITIAL_DISPLACEMENT", np.array((2.0, 0.0, 0.0)))
     goal = destinations(known)[node_at(known, 5.0)]
     west = state_of(node_at(known, 10.0), opposite_direction(eastwards(known)))
     belief = certain_belief(known.graph, CONFIGURATION.places, west)

@@ -92,8 +92,8 @@ def test_a_robot_that_goes_about_in_one_room_stays_in_its_area():
 
 
 def test_a_cut_has_to_be_found_at_several_keyframes_in_a_row():
-    _, first = drive_until_cut(aam(persistence=1))
-    _, third = drive_until_cut(aam(persistence=3))
+    _, first = drive_until_cut(aam(confirmations=1))
+    _, third = drive_until_cut(aam(confirmations=3))
     assert third == first + 2
 
 
@@ -193,7 +193,7 @@ def drive_back(process):
 
 
 def test_a_robot_that_returns_over_an_arc_has_moved_into_the_known_area():
-    _, pose, event = drive_back(aam(persistence=2))
+    _, pose, event = drive_back(aam(confirmations=2))
     assert (event.kind, event.area, event.keyframes) == ("moved", 0, ())
     assert 3.0 < pose[0] < 6.5
     assert 0.3 < event.score <= 1.0
@@ -213,18 +213,18 @@ def moves_about(process, poses):
 
 def test_the_margin_keeps_a_robot_that_dithers_in_the_door_from_flapping():
     dither = np.array([[6.1, 3.0, np.pi], [6.3, 3.0, np.pi]] * 6)
-    assert len(moves_about(aam(persistence=1), dither)) <= 1
-    assert len(moves_about(aam(persistence=1, move_margin=0.0), dither)) > 4
+    assert len(moves_about(aam(confirmations=1), dither)) <= 1
+    assert len(moves_about(aam(confirmations=1, move_margin=0.0), dither)) > 4
 
 
 def test_a_short_look_into_the_other_area_is_no_move():
     looks = np.array([[7.5, 3.0, np.pi], [5.0, 3.0, np.pi]] * 4)
-    assert moves_about(aam(persistence=2), looks) == []
-    assert len(moves_about(aam(persistence=1), looks)) == 8 - 1
+    assert moves_about(aam(confirmations=2), looks) == []
+    assert len(moves_about(aam(confirmations=1), looks)) == 8 - 1
 
 
 def test_the_robots_own_keyframes_stay_where_they_are_and_become_known_ground():
-    process = aam(persistence=1, min_cluster=3)
+    process = aam(confirmations=1, min_cluster=3)
     k, _, event = drive_back(process)
     process.handle(stay(k, 0, area=event.area))
     # In room 0 again: its keyframes are known ground and cannot leave it, however few of them are asked for.

@@ -45,7 +45,7 @@ def test_one_seed_gives_the_same_log_bit_for_bit_and_another_seed_another(family
 
 def test_another_process_makes_the_same_log():
     code = (
-        "import hashlib; from test_simulation_log import content; from hmt_slam_ros.logs import open_log;"
+        "import hashlib; from test_simulation_log import content; from hmt_slam_ros.open_log import open_log;"
         "print(hashlib.sha256(repr(content(open_log('sim:busy,seed=5'))).encode()).hexdigest())"
     )
     command = [sys.executable, "-c", code]

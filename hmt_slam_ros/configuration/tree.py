@@ -86,8 +86,8 @@ CONSISTENCY_RULES: tuple[ConsistencyRule, ...] = (
             not tree.robot.flow_control
             or tree.filter.max_scans_waiting_for_odometry < tree.robot.max_unacknowledged_scans
         ),
-        "filter.max_scans_waiting_for_odometry is not below robot.max_unacknowledged_scans, so without odometry metric SLAM would wait for scans that the "
-        "paced robot holds back; lower the one or raise the other",
+        "filter.max_scans_waiting_for_odometry is not below robot.max_unacknowledged_scans, so without odometry "
+        "metric SLAM would wait for scans that the paced robot holds back; lower the one or raise the other",
     ),
     ConsistencyRule(
         lambda tree: tree.robot.drive != "commands" or tree.robot.rate > 0.0,

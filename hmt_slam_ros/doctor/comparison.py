@@ -49,8 +49,8 @@ class ScalarEstimate:
 class OdometryComparison:
     """What odometry and scans say of the same motions.
 
-    :ivar clock_offset: what has to be added to a scan's stamp to have the odometry's time of it, s; None if it cannot be
-        told.
+    :ivar clock_offset: what has to be added to a scan's stamp to have the odometry's time of it, s; None if it cannot
+        be told.
     :ivar is_mirrored: whether scans and odometry turn to opposite sides.
     :ivar rotation_scale: the odometry's turns as a factor on the scans'; None where the robot hardly turned.
     :ivar translation_scale: the odometry's ways as a factor on the scans'; None where the robot hardly went.

@@ -86,8 +86,8 @@ def _check_static(messages: MessageStatistics) -> list[Finding]:
         Finding(
             "doubtful",
             "static transform moves",
-            f"The transform {joint.parent} -> {joint.child} on {joint.topic} changes by {joint.max_change:.3f} m though it "
-            "is static: the first one is believed; look for a second publisher.",
+            f"The transform {joint.parent} -> {joint.child} on {joint.topic} changes by {joint.max_change:.3f} m "
+            "though it is static: the first one is believed; look for a second publisher.",
         )
         for joint in messages.transforms
         if joint.topic.endswith("tf_static") and joint.max_change > _MOVES

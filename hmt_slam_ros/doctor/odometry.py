@@ -48,8 +48,8 @@ def _check_finite(odometry: OdometryStatistics) -> list[Finding]:
     if not odometry.non_finite_count:
         return []
     text = (
-        f"{odometry.non_finite_count} odometry readings are NaN or infinite and were left out: look for a division by zero "
-        "in the odometry's driver, or a quaternion of zeros."
+        f"{odometry.non_finite_count} odometry readings are NaN or infinite and were left out: look for a division by "
+        "zero in the odometry's driver, or a quaternion of zeros."
     )
     return [Finding("wrong", "odometry not finite", text)]
 
@@ -93,8 +93,8 @@ def _check_rotation(rotation: ScalarEstimate | None) -> list[Finding]:
     if severity == "fine":
         return []
     text = (
-        f"The odometry turns {_factor_text(rotation)} times as far as the scans: correct the distance of the wheels in the "
-        f"odometry by that factor, or the laser's angle_increment."
+        f"The odometry turns {_factor_text(rotation)} times as far as the scans: correct the distance of the wheels "
+        f"in the odometry by that factor, or the laser's angle_increment."
     )
     return [Finding(severity, "rotation scale", text)]
 
@@ -107,8 +107,8 @@ def _check_translation(translation: ScalarEstimate | None) -> list[Finding]:
     if severity == "fine":
         return []
     text = (
-        f"The odometry goes {_factor_text(translation)} times as far as the scans: correct the radius of the wheels in the "
-        "odometry by that factor, or the unit of the ranges."
+        f"The odometry goes {_factor_text(translation)} times as far as the scans: correct the radius of the wheels "
+        "in the odometry by that factor, or the unit of the ranges."
     )
     return [Finding(severity, "translation scale", text)]
 
@@ -142,9 +142,9 @@ def _check_laser_position(comparison: OdometryComparison) -> list[Finding]:
     if severity == "fine":
         return []
     text = (
-        f"The laser is {comparison.laser_forward.value:+.2f} m ahead and {comparison.laser_left.value:+.2f} m to the left of where "
-        "its transform says, by how it moves when the robot turns: correct base_link -> laser, or the odometry's "
-        "child frame if that is not between the wheels."
+        f"The laser is {comparison.laser_forward.value:+.2f} m ahead and {comparison.laser_left.value:+.2f} m to the "
+        "left of where its transform says, by how it moves when the robot turns: correct base_link -> laser, or the "
+        "odometry's child frame if that is not between the wheels."
     )
     return [Finding(severity, "laser place", text)]
 

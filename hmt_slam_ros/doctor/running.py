@@ -77,8 +77,8 @@ class RunningSystem:
     :ivar nodes: names of all nodes but the doctor's.
     :ivar sim_time_nodes: nodes with use_sim_time.
     :ivar diagnostics: by node.
-    :ivar clock_offsets: by topic, by how much its stamps are before the computer's clock as they arrive, s (median); empty where
-        a /clock runs.
+    :ivar clock_offsets: by topic, by how much its stamps are before the computer's clock as they arrive, s (median);
+        empty where a /clock runs.
     :ivar conflicting_transforms: transforms that two sources tell in turn, with how often.
     :ivar missing_laser_transform: what of the laser's transform is missing, empty where nothing is.
     """
@@ -113,7 +113,8 @@ def _check_nodes(running: RunningSystem) -> list[Finding]:
         return [Finding("fine", "nodes", text)]
     missing = [name for name in OUR_NODES if name not in there]
     if missing:
-        text = f"Of the nodes, {_join_names(missing)} {'is' if len(missing) == 1 else 'are'} missing: start all of them, such "
+        verb = "is" if len(missing) == 1 else "are"
+        text = f"Of the nodes, {_join_names(missing)} {verb} missing: start all of them, such "
         return [Finding("wrong", "nodes", text + "as by mapping.launch.py; the others wait for them.")]
     return [] if _check_states(running) else [Finding("fine", "nodes", f"All nodes run: {_join_names(there)}.")]
 
@@ -165,8 +166,8 @@ def _check_silence(running: RunningSystem) -> list[Finding]:
 def _silence_text(name: str, topic: Topic, seconds: float) -> str:
     if topic.publishers:
         return (
-            f"Nothing came on {name} for {seconds:g} s, though {_join_names(topic.publishers)} publishes it: look whether "
-            "the driver has its device and whether the network lets messages through."
+            f"Nothing came on {name} for {seconds:g} s, though {_join_names(topic.publishers)} publishes it: look "
+            "whether the driver has its device and whether the network lets messages through."
         )
     return (
         f"Nobody publishes {name}: start the driver, or remap its topic, such as --ros-args -r {name}:=/base_{name}, "
@@ -192,8 +193,8 @@ def _check_publishers(running: RunningSystem) -> list[Finding]:
         Finding(
             "wrong",
             "two publishers",
-            f"{name} has {len(topic.publishers)} publishers, {_join_names(topic.publishers)}: stop all but one of them, or "
-            "remap the others.",
+            f"{name} has {len(topic.publishers)} publishers, {_join_names(topic.publishers)}: stop all but one of "
+            "them, or remap the others.",
         )
         for name in SINGLE_PUBLISHER_TOPICS
         if (topic := running.topics.get(name)) is not None and len(topic.publishers) > 1
@@ -214,9 +215,9 @@ def _check_clock(running: RunningSystem) -> list[Finding]:
     found = []
     if running.sim_time_nodes and not clock:
         text = (
-            f"{_join_names(running.sim_time_nodes)} {'has' if len(running.sim_time_nodes) == 1 else 'have'} use_sim_time, and nobody "
-            "publishes /clock, so that time stands still: start the simulation or ros2 bag play --clock, or set "
-            "use_sim_time to false."
+            f"{_join_names(running.sim_time_nodes)} {'has' if len(running.sim_time_nodes) == 1 else 'have'} "
+            "use_sim_time, and nobody publishes /clock, so that time stands still: start the simulation or ros2 bag "
+            "play --clock, or set use_sim_time to false."
         )
         found.append(Finding("wrong", "use_sim_time", text))
     for name, away in running.clock_offsets.items():

@@ -38,9 +38,9 @@ def _check_backward(what: str, stamps: Int64) -> list[Finding]:
         Finding(
             "doubtful",
             f"{what} stamps jump back",
-            f"The {what} stamps jump back {times_text(back.size)}, by up to {-steps.min():.3f} s: the order of the messages "
-            "is believed and not the stamps, but other tools that sort by time will break the path; mend the clock or "
-            "the driver that stamps them.",
+            f"The {what} stamps jump back {times_text(back.size)}, by up to {-steps.min():.3f} s: the order of the "
+            "messages is believed and not the stamps, but other tools that sort by time will break the path; mend the "
+            "clock or the driver that stamps them.",
         )
     ]
 
@@ -153,9 +153,9 @@ def _check_gaps(what: str, driver: str, stamps: Int64) -> list[Finding]:
         Finding(
             "doubtful",
             f"{what} gaps",
-            f"The {what} messages stop {times_text(gaps.size)} for more than {_gap_limit(periods):.1f} s, the longest time "
-            f"for {periods[longest]:.1f} s, {at:.1f} s after the first: look whether the {driver} driver stalls or the "
-            "recorder or network drops messages.",
+            f"The {what} messages stop {times_text(gaps.size)} for more than {_gap_limit(periods):.1f} s, the longest "
+            f"time for {periods[longest]:.1f} s, {at:.1f} s after the first: look whether the {driver} driver stalls "
+            "or the recorder or network drops messages.",
         )
     ]
 

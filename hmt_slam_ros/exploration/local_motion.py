@@ -295,5 +295,3 @@ def _distance_along_arc(x: float, y: float, bend: float, radius: float) -> float
     angle = math.atan2(x, bend - y) - math.acos(min(1.0, max(-1.0, cosine)))
     return bend * (angle if angle >= 0.0 else angle + 2.0 * math.pi)
 
-
-__all__ = ["DriveCommand", "DriveLimits", "command_towards"]

@@ -36,9 +36,11 @@ class VirtualScan(NamedTuple):
     :ivar scan: in the frame of the base at the pose from which it was cast; its first beam looks backwards. NaN where
         the map shows no surface.
     :ivar free_range: shape (n,), how far each beam goes through known space, m: to the surface where there is one.
-    :ivar incidence_cosine: shape (n,), cosine of the angle between each beam and the normal of the surface that it meets,
-        at least 0.05. What a map errs by is across its surfaces, which makes a range err by as much divided by this.
-    :ivar ends_unknown: shape (n,), beams that come into unknown ground; the others meet a surface, or nothing within reach.
+    :ivar incidence_cosine: shape (n,), cosine of the angle between each beam and the normal of the surface that it
+        meets, at least 0.05. What a map errs by is across its surfaces, which makes a range err by as much divided by
+        this.
+    :ivar ends_unknown: shape (n,), beams that come into unknown ground; the others meet a surface, or nothing within
+        reach.
     """
 
     scan: Scan

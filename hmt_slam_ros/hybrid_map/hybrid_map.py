@@ -56,7 +56,8 @@ class HybridMap:
 
     :ivar common: what every live hypothesis agrees on.
     :ivar changed_areas: the areas in which this hypothesis differs from the common map, with all their keyframes.
-    :ivar changed_arcs: likewise the arcs, keyed by (smaller area, larger area); None for one that this hypothesis lacks.
+    :ivar changed_arcs: likewise the arcs, keyed by (smaller area, larger area); None for one that this hypothesis
+        lacks.
     """
 
     common: CommonMap = field(default_factory=CommonMap)

@@ -86,7 +86,8 @@ class Landmark:
     :ivar width_deviation: of this, m.
     :ivar existence: whether it is there.
     :ivar scatter: shape (3, 3), sum of the squares of its sightings about their mean, each in deviations.
-    :ivar scan_covariance_share: shape (3, 3), what part of their covariances is the scans' own, in deviations, on average.
+    :ivar scan_covariance_share: shape (3, 3), what part of their covariances is the scans' own, in deviations, on
+        average.
     """
 
     kind: int

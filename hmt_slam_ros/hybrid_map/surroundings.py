@@ -87,7 +87,8 @@ class EntryPrior(NamedTuple):
     """How the keyframes come to lie in an area's place, by the arcs.
 
     :ivar probability: pi(gamma), the probability that they do, exactly 0 where no draw says so.
-    :ivar median_mahalanobis2: squared Mahalanobis distance from the belief's mean of half of the poses in which they do.
+    :ivar median_mahalanobis2: squared Mahalanobis distance from the belief's mean of half of the poses in which they
+        do.
     """
 
     probability: float
@@ -109,7 +110,8 @@ def entry_prior(place: AreaPlace, belief: PoseGaussian, poses: NDArray[np.float6
 def sampled_entry_bound(
     known: NDArray[np.float64], belief: PoseGaussian, poses: NDArray[np.float64], radius: float
 ) -> float:
-    """No less than the share of :func:`entry_prior`, whatever is around the area, from its keyframes' positions (k, 2) alone.
+    """No less than the share of :func:`entry_prior`, whatever is around the area, from its keyframes' positions (k, 2)
+    alone.
 
     One of the keyframes in question at least has to be near to one of the area's.
     """

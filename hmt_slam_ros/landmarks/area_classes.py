@@ -125,7 +125,8 @@ def classify_area(spaces: Iterable[FreeSpace], features: FeatureParameters) -> A
 
 
 def decide_hallway(was_hallway: bool | None, probability: float, features: FeatureParameters) -> bool:
-    """What is taken for a hallway at its present probability and was ``was_hallway`` for one before; None for not yet."""
+    """What is taken for a hallway at its present probability and was ``was_hallway`` for one before; None for not
+    yet."""
     bound = 0.5 if was_hallway is None else 1.0 - features.hallway_sure if was_hallway else features.hallway_sure
     return probability >= bound
 

@@ -30,7 +30,8 @@ class LogRecord:
 
     :ivar source_stamp: the log's own time stamp in ns, which may jump back; results are keyed by it.
     :ivar measurement: the scan or odometry reading, with its ``stamp`` from the running clock, ns.
-    :ivar true_pose: shape (3,), the robot's true pose ``world_T_base`` at that time, m and rad; None where nobody knows it.
+    :ivar true_pose: shape (3,), the robot's true pose ``world_T_base`` at that time, m and rad; None where nobody knows
+        it.
     """
 
     source_stamp: int

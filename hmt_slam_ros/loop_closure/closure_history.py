@@ -176,7 +176,8 @@ class AcceptedPath:
 
     :ivar area: the robot's area.
     :ivar pose: shape (3,), ``area_T_base``.
-    :ivar frame_change: ``area_T_former``, shape (3,), where something was withdrawn that changed the robot's area or pose.
+    :ivar frame_change: ``area_T_former``, shape (3,), where something was withdrawn that changed the robot's area or
+        pose.
     """
 
     hybrid_map: HybridMap

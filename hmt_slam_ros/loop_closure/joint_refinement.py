@@ -144,7 +144,8 @@ def _most_overlapping(
 def _nearest_rows(
     poses: Float64, areas: Int64, seen_from: Float64, seen_from_areas: Int64, allowed: Bool, reach: float, count: int
 ) -> Int64:
-    """:func:`nearest_keyframes` as an array (m, count), filled up with -1; ``allowed[a, b]`` where b is linked with a."""
+    """:func:`nearest_keyframes` as an array (m, count), filled up with -1; ``allowed[a, b]`` where b is linked with
+    a."""
     rows, costs = np.full((len(seen_from), count), -1), np.empty(count)
     for i in range(len(seen_from)):
         held = 0

@@ -18,8 +18,8 @@ FrameKey = tuple[int, int, int]
 class PoseAmbiguity:
     """Remembers where each hypothesis has the robot's area, as long as nothing about it changes.
 
-    :ivar area_frames: {(hypothesis, number of the last change of its map, area): ``map_T_area``, shape (3,), or None where
-        no arc joins the area with the first}.
+    :ivar area_frames: {(hypothesis, number of the last change of its map, area): ``map_T_area``, shape (3,), or None
+        where no arc joins the area with the first}.
     """
 
     def __init__(self, area_frames: Mapping[FrameKey, NDArray[np.float64] | None] | None = None) -> None:

@@ -127,8 +127,8 @@ class TlcaState:
     :ivar published_change: the change after which global poses were told last, -1 before the first.
     :ivar reported_arcs: definite arcs of which it was told that they do not fit the others.
     :ivar closure_revision: what is known of questions that were opened again.
-    :ivar area_frames: {(hypothesis, number of the last change of its map, area): ``map_T_area``, shape (3,), or None where
-        no arc joins the area with the first}, of the robot's areas under several hypotheses.
+    :ivar area_frames: {(hypothesis, number of the last change of its map, area): ``map_T_area``, shape (3,), or None
+        where no arc joins the area with the first}, of the robot's areas under several hypotheses.
     """
 
     replica: ReplicaState = field(default_factory=ReplicaState)

@@ -71,9 +71,11 @@ class LiveHypothesisState:
     :ivar match_information: of the last keyframe event's match alone, in the frame of its pose, shape (3, 3).
     :ivar motion_error: of that motion.
     :ivar anchor: the stored keyframe to which scans are now related.
-    :ivar step_covariances: what the step which led to a keyframe adds to the drift, of those stored since the area was entered.
+    :ivar step_covariances: what the step which led to a keyframe adds to the drift, of those stored since the area was
+        entered.
     :ivar keyframe_covariances: of the poses of keyframes in their areas' frames, of all that are known.
-    :ivar pose_covariance: covariance of the pose at the last keyframe event in the area's frame, right tangent, shape (3, 3).
+    :ivar pose_covariance: covariance of the pose at the last keyframe event in the area's frame, right tangent, shape
+        (3, 3).
     :ivar scan_poses: (stamp, anchor, ``keyframe_T_base``) of the scans since the last keyframe event.
     :ivar contradicted: whether the scan of the last keyframe event contradicted what the robot should have seen.
     :ivar recent_scans: the scans that the next keyframe's is compared with, in mode lifelong.
@@ -104,9 +106,10 @@ class LiveHypothesis:
     :ivar event_pose: ``area_T_base`` at the last keyframe event, shape (3,).
     :ivar anchor: the stored keyframe to which scans are now related.
     :ivar motion_error: of that motion.
-    :ivar step_covariances: {keyframe: covariance (3, 3) that the step which led to it adds to the drift}, of those stored since
-        the area was entered.
-    :ivar keyframe_covariances: {keyframe: covariance (3, 3) of its pose in its area's frame, right tangent}, of all that are known.
+    :ivar step_covariances: {keyframe: covariance (3, 3) that the step which led to it adds to the drift}, of those
+        stored since the area was entered.
+    :ivar keyframe_covariances: {keyframe: covariance (3, 3) of its pose in its area's frame, right tangent}, of all
+        that are known.
     :ivar pose_covariance: covariance of the pose at the last keyframe event in the area's frame, right tangent.
     :ivar scan_poses: (stamp, anchor, ``keyframe_T_base``) of the scans since the last keyframe event.
     :ivar contradicted: whether the scan of the last keyframe event contradicted what the robot should have seen.

@@ -134,8 +134,8 @@ class OdometryMonitor:
         self._last_notice, self._unreported = episode.end * _SECOND, 0
         return (
             f"odometry {_motion_text(episode.odometry_motion)} from {episode.begin * _SECOND:.3f} s to "
-            f"{episode.end * _SECOND:.3f} s, where the scans say that it {_motion_text(episode.scan_motion)}{since}: the scans "
-            "are believed; look for slipping wheels and late stamps."
+            f"{episode.end * _SECOND:.3f} s, where the scans say that it {_motion_text(episode.scan_motion)}{since}: "
+            "the scans are believed; look for slipping wheels and late stamps."
         )
 
     def check_noise(self, noise: OdometryNoise) -> str | None:

@@ -94,8 +94,8 @@ class SlamState:
 class MetricSlam:
     """The metric SLAM process.
 
-    Consumes Scan, Odometry, PoseReset, Hypotheses, ClosureDecision, EndOfLog; produces TrackingReset, Keyframe, ScanPoses, LocalEstimate,
-    Notice, EndOfRun.
+    Consumes Scan, Odometry, PoseReset, Hypotheses, ClosureDecision, EndOfLog; produces TrackingReset, Keyframe,
+    ScanPoses, LocalEstimate, Notice, EndOfRun.
 
     :ivar mode: what is done with known ground; but a robot that may be anywhere maps what is around it.
     """

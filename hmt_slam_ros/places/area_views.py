@@ -33,7 +33,8 @@ class AreaView(NamedTuple):
     :ivar poses: shape (n, 3), their ``area_T_base``.
     :ivar sector_distances: shape (n, 72), how far one sees around each, m, in the frame of the base.
     :ivar hallway_lengths: shape (n,), how long the hallway is that each was taken in, m; nan in none.
-    :ivar min_hallway_lengths: shape (n,), how long a hallway as wide as there would be at least, m; nan where that is not known.
+    :ivar min_hallway_lengths: shape (n,), how long a hallway as wide as there would be at least, m; nan where that is
+        not known.
     """
 
     landmarks: tuple[Landmark, ...]

@@ -79,7 +79,8 @@ class RtlState:
 
 
 class Rtl:
-    """The RTL process. Consumes Odometry, TrackingReset, LocalEstimate, ClosureDecision; produces RealTimePose, Notice."""
+    """The RTL process. Consumes Odometry, TrackingReset, LocalEstimate, ClosureDecision; produces RealTimePose,
+    Notice."""
 
     def __init__(self, configuration: Configuration, state: RtlState | None = None) -> None:
         """:param state: to go on from."""

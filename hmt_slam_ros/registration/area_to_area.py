@@ -126,7 +126,8 @@ def match_areas(
 def best_pose(
     query: AreaGrid, candidate: AreaGrid, prior: PoseGaussian, settings: MatchSettings
 ) -> tuple[Float64, float] | None:
-    """Where the heaviest mode of :func:`match_areas` peaks, ``candidate_T_query``, and the log of its mass; None without one.
+    """Where the heaviest mode of :func:`match_areas` peaks, ``candidate_T_query``, and the log of its mass; None
+    without one.
 
     That costs a fraction of the mode with its covariance.
     """

@@ -19,7 +19,8 @@ class Agreement(NamedTuple):
 
     :ivar samples: how many there are.
     :ivar on_surface: how many are on known surfaces.
-    :ivar in_free_space: how many contradict: they are in space that is known to be free, or behind a wall that is known.
+    :ivar in_free_space: how many contradict: they are in space that is known to be free, or behind a wall that is
+        known.
     """
 
     samples: int

@@ -69,8 +69,8 @@ class AreaGrid:
     :ivar cell: edge of a cell, m.
     :ivar log_ratio: shape (rows, columns), float32, indexed [y, x]: log p(z | map) / p(z | unknown) of a surface
         measured in the cell; above 0 near a surface, below 0 in free space, 0 where nothing is known.
-    :ivar fine_log_ratio: shape (2 rows, 2 columns), float32, the same at the centres of cells half as long; smooth enough to be
-        interpolated, and ``log_ratio`` is the mean of four.
+    :ivar fine_log_ratio: shape (2 rows, 2 columns), float32, the same at the centres of cells half as long; smooth
+        enough to be interpolated, and ``log_ratio`` is the mean of four.
     :ivar free: shape (rows, columns), whether a beam passed through the cell.
     :ivar points: shape (n, 2), one surface point a voxel, m, area frame: samples far enough apart to count as
         independent.

@@ -224,8 +224,8 @@ def linearize(
 def misfit(points: Float64, pose: Float64, prior: Prior, view: GridView, settings: AlignmentSettings) -> float:
     """What :func:`align` minimises, at a pose, nats; but a point counts by its distance in any direction.
 
-    One in unknown space counts as if its surface were at ``_UNKNOWN_DISTANCE``: were it worse, new space ahead would draw the
-    robot back, were it better, nothing would keep it in the map.
+    One in unknown space counts as if its surface were at ``_UNKNOWN_DISTANCE``: were it worse, new space ahead would
+    draw the robot back, were it better, nothing would keep it in the map.
 
     :param points: (n, 2) or surfels (n, 4).
     """

@@ -28,7 +28,8 @@ class ScanTable:
         smallest valid range and smallest range that means "no return", m, time from one beam to the next, s.
     :ivar laser_poses: shape (n, 3), ``base_T_laser``, m and rad.
     :ivar motions: shape (n, 3), the base's motion from the first beam to the last as a twist, m, m, rad.
-    :ivar partial_beams: shape (c,), beams of all scans, counted through as in ``ranges``, that do not hold from the laser on.
+    :ivar partial_beams: shape (c,), beams of all scans, counted through as in ``ranges``, that do not hold from the
+        laser on.
     :ivar partial_starts: shape (c,), from where on each of these holds, m.
     """
 

@@ -70,7 +70,10 @@ class SweepCheck:
         if not (math.isfinite(scan.time_increment) and scan.time_increment >= 0.0):
             return "which is no time from one beam to the next"
         if scan.sweep_duration > _MAX_SWEEP:
-            return f"so that its {scan.ranges.size} beams would take {scan.sweep_duration:.2f} s, more than {_MAX_SWEEP:g} s"
+            return (
+                f"so that its {scan.ranges.size} beams would take {scan.sweep_duration:.2f} s, more than "
+                f"{_MAX_SWEEP:g} s"
+            )
         if len(self._periods) < _MIN_PERIODS or scan.sweep_duration <= _JITTER * median(self._periods):
             return None
         return (

@@ -196,8 +196,8 @@ class OdometryNoiseState:
 
     So the first few steps do not count for much.
 
-    :ivar weighted_ratios: shape (2,), weighted sums of the squared differences of late, of translation and rotation, against
-        what the model expects of them.
+    :ivar weighted_ratios: shape (2,), weighted sums of the squared differences of late, of translation and rotation,
+        against what the model expects of them.
     :ivar weights: shape (2,), the sums of these weights.
     """
 
@@ -284,8 +284,8 @@ class MotionState:
     :ivar noise: what odometry turned out to be worth.
     :ivar inertia: what is known of the velocity, None before the first scan.
     :ivar stamp: of the last scan, ns, None before the first.
-    :ivar interpolation_gap: half the product of the times from the last scan to the readings around it, s^2, None where odometry
-        does not enclose it.
+    :ivar interpolation_gap: half the product of the times from the last scan to the readings around it, s^2, None where
+        odometry does not enclose it.
     :ivar since_keyframe: the motion by odometry since the last keyframe event, None where it is unknown.
     :ivar last_motion: the motion by odometry to the last scan, likewise.
     """

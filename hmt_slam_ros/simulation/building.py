@@ -159,7 +159,8 @@ class Side(NamedTuple):
         )
 
     def rectangle(self, along: Point, out: Point) -> tuple[float, float, float, float]:
-        """The rectangle between two distances along and two out of the side, m, as `FloorPlan.cut_rectangle` takes it."""
+        """The rectangle between two distances along and two out of the side, m, as `FloorPlan.cut_rectangle` takes
+        it."""
         (ax, ay), (bx, by) = self.point(along[0], out[0]), self.point(along[1], out[1])
         return min(ax, bx), min(ay, by), max(ax, bx), max(ay, by)
 

@@ -85,7 +85,8 @@ class DrivenRobot:
         return self._walkers.discs
 
     def set_velocity(self, speed: float, turn_rate: float) -> None:
-        """Drive like this from now on, for `COMMAND_TIMEOUT` seconds unless told again; within the limits of the settings.
+        """Drive like this from now on, for `COMMAND_TIMEOUT` seconds unless told again; within the limits of the
+        settings.
 
         :param speed: m/s, backwards below 0.
         :param turn_rate: rad/s, to the left.

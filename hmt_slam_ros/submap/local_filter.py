@@ -34,7 +34,8 @@ class ParticleFilterState:
     :ivar motion_since_update: the predicted motion since then.
     :ivar leader: the particle whose pose is the filter's.
     :ivar tracking_covariance: of the leader's motion since the last filter step, shape (3, 3), right tangent frame.
-    :ivar residual_covariance: covariance of the leader's pose that the scans since the last filter step leave, likewise.
+    :ivar residual_covariance: covariance of the leader's pose that the scans since the last filter step leave,
+        likewise.
     :ivar clutter_estimate: of the scans so far.
     """
 
@@ -61,7 +62,8 @@ class LineFilterState:
 
     :ivar hypothesis: id of the hypothesis.
     :ivar area: the current area.
-    :ivar line_map: over the robot's pose and the lines; its marks are the pose at the last filter step, and the keyframes'.
+    :ivar line_map: over the robot's pose and the lines; its marks are the pose at the last filter step, and the
+        keyframes'.
     :ivar keyframes: the local map's keyframes, ids.
     :ivar keyframe_areas: their areas.
     :ivar reported_poses: shape (K, 3), ``map_T_base`` of each as it was told, m and rad.

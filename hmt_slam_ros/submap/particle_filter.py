@@ -50,7 +50,8 @@ class ParticleFilter:
     :ivar keyframe_poses: shape (M, K, 3), ``map_T_base`` of each under each particle.
     :ivar leader: the particle whose pose is the filter's.
     :ivar tracking_covariance: of the leader's motion since the last filter step, shape (3, 3), right tangent frame.
-    :ivar residual_covariance: covariance of the leader's pose that the scans since the last filter step leave, likewise.
+    :ivar residual_covariance: covariance of the leader's pose that the scans since the last filter step leave,
+        likewise.
     :ivar clutter_estimate: of the scans so far.
     """
 

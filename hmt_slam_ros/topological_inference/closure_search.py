@@ -67,8 +67,10 @@ class AreaComparison(NamedTuple):
     :ivar transition: pi of the known areas and of new ground.
     :ivar fits: the modes in all areas that were examined, the heaviest of each.
     :ivar examined_areas: those areas.
-    :ivar pending_candidates: areas beside whose place the keyframes fit; they are not in it yet, so that was not examined.
-    :ivar skipped_weight: probability of those that were not, and of further modes, on the scale of ``exp(Fit.log_weight)``.
+    :ivar pending_candidates: areas beside whose place the keyframes fit; they are not in it yet, so that was not
+        examined.
+    :ivar skipped_weight: probability of those that were not, and of further modes, on the scale of
+        ``exp(Fit.log_weight)``.
     """
 
     transition: Transition
@@ -82,8 +84,8 @@ class AreaComparison(NamedTuple):
 class SearchState:
     """What was learnt of the building by comparing its places.
 
-    :ivar negative_shares: how large a share of their surfaces keyframes found in places where they do not lie, of those that
-        were tried last.
+    :ivar negative_shares: how large a share of their surfaces keyframes found in places where they do not lie, of those
+        that were tried last.
     :ivar newest_sampled: the newest of the keyframes with which that was tried last, -1 before the first.
     """
 

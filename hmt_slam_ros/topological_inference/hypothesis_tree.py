@@ -112,18 +112,20 @@ class HypothesisState:
 
     :ivar covariances: {keyframe: covariance (3, 3) of ``area_T_base``, right tangent} of the unsettled keyframes: those
         stored in the robot's area since it was entered, and those that came over with it.
-    :ivar matched_keyframes: {known area: unsettled keyframes that were compared with it}. A keyframe speaks for or against a
-        known area once.
+    :ivar matched_keyframes: {known area: unsettled keyframes that were compared with it}. A keyframe speaks for or
+        against a known area once.
     :ivar local_area_poses: {area: ``current_T_area``} of the areas in the local map besides the robot's own.
     :ivar unmatched_keyframes: the unsettled keyframes that no re-check has looked at.
     :ivar pending_candidates: known areas that the newest of them fitted beside, and in which the robot may be soon.
-    :ivar unlinked_overlap: the area of the local map, joined to the robot's own by no arc, in whose place the robot seems to be,
-        and for how many keyframe events in a row; or None.
-    :ivar kidnapping_evidence: {keyframe event: nats by which its scan contradicted what the robot should have seen}, of the latest
-        events since the robot may have been displaced.
+    :ivar unlinked_overlap: the area of the local map, joined to the robot's own by no arc, in whose place the robot
+        seems to be, and for how many keyframe events in a row; or None.
+    :ivar kidnapping_evidence: {keyframe event: nats by which its scan contradicted what the robot should have seen}, of
+        the latest events since the robot may have been displaced.
     :ivar unstored_poses: {event of these: where the robot was}, where the map stays as it is and does not hold them.
-    :ivar lost_since: the keyframe at which the robot arrived it is not known where, until that is recognized; else None.
-    :ivar false_alarm: where it was then if it was not displaced, where nothing is mapped and nobody carried it; else None.
+    :ivar lost_since: the keyframe at which the robot arrived it is not known where, until that is recognized; else
+        None.
+    :ivar false_alarm: where it was then if it was not displaced, where nothing is mapped and nobody carried it; else
+        None.
     :ivar pose_hint: where one of the keyframes since then is, as somebody says; else None.
     :ivar relocalization_candidate: where it was recognized at the last look, if it was.
     :ivar relocalized_area: the known area in which it was recognized, until it goes over into another one; else None.
@@ -154,8 +156,8 @@ class HypothesisState:
         """After the scan of a keyframe event.
 
         :param unstored_pose: where the robot was, if the map does not hold that.
-        :param log_kidnapping_ratio: log p(scan | the robot was displaced before it) / p(scan | the robot is there), nats, by the map
-            of what is around.
+        :param log_kidnapping_ratio: log p(scan | the robot was displaced before it) / p(scan | the robot is there),
+            nats, by the map of what is around.
         """
         told = log_kidnapping_ratio - _CUSUM_DRIFT
         doubts = {k: nats for k, nats in self.kidnapping_evidence.items() if k > event - _CUSUM_WINDOW}

@@ -2,8 +2,8 @@
 
 Arcs can lie: wheels slip where the scans do not tell, readings are lost, robots are carried. That is rare, but then the
 scans contradict what the hypothesis has the robot see, by as many nats as a place that looks alike would explain them
-better; so the odds of it are known (``HypothesisState.kidnapping_test``). The keyframes since then begin a new area, to which an
-arc leads that tells nothing, and what follows is as for any robot of which nobody knows how it came there
+better; so the odds of it are known (``HypothesisState.kidnapping_test``). The keyframes since then begin a new area, to
+which an arc leads that tells nothing, and what follows is as for any robot of which nobody knows how it came there
 (``relocalization``).
 """
 

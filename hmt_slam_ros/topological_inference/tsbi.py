@@ -89,7 +89,8 @@ class TsbiState:
 class Tsbi:
     """Answers the area events of every keyframe with the live hypotheses.
 
-    Consumes TrackingReset, Keyframe, AreaEvents, ClosureDecision; produces Hypotheses, and Notices of loops that are looked for.
+    Consumes TrackingReset, Keyframe, AreaEvents, ClosureDecision; produces Hypotheses, and Notices of loops that are
+    looked for.
     """
 
     def __init__(
