@@ -6,11 +6,13 @@ they never reach PATH.
 """
 
 from pathlib import Path
+from runpy import run_path
 
 from setuptools import find_packages, setup
 
 NAME = "hmt_slam_ros"
-NODES = ("slam", "aam", "tsbi", "tlca", "rtl", "robot", "view", "explorer", "pilot")
+TABLE = run_path(f"{NAME}/process_table.py")
+NODES = TABLE["node_names"]()
 DOCS = ("myst-parser>=4.0", "sphinx>=8.1", "sphinx-autoapi>=3.4")
 SHARED = ("launch", "config", "data/malaga_one_loop")
 
@@ -52,7 +54,7 @@ setup(
     entry_points={
         "console_scripts": [
             f"hmt_slam = {NAME}.cli.main:main",
-            *(f"hmt_slam_{node} = {NAME}.ros.{node}_node:main" for node in NODES),
+            *(f"hmt_slam_{node} = {TABLE['console_script'](node)}" for node in NODES),
         ],
     },
 )

@@ -189,7 +189,7 @@ def _read(run: LockStepRun, records: Sequence[LogRecord]) -> LockStepRun:
 
 def _keyframes(state: RunState) -> dict[int, Float64]:
     """{stamp of a keyframe's scan: ``map_T_base`` (3,)} of the most probable map."""
-    replica = Replica.from_state(state.tsbi.replica)
+    replica = Replica.from_state(state.processes["tsbi"].replica)
     hybrid_map = replica.maps[replica.best_hypothesis]
     areas = complete_area_poses(hybrid_map, state.recorder.global_poses)
     return {

@@ -288,7 +288,7 @@ def _frame(recording: Recording, first: SimulatedLog) -> NDArray[np.float64]:
 
 def _same(before: RunState, after: RunState) -> bool:
     """Whether the best map of a state is in another one as it was."""
-    one, other = Replica.from_state(before.slam.replica), Replica.from_state(after.slam.replica)
+    one, other = (Replica.from_state(state.processes["slam"].replica) for state in (before, after))
     known, now = one.maps[one.best_hypothesis], other.maps[other.best_hypothesis]
     areas = known.area_ids()
     arcs = {(a, b): arc for a, b, arc in now.all_arcs()}

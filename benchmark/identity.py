@@ -192,7 +192,7 @@ def _piloted(folder: Path, changes: Sequence[str]) -> Digests:
     """A mission to the last room of a saved map, by a robot that woke up in it, and the robot's way."""
     configuration = load_configuration(PARAMETERS, list(changes))
     state, _ = read_run_state(folder)
-    pilot = PilotProcess(configuration, state.tsbi.replica)
+    pilot = PilotProcess(configuration, state.processes["tsbi"].replica)
     run = DrivenRun(_robot(1), configuration, pilot, state)
     outcome = run.do(Task("go", list(pilot.rooms)[-1]), _MISSION)
     return {"way": _way(run.robot), "outcome": _end(outcome)}

@@ -25,11 +25,12 @@ from benchmark.settings import Settings
 from hmt_slam_ros.messages.documents import RobotStatus, decode
 from hmt_slam_ros.messages.messages import LocalEstimate
 from hmt_slam_ros.open_log import open_log
+from hmt_slam_ros.process_table import process_names
 from hmt_slam_ros.ros import topics
 from hmt_slam_ros.ros.conversions import stamp_from_time
 from hmt_slam_ros.ros.topics import DOCUMENTS, ODOM, POSE, ROBOT_STATUS, SCAN
 
-PROCESSES = ("slam", "aam", "tsbi", "tlca", "rtl")
+PROCESSES = process_names()
 BUSY = "sim:office,rate=10,readings=10"
 """A drive with 100 odometry readings a second."""
 

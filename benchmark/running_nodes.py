@@ -21,6 +21,7 @@ from std_msgs.msg import String
 from benchmark.logs import BUNDLED, ROOT, opened
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.messages.messages import LocalEstimate
+from hmt_slam_ros.process_table import node_command, process_names
 from hmt_slam_ros.ros import topics
 from hmt_slam_ros.ros.domain import own_domain
 from hmt_slam_ros.ros.topics import DOCUMENTS
@@ -28,7 +29,7 @@ from hmt_slam_ros.ros.topics import DOCUMENTS
 Parameters = Mapping[str, str | float | list[float]]
 _PATIENCE = 120.0  # s
 _SPIN = 0.005  # s
-NODES = ("slam", "aam", "tsbi", "tlca", "rtl", "robot")
+NODES = (*process_names(), "robot")
 
 
 class Listener:
@@ -74,7 +75,7 @@ class Listener:
         """A node as a process of its own, which ends with the context."""
         words = [word for key, value in parameters.items() for word in ("-p", f"{key}:={value}")]
         process = subprocess.Popen(
-            [sys.executable, "-m", f"hmt_slam_ros.nodes.{name}_node", "--ros-args", *words],
+            [sys.executable, *node_command(name), "--ros-args", *words],
             cwd=ROOT,
             env=os.environ | {"ROS_DOMAIN_ID": str(self._domain)},
             stdin=subprocess.DEVNULL,

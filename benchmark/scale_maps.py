@@ -80,7 +80,9 @@ def _saved_and_loaded(lattice: Lattice, configuration: Configuration) -> Lasting
         writer = MapWriter(scratch)
         writer.write_state(state)
         writer.write_map(
-            Replica.from_state(state.tlca.replica), {entry.area: entry.pose for entry in lattice.poses()}, _ROBOT
+            Replica.from_state(state.processes["tlca"].replica),
+            {entry.area: entry.pose for entry in lattice.poses()},
+            _ROBOT,
         )
         writer.finish(configuration)
         replace_folder(scratch, directory)
@@ -106,22 +108,29 @@ def state_of(lattice: Lattice, configuration: Configuration) -> RunState:
     replica = Replica(scans, maps, one, {FIRST_HYPOTHESIS: 0}).state
     placed = KeyframeCovariances.from_dict(dict.fromkeys(keyframes, ARC))
     live = {
-        hypothesis: replace(own, keyframe_covariances=placed) for hypothesis, own in driven.slam.live_hypotheses.items()
+        hypothesis: replace(own, keyframe_covariances=placed)
+        for hypothesis, own in driven.processes["slam"].live_hypotheses.items()
     }
     graph = OverlapGraph(tuple(range(PER_AREA)), np.full((PER_AREA, PER_AREA), 0.5))
     graphs = tuple(replace(graph, keyframes=tuple(hybrid_map.keyframes(a))) for a in hybrid_map.area_ids())
     watch = PartitionState(0, {area: area for area in hybrid_map.area_ids()}, frozenset(keyframes[:PER_AREA]))
-    path = driven.tlca.paths[FIRST_HYPOTHESIS]
+    path = driven.processes["tlca"].paths[FIRST_HYPOTHESIS]
     arcs = [(a, b) for a, b, _ in hybrid_map.all_arcs()]
     steps = tuple(PathStep(k, a, b, ((a, b),), frozenset({k})) for k, (a, b) in enumerate(arcs))
     path = replace(path, arc_keyframes={pair: frozenset(pair) for pair in arcs}, history=PathHistory(steps, ()))
     return RunState(
         _log_state(keyframes),
-        replace(driven.slam, replica=replica, live_hypotheses=live, keyframe_events=len(keyframes)),
-        replace(driven.aam, replica=replica, graphs=graphs, partitions={FIRST_HYPOTHESIS: watch}),
-        replace(driven.tsbi, replica=replica, global_poses=lattice.poses()),
-        replace(driven.tlca, replica=replica, paths={FIRST_HYPOTHESIS: path}),
-        replace(driven.rtl, area_poses=lattice.poses()),
+        {
+            "slam": replace(
+                driven.processes["slam"], replica=replica, live_hypotheses=live, keyframe_events=len(keyframes)
+            ),
+            "aam": replace(
+                driven.processes["aam"], replica=replica, graphs=graphs, partitions={FIRST_HYPOTHESIS: watch}
+            ),
+            "tsbi": replace(driven.processes["tsbi"], replica=replica, global_poses=lattice.poses()),
+            "tlca": replace(driven.processes["tlca"], replica=replica, paths={FIRST_HYPOTHESIS: path}),
+            "rtl": replace(driven.processes["rtl"], area_poses=lattice.poses()),
+        },
         replace(driven.recorder, replica=replica, **_recorded(keyframes)),
     )
 

@@ -24,10 +24,11 @@ from benchmark.settings import Settings
 from hmt_slam_ros.logs.records import SIMULATION_PREFIX
 from hmt_slam_ros.messages.documents import RobotStatus, decode
 from hmt_slam_ros.open_log import open_log
+from hmt_slam_ros.process_table import process_names
 from hmt_slam_ros.ros import topics
 from hmt_slam_ros.ros.domain import own_domain
 from hmt_slam_ros.ros.execution import wait_until_alone
-from hmt_slam_ros.ros.replay import PROCESSES, NodeProcesses
+from hmt_slam_ros.ros.replay import NodeProcesses
 from hmt_slam_ros.ros.topics import DIAGNOSTICS, ROBOT_STATUS
 from hmt_slam_ros.ros.transforms import TFMessage
 from hmt_slam_ros.sensors import Scan
@@ -133,7 +134,7 @@ def soaked(minutes: float) -> Soak:
     lap = open_log(f"{SIMULATION_PREFIX}{WORLD},laps=1")
     name = f"{SIMULATION_PREFIX}{WORLD},laps={math.ceil(60.0 * minutes * RATE / lap.duration) + 1}"
     laser = next(r.measurement.laser_pose for r in lap.records() if isinstance(r.measurement, Scan)).tolist()
-    found = Soak(resident={node: [] for node in (*PROCESSES, "robot")})
+    found = Soak(resident={node: [] for node in (*process_names(), "robot")})
     with (
         tempfile.TemporaryDirectory(prefix="hmt_slam_soak_") as scratch,
         own_domain() as domain,
@@ -142,7 +143,7 @@ def soaked(minutes: float) -> Soak:
         with NodeProcesses(Path(scratch), (), print) as children:
             own = [] if TFMessage is not None else ["-p", f"laser_pose:={laser}"]
             environment = {**os.environ, "ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
-            for node in PROCESSES:
+            for node in process_names():
                 words = ["-p", f"recovery:={scratch}/recovery", *(own if node == "slam" else [])]
                 children.start(node, words, environment)
             robot = {"log": name, "robot.rate": RATE, "robot.odometry_listeners": 2, "robot.discovery_timeout": 600.0}

@@ -1,4 +1,4 @@
-"""Mapping with a live robot: the five processes, which want /scan, /odom and the transform from base to laser."""
+"""Mapping with a live robot: the processes, which want /scan, /odom and the transform from base to laser."""
 
 from launch import LaunchContext, LaunchDescription
 from launch.actions import DeclareLaunchArgument, OpaqueFunction
@@ -8,11 +8,11 @@ from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import FindPackageShare
 
-PROCESSES = ("slam", "aam", "tsbi", "tlca", "rtl")
+from hmt_slam_ros.process_table import process_names
 
 
 def generate_launch_description() -> LaunchDescription:
-    """Describe the five process nodes, the live page and their arguments."""
+    """Describe the process nodes, the live page and their arguments."""
     return LaunchDescription([*_arguments(), OpaqueFunction(function=_processes), _view()])
 
 
@@ -71,7 +71,7 @@ def _processes(context: LaunchContext) -> list[Node]:
             respawn_delay=1.0,
             respawn_max_retries=3,
         )
-        for process in PROCESSES
+        for process in process_names()
     ]
 
 

@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from hmt_slam_ros.process_table import node_command, process_names
 from hmt_slam_ros.ros.domain import own_domain
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -40,10 +41,9 @@ def main() -> None:
         def start(name: str, **parameters: object) -> subprocess.Popen[bytes]:
             named = [f"{key.replace('__', '.')}:={value}" for key, value in parameters.items()]
             settings = [word for setting in named for word in ("-p", setting)]
-            module = f"hmt_slam_ros.ros.{name}_node"
-            return subprocess.Popen([sys.executable, "-m", module, "--ros-args", *settings], env=environment)
+            return subprocess.Popen([sys.executable, *node_command(name), "--ros-args", *settings], env=environment)
 
-        nodes = [start(name) for name in ("slam", "aam", "tsbi", "tlca", "rtl")] + [start("view", port=PORT)]
+        nodes = [start(name) for name in process_names()] + [start("view", port=PORT)]
         nodes.append(start("robot", log=LOG, robot__rate=RATE, robot__odometry_listeners=2))
         browser = Browser(Path(scratch) / "profile")
         try:

@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # Makes the environment where it is missing and passes the tests.
-# Usage: scripts/test.sh [--floor] [pytest arguments]
+# Usage: scripts/test.sh [--floor] [pytest arguments], such as -k NAME for a part of them
 #   Without pytest arguments the accuracy is compared with benchmark/expected.toml after the tests.
 #   --floor  with the oldest versions supported (requirements/floor.txt), in .venv-floor, without ruff and mypy
 set -uo pipefail
@@ -32,6 +32,8 @@ else
     check ruff check
     check ruff format --check
     check mypy
+    echo "== lint-imports"
+    PYTHONPATH=. "$venv/bin/lint-imports" --no-logo || status=1
     wait
     [ "$status" = 0 ] || echo "ruff or mypy found faults, see above; the tests run all the same"
 fi

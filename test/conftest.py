@@ -9,6 +9,8 @@ import time
 import hypothesis
 import pytest
 
+from hmt_slam_ros.process_table import node_command
+
 # The same examples at every run, however long one takes where the machine is busy.
 hypothesis.settings.register_profile("repeatable", deadline=None, derandomize=True)
 hypothesis.settings.load_profile("repeatable")
@@ -125,7 +127,7 @@ def start(domain):
     def start(name, *arguments, before=(), **parameters):
         words = [word for key, value in parameters.items() for word in ("-p", f"{key.replace('__', '.')}:={value}")]
         process = subprocess.Popen(
-            [*before, sys.executable, "-m", f"hmt_slam_ros.ros.{name}_node", "--ros-args", *words, *arguments],
+            [*before, sys.executable, *node_command(name), "--ros-args", *words, *arguments],
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,

@@ -9,6 +9,7 @@ import pytest
 
 import hmt_slam_ros
 from benchmark.__main__ import _GROUPS, MEASUREMENTS
+from hmt_slam_ros.process_table import DOCUMENTS
 
 PACKAGE = Path(hmt_slam_ros.__file__).parent
 ROOT = PACKAGE.parent
@@ -75,10 +76,10 @@ def test_every_topic_and_every_document_is_in_the_reference():
     constants = {
         node.value for node in ast.walk(tree) if isinstance(node, ast.Constant) and isinstance(node.value, str)
     }
-    topics = {value for value in constants if re.fullmatch(r"[a-z_]+/[a-z_]+", value)}
+    topics = {value for value in constants if re.fullmatch(r"[a-z_]+/[a-z_]+", value)} | {
+        row.topic for row in DOCUMENTS
+    }
     assert len(topics) > 20
     assert {topic for topic in topics if f"| {topic} |" not in text} == set()
-    tree = ast.parse((PACKAGE / "messages" / "documents.py").read_text(encoding="utf-8"))
-    (table,) = (node.value for node in tree.body if isinstance(node, ast.AnnAssign) and node.target.id == "_DOCUMENTS")
-    for name, version in map(ast.literal_eval, table.values):
-        assert f'{{"document":"{name}","version":{version},' in text, name
+    for row in DOCUMENTS:
+        assert f'{{"document":"{row.document}","version":{row.version},' in text, row.document

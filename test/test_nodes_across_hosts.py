@@ -8,9 +8,11 @@ import pytest
 from logs_for_nodes import corridor_bag
 from lossy_link import LossyLink, reason_against
 
+from hmt_slam_ros.process_table import process_names
+
 pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
 
-PROCESSES = ("slam", "aam", "tsbi", "tlca", "rtl")
+PROCESSES = process_names()
 SCANS = 60
 DECIDED = ("scans.bin", "chain.bin", "tlca.bin")
 """Files of a map with what all processes said and decided."""
@@ -34,7 +36,14 @@ def test_the_map_is_that_of_one_host(link, domain, start, tmp_path):
         assert listener.stdout.readline() == "listens\n"
         for name in PROCESSES:
             start(name, before=link.on(1), save_to=saved)
-        start("robot", before=link.on(0), log=log, robot__rate=0.0, robot__odometry_listeners=2, robot__discovery_timeout=60.0)
+        start(
+            "robot",
+            before=link.on(0),
+            log=log,
+            robot__rate=0.0,
+            robot__odometry_listeners=2,
+            robot__discovery_timeout=60.0,
+        )
         print(listener.communicate()[0])  # shown where the test fails
     assert listener.returncode == 0
     for file in DECIDED:

@@ -50,7 +50,12 @@ def texts(findings, *severities):
 
 
 def test_a_sound_robot_gets_a_clean_bill(listener, doctor, start):
-    parameters = {"robot__rate": 6.0, "robot__flow_control": False, "robot__scan_listeners": 0, "robot__odometry_listeners": 0}
+    parameters = {
+        "robot__rate": 6.0,
+        "robot__flow_control": False,
+        "robot__scan_listeners": 0,
+        "robot__odometry_listeners": 0,
+    }
     scans = listener.hear(LaserScan, "scan", BEST_EFFORT)
     robot = start("robot", log=WORLD, **parameters)
     listener.until(lambda: scans, alive=[robot])
@@ -103,7 +108,7 @@ def test_nodes_that_are_not_active_are_named_with_what_makes_them_so(listener, s
         "states: /robot1/slam is finalized and takes no part: end /robot1/slam and start it again, since no transition "
         "leads out of that.",
     ]
-    assert not any(text.startswith("nodes: All five") for text in texts(findings, "fine"))
+    assert not any(text.startswith("nodes: All nodes") for text in texts(findings, "fine"))
 
 
 @pytest.mark.skipif(TFMessage is None, reason="tf2_msgs is not installed: run scripts/test.sh, which builds it")

@@ -12,6 +12,7 @@ from sensor_msgs.msg import LaserScan
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
+from hmt_slam_ros.process_table import process_names
 from hmt_slam_ros.ros import topics
 from hmt_slam_ros.ros.conversions import keyframe_frame, pose_from_message
 from hmt_slam_ros.ros.topics import KEYFRAME_SCANS, KEYFRAMES
@@ -24,7 +25,7 @@ settings: {field_of_view: 360.0, beams: 360, laps: 1, people: 0}
 """
 """A short hallway with an arm to the left."""
 
-PROCESSES = ("slam", "aam", "tsbi", "tlca", "rtl")
+PROCESSES = process_names()
 
 
 @pytest.fixture

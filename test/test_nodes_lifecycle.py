@@ -20,11 +20,12 @@ from std_msgs.msg import Float64MultiArray, String
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.messages.documents import encode
 from hmt_slam_ros.messages.messages import AreaEvents, ClosureDecision, Hypotheses, Hypothesis, LocalEstimate
+from hmt_slam_ros.process_table import process_names
 from hmt_slam_ros.ros import conversions, topics
 from hmt_slam_ros.ros.topics import DIAGNOSTICS, DOCUMENTS, HMT_POSE, KEYFRAMES, POSE
 from hmt_slam_ros.sensors import Odometry
 
-NODES = ("slam", "aam", "tsbi", "tlca", "rtl", "robot")
+NODES = (*process_names(), "robot")
 
 
 def parameters(name, tmp_path):
@@ -94,9 +95,9 @@ def test_a_malformed_document_is_told_and_survived(listener, start):
     told = listener.hear(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
     events = listener.node.create_publisher(String, DOCUMENTS[ClosureDecision], topics.CHAIN)
     process = start("rtl")
-    events.publish(String(data='{"document":"accepted","version":99}'))
+    events.publish(String(data='{"document":"closure_decision","version":99}'))
     listener.until(lambda: (status := level(told, "rtl")) and status.level == DiagnosticStatus.ERROR, alive=[process])
-    assert "has version 99, not 4" in level(told, "rtl").message
+    assert "has version 99, not 1" in level(told, "rtl").message
 
 
 def test_a_lost_message_of_the_chain_is_told(listener, start):
@@ -209,7 +210,7 @@ def test_a_node_ends_with_the_program_that_started_it(listener):
     script = (
         "import os, subprocess, sys, time\n"
         "environment = {**os.environ, 'HMT_SLAM_PARENT': str(os.getpid())}\n"
-        "node = subprocess.Popen([sys.executable, '-m', 'hmt_slam_ros.ros.rtl_node'], env=environment)\n"
+        "node = subprocess.Popen([sys.executable, '-m', 'hmt_slam_ros.ros.run_node', 'rtl'], env=environment)\n"
         "print(node.pid, flush=True)\n"
         "time.sleep(600)\n"
     )

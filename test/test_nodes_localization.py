@@ -19,11 +19,12 @@ from std_srvs.srv import Trigger
 
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.messages.messages import LocalEstimate, Notice
+from hmt_slam_ros.process_table import process_names
 from hmt_slam_ros.ros import topics
 from hmt_slam_ros.ros.conversions import pose_from_message, pose_with_covariance_message, stamp_from_time
 from hmt_slam_ros.ros.topics import DIAGNOSTICS, DOCUMENTS, ENTROPY, IS_LOCALIZED, POSE
 
-NODES = ("slam", "aam", "tsbi", "tlca", "rtl")
+NODES = process_names()
 SCANS = 120
 CARRIED = "sim:office,seed=3,size=0.7,laps=1,carried=0.35,to=0.08,turned=120"
 
@@ -80,11 +81,7 @@ class Nodes:
 
     def diagnosis(self, node):
         """What a node said of itself last, {name: value}; values are empty while it said nothing."""
-        said = (
-            m.status[0]
-            for m in reversed(self.diagnostics)
-            if m.status[0].name == f"{self.namespace}/{node}"
-        )
+        said = (m.status[0] for m in reversed(self.diagnostics) if m.status[0].name == f"{self.namespace}/{node}")
         return defaultdict(str, {value.key: value.value for status in islice(said, 1) for value in status.values})
 
 

@@ -19,11 +19,12 @@ from std_msgs.msg import Bool, String
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.messages.documents import decode
 from hmt_slam_ros.messages.tasks import PlaceEstimate
+from hmt_slam_ros.process_table import process_names
 from hmt_slam_ros.ros import topics
 from hmt_slam_ros.ros.conversions import pose_from_message
 from hmt_slam_ros.ros.topics import DIAGNOSTICS, GOAL_POSE, INITIAL_POSE, IS_LOCALIZED, PLACE
 
-PROCESSES = ("slam", "aam", "tsbi", "tlca", "rtl")
+PROCESSES = process_names()
 
 
 @pytest.fixture(scope="module")
@@ -77,9 +78,7 @@ def test_it_goes_to_a_room_and_has_slam_begin_at_the_door(mapped, listener, star
     # The last keyframe in the room is up to half a metre before the drive's end.
     np.testing.assert_allclose(place, (ROOM[0], ROOM[1] - 0.25, 0.5 * math.pi), atol=0.25)
     assert math.dist(pose_from_message(truths[-1].pose)[:2], place[:2]) < 0.2
-    said = [
-        value.value for m in diagnostics if m.status[0].name == "/pilot" for value in m.status[0].values
-    ]
+    said = [value.value for m in diagnostics if m.status[0].name == "/pilot" for value in m.status[0].values]
     assert "'dance' is no errand: give one of find, stop, or go and the name of a place" in said
     last = decode(places[-1].data, PlaceEstimate)
     assert (last.place, last.room, last.confident) == (room.replace("room", "door"), room, True)

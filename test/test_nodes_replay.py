@@ -23,12 +23,13 @@ from hmt_slam_ros.results.hmt_map import read_saved_map
 
 pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
 
+from hmt_slam_ros.process_table import RUN_NODE, process_names
 from hmt_slam_ros.ros.replay import PROCESSES, replay
 
 ROOT = Path(__file__).resolve().parent.parent
 BUNDLED = ROOT / "data" / "malaga_one_loop"
 COMMAND = (sys.executable, "-m", "hmt_slam_ros.cli.main")
-NODES = {"slam", "aam", "tsbi", "tlca", "rtl", "robot"}
+NODES = {*process_names(), "robot"}
 
 
 def children_of(pid):
@@ -41,9 +42,8 @@ def children_of(pid):
                 words = (folder / "cmdline").read_text().split("\0")
             except (OSError, ValueError):
                 continue
-            module = next((word for word in words if word.startswith("hmt_slam_ros.ros.")), None)
-            if parent == pid and module:
-                found[module.removeprefix("hmt_slam_ros.ros.").removesuffix("_node")] = int(folder.name)
+            if parent == pid and RUN_NODE in words:
+                found[words[words.index(RUN_NODE) + 1]] = int(folder.name)
     return found
 
 

@@ -115,7 +115,13 @@ def test_a_pause_stops_the_robot_and_its_end_lets_it_go_on(tmp_path, listener, s
 
 def test_a_paced_robot_waits_for_the_acknowledgement(tmp_path, listener, start, heard):
     estimates = listener.node.create_publisher(String, DOCUMENTS[LocalEstimate], topics.CHAIN)
-    start("robot", log=corridor_bag(tmp_path), robot__rate=0.0, robot__max_unacknowledged_scans=4, filter__max_scans_waiting_for_odometry=3)
+    start(
+        "robot",
+        log=corridor_bag(tmp_path),
+        robot__rate=0.0,
+        robot__max_unacknowledged_scans=4,
+        filter__max_scans_waiting_for_odometry=3,
+    )
     listener.until(lambda: len(heard["scan"]) == 4)
     listener.spin(0.5)
     assert len(heard["scan"]) == 4
@@ -133,7 +139,11 @@ def test_a_paced_robot_waits_for_the_acknowledgement(tmp_path, listener, start, 
 def test_the_robot_waits_for_those_who_have_to_hear_it_and_answer(tmp_path, listener, start):
     listener.hear(LaserScan, "scan", topics.SENSOR)  # as a recorder does
     robot = start(
-        "robot", log=corridor_bag(tmp_path), robot__discovery_timeout=3.0, robot__scan_listeners=1, robot__odometry_listeners=0
+        "robot",
+        log=corridor_bag(tmp_path),
+        robot__discovery_timeout=3.0,
+        robot__scan_listeners=1,
+        robot__odometry_listeners=0,
     )
     error = robot.communicate(timeout=40)[1]
     assert robot.returncode == 2
@@ -152,7 +162,12 @@ def test_a_log_that_loops_goes_on_from_the_start_with_later_stamps(tmp_path, lis
 
 def test_start_and_duration_play_a_part(tmp_path, listener, start, heard):
     start(
-        "robot", log=corridor_bag(tmp_path), robot__rate=0.0, robot__flow_control=False, robot__start=0.5, robot__duration=1.0
+        "robot",
+        log=corridor_bag(tmp_path),
+        robot__rate=0.0,
+        robot__flow_control=False,
+        robot__start=0.5,
+        robot__duration=1.0,
     )
     listener.until(ended(heard))
     stamps = [(conversions.stamp_from_time(message.header.stamp) - START) / 1e9 for message in heard["scan"]]

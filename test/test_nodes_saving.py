@@ -21,13 +21,14 @@ from hmt_slam_ros.loop_closure.tlca import TlcaState
 from hmt_slam_ros.messages.documents import KeyframeHeader, decode
 from hmt_slam_ros.messages.messages import LocalEstimate
 from hmt_slam_ros.metric_slam.slam import SlamState
+from hmt_slam_ros.process_table import process_names
 from hmt_slam_ros.results.hmt_map import ChainState, read_saved_map
 from hmt_slam_ros.ros import topics
 from hmt_slam_ros.ros.topics import DOCUMENTS, KEYFRAMES, MAP
 from hmt_slam_ros.saved_map.folder import FORMAT, VERSION, FolderReader
 from hmt_slam_ros.topological_inference.tsbi import TsbiState
 
-NODES = ("slam", "aam", "tsbi", "tlca", "rtl")
+NODES = process_names()
 STATES = {"slam": SlamState, "aam": AamState, "tsbi": TsbiState, "tlca": TlcaState}
 
 

@@ -166,7 +166,7 @@ def stands(nodes):
 def begun_anew(manager, nodes, log):
     """Slam alone does not begin anew, all five do."""
     manager.lead(["slam"], "cleanup", "unconfigured")
-    assert not manager.apply_changes("slam", "configure")
+    assert not manager.change("slam", "configure")
     assert manager.state("slam") == "unconfigured"
     nodes.until(lambda: "still have the map that slam gave up" in nodes.diagnosis("slam")["last error"])
     assert nodes.diagnosis("slam")["last error"].startswith("aam, rtl, tlca, tsbi still")

@@ -28,6 +28,7 @@ from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.shortest_path import uninformative_belief
 from hmt_slam_ros.messages.map_changes import Arc, AreaPose
 from hmt_slam_ros.messages.messages import ClosureDecision, Hypotheses, Hypothesis, HypothesisEstimate, Keyframe
+from hmt_slam_ros.process_table import process_names
 from hmt_slam_ros.registration.consistency import Clutter
 from hmt_slam_ros.ros import topics
 from hmt_slam_ros.ros.map_view import MapRenderer, MapRendererState
@@ -36,7 +37,7 @@ from hmt_slam_ros.ros.transforms import TFMessage
 from hmt_slam_ros.sensors import Scan
 
 BUNDLED = Path(__file__).resolve().parent.parent / "data" / "malaga_one_loop"
-PROCESSES = ("slam", "aam", "tsbi", "tlca", "rtl")
+PROCESSES = process_names()
 ALL = QoSProfile(history=HistoryPolicy.KEEP_ALL)
 DESKTOP, PHONE = (1280, 800), (390, 844)
 
@@ -149,9 +150,7 @@ def assert_graph(graph):
 
 
 def assert_health(health):
-    told = {
-        status.name.strip("/"): {v.key: v.value for v in status.values} for a in health for status in a.status
-    }
+    told = {status.name.strip("/"): {v.key: v.value for v in status.values} for a in health for status in a.status}
     assert set(told) == {*PROCESSES, "robot", "view"}
     assert {"memory", "peak memory", "busy", "last error"} <= set.intersection(*map(set, told.values()))
     assert float(told["slam"]["effective samples"].removesuffix(" of 12")) >= 1.0
@@ -177,7 +176,7 @@ def assert_page(page, port, graph, pmf):
     leaves = zip(*[iter(pmf.data)] * 3, strict=True)
     rows = [(hypothesis, area) for hypothesis, area, _ in leaves if hypothesis >= 0]
     assert drawn["bars"] == len(rows)
-    assert [tuple(leaf[:2]) for leaf in known["history"]["events"][-1]["leaves"]] == rows
+    assert [tuple(leaf[:2]) for leaf in known["history"]["events"][-1]["hypotheses"]] == rows
     assert drawn["events"] == len(known["history"]["events"]) > 50
     assert drawn["robot"] == known["robot"]["pose"]
     assert page.text("position").startswith(f"{drawn['robot'][0]:.2f}")

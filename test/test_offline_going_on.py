@@ -33,19 +33,19 @@ def contents(directory):
 def written(directory, state):
     """A folder with nothing but the state of a run."""
     writer = FolderWriter(directory)
-    for name in PARTS:
-        writer.write(name, getattr(state, name))
+    for name, part in state.parts.items():
+        writer.write(name, part)
     writer.finish("state", 1)
     return directory
 
 
 def read(directory):
     folder = FolderReader(directory, "state", 1)
-    return RunState(**{name: folder.read(name, kind) for name, kind in PARTS.items()})
+    return RunState.from_parts({name: folder.read(name, kind) for name, kind in PARTS.items()})
 
 
 def same_outcome(one, other):
-    for name in ("trajectory", "online", "odometry"):
+    for name in ("trajectory", "online_trajectory", "odometry"):
         np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
     assert one.probabilities == other.probabilities
     assert [notice.text for notice in one.notices] == [notice.text for notice in other.notices]
@@ -55,7 +55,7 @@ def same_outcome(one, other):
 def beginning(configuration, branching):
     """A run whose TSBI makes the children of hypotheses in some way."""
     run = LockStepRun(configuration)
-    run.lock_step.processes["tsbi"] = run._tsbi = Tsbi(configuration, branching)
+    run.lock_step.processes["tsbi"] = run._processes["tsbi"] = Tsbi(configuration, branching)
     return run
 
 
@@ -74,7 +74,7 @@ def compared(log, folder, stops, branching=lambda: Branching, configuration=None
         run.read(record)
         if stops(number, run._tsbi.state):
             state = run.state
-            stopped.append(state.tsbi)
+            stopped.append(state.processes["tsbi"])
             run = LockStepRun(configuration, state=read(written(folder / str(number), state)))
     assert contents(written(folder / "stopped", run.state)) == contents(written(folder / "whole", whole.state))
     same_outcome(*(end.recorder.finish(end.log.stamps) for end in (run.finish(), whole.finish())))
@@ -157,7 +157,7 @@ def test_scans_without_odometry_wait_in_the_saved_map_as_well(tmp_path):
         whole.process_record(record)
         run.process_record(record)
     state = run.state
-    assert len(state.slam.scan_queue.scans) == 3
+    assert len(state.processes["slam"].scan_queue.scans) == 3
     run = LockStepRun(Configuration(), state=read(written(tmp_path / "waiting", state)))
     for record in scans[3:]:
         whole.process_record(record)

@@ -16,9 +16,10 @@ import pytest
 import yaml
 
 import hmt_slam_ros
+from hmt_slam_ros.process_table import node_names
 
 ROOT = Path(__file__).resolve().parent.parent
-NODES = ("slam", "aam", "tsbi", "tlca", "rtl", "robot", "view", "explorer", "pilot")
+NODES = node_names()
 LAUNCH_FILES = sorted((ROOT / "launch").glob("*.launch.py"))
 
 
@@ -82,7 +83,7 @@ def test_ros2_run_finds_an_executable_that_runs_the_node_of_its_name(setup_argum
     package = tmp_path / "hmt_slam_ros" / "ros"
     package.mkdir(parents=True)
     (package.parent / "process_settings.py").symlink_to(ROOT / "hmt_slam_ros" / "process_settings.py")
-    (package / f"{node}_node.py").write_text(f"def main():\n    print('this is {node}')\n")
+    (package / "run_node.py").write_text("def run_node(name):\n    print(f'this is {name}')\n")
     executable = tmp_path / node
     executable.write_bytes(source.read_bytes())
     result = subprocess.run(

@@ -6,9 +6,11 @@ import sys
 
 import pytest
 
+from hmt_slam_ros.process_table import console_script, process_names
+
 # Modules that a console script, `ros2 run` or `python -m` starts.
-NODES = ("slam", "aam", "tsbi", "tlca", "rtl", "robot")
-ENTRIES = ("hmt_slam_ros.cli.main", *(f"hmt_slam_ros.ros.{node}_node" for node in NODES))
+NODES = (*process_names(), "robot")
+ENTRIES = ("hmt_slam_ros.cli.main", *(console_script(node).partition(":")[0] for node in NODES))
 WORK = """
 import numpy as np, scipy.linalg
 scipy.linalg.eigh(np.eye(300) @ np.eye(300))
@@ -18,6 +20,8 @@ THREADS = "import os; print(len(os.listdir('/proc/self/task')))"
 # 20 MB go and come back as less, behind which a small object stays.
 HEAP = """
 import numpy as np
+
+from hmt_slam_ros.process_table import console_script, process_names
 def resident():
     return int(open("/proc/self/statm").read().split()[1]) * 4096
 first = np.ones(20_000_000, np.uint8); del first

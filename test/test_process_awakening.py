@@ -38,7 +38,7 @@ def office(maps):
 @pytest.fixture(scope="module")
 def begin(office):
     """The record of a keyframe's scan."""
-    known = {scan.stamp for scan in Replica.from_state(office.state.tsbi.replica).scans.values()}
+    known = {scan.stamp for scan in Replica.from_state(office.state.processes["tsbi"].replica).scans.values()}
     return [scan for scan in office.scans if office.records[scan].measurement.stamp in known][60]
 
 
@@ -55,9 +55,9 @@ def carried(office, records, scans):
 
 
 def test_it_begins_a_new_area_to_which_an_arc_leads_that_tells_nothing(office, begin):
-    before = Replica.from_state(office.state.tsbi.replica)
+    before = Replica.from_state(office.state.processes["tsbi"].replica)
     run = carried(office, office.records[begin:], 10)
-    replica = Replica.from_state(run.state.tsbi.replica)
+    replica = Replica.from_state(run.state.processes["tsbi"].replica)
     (leaf,) = run.recorder.hypotheses[max(run.recorder.hypotheses)].hypotheses
     assert leaf.lost
     assert leaf.area not in before.maps[before.best_hypothesis].area_ids()
@@ -89,7 +89,7 @@ def test_without_landmarks_as_prior_it_is_recognized_too(maps, share):
 
 def test_in_the_map_of_the_first_half_it_wakes_up_in_the_second_near_keyframes_of_the_first(maps):
     log, whole = maps["first half"], maps["whole"]
-    scans = Replica.from_state(log.state.tsbi.replica).scans.values()
+    scans = Replica.from_state(log.state.processes["tsbi"].replica).scans.values()
     stamps = {log.records[scan].measurement.stamp: n for n, scan in enumerate(log.scans)}
     known = np.array([log.truth[stamps[scan.stamp], :2] for scan in scans])
     assert max(stamps[scan.stamp] for scan in scans) < min(log.starts)
@@ -126,7 +126,7 @@ def test_in_a_building_that_it_does_not_know_it_stays_lost(office, seed):
 
 def test_a_robot_that_stands_still_is_recognized_where_somebody_says_that_it_is(office, begin):
     """In the place of a keyframe; what is said is 0.4 m and 6 degrees off."""
-    replica = Replica.from_state(office.state.tsbi.replica)
+    replica = Replica.from_state(office.state.processes["tsbi"].replica)
     hybrid_map = replica.maps[replica.best_hypothesis]
     scan = office.records[begin].measurement
     (at,) = [
@@ -149,8 +149,8 @@ def test_a_robot_that_stands_still_is_recognized_where_somebody_says_that_it_is(
 
 def test_scans_are_counted_on_and_odometry_begins_anew(office, begin):
     run = carried(office, office.records[begin:], 25)
-    assert run.state.slam.processed_scans == office.state.slam.processed_scans + 25
-    assert run.state.slam.dropped_scans == 0
+    assert run.state.processes["slam"].processed_scans == office.state.processes["slam"].processed_scans + 25
+    assert run.state.processes["slam"].dropped_scans == 0
 
 
 def test_one_that_is_carried_while_it_maps_notices_and_is_recognized():
@@ -179,7 +179,7 @@ def test_one_that_is_carried_while_it_stores_nothing_notices_and_is_recognized(o
     assert not any(lost for since, lost in heard if -1.0 < since < 0.0)
     assert any(lost for since, lost in heard if 0.0 < since < SOON)  # at 0.6 m/s at most
     assert not heard[-1][1]
-    assert run.state.slam.dropped_scans == 0
+    assert run.state.processes["slam"].dropped_scans == 0
 
 
 def test_an_arc_that_tells_nothing_is_told_from_the_least_certain_one_between_areas():

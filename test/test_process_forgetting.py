@@ -53,7 +53,7 @@ class Rounds:
     @property
     def placed(self):
         """{keyframe: its area} of the map, of which there is one."""
-        replica = self.run.state.slam.replica
+        replica = self.run.state.processes["slam"].replica
         return {k for area in replica.common.area_keyframes().values() for k in area} | {
             k for own in replica.changes.values() for area in own.area_keyframes().values() for k in area
         }
@@ -73,23 +73,23 @@ def test_what_is_forgotten_was_stored_before_and_is_gone_in_every_process(rounds
     state, gone = rounds.run.state, {one.keyframe for one in rounds.ears.forgotten}
     assert len(gone) >= 4 * (LAPS - 2)
     for replica in (
-        state.slam.replica,
-        state.aam.replica,
-        state.tsbi.replica,
-        state.tlca.replica,
+        state.processes["slam"].replica,
+        state.processes["aam"].replica,
+        state.processes["tsbi"].replica,
+        state.processes["tlca"].replica,
         state.recorder.replica,
     ):
         assert not gone & replica.scans.keys()
-        assert replica.scans.keys() == state.slam.replica.scans.keys()
+        assert replica.scans.keys() == state.processes["slam"].replica.scans.keys()
     assert not gone & rounds.placed
-    for live in state.slam.live_hypotheses.values():
+    for live in state.processes["slam"].live_hypotheses.values():
         assert not gone & {
             *live.particle_filter.keyframes,
             *live.keyframe_covariances.to_dict(),
             *live.step_covariances.to_dict(),
             live.anchor,
         }
-    assert not gone & {keyframe for graph in state.aam.graphs for keyframe in graph.keyframes}
+    assert not gone & {keyframe for graph in state.processes["aam"].graphs for keyframe in graph.keyframes}
 
 
 def test_every_scan_keeps_its_pose_relative_to_a_keyframe_that_is_there(rounds):

@@ -7,10 +7,11 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from hmt_slam_ros.doctor.finding import Finding, Severity, times_text
+from hmt_slam_ros.process_table import COORDINATOR, process_names, topic_of
 
-OUR_NODES = ("slam", "aam", "tsbi", "tlca", "rtl")
+OUR_NODES = process_names()
 SCAN, ODOM, TF, TF_STATIC, CLOCK = "scan", "odom", "tf", "tf_static", "/clock"
-ESTIMATES = "hmt/local_estimate"
+ESTIMATES = topic_of("LocalEstimate")
 SINGLE_PUBLISHER_TOPICS = (SCAN, ODOM, "map", "pose", CLOCK)
 """Topics that have one publisher."""
 
@@ -112,12 +113,10 @@ def _check_nodes(running: RunningSystem) -> list[Finding]:
         return [Finding("fine", "nodes", text)]
     missing = [name for name in OUR_NODES if name not in there]
     if missing:
-        text = (
-            f"Of the nodes, {_join_names(missing)} {'is' if len(missing) == 1 else 'are'} missing: start all five, "
-            "such "
-        )
+        verb = "is" if len(missing) == 1 else "are"
+        text = f"Of the nodes, {_join_names(missing)} {verb} missing: start all of them, such "
         return [Finding("wrong", "nodes", text + "as by mapping.launch.py; the others wait for them.")]
-    return [] if _check_states(running) else [Finding("fine", "nodes", f"All five nodes run: {_join_names(there)}.")]
+    return [] if _check_states(running) else [Finding("fine", "nodes", f"All nodes run: {_join_names(there)}.")]
 
 
 def _check_states(running: RunningSystem) -> list[Finding]:
@@ -151,7 +150,7 @@ def _check_silence(running: RunningSystem) -> list[Finding]:
         found.append(Finding("wrong", "laser transform", running.missing_laser_transform))
     estimates = running.topics[ESTIMATES]
     if (
-        "slam" in running.nodes
+        COORDINATOR in running.nodes
         and running.topics[SCAN].message_count
         and not estimates.message_count
         and not _check_states(running)

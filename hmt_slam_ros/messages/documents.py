@@ -17,18 +17,12 @@ from numpy.typing import NDArray
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.messages.map_changes import InitialPose, StaleBeams
 from hmt_slam_ros.messages.messages import (
-    AreaEvents,
-    ClosureDecision,
     EndOfRun,
-    Hypotheses,
     HypothesisEstimate,
     Keyframe,
-    LocalEstimate,
-    Notice,
-    TrackingReset,
 )
-from hmt_slam_ros.messages.tasks import PlaceEstimate
 from hmt_slam_ros.plain_data import PlainDataReader, Reader, to_plain
+from hmt_slam_ros.process_table import DOCUMENTS
 from hmt_slam_ros.saved_map.folder import FileRecord
 from hmt_slam_ros.sensors import Scan
 
@@ -193,23 +187,7 @@ class ResetResponse:
     error: str = ""
 
 
-# Raise a document's version with every change of its dataclass: a receiver refuses any other.
-_DOCUMENTS: dict[type, tuple[str, int]] = {
-    KeyframeHeader: ("keyframe", 10),
-    AreaEvents: ("area_events", 4),
-    Hypotheses: ("hypotheses", 9),
-    ClosureDecision: ("closure_decision", 1),
-    LocalEstimate: ("local_estimate", 1),
-    TrackingReset: ("tracking_reset", 1),
-    Notice: ("notice", 1),
-    FinalCounts: ("finished", 2),
-    RobotStatus: ("robot_status", 2),
-    SaveRequest: ("save_request", 2),
-    SaveResponse: ("save_response", 1),
-    ResetRequest: ("reset_request", 1),
-    ResetResponse: ("reset_response", 1),
-    PlaceEstimate: ("place_estimate", 2),
-}
+_DOCUMENTS: dict[type, tuple[str, int]] = {row.message_class: (row.document, row.version) for row in DOCUMENTS}
 
 
 def encode(message: object, reset_number: int = 0) -> str:

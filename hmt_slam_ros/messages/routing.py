@@ -2,25 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from collections.abc import Iterable
+from typing import Protocol, get_args
 
-from hmt_slam_ros.messages.messages import (
-    AreaEvents,
-    ClosureDecision,
-    EndOfLog,
-    EndOfRun,
-    Hypotheses,
-    Keyframe,
-    LocalEstimate,
-    Message,
-    Notice,
-    PoseReset,
-    RealTimePose,
-    ScanPoses,
-    TrackingReset,
-)
-from hmt_slam_ros.messages.tasks import Task, TaskResult, VelocityCommand
-from hmt_slam_ros.sensors import Odometry, Scan
+from hmt_slam_ros.messages.messages import Message
+from hmt_slam_ros.process_table import COMPANIONS, PROCESSES, RECORDER, resolve_class
 
 
 class Process(Protocol):
@@ -38,14 +24,18 @@ class Checkpointable(Process, Protocol):
         """All that it knows between two messages, or between two keyframe events."""
 
 
+_KINDS = {kind.__name__: kind for kind in get_args(Message)}
+
+
+def message_types(names: Iterable[str]) -> tuple[type, ...]:
+    """Classes of messages.
+
+    :param names: of members of ``Message``, or "module:Class".
+    """
+    return tuple(resolve_class(name) if ":" in name else _KINDS[name] for name in names)
+
+
 SUBSCRIPTIONS: dict[str, tuple[type, ...]] = {
-    "slam": (Scan, Odometry, PoseReset, Hypotheses, ClosureDecision, EndOfLog),
-    "aam": (Keyframe, Hypotheses, ClosureDecision),
-    "tsbi": (TrackingReset, Keyframe, AreaEvents, ClosureDecision),
-    "tlca": (Keyframe, Hypotheses),
-    "rtl": (Odometry, TrackingReset, LocalEstimate, Hypotheses, ClosureDecision),
-    "explorer": (Task, Scan, RealTimePose, Keyframe, Hypotheses, ClosureDecision),
-    "pilot": (Task, Odometry, Scan, RealTimePose, Keyframe, Hypotheses, ClosureDecision),
-    "robot": (VelocityCommand, TaskResult),
-    "recorder": (Keyframe, Hypotheses, ClosureDecision, ScanPoses, LocalEstimate, EndOfRun, Notice),
+    row.name: message_types(row.consumes) for row in (*PROCESSES, *COMPANIONS, RECORDER)
 }
+"""{process or node: classes of the messages that it receives}."""

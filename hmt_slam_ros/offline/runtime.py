@@ -1,4 +1,4 @@
-"""The five processes in lock-step in one process: every message is delivered in the order in which it was said."""
+"""All processes in lock-step in one process: every message is delivered in the order in which it was said."""
 
 from __future__ import annotations
 
@@ -11,13 +11,12 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from hmt_slam_ros import composition
 from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.logs.records import Log, LogRecord
-from hmt_slam_ros.loop_closure.tlca import Tlca
 from hmt_slam_ros.messages.messages import EndOfLog, Message, PoseReset
-from hmt_slam_ros.messages.routing import SUBSCRIPTIONS, Process
-from hmt_slam_ros.real_time_localization.rtl import Rtl
+from hmt_slam_ros.messages.routing import SUBSCRIPTIONS, Checkpointable, Process
+from hmt_slam_ros.metric_slam.slam import MetricSlam
+from hmt_slam_ros.process_table import COORDINATOR, PROCESSES, RECORDER
 from hmt_slam_ros.results.hmt_map import RunState
 from hmt_slam_ros.results.log_reading import LogProgress, LogReader, is_newest_log
 from hmt_slam_ros.results.recorder import Recorder
@@ -76,7 +75,7 @@ class RunResult:
 
 
 class LockStepRun:
-    """The five processes and the recorder in lock-step, from the start or from a state on.
+    """All processes and the recorder in lock-step, from the start or from a state on.
 
     :ivar lock_step: that runs them.
     :ivar recorder: that listens.
@@ -95,25 +94,16 @@ class LockStepRun:
         :param observers: {name: process}, which listen as well.
         """
         state = state or RunState()
-        self._slam = composition.metric_slam(configuration, state.slam)
-        self._aam = composition.area_abstraction(configuration, state.aam)
-        self._tsbi = composition.topological_inference(configuration, state.tsbi)
-        self._tlca = Tlca(configuration, state.tlca)
-        self._rtl = Rtl(configuration, state.rtl)
+        self._processes: dict[str, Checkpointable] = {
+            row.name: row.make(configuration, state.processes[row.name]) for row in PROCESSES
+        }
+        replaced = {"aam": abstraction(configuration)} if abstraction else {}
         self.recorder = Recorder(configuration, state.recorder)
         self.lock_step = LockStep(
-            {
-                "slam": self._slam,
-                "aam": abstraction(configuration) if abstraction else self._aam,
-                "tsbi": self._tsbi,
-                "tlca": self._tlca,
-                "rtl": self._rtl,
-                "recorder": self.recorder,
-                **(observers or {}),
-            }
+            {**self._processes, **replaced, RECORDER.name: self.recorder, **(observers or {})}
         )
         self._log_reader = LogReader(state.log)
-        self._seconds_per_scan = {name: array("d") for name in self.lock_step.processes if name != "recorder"}
+        self._seconds_per_scan = {name: array("d") for name in self.lock_step.processes if name != RECORDER.name}
 
     @property
     def scans_read(self) -> int:
@@ -131,11 +121,7 @@ class LockStepRun:
         """All that is known, between two records of the log."""
         return RunState(
             self._log_reader.state,
-            self._slam.state,
-            self._aam.state,
-            self._tsbi.state,
-            self._tlca.state,
-            self._rtl.state,
+            {name: process.state for name, process in self._processes.items()},
             self.recorder.record(),
         )
 
@@ -164,8 +150,10 @@ class LockStepRun:
     def finish(self) -> RunResult:
         """End the run."""
         self.lock_step.feed(EndOfLog())
+        slam = self._processes[COORDINATOR]
+        assert isinstance(slam, MetricSlam)
         seconds = {name: np.array(spent) for name, spent in self._seconds_per_scan.items()}
-        return RunResult(self.recorder, self._log_reader.state, seconds, self._slam.peak_map_bytes)
+        return RunResult(self.recorder, self._log_reader.state, seconds, slam.peak_map_bytes)
 
 
 def run_log(

@@ -170,7 +170,7 @@ class CorridorFrame:
         return _unit_vector(self.travel_axis)
 
     @property
-    def left(self) -> Float64:
+    def left_normal(self) -> Float64:
         """Unit vector across it, shape (2,)."""
         return _unit_vector(self.travel_axis + 1)
 
@@ -183,7 +183,7 @@ class CorridorFrame:
     @property
     def lateral_offset(self) -> float:
         """How far the robot is to the right of the hallway's middle, m."""
-        return float((self.hallway_center - self.position) @ self.left)
+        return float((self.hallway_center - self.position) @ self.left_normal)
 
     @property
     def last_node_position(self) -> Float64:
@@ -208,7 +208,7 @@ class CorridorFrame:
 
     def center_point_ahead(self, distance: float) -> Float64:
         """The place in the hallway's middle so far ahead of the robot, m, shape (2,)."""
-        return np.asarray(self.position + distance * self.direction + self.lateral_offset * self.left)
+        return np.asarray(self.position + distance * self.direction + self.lateral_offset * self.left_normal)
 
     def center_point_ahead_in_base(self, distance: float) -> Float64:
         """The same place in the frame of the base."""

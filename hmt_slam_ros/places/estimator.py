@@ -75,7 +75,7 @@ class OpeningTracker:
         """The openings to the sides of a robot's hallway that one believes in, in the frame along the walls."""
         for one in self._landmark_map.landmarks:
             heading = float(one.pose.mean[2]) - QUARTER_TURN * frame.travel_axis
-            beside = float((one.pose.mean[:2] - frame.position) @ frame.left)
+            beside = float((one.pose.mean[:2] - frame.position) @ frame.left_normal)
             side = math.copysign(1.0, beside) * math.sin(heading)
             existence = one.existence
             believed = existence.confidence >= _LEAST and existence.detections >= max(_SIGHTINGS, existence.misses)

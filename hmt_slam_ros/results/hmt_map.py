@@ -9,24 +9,21 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import get_type_hints
+from typing import Any
 
-from hmt_slam_ros.area_abstraction.partition import AamState
 from hmt_slam_ros.configuration import Configuration, load_configuration
 from hmt_slam_ros.configuration.documents import ros_yaml
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.loop_closure.tlca import TlcaState
 from hmt_slam_ros.messages.map_changes import AreaPose
 from hmt_slam_ros.messages.messages import LocalEstimate
 from hmt_slam_ros.messages.replica import Replica, ReplicaState
 from hmt_slam_ros.metric_slam.slam import SlamState
-from hmt_slam_ros.real_time_localization.rtl import RtlState
+from hmt_slam_ros.process_table import COORDINATOR, PROCESSES
 from hmt_slam_ros.results.log_reading import LogProgress
 from hmt_slam_ros.results.record import RunRecord
 from hmt_slam_ros.results.trajectories import RelativeTrajectory
 from hmt_slam_ros.saved_map.folder import CONFIGURATION, FORMAT, VERSION, FileRecord, FolderReader, FolderWriter
-from hmt_slam_ros.topological_inference.tsbi import TsbiState
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,17 +31,23 @@ class RunState:
     """All that a run in lock-step knows between two records of a log, at first before the first one.
 
     :ivar log: how far the logs were read.
-    :ivar slam: metric SLAM, and so on the other processes.
+    :ivar processes: {process: its state}, of all processes of the table.
     :ivar recorder: what the output folder needs of the run so far.
     """
 
     log: LogProgress = field(default_factory=LogProgress)
-    slam: SlamState = field(default_factory=SlamState)
-    aam: AamState = field(default_factory=AamState)
-    tsbi: TsbiState = field(default_factory=TsbiState)
-    tlca: TlcaState = field(default_factory=TlcaState)
-    rtl: RtlState = field(default_factory=RtlState)
+    processes: Mapping[str, Any] = field(default_factory=lambda: {row.name: row.state_class() for row in PROCESSES})
     recorder: RunRecord = field(default_factory=RunRecord)
+
+    @classmethod
+    def from_parts(cls, parts: Mapping[str, Any]) -> RunState:
+        """The state of its parts, as :attr:`parts` gives them."""
+        return cls(parts["log"], {row.name: parts[row.name] for row in PROCESSES}, parts["recorder"])
+
+    @property
+    def parts(self) -> dict[str, Any]:
+        """{name of the part: its value}, with the names of :data:`PARTS`."""
+        return {"log": self.log, **self.processes, "recorder": self.recorder}
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,8 +76,12 @@ class ChainState:
     events: int
 
 
-PARTS: Mapping[str, type] = get_type_hints(RunState)
-"""The parts of the state from which a run goes on."""
+PARTS: Mapping[str, type] = {
+    "log": LogProgress,
+    **{row.name: row.state_class for row in PROCESSES},
+    "recorder": RunRecord,
+}
+"""{part of the state from which a run goes on: its class}; each is a file of the map."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,13 +109,13 @@ class MapWriter:
 
     def write_state(self, state: RunState) -> None:
         """Write what a run goes on from."""
-        for name in PARTS:
-            self._folder.write(name, getattr(state, name))
-        self._folder.write("chain", ChainState(state.slam.keyframe_events))
+        for name, part in state.parts.items():
+            self._folder.write(name, part)
+        self._folder.write("chain", ChainState(state.processes[COORDINATOR].keyframe_events))
 
     def write_slam_state(self, state: SlamState) -> None:
         """Write metric SLAM's part of what nodes go on from; :meth:`join` takes those of the others."""
-        self._folder.write("slam", state)
+        self._folder.write(COORDINATOR, state)
         self._folder.write("chain", ChainState(state.keyframe_events))
 
     def add_files(self, files: Iterable[FileRecord]) -> None:
@@ -164,5 +171,5 @@ def read_run_state(directory: Path) -> tuple[RunState, Configuration]:
             f"{directory} holds a map without the state of a run, so that none can go on from it: give one that "
             "hmt_slam map wrote, or start nodes from one that nodes saved"
         )
-    state = RunState(**{name: folder.read(name, kind) for name, kind in PARTS.items()})
+    state = RunState.from_parts({name: folder.read(name, kind) for name, kind in PARTS.items()})
     return state, load_configuration(directory / CONFIGURATION)

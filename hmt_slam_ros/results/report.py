@@ -20,7 +20,6 @@ from hmt_slam_ros.results.record import TopologyProbability
 from hmt_slam_ros.results.recorder import Recording
 from hmt_slam_ros.sensors import Scan
 
-
 # Columns of pmf.csv that are not called as the fields.
 _PROBABILITY_COLUMNS = {"path_length": "travelled"}
 

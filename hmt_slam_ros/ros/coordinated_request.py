@@ -20,6 +20,7 @@ from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.messages.documents import ResetRequest, ResetResponse, SaveRequest, SaveResponse, decode, encode
 from hmt_slam_ros.messages.messages import Message
 from hmt_slam_ros.messages.routing import SUBSCRIPTIONS
+from hmt_slam_ros.process_table import participant_names
 from hmt_slam_ros.ros import topics
 from hmt_slam_ros.ros.diagnostics import PERIOD
 from hmt_slam_ros.ros.inbox import CHAIN
@@ -27,8 +28,8 @@ from hmt_slam_ros.ros.node_interfaces import CoordinatorNode, ParticipantNode
 from hmt_slam_ros.ros.topics import RESET_REQUEST, RESET_RESPONSE, SAVE_REQUEST, SAVE_RESPONSE
 from hmt_slam_ros.saved_map.folder import FileRecord, FolderWriter
 
-PARTICIPANTS = ("aam", "tsbi", "tlca", "rtl")
-"""The nodes that slam asks."""
+PARTICIPANTS = participant_names()
+"""The processes that slam asks."""
 
 
 class RequestParticipant:

@@ -37,6 +37,7 @@ from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.logs.mounting import FrameTree, Mounting, frame_name, planar_mounting
 from hmt_slam_ros.logs.records import LogRecord
 from hmt_slam_ros.logs.stamps import running_stamps
+from hmt_slam_ros.process_table import producer, topic_of
 from hmt_slam_ros.ros import conversions, topics
 from hmt_slam_ros.ros.diagnostics import STATE
 from hmt_slam_ros.ros.topics import DIAGNOSTICS
@@ -49,9 +50,9 @@ _BEST_EFFORT = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=1000, reliabili
 # Nodes that are there at all are found in this time, s.
 _DISCOVERY_TIMEOUT = 5.0
 _USE_SIM_TIME, _LASER_POSE = "use_sim_time", "laser_pose"
-_GRAPH_ONLY_TOPICS = ("map", "pose", "hmt/keyframes", "hmt/hypotheses", "hmt/closure_decisions")
+_GRAPH_ONLY_TOPICS = ("map", "pose", *map(topic_of, ("KeyframeHeader", "Hypotheses", "ClosureDecision")))
 _ODOM_FRAME, _BASE_FRAME = "odom", "base_link"
-_MAP_TO_ODOM_NODE = "rtl"  # the node of ours that publishes that
+_MAP_TO_ODOM_NODE = producer("RealTimePose")  # the node of ours that publishes that
 
 
 def examine_running(seconds: float, ros_arguments: Sequence[str]) -> list[Finding]:

@@ -23,6 +23,8 @@ RCLError = rclpy_implementation.RCLError
 Writer = Callable[[Any], None]
 
 _COUNTED = (Keyframe, ScanPoses)
+# Beside the documents; for any other kind the node sets a writer of its own.
+_PUBLISHED = (Keyframe, ScanPoses, EndOfRun)
 
 
 class Outbox:
@@ -37,7 +39,9 @@ class Outbox:
         self._node = node
         self.reset_number = reset_number
         self.sent = dict.fromkeys((kind.__name__ for kind in _COUNTED), 0)
-        self._writers: dict[type, Writer] = {kind: self._writer(kind) for kind in message_types}
+        self._writers: dict[type, Writer] = {
+            kind: self._writer(kind) for kind in message_types if kind in _PUBLISHED or kind in DOCUMENTS
+        }
 
     def set_writer(self, kind: type, writer: Writer) -> None:
         """Send messages of a kind by a writer of the node's own."""

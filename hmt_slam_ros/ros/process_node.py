@@ -1,10 +1,10 @@
-"""The shell that all five process nodes share: convert, call the process once, publish."""
+"""The shell that all process nodes share: convert, call the process once, publish."""
 
 from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from rcl_interfaces.msg import ParameterDescriptor
@@ -14,7 +14,8 @@ from hmt_slam_ros.compilation import report_compilation
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.configuration.flat import as_flat
 from hmt_slam_ros.messages.messages import Message, Notice, RealTimePose, TrackingReset
-from hmt_slam_ros.messages.routing import SUBSCRIPTIONS, Checkpointable
+from hmt_slam_ros.messages.routing import SUBSCRIPTIONS, Checkpointable, message_types
+from hmt_slam_ros.process_table import process_row
 from hmt_slam_ros.ros.coordinated_request import PARTICIPANTS, RequestParticipant
 from hmt_slam_ros.ros.inbox import Inbox
 from hmt_slam_ros.ros.initial_state import InitialState, declare_initial_state
@@ -54,18 +55,14 @@ class ProcessNode(ManagedNode):
     def __init__(
         self,
         name: str,
-        make_process: Callable[[Configuration, InitialState], Checkpointable],
-        output_types: Iterable[type],
         changeable: Iterable[str] = (),
     ) -> None:
         """Declare the parameters.
 
-        :param name: one of those in ``SUBSCRIPTIONS``.
-        :param make_process: makes it from what the node begins with.
-        :param output_types: kinds of messages that the process says.
+        :param name: of a process in the process table.
         :param changeable: parameters that may change while the node runs.
         """
-        self._make_process, self._name, self._output_types = make_process, name, (*output_types, Notice)
+        self._name, self._output_types = name, (*message_types(process_row(name).produces), Notice)
         super().__init__(name, changeable)
 
     def declare_own_parameters(self) -> None:
@@ -155,9 +152,19 @@ class ProcessNode(ManagedNode):
         if self.is_configured:
             self.recovery.discard()
 
+    def make_process(self, beginning: InitialState) -> Checkpointable:
+        """The process, made from the map that the node begins with.
+
+        :raises HmtSlamError: where the map lacks the state of the process.
+        """
+        # It takes time, in which a signal has to be heard.
+        row = process_row(self._name)
+        process: Checkpointable = row.make(self.configuration, beginning.read_part(self._name, row.state_class))
+        return process
+
     def _create_process(self) -> Checkpointable:
         """The process, made from the beginning."""
-        process = self._make_process(self.configuration, self.initial_state)
+        process = self.make_process(self.initial_state)
         if self.initial_state.lost and TrackingReset in SUBSCRIPTIONS[self._name]:
             # Slam says so too, but not before this node could say otherwise.
             process.handle(TrackingReset(self.initial_state.events, 0))

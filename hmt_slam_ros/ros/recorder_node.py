@@ -15,6 +15,7 @@ from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.messages.documents import RobotStatus, decode
 from hmt_slam_ros.messages.messages import AreaEvents, Message
 from hmt_slam_ros.messages.routing import SUBSCRIPTIONS
+from hmt_slam_ros.process_table import RECORDER, producer
 from hmt_slam_ros.results.recorder import Recorder
 from hmt_slam_ros.ros import topics
 from hmt_slam_ros.ros.conversions import stamp_from_time
@@ -36,7 +37,7 @@ class RecorderNode(Node):
     """
 
     def __init__(self, configuration: Configuration, context: Context) -> None:
-        super().__init__("recorder", context=context)
+        super().__init__(RECORDER.name, context=context)
         self.recorder = Recorder(configuration)
         self.message_count = 0
         self.robot_status: RobotStatus | None = None
@@ -46,7 +47,7 @@ class RecorderNode(Node):
         self.area_event_count = 0
         self._diagnostics = NodeDiagnostics(self)
         self._inbox = Inbox(
-            self, (*SUBSCRIPTIONS["recorder"], AreaEvents), self._on_message, self._diagnostics, topics.CHAIN
+            self, (*SUBSCRIPTIONS[RECORDER.name], AreaEvents), self._on_message, self._diagnostics, topics.CHAIN
         )
         self.create_subscription(String, ROBOT_STATUS, self._on_robot_status, topics.LATCHED)
         self.create_subscription(DiagnosticArray, DIAGNOSTICS, self._on_diagnostics, topics.STREAM)
@@ -67,16 +68,16 @@ class RecorderNode(Node):
         """The node from which the next message is due."""
         recorder = self.recorder
         if len(recorder.decisions) < len(recorder.hypotheses):
-            return "tlca"
+            return producer("ClosureDecision")
         if len(recorder.hypotheses) < self.area_event_count:
-            return "tsbi"
+            return producer("Hypotheses")
         if self.area_event_count < len(recorder.keyframes):
-            return "aam"
+            return producer("AreaEvents")
         if self.robot_status is None or (
             self.robot_status.state != "ended" and self.robot_status.acknowledged >= self.robot_status.scans
         ):
             return "robot"
-        return "slam"
+        return producer("Keyframe")
 
     def seconds_per_scan(self, stamps: NDArray[np.int64]) -> dict[str, NDArray[np.float64]]:
         """Seconds of computing of every process for each scan.

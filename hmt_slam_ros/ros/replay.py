@@ -1,4 +1,4 @@
-"""A whole run of the robot node and the five process nodes, each an OS process of its own, into an output folder."""
+"""A whole run of the robot node and the process nodes, each an OS process of its own, into an output folder."""
 
 from __future__ import annotations
 
@@ -26,6 +26,7 @@ from hmt_slam_ros.configuration.documents import ros_yaml, yaml_value
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.logs import Log
 from hmt_slam_ros.open_log import is_simulated, open_log
+from hmt_slam_ros.process_table import COORDINATOR, consumer_count, node_command, process_names
 from hmt_slam_ros.results.final_map import deskewed_scans, final_map
 from hmt_slam_ros.results.output_folder import atomic_output, write_output
 from hmt_slam_ros.results.recorder import Recording
@@ -76,7 +77,7 @@ class NodeProcesses:
     def start(self, name: str, arguments: Sequence[str], environment: Mapping[str, str]) -> None:
         """Start the node ``name`` with arguments for ROS."""
         self._start_arguments[name] = arguments, environment
-        command = [sys.executable, "-m", f"hmt_slam_ros.ros.{name}_node", "--ros-args", *arguments]
+        command = [sys.executable, *node_command(name), "--ros-args", *arguments]
         with self._open_log(name, "ab") as stderr:
             self.processes[name] = subprocess.Popen(
                 command,
@@ -162,7 +163,6 @@ def _cpu_seconds(pid: int) -> float:
     return sum(map(int, ticks)) / float(os.sysconf("SC_CLK_TCK"))
 
 
-PROCESSES = ("slam", "aam", "tsbi", "tlca", "rtl")
 # On a slow computer the first run compiles for a while before anything is said.
 STALL_TIMEOUT = 180.0  # s
 _DISCOVERY_TIMEOUT = 60.0  # s
@@ -294,7 +294,7 @@ class _ReplayRun:
             tempfile.TemporaryDirectory(prefix="hmt_slam_replay_") as scratch,
             own_domain() as domain,
             self._recorder_executor(domain) as executor,
-            NodeProcesses(Path(scratch), (*PROCESSES, "view"), _print_notice) as children,
+            NodeProcesses(Path(scratch), (*process_names(), "view"), _print_notice) as children,
         ):
             begin = time.monotonic()
             self._start_nodes(children, log, slam_settings, domain, Path(scratch))
@@ -332,11 +332,11 @@ class _ReplayRun:
             children.start("view", ["-p", f"port:={self._view_port}"], environment)
         shared = ["--params-file", str(parameters)]
         recovery = ["-p", f"recovery:={scratch / 'recovery'}"]
-        for name in PROCESSES:
-            children.start(name, shared + recovery + (slam_settings if name == "slam" else []), environment)
+        for name in process_names():
+            children.start(name, shared + recovery + (slam_settings if name == COORDINATOR else []), environment)
         own = {
             "log": yaml_value(str(log if is_simulated(log) else log.absolute())),
-            "robot.odometry_listeners": 2,  # slam and rtl
+            "robot.odometry_listeners": consumer_count("Odometry"),
             "robot.discovery_timeout": _DISCOVERY_TIMEOUT,
         }
         settings = [word for name, value in own.items() for word in ("-p", f"{name}:={value}")]
@@ -371,7 +371,7 @@ class _ReplayRun:
         """Hear once more from every process what it cost, which each tells every second."""
         asked, deadline = time.time_ns(), time.monotonic() + _DIAGNOSTICS_TIMEOUT
         while time.monotonic() < deadline and any(
-            self.recorder_node.diagnostics_stamps.get(name, 0) < asked for name in PROCESSES
+            self.recorder_node.diagnostics_stamps.get(name, 0) < asked for name in process_names()
         ):
             executor.spin_once(timeout_sec=_SPIN)
 

@@ -6,14 +6,10 @@ import sys
 
 from geometry_msgs.msg import PoseWithCovarianceStamped
 
-from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.messages.messages import RealTimePose
-from hmt_slam_ros.messages.routing import Checkpointable
 from hmt_slam_ros.real_time_localization.correction import CorrectionSmoother
-from hmt_slam_ros.real_time_localization.rtl import Rtl, RtlState
 from hmt_slam_ros.ros import conversions, topics
 from hmt_slam_ros.ros.execution import run, set_realtime_priority
-from hmt_slam_ros.ros.initial_state import InitialState
 from hmt_slam_ros.ros.map_services import spin
 from hmt_slam_ros.ros.parameters import declare_frame
 from hmt_slam_ros.ros.process_node import ProcessNode
@@ -28,7 +24,7 @@ class RtlNode(ProcessNode):
     is_always_listening = True
 
     def __init__(self) -> None:
-        super().__init__("rtl", _make_process, (), changeable=("rtl.publish_tf", "rtl.correction_time"))
+        super().__init__("rtl", changeable=("rtl.publish_tf", "rtl.correction_time"))
 
     def declare_own_parameters(self) -> None:
         """Declare the names of the frames too."""
@@ -55,10 +51,6 @@ class RtlNode(ProcessNode):
             shown = self._correction.smooth(pose.stamp, pose.map_T_odom, pose.odometry, settings.correction_time)
             joint = conversions.transform_message(pose.stamp, self._map_frame, self._odom_frame, shown)
             self._send_transforms([joint])
-
-
-def _make_process(configuration: Configuration, beginning: InitialState) -> Checkpointable:
-    return Rtl(configuration, beginning.read_part("rtl", RtlState))
 
 
 def main() -> None:

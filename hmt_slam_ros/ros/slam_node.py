@@ -24,15 +24,13 @@ from hmt_slam_ros.messages.map_changes import AreaPose, InitialPose
 from hmt_slam_ros.messages.messages import (
     ClosureDecision,
     EndOfLog,
-    EndOfRun,
     Keyframe,
     LocalEstimate,
     Message,
     PoseReset,
-    ScanPoses,
-    TrackingReset,
 )
 from hmt_slam_ros.messages.replica import FIRST_AREA
+from hmt_slam_ros.process_table import process_row
 from hmt_slam_ros.ros import conversions, topics
 from hmt_slam_ros.ros.diagnostics import PERIOD
 from hmt_slam_ros.ros.execution import run
@@ -81,9 +79,7 @@ class SlamNode(ProcessNode):
     is_always_listening = True
 
     def __init__(self) -> None:
-        super().__init__(
-            "slam", _make_process, (TrackingReset, Keyframe, ScanPoses, LocalEstimate, EndOfRun), ("mode",)
-        )
+        super().__init__("slam", ("mode",))
         self._stale_subscribers = StaleSubscribers(self)
 
     def declare_own_parameters(self) -> None:
@@ -97,6 +93,19 @@ class SlamNode(ProcessNode):
         self._initial_pose = declare_initial_pose(self)
         if self._initial_pose is not None and not self.start_from:
             raise HmtSlamError("initial_pose is set, but no map that it is a pose in: set start_from, or leave it away")
+
+    def make_process(self, beginning: InitialState) -> MetricSlam:
+        """As any process node; scans are numbered on from those of before."""
+        row = process_row("slam")
+        state = beginning.read_part(row.name, row.state_class) or row.state_class()
+        more = max(0, beginning.previous_scans - state.processed_scans)
+        numbered_on = replace(
+            state,
+            processed_scans=state.processed_scans + more,
+            first_unpublished_scan=state.first_unpublished_scan + more,
+        )
+        process: MetricSlam = row.make(self.configuration, numbered_on)
+        return process
 
     def configure_node(self) -> None:
         """As any process node, and say where the robot is in the map that it begins with.
@@ -388,19 +397,6 @@ class SlamNode(ProcessNode):
             placed = se2.compose(self._area_poses[area].pose.mean, poses)
             header = conversions.header_message(stamp, self.map_frame)
             self._particles.publish(PoseArray(header=header, poses=[conversions.pose_message(pose) for pose in placed]))
-
-
-def _make_process(configuration: Configuration, beginning: InitialState) -> MetricSlam:
-    # It takes time, in which a signal has to be heard.
-    from hmt_slam_ros import composition  # noqa: PLC0415
-    from hmt_slam_ros.metric_slam.slam import SlamState  # noqa: PLC0415
-
-    state = beginning.read_part("slam", SlamState) or SlamState()
-    more = max(0, beginning.previous_scans - state.processed_scans)
-    numbered_on = replace(
-        state, processed_scans=state.processed_scans + more, first_unpublished_scan=state.first_unpublished_scan + more
-    )
-    return composition.metric_slam(configuration, numbered_on)
 
 
 def main() -> None:

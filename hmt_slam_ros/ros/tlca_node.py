@@ -10,12 +10,9 @@ from nav_msgs.srv import GetMap
 from rclpy.publisher import Publisher
 from visualization_msgs.msg import MarkerArray
 
-from hmt_slam_ros.configuration import Configuration
-from hmt_slam_ros.messages.messages import ClosureDecision, Message
-from hmt_slam_ros.messages.routing import Checkpointable
+from hmt_slam_ros.messages.messages import Message
 from hmt_slam_ros.ros import topics
 from hmt_slam_ros.ros.execution import run
-from hmt_slam_ros.ros.initial_state import InitialState
 from hmt_slam_ros.ros.map_services import spin
 from hmt_slam_ros.ros.map_view import MapRenderer, MapRendererState
 from hmt_slam_ros.ros.parameters import declare_frame
@@ -32,7 +29,7 @@ class TlcaNode(ProcessNode):
     """The node ``tlca``."""
 
     def __init__(self) -> None:
-        super().__init__("tlca", _make_process, (ClosureDecision,))
+        super().__init__("tlca")
 
     def declare_own_parameters(self) -> None:
         """Declare the name of the frame too."""
@@ -92,13 +89,6 @@ class TlcaNode(ProcessNode):
         if due:
             self._published_versions[topic] = self._renderer.version
         return due
-
-
-def _make_process(configuration: Configuration, beginning: InitialState) -> Checkpointable:
-    # It takes time, in which a signal has to be heard.
-    from hmt_slam_ros.loop_closure.tlca import Tlca, TlcaState  # noqa: PLC0415
-
-    return Tlca(configuration, beginning.read_part("tlca", TlcaState))
 
 
 def main() -> None:

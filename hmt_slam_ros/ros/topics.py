@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
-from hmt_slam_ros.messages.messages import AreaEvents, ClosureDecision, Hypotheses, LocalEstimate, Notice, TrackingReset
+from hmt_slam_ros import process_table
+from hmt_slam_ros.process_table import topic_of
 
 # Scans and odometry between the robot node and the processes: nothing is lost, however fast the replay runs.
 # A reader that falls behind makes the writer wait, since the history of a reliable KEEP_ALL topic is bounded (5000).
@@ -67,13 +68,13 @@ SCAN, ODOM, CLOCK = "scan", "odom", "/clock"
 CMD_VEL, GROUND_TRUTH = "cmd_vel", "ground_truth"
 TASK_GOALS = {"explorer": "explorer/task", "pilot": "pilot/task"}
 TASK_RESULTS = {"explorer": "explorer/task_result", "pilot": "pilot/task_result"}
-GOAL_POSE, PLACE = "goal_pose", "pilot/place_estimate"
-KEYFRAMES, KEYFRAME_SCANS = "hmt/keyframes", "hmt/keyframe_scans"
+GOAL_POSE, PLACE = "goal_pose", topic_of("PlaceEstimate")
+KEYFRAMES, KEYFRAME_SCANS = topic_of("KeyframeHeader"), "hmt/keyframe_scans"
 SCAN_POSES = "hmt/scan_poses"
-FINISHED = "hmt/finished"
-ROBOT_STATUS = "hmt/robot_status"
-SAVE_REQUEST, SAVE_RESPONSE = "hmt/save_request", "hmt/save_response"
-RESET_REQUEST, RESET_RESPONSE = "hmt/reset_request", "hmt/reset_response"
+FINISHED = topic_of("FinalCounts")
+ROBOT_STATUS = topic_of("RobotStatus")
+SAVE_REQUEST, SAVE_RESPONSE = topic_of("SaveRequest"), topic_of("SaveResponse")
+RESET_REQUEST, RESET_RESPONSE = topic_of("ResetRequest"), topic_of("ResetResponse")
 COST = "hmt/cost"
 HMT_POSE, POSE = "hmt/pose", "pose"
 MAP, GRAPH, PARTICLES, PMF = "map", "hmt/graph", "hmt/particles", "hmt/pmf"
@@ -81,11 +82,5 @@ IS_LOCALIZED, ENTROPY = "hmt/is_localized", "hmt/entropy"
 INITIAL_POSE = "initialpose"
 DIAGNOSTICS = "diagnostics"
 
-DOCUMENTS: dict[type, str] = {
-    AreaEvents: "hmt/area_events",
-    Hypotheses: "hmt/hypotheses",
-    ClosureDecision: "hmt/closure_decisions",
-    LocalEstimate: "hmt/local_estimate",
-    TrackingReset: "hmt/tracking_reset",
-    Notice: "hmt/notices",
-}
+DOCUMENTS: dict[type, str] = {row.message_class: row.topic for row in process_table.DOCUMENTS}
+"""{class of a message that travels as a document: topic}."""

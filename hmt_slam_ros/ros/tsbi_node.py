@@ -7,12 +7,10 @@ from typing import TYPE_CHECKING
 
 from std_msgs.msg import Bool, Float64, Float64MultiArray, MultiArrayDimension, MultiArrayLayout
 
-from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.messages.messages import ClosureDecision, Hypotheses, Message, TrackingReset
 from hmt_slam_ros.ros import topics
 from hmt_slam_ros.ros.conversions import flatten_rows
 from hmt_slam_ros.ros.execution import run
-from hmt_slam_ros.ros.initial_state import InitialState
 from hmt_slam_ros.ros.map_services import spin
 from hmt_slam_ros.ros.process_node import ProcessNode
 from hmt_slam_ros.ros.topics import ENTROPY, IS_LOCALIZED, PMF
@@ -27,7 +25,7 @@ class TsbiNode(ProcessNode):
     process: Tsbi
 
     def __init__(self) -> None:
-        super().__init__("tsbi", _make_process, (Hypotheses,))
+        super().__init__("tsbi")
 
     def configure_node(self) -> None:
         """As any process node, and say whether the robot's place is known."""
@@ -67,14 +65,6 @@ def pmf_message(hypotheses: Hypotheses) -> Float64MultiArray:
         MultiArrayDimension(label="hypothesis,area,probability", size=3, stride=3),
     ]
     return Float64MultiArray(layout=MultiArrayLayout(dim=layout), data=flatten_rows(rows))
-
-
-def _make_process(configuration: Configuration, beginning: InitialState) -> Tsbi:
-    # It takes time, in which a signal has to be heard.
-    from hmt_slam_ros import composition  # noqa: PLC0415
-    from hmt_slam_ros.topological_inference.tsbi import TsbiState  # noqa: PLC0415
-
-    return composition.topological_inference(configuration, beginning.read_part("tsbi", TsbiState))
 
 
 def main() -> None:

@@ -26,6 +26,7 @@ from hmt_slam_ros.geometry.gaussian import ELLIPSE_95
 from hmt_slam_ros.hybrid_map.shortest_path import is_uninformative
 from hmt_slam_ros.messages.documents import KeyframeHeader, RobotStatus, decode
 from hmt_slam_ros.messages.messages import Hypotheses
+from hmt_slam_ros.process_table import process_names, producer
 from hmt_slam_ros.ros import topics
 from hmt_slam_ros.ros.conversions import area_from_frame, gaussian_from_message, pose_from_message, stamp_from_time
 from hmt_slam_ros.ros.diagnostics import NodeDiagnostics
@@ -62,14 +63,13 @@ _PORT = ParameterDescriptor(
     read_only=True,
     integer_range=[IntegerRange(from_value=0, to_value=65535)],
 )
-_EXPECTED = ("slam", "aam", "tsbi", "tlca", "rtl")
 _PUBLISHERS = {
-    POSE: "rtl",
-    HMT_POSE: "rtl",
+    POSE: producer("RealTimePose"),
+    HMT_POSE: producer("RealTimePose"),
     GRAPH: "tlca",
     MAP: "tlca",
-    KEYFRAMES: "slam",
-    DOCUMENTS[Hypotheses]: "tsbi",
+    KEYFRAMES: producer("Keyframe"),
+    DOCUMENTS[Hypotheses]: producer("Hypotheses"),
     IS_LOCALIZED: "tsbi",
     ENTROPY: "tsbi",
     DIAGNOSTICS: "every node",
@@ -83,7 +83,7 @@ class ViewNode(Node):
         super().__init__("view")
         self.diagnostics = NodeDiagnostics(self)
         self.board = Board()
-        self._health, self._history = SystemHealth(_EXPECTED), KeyframeHistory(self.board)
+        self._health, self._history = SystemHealth(process_names()), KeyframeHistory(self.board)
         self._heard_at: dict[str, float] = {}
         self._message_count = 0
         # Seconds in which this node listened: where the computer stood still, nobody fell silent.

@@ -1,0 +1,242 @@
+"""Processes, their messages and their nodes: one row a process; both runtimes, doctor, page and packaging read it.
+
+A new process is a new row in :data:`PROCESSES`. Only the standard library is imported, so that ``setup.py`` and launch
+files can read the table; names are resolved when they are needed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from importlib import import_module
+from typing import Any
+
+_COMPOSITION = "hmt_slam_ros.composition"
+_MESSAGES = "hmt_slam_ros.messages.messages"
+_DOCUMENTS = "hmt_slam_ros.messages.documents"
+_ROS = "hmt_slam_ros.ros"
+
+RUN_NODE = f"{_ROS}.run_node"
+"""Module that runs any node; for a process without a node module of its own it makes a plain process node."""
+
+COORDINATOR = "slam"
+"""The process that starts coordinated requests; all others take part."""
+
+
+@dataclass(frozen=True)
+class NodeRow:
+    """A node.
+
+    :ivar name: of the node, and of its executable.
+    :ivar title: what it does, a few words.
+    :ivar node_module: module with its function ``main``, empty where :data:`RUN_NODE` makes it.
+    :ivar consumes: names of the message classes that it receives.
+    """
+
+    name: str
+    title: str
+    node_module: str = ""
+    consumes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class ProcessRow(NodeRow):
+    """A process of the SLAM system with its node.
+
+    Its messages include at least one of the chain Keyframe, AreaEvents, Hypotheses, ClosureDecision.
+
+    :ivar factory: "module:function", which makes the process of (configuration, state or None).
+    :ivar state: "module:Class" of its state; without arguments the class is the state before the first message.
+    :ivar produces: names of the message classes that it sends; ``Notice`` is implied.
+    """
+
+    factory: str = ""
+    state: str = ""
+    produces: tuple[str, ...] = ()
+
+    @property
+    def state_class(self) -> type[Any]:
+        """Class of the state."""
+        return resolve_class(self.state)
+
+    def make(self, configuration: Any, state: Any = None) -> Any:  # noqa: ANN401  the table knows no class
+        """Make the process.
+
+        :param configuration: all parameters.
+        :param state: to go on from, None for the start.
+        """
+        return resolve(self.factory)(configuration, state)
+
+
+@dataclass(frozen=True)
+class DocumentRow:
+    """A message that travels as a JSON document on a topic of its own.
+
+    :ivar message: "module:Class" of the message.
+    :ivar topic: name of the topic, relative to the namespace.
+    :ivar document: name of the document.
+    :ivar version: of the document; raise it with every change of the class.
+    """
+
+    message: str
+    topic: str
+    document: str
+    version: int
+
+    @property
+    def message_class(self) -> type[Any]:
+        """Class of the message."""
+        return resolve_class(self.message)
+
+
+# Messages are delivered in the order of the rows.
+PROCESSES: tuple[ProcessRow, ...] = (
+    ProcessRow(
+        name="slam",
+        title="metric SLAM in the local area",
+        node_module=f"{_ROS}.slam_node",
+        consumes=("Scan", "Odometry", "PoseReset", "Hypotheses", "ClosureDecision", "EndOfLog"),
+        factory=f"{_COMPOSITION}:metric_slam",
+        state="hmt_slam_ros.metric_slam.slam:SlamState",
+        produces=("TrackingReset", "Keyframe", "ScanPoses", "LocalEstimate", "EndOfRun"),
+    ),
+    ProcessRow(
+        name="aam",
+        title="area abstraction",
+        consumes=("Keyframe", "Hypotheses", "ClosureDecision"),
+        factory=f"{_COMPOSITION}:area_abstraction",
+        state="hmt_slam_ros.area_abstraction.partition:AamState",
+        produces=("AreaEvents",),
+    ),
+    ProcessRow(
+        name="tsbi",
+        title="Bayesian inference of the topology",
+        node_module=f"{_ROS}.tsbi_node",
+        consumes=("TrackingReset", "Keyframe", "AreaEvents", "ClosureDecision"),
+        factory=f"{_COMPOSITION}:topological_inference",
+        state="hmt_slam_ros.topological_inference.tsbi:TsbiState",
+        produces=("Hypotheses",),
+    ),
+    ProcessRow(
+        name="tlca",
+        title="loop closure acceptance and the global map",
+        node_module=f"{_ROS}.tlca_node",
+        consumes=("Keyframe", "Hypotheses"),
+        factory=f"{_COMPOSITION}:loop_closure",
+        state="hmt_slam_ros.loop_closure.tlca:TlcaState",
+        produces=("ClosureDecision",),
+    ),
+    ProcessRow(
+        name="rtl",
+        title="real-time localization",
+        node_module=f"{_ROS}.rtl_node",
+        consumes=("Odometry", "TrackingReset", "LocalEstimate", "Hypotheses", "ClosureDecision"),
+        factory=f"{_COMPOSITION}:real_time_localization",
+        state="hmt_slam_ros.real_time_localization.rtl:RtlState",
+        produces=("RealTimePose",),
+    ),
+)
+
+COMPANIONS: tuple[NodeRow, ...] = (
+    NodeRow("robot", "replay of a log, or simulation", f"{_ROS}.robot_node", ("VelocityCommand", "TaskResult")),
+    NodeRow("view", "live page", f"{_ROS}.view_node"),
+    NodeRow(
+        "explorer",
+        "exploration",
+        f"{_ROS}.explorer_node",
+        ("Task", "Scan", "RealTimePose", "Keyframe", "Hypotheses", "ClosureDecision"),
+    ),
+    NodeRow(
+        "pilot",
+        "localization and navigation among places",
+        f"{_ROS}.pilot_node",
+        ("Task", "Odometry", "Scan", "RealTimePose", "Keyframe", "Hypotheses", "ClosureDecision"),
+    ),
+)
+"""Nodes beside the processes."""
+
+RECORDER = NodeRow(
+    "recorder",
+    "recording for the output folder",
+    consumes=("Keyframe", "Hypotheses", "ClosureDecision", "ScanPoses", "LocalEstimate", "EndOfRun", "Notice"),
+)
+"""The listener of both runtimes; in a replay its node lives in the process that started the others."""
+
+DOCUMENTS: tuple[DocumentRow, ...] = (
+    DocumentRow(f"{_DOCUMENTS}:KeyframeHeader", "hmt/keyframes", "keyframe", 10),
+    DocumentRow(f"{_MESSAGES}:AreaEvents", "hmt/area_events", "area_events", 4),
+    DocumentRow(f"{_MESSAGES}:Hypotheses", "hmt/hypotheses", "hypotheses", 9),
+    DocumentRow(f"{_MESSAGES}:ClosureDecision", "hmt/closure_decisions", "closure_decision", 1),
+    DocumentRow(f"{_MESSAGES}:LocalEstimate", "hmt/local_estimate", "local_estimate", 1),
+    DocumentRow(f"{_MESSAGES}:TrackingReset", "hmt/tracking_reset", "tracking_reset", 1),
+    DocumentRow(f"{_MESSAGES}:Notice", "hmt/notices", "notice", 1),
+    DocumentRow(f"{_DOCUMENTS}:FinalCounts", "hmt/finished", "finished", 2),
+    DocumentRow(f"{_DOCUMENTS}:RobotStatus", "hmt/robot_status", "robot_status", 2),
+    DocumentRow(f"{_DOCUMENTS}:SaveRequest", "hmt/save_request", "save_request", 2),
+    DocumentRow(f"{_DOCUMENTS}:SaveResponse", "hmt/save_response", "save_response", 1),
+    DocumentRow(f"{_DOCUMENTS}:ResetRequest", "hmt/reset_request", "reset_request", 1),
+    DocumentRow(f"{_DOCUMENTS}:ResetResponse", "hmt/reset_response", "reset_response", 1),
+    DocumentRow("hmt_slam_ros.messages.tasks:PlaceEstimate", "pilot/place_estimate", "place_estimate", 2),
+)
+
+
+def resolve(reference: str) -> Any:  # noqa: ANN401  whatever has that name
+    """The object that "module:name" refers to."""
+    module, _, name = reference.partition(":")
+    return getattr(import_module(module), name)
+
+
+def resolve_class(reference: str) -> type[Any]:
+    """The class that "module:Class" refers to."""
+    found = resolve(reference)
+    assert isinstance(found, type)
+    return found
+
+
+def process_names() -> tuple[str, ...]:
+    """Names of the processes, in the order of delivery."""
+    return tuple(row.name for row in PROCESSES)
+
+
+def participant_names() -> tuple[str, ...]:
+    """Names of the processes that the coordinator asks."""
+    return tuple(name for name in process_names() if name != COORDINATOR)
+
+
+def node_names() -> tuple[str, ...]:
+    """Names of all nodes that have an executable."""
+    return tuple(row.name for row in (*PROCESSES, *COMPANIONS))
+
+
+def process_row(name: str) -> ProcessRow:
+    """The row of a process."""
+    return next(row for row in PROCESSES if row.name == name)
+
+
+def node_row(name: str) -> NodeRow:
+    """The row of a node that has an executable."""
+    return next(row for row in (*PROCESSES, *COMPANIONS) if row.name == name)
+
+
+def producer(message: str) -> str:
+    """Name of the process that sends a kind of message."""
+    return next(row.name for row in PROCESSES if message in row.produces)
+
+
+def consumer_count(message: str) -> int:
+    """Number of processes that receive a kind of message."""
+    return sum(message in row.consumes for row in PROCESSES)
+
+
+def topic_of(message: str) -> str:
+    """Topic of the documents of a message class, by its name."""
+    return next(row.topic for row in DOCUMENTS if row.message.endswith(f":{message}"))
+
+
+def console_script(name: str) -> str:
+    """ "module:function" of a node's console script."""
+    return f"{node_row(name).node_module or RUN_NODE}:main"
+
+
+def node_command(name: str) -> list[str]:
+    """Arguments of the Python interpreter that run a node; arguments for ROS may follow."""
+    return ["-m", RUN_NODE, name]
