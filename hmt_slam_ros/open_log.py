@@ -25,7 +25,7 @@ def open_log(
 ) -> Log:
     """Open a rosbag2 (folder, .mcap, .db3), a CARMEN log (plain, .gz, .xz) or an MRPT rawlog; content tells which.
 
-    :param path: file or folder, or ``sim:WORLD,name=value,...`` for a simulated drive (docs/simulation.md).
+    :param path: file or folder, or ``sim:WORLD,name=value,...`` for a simulated drive (docs/guides/simulation.md).
     :param scan_topic: of a bag; where the default is missing, the only topic with scans serves.
     :param odom_topic: of a bag; likewise, and without any, the transform odom -> base on /tf.
     :param start: seconds from the log's first stamp at which the wanted part begins.

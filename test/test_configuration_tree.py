@@ -173,7 +173,7 @@ def test_an_unknown_name_is_refused_with_the_nearest_ones(name: str, near: str) 
 
 
 def test_a_name_like_no_other_points_to_the_reference() -> None:
-    with pytest.raises(HmtSlamError, match=r"docs/parameters\.md"):
+    with pytest.raises(HmtSlamError, match=r"docs/reference/parameters\.md"):
         with_changes(Configuration(), {"zzzzzz": 1})
 
 

@@ -171,8 +171,8 @@ def test_what_else_a_manifest_can_be_has_its_sentence(tmp_path):
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
-        ({"doubt": "much"}, r"notes\.doubt = much is not a finite number: see docs/map_format.md"),
-        ({"flags": np.zeros(2)}, r"notes\.flags = .*float64.* is not an array of bool: see docs/map_format.md"),
+        ({"doubt": "much"}, r"notes\.doubt = much is not a finite number: see docs/reference/map_format.md"),
+        ({"flags": np.zeros(2)}, r"notes\.flags = .*float64.* is not an array of bool: see docs/reference/map_format.md"),
         ({"scans": (7,)}, r"notes\.scans\[0\] = 7 is no scan of the map"),
         ({"pairs": {(1,): frozenset()}}, r"notes\.pairs\[0\]\[0\] = \[1\] is not a list of 2"),
         ({"pairs": {(1, 2): frozenset({"x"})}}, r"notes\.pairs\[0\]\[1\]\[0\] = x is not a whole number"),

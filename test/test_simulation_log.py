@@ -145,7 +145,7 @@ def test_true_relations_reach_to_the_next_metre_the_tenth_and_the_lap_before():
         ("sim:", "no simulated world ''"),
         ("sim:castle", "choose one of office, busy"),
         ("sim:office,seeds=3", "did you mean seed"),
-        ("sim:office,moat=3", "see docs/simulation.md"),
+        ("sim:office,moat=3", "see docs/guides/simulation_settings.md"),
         ("sim:office,people=-1", "people = -1 is out of range"),
         ("sim:office,people=some", "people = 'some' is not a whole number"),
         ("sim:office,people", "write name=value"),

@@ -30,7 +30,7 @@ def ros_yaml(configuration: Configuration) -> str:
 
 
 def parameter_reference(configuration: Configuration) -> str:
-    """docs/parameters.md: every parameter with default, unit, range and description."""
+    """docs/reference/parameters.md: every parameter with default, unit, range and description."""
     lines = [
         "# Parameters",
         "",

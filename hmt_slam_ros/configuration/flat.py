@@ -105,7 +105,7 @@ def with_changes(configuration: Configuration, changes: Mapping[str, Any]) -> Co
     :raises HmtSlamError: for an unknown name, a value of the wrong type or out of range, or values that do not fit
         together.
     """
-    changed = apply_changes(configuration, changes, "docs/parameters.md")
+    changed = apply_changes(configuration, changes, "docs/reference/parameters.md")
     for rule in CONSISTENCY_RULES:
         if not rule.holds(changed):
             raise HmtSlamError(f"the configuration contradicts itself: {rule.advice}")

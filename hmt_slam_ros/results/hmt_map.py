@@ -1,7 +1,7 @@
 """hmt_map/: the HMT map as a folder, the same byte for byte for the same run, and read back complete.
 
 Part ``map`` is the map at its best, after the final refinement; the others are the state from which a run goes on, as
-it was before that. docs/map_format.md describes every file and field.
+it was before that. docs/reference/map_format.md describes every file and field.
 """
 
 from __future__ import annotations

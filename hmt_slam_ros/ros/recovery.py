@@ -7,7 +7,7 @@ is killed takes nothing with it that the system has taken over.
 A process is a value machine: from the same state and the same messages in the same order it goes on to the same bit. So
 a node writes down every message before its process hears it, and now and then the state of its process. Another node of
 the same name and folder begins with that state, hears the messages again and says what it said again, which the others
-recognize by its numbers. docs/architecture.md has the reasons.
+recognize by its numbers. docs/decisions/0033-journal-recovery.md has the reasons.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from hmt_slam_ros.saved_map.folder import CONFIGURATION, VERSION, FolderWriter
 from hmt_slam_ros.sensors import Odometry, Scan
 
 _LINES, _ARRAYS = "jsonl", "bin"
-_FORMAT_DOC = "docs/architecture.md"
+_FORMAT_DOC = "docs/decisions/0033-journal-recovery.md"
 
 
 class JournalEntry(NamedTuple):

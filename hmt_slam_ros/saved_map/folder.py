@@ -90,7 +90,7 @@ def _flush_folder(folder: Path) -> None:
 
 
 MANIFEST = "manifest.json"
-FORMAT_DOC = "docs/map_format.md"
+FORMAT_DOC = "docs/reference/map_format.md"
 SCANS = "scans"
 _REMEDY = "take a copy that is whole, or map the log again"
 

@@ -86,4 +86,4 @@ def chosen_settings(own: Mapping[str, Value], given: Mapping[str, Value]) -> Set
 
     :raises HmtSlamError: for an unknown name, a value of the wrong type or out of range.
     """
-    return apply_changes(Settings(), {**own, **given}, "docs/simulation.md")
+    return apply_changes(Settings(), {**own, **given}, "docs/guides/simulation_settings.md")
