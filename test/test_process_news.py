@@ -192,7 +192,12 @@ def test_every_process_leaves_the_same_beams_out_and_little_is_stored(visits):
     assert 0 < sum(stored) < 0.4 * len(stored)
     assert all(message.mapping for message in said)
     scans = after.processes["slam"].replica.scans
-    for replica in (after.processes["aam"].replica, after.processes["tsbi"].replica, after.processes["tlca"].replica, after.recorder.replica):
+    for replica in (
+        after.processes["aam"].replica,
+        after.processes["tsbi"].replica,
+        after.processes["tlca"].replica,
+        after.recorder.replica,
+    ):
         assert replica.scans.keys() == scans.keys()
         assert all(scan is scans[keyframe] for keyframe, scan in replica.scans.items())
     told = [one for message in said for one in message.stale_beams]
