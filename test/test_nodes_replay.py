@@ -154,7 +154,7 @@ def test_processes_that_are_killed_one_after_the_other_go_on_to_the_same_bit(fol
     replay(BUNDLED, out, load_configuration(settings=["robot.rate=0.0"]), strike)
     assert not due
     told = capfd.readouterr().err
-    for name in PROCESSES:
+    for name in process_names():
         assert told.count(f"the node {name} was killed by signal 9: it is started again and goes on where it was") == 2
     for name in ("trajectory.tum", "trajectory_online.tum", "graph.g2o", "pmf.csv", "map.pgm", "hmt_map/map.bin"):
         assert (out / name).read_bytes() == (folders[1] / name).read_bytes()
