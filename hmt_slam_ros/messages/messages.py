@@ -1,4 +1,4 @@
-"""What the five processes say to each other, as immutable values.
+"""What the processes say to each other, as immutable values.
 
 Scans and odometry enter as :class:`~hmt_slam_ros.sensors.Scan` and :class:`~hmt_slam_ros.sensors.Odometry`. One
 *keyframe event* k sets off the chain Keyframe(k) -> AreaEvents(k) -> Hypotheses(k) -> ClosureDecision(k), after which
