@@ -1,4 +1,4 @@
-"""A simulated robot explores a world by itself: the robot node drives, the five processes map, the explorer leads."""
+"""A simulated robot explores a world by itself: the robot node drives, the processes map, the explorer leads."""
 
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument, IncludeLaunchDescription

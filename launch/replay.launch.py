@@ -1,4 +1,4 @@
-"""Replay of a log: the robot node plays it, the five processes map it on the log's own clock, RViz may watch."""
+"""Replay of a log: the robot node plays it, the processes map it on the log's own clock, RViz may watch."""
 
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument, IncludeLaunchDescription

@@ -2,17 +2,14 @@
 
 import numpy as np
 
-from hmt_slam_ros.area_abstraction.aam import Aam
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.shortest_path import shortest_path_beliefs
-from hmt_slam_ros.loop_closure.tlca import Tlca
 from hmt_slam_ros.messages.documents import decode, encode
 from hmt_slam_ros.messages.map_changes import Arc
 from hmt_slam_ros.messages.messages import ClosureDecision, EndOfLog, Hypotheses
-from hmt_slam_ros.metric_slam.slam import MetricSlam
 from hmt_slam_ros.offline.runtime import LockStep
-from hmt_slam_ros.real_time_localization.rtl import Rtl
+from hmt_slam_ros.process_table import PROCESSES
 from hmt_slam_ros.results.recorder import Recorder
 from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.topological_inference.branching import Branches, Branching, Child
@@ -60,13 +57,8 @@ class OverJson:
 def run(log, configuration, branching=Branching):
     """A whole log in lock-step; what was recorded."""
     recorder = Recorder(configuration)
-    processes = {
-        "slam": MetricSlam(configuration),
-        "aam": Aam(configuration),
-        "tsbi": Tsbi(configuration, branching),
-        "tlca": Tlca(configuration),
-        "rtl": Rtl(configuration),
-    }
+    processes = {row.name: row.make(configuration) for row in PROCESSES}
+    processes["tsbi"] = Tsbi(configuration, branching)
     lock_step = LockStep({name: OverJson(process) for name, process in processes.items()} | {"recorder": recorder})
     stamps = []
     for record in log.records():

@@ -56,7 +56,7 @@ def test_help_is_there_for_every_command_and_comes_at_once(command: str) -> None
 
 def test_help_imports_nothing_heavy() -> None:
     code = (
-        "import sys; from hmt_slam_ros.cli.arguments import parser; parser();"
+        "import sys; from hmt_slam_ros.cli.arguments import build_parser; build_parser();"
         "print(sorted({'numpy', 'numba', 'matplotlib', 'scipy', 'rosbags', 'rclpy', 'yaml'} & set(sys.modules)))"
     )
     result = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)

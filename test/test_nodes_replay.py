@@ -24,7 +24,7 @@ from hmt_slam_ros.results.hmt_map import read_saved_map
 pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
 
 from hmt_slam_ros.process_table import RUN_NODE, process_names
-from hmt_slam_ros.ros.replay import PROCESSES, replay
+from hmt_slam_ros.ros.replay import replay
 
 ROOT = Path(__file__).resolve().parent.parent
 BUNDLED = ROOT / "data" / "malaga_one_loop"
@@ -143,7 +143,7 @@ def test_the_report_accounts_for_every_scan_and_every_process(folders):
 
 def test_processes_that_are_killed_one_after_the_other_go_on_to_the_same_bit(folders, tmp_path, capfd):
     """At last all of them at once. Scans, keyframe events and checkpoints are under way wherever that happens."""
-    due = {20: ("rtl",), 45: ("tlca",), 75: ("tsbi",), 105: ("aam",), 135: ("slam",), 165: PROCESSES}
+    due = {20: ("rtl",), 45: ("tlca",), 75: ("tsbi",), 105: ("aam",), 135: ("slam",), 165: process_names()}
 
     def strike(scans):
         if due and scans >= min(due):
@@ -154,7 +154,7 @@ def test_processes_that_are_killed_one_after_the_other_go_on_to_the_same_bit(fol
     replay(BUNDLED, out, load_configuration(settings=["robot.rate=0.0"]), strike)
     assert not due
     told = capfd.readouterr().err
-    for name in PROCESSES:
+    for name in process_names():
         assert told.count(f"the node {name} was killed by signal 9: it is started again and goes on where it was") == 2
     for name in ("trajectory.tum", "trajectory_online.tum", "graph.g2o", "pmf.csv", "map.pgm", "hmt_map/map.bin"):
         assert (out / name).read_bytes() == (folders[1] / name).read_bytes()

@@ -70,7 +70,7 @@ def test_every_scan_and_odometry_reading_arrives_as_it_is_in_the_log(tmp_path, l
     assert np.allclose([reading.pose[0] for reading in readings], 0.025 * np.arange(45))
     assert heard["odom"][0].header.frame_id == "odom"
     status = last_status(heard)
-    assert (status["scans"], status["scans_in_log"], status["odometry"]) == (12, 12, 45)
+    assert (status["scans"], status["scans_in_log"], status["odometry_readings"]) == (12, 12, 45)
     listener.until(lambda: heard["clock"] and conversions.stamp_from_time(heard["clock"][-1].clock) == SCANS[-1].stamp)
 
 

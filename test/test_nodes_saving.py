@@ -76,7 +76,7 @@ def replica_in_words(replica):
         replica.common.poses.tolist(),
         replica.common.means.tolist(),
         {h: (own.keyframes.tolist(), own.poses.tolist()) for h, own in replica.changes.items()},
-        dict(replica.areas),
+        dict(replica.robot_areas),
     )
 
 
@@ -88,7 +88,7 @@ def test_a_map_is_saved_while_the_robot_drives_and_others_go_on_from_it_when_all
     assert saved.success, saved.message
     assert saved.message == f"saved to {folder}"
     parts, events = states(folder)
-    assert events == parts["slam"].events > 3
+    assert events == parts["slam"].keyframe_events > 3
     # All parts are of one and the same moment.
     maps = {name: replica_in_words(part.replica) for name, part in parts.items()}
     assert maps["slam"] == maps["aam"] == maps["tsbi"] == maps["tlca"]
@@ -99,7 +99,7 @@ def test_a_map_is_saved_while_the_robot_drives_and_others_go_on_from_it_when_all
     listener.spin(1.0)
     assert first.save().success
     stopped, events = states(folder)
-    assert stopped["slam"].scans == len(first.estimates) < 80
+    assert stopped["slam"].processed_scans == len(first.estimates) < 80
     first.kill()
 
     # At the first scan that is not in the map.

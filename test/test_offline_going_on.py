@@ -70,14 +70,14 @@ def compared(log, folder, stops, branching=lambda: Branching, configuration=None
     configuration = configuration or Configuration()
     whole, run, stopped = beginning(configuration, branching()), beginning(configuration, branching()), []
     for number, record in enumerate(log.records()):
-        whole.read(record)
-        run.read(record)
-        if stops(number, run._tsbi.state):
+        whole.process_record(record)
+        run.process_record(record)
+        if stops(number, run._processes["tsbi"].state):
             state = run.state
             stopped.append(state.processes["tsbi"])
             run = LockStepRun(configuration, state=read(written(folder / str(number), state)))
     assert contents(written(folder / "stopped", run.state)) == contents(written(folder / "whole", whole.state))
-    same_outcome(*(end.recorder.finish(end.log.stamps) for end in (run.finish(), whole.finish())))
+    same_outcome(*(end.recorder.finish(end.log_progress.stamps) for end in (run.finish(), whole.finish())))
     return stopped
 
 
@@ -86,7 +86,7 @@ def test_a_run_that_forgot_keyframes_goes_on_without_them(tmp_path):
 
     def forgot(_, state):
         known.append(len(state.replica.scans))
-        return known[-1] < known[-2] and len(state.notes) == 1
+        return known[-1] < known[-2] and len(state.hypothesis_states) == 1
 
     log = open_log("sim:office,size=0.7,rate=2.5,laps=3")
     assert len(compared(log, tmp_path, forgot)) > 2
@@ -106,10 +106,10 @@ def once(*conditions):
 
 def test_a_run_that_stops_again_and_again_ends_as_one_that_does_not(tmp_path):
     """Also where two hypotheses are alive, and between an odometry reading and its scan."""
-    several = once(lambda state: len(state.notes) > 1)
+    several = once(lambda state: len(state.hypothesis_states) > 1)
     stopped = compared(open_log(LOG), tmp_path, lambda number, state: number % 77 == 7 or several(number, state))
     assert len(stopped) > 5
-    assert max(len(state.notes) for state in stopped) == 2
+    assert max(len(state.hypothesis_states) for state in stopped) == 2
 
 
 def test_a_run_in_which_closures_were_accepted_and_areas_became_one_can_stop(tmp_path):
@@ -117,9 +117,9 @@ def test_a_run_in_which_closures_were_accepted_and_areas_became_one_can_stop(tmp
         return state.replica.common.closures.any()
 
     def merged(state):
-        return len(state.replica.common.areas) <= state.replica.largest
+        return len(state.replica.common.areas) <= state.replica.max_area_id
 
-    several = once(lambda state: len(state.notes) > 1, closed, merged)
+    several = once(lambda state: len(state.hypothesis_states) > 1, closed, merged)
     stopped = compared(open_log("sim:grid,seed=1,count=2", duration=110.0), tmp_path, several)
     assert len(stopped) == 3
 
@@ -127,7 +127,7 @@ def test_a_run_in_which_closures_were_accepted_and_areas_became_one_can_stop(tmp
 def test_a_run_in_which_a_closure_is_doubted_can_stop_before_the_question_is_answered(tmp_path):
     log = open_log("sim:ring,seed=3,size=1.5", duration=165.0)
     (stopped,) = compared(log, tmp_path, once(lambda state: state.revised_hypotheses), lambda: misled(2, 0, 3.8))
-    assert [ends.source for ends in stopped.revised_hypotheses[0].withdrawn] == [0]
+    assert [ends.source for ends in stopped.revised_hypotheses[0].removed_arcs] == [0]
 
 
 @pytest.mark.parametrize("kind", ["lines", "by_class"])
@@ -166,7 +166,7 @@ def test_scans_without_odometry_wait_in_the_saved_map_as_well(tmp_path):
 
 
 def test_a_run_whose_areas_end_at_doors_goes_on_with_the_openings_that_it_saw(tmp_path):
-    several = once(lambda state: len(state.notes) > 1)
+    several = once(lambda state: len(state.hypothesis_states) > 1)
     configuration = with_changes(Configuration(), {"aam.area_policy": "both"})
     log = open_log("sim:office,size=0.7,rate=2.5,laps=1")
     stopped = compared(log, tmp_path, lambda k, state: k % 150 == 149 or several(k, state), configuration=configuration)

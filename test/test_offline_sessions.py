@@ -81,7 +81,7 @@ def test_the_robot_was_lost_at_first_and_then_joined(first, second_log):
     for record in run.unread_records(second_log):
         run.process_record(record)
         events = max(run.recorder.hypotheses, default=-1)
-        if events >= first.slam.events:
+        if events >= first.processes["slam"].keyframe_events:
             lost.append(all(leaf.lost for leaf in run.recorder.hypotheses[events].hypotheses))
     assert lost[0]
     assert not lost[-1]

@@ -191,13 +191,18 @@ def test_every_process_leaves_the_same_beams_out_and_little_is_stored(visits):
     stored = [any(leaf.stored for leaf in message.estimates) for message in said]
     assert 0 < sum(stored) < 0.4 * len(stored)
     assert all(message.mapping for message in said)
-    scans = after.slam.replica.scans
-    for replica in (after.aam.replica, after.tsbi.replica, after.tlca.replica, after.recorder.replica):
+    scans = after.processes["slam"].replica.scans
+    for replica in (
+        after.processes["aam"].replica,
+        after.processes["tsbi"].replica,
+        after.processes["tlca"].replica,
+        after.recorder.replica,
+    ):
         assert replica.scans.keys() == scans.keys()
         assert all(scan is scans[keyframe] for keyframe, scan in replica.scans.items())
     told = [one for message in said for one in message.stale_beams]
     assert all(isinstance(one, StaleBeams) for one in told)
-    old = [one for one in told if one.keyframe in before.slam.replica.scans and one.keyframe in scans]
+    old = [one for one in told if one.keyframe in before.processes["slam"].replica.scans and one.keyframe in scans]
     assert len(old) > 10
     for one in old:
         assert not scans[one.keyframe].valid[list(one.removed)].any()
@@ -211,7 +216,7 @@ def test_every_process_leaves_the_same_beams_out_and_little_is_stored(visits):
 def test_a_run_that_goes_on_from_its_state_says_the_same(visits):
     _, folder, rest, said, _ = visits
     middle, _ = read_run_state(folder)
-    assert any(live.recent_scans for live in middle.slam.live_hypotheses.values())
+    assert any(live.recent_scans for live in middle.processes["slam"].live_hypotheses.values())
     again, _ = read(LockStepRun(LIFELONG, state=middle), rest)
     same = said[-len(again) :]
     assert [encode(KeyframeHeader.from_keyframe(one)) for one in again] == [

@@ -66,13 +66,13 @@ def test_a_browser_hears_of_what_changed_alone(board):
 def test_the_history_comes_once_and_whole_where_it_began_anew(board):
     one, other = ClientState(), ClientState()
     for event in range(3):
-        board.append(event)
+        board.append_event(event)
     assert board.wait_for_changes(one)["history"] == {"anew": True, "events": [0, 1, 2]}
-    board.append(3)
+    board.append_event(3)
     assert board.wait_for_changes(one)["history"] == {"anew": False, "events": [3]}
     assert board.wait_for_changes(other)["history"] == {"anew": True, "events": [0, 1, 2, 3]}
     board.clear_history()
-    board.append(7)
+    board.append_event(7)
     assert board.wait_for_changes(one)["history"] == {"anew": True, "events": [7]}
 
 
@@ -80,7 +80,7 @@ def test_a_browser_that_missed_more_than_is_kept_gets_what_is_left(board):
     seen = ClientState()
     board.wait_for_changes(seen)
     for event in range(HISTORY_LENGTH + 5):
-        board.append(event)
+        board.append_event(event)
     assert board.wait_for_changes(seen)["history"]["events"] == list(range(5, HISTORY_LENGTH + 5))
 
 
@@ -188,7 +188,7 @@ def test_browsers_beyond_the_twentieth_stream_are_told_so(server):
 def well(health, now, **messages):
     for name in NODES:
         level, text = messages.get(name, (0, "running"))
-        health.hear(name, level, text, {"busy": f"{0.25 * now:.3f} s"}, now)
+        health.update(name, level, text, {"busy": f"{0.25 * now:.3f} s"}, now)
 
 
 def test_where_no_node_runs_the_page_says_what_to_start():

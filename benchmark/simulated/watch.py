@@ -25,18 +25,16 @@ from benchmark.simulated.loops import Loop, Loops, rivalries
 from benchmark.simulated.records import code
 from benchmark.simulated.truth import Pose, Truth, doors, nees
 from benchmark.simulated.worlds import World
-from hmt_slam_ros import composition
 from hmt_slam_ros.configuration import Configuration, load_configuration
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
-from hmt_slam_ros.loop_closure.tlca import Tlca
 from hmt_slam_ros.messages.messages import ClosureDecision, EndOfLog, Hypotheses, Keyframe, Message, RealTimePose
 from hmt_slam_ros.messages.replica import FIRST_AREA, Replica
 from hmt_slam_ros.messages.routing import Process
 from hmt_slam_ros.offline.runtime import LockStep
-from hmt_slam_ros.real_time_localization.rtl import Rtl
+from hmt_slam_ros.process_table import PROCESSES
 from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.simulation import SimulatedLog, open_simulated
 from hmt_slam_ros.topological_inference.branching import Branching
@@ -98,13 +96,8 @@ class Watch:
     def run(self) -> None:
         """Map the whole log."""
         configuration = self.configuration
-        processes: dict[str, Process] = {
-            "slam": composition.metric_slam(configuration),
-            "aam": composition.area_abstraction(configuration),
-            "tsbi": Tsbi(configuration, self.branching),
-            "tlca": Tlca(configuration),
-            "rtl": Rtl(configuration),
-        }
+        processes: dict[str, Process] = {row.name: row.make(configuration) for row in PROCESSES}
+        processes["tsbi"] = Tsbi(configuration, self.branching)
         lock_step = LockStep({name: _Tapped(process, self._hear) for name, process in processes.items()})
         for record in self.log.records():
             lock_step.feed(record.measurement)

@@ -294,4 +294,3 @@ def _distance_along_arc(x: float, y: float, bend: float, radius: float) -> float
     cosine = (bend * bend + away * away - radius * radius) / (2.0 * bend * away)
     angle = math.atan2(x, bend - y) - math.acos(min(1.0, max(-1.0, cosine)))
     return bend * (angle if angle >= 0.0 else angle + 2.0 * math.pi)
-

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hmt_slam_ros.errors import HmtSlamError
-from hmt_slam_ros.logs.ros_types import RosMessage
+
+if TYPE_CHECKING:
+    from hmt_slam_ros.logs.ros_types import RosMessage
 
 _LARGEST_TILT = np.deg2rad(10.0)  # beyond it, ranges are too far from distances on the floor plan
 

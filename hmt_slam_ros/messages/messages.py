@@ -1,8 +1,8 @@
-"""What the five processes say to each other, as immutable values.
+"""What the processes say to each other, as immutable values.
 
 Scans and odometry enter as :class:`~hmt_slam_ros.sensors.Scan` and :class:`~hmt_slam_ros.sensors.Odometry`. One
-*keyframe event* k sets off the chain Keyframe(k) -> AreaEvents(k) -> Hypotheses(k) -> ClosureDecision(k), after which metric
-SLAM takes up the scans that waited.
+*keyframe event* k sets off the chain Keyframe(k) -> AreaEvents(k) -> Hypotheses(k) -> ClosureDecision(k), after which
+metric SLAM takes up the scans that waited.
 """
 
 from __future__ import annotations
@@ -44,11 +44,12 @@ class HypothesisEstimate:
     :ivar stored: whether the keyframe enters this hypothesis's map; False where it would add nothing new.
     :ivar log_evidence: log-likelihood of the keyframe's scan where it is in the place that this hypothesis has it in,
         relative to a place that looks alike; nats, not accumulated over keyframes.
-    :ivar log_kidnapping_ratio: by how much likelier the scan is where the robot was displaced before it, nats, likewise.
+    :ivar log_kidnapping_ratio: by how much likelier the scan is where the robot was displaced before it, nats,
+        likewise.
     :ivar clutter: what contradicts the hypothesis's map usually.
     :ivar effective_samples: ESS of the hypothesis's particles, in [1, number of particles].
-    :ivar revised_keyframes: earlier keyframes of the area whose pose changed because another particle leads now; ``source`` and
-        ``area`` are equal.
+    :ivar revised_keyframes: earlier keyframes of the area whose pose changed because another particle leads now;
+        ``source`` and ``area`` are equal.
     """
 
     hypothesis: int
@@ -132,17 +133,17 @@ class Hypothesis:
     :ivar parent: the hypothesis it continues.
     :ivar probability: P(gamma^t | d), Eq. (14).
     :ivar area: the robot's area now.
-    :ivar frame_change: belief over ``area_T_previous``: the frame of the robot's area before the event in that of ``area``,
-        as uncertain as the newest keyframe that came over is in the area, or as the arc; None where the area did not
-        change and the robot's pose stands.
+    :ivar frame_change: belief over ``area_T_previous``: the frame of the robot's area before the event in that of
+        ``area``, as uncertain as the newest keyframe that came over is in the area, or as the arc; None where the area
+        did not change and the robot's pose stands.
     :ivar moved_keyframes: keyframes that change area.
     :ivar arcs: arcs that are new or replaced.
     :ivar local_areas: the areas of the local map, the current one first; empty where the local map stays as it is.
     :ivar removed_arcs: arcs that this hypothesis does not believe any more.
     :ivar area_merge: two areas that are one, where this is the only hypothesis; else None.
     :ivar lost: whether the robot may be anywhere in the map, and maps around itself until it is recognized where.
-    :ivar tracking_reset: whether it is lost since now, and nothing was stored that it could map on from: it does from the
-        next scan on.
+    :ivar tracking_reset: whether it is lost since now, and nothing was stored that it could map on from: it does from
+        the next scan on.
     """
 
     id: int
@@ -188,9 +189,9 @@ class ClosureDecision:
     :ivar moved_keyframes: keyframes of that hypothesis whose pose in their area was refined.
     :ivar global_poses: ``map_T_area`` of all areas of the most probable hypothesis, ordered by id; empty where
         unchanged since the last message.
-    :ivar revised_hypotheses: where accepted closures contradict each other, the explanations of that, the most probable first:
-        the children into which TSBI branches the hypothesis at the next event, with ids of its own and their local
-        maps. Each child withdraws what its explanation takes for false. Else empty.
+    :ivar revised_hypotheses: where accepted closures contradict each other, the explanations of that, the most probable
+        first: the children into which TSBI branches the hypothesis at the next event, with ids of its own and their
+        local maps. Each child withdraws what its explanation takes for false. Else empty.
     :ivar ambiguity: shape (3, 3), the second moment of the robot's pose under the other live hypotheses about that
         under the most probable one: x, y along the axes of the map, m, and heading, rad; 0 where there is no other.
     """
@@ -286,8 +287,8 @@ class RealTimePose:
 class PoseReset:
     """robot -> slam: the next scan may be from anywhere, at any time; odometry begins anew.
 
-    :ivar initial_pose: where it is as somebody says, None where nobody knows. A robot that may be anywhere was not carried
-        then: that its place was not known is why it is said.
+    :ivar initial_pose: where it is as somebody says, None where nobody knows. A robot that may be anywhere was not
+        carried then: that its place was not known is why it is said.
     """
 
     initial_pose: InitialPose | None = None

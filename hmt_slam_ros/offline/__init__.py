@@ -1,1 +1,1 @@
-"""The five processes in lock-step in one process, and the output folder."""
+"""All processes in lock-step in one process, and the output folder."""

@@ -99,9 +99,7 @@ class LockStepRun:
         }
         replaced = {"aam": abstraction(configuration)} if abstraction else {}
         self.recorder = Recorder(configuration, state.recorder)
-        self.lock_step = LockStep(
-            {**self._processes, **replaced, RECORDER.name: self.recorder, **(observers or {})}
-        )
+        self.lock_step = LockStep({**self._processes, **replaced, RECORDER.name: self.recorder, **(observers or {})})
         self._log_reader = LogReader(state.log)
         self._seconds_per_scan = {name: array("d") for name in self.lock_step.processes if name != RECORDER.name}
 
@@ -172,7 +170,8 @@ def run_log(
     :param abstraction: what makes areas of keyframes instead of the AAM, such as nothing.
     :param state: to go on from, at the first record that it does not know.
     :param on_state: called with the state after the last record, before the end of the log is told.
-    :param compact_record: whether the recorder keeps a record of what was said, and not the messages, so that a run may last.
+    :param compact_record: whether the recorder keeps a record of what was said, and not the messages, so that a run may
+        last.
     :raises HmtSlamError: where the log is faulty.
     """
     run = LockStepRun(configuration, abstraction, state)

@@ -33,8 +33,8 @@ class LogProgress:
     :ivar stamps: shape (n,), of the scans of all logs on the map's clock, ns, increasing.
     :ivar source_stamps: shape (n,), the logs' own stamps of them, ns.
     :ivar first_scans: number of the first scan of each log.
-    :ivar earlier_trajectory: where the scans of all logs before the newest were taken after the final refinement of that time, or
-        none.
+    :ivar earlier_trajectory: where the scans of all logs before the newest were taken after the final refinement of
+        that time, or none.
     :ivar clock_offset: what the map's clock is ahead of the running clock of the newest log, ns.
     :ivar checksum: CRC-32 of the ranges of the first scan of the newest log.
     """
@@ -197,8 +197,8 @@ def describe_parameter_changes(saved: Configuration, asked: Configuration, *, fu
     fixed = [name for name in changed if name in FIXED_PARAMETERS or (name == _START and not further)]
     if fixed:
         raise HmtSlamError(
-            f"the map was made with {_join_settings(fixed, before)}, not with {_join_settings(fixed, now)}, and cannot go on with "
-            "another value: leave that away, or map the log anew"
+            f"the map was made with {_join_settings(fixed, before)}, not with {_join_settings(fixed, now)}, and cannot "
+            "go on with another value: leave that away, or map the log anew"
         )
     free = [name for name in changed if not name.startswith(_CHANGEABLE)]
     return (

@@ -1,4 +1,4 @@
-"""The recorder listens to the five processes and keeps what the output folder needs.
+"""The recorder listens to the processes and keeps what the output folder needs.
 
 Messages are filed by their own numbers, so that the order in which they arrive from several OS processes does not
 matter; :meth:`Recorder.finish` then goes through the keyframe events in their order.

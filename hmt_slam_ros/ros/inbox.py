@@ -1,8 +1,8 @@
 """From what comes in on the topics to messages, in the order in which a process has to hear them.
 
 DDS keeps the order within a topic, not across topics: Keyframe(k+1) may overtake ClosureDecision(k). Every process gets
-Keyframe(k), AreaEvents(k), Hypotheses(k), ClosureDecision(k), Keyframe(k+1), ... as far as it listens to them, so that a run
-of the nodes takes the same decisions as the lock-step run, and a node that starts late catches up.
+Keyframe(k), AreaEvents(k), Hypotheses(k), ClosureDecision(k), Keyframe(k+1), ... as far as it listens to them, so that
+a run of the nodes takes the same decisions as the lock-step run, and a node that starts late catches up.
 """
 
 from __future__ import annotations
@@ -81,8 +81,8 @@ class ChainOrder:
             return []
         if sequence > self._next_sequences[kind] and self.fault is None:
             self.fault = (
-                f"{kind.__name__} {self._next_sequences[kind]} never came, {sequence} did: the node started too late or lost "
-                "messages, restart all nodes"
+                f"{kind.__name__} {self._next_sequences[kind]} never came, {sequence} did: the node started too late "
+                "or lost messages, restart all nodes"
             )
         self._next_sequences[kind] = sequence + 1
         self._waiting[kind].append(message)
@@ -127,8 +127,8 @@ class Inbox:
         :param deliver: called for each message in its turn.
         :param estimate_profile: profile for LocalEstimate, of which most nodes have no use for the past.
         :param first_event: keyframe event with which the chain begins.
-        :param reset_number: number of the request after which the node began anew, 0 before the first; None where it hears
-            on, whoever begins anew.
+        :param reset_number: number of the request after which the node began anew, 0 before the first; None where it
+            hears on, whoever begins anew.
         :param resume_stamps: {kind of measurement: stamp from which on, ns}, where past ones are wanted too.
         """
         self._resume_stamps, self._reset_number = resume_stamps or {}, reset_number

@@ -82,7 +82,7 @@ class ManagedNode(LifecycleNodeMixin, ConfiguredNode):
         """
 
     def clean_up_node(self) -> None:
-        """Forget what :meth:`configure_node` made; publishers, subscriptions, services and timers vanish by themselves."""
+        """Forget what :meth:`configure_node` made, but for publishers, subscriptions, services and timers."""
 
     def abandon_configuration(self) -> None:
         """Forget what :meth:`configure_node` made before it failed."""

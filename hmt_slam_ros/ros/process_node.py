@@ -45,7 +45,8 @@ _SAVE_ON_SHUTDOWN = ParameterDescriptor(
 class ProcessNode(ManagedNode):
     """A process of :mod:`hmt_slam_ros.messages` as a node of the same name.
 
-    :ivar is_always_listening: whether the process hears all the same while the node is inactive, and says what it has to.
+    :ivar is_always_listening: whether the process hears all the same while the node is inactive, and says what it has
+        to.
     :ivar save_on_shutdown: whether it stays for that when it is told to end.
     """
 

@@ -159,8 +159,8 @@ class RobotNode(ConfiguredNode):
         if time.monotonic() - self._started_at > settings.discovery_timeout:
             name = "scan" if missing[0] == SCAN else "odometry"
             raise HmtSlamError(
-                f"too few subscribers of {' and '.join(missing)} after {settings.discovery_timeout:g} s: start the slam and rtl "
-                f"nodes, or set robot.{name}_listeners to 0"
+                f"too few subscribers of {' and '.join(missing)} after {settings.discovery_timeout:g} s: start the "
+                f"slam and rtl nodes, or set robot.{name}_listeners to 0"
             )
 
     def _send(self, measurement: Scan | Odometry) -> None:
@@ -239,8 +239,8 @@ class RobotNode(ConfiguredNode):
         ):
             self._last_progress = time.monotonic()
             self.diagnostics.warn(
-                f"the robot waits: slam has not answered the last {self._settings.max_unacknowledged_scans} scans; start the slam node, "
-                "or set robot.flow_control to false to replay without it"
+                f"the robot waits: slam has not answered the last {self._settings.max_unacknowledged_scans} scans; "
+                "start the slam node, or set robot.flow_control to false to replay without it"
             )
 
 

@@ -89,8 +89,8 @@ class SensorSubscription:
         """Listen to nothing yet.
 
         :param diagnostics: through which it tells.
-        :param resume_stamp: stamp of the last message that was heard before, ns, where what was missed since is wanted, from a
-            publisher that kept it.
+        :param resume_stamp: stamp of the last message that was heard before, ns, where what was missed since is wanted,
+            from a publisher that kept it.
         """
         self.is_best_effort = False
         self._node, self._kind, self._topic, self._deliver = node, kind, topic, on_message
@@ -143,8 +143,8 @@ class SensorSubscription:
         self._diagnostics.values[f"refused on {self._topic}"] = order.rejected_count
         if order.rejected_count == 1:
             self._diagnostics.warn(
-                f"on {self._topic} the message of stamp {order.last_rejected_stamp} ns came late or twice, after that of "
-                f"{newest} ns, and is left out, as all such: look for a second publisher, or a link that reorders"
+                f"on {self._topic} the message of stamp {order.last_rejected_stamp} ns came late or twice, after that "
+                f"of {newest} ns, and is left out, as all such: look for a second publisher, or a link that reorders"
             )
 
     def _relax_qos(self, _event: object) -> None:
@@ -212,9 +212,9 @@ class SensorMonitor:
         if self._compared_scans == _SCANS:
             if abs(self._clock_offset) > _MAX_CLOCK_OFFSET:
                 self._diagnostics.warn(
-                    f"scans are stamped {abs(self._clock_offset) / 1e9:.1f} s {'after' if self._clock_offset > 0 else 'before'} the "
-                    "odometry that comes with them: let both computers have one clock (NTP, PTP), or correct the "
-                    "stamps; until then odometry does not help"
+                    f"scans are stamped {abs(self._clock_offset) / 1e9:.1f} s "
+                    f"{'after' if self._clock_offset > 0 else 'before'} the odometry that comes with them: let both "
+                    "computers have one clock (NTP, PTP), or correct the stamps; until then odometry does not help"
                 )
             self._clock_offset, self._compared_scans = math.inf, 0
 
@@ -245,6 +245,6 @@ class SensorMonitor:
         if moving and not self._is_silent and now - self._last_scan_at > _SILENCE_TIMEOUT:
             self._is_silent = True
             self._diagnostics.warn(
-                f"no scan came for {_SILENCE_TIMEOUT:g} s, while odometry does: look at the laser, and at the name and the "
-                "type of the topic scan; meanwhile the pose goes on by odometry"
+                f"no scan came for {_SILENCE_TIMEOUT:g} s, while odometry does: look at the laser, and at the name and "
+                "the type of the topic scan; meanwhile the pose goes on by odometry"
             )

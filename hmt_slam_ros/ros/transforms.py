@@ -92,6 +92,7 @@ class LaserMountings:
         """One sentence for a scan whose transform is missing."""
         cause = "" if TFMessage is not None else " (tf2_msgs is not installed)"
         return (
-            f"no transform from '{self._base_frame}' to '{scan.header.frame_id}' on /tf_static{cause}, so {waiting} scans "
-            f"wait, the first of stamp {stamp_from_time(scan.header.stamp)} ns: publish it, or set the parameter laser_pose"
+            f"no transform from '{self._base_frame}' to '{scan.header.frame_id}' on /tf_static{cause}, so {waiting} "
+            f"scans wait, the first of stamp {stamp_from_time(scan.header.stamp)} ns: publish it, or set the parameter "
+            "laser_pose"
         )

@@ -1,0 +1,144 @@
+"""A process is one row of the table: a sixth one takes part in both runtimes, and all others expect it."""
+
+import json
+import os
+import socket
+import subprocess
+import sys
+from collections import defaultdict
+from dataclasses import dataclass
+from pathlib import Path
+from urllib.request import urlopen
+
+import pytest
+
+from hmt_slam_ros import process_table
+from hmt_slam_ros.process_table import ProcessRow, node_command, process_names, topic_of
+
+NAME = "counter"
+WORLD, SECONDS = "sim:office,size=0.7,rate=2.5", 30.0
+
+
+@dataclass(frozen=True)
+class CounterState:
+    """Number of closure decisions so far."""
+
+    decisions: int = 0
+
+
+class Counter:
+    """A process that counts closure decisions, and says so."""
+
+    def __init__(self, _configuration, state=None):
+        self.state = state or CounterState()
+
+    def handle(self, _message):
+        from hmt_slam_ros.messages.messages import Notice  # noqa: PLC0415  when the row is in the table
+
+        self.state = CounterState(self.state.decisions + 1)
+        return [Notice(NAME, f"decisions: {self.state.decisions}")]
+
+
+ROW = ProcessRow(
+    name=NAME,
+    title="counts closure decisions",
+    consumes=("ClosureDecision",),
+    factory="test_process_table:Counter",
+    state="test_process_table:CounterState",
+)
+
+
+def add_row():
+    process_table.PROCESSES = (*process_table.PROCESSES, ROW)
+
+
+@pytest.fixture
+def with_row(tmp_path, monkeypatch):
+    """All Python programs that are started from here on have the row in the table from the beginning."""
+    (tmp_path / "sitecustomize.py").write_text("import test_process_table\ntest_process_table.add_row()\n")
+    folders = [str(tmp_path), str(Path(__file__).parent), *sys.path]
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(folders))
+
+
+def run_with_row(function, *arguments):
+    """Call a function of this file in a program of its own."""
+    code = f"import test_process_table; test_process_table.{function}(*{arguments!r})"
+    finished = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert finished.returncode == 0, finished.stderr
+
+
+def map_and_go_on(folder):
+    from hmt_slam_ros.configuration import Configuration  # noqa: PLC0415  when the row is in the table
+    from hmt_slam_ros.offline.runtime import LockStepRun, run_log  # noqa: PLC0415
+    from hmt_slam_ros.open_log import open_log  # noqa: PLC0415
+    from hmt_slam_ros.results.hmt_map import MapWriter, read_run_state  # noqa: PLC0415
+
+    states, configuration = [], Configuration()
+    recorder = run_log(open_log(WORLD, duration=SECONDS), configuration, on_state=states.append).recorder
+    counted = states[0].processes[NAME].decisions
+    assert counted == len(recorder.decisions) > 0
+    assert (NAME, f"decisions: {counted}") in recorder.notices
+    writer = MapWriter(Path(folder))
+    writer.write_state(states[0])
+    writer.finish(configuration)
+    again, _ = read_run_state(Path(folder))
+    assert LockStepRun(configuration, state=again).state.processes[NAME] == CounterState(counted)
+
+
+def test_lock_step_delivers_its_messages_and_a_saved_map_has_its_state(with_row, tmp_path):
+    run_with_row("map_and_go_on", str(tmp_path / "hmt_map"))
+
+
+def examine_without_it():
+    from hmt_slam_ros.doctor.running import RunningSystem, Topic, findings  # noqa: PLC0415  as above
+
+    others = tuple(name for name in process_names() if name != NAME)
+    topics = defaultdict(lambda: Topic(1, ("driver",)))
+    told = [finding.text for finding in findings(RunningSystem(1.0, topics, others, (), (), {}, {}, ""))]
+    assert any(f"Of the nodes, {NAME} is missing" in text for text in told), told
+
+
+def test_the_doctor_misses_it(with_row):
+    run_with_row("examine_without_it")
+
+
+def test_the_page_expects_it(with_row, start):
+    pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    page = start("view", port=port)
+    while "the page is at" not in page.stderr.readline():
+        assert page.poll() is None
+    with urlopen(f"http://127.0.0.1:{port}/news", timeout=10) as stream:
+        news = json.loads(next(line for line in stream if line.startswith(b"data: ")).removeprefix(b"data: "))
+    assert NAME in {row["name"] for row in news["nodes"]}
+
+
+def test_a_node_of_it_answers_and_saves_its_part(with_row, listener, start, tmp_path):
+    from std_msgs.msg import String  # noqa: PLC0415  only where there is ROS
+
+    from hmt_slam_ros.messages.documents import SaveRequest, SaveResponse, decode, encode  # noqa: PLC0415
+    from hmt_slam_ros.messages.messages import ClosureDecision, Notice  # noqa: PLC0415
+    from hmt_slam_ros.ros import topics  # noqa: PLC0415
+
+    notices = listener.hear(String, topic_of("Notice"), topics.CHAIN)
+    answers = listener.hear(String, topic_of("SaveResponse"), topics.CHAIN)
+    decisions = listener.node.create_publisher(String, topic_of("ClosureDecision"), topics.CHAIN)
+    requests = listener.node.create_publisher(String, topic_of("SaveRequest"), topics.CHAIN)
+    start(NAME)
+    for number in range(3):
+        decisions.publish(String(data=encode(ClosureDecision(number))))
+    listener.until(lambda: len(notices) == 3)
+    assert decode(notices[-1].data, Notice).text == "decisions: 3"
+    listener.until(requests.get_subscription_count)
+    requests.publish(String(data=encode(SaveRequest(1, 3, str(tmp_path), shutdown=False))))
+    listener.until(lambda: answers)
+    answer = decode(answers[0].data, SaveResponse)
+    assert (answer.process, answer.error) == (NAME, "")
+    assert (tmp_path / f"{NAME}.json").is_file()
+
+
+def test_every_node_is_started_by_its_name():
+    assert node_command(NAME) == ["-m", process_table.RUN_NODE, NAME]
+    assert NAME not in process_names()
