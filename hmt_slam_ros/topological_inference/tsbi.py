@@ -40,8 +40,10 @@ from hmt_slam_ros.topological_inference.global_localization import PoseDistribut
 from hmt_slam_ros.topological_inference.hypothesis_merging import LocalizedHypothesis, merge_equivalent
 from hmt_slam_ros.topological_inference.hypothesis_tree import (
     HypothesisState,
+    Lost,
     PoseInArea,
     ReducedDistribution,
+    Tracking,
     normalize_and_reduce,
 )
 from hmt_slam_ros.topological_inference.kidnapping import decide_without_mapping, spawn_kidnapped_hypothesis
@@ -141,12 +143,13 @@ class Tsbi:
             HypothesisSummary(
                 probability,
                 self._replica.robot_areas[hypothesis],
-                arriving or self._hypothesis_states[hypothesis].lost_since is not None,
+                arriving or self._hypothesis_states[hypothesis].is_lost,
             )
             for hypothesis, probability in self._replica.probabilities.items()
         ]
         best = self._replica.best_hypothesis
-        since = self._reset_event if arriving else self._hypothesis_states[best].lost_since
+        leading = self._hypothesis_states[best].localization
+        since = self._reset_event if arriving else leading.since if isinstance(leading, Lost) else None
         hybrid_map = self._replica.maps[best]
         known = sum(
             since is None or any(k < since for k in hybrid_map.keyframes(area)) for area in hybrid_map.area_ids()
@@ -257,7 +260,8 @@ class Tsbi:
     @property
     def _is_kidnapped(self) -> bool:
         """Whether the robot was displaced under one of the hypotheses, and is not found yet."""
-        return any(notes.tracked_pose is not None for notes in self._hypothesis_states.values())
+        found = [state.localization for state in self._hypothesis_states.values()]
+        return any(isinstance(one, Lost) and one.tracked_pose is not None for one in found)
 
     def _branch(self, parent: Parent, event: AreaEvent | None, keyframe: Keyframe) -> Branches:
         """The continuations of one hypothesis, each with its weight."""
@@ -266,9 +270,10 @@ class Tsbi:
             return come if keyframe.mapping else accept_relocalization(come)
         if self._revised_hypotheses:
             return Branches([apply_revision(parent, leaf, keyframe.sequence) for leaf in self._revised_hypotheses])
-        if not keyframe.mapping and parent.state.lost_since is None:
-            return self._branch_without_mapping(parent, event, keyframe.sequence)
-        if not any(notes.lost_since is not None for notes in self._hypothesis_states.values()):
+        if not keyframe.mapping and isinstance(parent.state.localization, Tracking):
+            found = parent.state.localization.relocalized_area
+            return self._branch_without_mapping(parent, event, keyframe.sequence, found)
+        if not any(notes.is_lost for notes in self._hypothesis_states.values()):
             displaced = spawn_kidnapped_hypothesis(self._branching, parent)
             if displaced is not None:
                 return displaced
@@ -276,15 +281,20 @@ class Tsbi:
             return self._branch_on_area_event(parent, event)
         return self._branch_without_area_event(parent, self._estimates[parent.hypothesis], keyframe)
 
-    def _branch_without_mapping(self, parent: Parent, event: AreaEvent | None, sequence: int) -> Branches:
+    def _branch_without_mapping(
+        self, parent: Parent, event: AreaEvent | None, sequence: int, relocalized_area: int | None
+    ) -> Branches:
         """The map stays as it is; the robot may go into another area of it, or be lost.
 
         What it mapped while it was lost is joined to the map in one place alone and leads nowhere, so that it goes over
         into the area where it was recognized as soon as that is sure.
+
+        :param relocalized_area: that area, if there is one.
         """
-        child, found = decide_without_mapping(self._branching, parent, sequence), parent.state.relocalized_area
-        if child.state.lost_since is not None:
+        child = decide_without_mapping(self._branching, parent, sequence)
+        if child.state.is_lost:
             return Branches([child])
+        found = relocalized_area
         if found is not None and len(self._hypothesis_states) == 1 and parent.hybrid_map.has_area(found):
             return self._branching.move(parent, found)
         if event is not None and event.kind == "moved":
@@ -301,18 +311,17 @@ class Tsbi:
 
     def _branch_without_area_event(self, parent: Parent, estimate: HypothesisEstimate, keyframe: Keyframe) -> Branches:
         """No area was left; but the robot may be in known ground that area abstraction does not know to be near."""
-        notes = replace(
-            parent.state.after_overlap(self._branching.find_unlinked_overlap(parent, estimate.pose.mean)),
-            relocalized_area=None,
-        )
+        overlap = self._branching.find_unlinked_overlap(parent, estimate.pose.mean)
+        lost = parent.state.localization if isinstance(parent.state.localization, Lost) else None
+        notes = replace(parent.state.after_overlap(overlap), localization=lost or Tracking())
         parent = replace(parent, state=notes)
         if notes.unlinked_overlap is not None and notes.unlinked_overlap[1] >= _OVERLAP_PERSISTENCE:
             return self._branching.link(parent, notes.unlinked_overlap[0], keyframe.scan, estimate.pose)
-        enough = self._options.recheck_keyframes if notes.pose_hint is None else 1
-        if len(notes.unmatched_keyframes) >= enough and notes.lost_since is not None:
+        enough = self._options.recheck_keyframes
+        if lost is not None and len(notes.unmatched_keyframes) >= (enough if lost.pose_hint is None else 1):
             looked = update_relocalization(self._branching, parent)
             return looked if keyframe.mapping else accept_relocalization(looked)
-        if len(notes.unmatched_keyframes) >= self._options.recheck_keyframes:
+        if len(notes.unmatched_keyframes) >= enough:
             return self._branching.recheck(parent)
         if notes.pending_candidates and len(notes.unmatched_keyframes) == _RETRY_KEYFRAMES:
             return self._branching.recheck(parent, notes.pending_candidates)
@@ -342,7 +351,7 @@ class Tsbi:
             for child, probability in zip(chosen, probabilities, strict=True)
         ]
         self._hypothesis_states = {leaf.id: child.state for leaf, child in zip(leaves, chosen, strict=True)}
-        if all(notes.lost_since is None for notes in self._hypothesis_states.values()):
+        if not any(notes.is_lost for notes in self._hypothesis_states.values()):
             self._branching.end_global_localization()
         return leaves
 
@@ -351,7 +360,7 @@ class Tsbi:
         if branched:
             hypothesis = self._next_hypothesis
             self._next_hypothesis += 1
-        lost, newest = child.state.lost_since, -1 if self._keyframe is None else self._keyframe.sequence
+        found, newest = child.state.localization, -1 if self._keyframe is None else self._keyframe.sequence
         return Hypothesis(
             hypothesis,
             child.parent,
@@ -362,8 +371,8 @@ class Tsbi:
             child.arcs,
             removed_arcs=child.removed_arcs,
             area_merge=child.area_merge,
-            lost=lost is not None,
-            tracking_reset=lost is not None and lost > newest,
+            lost=isinstance(found, Lost),
+            tracking_reset=isinstance(found, Lost) and found.since > newest,
         )
 
     def _with_local_map(self, leaf: Hypothesis, child: Child) -> Hypothesis:
