@@ -89,7 +89,7 @@ def test_what_is_forgotten_was_stored_before_and_is_gone_in_every_process(rounds
             *live.step_covariances.to_dict(),
             live.anchor,
         }
-    assert not gone & {keyframe for graph in state.aam.graphs for keyframe in graph.keyframes}
+    assert not gone & {keyframe for graph in state.aam.graphs.values() for keyframe in graph.keyframes}
 
 
 def test_every_scan_keeps_its_pose_relative_to_a_keyframe_that_is_there(rounds):

@@ -12,11 +12,11 @@ import numpy as np
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.hybrid_map.common_map import ArcValue, AreaPair
+from hmt_slam_ros.hybrid_map.common_map import ArcValue, AreaPair, area_pair
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap, apply_sigma_floor, fuse_traversals
 from hmt_slam_ros.hybrid_map.shortest_path import is_uninformative
 from hmt_slam_ros.loop_closure.area_alignment import AreaAlignment
-from hmt_slam_ros.loop_closure.closure_history import Closure, MapSnapshot, area_pair
+from hmt_slam_ros.loop_closure.closure_history import Closure, MapSnapshot
 from hmt_slam_ros.loop_closure.closure_refinement import ClosureRefinement
 from hmt_slam_ros.messages.map_changes import Arc, MovedKeyframe
 from hmt_slam_ros.messages.messages import Hypothesis

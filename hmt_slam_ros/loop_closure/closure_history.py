@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.hybrid_map.common_map import ArcValue, AreaPair
+from hmt_slam_ros.hybrid_map.common_map import ArcValue, AreaPair, area_pair
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.hybrid_map.shortest_path import shortest_path_beliefs
 from hmt_slam_ros.messages.map_changes import AreaMerge
@@ -112,11 +112,6 @@ class MapRollback:
 
 
 ClosureId = tuple[int, AreaPair]
-
-
-def area_pair(a: int, b: int) -> AreaPair:
-    """The arc between two areas, whatever its direction."""
-    return min(a, b), max(a, b)
 
 
 @dataclass(frozen=True, eq=False)
