@@ -87,7 +87,7 @@ def test_what_is_forgotten_was_stored_before_and_is_gone_in_every_process(rounds
             *live.particle_filter.keyframes,
             *live.keyframe_covariances.to_dict(),
             *live.step_covariances.to_dict(),
-            live.anchor,
+            live.event.anchor,
         }
     assert not gone & {keyframe for graph in state.aam.graphs.values() for keyframe in graph.keyframes}
 
