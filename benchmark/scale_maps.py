@@ -18,7 +18,6 @@ from hmt_slam_ros.area_abstraction.partition import Partition
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.loop_closure.closure_history import PathStep
-from hmt_slam_ros.loop_closure.closure_revision import PathHistory
 from hmt_slam_ros.messages.messages import LocalEstimate, ScanPoses
 from hmt_slam_ros.messages.replica import FIRST_HYPOTHESIS, Replica
 from hmt_slam_ros.metric_slam.live_hypothesis import KeyframeCovariances
@@ -114,7 +113,7 @@ def state_of(lattice: Lattice, configuration: Configuration) -> RunState:
     path = driven.tlca.paths[FIRST_HYPOTHESIS]
     arcs = [(a, b) for a, b, _ in hybrid_map.all_arcs()]
     steps = tuple(PathStep(k, a, b, ((a, b),), frozenset({k})) for k, (a, b) in enumerate(arcs))
-    path = replace(path, arc_keyframes={pair: frozenset(pair) for pair in arcs}, history=PathHistory(steps, ()))
+    path = replace(path, arc_keyframes={pair: frozenset(pair) for pair in arcs}, history=steps)
     return RunState(
         _log_state(keyframes),
         replace(driven.slam, replica=replica, live_hypotheses=live, keyframe_events=len(keyframes)),
