@@ -97,10 +97,11 @@ def test_where_nothing_is_stored_it_goes_over_into_the_area_where_it_was_recogni
     for pose in poses[:-1]:
         run.keyframe(pose)
     run.keyframe(poses[-1], cut=3)
-    run.tsbi._hypothesis_states[0] = replace(run.tsbi._hypothesis_states[0], localization=Tracking(0))
+    found = replace(run.tsbi.state.hypothesis_states[0], localization=Tracking(0))
+    run.tsbi._state = replace(run.tsbi._state, hypothesis_states={0: found})
     (leaf,) = run.keyframe(poses[-1], mapping=mapping).hypotheses
     assert leaf.area == area
-    assert run.tsbi._hypothesis_states[0].localization.relocalized_area is None
+    assert run.tsbi.state.hypothesis_states[0].localization.relocalized_area is None
 
 
 def test_on_ground_that_nobody_knows_the_doubts_alone_speak_for_it():

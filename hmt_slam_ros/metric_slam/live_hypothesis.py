@@ -42,6 +42,8 @@ _NO_ERROR = MatchError(_INITIAL_COVARIANCE, _INITIAL_COVARIANCE, np.zeros((3, 3)
 class KeyframeCovariances:
     """Covariances by keyframe, in the order in which these came.
 
+    A hypothesis looks them up in a dictionary, of which this is the saved form: two arrays for thousands of keyframes.
+
     :ivar keyframes: shape (n,).
     :ivar covariances: shape (n, 3, 3), right tangent frame.
     """

@@ -110,6 +110,8 @@ _UNCONFIRMED = 100.0
 class BranchingState:
     """What is known of areas beside the maps of the hypotheses.
 
+    :class:`Branching` does not hold it, as its search reads the scans from a table that changes in place.
+
     :ivar largest_area: the largest number that an area was given.
     :ivar search: what was learnt by comparing areas.
     :ivar unstored_scans: {keyframe event: scan} of those that no map holds and that may be looked for.
