@@ -138,7 +138,7 @@ def _take(live: LiveHypothesis, motion: MotionModel, number: int, sighting: Prep
         motion.observe(tracked.increment, tracked.information, tracked.contradicts_odometry)
     if not number or live.is_event_due(sighting):
         live.process_keyframe(number, sighting, after_reset=number == 0)
-        motion.observe_keyframe(live.event_motion, live.match_information)
+        motion.observe_keyframe(live.event.motion, live.event.match_information)
 
 
 def errors_of(drives: Sequence[Drive], stride: int) -> Errors:

@@ -14,11 +14,10 @@ import numpy as np
 
 from benchmark.lattice import ARC, FIRST_KEYFRAME, PER_AREA, Lattice, scan_at, shared_scan
 from hmt_slam_ros.area_abstraction.overlap_graph import OverlapGraph
-from hmt_slam_ros.area_abstraction.partition import PartitionState
+from hmt_slam_ros.area_abstraction.partition import Partition
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.loop_closure.closure_history import PathStep
-from hmt_slam_ros.loop_closure.closure_revision import PathHistory
 from hmt_slam_ros.messages.messages import LocalEstimate, ScanPoses
 from hmt_slam_ros.messages.replica import FIRST_HYPOTHESIS, Replica
 from hmt_slam_ros.metric_slam.live_hypothesis import KeyframeCovariances
@@ -112,12 +111,12 @@ def state_of(lattice: Lattice, configuration: Configuration) -> RunState:
         for hypothesis, own in driven.processes["slam"].live_hypotheses.items()
     }
     graph = OverlapGraph(tuple(range(PER_AREA)), np.full((PER_AREA, PER_AREA), 0.5))
-    graphs = tuple(replace(graph, keyframes=tuple(hybrid_map.keyframes(a))) for a in hybrid_map.area_ids())
-    watch = PartitionState(0, {area: area for area in hybrid_map.area_ids()}, frozenset(keyframes[:PER_AREA]))
+    graphs = {a: replace(graph, keyframes=tuple(hybrid_map.keyframes(a))) for a in hybrid_map.area_ids()}
+    watch = Partition(0, {area: area for area in hybrid_map.area_ids()}, frozenset(keyframes[:PER_AREA]))
     path = driven.processes["tlca"].paths[FIRST_HYPOTHESIS]
     arcs = [(a, b) for a, b, _ in hybrid_map.all_arcs()]
     steps = tuple(PathStep(k, a, b, ((a, b),), frozenset({k})) for k, (a, b) in enumerate(arcs))
-    path = replace(path, arc_keyframes={pair: frozenset(pair) for pair in arcs}, history=PathHistory(steps, ()))
+    path = replace(path, arc_keyframes={pair: frozenset(pair) for pair in arcs}, history=steps)
     return RunState(
         _log_state(keyframes),
         {

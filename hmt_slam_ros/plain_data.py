@@ -2,6 +2,7 @@
 
 The form follows from the annotations: a dataclass or a named tuple is an object with exactly its fields, a tuple is a
 list, a set is a list in order, a mapping is a list of pairs in its own order. A float comes back with the same bits.
+Each dataclass of a union has a field ``kind`` with a word of its own, by which it is told from the others.
 """
 
 from __future__ import annotations
@@ -83,7 +84,7 @@ class PlainDataReader:
         if is_record(kind):
             return self._object(cast(type, kind))
         if origin in (Union, types.UnionType):
-            return self._optional(self._reader(field, arguments[0]))
+            return self._union(field, arguments)
         return self._literal(arguments) if origin is Literal else self._collection(origin, arguments)
 
     def _collection(self, origin: object, arguments: tuple[Any, ...]) -> Reader:
@@ -143,8 +144,27 @@ class PlainDataReader:
 
         return read
 
+    def _union(self, field: str, arguments: tuple[Any, ...]) -> Reader:
+        some = [argument for argument in arguments if argument is not type(None)]
+        found = self._reader(field, some[0]) if len(some) == 1 else self._tagged(some)
+        return found if len(some) == len(arguments) else self._optional(found)
+
     def _optional(self, some: Reader) -> Reader:
         return lambda content, path: None if content is None else some(content, path)
+
+    def _tagged(self, kinds: list[type]) -> Reader:
+        """Of one of some dataclasses, told apart by the words of their fields ``kind``."""
+        readers = {get_args(get_type_hints(kind)["kind"])[0]: self._reader("", kind) for kind in kinds}
+
+        def read(content: object, path: str) -> object:
+            if not isinstance(content, dict):
+                raise self.error_at(path, content, "an object")
+            kind = content.get("kind")
+            if not isinstance(kind, str) or kind not in readers:
+                raise self.error_at(f"{path}.kind", kind, " or ".join(readers))
+            return readers[kind](content, path)
+
+        return read
 
     def _literal(self, words: tuple[str, ...]) -> Reader:
         def read(content: object, path: str) -> object:

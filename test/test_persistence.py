@@ -8,7 +8,7 @@ import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 import pytest
@@ -31,6 +31,30 @@ class Place(NamedTuple):
     certain: bool
 
 
+@dataclass(frozen=True)
+class Pencil:
+    """A pencil.
+
+    :ivar length: m.
+    :ivar kind: tells it from a pen.
+    """
+
+    length: float
+    kind: Literal["pencil"] = "pencil"
+
+
+@dataclass(frozen=True)
+class Pen:
+    """A pen.
+
+    :ivar color: its name.
+    :ivar kind: tells it from a pencil.
+    """
+
+    color: str
+    kind: Literal["pen"] = "pen"
+
+
 @dataclass(frozen=True, eq=False)
 class Notebook:
     """All kinds of things.
@@ -41,6 +65,8 @@ class Notebook:
     :ivar flags: shape (n,).
     :ivar ranges: shape (n, 2).
     :ivar doubt: a number, or None.
+    :ivar tool: to write with.
+    :ivar spare: another, or None.
     """
 
     places: Mapping[str, Place]
@@ -49,6 +75,8 @@ class Notebook:
     flags: Bool
     ranges: Float32
     doubt: float | None
+    tool: Pencil | Pen
+    spare: Pencil | Pen | None
 
 
 def scan(stamp, first=1.0):
@@ -64,6 +92,8 @@ def notebook(**changes):
         "flags": np.array([True, False, True]),
         "ranges": np.asfortranarray(np.arange(4, dtype=np.float32).reshape(2, 2)),
         "doubt": None,
+        "tool": Pen("blue"),
+        "spare": None,
     }
     return Notebook(**content | changes)
 
@@ -97,6 +127,7 @@ def test_everything_comes_back_bit_for_bit_and_can_be_written_to(tmp_path):
     assert found.pairs == wanted.pairs
     assert list(found.pairs) == [(2, 1), (1, 2)]
     assert found.doubt is None
+    assert (found.tool, found.spare) == (Pen("blue"), None)
     for name in ("flags", "ranges"):
         np.testing.assert_array_equal(getattr(found, name), getattr(wanted, name))
         assert getattr(found, name).dtype == getattr(wanted, name).dtype
@@ -171,8 +202,16 @@ def test_what_else_a_manifest_can_be_has_its_sentence(tmp_path):
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
+        (
+            {"tool": Pen("blue", "ink")},
+            r"notes\.tool\.kind = ink is not pencil or pen: see docs/reference/map_format.md",
+        ),
+        ({"spare": 3}, r"notes\.spare = 3 is not an object: see docs/reference/map_format.md"),
         ({"doubt": "much"}, r"notes\.doubt = much is not a finite number: see docs/reference/map_format.md"),
-        ({"flags": np.zeros(2)}, r"notes\.flags = .*float64.* is not an array of bool: see docs/reference/map_format.md"),
+        (
+            {"flags": np.zeros(2)},
+            r"notes\.flags = .*float64.* is not an array of bool: see docs/reference/map_format.md",
+        ),
         ({"scans": (7,)}, r"notes\.scans\[0\] = 7 is no scan of the map"),
         ({"pairs": {(1,): frozenset()}}, r"notes\.pairs\[0\]\[0\] = \[1\] is not a list of 2"),
         ({"pairs": {(1, 2): frozenset({"x"})}}, r"notes\.pairs\[0\]\[1\]\[0\] = x is not a whole number"),
@@ -211,6 +250,8 @@ def test_the_description_tells_every_field_of_every_object():
     assert "| `scans` | list of name of a scan | some scans. |" in lines
     assert "| `doubt` | number, or null | a number, or None. |" in lines
     assert "| `pose` | array of float64 | shape (3,). |" in lines
+    assert "| `tool` | `Pencil` or `Pen` | to write with. |" in lines
+    assert "| `spare` | `Pencil` or `Pen`, or null | another, or None. |" in lines
 
 
 def test_one_folder_takes_the_place_of_another(tmp_path):

@@ -316,11 +316,13 @@ def test_a_room_that_was_taken_for_a_new_one_is_the_same_area_when_the_loop_is_c
     )
     process.handle(ClosureDecision(k, 0))
     # Its keyframes are the robot's own, and one graph holds them and the known ones.
-    watch = process._partitions[0]
+    watch = process.state.partitions[0]
     assert watch.area == 0
     assert watch.new_keyframes >= {*range(k - len(AGAIN) + 1, k)}
     assert watch.graphs.keys() == {0, 1}
-    assert set(watch.graphs[0].keyframes) == set(process._replica.maps[0].keyframes(0))
+    joined = {joint.graph for joint in watch.joined_graphs.values()}
+    assert process.state.graphs.keys() == joined.union(watch.graphs.values())
+    assert set(process.state.graphs[watch.graphs[0]].keyframes) == set(process._replica.maps[0].keyframes(0))
     (answer,) = process.handle(keyframe(k + 1, AGAIN[-1], estimate(0, 0, se2.between(THERE[0], AGAIN[-1]), False)))
     assert answer.events == ()
 

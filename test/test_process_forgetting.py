@@ -87,9 +87,9 @@ def test_what_is_forgotten_was_stored_before_and_is_gone_in_every_process(rounds
             *live.particle_filter.keyframes,
             *live.keyframe_covariances.to_dict(),
             *live.step_covariances.to_dict(),
-            live.anchor,
+            live.event.anchor,
         }
-    assert not gone & {keyframe for graph in state.processes["aam"].graphs for keyframe in graph.keyframes}
+    assert not gone & {keyframe for graph in state.processes["aam"].graphs.values() for keyframe in graph.keyframes}
 
 
 def test_every_scan_keeps_its_pose_relative_to_a_keyframe_that_is_there(rounds):
@@ -106,7 +106,7 @@ def test_every_scan_keeps_its_pose_relative_to_a_keyframe_that_is_there(rounds):
 
 
 def test_a_record_instead_of_messages_tells_the_same(rounds):
-    assert rounds.indices < 100 < len(rounds.run.recorder.keyframes)
+    assert rounds.kept < 100 < len(rounds.run.recorder.keyframes)
     folded = rounds.folding.finish(rounds.log_state.stamps)
     for name in ("trajectory", "online", "odometry"):
         np.testing.assert_array_equal(getattr(folded, name), getattr(rounds.recording, name))

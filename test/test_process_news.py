@@ -216,7 +216,7 @@ def test_every_process_leaves_the_same_beams_out_and_little_is_stored(visits):
 def test_a_run_that_goes_on_from_its_state_says_the_same(visits):
     _, folder, rest, said, _ = visits
     middle, _ = read_run_state(folder)
-    assert any(live.recent_scans for live in middle.processes["slam"].live_hypotheses.values())
+    assert any(live.event.recent_scans for live in middle.processes["slam"].live_hypotheses.values())
     again, _ = read(LockStepRun(LIFELONG, state=middle), rest)
     same = said[-len(again) :]
     assert [encode(KeyframeHeader.from_keyframe(one)) for one in again] == [

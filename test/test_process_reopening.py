@@ -41,13 +41,13 @@ def around(a, b):
 
 def corridor(areas):
     """Areas 0, 1, ... along a corridor, each with keyframes 10 a and 10 a + 1, joined by odometry; its history."""
-    hybrid_map, history = HybridMap(), None
+    hybrid_map, history = HybridMap(), ()
     for area in range(areas):
         hybrid_map.set_keyframe(10 * area, area, np.zeros(3))
         hybrid_map.set_keyframe(10 * area + 1, area, np.array([1.0, 0.0, 0.0]))
         if area:
             hybrid_map.set_arc(area - 1, area, PoseGaussian(NEXT, ODOMETRY), closure=False)
-            history = history, PathStep(10 * area, area - 1, area, ((area - 1, area),), frozenset({10 * area}))
+            history += (PathStep(10 * area, area - 1, area, ((area - 1, area),), frozenset({10 * area})),)
     return hybrid_map, history
 
 
@@ -71,7 +71,7 @@ def drive_with(*found, areas=8, area=7):
     closures = []
     for event, near, far, error in found:
         closures.append(closed(hybrid_map, event, near, far, error))
-        history = history, PathStep(event, near, near, (closures[-1].pair,))
+        history += (PathStep(event, near, near, (closures[-1].pair,)),)
     return account_of(hybrid_map, history, closures, area)
 
 
@@ -133,12 +133,11 @@ def joined():
     hybrid_map.set_keyframe(45, 1, np.array([0.5, 0.1, 0.0]))
     hybrid_map.set_keyframe(50, 4, np.zeros(3))
     hybrid_map.set_arc(1, 4, PoseGaussian(np.array([0.0, 3.0, 1.5]), ODOMETRY), closure=False)
-    for step in (
+    history += (
         PathStep(40, 3, 0, ((0, 3),), frozenset({39})),
         PathStep(43, 0, 1, ()),
         PathStep(50, 1, 4, ((1, 4),), frozenset({50})),
-    ):
-        history = history, step
+    )
     return account_of(hybrid_map, history, [closure], 4)
 
 
@@ -181,15 +180,14 @@ def test_what_was_stored_in_areas_that_were_entered_falsely_becomes_an_area_of_i
 
 def test_a_robot_that_is_in_an_area_falsely_is_then_in_the_new_one():
     before = joined()
-    earlier, _ = before.history
     hybrid_map = before.hybrid_map.branch()
     hybrid_map.remove_arc(1, 4)
     found = withdraw_closure(
-        replace(before, hybrid_map=hybrid_map, history=earlier, area=1), before.closures[0].closure_id, 9
+        replace(before, hybrid_map=hybrid_map, history=before.history[:-1], area=1), before.closures[0].closure_id, 9
     )
     assert found.area == 9
     np.testing.assert_allclose(found.frame_change, NEXT, atol=1e-12)
-    assert found.history[1].area_after == 9
+    assert found.history[-1].area_after == 9
 
 
 def test_a_link_that_the_robot_never_crossed_is_only_taken_out():
@@ -214,8 +212,7 @@ def test_what_a_refinement_moved_goes_back_and_what_was_stored_since_goes_with_i
     hybrid_map.set_keyframe(41, 3, se2.compose(bent, stored))
     hybrid_map.set_keyframe(45, 4, np.zeros(3))
     hybrid_map.set_arc(3, 4, PoseGaussian(se2.compose(bent, reached), ODOMETRY), closure=False)
-    history = history, PathStep(40, 3, 3, ((0, 3),))
-    history = history, PathStep(45, 3, 4, ((3, 4),), frozenset({45}))
+    history += (PathStep(40, 3, 3, ((0, 3),)), PathStep(45, 3, 4, ((3, 4),), frozenset({45})))
     account = account_of(hybrid_map, history, [replace(closure, snapshot=undo)], 4)
     found = undo_refinements(account, closure.closure_id)
     placed = found.hybrid_map.keyframes(3)
@@ -236,10 +233,7 @@ def test_an_area_that_became_part_of_another_is_that_one_in_the_account():
     history, closures = apply_area_merge(account, AreaMerge(6, 3, account.hybrid_map.arc(3, 6)))
     assert [(c.closure_id[0], c.near, c.far) for c in closures] == [(81, 7, 1), (82, 3, 0)]
     np.testing.assert_allclose(closures[1].pose.mean, around(3, 0), atol=1e-9)
-    steps = []
-    while history is not None:
-        history, step = history
-        steps.insert(0, (step.event, step.area_before, step.area_after, step.new_arcs))
+    steps = [(step.event, step.area_before, step.area_after, step.new_arcs) for step in history]
     assert steps[4:] == [
         (50, 4, 5, ((4, 5),)),
         (60, 5, 3, ((3, 5),)),

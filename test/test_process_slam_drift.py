@@ -93,7 +93,7 @@ def test_a_robot_that_enters_an_area_is_as_uncertain_in_it_as_the_newest_keyfram
     content = [PlacedKeyframe(k, 1, driven.scans[k], se2.compose(rebase.mean, poses[k])) for k in range(16)]
     live.change_area(leaf, content, ParticleFilters(live.filter.mapping))
     np.testing.assert_allclose(live.filter.pose, entry.mean, atol=1e-9)
-    np.testing.assert_allclose(live.pose_covariance, entry.covariance, atol=1e-6)
+    np.testing.assert_allclose(live.event.pose_covariance, entry.covariance, atol=1e-6)
     assert live.pose_belief().covariance[0, 0] >= 0.9 * sigma**2
 
 
@@ -101,9 +101,9 @@ def test_a_robot_that_goes_back_into_an_area_is_as_far_off_as_the_map_there_and_
     drive_ = Drive()
     drive_.along(THERE[1:])
     live, rebase = drive_.live, PoseGaussian(np.array([-1.0, 0.0, 0.0]), np.diag([0.4, 0.4, 0.0]) ** 2)
-    before = live.pose_covariance
+    before = live.event.pose_covariance
     leaf, poses = entered(live, (), rebase)
     content = [PlacedKeyframe(k, 1, drive_.scans[k], se2.compose(rebase.mean, poses[k])) for k in range(16)]
     live.change_area(leaf, content, ParticleFilters(live.filter.mapping))
-    assert live.pose_covariance[0, 0] == pytest.approx(before[0, 0] + 0.16, rel=0.2)
-    assert live.pose_covariance[1, 1] < 0.05
+    assert live.event.pose_covariance[0, 0] == pytest.approx(before[0, 0] + 0.16, rel=0.2)
+    assert live.event.pose_covariance[1, 1] < 0.05

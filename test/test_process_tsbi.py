@@ -171,7 +171,8 @@ def split_in_two(run, apart):
     split = Hypotheses(len(run.answers) - 1, (Hypothesis(1, 0, 0.6, 0), Hypothesis(2, 0, 0.4, 0)))
     for replica in (run.replica, run.tsbi._replica):
         replica.apply_hypotheses(split)
-    run.tsbi._hypothesis_states = dict.fromkeys((1, 2), run.tsbi._hypothesis_states[0])
+    states = dict.fromkeys((1, 2), run.tsbi.state.hypothesis_states[0])
+    run.tsbi._state = replace(run.tsbi._state, hypothesis_states=states)
     run.poses = {1: run.poses[0], 2: se2.compose(run.poses[0], apart)}
     run.covariances = {1: STEP, 2: STEP}
 

@@ -17,7 +17,7 @@ from hmt_slam_ros.messages.map_changes import InitialPose
 from hmt_slam_ros.messages.messages import AreaEvents, Keyframe, PrunedKeyframe
 from hmt_slam_ros.topological_inference import relocalization
 from hmt_slam_ros.topological_inference.global_localization import PoseDistribution
-from hmt_slam_ros.topological_inference.hypothesis_tree import FalseAlarm, HypothesisState, PoseInArea
+from hmt_slam_ros.topological_inference.hypothesis_tree import FalseAlarm, HypothesisState, Lost, PoseInArea, Tracking
 from hmt_slam_ros.topological_inference.kidnapping import decide_without_mapping, spawn_kidnapped_hypothesis
 from hmt_slam_ros.topological_inference.relocalization import KIDNAPPED_UNMAPPED_PRIOR
 from hmt_slam_ros.topological_inference.tsbi import Tsbi
@@ -47,11 +47,16 @@ def asked(rooms, doubts, first=FAR, hall=2):
     return spawn_kidnapped_hypothesis(branching, replace(parent, state=notes))
 
 
+def since(child):
+    """The keyframe since which the robot is lost; None where it is not."""
+    return child.state.localization.since if child.state.is_lost else None
+
+
 def test_the_keyframes_since_then_begin_an_area_of_which_nothing_tells_where_it_is():
     stays, lost = asked((ROOM, OTHER, ROOM), {2: 8.0}).children
     assert (stays.area, stays.log_weight, stays.moved_keyframes) == (2, 0.0, ())
     assert lost.area == 3
-    assert lost.state.lost_since == 14
+    assert lost.state.localization.since == 14
     (arc,) = lost.arcs
     assert (arc.source, arc.target) == (2, 3)
     assert is_uninformative(arc.pose)
@@ -66,22 +71,22 @@ def test_the_keyframes_since_then_begin_an_area_of_which_nothing_tells_where_it_
 def test_that_the_place_is_known_elsewhere_speaks_for_it_and_one_look_has_found_it():
     _, lost = asked((ROOM, OTHER, ROOM), {2: 8.0}).children
     assert lost.log_weight > PRIOR + 8.0 + 1.0
-    assert lost.state.counted_evidence == pytest.approx(lost.log_weight - PRIOR - 8.0)
-    assert lost.state.relocalization_candidate.area == 0
-    np.testing.assert_allclose(lost.state.relocalization_candidate.pose, se2.between(PATH[0], PATH[5]), atol=0.05)
+    assert lost.state.localization.counted_evidence == pytest.approx(lost.log_weight - PRIOR - 8.0)
+    assert lost.state.localization.candidate.area == 0
+    np.testing.assert_allclose(lost.state.localization.candidate.pose, se2.between(PATH[0], PATH[5]), atol=0.05)
 
 
 def test_it_is_believed_to_be_where_two_looks_find_it():
     parent, branching, newest = rooms_apart((ROOM, OTHER, ROOM), [FAR, FAR], 0.1)
-    notes = replace(
-        parent.state, lost_since=newest[0], tracked_pose=PoseInArea(2, newest[0], np.zeros(3)), counted_evidence=None
-    )
+    lost = Lost(newest[0], tracked_pose=PoseInArea(2, newest[0], np.zeros(3)), counted_evidence=None)
+    notes = replace(parent.state, localization=lost)
     (still,) = relocalization.update_relocalization(branching, replace(parent, state=notes)).children
-    assert still.state.relocalization_candidate.area == 0
+    assert still.state.localization.candidate.area == 0
     looked = relocalization.update_relocalization(branching, replace(parent, state=still.state))
     _, found = looked.children
     assert relocalization.accept_relocalization(looked).children == [found]
-    assert (found.state.lost_since, found.state.tracked_pose, found.state.relocalized_area) == (None, None, 0)
+    assert isinstance(found.state.localization, Tracking)
+    assert found.state.localization.relocalized_area == 0
     assert (found.arcs[0].source, found.arcs[0].target) == (2, 0)
 
 
@@ -92,16 +97,17 @@ def test_where_nothing_is_stored_it_goes_over_into_the_area_where_it_was_recogni
     for pose in poses[:-1]:
         run.keyframe(pose)
     run.keyframe(poses[-1], cut=3)
-    run.tsbi._hypothesis_states[0] = replace(run.tsbi._hypothesis_states[0], relocalized_area=0)
+    found = replace(run.tsbi.state.hypothesis_states[0], localization=Tracking(0))
+    run.tsbi._state = replace(run.tsbi._state, hypothesis_states={0: found})
     (leaf,) = run.keyframe(poses[-1], mapping=mapping).hypotheses
     assert leaf.area == area
-    assert run.tsbi._hypothesis_states[0].relocalized_area is None
+    assert run.tsbi.state.hypothesis_states[0].localization.relocalized_area is None
 
 
 def test_on_ground_that_nobody_knows_the_doubts_alone_speak_for_it():
     _, lost = asked((OTHER, OTHER, ROOM), {2: 8.0}).children
     assert lost.log_weight == pytest.approx(PRIOR + 8.0 + math.log(KIDNAPPED_UNMAPPED_PRIOR), abs=0.5)
-    assert lost.state.relocalization_candidate is None
+    assert lost.state.localization.candidate is None
 
 
 def test_that_the_place_is_known_where_the_robot_would_be_anyway_speaks_against_it():
@@ -130,11 +136,11 @@ def test_where_nothing_is_stored_it_is_lost_from_the_next_keyframe_on_if_that_is
     doubtful = replace(parent, state=replace(parent.state, kidnapping_evidence={17: nats}, unstored_poses={17: spot}))
     branching.keep_scans(17, scan_in(OTHER, PATH[3], field_of_view=2 * np.pi, beams=361), {17})
     child = decide_without_mapping(branching, doubtful, 17)
-    assert child.state.lost_since == lost
+    assert since(child) == lost
     assert bool(child.state.kidnapping_evidence) == (lost is None)
     if lost is not None:
-        assert child.state.false_alarm.tracked_pose is spot
-        assert child.state.false_alarm.probability == pytest.approx(1.0 / (1.0 + math.exp(PRIOR + nats)))
+        assert child.state.localization.false_alarm.tracked_pose is spot
+        assert child.state.localization.false_alarm.probability == pytest.approx(1.0 / (1.0 + math.exp(PRIOR + nats)))
 
 
 @pytest.mark.parametrize(
@@ -151,7 +157,7 @@ def test_where_nothing_is_stored_it_is_lost_if_it_is_rather_in_another_place(wor
         notes = notes.after_scan(event, 6.0, PoseInArea(1, event, claimed))
         branching.keep_scans(event, scan, notes.unstored_poses)
     child = decide_without_mapping(branching, replace(parent, state=notes), 15)
-    assert child.state.lost_since == lost
+    assert since(child) == lost
     assert not child.state.kidnapping_evidence
     assert not child.state.unstored_poses
 
@@ -159,20 +165,21 @@ def test_where_nothing_is_stored_it_is_lost_if_it_is_rather_in_another_place(wor
 @pytest.mark.parametrize(("lost", "stays"), [(11, True), (9, False)], ids=["takes itself for lost", "was carried"])
 def test_where_it_would_be_if_it_had_not_been_displaced_is_where_odometry_has_it_when_it_is_lost(lost, stays):
     parent, branching, _ = rooms_apart((ROOM, OTHER), [FAR], 0.1)
-    notes = replace(parent.state, lost_since=lost, false_alarm=FalseAlarm(PoseInArea(1, 10, PATH[2]), 0.4))
+    alarm = FalseAlarm(PoseInArea(1, 10, PATH[2]), 0.4)
+    notes = replace(parent.state, localization=Lost(lost, alarm))
     scan = scan_in(ROOM, PATH[3], field_of_view=2 * np.pi, beams=361)
     keyframe = Keyframe(11, scan, 1.0, (), motion_unknown=True, mapping=False)
     (child,) = relocalization.begin_relocalization(branching, replace(parent, state=notes), keyframe, PATH[3]).children
-    assert child.state.lost_since == 11
+    assert since(child) == 11
     if not stays:
-        assert child.state.false_alarm is None
+        assert child.state.localization.false_alarm is None
         return
     assert (
-        child.state.false_alarm.tracked_pose.area,
-        child.state.false_alarm.tracked_pose.keyframe,
-        child.state.false_alarm.probability,
+        child.state.localization.false_alarm.tracked_pose.area,
+        child.state.localization.false_alarm.tracked_pose.keyframe,
+        child.state.localization.false_alarm.probability,
     ) == (1, 11, 0.4)
-    np.testing.assert_array_equal(child.state.false_alarm.tracked_pose.pose, PATH[3])
+    np.testing.assert_array_equal(child.state.localization.false_alarm.tracked_pose.pose, PATH[3])
 
 
 @pytest.mark.parametrize(("at", "found"), [(0.0, True), (3.0, False)], ids=["there", "elsewhere"])
@@ -181,7 +188,7 @@ def test_a_place_is_believed_sooner_where_it_would_be_if_it_had_not_been_displac
     looked = {}
     for probability in (0.0, 0.4):
         stay = FalseAlarm(PoseInArea(0, newest[0], np.array([at, 0.0, 0.0])), probability)
-        notes = replace(parent.state, lost_since=newest[0], false_alarm=stay)
+        notes = replace(parent.state, localization=Lost(newest[0], stay))
         where = relocalization.update_relocalization(branching, replace(parent, state=notes)).pose_distribution
         looked[probability] = max(
             p for p, fit in zip(where.probabilities, where.candidates, strict=True) if fit.area == 0
@@ -191,14 +198,14 @@ def test_a_place_is_believed_sooner_where_it_would_be_if_it_had_not_been_displac
 
 def test_who_says_where_it_is_knows_better_than_where_it_would_be_if_it_had_not_been_displaced():
     parent, branching, newest = rooms_apart((ROOM, OTHER, ROOM), [FAR, FAR], 0.1)
-    notes = replace(
-        parent.state, lost_since=newest[0], false_alarm=FalseAlarm(PoseInArea(1, newest[0], np.zeros(3)), 0.4)
-    )
+    alarm = FalseAlarm(PoseInArea(1, newest[0], np.zeros(3)), 0.4)
+    notes = replace(parent.state, localization=Lost(newest[0], alarm))
     told = InitialPose(0, PoseGaussian(se2.between(PATH[0], PATH[5]), np.diag([0.3, 0.3, 0.2]) ** 2))
     pose = parent.hybrid_map.keyframes(2)[newest[-1]]
     keyframe = Keyframe(newest[-1], branching._replica.scans[newest[-1]], 1.0, (), initial_pose=told, mapping=False)
     looked = relocalization.begin_relocalization(branching, replace(parent, state=notes), keyframe, pose)
-    assert all(child.state.false_alarm is None for child in looked.children)
+    lost = [child.state.localization for child in looked.children if child.state.is_lost]
+    assert [one.false_alarm for one in lost] == [None]
 
 
 def test_a_robot_that_may_have_stayed_where_much_was_moved_is_nowhere_rather_than_in_a_like_place():

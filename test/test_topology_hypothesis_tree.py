@@ -11,6 +11,8 @@ from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.random_streams import Purpose, random_stream
 from hmt_slam_ros.topological_inference.hypothesis_tree import (
     HypothesisState,
+    Lost,
+    Tracking,
     normalize_and_reduce,
     relative_covariance,
 )
@@ -81,6 +83,14 @@ def test_entering_an_area_keeps_the_notes_of_the_keyframes_that_came_along():
     assert entered.matched_keyframes == {9: {5}}
     assert entered.covariances.keys() == {5}
     assert entered.unmatched_keyframes == ()
+
+
+def test_entering_an_area_a_lost_robot_stays_lost_and_a_tracked_one_is_no_more_where_it_was_recognized():
+    lost = Lost(7, counted_evidence=2.0)
+    assert HypothesisState(localization=lost).after_area_change({}).localization is lost
+    entered = HypothesisState(localization=Tracking(3)).after_area_change({})
+    assert not entered.is_lost
+    assert entered.localization.relocalized_area is None
 
 
 def test_areas_beside_which_keyframes_fitted_are_remembered_until_the_next_comparison():

@@ -5,6 +5,7 @@ A hypothesis is one topological path, so "once for every group of particles with
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -13,17 +14,10 @@ from numpy.typing import NDArray
 from hmt_slam_ros.area_abstraction.doors import DoorTracker, OpeningDetector
 from hmt_slam_ros.area_abstraction.overlap import SensedSpace, overlaps, sensed_overlaps
 from hmt_slam_ros.area_abstraction.overlap_graph import OverlapGraph, Separation, min_ncut, synchronize_graph
-from hmt_slam_ros.area_abstraction.partition import (
-    AamState,
-    AreaPolicy,
-    JoinedGraph,
-    Partition,
-    partition_from_state,
-    partition_to_state,
-)
+from hmt_slam_ros.area_abstraction.partition import AamState, AreaPolicy, JoinedGraph, Partition
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.hybrid_map.common_map import AreaPair, KeyframePoses
+from hmt_slam_ros.hybrid_map.common_map import AreaPair, KeyframePoses, area_pair
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.hybrid_map.keyframe_pruning import is_same_viewpoint, redundant_keyframes
 from hmt_slam_ros.hybrid_map.shortest_path import informative_arc
@@ -38,7 +32,7 @@ from hmt_slam_ros.messages.messages import (
     Keyframe,
     Message,
 )
-from hmt_slam_ros.messages.replica import Replica
+from hmt_slam_ros.messages.replica import Replica, ReplicaState
 from hmt_slam_ros.sensors import Scan
 
 # An area's overlap with a scan is that of the best few keyframes among those taken nearest to it.
@@ -82,49 +76,55 @@ class Aam:
         self._policy = AreaPolicy(configuration, detector)
         self._replica = Replica.from_state(state.replica)
         self._sensed_spaces: dict[int, SensedSpace] = {}
-        self._partitions = {
-            hypothesis: partition_from_state(own, state.graphs) for hypothesis, own in state.partitions.items()
-        }
-        self._merge_queue = set(state.merge_queue)
-        self._prune_queue = set(state.prune_queue)
+        # All but the replica, which changes in place.
+        self._state = replace(state, replica=ReplicaState())
 
     @property
     def state(self) -> AamState:
         """All that the AAM knows, as a value."""
-        known = self._partitions.values()
-        graphs = {id(graph): graph for watch in known for graph in watch.graphs.values()}
-        graphs |= {id(joint.graph): joint.graph for watch in known for joint in watch.joined_graphs.values()}
-        numbers = {name: number for number, name in enumerate(graphs)}
-        watches = {hypothesis: partition_to_state(watch, numbers) for hypothesis, watch in self._partitions.items()}
-        asked, left = frozenset(self._merge_queue), frozenset(self._prune_queue)
-        return AamState(self._replica.state, tuple(graphs.values()), watches, asked, left)
+        return replace(self._state, replica=self._replica.state)
 
     def handle(self, message: Message) -> list[Message]:
         """Answer a ``Keyframe`` with its ``AreaEvents``; learn from ``Hypotheses`` and ``ClosureDecision``."""
+        answers: list[Message] = []
         if isinstance(message, Keyframe):
-            return [self._examine(message)]
-        if isinstance(message, Hypotheses):
-            self._replica.apply_hypotheses(message)
-            self._partitions = {leaf.id: self._update_partition(leaf) for leaf in message.hypotheses}
-            self._remove_keyframes({one.keyframe for one in message.pruned_keyframes})
-            for late in message.stale_beams:
-                self._sensed_spaces.pop(late.keyframe, None)
+            answers = [self._examine(message)]
+        elif isinstance(message, Hypotheses):
+            self._apply_hypotheses(message)
         elif isinstance(message, ClosureDecision) and message.hypothesis is not None:
-            self._replica.apply_decision(message)
-            self._partitions = {message.hypothesis: self._partitions[message.hypothesis]}
-            if message.moved_keyframes:
-                self._interrupt_door_tracker(message.hypothesis)
-            self._merge_queue |= {(min(arc.source, arc.target), max(arc.source, arc.target)) for arc in message.arcs}
-            if message.revised_hypotheses:
-                self._merge_queue = set()
-                self._partitions = {one: replace(watch, joined_graphs={}) for one, watch in self._partitions.items()}
-        return []
+            self._apply_decision(message, message.hypothesis)
+        self._state = self._state.without_unused_graphs()
+        return answers
+
+    def _apply_hypotheses(self, hypotheses: Hypotheses) -> None:
+        self._replica.apply_hypotheses(hypotheses)
+        partitions = {leaf.id: self._update_partition(leaf) for leaf in hypotheses.hypotheses}
+        self._state = replace(self._state, partitions=partitions)
+        pruned = {one.keyframe for one in hypotheses.pruned_keyframes}
+        if pruned:
+            self._state = self._state.without_keyframes(pruned)
+        for keyframe in pruned | {late.keyframe for late in hypotheses.stale_beams}:
+            self._sensed_spaces.pop(keyframe, None)
+
+    def _apply_decision(self, decision: ClosureDecision, hypothesis: int) -> None:
+        """Go on with the hypothesis that is definite now."""
+        self._replica.apply_decision(decision)
+        partition = self._state.partitions[hypothesis]
+        if decision.moved_keyframes:
+            # With the keyframes the robot moved.
+            partition = replace(partition, door_tracker=partition.door_tracker.break_path())
+        merge_queue = self._state.merge_queue | {area_pair(arc.source, arc.target) for arc in decision.arcs}
+        if decision.revised_hypotheses:
+            merge_queue, partition = frozenset(), replace(partition, joined_graphs={})
+        self._state = replace(self._state, partitions={hypothesis: partition}, merge_queue=merge_queue)
 
     def _examine(self, keyframe: Keyframe) -> AreaEvents:
         self._replica.add_keyframe(keyframe)
         self._sensed_spaces[keyframe.sequence] = self._sense(keyframe.scan)
-        known = [leaf for leaf in keyframe.estimates if leaf.hypothesis in self._partitions]
-        self._partitions |= self._policy.track_doors(keyframe, known, self._replica, self._partitions)
+        partitions = self._state.partitions
+        known = [leaf for leaf in keyframe.estimates if leaf.hypothesis in partitions]
+        tracked = self._policy.track_doors(keyframe, known, self._replica, partitions)
+        self._state = replace(self._state, partitions={**partitions, **tracked})
         events = [
             self._find_cut(leaf, keyframe.sequence)
             or (self._find_merge(leaf.hypothesis) if keyframe.mapping else None)
@@ -133,7 +133,7 @@ class Aam:
         ]
         if not any(leaf.stored for leaf in known):
             del self._sensed_spaces[keyframe.sequence]
-        may_forget = keyframe.mapping and len(self._partitions) == 1
+        may_forget = keyframe.mapping and len(partitions) == 1
         forgotten = self._keyframes_to_prune(known[0], events[0], keyframe.sequence) if may_forget else ()
         return AreaEvents(keyframe.sequence, tuple(event for event in events if event is not None), forgotten)
 
@@ -151,7 +151,7 @@ class Aam:
         Metric SLAM did, as it does not hold areas whose place is uncertain. Without that an area grew into the next one
         with every pass, by as many keyframes as it takes to notice the move.
         """
-        watch, hybrid_map = self._partitions[hypothesis], self._replica.maps[hypothesis]
+        watch, hybrid_map = self._state.partitions[hypothesis], self._replica.maps[hypothesis]
         arc, known = hybrid_map.arc(entered, watch.area), np.array(list(self._keyframes(hypothesis, entered).values()))
         placed = self._keyframes(hypothesis, watch.area)
         if arc is None or not known.size:
@@ -165,29 +165,19 @@ class Aam:
 
     def _redundant_after_leaving(self, hypothesis: int, newest: int) -> tuple[PrunedKeyframe, ...]:
         """The superfluous keyframes of an area that the robot left."""
-        if not self._prune_queue:
+        if not self._state.prune_queue:
             return ()
-        area = min(self._prune_queue)
-        self._prune_queue.discard(area)
+        area = min(self._state.prune_queue)
+        self._state = replace(self._state, prune_queue=self._state.prune_queue - {area})
         if not self._replica.maps[hypothesis].has_area(area):
             return ()
         placed = self._keyframes(hypothesis, area)
         kept = {
             *list(placed)[:1],
             *(k for k in placed if k > newest - _RECENT),
-            *self._partitions[hypothesis].new_keyframes,
+            *self._state.partitions[hypothesis].new_keyframes,
         }
         return tuple(PrunedKeyframe(k, area) for k in redundant_keyframes(placed, kept, _MAX_IN_PLACE, self._filter))
-
-    def _remove_keyframes(self, keyframes: set[int]) -> None:
-        """Go on without what the maps do not hold any more."""
-        if not keyframes:
-            return
-        for keyframe in keyframes:
-            self._sensed_spaces.pop(keyframe, None)
-        for hypothesis, watch in self._partitions.items():
-            held = {area: graph.without_keyframes(keyframes) for area, graph in watch.graphs.items()}
-            self._partitions[hypothesis] = replace(watch, graphs=held, new_keyframes=watch.new_keyframes - keyframes)
 
     def _sense(self, scan: Scan) -> SensedSpace:
         return SensedSpace.from_scan(scan, self._max_range, self._options.overlap_points)
@@ -202,17 +192,17 @@ class Aam:
         """The event that the newest keyframes leave the robot's area, when that has lasted."""
         if not leaf.stored:
             return None
-        watch = self._partitions[leaf.hypothesis]
+        watch = self._state.partitions[leaf.hypothesis]
         graph = self._graph(watch, leaf.hypothesis, watch.area)
         own = watch.new_keyframes | {newest}
         found = self._policy.find_separation(graph, own, newest, watch.door_tracker)
         watch = replace(
             watch,
-            graphs=watch.graphs | {watch.area: graph},
+            graphs=self._with_graph(watch.graphs, watch.area, graph),
             new_keyframes=own,
             separation_count=watch.separation_count + 1 if found else 0,
         )
-        self._partitions[leaf.hypothesis] = watch
+        self._state = self._state.with_partition(leaf.hypothesis, watch)
         return self._cut_event(leaf.hypothesis, watch, found)
 
     def _cut_event(self, hypothesis: int, partition: Partition, found: Separation | None) -> AreaEvent | None:
@@ -223,36 +213,37 @@ class Aam:
     def _find_merge(self, hypothesis: int) -> AreaEvent | None:
         """The event that two areas are one, where there is no other hypothesis."""
         hybrid_map = self._replica.maps[hypothesis]
-        while self._merge_queue and len(self._partitions) == 1:
-            into, area = pair = min(self._merge_queue)
-            self._merge_queue.discard(pair)
+        while self._state.merge_queue and len(self._state.partitions) == 1:
+            into, area = pair = min(self._state.merge_queue)
+            self._state = replace(self._state, merge_queue=self._state.merge_queue - {pair})
             arc = hybrid_map.arc_value(into, area)
             if arc is None or not arc.closure:
                 continue
             joint = self._joined_graph(hypothesis, pair, arc.pose.mean)
-            least = (
-                self._policy.min_ncut(joint)
-                if pair in self._partitions[hypothesis].pairs_split_by_door
-                else joint.min_ncut
-            )
+            least = joint.min_ncut
+            if pair in self._state.partitions[hypothesis].pairs_split_by_door:
+                least = self._policy.min_ncut(self._state.graph(joint.graph), joint.second_keyframes)
             if least > self._options.ncut_threshold:
                 return AreaEvent(hypothesis, "merged", (), area, least, into)
         return None
 
     def _joined_graph(self, hypothesis: int, pair: AreaPair, arc: NDArray[np.float64]) -> JoinedGraph:
         """Two areas as one, whose arc is ``arc``; from what was found before, measuring only what is new."""
-        watch, (into, area) = self._partitions[hypothesis], pair
+        watch, (into, area) = self._state.partitions[hypothesis], pair
         other, before = self._keyframes(hypothesis, area), watch.joined_graphs.get(pair)
         placed = dict(self._keyframes(hypothesis, into))
         placed |= {keyframe: se2.compose(arc, pose) for keyframe, pose in other.items()}
-        known = [watch.graphs.get(one, OverlapGraph()) for one in pair]
+        known = [self._state.graph(watch.graphs.get(one)) for one in pair]
         if before is not None and before.max_displacement(arc, other) < _REMEASURE_SHARE * self._options.overlap_radius:
-            if before.second_keyframes == other.keys() and set(before.graph.keyframes) == placed.keys():
+            graph_before = self._state.graph(before.graph)
+            if before.second_keyframes == other.keys() and set(graph_before.keyframes) == placed.keys():
                 return before
-            arc, known = before.arc, [before.graph, *known]
+            arc, known = before.arc, [graph_before, *known]
         graph = self._synchronize_graph(placed, *known)
-        joint = JoinedGraph(arc, graph, frozenset(other), min_ncut(graph, other, self._options.min_cluster))
-        self._partitions[hypothesis] = replace(watch, joined_graphs=watch.joined_graphs | {pair: joint})
+        least = min_ncut(graph, other, self._options.min_cluster)
+        joint = JoinedGraph(arc, self._add_graph(graph), frozenset(other), least)
+        watch = replace(watch, joined_graphs={**watch.joined_graphs, pair: joint})
+        self._state = self._state.with_partition(hypothesis, watch)
         return joint
 
     def _find_move(self, leaf: HypothesisEstimate, newest: int) -> AreaEvent | None:
@@ -261,7 +252,7 @@ class Aam:
         The margin by which the other area has to overlap more keeps the robot from going back and forth at a border.
         Keyframes that the robot stored in the area it leaves stay there.
         """
-        watch = self._partitions[leaf.hypothesis]
+        watch = self._state.partitions[leaf.hypothesis]
         shares = self._area_overlaps(leaf, newest)
         best = max(shares, key=lambda area: (shares[area], -area))
         inside = best == watch.area or shares[best] < shares[watch.area] + self._options.move_margin
@@ -270,7 +261,8 @@ class Aam:
             if watch.overlap_candidate is None or watch.overlap_candidate[0] != best
             else watch.overlap_candidate[1] + 1
         )
-        self._partitions[leaf.hypothesis] = replace(watch, overlap_candidate=None if inside else (best, times))
+        watch = replace(watch, overlap_candidate=None if inside else (best, times))
+        self._state = self._state.with_partition(leaf.hypothesis, watch)
         if inside or times < self._options.confirmations:
             return None
         return AreaEvent(leaf.hypothesis, "moved", (), best, shares[best])
@@ -304,24 +296,27 @@ class Aam:
 
     def _update_partition(self, leaf: Hypothesis) -> Partition:
         """The watch over a hypothesis after TSBI's answer."""
-        watch = self._partitions[leaf.parent]
+        watch = self._state.partitions[leaf.parent]
         if leaf.area_merge is not None:
             return self._merge_in_partition(watch, leaf, leaf.area_merge)
         if leaf.area == watch.area:
             return replace(watch, door_tracker=watch.door_tracker.break_path()) if leaf.removed_arcs else watch
         moved = frozenset(r.keyframe for r in leaf.moved_keyframes if r.area == leaf.area)
         entered = self._graph(watch, leaf.id, leaf.area)
-        left = watch.graphs.get(watch.area, OverlapGraph()).subgraph(self._keyframes(leaf.id, watch.area))
+        left = self._state.graph(watch.graphs.get(watch.area)).subgraph(self._keyframes(leaf.id, watch.area))
         beside = self._replica.maps[leaf.id].neighbors(watch.area)
-        self._merge_queue |= {(min(watch.area, other), max(watch.area, other)) for other in beside}
-        self._prune_queue.add(watch.area)
-        graphs = watch.graphs | {watch.area: left, leaf.area: entered}
+        self._state = replace(
+            self._state,
+            merge_queue=self._state.merge_queue | {area_pair(watch.area, other) for other in beside},
+            prune_queue=self._state.prune_queue | {watch.area},
+        )
+        graphs = self._with_graph(self._with_graph(watch.graphs, watch.area, left), leaf.area, entered)
         way, parted = (
             DoorTracker() if leaf.frame_change is None else watch.door_tracker.transform(leaf.frame_change.mean),
             watch.pairs_split_by_door,
         )
         if moved and watch.door_tracker.segment_labels(moved)[max(moved)] != 0:
-            parted |= {(min(watch.area, leaf.area), max(watch.area, leaf.area))}
+            parted |= {area_pair(watch.area, leaf.area)}
         way = way.keep_crossings_after(min(moved, default=None))
         return Partition(
             leaf.area, graphs, moved, joined_graphs=watch.joined_graphs, door_tracker=way, pairs_split_by_door=parted
@@ -329,10 +324,11 @@ class Aam:
 
     def _merge_in_partition(self, partition: Partition, leaf: Hypothesis, merged: AreaMerge) -> Partition:
         """The watch with one area for two; what was the robot's own in one of them still is."""
-        self._merge_queue = {pair for pair in self._merge_queue if merged.area not in pair}
-        graphs = {area: graph for area, graph in partition.graphs.items() if area != merged.area}
-        one, other = (partition.graphs.get(area, OverlapGraph()) for area in (merged.into, merged.area))
-        graphs[merged.into] = self._synchronize_graph(self._keyframes(leaf.id, merged.into), one, other)
+        merge_queue = frozenset(pair for pair in self._state.merge_queue if merged.area not in pair)
+        self._state = replace(self._state, merge_queue=merge_queue)
+        graphs = {area: number for area, number in partition.graphs.items() if area != merged.area}
+        one, other = (self._state.graph(partition.graphs.get(area)) for area in (merged.into, merged.area))
+        whole = self._synchronize_graph(self._keyframes(leaf.id, merged.into), one, other)
         joints = {pair: joint for pair, joint in partition.joined_graphs.items() if merged.area not in pair}
         way = (
             partition.door_tracker
@@ -346,21 +342,28 @@ class Aam:
         return replace(
             partition,
             area=leaf.area,
-            graphs=graphs,
+            graphs=self._with_graph(graphs, merged.into, whole),
             overlap_candidate=None,
             joined_graphs=joints,
             door_tracker=way,
             pairs_split_by_door=parted,
         )
 
-    def _interrupt_door_tracker(self, hypothesis: int) -> None:
-        """Keyframes of a hypothesis moved, and the robot with them."""
-        watch = self._partitions[hypothesis]
-        self._partitions[hypothesis] = replace(watch, door_tracker=watch.door_tracker.break_path())
+    def _with_graph(self, graphs: Mapping[int, int], area: int, graph: OverlapGraph) -> dict[int, int]:
+        """{area: number of its overlap graph} where that of one area is this."""
+        if area in graphs and self._state.graphs[graphs[area]] is graph:
+            return dict(graphs)
+        return {**graphs, area: self._add_graph(graph)}
+
+    def _add_graph(self, graph: OverlapGraph) -> int:
+        """The number under which a graph is held now."""
+        number = max(self._state.graphs, default=-1) + 1
+        self._state = replace(self._state, graphs={**self._state.graphs, number: graph})
+        return number
 
     def _graph(self, partition: Partition, hypothesis: int, area: int) -> OverlapGraph:
         """The overlap graph of an area as it is now, from what the watch knows."""
-        known = [partition.graphs.get(one, OverlapGraph()) for one in (area, partition.area)]
+        known = [self._state.graph(partition.graphs.get(one)) for one in (area, partition.area)]
         return self._synchronize_graph(self._keyframes(hypothesis, area), *known)
 
     def _keyframes(self, hypothesis: int, area: int) -> KeyframePoses:

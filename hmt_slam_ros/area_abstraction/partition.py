@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,52 +25,8 @@ from hmt_slam_ros.messages.messages import HypothesisEstimate, Keyframe
 from hmt_slam_ros.messages.replica import FIRST_AREA, FIRST_HYPOTHESIS, Replica, ReplicaState
 
 
-class JoinedGraph(NamedTuple):
-    """Two areas that a closure joins, as one.
-
-    :ivar arc: ``a_T_b``, shape (3,), by which overlaps between the two were measured.
-    :ivar graph: of the keyframes of both.
-    :ivar second_keyframes: keyframes of area b.
-    :ivar min_ncut: least normalized cut of the graph.
-    """
-
-    arc: NDArray[np.float64]
-    graph: OverlapGraph
-    second_keyframes: frozenset[int]
-    min_ncut: float
-
-    def max_displacement(self, arc: NDArray[np.float64], placed: KeyframePoses) -> float:
-        """How far at most another arc has the keyframes of area b, {keyframe: pose in b}, from where they were, m."""
-        points = np.array([pose[:2] for pose in placed.values()]).reshape(-1, 2)
-        return float(np.hypot(*(se2.transform(arc, points) - se2.transform(self.arc, points)).T).max(initial=0.0))
-
-
-@dataclass(frozen=True)
-class Partition:
-    """What the AAM remembers of one hypothesis; a value, so that the children of a hypothesis inherit it.
-
-    :ivar area: the robot's area.
-    :ivar graphs: {area: overlap graph of its keyframes} of the areas that the robot was in.
-    :ivar new_keyframes: keyframes stored since the robot entered ``area``, and those that came over with it.
-    :ivar separation_count: at how many of the latest evaluations in a row the newest keyframes separated.
-    :ivar overlap_candidate: the known area that the robot seems to be in, and for how many keyframes in a row.
-    :ivar joined_graphs: {pair of areas: what was found when it was last asked whether they are one}.
-    :ivar door_tracker: the openings that the robot passes, where the policy asks for them.
-    :ivar pairs_split_by_door: areas, the smaller first, between which the path went through an opening, likewise.
-    """
-
-    area: int
-    graphs: dict[int, OverlapGraph] = field(default_factory=dict)
-    new_keyframes: frozenset[int] = frozenset()
-    separation_count: int = 0
-    overlap_candidate: tuple[int, int] | None = None
-    joined_graphs: dict[AreaPair, JoinedGraph] = field(default_factory=dict)
-    door_tracker: DoorTracker = field(default_factory=DoorTracker)
-    pairs_split_by_door: frozenset[AreaPair] = frozenset()
-
-
 @dataclass(frozen=True, eq=False)
-class JoinedGraphState:
+class JoinedGraph:
     """Two areas a and b that a closure joins, as one.
 
     :ivar arc: ``a_T_b``, shape (3,), by which overlaps between the two were measured, m and rad.
@@ -85,13 +40,19 @@ class JoinedGraphState:
     second_keyframes: frozenset[int]
     min_ncut: float
 
+    def max_displacement(self, arc: NDArray[np.float64], placed: KeyframePoses) -> float:
+        """How far at most another arc has the keyframes of area b, {keyframe: pose in b}, from where they were, m."""
+        points = np.array([pose[:2] for pose in placed.values()]).reshape(-1, 2)
+        return float(np.hypot(*(se2.transform(arc, points) - se2.transform(self.arc, points)).T).max(initial=0.0))
+
 
 @dataclass(frozen=True, eq=False)
-class PartitionState:
-    """What the AAM remembers of one hypothesis.
+class Partition:
+    """What the AAM remembers of one hypothesis; a value, so that the children of a hypothesis inherit it.
 
     :ivar area: the robot's area.
-    :ivar graphs: {area: number of the overlap graph of its keyframes in ``AamState.graphs``}.
+    :ivar graphs: {area: number of the overlap graph of its keyframes in ``AamState.graphs``} of the areas that the
+        robot was in.
     :ivar new_keyframes: keyframes stored since the robot entered ``area``, and those that came over with it.
     :ivar separation_count: at how many of the latest evaluations in a row the newest keyframes separated.
     :ivar overlap_candidate: the known area that the robot seems to be in, and for how many keyframes in a row.
@@ -105,7 +66,7 @@ class PartitionState:
     new_keyframes: frozenset[int] = frozenset()
     separation_count: int = 0
     overlap_candidate: tuple[int, int] | None = None
-    joined_graphs: Mapping[AreaPair, JoinedGraphState] = field(default_factory=dict)
+    joined_graphs: Mapping[AreaPair, JoinedGraph] = field(default_factory=dict)
     door_tracker: DoorTracker = field(default_factory=DoorTracker)
     pairs_split_by_door: frozenset[AreaPair] = frozenset()
 
@@ -115,57 +76,50 @@ class AamState:
     """The AAM between two keyframe events, at first before the first one.
 
     :ivar replica: the maps of the live hypotheses.
-    :ivar graphs: overlap graphs; hypotheses share them.
+    :ivar graphs: {number: overlap graph}; hypotheses share them.
     :ivar partitions: {hypothesis: what is remembered of it}.
     :ivar merge_queue: areas, the smaller first, of which is still to be asked whether they are one.
     :ivar prune_queue: areas that the robot left, of which is still to be asked whether they hold too much.
     """
 
     replica: ReplicaState = field(default_factory=ReplicaState)
-    graphs: tuple[OverlapGraph, ...] = ()
-    partitions: Mapping[int, PartitionState] = field(
-        default_factory=lambda: {FIRST_HYPOTHESIS: PartitionState(FIRST_AREA)}
-    )
+    graphs: Mapping[int, OverlapGraph] = field(default_factory=dict)
+    partitions: Mapping[int, Partition] = field(default_factory=lambda: {FIRST_HYPOTHESIS: Partition(FIRST_AREA)})
     merge_queue: frozenset[AreaPair] = frozenset()
     prune_queue: frozenset[int] = frozenset()
 
+    def with_partition(self, hypothesis: int, partition: Partition) -> AamState:
+        """The state with something else remembered of a hypothesis."""
+        return replace(self, partitions={**self.partitions, hypothesis: partition})
 
-def partition_to_state(partition: Partition, numbers: Mapping[int, int]) -> PartitionState:
-    """A watch as a value, where its graphs have numbers by their identities."""
-    joints = {
-        pair: JoinedGraphState(joint.arc, numbers[id(joint.graph)], joint.second_keyframes, joint.min_ncut)
-        for pair, joint in partition.joined_graphs.items()
-    }
-    graphs = {area: numbers[id(graph)] for area, graph in partition.graphs.items()}
-    return PartitionState(
-        partition.area,
-        graphs,
-        partition.new_keyframes,
-        partition.separation_count,
-        partition.overlap_candidate,
-        joints,
-        partition.door_tracker,
-        partition.pairs_split_by_door,
-    )
+    def graph(self, number: int | None) -> OverlapGraph:
+        """The graph of a number, without keyframes for None."""
+        return OverlapGraph() if number is None else self.graphs[number]
 
+    def without_unused_graphs(self) -> AamState:
+        """The state without the graphs of which no hypothesis knows any more."""
+        known = self.partitions.values()
+        used = {number for partition in known for number in partition.graphs.values()}
+        used |= {joined.graph for partition in known for joined in partition.joined_graphs.values()}
+        if used == self.graphs.keys():
+            return self
+        return replace(self, graphs={number: graph for number, graph in self.graphs.items() if number in used})
 
-def partition_from_state(state: PartitionState, graphs: Sequence[OverlapGraph]) -> Partition:
-    """The watch of a value, whose graphs have numbers in ``graphs``."""
-    joints = {
-        pair: JoinedGraph(joint.arc, graphs[joint.graph], joint.second_keyframes, joint.min_ncut)
-        for pair, joint in state.joined_graphs.items()
-    }
-    own = {area: graphs[number] for area, number in state.graphs.items()}
-    return Partition(
-        state.area,
-        own,
-        state.new_keyframes,
-        state.separation_count,
-        state.overlap_candidate,
-        joints,
-        state.door_tracker,
-        state.pairs_split_by_door,
-    )
+    def without_keyframes(self, keyframes: Collection[int]) -> AamState:
+        """The state without keyframes that the maps do not hold any more; areas as one are left as they are."""
+        known = self.partitions.values()
+        changed = {number for partition in known for number in partition.graphs.values()}
+        return replace(
+            self,
+            graphs={
+                number: graph.without_keyframes(keyframes) if number in changed else graph
+                for number, graph in self.graphs.items()
+            },
+            partitions={
+                hypothesis: replace(partition, new_keyframes=partition.new_keyframes.difference(keyframes))
+                for hypothesis, partition in self.partitions.items()
+            },
+        )
 
 
 # Keyframes in whose map an opening around the robot is looked for.
@@ -240,7 +194,11 @@ class AreaPolicy:
             graph = graph.weaken_across_doors(door_tracker.segment_labels(new_keyframes), self._door_factor)
         return find_separation(graph, new_keyframes, newest, self._options.ncut_threshold, self._options.min_cluster)
 
-    def min_ncut(self, joined: JoinedGraph) -> float:
-        """The least NCut of two areas as one between which the path went through an opening."""
-        graph = joined.graph.weaken_across_doors(dict.fromkeys(joined.second_keyframes, 1), self._door_factor)
-        return min_ncut(graph, joined.second_keyframes, self._options.min_cluster)
+    def min_ncut(self, graph: OverlapGraph, second_keyframes: Collection[int]) -> float:
+        """The least NCut of two areas as one between which the path went through an opening.
+
+        :param graph: of the keyframes of both.
+        :param second_keyframes: of one of them.
+        """
+        weakened = graph.weaken_across_doors(dict.fromkeys(second_keyframes, 1), self._door_factor)
+        return min_ncut(weakened, second_keyframes, self._options.min_cluster)

@@ -116,7 +116,9 @@ def _add_storage(command: argparse.ArgumentParser) -> None:
 
 
 def _add_simulate_arguments(command: argparse.ArgumentParser) -> None:
-    command.add_argument("world", metavar="WORLD", help="family of buildings or .yaml file, see docs/guides/simulation.md")
+    command.add_argument(
+        "world", metavar="WORLD", help="family of buildings or .yaml file, see docs/guides/simulation.md"
+    )
     command.add_argument("--out", type=Path, required=True, metavar="BAG", help="rosbag2 folder to make")
     command.add_argument("--seed", type=int, metavar="N", help="seed of building, noise, people and furniture")
     command.add_argument(

@@ -23,6 +23,11 @@ _NONE = -1
 _FIRST_ROOM = 16
 
 
+def area_pair(a: int, b: int) -> AreaPair:
+    """The arc between two areas, whatever its direction."""
+    return min(a, b), max(a, b)
+
+
 @dataclass(frozen=True, eq=False, slots=True)
 class ArcValue:
     """What the map stores of an arc.

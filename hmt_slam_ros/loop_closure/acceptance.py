@@ -12,11 +12,11 @@ import numpy as np
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.hybrid_map.common_map import ArcValue, AreaPair
+from hmt_slam_ros.hybrid_map.common_map import ArcValue, AreaPair, area_pair
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap, apply_sigma_floor, fuse_traversals
 from hmt_slam_ros.hybrid_map.shortest_path import is_uninformative
 from hmt_slam_ros.loop_closure.area_alignment import AreaAlignment
-from hmt_slam_ros.loop_closure.closure_history import Closure, MapSnapshot, area_pair
+from hmt_slam_ros.loop_closure.closure_history import Closure, MapSnapshot
 from hmt_slam_ros.loop_closure.closure_refinement import ClosureRefinement
 from hmt_slam_ros.messages.map_changes import Arc, MovedKeyframe
 from hmt_slam_ros.messages.messages import Hypothesis
@@ -112,7 +112,7 @@ class Acceptance:
         hybrid_map: HybridMap,
         scans: KeyframeScans,
         pending_arcs: Iterable[PendingArc],
-        arc_keyframes: ArcKeyframes,
+        arc_keyframes: Mapping[AreaPair, frozenset[int]],
         closed_areas: Collection[int],
     ) -> AcceptanceResult:
         """What becomes of a path that is accepted, changing its map.
@@ -125,16 +125,16 @@ class Acceptance:
         arcs: dict[AreaPair, Arc] = {}
         relabelled: list[MovedKeyframe] = []
         before: dict[AreaPair, ArcValue] = {}
-        arc_keyframes = dict(arc_keyframes)
+        observed = dict(arc_keyframes)
         for seen in pending_arcs:
             aligned, moved = self._align(hybrid_map, scans, seen)
             relabelled += moved
             old = arcs.get(seen.pair, seen.replaced_arc)
-            arcs[seen.pair] = self._fuse_arc(aligned, old, arc_keyframes.get(seen.pair, frozenset()))
-            arc_keyframes[seen.pair] = arc_keyframes.get(seen.pair, frozenset()) | seen.observing_keyframes
+            arcs[seen.pair] = self._fuse_arc(aligned, old, observed.get(seen.pair, frozenset()))
+            observed[seen.pair] = observed.get(seen.pair, frozenset()) | seen.observing_keyframes
         if closed_areas:
             relabelled, before = self._refine_closed_areas(hybrid_map, scans, closed_areas, arcs, relabelled)
-        return AcceptanceResult(arcs, relabelled, arc_keyframes, before)
+        return AcceptanceResult(arcs, relabelled, observed, before)
 
     def _refine_closed_areas(
         self,

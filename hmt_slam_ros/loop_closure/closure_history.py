@@ -11,7 +11,8 @@ that begin in it begin there.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping
+from bisect import bisect_left
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -19,7 +20,7 @@ from numpy.typing import NDArray
 
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.hybrid_map.common_map import ArcValue, AreaPair
+from hmt_slam_ros.hybrid_map.common_map import ArcValue, AreaPair, area_pair
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.hybrid_map.shortest_path import shortest_path_beliefs
 from hmt_slam_ros.messages.map_changes import AreaMerge
@@ -114,11 +115,6 @@ class MapRollback:
 ClosureId = tuple[int, AreaPair]
 
 
-def area_pair(a: int, b: int) -> AreaPair:
-    """The arc between two areas, whatever its direction."""
-    return min(a, b), max(a, b)
-
-
 @dataclass(frozen=True, eq=False)
 class PathStep:
     """A keyframe event at which the robot changed its area or arcs were new.
@@ -135,10 +131,6 @@ class PathStep:
     area_after: int
     new_arcs: tuple[AreaPair, ...]
     joined_keyframes: frozenset[int] = frozenset()
-
-
-StepHistory = tuple["StepHistory", PathStep] | None
-"""The steps of a path, the last one outside: children share what their parent went through."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,6 +166,7 @@ class Closure:
 class AcceptedPath:
     """A definite path.
 
+    :ivar history: the keyframe events at which the robot changed its area or arcs were new, in order.
     :ivar area: the robot's area.
     :ivar pose: shape (3,), ``area_T_base``.
     :ivar frame_change: ``area_T_former``, shape (3,), where something was withdrawn that changed the robot's area or
@@ -181,7 +174,7 @@ class AcceptedPath:
     """
 
     hybrid_map: HybridMap
-    history: StepHistory
+    history: tuple[PathStep, ...]
     closures: tuple[Closure, ...]
     area: int
     pose: Pose
@@ -277,11 +270,9 @@ def withdraw_closure(path: AcceptedPath, closure_id: ClosureId, new_area: int) -
         hybrid_map.set_arc(closure.near, own, closure.pose, closure=False)
     for pair, area in layer.arcs.items():
         _reattach_arc(hybrid_map, pair, area, own, frames[area])
-    history = earlier
-    for step, before, after in layer.visited_steps:
-        history = history, _reassign_step(step, before, after, layer, own)
+    steps = tuple(_reassign_step(step, before, after, layer, own) for step, before, after in layer.visited_steps)
     closures = tuple(_remaining_closures(hybrid_map, path.closures, layer, own, frames))
-    found = replace(path, hybrid_map=hybrid_map, history=history, closures=closures)
+    found = replace(path, hybrid_map=hybrid_map, history=earlier + steps, closures=closures)
     return found.with_robot_in(own, frames[path.area]) if layer.is_inside else found
 
 
@@ -325,26 +316,10 @@ def map_as_measured(path: AcceptedPath) -> HybridMap:
     return hybrid_map
 
 
-def list_steps(history: StepHistory) -> tuple[PathStep, ...]:
-    """The steps of a history, in their order."""
-    return tuple(split_history(history, 0)[1])
-
-
-def chain_steps(steps: Iterable[PathStep]) -> StepHistory:
-    """The history of some steps, in their order."""
-    history: StepHistory = None
-    for step in steps:
-        history = history, step
-    return history
-
-
-def split_history(history: StepHistory, event: int) -> tuple[StepHistory, list[PathStep]]:
-    """The history before an event, and the steps from it on."""
-    steps = []
-    while history is not None and history[1].event >= event:
-        history, step = history
-        steps.append(step)
-    return history, steps[::-1]
+def split_history(history: tuple[PathStep, ...], event: int) -> tuple[tuple[PathStep, ...], tuple[PathStep, ...]]:
+    """The steps before an event, and those from it on."""
+    begin = bisect_left(history, event, key=lambda step: step.event)
+    return history[:begin], history[begin:]
 
 
 def _reattach_arc(hybrid_map: HybridMap, pair: AreaPair, area: int, own: int, own_T_area: Pose) -> None:
@@ -396,7 +371,7 @@ def _remaining_closures(
     return kept
 
 
-def apply_area_merge(path: AcceptedPath, areas: AreaMerge) -> tuple[StepHistory, tuple[Closure, ...]]:
+def apply_area_merge(path: AcceptedPath, areas: AreaMerge) -> tuple[tuple[PathStep, ...], tuple[Closure, ...]]:
     """History and closures of an account where an area becomes part of another.
 
     That is final. The closure of the two is no more, and one beside which another observation of its arc is fused now
@@ -407,7 +382,7 @@ def apply_area_merge(path: AcceptedPath, areas: AreaMerge) -> tuple[StepHistory,
     hybrid_map = path.hybrid_map
     beside = {*hybrid_map.neighbors(areas.area)} & {*hybrid_map.neighbors(areas.into)}
     fused = {area_pair(areas.into, other) for other in beside}
-    history = chain_steps(_relabel_step(step, areas) for step in list_steps(path.history))
+    history = tuple(_relabel_step(step, areas) for step in path.history)
     found = (_relabel_closure(closure, areas).without_arcs(fused) for closure in path.closures)
     return history, tuple(closure for closure in found if closure.near != closure.far and closure.pair not in fused)
 

@@ -13,7 +13,7 @@ What was accepted after a false closure was judged by a false map; of these, all
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -28,7 +28,6 @@ from hmt_slam_ros.loop_closure.closure_history import (
     Closure,
     ClosureId,
     PathStep,
-    list_steps,
     map_as_measured,
     undo_refinements,
     withdraw_closure,
@@ -192,14 +191,12 @@ class ClosureRevision:
         """:param state: to go on from."""
         self._max_excess = chi_square_gate(options.contradiction_probability)
         self._min_probability = 1.0 - options.accept_probability
-        self._max_area_id = state.max_area_id
-        self._requested_at = state.requested_at
-        self._histories = dict(state.histories)
+        self._state = state
 
     @property
     def state(self) -> ClosureRevisionState:
         """All that is known."""
-        return ClosureRevisionState(self._max_area_id, self._requested_at, dict(self._histories))
+        return self._state
 
     def check(
         self, event: int, path: AcceptedPath, new: Collection[ClosureId], hypothesis: int
@@ -209,17 +206,17 @@ class ClosureRevision:
         :param new: these closures.
         :param hypothesis: the hypothesis of the account.
         """
-        doubt = ClosureConsistencyCheck(path, self._max_excess, self._max_area_id + 1).find_inconsistency(
+        doubt = ClosureConsistencyCheck(path, self._max_excess, self._state.max_area_id + 1).find_inconsistency(
             new, self._min_probability
         )
         if doubt is None:
             return None
         leaves = tuple(_as_hypothesis(explanation, hypothesis, path.hybrid_map) for explanation in doubt.explanations)
-        self._requested_at = event
-        self._histories = {
-            _explanation_key(leaf): PathHistory(list_steps(explanation.path.history), explanation.path.closures)
+        histories = {
+            _explanation_key(leaf): PathHistory(explanation.path.history, explanation.path.closures)
             for leaf, explanation in zip(leaves, doubt.explanations, strict=True)
         }
+        self._state = replace(self._state, requested_at=event, histories=histories)
         for leaf in leaves:
             self._note_areas(leaf)
         return RevisionRequest(leaves, Notice("tlca", _notice_text(doubt, self._max_excess)))
@@ -227,11 +224,12 @@ class ClosureRevision:
     def resolve(self, leaf: Hypothesis, event: int) -> PathHistory | None:
         """Learn of a leaf; where it answers the question of the event before, the past of a path with that answer."""
         self._note_areas(leaf)
-        return self._histories[_explanation_key(leaf)] if event == self._requested_at + 1 and self._histories else None
+        asked = self._state.histories if event == self._state.requested_at + 1 else {}
+        return asked[_explanation_key(leaf)] if asked else None
 
     def _note_areas(self, leaf: Hypothesis) -> None:
         areas = [area for arc in leaf.arcs for area in (arc.source, arc.target)]
-        self._max_area_id = max(self._max_area_id, leaf.area, *areas)
+        self._state = replace(self._state, max_area_id=max(self._state.max_area_id, leaf.area, *areas))
 
 
 def _as_hypothesis(explanation: Explanation, hypothesis: int, hybrid_map: HybridMap) -> Hypothesis:

@@ -21,16 +21,12 @@ from hmt_slam_ros.loop_closure.closure_history import (
     ClosureId,
     MapSnapshot,
     PathStep,
-    StepHistory,
     apply_area_merge,
-    chain_steps,
-    list_steps,
     merge_arc_keyframes,
 )
 from hmt_slam_ros.loop_closure.closure_revision import (
     ClosureRevision,
     ClosureRevisionState,
-    PathHistory,
     RevisionRequest,
 )
 from hmt_slam_ros.loop_closure.pose_ambiguity import FrameKey, PoseAmbiguity
@@ -43,7 +39,7 @@ _MIN_FALSE_PROBABILITY = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
-class _TopologicalPath:
+class TopologicalPath:
     """What TLCA remembers of one hypothesis; a value, so that children inherit it.
 
     :ivar version: number of the last change of its areas and arcs, of all hypotheses.
@@ -52,7 +48,7 @@ class _TopologicalPath:
     :ivar is_definite: whether nothing happened since it was accepted.
     :ivar pending_arcs: arcs that wait for acceptance, in order.
     :ivar arc_keyframes: {arc: the keyframes by which it was observed}, of the definite arcs.
-    :ivar history: where the robot was.
+    :ivar history: the keyframe events at which the robot changed its area or arcs were new, in order.
     :ivar closures: those that were accepted, in order.
     """
 
@@ -61,58 +57,9 @@ class _TopologicalPath:
     dominant_keyframes: int = 0
     is_definite: bool = False
     pending_arcs: tuple[PendingArc, ...] = ()
-    arc_keyframes: dict[AreaPair, frozenset[int]] = field(default_factory=dict)
-    history: StepHistory = None
+    arc_keyframes: Mapping[AreaPair, frozenset[int]] = field(default_factory=dict)
+    history: tuple[PathStep, ...] = ()
     closures: tuple[Closure, ...] = ()
-
-
-@dataclass(frozen=True, eq=False)
-class TopologicalPathState:
-    """What TLCA remembers of one hypothesis.
-
-    :ivar version: number of the last change of its areas and arcs, of all hypotheses.
-    :ivar branched_at: path length at which it parted from others, m.
-    :ivar dominant_keyframes: at how many of the latest keyframes in a row it dominated since then.
-    :ivar is_definite: whether nothing happened since it was accepted.
-    :ivar pending_arcs: arcs that wait for acceptance, in order.
-    :ivar arc_keyframes: {arc: the keyframes by which it was observed}, of the definite arcs.
-    :ivar history: where the robot was, and the closures that were accepted.
-    """
-
-    version: int
-    branched_at: float
-    dominant_keyframes: int
-    is_definite: bool
-    pending_arcs: tuple[PendingArc, ...]
-    arc_keyframes: Mapping[AreaPair, frozenset[int]]
-    history: PathHistory
-
-    @classmethod
-    def from_path(cls, path: _TopologicalPath) -> TopologicalPathState:
-        """Of a path."""
-        past = PathHistory(list_steps(path.history), path.closures)
-        return cls(
-            path.version,
-            path.branched_at,
-            path.dominant_keyframes,
-            path.is_definite,
-            path.pending_arcs,
-            path.arc_keyframes,
-            past,
-        )
-
-    def to_path(self) -> _TopologicalPath:
-        """The path."""
-        return _TopologicalPath(
-            self.version,
-            self.branched_at,
-            self.dominant_keyframes,
-            self.is_definite,
-            self.pending_arcs,
-            dict(self.arc_keyframes),
-            chain_steps(self.history.steps),
-            self.history.closures,
-        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,9 +79,7 @@ class TlcaState:
     """
 
     replica: ReplicaState = field(default_factory=ReplicaState)
-    paths: Mapping[int, TopologicalPathState] = field(
-        default_factory=lambda: {FIRST_HYPOTHESIS: TopologicalPathState.from_path(_TopologicalPath())}
-    )
+    paths: Mapping[int, TopologicalPath] = field(default_factory=lambda: {FIRST_HYPOTHESIS: TopologicalPath()})
     path_length: float = 0.0
     poses: Mapping[int, NDArray[np.float64]] = field(default_factory=lambda: {FIRST_HYPOTHESIS: np.zeros(3)})
     change_count: int = 0
@@ -159,14 +104,11 @@ class Tlca:
         self._options = configuration.tlca
         self._acceptance = Acceptance(configuration)
         self._replica = Replica.from_state(state.replica)
-        self._paths = {hypothesis: path.to_path() for hypothesis, path in state.paths.items()}
-        self._path_length = state.path_length
-        self._poses = dict(state.poses)
-        self._change_count, self._published_change = state.change_count, state.published_change
         self._gate = chi_square_gate(configuration.tsbi.gate_probability)
-        self._reported_arcs = set(state.reported_arcs)
         self._closure_revision = ClosureRevision(self._options, state.closure_revision)
         self._ambiguity = PoseAmbiguity(state.area_frames)
+        # All but the three parts above, which change in place.
+        self._state = replace(state, replica=ReplicaState(), closure_revision=ClosureRevisionState(), area_frames={})
         # The stated risk: beyond it, TSBI's probabilities are not taken at their word.
         self._min_false_probability = max(1.0 - self._options.accept_probability, _MIN_FALSE_PROBABILITY)
         self._new_closures: frozenset[ClosureId] = frozenset()
@@ -175,24 +117,20 @@ class Tlca:
     @property
     def state(self) -> TlcaState:
         """All that TLCA knows between two keyframe events, as a value."""
-        return TlcaState(
-            self._replica.state,
-            {hypothesis: TopologicalPathState.from_path(path) for hypothesis, path in self._paths.items()},
-            self._path_length,
-            dict(self._poses),
-            self._change_count,
-            self._published_change,
-            frozenset(self._reported_arcs),
-            self._closure_revision.state,
-            dict(self._ambiguity.area_frames),
+        return replace(
+            self._state,
+            replica=self._replica.state,
+            closure_revision=self._closure_revision.state,
+            area_frames=self._ambiguity.area_frames,
         )
 
     def handle(self, message: Message) -> list[Message]:
         """Learn from a ``Keyframe``; answer ``Hypotheses``."""
         if isinstance(message, Keyframe):
             self._replica.add_keyframe(message)
-            self._path_length, self._is_mapping = message.path_length, message.mapping
-            self._poses |= {leaf.hypothesis: leaf.pose.mean for leaf in message.estimates}
+            self._is_mapping = message.mapping
+            poses = {**self._state.poses, **{leaf.hypothesis: leaf.pose.mean for leaf in message.estimates}}
+            self._state = replace(self._state, path_length=message.path_length, poses=poses)
         elif isinstance(message, Hypotheses):
             return self._decide(message)
         return []
@@ -203,46 +141,45 @@ class Tlca:
 
     def _decide(self, hypotheses: Hypotheses) -> list[Message]:
         paths = {leaf.id: self._updated_path(leaf, hypotheses.sequence) for leaf in hypotheses.hypotheses}
-        self._poses = {leaf.id: _rebase_pose(self._poses[leaf.parent], leaf) for leaf in hypotheses.hypotheses}
+        poses = {leaf.id: _rebase_pose(self._state.poses[leaf.parent], leaf) for leaf in hypotheses.hypotheses}
         self._replica.apply_hypotheses(hypotheses)
-        self._paths, self._new_closures = paths, frozenset()
+        self._state, self._new_closures = replace(self._state, paths=paths, poses=poses), frozenset()
         chosen = self._dominant_hypothesis()
         arcs, relabelled = ((), ()) if chosen is None else self._accept_path(chosen)
         accepted = ClosureDecision(hypotheses.sequence, chosen, arcs, relabelled)
         self._replica.apply_decision(accepted)
-        self._paths = {hypothesis: self._paths[hypothesis] for hypothesis in self._replica.maps}
-        versions = {hypothesis: path.version for hypothesis, path in self._paths.items()}
-        accepted = replace(accepted, ambiguity=self._ambiguity.second_moment(self._replica, self._poses, versions))
+        paths = {hypothesis: self._state.paths[hypothesis] for hypothesis in self._replica.maps}
+        self._state = replace(self._state, paths=paths)
+        versions = {hypothesis: path.version for hypothesis, path in paths.items()}
+        accepted = replace(accepted, ambiguity=self._ambiguity.second_moment(self._replica, poses, versions))
         question = None if chosen is None else self._revision_request(chosen, hypotheses.sequence)
         if question is not None:
             # No pose is told: the map is not bent to what does not fit.
             return [question.notice, replace(accepted, revised_hypotheses=question.hypotheses)]
-        poses, notices = self._global_poses()
-        return [*notices, replace(accepted, global_poses=poses)]
+        global_poses, notices = self._global_poses()
+        return [*notices, replace(accepted, global_poses=global_poses)]
 
     def _revision_request(self, hypothesis: int, event: int) -> RevisionRequest | None:
         """The contradiction that the closures bring that have just been accepted, if any."""
-        path, area = self._paths[hypothesis], self._replica.robot_areas[hypothesis]
-        account = AcceptedPath(
-            self._replica.maps[hypothesis], path.history, path.closures, area, self._poses[hypothesis]
-        )
+        path, area = self._state.paths[hypothesis], self._replica.robot_areas[hypothesis]
+        pose = self._state.poses[hypothesis]
+        account = AcceptedPath(self._replica.maps[hypothesis], path.history, path.closures, area, pose)
         return self._closure_revision.check(event, account, self._new_closures, hypothesis)
 
-    def _updated_path(self, leaf: Hypothesis, sequence: int) -> _TopologicalPath:
+    def _updated_path(self, leaf: Hypothesis, sequence: int) -> TopologicalPath:
         """The path after TSBI's answer, which is not applied yet: the arcs that it replaces are still there."""
-        path, before = self._paths[leaf.parent], self._replica.robot_areas[leaf.parent]
+        path, before = self._state.paths[leaf.parent], self._replica.robot_areas[leaf.parent]
         if leaf.id != leaf.parent:
-            path = replace(path, branched_at=self._path_length, dominant_keyframes=0)
+            path = replace(path, branched_at=self._state.path_length, dominant_keyframes=0)
         dominates = leaf.probability >= self._options.accept_probability
         path = replace(path, dominant_keyframes=path.dominant_keyframes + 1 if dominates else 0)
         if leaf.arcs or leaf.moved_keyframes or leaf.removed_arcs or leaf.area_merge:
-            self._change_count += 1
-            path = replace(path, version=self._change_count, is_definite=False)
+            path = replace(path, version=self._count_change(), is_definite=False)
         elif leaf.frame_change:
             path = replace(path, is_definite=False)
         past = self._closure_revision.resolve(leaf, sequence)
         if past is not None:
-            return replace(path, is_definite=False, history=chain_steps(past.steps), closures=past.closures)
+            return replace(path, is_definite=False, history=past.steps, closures=past.closures)
         parent = self._replica.maps[leaf.parent]
         if leaf.area_merge is not None:
             history, closures = apply_area_merge(
@@ -254,34 +191,32 @@ class Tlca:
         new = tuple(seen.pair for seen in observations if seen.replaced_arc is None)
         if new or leaf.area != before:
             joined = frozenset(r.keyframe for r in leaf.moved_keyframes if r.area == leaf.area)
-            path = replace(path, history=(path.history, PathStep(sequence, before, leaf.area, new, joined)))
+            path = replace(path, history=(*path.history, PathStep(sequence, before, leaf.area, new, joined)))
         return replace(path, pending_arcs=path.pending_arcs + observations)
 
     def _dominant_hypothesis(self) -> int | None:
         """The hypothesis that becomes definite now, if any."""
         best = self._replica.best_hypothesis
-        path = self._paths[best]
-        if len(self._paths) == 1:
+        path = self._state.paths[best]
+        if len(self._state.paths) == 1:
             return None if path.is_definite else best
         held = path.dominant_keyframes >= self._options.accept_keyframes
-        return best if held and self._path_length - path.branched_at >= self._options.accept_distance else None
+        return best if held and self._state.path_length - path.branched_at >= self._options.accept_distance else None
 
     def _accept_path(self, hypothesis: int) -> tuple[tuple[Arc, ...], tuple[MovedKeyframe, ...]]:
         """Align and fuse what the accepted path observed, changing its map."""
-        path, hybrid_map = self._paths[hypothesis], self._replica.maps[hypothesis]
+        path, hybrid_map = self._state.paths[hypothesis], self._replica.maps[hypothesis]
         found = [seen.pair for seen in path.pending_arcs if seen.closure]
         found += [closure.pair for closure in path.closures if closure.snapshot is None]
         # What is refined moves, which is a change of the map.
         closed = {area for pair in found for area in pair} if self._is_mapping else set()
         poses = {k: (area, pose) for area in sorted(closed) for k, pose in hybrid_map.keyframes(area).items()}
         made = self._acceptance.accept(hybrid_map, self._replica.scans, path.pending_arcs, path.arc_keyframes, closed)
-        if made.arcs:
-            self._change_count += 1
-        version = self._change_count if made.arcs else path.version
+        version = self._count_change() if made.arcs else path.version
         closures = self._accepted_closures(
             path, self._replica.probabilities[hypothesis], MapSnapshot(poses, made.arcs_before)
         )
-        self._paths[hypothesis] = replace(
+        accepted = replace(
             path,
             version=version,
             is_definite=True,
@@ -289,9 +224,15 @@ class Tlca:
             arc_keyframes=made.arc_keyframes,
             closures=closures,
         )
+        self._state = replace(self._state, paths={**self._state.paths, hypothesis: accepted})
         return tuple(made.arcs.values()), tuple(made.moved_keyframes)
 
-    def _accepted_closures(self, path: _TopologicalPath, probability: float, undo: MapSnapshot) -> tuple[Closure, ...]:
+    def _count_change(self) -> int:
+        """The number of a change of areas or arcs."""
+        self._state = replace(self._state, change_count=self._state.change_count + 1)
+        return self._state.change_count
+
+    def _accepted_closures(self, path: TopologicalPath, probability: float, undo: MapSnapshot) -> tuple[Closure, ...]:
         """Those of a path that is now accepted; what was observed again since is not to be undone."""
         again = {seen.pair for seen in path.pending_arcs if seen.replaced_arc is not None}
         closures = {
@@ -307,20 +248,21 @@ class Tlca:
     def _global_poses(self) -> tuple[tuple[AreaPose, ...], list[Message]]:
         """The poses of all areas under the most probable hypothesis, where they changed; arcs that refuse to fit."""
         best = self._replica.best_hypothesis
-        version = self._paths[best].version
-        if version == self._published_change:
+        path = self._state.paths[best]
+        if path.version == self._state.published_change:
             return (), []
-        self._published_change = version
+        self._state = replace(self._state, published_change=path.version)
         hybrid_map = self._replica.maps[best]
         consistent = self._options.global_map == "consistent"
         found = consistent_map(hybrid_map) if consistent else shortest_path_map(hybrid_map)
-        notices = self._misfit_notices(found.arc_chi2) if self._paths[best].is_definite else []
+        notices = self._misfit_notices(found.arc_chi2) if path.is_definite else []
         return tuple(AreaPose(area, pose) for area, pose in found.poses.items()), notices
 
     def _misfit_notices(self, arc_chi2: dict[AreaPair, float]) -> list[Message]:
         """A notice of every definite arc that does not fit the others, once: a sign of a closure that was false."""
-        wrong = [pair for pair, value in arc_chi2.items() if value > self._gate and pair not in self._reported_arcs]
-        self._reported_arcs.update(wrong)
+        known = self._state.reported_arcs
+        wrong = [pair for pair, value in arc_chi2.items() if value > self._gate and pair not in known]
+        self._state = replace(self._state, reported_arcs=known.union(wrong))
         return [
             Notice(
                 "tlca",

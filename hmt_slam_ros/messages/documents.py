@@ -224,9 +224,13 @@ def decode_with_reset(text: str, kind: type[Document]) -> tuple[Document, int]:
     try:
         content = json.loads(text)
     except ValueError as error:
-        raise HmtSlamError(f"a {name} document is no JSON ({error}): see docs/reference/messages.md for its form") from error
+        raise HmtSlamError(
+            f"a {name} document is no JSON ({error}): see docs/reference/messages.md for its form"
+        ) from error
     if not isinstance(content, dict) or content.pop("document", None) != name:
-        raise HmtSlamError(f"a document that is no {name} came on its topic: see docs/reference/messages.md for its form")
+        raise HmtSlamError(
+            f"a document that is no {name} came on its topic: see docs/reference/messages.md for its form"
+        )
     if (found := content.pop("version", None)) != version:
         raise HmtSlamError(
             f"a {name} document has version {found}, not {version}: run the same version of hmt_slam_ros everywhere"

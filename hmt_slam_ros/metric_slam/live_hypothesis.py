@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import numpy as np
@@ -42,6 +42,8 @@ _NO_ERROR = MatchError(_INITIAL_COVARIANCE, _INITIAL_COVARIANCE, np.zeros((3, 3)
 class KeyframeCovariances:
     """Covariances by keyframe, in the order in which these came.
 
+    A hypothesis looks them up in a dictionary, of which this is the saved form: two arrays for thousands of keyframes.
+
     :ivar keyframes: shape (n,).
     :ivar covariances: shape (n, 3, 3), right tangent frame.
     """
@@ -61,74 +63,64 @@ class KeyframeCovariances:
 
 
 @dataclass(frozen=True, eq=False)
+class LastEvent:
+    """What is remembered of the last keyframe event of a hypothesis.
+
+    :ivar pose: ``area_T_base`` then, shape (3,), m and rad.
+    :ivar motion: the motion between the last two keyframe events, as matched, shape (3,).
+    :ivar match_information: of the event's match alone, in the frame of its pose, shape (3, 3).
+    :ivar motion_error: of that motion.
+    :ivar anchor: the stored keyframe to which scans are now related.
+    :ivar pose_covariance: covariance of the pose in the area's frame, right tangent, shape (3, 3).
+    :ivar contradicted: whether the scan contradicted what the robot should have seen.
+    :ivar recent_scans: the scans that the next keyframe's is compared with, in mode lifelong.
+    """
+
+    pose: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
+    motion: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
+    match_information: NDArray[np.float64] = field(default_factory=lambda: np.zeros((3, 3)))
+    motion_error: MatchError = _NO_ERROR
+    anchor: int = 0
+    pose_covariance: NDArray[np.float64] = field(default_factory=_INITIAL_COVARIANCE.copy)
+    contradicted: bool = False
+    recent_scans: tuple[RecentScan, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
 class LiveHypothesisState:
-    """One live hypothesis inside metric SLAM.
+    """One live hypothesis inside metric SLAM, as it is saved: what it holds in tables that grow is here as a value.
 
     :ivar particle_filter: its particles, where its local map is a grid.
     :ivar line_filter: its filter, where its local map is one of lines.
-    :ivar event_pose: ``area_T_base`` at the last keyframe event, shape (3,), m and rad.
-    :ivar event_motion: the motion between the last two keyframe events, as matched, shape (3,).
-    :ivar match_information: of the last keyframe event's match alone, in the frame of its pose, shape (3, 3).
-    :ivar motion_error: of that motion.
-    :ivar anchor: the stored keyframe to which scans are now related.
+    :ivar event: what is remembered of the last keyframe event.
     :ivar step_covariances: what the step which led to a keyframe adds to the drift, of those stored since the area was
         entered.
     :ivar keyframe_covariances: of the poses of keyframes in their areas' frames, of all that are known.
-    :ivar pose_covariance: covariance of the pose at the last keyframe event in the area's frame, right tangent, shape
-        (3, 3).
     :ivar scan_poses: (stamp, anchor, ``keyframe_T_base``) of the scans since the last keyframe event.
-    :ivar contradicted: whether the scan of the last keyframe event contradicted what the robot should have seen.
-    :ivar recent_scans: the scans that the next keyframe's is compared with, in mode lifelong.
     """
 
     particle_filter: ParticleFilterState | None
     line_filter: LineFilterState | None
-    event_pose: NDArray[np.float64]
-    event_motion: NDArray[np.float64]
-    match_information: NDArray[np.float64]
-    motion_error: MatchError
-    anchor: int
+    event: LastEvent
     step_covariances: KeyframeCovariances
     keyframe_covariances: KeyframeCovariances
-    pose_covariance: NDArray[np.float64]
     scan_poses: tuple[tuple[int, int, NDArray[np.float64]], ...]
-    contradicted: bool
-    recent_scans: tuple[RecentScan, ...]
 
 
 @dataclass
 class LiveHypothesis:
-    """A filter and what metric SLAM remembers beside it.
+    """A filter and what metric SLAM remembers beside it; in its tables as :class:`LiveHypothesisState` tells.
 
     :ivar settings: when keyframes are taken, and how far their covariance is to be trusted.
-    :ivar event_motion: the motion between the last two keyframe events, as matched, shape (3,).
-    :ivar match_information: of the last keyframe event's match alone, in the frame of its pose, shape (3, 3).
-    :ivar event_pose: ``area_T_base`` at the last keyframe event, shape (3,).
-    :ivar anchor: the stored keyframe to which scans are now related.
-    :ivar motion_error: of that motion.
-    :ivar step_covariances: {keyframe: covariance (3, 3) that the step which led to it adds to the drift}, of those
-        stored since the area was entered.
-    :ivar keyframe_covariances: {keyframe: covariance (3, 3) of its pose in its area's frame, right tangent}, of all
-        that are known.
-    :ivar pose_covariance: covariance of the pose at the last keyframe event in the area's frame, right tangent.
-    :ivar scan_poses: (stamp, anchor, ``keyframe_T_base``) of the scans since the last keyframe event.
-    :ivar contradicted: whether the scan of the last keyframe event contradicted what the robot should have seen.
-    :ivar recent_scans: the scans that the next keyframe's is compared with, in mode lifelong.
+    :ivar event: what is remembered of the last keyframe event.
     """
 
     filter: LocalFilter
     settings: FilterParameters
-    event_pose: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
-    event_motion: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
-    match_information: NDArray[np.float64] = field(default_factory=lambda: np.zeros((3, 3)))
-    motion_error: MatchError = _NO_ERROR
-    anchor: int = 0
+    event: LastEvent = field(default_factory=LastEvent)
     step_covariances: dict[int, NDArray[np.float64]] = field(default_factory=dict)
     keyframe_covariances: dict[int, NDArray[np.float64]] = field(default_factory=dict)
-    pose_covariance: NDArray[np.float64] = field(default_factory=_INITIAL_COVARIANCE.copy)
     scan_poses: list[tuple[int, int, NDArray[np.float64]]] = field(default_factory=list)
-    contradicted: bool = False
-    recent_scans: tuple[RecentScan, ...] = ()
 
     @classmethod
     def from_state(
@@ -140,17 +132,10 @@ class LiveHypothesis:
         return cls(
             filters.restore(own),
             settings,
-            state.event_pose,
-            state.event_motion,
-            state.match_information,
-            state.motion_error,
-            state.anchor,
+            state.event,
             state.step_covariances.to_dict(),
             state.keyframe_covariances.to_dict(),
-            state.pose_covariance,
             list(state.scan_poses),
-            state.contradicted,
-            state.recent_scans,
         )
 
     def state(self) -> LiveHypothesisState:
@@ -159,17 +144,10 @@ class LiveHypothesis:
         return LiveHypothesisState(
             own if isinstance(own, ParticleFilterState) else None,
             None if isinstance(own, ParticleFilterState) else own,
-            self.event_pose,
-            self.event_motion,
-            self.match_information,
-            self.motion_error,
-            self.anchor,
+            self.event,
             KeyframeCovariances.from_dict(self.step_covariances),
             KeyframeCovariances.from_dict(self.keyframe_covariances),
-            self.pose_covariance,
             tuple(self.scan_poses),
-            self.contradicted,
-            self.recent_scans,
         )
 
     def branch(self, hypothesis: int) -> LiveHypothesis:
@@ -177,17 +155,10 @@ class LiveHypothesis:
         return LiveHypothesis(
             self.filter.branch(hypothesis),
             self.settings,
-            self.event_pose,
-            self.event_motion,
-            self.match_information,
-            self.motion_error,
-            self.anchor,
+            self.event,
             dict(self.step_covariances),
             dict(self.keyframe_covariances),
-            self.pose_covariance,
             list(self.scan_poses),
-            self.contradicted,
-            self.recent_scans,
         )
 
     def is_event_due(self, sighting: PreparedScan) -> bool:
@@ -196,11 +167,11 @@ class LiveHypothesis:
         :param sighting: the newest one. Where it is the first that contradicts what the robot should see, it is where
             the robot is now.
         """
-        moved = se2.between(self.event_pose, self.filter.pose)
+        moved = se2.between(self.event.pose, self.filter.pose)
         far = math.hypot(moved[0], moved[1]) >= self.settings.keyframe_distance
         if far or abs(moved[2]) >= math.radians(self.settings.keyframe_angle):
             return True
-        if self.contradicted:
+        if self.event.contradicted:
             return False
         return (
             self.filter.clutter_estimate.evaluate(self.filter.compare_scan(sighting)).log_kidnapping_ratio
@@ -230,20 +201,24 @@ class LiveHypothesis:
         else:
             step = self.filter.update(sighting, sequence)
         judgement = NO_EVIDENCE if after_reset else self._scan_evidence(sighting)
-        self.recent_scans = () if after_reset else self.recent_scans
-        self.motion_error, self.contradicted = step.match_error, judgement.log_kidnapping_ratio > _CONTRADICTION_NATS
+        self.event = replace(
+            self.event,
+            motion=step.increment,
+            match_information=step.information,
+            motion_error=step.match_error,
+            contradicted=judgement.log_kidnapping_ratio > _CONTRADICTION_NATS,
+            recent_scans=() if after_reset else self.event.recent_scans,
+        )
         # Of a displaced robot it is the first of where it is now.
-        stored = after_reset or (may_store and ((is_informative or self.is_new_viewpoint)() or self.contradicted))
+        stored = after_reset or (may_store and ((is_informative or self.is_new_viewpoint)() or self.event.contradicted))
         self._propagate_covariance(sequence if stored else None)
         if stored:
             self.filter.add_keyframe(sequence, sighting.scan)
-        self.event_motion, self.match_information = step.increment, step.information
-        self.event_pose = self.filter.pose
-        self._choose_anchor()
+        self.event = replace(self.event, pose=self.filter.pose, anchor=self._nearest_keyframe())
         return HypothesisEstimate(
             self.filter.hypothesis,
             self.filter.area,
-            PoseGaussian(self.filter.pose, self.pose_covariance),
+            PoseGaussian(self.filter.pose, self.event.pose_covariance),
             stored,
             judgement.log_evidence,
             judgement.log_kidnapping_ratio,
@@ -261,7 +236,8 @@ class LiveHypothesis:
 
     def add_recent_scan(self, scan: Scan) -> None:
         """Compare what follows with a scan that was taken where the filter is."""
-        self.recent_scans = append_recent_scan(self.recent_scans, RecentScan(scan, self.filter.pose.copy()))
+        recent = append_recent_scan(self.event.recent_scans, RecentScan(scan, self.filter.pose.copy()))
+        self.event = replace(self.event, recent_scans=recent)
 
     def is_new_viewpoint(self) -> bool:
         """Whether no keyframe of the local map was taken from nearby with a like heading."""
@@ -272,20 +248,23 @@ class LiveHypothesis:
 
     def _propagate_covariance(self, keyframe: int | None) -> None:
         """Carry the drift on to the pose now, of a keyframe that is stored, or of none over ground that is mapped."""
-        ad = se2.adjoint(se2.between(self.filter.pose, self.event_pose))
-        carried = ad @ self.pose_covariance @ ad.T
+        ad = se2.adjoint(se2.between(self.filter.pose, self.event.pose))
+        covariance = ad @ self.event.pose_covariance @ ad.T
         if keyframe is None:
-            self.pose_covariance = self._map_bounded_covariance(carried)
-            return
-        self.pose_covariance = carried + self.motion_error.drift_covariance
-        self.step_covariances[keyframe] = self.motion_error.drift_covariance
-        self.keyframe_covariances[keyframe] = self.pose_covariance
+            covariance = self._map_bounded_covariance(covariance)
+        else:
+            step = self.event.motion_error.drift_covariance
+            covariance = covariance + step
+            self.step_covariances[keyframe], self.keyframe_covariances[keyframe] = step, covariance
+        self.event = replace(self.event, pose_covariance=covariance)
 
     def _map_bounded_covariance(self, carried: NDArray[np.float64]) -> NDArray[np.float64]:
         """The drift where the map bounds it, as far as the match tells: the pose is as far off as the map is there."""
-        gain = self.motion_error.gain
+        gain = self.event.motion_error.gain
         free = np.eye(3) - gain
-        return gain @ self._map_covariance() @ gain.T + free @ carried @ free.T + self.motion_error.pose_covariance
+        return (
+            gain @ self._map_covariance() @ gain.T + free @ carried @ free.T + self.event.motion_error.pose_covariance
+        )
 
     def _map_covariance(self) -> NDArray[np.float64]:
         """How far off the map is here: covariance of the area's nearest keyframe, carried here; 0 where unknown."""
@@ -303,11 +282,11 @@ class LiveHypothesis:
         covariance: NDArray[np.float64] = ad @ self.keyframe_covariances[own[nearest][0]] @ ad.T
         return covariance
 
-    def _choose_anchor(self) -> None:
-        """Relate the scans to come to the nearest keyframe."""
+    def _nearest_keyframe(self) -> int:
+        """The keyframe to which the scans to come are related."""
         relative = se2.between(self.filter.leading_keyframe_poses(), self.filter.pose)
         cost = np.hypot(relative[:, 0], relative[:, 1]) + np.abs(relative[:, 2])
-        self.anchor = self.filter.keyframes[int(np.argmin(cost))]
+        return self.filter.keyframes[int(np.argmin(cost))]
 
     def prune(self, keyframes: Collection[int]) -> None:
         """Go on without some keyframes of known ground; scans related to them are related to those that stay.
@@ -321,7 +300,7 @@ class LiveHypothesis:
             self.keyframe_covariances.pop(keyframe, None)
         names, poses = list(self.filter.keyframes), self.filter.leading_keyframe_poses()
         areas, placed = dict(zip(names, self.filter.keyframe_areas, strict=True)), dict(zip(names, poses, strict=True))
-        for lost in ({self.anchor} | {anchor for _, anchor, _ in self.scan_poses}) & set(keyframes):
+        for lost in ({self.event.anchor} | {anchor for _, anchor, _ in self.scan_poses}) & set(keyframes):
             staying = {k: at for k, at in placed.items() if k not in keyframes and areas[k] == areas[lost]}
             self._replace_anchor(lost, nearest_replacement(placed[lost], staying))
         self.filter.drop_keyframes(keyframes)
@@ -332,8 +311,8 @@ class LiveHypothesis:
             (stamp, held.keyframe, se2.compose(held.pose, pose)) if anchor == lost else (stamp, anchor, pose)
             for stamp, anchor, pose in self.scan_poses
         ]
-        if self.anchor == lost:
-            self.anchor = held.keyframe
+        if self.event.anchor == lost:
+            self.event = replace(self.event, anchor=held.keyframe)
 
     def _revised_keyframes(self, newest: int) -> tuple[MovedKeyframe, ...]:
         # The messages must not hold on to the poses under all particles.
@@ -346,8 +325,9 @@ class LiveHypothesis:
 
     def add_scan_pose(self, stamp: int) -> None:
         """Append the scan just processed to the trail."""
-        anchor_pose = self.filter.leading_keyframe_poses()[self.filter.keyframes.index(self.anchor)]
-        self.scan_poses.append((stamp, self.anchor, se2.between(anchor_pose, self.filter.pose)))
+        anchor = self.event.anchor
+        anchor_pose = self.filter.leading_keyframe_poses()[self.filter.keyframes.index(anchor)]
+        self.scan_poses.append((stamp, anchor, se2.between(anchor_pose, self.filter.pose)))
 
     def take_scan_poses(self, first_scan: int) -> list[ScanPoses]:
         """The trail as a message, if there is one, and begin it anew."""
@@ -367,8 +347,8 @@ class LiveHypothesis:
 
     def pose_belief(self) -> PoseGaussian:
         """The belief over ``area_T_base`` now."""
-        ad = se2.adjoint(se2.between(self.filter.pose, self.event_pose))
-        return PoseGaussian(self.filter.pose, ad @ self.pose_covariance @ ad.T + self.filter.tracking_covariance)
+        ad = se2.adjoint(se2.between(self.filter.pose, self.event.pose))
+        return PoseGaussian(self.filter.pose, ad @ self.event.pose_covariance @ ad.T + self.filter.tracking_covariance)
 
     def change_area(self, leaf: Hypothesis, content: Sequence[PlacedKeyframe], filters: FilterFactory) -> None:
         """Change the reference frame and load the local map, as TSBI decided.
@@ -381,17 +361,25 @@ class LiveHypothesis:
             self.filter = filters.select(self.filter, leaf.area, content)
         area_T_previous = np.zeros(3) if leaf.frame_change is None else leaf.frame_change.mean
         self.filter.change_area(leaf.area, area_T_previous, content)
-        self.event_pose = se2.compose(area_T_previous, self.event_pose)
-        self.recent_scans = tuple(
-            RecentScan(look.scan, se2.compose(area_T_previous, look.pose)) for look in self.recent_scans
-        )
+        self._move_event(area_T_previous)
         if entered and leaf.area_merge is None:
             moved = {relabelled.keyframe for relabelled in leaf.moved_keyframes}
             self.step_covariances = {
                 keyframe: step for keyframe, step in self.step_covariances.items() if keyframe in moved
             }
-            self._rebase_covariances(leaf.frame_change or _IDENTITY)
-        self._choose_anchor()
+            covariance = self._rebase_covariances(leaf.frame_change or _IDENTITY)
+            self.event = replace(self.event, pose_covariance=covariance)
+        self.event = replace(self.event, anchor=self._nearest_keyframe())
+
+    def _move_event(self, area_T_previous: NDArray[np.float64]) -> None:
+        """Have the last event in another area's frame."""
+        self.event = replace(
+            self.event,
+            pose=se2.compose(area_T_previous, self.event.pose),
+            recent_scans=tuple(
+                RecentScan(look.scan, se2.compose(area_T_previous, look.pose)) for look in self.event.recent_scans
+            ),
+        )
 
     def merge(self, merged: AreaMerge, keyframes: Mapping[int, NDArray[np.float64]]) -> None:
         """What is in an area is as uncertain in the one that it becomes part of as that is known relative to it.
@@ -403,19 +391,21 @@ class LiveHypothesis:
                 known = PoseGaussian(pose, self.keyframe_covariances[keyframe])
                 self.keyframe_covariances[keyframe] = merged.pose.compose(known).covariance
         if self.filter.area == merged.area:
-            self.pose_covariance = merged.pose.compose(PoseGaussian(self.event_pose, self.pose_covariance)).covariance
+            belief = merged.pose.compose(PoseGaussian(self.event.pose, self.event.pose_covariance))
+            self.event = replace(self.event, pose_covariance=belief.covariance)
 
-    def _rebase_covariances(self, rebase: PoseGaussian) -> None:
-        """The drift in the area that was entered: along the keyframes that moved with the robot, or else by the map.
+    def _rebase_covariances(self, rebase: PoseGaussian) -> NDArray[np.float64]:
+        """The drift in the area that was entered, shape (3, 3); that of the keyframes that moved with the robot is set.
+
+        It is along these keyframes, or else by the map.
 
         :param rebase: belief over ``area_T_previous``.
         """
         moved = sorted(self.step_covariances)
         if not moved:
-            self.pose_covariance = self._map_bounded_covariance(
-                self.pose_covariance + _propagated_covariance(rebase, self.event_pose)
+            return self._map_bounded_covariance(
+                self.event.pose_covariance + _propagated_covariance(rebase, self.event.pose)
             )
-            return
         poses = dict(zip(self.filter.keyframes, self.filter.leading_keyframe_poses(), strict=True))
         self.keyframe_covariances[moved[0]] = _INITIAL_COVARIANCE
         for previous, keyframe in pairwise(moved):
@@ -424,7 +414,7 @@ class LiveHypothesis:
                 ad @ self.keyframe_covariances[previous] @ ad.T + self.step_covariances[keyframe]
             )
         # TSBI knows how they lie in the area, and takes the drift from there on for what is added to it.
-        self.pose_covariance = _propagated_covariance(rebase, self.event_pose) + _INITIAL_COVARIANCE
+        return _propagated_covariance(rebase, self.event.pose) + _INITIAL_COVARIANCE
 
     def reload(self, content: Sequence[PlacedKeyframe]) -> None:
         """Build the local map anew after TLCA refined its keyframes; the robot stays where it is from its anchor.
@@ -432,11 +422,15 @@ class LiveHypothesis:
         :param content: all keyframes of the local map, in the frame of the robot's area.
         """
         before = self.filter.pose
-        self.filter.reload(content, self.anchor)
-        self.event_pose = se2.compose(self.filter.pose, se2.between(before, self.event_pose))
-        moved = [se2.compose(self.filter.pose, se2.between(before, look.pose)) for look in self.recent_scans]
-        self.recent_scans = tuple(
-            RecentScan(look.scan, pose) for look, pose in zip(self.recent_scans, moved, strict=True)
+        self.filter.reload(content, self.event.anchor)
+        after = self.filter.pose
+        self.event = replace(
+            self.event,
+            pose=se2.compose(after, se2.between(before, self.event.pose)),
+            recent_scans=tuple(
+                RecentScan(look.scan, se2.compose(after, se2.between(before, look.pose)))
+                for look in self.event.recent_scans
+            ),
         )
 
 

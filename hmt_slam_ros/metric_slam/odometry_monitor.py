@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.geometry import se2
@@ -89,20 +89,12 @@ class OdometryMonitor:
 
     def __init__(self, state: OdometryMonitorState | None = None) -> None:
         """:param state: to go on from."""
-        state = state or OdometryMonitorState()
-        self._last_stamp, self._disagreement = state.last_stamp, state.disagreement
-        self._last_notice, self._unreported, self._noise_reported = (
-            state.last_notice,
-            state.unreported,
-            state.noise_reported,
-        )
+        self._state = state or OdometryMonitorState()
 
     @property
     def state(self) -> OdometryMonitorState:
         """All that was heard and said."""
-        return OdometryMonitorState(
-            self._last_stamp, self._disagreement, self._last_notice, self._unreported, self._noise_reported
-        )
+        return self._state
 
     def add_scan(self, stamp: int, step: RelativeMotion | None, tracked: TrackedMotion) -> str | None:
         """Take note of a scan; the sentence about an episode that is over, if there is one.
@@ -110,28 +102,29 @@ class OdometryMonitor:
         :param stamp: of the scan, ns.
         :param step: odometry's motion since the scan before, None where it is unknown.
         """
-        before, self._last_stamp = self._last_stamp, stamp
-        if tracked.contradicts_odometry and self._disagreement is None:
-            self._disagreement = OdometryDisagreement.from_stamp(before)
-        if self._disagreement is None:
+        episode = self._state.disagreement
+        if tracked.contradicts_odometry and episode is None:
+            episode = OdometryDisagreement.from_stamp(self._state.last_stamp)
+        self._state = replace(self._state, last_stamp=stamp, disagreement=episode)
+        if episode is None:
             return None
-        if step is not None and (
-            tracked.contradicts_odometry or (stamp - self._disagreement.last_contradiction) * _SECOND <= _QUIET
-        ):
-            self._disagreement = self._disagreement.extend(stamp, step, tracked)
-            return None
-        return self.end_disagreement()
+        lasts = tracked.contradicts_odometry or (stamp - episode.last_contradiction) * _SECOND <= _QUIET
+        if step is None or not lasts:
+            return self.end_disagreement()
+        self._state = replace(self._state, disagreement=episode.extend(stamp, step, tracked))
+        return None
 
     def end_disagreement(self) -> str | None:
         """The sentence about the episode that is open, if it matters and none was said of late."""
-        episode, self._disagreement = self._disagreement, None
+        episode, self._state = self._state.disagreement, replace(self._state, disagreement=None)
         if episode is None or not episode.is_significant():
             return None
-        if self._last_notice is not None and episode.end * _SECOND - self._last_notice < _PAUSE:
-            self._unreported += 1
+        last, unreported = self._state.last_notice, self._state.unreported
+        if last is not None and episode.end * _SECOND - last < _PAUSE:
+            self._state = replace(self._state, unreported=unreported + 1)
             return None
-        since = f" ({self._unreported} times more since it was last said)" if self._unreported else ""
-        self._last_notice, self._unreported = episode.end * _SECOND, 0
+        since = f" ({unreported} times more since it was last said)" if unreported else ""
+        self._state = replace(self._state, last_notice=episode.end * _SECOND, unreported=0)
         return (
             f"odometry {_motion_text(episode.odometry_motion)} from {episode.begin * _SECOND:.3f} s to "
             f"{episode.end * _SECOND:.3f} s, where the scans say that it {_motion_text(episode.scan_motion)}{since}: "
@@ -141,9 +134,9 @@ class OdometryMonitor:
     def check_noise(self, noise: OdometryNoise) -> str | None:
         """The sentence about odometry that is much noisier than its model, once."""
         translation, rotation = noise.factors
-        if self._noise_reported or max(translation, rotation) < NOISY_FACTOR:
+        if self._state.noise_reported or max(translation, rotation) < NOISY_FACTOR:
             return None
-        self._noise_reported = True
+        self._state = replace(self._state, noise_reported=True)
         return (
             f"odometry and scans differ {translation:.1f} times as much in distance and {rotation:.1f} times as much "
             "in heading as the noise model of odometry expects, so it is trusted less: raise "

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from hmt_slam_ros.messages.messages import Message, Notice
 from hmt_slam_ros.sensors import Odometry, Scan
@@ -44,10 +44,9 @@ class ScanQueue:
         self._max_waiting = max_waiting
         self._odometry = odometry
         self._scans = deque(state.scans)
-        self._last_stamp = state.last_stamp
         self._sweeps = SweepCheck(state.sweeps)
-        self._reported_faults = set(state.reported_faults)
-        self._waits_for_odometry = state.waits_for_odometry
+        # All but the scans and what their times tell, which are beside it.
+        self._state = replace(state, scans=(), sweeps=SweepState())
 
     def __len__(self) -> int:
         return len(self._scans)
@@ -55,22 +54,20 @@ class ScanQueue:
     @property
     def state(self) -> ScanQueueState:
         """All that the queue knows."""
-        noticed = frozenset(self._reported_faults)
-        return ScanQueueState(
-            tuple(self._scans), self._last_stamp, self._sweeps.state, noticed, self._waits_for_odometry
-        )
+        return replace(self._state, scans=tuple(self._scans), sweeps=self._sweeps.state)
 
     def empty_copy(self, odometry: OdometryBuffer) -> ScanQueue:
         """A queue for scans of any other time, of whose faults nothing is said twice.
 
         :param odometry: what these wait for.
         """
-        return ScanQueue(self._max_waiting, odometry, ScanQueueState(reported_faults=frozenset(self._reported_faults)))
+        return ScanQueue(self._max_waiting, odometry, ScanQueueState(reported_faults=self._state.reported_faults))
 
     def add_odometry(self, odometry: Odometry) -> None:
         """Take in a reading."""
         self._odometry.add(odometry)
-        self._waits_for_odometry = True
+        if not self._state.waits_for_odometry:
+            self._state = replace(self._state, waits_for_odometry=True)
 
     def add_scan(self, scan: Scan) -> list[Message]:
         """Take in a scan; say, once for each fault, what is wrong with it."""
@@ -78,11 +75,11 @@ class ScanQueue:
         scan, fault = self._sweeps.check(scan)
         if fault is not None:
             said += self._notice("sweep", fault)
-        if scan.stamp <= self._last_stamp:
+        if scan.stamp <= self._state.last_stamp:
             said += self._notice(
                 "order",
                 f"A scan is stamped {scan.stamp / 1e9:.6f} s, not after its predecessor "
-                f"({self._last_stamp / 1e9:.6f} s); scans are taken in the order of their arrival: check the clocks or "
+                f"({self._state.last_stamp / 1e9:.6f} s); scans are taken in the order of their arrival: check the clocks or "
                 "the order of the log.",
             )
         if not scan.valid.any():
@@ -92,7 +89,7 @@ class ScanQueue:
                 "m; such scans are placed by odometry alone: check the laser and its range limits.",
             )
         self._scans.append(scan)
-        self._last_stamp = scan.stamp
+        self._state = replace(self._state, last_stamp=scan.stamp)
         return said + self._stop_waiting()
 
     def is_ready(self, *, ended: bool) -> bool:
@@ -101,7 +98,7 @@ class ScanQueue:
         :param ended: whether no more odometry will come.
         """
         return bool(self._scans) and (
-            ended or not self._waits_for_odometry or self._odometry.covers(self._scans[0].end_stamp)
+            ended or not self._state.waits_for_odometry or self._odometry.covers(self._scans[0].end_stamp)
         )
 
     def pop(self) -> Scan:
@@ -113,9 +110,9 @@ class ScanQueue:
         first = self._scans[0]
         patience = self._max_waiting * (1 if self._odometry.is_empty else _LATE)
         waited = len(self._scans) > patience
-        if not waited or not self._waits_for_odometry or self._odometry.covers(first.end_stamp):
+        if not waited or not self._state.waits_for_odometry or self._odometry.covers(first.end_stamp):
             return []
-        self._waits_for_odometry = False
+        self._state = replace(self._state, waits_for_odometry=False)
         return self._notice(
             "odometry",
             f"{len(self._scans)} scans wait for odometry at {first.stamp / 1e9:.6f} s and are matched without from "
@@ -123,7 +120,7 @@ class ScanQueue:
         )
 
     def _notice(self, fault: str, text: str) -> list[Message]:
-        if fault in self._reported_faults:
+        if fault in self._state.reported_faults:
             return []
-        self._reported_faults.add(fault)
+        self._state = replace(self._state, reported_faults=self._state.reported_faults | {fault})
         return [Notice("slam", text)]

@@ -123,12 +123,16 @@ class MetricSlam:
             configuration.filter.max_scans_waiting_for_odometry, self._motion.odometry, state.scan_queue
         )
         self._live_hypotheses = self._restored_hypotheses(state)
-        self._keyframe_events, self._reset_pending = state.keyframe_events, state.reset_pending
-        self._lost, self._initial_pose = state.lost, state.initial_pose
-        self._awaiting_decision = state.awaiting_decision
-        self._path_length = state.path_length
-        self._processed_scans, self._dropped_scans = state.processed_scans, state.dropped_scans
-        self._first_unpublished_scan = state.first_unpublished_scan
+        # All but the six parts above, which change in place.
+        self._state = replace(
+            state,
+            replica=ReplicaState(),
+            motion=MotionState(),
+            odometry_monitor=OdometryMonitorState(),
+            scan_queue=ScanQueueState(),
+            patches=None,
+            live_hypotheses={},
+        )
         self._ended = False
 
     def _restored_hypotheses(self, state: SlamState) -> dict[int, LiveHypothesis]:
@@ -150,22 +154,14 @@ class MetricSlam:
     def state(self) -> SlamState:
         """All that metric SLAM knows, as a value."""
         live, patches = self._hypothesis_states()
-        return SlamState(
-            self._replica.state,
-            self._motion.state,
-            self._odometry_monitor.state,
-            self._scan_queue.state,
-            patches,
-            live,
-            self._keyframe_events,
-            self._awaiting_decision,
-            self._path_length,
-            self._processed_scans,
-            self._dropped_scans,
-            self._first_unpublished_scan,
-            self._reset_pending,
-            self._lost,
-            self._initial_pose,
+        return replace(
+            self._state,
+            replica=self._replica.state,
+            motion=self._motion.state,
+            odometry_monitor=self._odometry_monitor.state,
+            scan_queue=self._scan_queue.state,
+            patches=patches,
+            live_hypotheses=live,
         )
 
     def _hypothesis_states(self) -> tuple[dict[int, LiveHypothesisState], PatchState | None]:
@@ -192,22 +188,22 @@ class MetricSlam:
     @property
     def is_awaiting_decision(self) -> bool:
         """Whether the answer to a keyframe event is due."""
-        return self._awaiting_decision
+        return self._state.awaiting_decision
 
     @property
     def keyframe_events(self) -> int:
         """Keyframe events so far."""
-        return self._keyframe_events
+        return self._state.keyframe_events
 
     @property
     def processed_scans(self) -> int:
         """Scans that were given a pose."""
-        return self._processed_scans
+        return self._state.processed_scans
 
     @property
     def is_lost(self) -> bool:
         """Whether the robot may be anywhere in the map."""
-        return self._lost
+        return self._state.lost
 
     @property
     def queued_scans(self) -> int:
@@ -239,41 +235,45 @@ class MetricSlam:
         elif isinstance(message, ClosureDecision):
             self._apply_decision(message)
         elif isinstance(message, PoseReset):
-            self._initial_pose = message.initial_pose
-            return [] if self._lost and self._initial_pose is not None else self._reset_tracking()
+            self._state = replace(self._state, initial_pose=message.initial_pose)
+            return [] if self._state.lost and message.initial_pose is not None else self._reset_tracking()
         elif isinstance(message, EndOfLog):
             self._ended = True
         return self._process_queue()
 
     def _process_queue(self) -> list[Message]:
         said: list[Message] = []
-        while not self._awaiting_decision and self._scan_queue.is_ready(ended=self._ended):
+        while not self._state.awaiting_decision and self._scan_queue.is_ready(ended=self._ended):
             said += self._process_scan(self._scan_queue.pop())
-        if self._ended and not self._scan_queue and not self._awaiting_decision:
+        if self._ended and not self._scan_queue and not self._state.awaiting_decision:
             said += self._finish()
         return said
 
     def _reset_tracking(self) -> list[Message]:
         """Forget how the robot came here; scans that still wait were taken before and are passed over."""
         self._motion, self._odometry_monitor = MotionModel(self._configuration.motion), OdometryMonitor()
-        self._dropped_scans += len(self._scan_queue)
+        dropped = self._state.dropped_scans + len(self._scan_queue)
         self._scan_queue = self._scan_queue.empty_copy(self._motion.odometry)
-        self._reset_pending = True
-        return [TrackingReset(self._keyframe_events, self._processed_scans)]
+        self._state = replace(self._state, dropped_scans=dropped, reset_pending=True)
+        return [TrackingReset(self._state.keyframe_events, self._state.processed_scans)]
 
     def _process_scan(self, scan: Scan) -> list[Message]:
         prediction = self._motion.predict(scan.stamp)
         sighting = PreparedScan(self._mapping, deskew_scan(scan, self._motion.odometry, self._configuration.rtl))
         said: list[Message] = []
-        if self._reset_pending:
+        if self._state.reset_pending:
             self._reset_filters(prediction)
         else:
             said += self._track(sighting, prediction)
-        if self._reset_pending or self._initial_pose is not None or self._best_hypothesis.is_event_due(sighting):
+        if (
+            self._state.reset_pending
+            or self._state.initial_pose is not None
+            or self._best_hypothesis.is_event_due(sighting)
+        ):
             said += self._keyframe_event(sighting)
         for live in self._live_hypotheses.values():
             live.add_scan_pose(scan.stamp)
-        self._processed_scans += 1
+        self._state = replace(self._state, processed_scans=self._state.processed_scans + 1)
         return [*said, self._local_estimate(scan.stamp)]
 
     def _reset_filters(self, prediction: Prediction) -> None:
@@ -292,7 +292,8 @@ class MetricSlam:
         }
         best = tracked[self._replica.best_hypothesis]
         self._motion.observe(best.increment, best.information, best.contradicts_odometry)
-        self._path_length += math.hypot(best.increment[0], best.increment[1])
+        path_length = self._state.path_length + math.hypot(best.increment[0], best.increment[1])
+        self._state = replace(self._state, path_length=path_length)
         return self._notices(self._odometry_monitor.add_scan(sighting.scan.stamp, prediction.odometry, best))
 
     @staticmethod
@@ -300,40 +301,42 @@ class MetricSlam:
         return [] if text is None else [Notice("slam", text)]
 
     def _keyframe_event(self, sighting: PreparedScan) -> list[Message]:
-        sequence, scan = self._keyframe_events, sighting.scan
+        sequence, scan = self._state.keyframe_events, sighting.scan
         trails: list[Message] = self._take_scan_poses()
-        storing = self.is_mapping or self._lost
+        storing = self.is_mapping or self._state.lost
         news: list[tuple[Changes, float]] = []
         leaves = tuple(
             live.process_keyframe(
                 sequence,
                 sighting,
-                after_reset=self._reset_pending,
+                after_reset=self._state.reset_pending,
                 may_store=storing,
                 is_informative=partial(self._shows_changes, live, scan, news) if self._is_lifelong else None,
             )
             for live in self._live_hypotheses.values()
         )
-        self._motion.observe_keyframe(self._best_hypothesis.event_motion, self._best_hypothesis.match_information)
-        carried, place = self._reset_pending and sequence > 0, self._initial_pose
+        last = self._best_hypothesis.event
+        self._motion.observe_keyframe(last.motion, last.match_information)
+        carried, place = self._state.reset_pending and sequence > 0, self._state.initial_pose
         keyframe = Keyframe(
-            sequence, scan, self._path_length, leaves, carried, place, self.is_mapping, combine_stale_beams(news)
+            sequence, scan, self._state.path_length, leaves, carried, place, self.is_mapping, combine_stale_beams(news)
         )
         self._replica.add_keyframe(keyframe)
-        self._keyframe_events += 1
         # With the scan of its arrival the robot is put where somebody says, with the next one it is looked for there,
         # even if it stands still.
-        self._awaiting_decision, self._reset_pending, self._initial_pose = (
-            True,
-            False,
-            place if self._reset_pending else None,
+        self._state = replace(
+            self._state,
+            keyframe_events=sequence + 1,
+            awaiting_decision=True,
+            reset_pending=False,
+            initial_pose=place if self._state.reset_pending else None,
         )
         return [*trails, keyframe, *self._notices(self._odometry_monitor.check_noise(self._motion.noise))]
 
     @property
     def _is_lifelong(self) -> bool:
         """Whether the map is changed only where the world is new or has changed."""
-        return self.mode == "lifelong" and not self._lost
+        return self.mode == "lifelong" and not self._state.lost
 
     def _shows_changes(self, live: LiveHypothesis, scan: Scan, found: list[tuple[Changes, float]]) -> bool:
         """Whether a scan shows what a hypothesis's map does not hold; what was found is added."""
@@ -343,7 +346,7 @@ class MetricSlam:
         # A laser sees farther than the local map reaches.
         around = areas_around(hybrid_map, own.area, self._neighborhood, own.keyframe_areas)
         beyond = self._area_keyframes(own.hypothesis, {area: belief.mean for area, belief in around.items()})
-        news = detect_changes(RecentScan(scan, own.pose), live.recent_scans, [*known, *beyond])
+        news = detect_changes(RecentScan(scan, own.pose), live.event.recent_scans, [*known, *beyond])
         live.add_recent_scan(scan)
         found.append((news, self._replica.probabilities[own.hypothesis]))
         return news.has_new_surface or news.has_changed_surface
@@ -353,16 +356,21 @@ class MetricSlam:
         said: list[Message] = [
             trail
             for live in self._live_hypotheses.values()
-            for trail in live.take_scan_poses(self._first_unpublished_scan)
+            for trail in live.take_scan_poses(self._state.first_unpublished_scan)
         ]
-        self._first_unpublished_scan = self._processed_scans
+        self._state = replace(self._state, first_unpublished_scan=self._state.processed_scans)
         return said
 
     def _local_estimate(self, stamp: int) -> LocalEstimate:
         best = self._best_hypothesis
         odometry = self._motion.odometry_pose
         return LocalEstimate(
-            stamp, self._processed_scans - 1, best.filter.area, best.pose_belief(), odometry, self._dropped_scans
+            stamp,
+            self._state.processed_scans - 1,
+            best.filter.area,
+            best.pose_belief(),
+            odometry,
+            self._state.dropped_scans,
         )
 
     def _apply_hypotheses(self, hypotheses: Hypotheses) -> None:
@@ -374,8 +382,11 @@ class MetricSlam:
                 keyframes = self._replica.maps[leaf.parent].keyframes(leaf.area_merge.area)
                 self._live_hypotheses[leaf.parent].merge(leaf.area_merge, keyframes)
         self._replica.apply_hypotheses(hypotheses)
-        self._lost = all(leaf.lost for leaf in hypotheses.hypotheses)
-        self._reset_pending |= all(leaf.tracking_reset for leaf in hypotheses.hypotheses)
+        self._state = replace(
+            self._state,
+            lost=all(leaf.lost for leaf in hypotheses.hypotheses),
+            reset_pending=self._state.reset_pending or all(leaf.tracking_reset for leaf in hypotheses.hypotheses),
+        )
         children = {}
         for leaf in hypotheses.hypotheses:
             parent = self._live_hypotheses[leaf.parent]
@@ -397,7 +408,7 @@ class MetricSlam:
             self._replace_hypotheses({accepted.hypothesis: live})
             if accepted.moved_keyframes:
                 live.reload(self._local_map_keyframes(live))
-        self._awaiting_decision = False
+        self._state = replace(self._state, awaiting_decision=False)
 
     def _replace_hypotheses(self, live: dict[int, LiveHypothesis]) -> None:
         for hypothesis, old in self._live_hypotheses.items():
@@ -427,5 +438,6 @@ class MetricSlam:
 
     def _finish(self) -> list[Message]:
         self._ended = False
-        finished = EndOfRun(self._processed_scans + self._dropped_scans, self._processed_scans, self._dropped_scans)
+        processed, dropped = self._state.processed_scans, self._state.dropped_scans
+        finished = EndOfRun(processed + dropped, processed, dropped)
         return [*self._take_scan_poses(), *self._notices(self._odometry_monitor.end_disagreement()), finished]

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import NamedTuple
 
@@ -65,7 +65,8 @@ class RtlState:
     :ivar base_estimate: the last one whose area's place in the map is known, on which the pose rests.
     :ivar base_reading: the reading at that estimate, None before the next reading.
     :ivar area_poses: ``map_T_area`` as TLCA told it last, ordered by area.
-    :ivar base_area_pose: that of the area of ``base_estimate``.
+    :ivar base_area_pose: that of the area of ``base_estimate``, kept where another hypothesis leads, which may not
+        know it.
     :ivar ambiguity: of TLCA's last answer, shape (3, 3).
     """
 
@@ -88,55 +89,40 @@ class Rtl:
         self._motion = configuration.motion
         self._settings = configuration.rtl
         self._readings = deque(state.readings, maxlen=_READINGS_KEPT)
-        self._newest_estimate, self._base_estimate, self._base_reading = (
-            state.newest_estimate,
-            state.base_estimate,
-            state.base_reading,
-        )
-        self._area_poses = GlobalPoses(state.area_poses)
-        # That of the estimate's area, kept where another hypothesis leads, which may not know it.
-        self._base_area_pose = state.base_area_pose
-        self._ambiguity = state.ambiguity
+        # All but the readings, which come and go at the rate of the odometry.
+        self._state = replace(state, readings=())
         # Estimates of scans before this one are of before the robot arrived; a state is saved when none is under way.
         self._first_valid_scan = 0
 
     @property
     def state(self) -> RtlState:
         """All that RTL knows, as a value."""
-        return RtlState(
-            tuple(self._readings),
-            self._newest_estimate,
-            self._base_estimate,
-            self._base_reading,
-            self._area_poses.areas,
-            self._base_area_pose,
-            self._ambiguity,
-        )
+        return replace(self._state, readings=tuple(self._readings))
 
     def handle(self, message: Message) -> list[Message]:
         """Take in one message; an odometry reading is answered with the pose at its stamp, once one is known."""
         if isinstance(message, Odometry):
             return self._on_odometry(message)
         if isinstance(message, LocalEstimate):
-            if message.scan_index >= self._first_valid_scan and (
-                self._newest_estimate is None or message.stamp > self._newest_estimate.stamp
-            ):
-                self._newest_estimate = message
+            newest = self._state.newest_estimate
+            if message.scan_index >= self._first_valid_scan and (newest is None or message.stamp > newest.stamp):
+                self._state = replace(self._state, newest_estimate=message)
                 self._update_base()
         elif isinstance(message, ClosureDecision):
             self._on_closure_decision(message)
         elif isinstance(message, TrackingReset):
             self._first_valid_scan = message.scans_before
             self._readings.clear()
-            self._newest_estimate = self._base_estimate = self._base_reading = None
+            self._state = replace(self._state, newest_estimate=None, base_estimate=None, base_reading=None)
         return []
 
     def _on_closure_decision(self, accepted: ClosureDecision) -> None:
-        self._ambiguity = accepted.ambiguity
+        self._state = replace(self._state, ambiguity=accepted.ambiguity)
         if accepted.global_poses:
-            self._area_poses = GlobalPoses(accepted.global_poses)
-            if self._base_estimate is not None:
-                self._base_area_pose = self._area_poses.get(self._base_estimate.area, self._base_area_pose)
+            base, pose = self._state.base_estimate, self._state.base_area_pose
+            if base is not None:
+                pose = GlobalPoses(accepted.global_poses).get(base.area, pose)
+            self._state = replace(self._state, area_poses=accepted.global_poses, base_area_pose=pose)
             self._update_base()
 
     def _on_odometry(self, reading: Odometry) -> list[Message]:
@@ -170,32 +156,39 @@ class Rtl:
 
         An area that is new has no place in the map before TLCA's answer is here: until then the former estimate holds.
         """
-        if self._newest_estimate is None:
+        newest, base = self._state.newest_estimate, self._state.base_estimate
+        if newest is None:
             return
-        pose: PoseGaussian | None = self._base_area_pose
-        if self._base_estimate is None or self._newest_estimate.area != self._base_estimate.area:
-            pose = self._area_poses.get(self._newest_estimate.area)
+        pose: PoseGaussian | None = self._state.base_area_pose
+        if base is None or newest.area != base.area:
+            pose = GlobalPoses(self._state.area_poses).get(newest.area)
         if pose is None:
             return
-        self._base_estimate, self._base_area_pose, self._base_reading = self._newest_estimate, pose, None
-        while len(self._readings) > 1 and self._readings[1].stamp <= self._base_estimate.stamp:
+        self._state = replace(self._state, base_estimate=newest, base_area_pose=pose, base_reading=None)
+        while len(self._readings) > 1 and self._readings[1].stamp <= newest.stamp:
             self._readings.popleft()
 
     def _predict(self) -> list[Message]:
         """The estimate carried on by the odometry since its scan."""
-        estimate = self._base_estimate
+        estimate, start, now = self._state.base_estimate, self._state.base_reading, self._readings[-1]
         if estimate is None:
             return []
-        if self._base_reading is None:
-            self._base_reading = self._readings[0].with_measured(estimate.odometry)
-        start, now = self._base_reading, self._readings[-1]
+        if start is None:
+            start = self._readings[0].with_measured(estimate.odometry)
+            self._state = replace(self._state, base_reading=start)
         since = PoseGaussian(
             se2.between(start.reset_free, now.reset_free),
             path_covariance(now.distance - start.distance, min(now.angle - start.angle, math.pi), self._motion),
         )
         return [
             RealTimePose(
-                now.stamp, estimate.area, self._base_area_pose, estimate.pose, since, now.measured, self._ambiguity
+                now.stamp,
+                estimate.area,
+                self._state.base_area_pose,
+                estimate.pose,
+                since,
+                now.measured,
+                self._state.ambiguity,
             )
         ]
 

@@ -60,7 +60,9 @@ class ArrayReader:
                     if 0 <= at <= len(self._content) - count * size:
                         flat = np.frombuffer(self._content, wanted.newbyteorder("<"), count, at)
                         return flat.reshape(shape).astype(wanted)
-            raise HmtSlamError(f"{path} = {str(content)[:60]} is not an array of {name}: see docs/reference/map_format.md")
+            raise HmtSlamError(
+                f"{path} = {str(content)[:60]} is not an array of {name}: see docs/reference/map_format.md"
+            )
 
         return read
 

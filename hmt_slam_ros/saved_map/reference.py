@@ -76,7 +76,8 @@ def _type_text(kind: Any, names: Mapping[type, str]) -> str:  # noqa: ANN401  an
     if kind in _SCALARS or is_record(kind):
         return _SCALARS.get(kind) or f"`{names[kind]}`"
     if origin in (Union, types.UnionType):
-        return f"{_type_text(arguments[0], names)}, or null"
+        some = [_type_text(argument, names) for argument in arguments if argument is not type(None)]
+        return " or ".join(some) + (", or null" if type(None) in arguments else "")
     return _collection_text(origin, arguments, names)
 
 

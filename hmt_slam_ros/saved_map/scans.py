@@ -126,7 +126,9 @@ class ScanReader:
 
         def read(content: object, path: str) -> Scan:
             if not isinstance(content, int) or content not in self._scans:
-                raise HmtSlamError(f"{path} = {str(content)[:60]} is no scan of the map: see docs/reference/map_format.md")
+                raise HmtSlamError(
+                    f"{path} = {str(content)[:60]} is no scan of the map: see docs/reference/map_format.md"
+                )
             return self._scans[content]
 
         return read

@@ -31,7 +31,7 @@ from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.topological_inference.admission import Query
 from hmt_slam_ros.topological_inference.closure_search import AreaComparison, ClosureSearch, Fit, SearchState
 from hmt_slam_ros.topological_inference.global_localization import PoseDistribution, PoseHint
-from hmt_slam_ros.topological_inference.hypothesis_tree import HypothesisState, relative_covariance
+from hmt_slam_ros.topological_inference.hypothesis_tree import HypothesisState, Lost, relative_covariance
 from hmt_slam_ros.topological_inference.landmark_evidence import LandmarkEvidence
 
 
@@ -110,6 +110,8 @@ _UNCONFIRMED = 100.0
 class BranchingState:
     """What is known of areas beside the maps of the hypotheses.
 
+    :class:`Branching` does not hold it, as its search reads the scans from a table that changes in place.
+
     :ivar largest_area: the largest number that an area was given.
     :ivar search: what was learnt by comparing areas.
     :ivar unstored_scans: {keyframe event: scan} of those that no map holds and that may be looked for.
@@ -174,14 +176,16 @@ class Branching:
         :param pose_hint: where the reference is, if somebody says so.
         """
         where = self.search.localize_globally(parent.hybrid_map, poses, before, parent.clutter, pose_hint)
-        if self.landmarks is None or parent.state.relocalization_candidate is None:
+        lost = parent.state.localization
+        if self.landmarks is None or not isinstance(lost, Lost) or lost.candidate is None:
             return where
         return self.landmarks.weigh(where, parent.hybrid_map, poses, before)
 
     def look_ahead(self, parents: Sequence[Parent]) -> None:
         """At an event at which nothing was looked for, prepare what the next look will ask for."""
         self.search.look_ahead(max(parents, key=lambda parent: parent.log_weight).hybrid_map)
-        lost = [(one.hybrid_map, one.state.lost_since) for one in parents if one.state.lost_since is not None]
+        found = [(one.hybrid_map, one.state.localization) for one in parents]
+        lost = [(hybrid_map, one.since) for hybrid_map, one in found if isinstance(one, Lost)]
         if lost and self.landmarks is not None:
             self.landmarks.prepare_places(lost)
 

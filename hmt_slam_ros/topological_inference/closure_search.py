@@ -84,6 +84,8 @@ class AreaComparison(NamedTuple):
 class SearchState:
     """What was learnt of the building by comparing its places.
 
+    :class:`ClosureSearch` does not hold it, as the shares are in a queue that drops the oldest.
+
     :ivar negative_shares: how large a share of their surfaces keyframes found in places where they do not lie, of those
         that were tried last.
     :ivar newest_sampled: the newest of the keyframes with which that was tried last, -1 before the first.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -107,6 +107,42 @@ class FalseAlarm:
 
 
 @dataclass(frozen=True, eq=False)
+class Tracking:
+    """That the place of the robot in the map is known.
+
+    :ivar relocalized_area: the known area in which it was recognized, until it goes over into another one; else None.
+    :ivar kind: tells it from ``Lost`` in a document.
+    """
+
+    relocalized_area: int | None = None
+    kind: Literal["tracking"] = "tracking"
+
+
+@dataclass(frozen=True, eq=False)
+class Lost:
+    """That the robot may be anywhere, until it is recognized.
+
+    :ivar since: the keyframe at which the robot arrived it is not known where.
+    :ivar false_alarm: where it was then if it was not displaced, where nothing is mapped and nobody carried it; else
+        None.
+    :ivar pose_hint: where one of the keyframes since then is, as somebody says; else None.
+    :ivar candidate: where it was recognized at the last look, if it was.
+    :ivar tracked_pose: where it was at ``since`` if it was not displaced, as another hypothesis says; else None.
+    :ivar counted_evidence: nats by which what it saw since then speaks for a place elsewhere, as far as that is in the
+        hypothesis's weight; None where another one has it there since.
+    :ivar kind: tells it from ``Tracking`` in a document.
+    """
+
+    since: int
+    false_alarm: FalseAlarm | None = None
+    pose_hint: PoseHint | None = None
+    candidate: PoseInArea | None = None
+    tracked_pose: PoseInArea | None = None
+    counted_evidence: float | None = 0.0
+    kind: Literal["lost"] = "lost"
+
+
+@dataclass(frozen=True, eq=False)
 class HypothesisState:
     """What TSBI remembers of a leaf beside its map; children inherit it.
 
@@ -122,16 +158,7 @@ class HypothesisState:
     :ivar kidnapping_evidence: {keyframe event: nats by which its scan contradicted what the robot should have seen}, of
         the latest events since the robot may have been displaced.
     :ivar unstored_poses: {event of these: where the robot was}, where the map stays as it is and does not hold them.
-    :ivar lost_since: the keyframe at which the robot arrived it is not known where, until that is recognized; else
-        None.
-    :ivar false_alarm: where it was then if it was not displaced, where nothing is mapped and nobody carried it; else
-        None.
-    :ivar pose_hint: where one of the keyframes since then is, as somebody says; else None.
-    :ivar relocalization_candidate: where it was recognized at the last look, if it was.
-    :ivar relocalized_area: the known area in which it was recognized, until it goes over into another one; else None.
-    :ivar tracked_pose: where it was at ``lost_since`` if it was not displaced, as another hypothesis says; else None.
-    :ivar counted_evidence: nats by which what it saw since then speaks for a place elsewhere, as far as that is in the
-        hypothesis's weight; None where another one has it there since.
+    :ivar localization: whether the place of the robot in the map is known.
     """
 
     covariances: Mapping[int, Covariance] = field(default_factory=dict)
@@ -142,13 +169,12 @@ class HypothesisState:
     unlinked_overlap: tuple[int, int] | None = None
     kidnapping_evidence: Mapping[int, float] = field(default_factory=dict)
     unstored_poses: Mapping[int, PoseInArea] = field(default_factory=dict)
-    lost_since: int | None = None
-    false_alarm: FalseAlarm | None = None
-    pose_hint: PoseHint | None = None
-    relocalization_candidate: PoseInArea | None = None
-    relocalized_area: int | None = None
-    tracked_pose: PoseInArea | None = None
-    counted_evidence: float | None = 0.0
+    localization: Tracking | Lost = field(default_factory=Tracking)
+
+    @property
+    def is_lost(self) -> bool:
+        """Whether the robot may be anywhere."""
+        return isinstance(self.localization, Lost)
 
     def after_scan(
         self, event: int, log_kidnapping_ratio: float, unstored_pose: PoseInArea | None = None
@@ -227,12 +253,7 @@ class HypothesisState:
             compared,
             kidnapping_evidence=self.kidnapping_evidence,
             unstored_poses=self.unstored_poses,
-            lost_since=self.lost_since,
-            false_alarm=self.false_alarm,
-            pose_hint=self.pose_hint,
-            relocalization_candidate=self.relocalization_candidate,
-            tracked_pose=self.tracked_pose,
-            counted_evidence=self.counted_evidence,
+            localization=self.localization if isinstance(self.localization, Lost) else Tracking(),
         )
 
 

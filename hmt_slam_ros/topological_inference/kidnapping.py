@@ -19,7 +19,7 @@ from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.shortest_path import shortest_path_beliefs, uninformative_belief
 from hmt_slam_ros.topological_inference.branching import Branches, Branching, Child, Parent
-from hmt_slam_ros.topological_inference.hypothesis_tree import FalseAlarm, PoseInArea
+from hmt_slam_ros.topological_inference.hypothesis_tree import FalseAlarm, Lost, PoseInArea
 from hmt_slam_ros.topological_inference.relocalization import (
     KIDNAPPED_UNMAPPED_PRIOR,
     decisive_candidate,
@@ -58,7 +58,8 @@ def decide_without_mapping(branching: Branching, parent: Parent, event: int) -> 
             notes = replace(notes, kidnapping_evidence={}, unstored_poses={})
         else:
             stay = FalseAlarm(notes.unstored_poses[event], 1.0 / (1.0 + math.exp(log_odds)))
-            notes = replace(notes, kidnapping_evidence={}, unstored_poses={}, lost_since=event + 1, false_alarm=stay)
+            lost = Lost(event + 1, false_alarm=stay)
+            notes = replace(notes, kidnapping_evidence={}, unstored_poses={}, localization=lost)
     return Child(parent.hypothesis, parent.log_weight, parent.area, notes)
 
 
@@ -95,12 +96,5 @@ def _kidnapped_child(branching: Branching, parent: Parent, keyframes: Sequence[i
         parent, query, area, origin, uninformative_belief(query.belief.mean), log_odds + credit
     )
     sighted = decisive_candidate(where, query.poses)
-    notes = replace(
-        child.state,
-        kidnapping_evidence={},
-        lost_since=keyframes[0],
-        tracked_pose=claim,
-        counted_evidence=credit,
-        relocalization_candidate=sighted,
-    )
-    return replace(child, state=notes)
+    lost = Lost(keyframes[0], candidate=sighted, tracked_pose=claim, counted_evidence=credit)
+    return replace(child, state=replace(child.state, kidnapping_evidence={}, localization=lost))

@@ -24,7 +24,7 @@ from hmt_slam_ros.messages.messages import Keyframe
 from hmt_slam_ros.topological_inference.branching import Branches, Branching, Child, Parent
 from hmt_slam_ros.topological_inference.global_localization import PoseDistribution, PoseHint
 from hmt_slam_ros.topological_inference.global_scan_matching import PoseCandidate, is_certain
-from hmt_slam_ros.topological_inference.hypothesis_tree import PoseInArea
+from hmt_slam_ros.topological_inference.hypothesis_tree import Lost, PoseInArea, Tracking
 
 Pose = NDArray[np.float64]
 
@@ -55,8 +55,9 @@ def begin_relocalization(branching: Branching, parent: Parent, keyframe: Keyfram
         return _enter_unknown_area(
             branching, _update_false_alarm(parent, keyframe, pose), keyframe.sequence, keyframe.initial_pose
         )
-    if keyframe.initial_pose is not None and parent.state.lost_since is not None:
-        return _relocalize_at_hint(branching, parent, keyframe.initial_pose, pose)
+    lost = parent.state.localization
+    if keyframe.initial_pose is not None and isinstance(lost, Lost):
+        return _relocalize_at_hint(branching, parent, lost, keyframe.initial_pose, pose)
     return Branches([Child(parent.hypothesis, parent.log_weight, parent.area, parent.state)])
 
 
@@ -65,12 +66,19 @@ def _update_false_alarm(parent: Parent, keyframe: Keyframe, pose: Pose) -> Paren
 
     :param pose: ``area_T_base`` of the scan, as its odometry has it.
     """
-    stay, notes = parent.state.false_alarm, parent.state
-    if stay is not None and notes.lost_since == keyframe.sequence and keyframe.initial_pose is None:
+    lost = parent.state.localization
+    if not isinstance(lost, Lost):
+        return parent
+    stay = lost.false_alarm
+    if stay is not None and lost.since == keyframe.sequence and keyframe.initial_pose is None:
         stay = replace(stay, tracked_pose=PoseInArea(parent.area, keyframe.sequence, pose))
     else:
         stay = None
-    return replace(parent, state=replace(notes, false_alarm=stay))
+    return _with_localization(parent, replace(lost, false_alarm=stay))
+
+
+def _with_localization(parent: Parent, localization: Tracking | Lost) -> Parent:
+    return replace(parent, state=replace(parent.state, localization=localization))
 
 
 def _enter_unknown_area(branching: Branching, parent: Parent, keyframe: int, place: InitialPose | None) -> Branches:
@@ -85,24 +93,24 @@ def _enter_unknown_area(branching: Branching, parent: Parent, keyframe: int, pla
     arc = uninformative_belief(query.belief.mean if told is None else _hinted_pose(parent, parent.area, told))
     origin = PoseGaussian.from_pose(np.zeros(3))
     child = branching.enter_area(parent, query, branching.new_area(parent, query), origin, arc, 0.0)
-    return Branches([replace(child, state=replace(child.state, lost_since=keyframe, pose_hint=told))])
+    before = child.state.localization
+    lost = replace(before if isinstance(before, Lost) else Lost(keyframe), since=keyframe, pose_hint=told)
+    return Branches([replace(child, state=replace(child.state, localization=lost))])
 
 
-def _relocalize_at_hint(branching: Branching, parent: Parent, place: InitialPose, pose: Pose) -> Branches:
+def _relocalize_at_hint(branching: Branching, parent: Parent, lost: Lost, place: InitialPose, pose: Pose) -> Branches:
     """A robot that may be anywhere, of which somebody says where it is: it is drawn there, and looked for at once.
 
     :param pose: ``area_T_base`` of the newest scan.
     """
-    assert parent.state.lost_since is not None
-    seen = _poses_since(parent, parent.state.lost_since)
+    seen = _poses_since(parent, lost.since)
     if not parent.hybrid_map.has_area(place.area) or not seen:
         return Branches([Child(parent.hypothesis, parent.log_weight, parent.area, parent.state)])
     newest = max(seen)
     told = PoseHint(newest, place.area, place.pose.compose(PoseGaussian.from_pose(se2.between(pose, seen[newest]))))
-    looked = update_relocalization(
-        branching, replace(parent, state=replace(parent.state, pose_hint=told, false_alarm=None))
-    )
-    arcs = _hinted_arcs(parent, parent.state.lost_since, told, seen[newest])
+    hinted = _with_localization(parent, replace(lost, pose_hint=told, false_alarm=None))
+    looked = update_relocalization(branching, hinted)
+    arcs = _hinted_arcs(parent, lost.since, told, seen[newest])
     return looked._replace(children=[replace(child, arcs=child.arcs or arcs) for child in looked.children])
 
 
@@ -126,64 +134,75 @@ def _hinted_arcs(parent: Parent, lost: int, pose_hint: PoseHint, pose: Pose) -> 
 
 
 def update_relocalization(branching: Branching, parent: Parent) -> Branches:
-    """To be lost still, or where the robot was recognized."""
-    assert parent.state.lost_since is not None
-    keyframes = _poses_since(parent, parent.state.lost_since)
+    """To be lost still, or where the robot was recognized.
+
+    :param parent: a hypothesis in which the robot is lost.
+    """
+    lost = parent.state.localization
+    assert isinstance(lost, Lost)
+    keyframes = _poses_since(parent, lost.since)
     reference = next(iter(keyframes.values()))
     poses = {k: se2.between(reference, pose) for k, pose in keyframes.items()}
-    told = _hint_of_first(parent, keyframes)
-    where = branching.localize_globally(parent, poses, parent.state.lost_since, told)
-    if parent.state.tracked_pose is not None:
+    told = _hint_of_first(lost, keyframes)
+    where = branching.localize_globally(parent, poses, lost.since, told)
+    if lost.tracked_pose is not None:
         where = where.with_unmapped_prior(KIDNAPPED_UNMAPPED_PRIOR)
-    where = _with_false_alarm(parent, where, poses)
-    noted = _reweight_by_evidence(replace(parent, state=parent.state.after_matching((), tuple(poses))), where, poses)
+    where = _with_false_alarm(parent.hybrid_map, lost, where, poses)
+    matched = replace(parent, state=parent.state.after_matching((), tuple(poses)))
+    noted, lost = _reweight_by_evidence(matched, lost, where, poses)
     if len(keyframes) >= _REFUTING_KEYFRAMES and float(where.probabilities.sum()) < 1.0 - _REFUTING_PROBABILITY:
-        noted = replace(noted, state=replace(noted.state, pose_hint=None))
+        lost = replace(lost, pose_hint=None)
     best = where.best
-    if best is None or not _is_decisive(*best, mapping=parent.state.tracked_pose is not None):
-        unsighted = replace(noted.state, relocalization_candidate=None)
-        return Branches(
-            [Child(parent.hypothesis, noted.log_weight, parent.area, unsighted)], True, pose_distribution=where
-        )
+    if best is None or not _is_decisive(*best, mapping=lost.tracked_pose is not None):
+        return Branches([_unmoved_child(noted, replace(lost, candidate=None))], True, pose_distribution=where)
     located, probability = best
-    sighted = replace(noted.state, relocalization_candidate=_pose_in_area(located, poses, max(poses)))
-    still = Child(parent.hypothesis, noted.log_weight, parent.area, sighted)
-    if not (told is not None and probability >= _ACCEPTANCE_WITH_HINT) and not _confirms_candidate(
-        parent, located, poses
-    ):
-        return Branches([still], True, pose_distribution=where)
-    arc = Arc(
-        parent.area, located.area, PoseGaussian.from_pose(reference).compose(located.mode.measured.inverse()), True
-    )
-    log_weight = noted.log_weight + math.log(probability)
-    notes = replace(
-        noted.state,
-        lost_since=None,
-        false_alarm=None,
-        pose_hint=None,
-        relocalization_candidate=None,
-        relocalized_area=located.area,
-        tracked_pose=None,
-        counted_evidence=0.0,
-    )
-    found = Child(parent.hypothesis, log_weight, parent.area, notes, arcs=(arc,), reload_local_map=True)
+    sighted = replace(lost, candidate=_pose_in_area(located, poses, max(poses)))
+    by_hint = told is not None and probability >= _ACCEPTANCE_WITH_HINT
+    if not by_hint and not _confirms_candidate(parent.hybrid_map, lost, located, poses):
+        return Branches([_unmoved_child(noted, sighted)], True, pose_distribution=where)
+    return Branches(_split_at_candidate(noted, sighted, reference, *best), True, pose_distribution=where)
+
+
+def _split_at_candidate(
+    parent: Parent, lost: Lost, reference: Pose, candidate: PoseCandidate, probability: float
+) -> list[Child]:
+    """The two continuations of a hypothesis where a place was found: lost still, and recognized there.
+
+    :param lost: what is remembered while the robot is lost.
+    :param reference: ``area_T_reference`` of the keyframes that were located, shape (3,).
+    :param probability: of the place.
+    """
     # What speaks for the place from here on is the other's.
-    still_lost = replace(sighted, counted_evidence=None)
-    left = noted.log_weight + math.log(max(1.0 - probability, 1e-300))
-    still = replace(still, log_weight=left, state=still_lost)
-    return Branches([still, found], True, pose_distribution=where)
+    still = _unmoved_child(parent, replace(lost, counted_evidence=None))
+    left = parent.log_weight + math.log(max(1.0 - probability, 1e-300))
+    belief = PoseGaussian.from_pose(reference).compose(candidate.mode.measured.inverse())
+    found = replace(
+        _unmoved_child(parent, Tracking(candidate.area)),
+        log_weight=parent.log_weight + math.log(probability),
+        arcs=(Arc(parent.area, candidate.area, belief, True),),
+        reload_local_map=True,
+    )
+    return [replace(still, log_weight=left), found]
 
 
-def _with_false_alarm(parent: Parent, distribution: PoseDistribution, poses: Mapping[int, Pose]) -> PoseDistribution:
+def _unmoved_child(parent: Parent, localization: Tracking | Lost) -> Child:
+    """The hypothesis with the robot in its area, of whose place this is known now."""
+    state = replace(parent.state, localization=localization)
+    return Child(parent.hypothesis, parent.log_weight, parent.area, state)
+
+
+def _with_false_alarm(
+    hybrid_map: HybridMap, lost: Lost, distribution: PoseDistribution, poses: Mapping[int, Pose]
+) -> PoseDistribution:
     """Where a robot is that may have been right about its place before it took itself for lost.
 
     :param poses: {keyframe: ``reference_T_base``} of those that were located.
     """
-    stay = parent.state.false_alarm
+    stay = lost.false_alarm
     if stay is None or stay.tracked_pose.keyframe not in poses:
         return distribution
-    there = _candidates_at(parent.hybrid_map, distribution, stay.tracked_pose, poses)
-    return distribution.with_false_alarm(there, stay.probability, len(parent.hybrid_map.area_ids()))
+    there = _candidates_at(hybrid_map, distribution, stay.tracked_pose, poses)
+    return distribution.with_false_alarm(there, stay.probability, len(hybrid_map.area_ids()))
 
 
 def accept_relocalization(branches: Branches) -> Branches:
@@ -192,21 +211,23 @@ def accept_relocalization(branches: Branches) -> Branches:
     Where nothing is mapped, what the robot saw since would go on to explain itself better than a map of before that the
     world does not keep to; if it was taken for another place, the map contradicts it soon.
     """
-    found = [child for child in branches.children if child.state.lost_since is None]
+    found = [child for child in branches.children if not child.state.is_lost]
     return branches._replace(children=found or branches.children)
 
 
-def _reweight_by_evidence(parent: Parent, distribution: PoseDistribution, poses: Mapping[int, Pose]) -> Parent:
+def _reweight_by_evidence(
+    parent: Parent, lost: Lost, distribution: PoseDistribution, poses: Mapping[int, Pose]
+) -> tuple[Parent, Lost]:
     """A hypothesis of a displaced robot, weighed by what it saw since, as far as that is not in its weight yet.
 
     :param poses: {keyframe: ``reference_T_base``} of those that were located.
     """
-    claim = parent.state.tracked_pose
-    if claim is None or parent.state.counted_evidence is None or claim.keyframe not in poses:
-        return parent
+    claim = lost.tracked_pose
+    if claim is None or lost.counted_evidence is None or claim.keyframe not in poses:
+        return parent, lost
     credit = log_bayes_factor(parent.hybrid_map, distribution, claim, poses)
-    notes = replace(parent.state, counted_evidence=credit)
-    return replace(parent, log_weight=parent.log_weight + credit - parent.state.counted_evidence, state=notes)
+    weighed = replace(parent, log_weight=parent.log_weight + credit - lost.counted_evidence)
+    return weighed, replace(lost, counted_evidence=credit)
 
 
 def log_bayes_factor(
@@ -279,17 +300,17 @@ def _pose_in_area(candidate: PoseCandidate, poses: Mapping[int, Pose], keyframe:
     return PoseInArea(candidate.area, keyframe, se2.compose(candidate.mode.pose.mean, poses[keyframe]))
 
 
-def _confirms_candidate(parent: Parent, candidate: PoseCandidate, poses: Mapping[int, Pose]) -> bool:
+def _confirms_candidate(hybrid_map: HybridMap, lost: Lost, candidate: PoseCandidate, poses: Mapping[int, Pose]) -> bool:
     """Whether the last look found the robot where this one has it.
 
     A place that looks alike is seldom taken for the right one twice, as other things are seen next.
 
     :param poses: {keyframe: ``reference_T_base``} of those that were located.
     """
-    before = parent.state.relocalization_candidate
+    before = lost.candidate
     if before is None or before.keyframe not in poses:
         return False
-    return _is_same_place(parent.hybrid_map, _pose_in_area(candidate, poses, before.keyframe), before)
+    return _is_same_place(hybrid_map, _pose_in_area(candidate, poses, before.keyframe), before)
 
 
 def _is_same_place(hybrid_map: HybridMap, one: PoseInArea, other: PoseInArea) -> bool:
@@ -301,9 +322,9 @@ def _is_same_place(hybrid_map: HybridMap, one: PoseInArea, other: PoseInArea) ->
     return bool(math.hypot(away[0], away[1]) <= _SAME_DISTANCE and abs(away[2]) <= _SAME_ANGLE)
 
 
-def _hint_of_first(parent: Parent, keyframes: dict[int, Pose]) -> PoseHint | None:
+def _hint_of_first(lost: Lost, keyframes: dict[int, Pose]) -> PoseHint | None:
     """Where the first of keyframes, {keyframe: ``area_T_base``}, is, as somebody said of one of them."""
-    told = parent.state.pose_hint
+    told = lost.pose_hint
     if told is None or told.keyframe not in keyframes:
         return None
     first = next(iter(keyframes))

@@ -40,8 +40,10 @@ from hmt_slam_ros.topological_inference.global_localization import PoseDistribut
 from hmt_slam_ros.topological_inference.hypothesis_merging import LocalizedHypothesis, merge_equivalent
 from hmt_slam_ros.topological_inference.hypothesis_tree import (
     HypothesisState,
+    Lost,
     PoseInArea,
     ReducedDistribution,
+    Tracking,
     normalize_and_reduce,
 )
 from hmt_slam_ros.topological_inference.kidnapping import decide_without_mapping, spawn_kidnapped_hypothesis
@@ -109,13 +111,10 @@ class Tsbi:
         self._replica = Replica.from_state(state.replica)
         self._branching = branching(configuration, self._replica)
         self._branching.restore(state.branching)
-        self._hypothesis_states = dict(state.hypothesis_states)
+        # All but the two parts above, which change in place.
+        self._state = replace(state, replica=ReplicaState(), branching=BranchingState())
         self._keyframe: Keyframe | None = None
         self._estimates: dict[int, HypothesisEstimate] = {}
-        self._next_hypothesis = state.next_hypothesis
-        self._unexamined = state.unexamined
-        self._global_poses = GlobalPoses(state.global_poses)
-        self._revised_hypotheses = state.revised_hypotheses
         # What the next look finds out anew: the keyframe event before which the robot arrived, and where it may be.
         self._reset_event = -1
         self._pose_distribution: PoseDistribution | None = None
@@ -123,15 +122,7 @@ class Tsbi:
     @property
     def state(self) -> TsbiState:
         """All that TSBI knows between two keyframe events, as a value."""
-        return TsbiState(
-            self._replica.state,
-            self._branching.state,
-            dict(self._hypothesis_states),
-            self._next_hypothesis,
-            self._unexamined,
-            self._global_poses.areas,
-            self._revised_hypotheses,
-        )
+        return replace(self._state, replica=self._replica.state, branching=self._branching.state)
 
     @property
     def localization(self) -> LocalizationStatus:
@@ -141,17 +132,20 @@ class Tsbi:
             HypothesisSummary(
                 probability,
                 self._replica.robot_areas[hypothesis],
-                arriving or self._hypothesis_states[hypothesis].lost_since is not None,
+                arriving or self._state.hypothesis_states[hypothesis].is_lost,
             )
             for hypothesis, probability in self._replica.probabilities.items()
         ]
         best = self._replica.best_hypothesis
-        since = self._reset_event if arriving else self._hypothesis_states[best].lost_since
+        leading = self._state.hypothesis_states[best].localization
+        since = self._reset_event if arriving else leading.since if isinstance(leading, Lost) else None
         hybrid_map = self._replica.maps[best]
         known = sum(
             since is None or any(k < since for k in hybrid_map.keyframes(area)) for area in hybrid_map.area_ids()
         )
-        return summarize_localization(standings, self._unexamined, known, None if arriving else self._pose_distribution)
+        return summarize_localization(
+            standings, self._state.unexamined, known, None if arriving else self._pose_distribution
+        )
 
     def handle(self, message: Message) -> list[Message]:
         """Learn from ``Keyframe`` and ``ClosureDecision``; answer ``AreaEvents`` with ``Hypotheses``."""
@@ -172,16 +166,16 @@ class Tsbi:
         self._replica.add_keyframe(keyframe)
         self._keyframe = keyframe
         self._estimates = {leaf.hypothesis: leaf for leaf in keyframe.estimates}
+        states = dict(self._state.hypothesis_states)
         for leaf in keyframe.estimates:
-            if leaf.hypothesis in self._hypothesis_states:
+            if leaf.hypothesis in states:
                 held = keyframe.mapping or leaf.stored
                 spot = None if held else PoseInArea(leaf.area, keyframe.sequence, leaf.pose.mean)
-                notes = self._hypothesis_states[leaf.hypothesis].after_scan(
-                    keyframe.sequence, leaf.log_kidnapping_ratio, spot
-                )
+                notes = states[leaf.hypothesis].after_scan(keyframe.sequence, leaf.log_kidnapping_ratio, spot)
                 stored = notes.after_keyframe(keyframe.sequence, leaf.pose.covariance) if leaf.stored else notes
-                self._hypothesis_states[leaf.hypothesis] = stored
-        wanted = {event for notes in self._hypothesis_states.values() for event in notes.unstored_poses}
+                states[leaf.hypothesis] = stored
+        self._state = replace(self._state, hypothesis_states=states)
+        wanted = {event for notes in states.values() for event in notes.unstored_poses}
         self._branching.keep_scans(keyframe.sequence, keyframe.scan, wanted)
 
     def _infer(self, events: AreaEvents) -> Hypotheses:
@@ -210,24 +204,23 @@ class Tsbi:
         arrived_now = keyframe.motion_unknown or keyframe.initial_pose is not None
         # Area abstraction, which does not know that the robot was displaced, forgets where it moves nothing itself.
         displaced = any(leaf.moved_keyframes for leaf in changed)
-        forgotten = () if self._revised_hypotheses or arrived_now or displaced else events.redundant_keyframes
-        outdated = () if self._revised_hypotheses or arrived_now else keyframe.stale_beams
+        revised = self._state.revised_hypotheses
+        forgotten = () if revised or arrived_now or displaced else events.redundant_keyframes
+        outdated = () if revised or arrived_now else keyframe.stale_beams
         self._replica.apply_hypotheses(
             Hypotheses(events.sequence, tuple(changed), settled.unexamined, forgotten, outdated)
         )
         if outdated:
             self._branching.forget_scans()
         loaded = [self._with_local_map(changed[n], child) for n, child in enumerate(chosen)]
-        self._unexamined, self._revised_hypotheses = (
-            settled.unexamined,
-            self._revised_hypotheses if keyframe.motion_unknown else (),
-        )
+        still_revised = revised if keyframe.motion_unknown else ()
+        self._state = replace(self._state, unexamined=settled.unexamined, revised_hypotheses=still_revised)
         leaves = tuple(sorted(loaded, key=lambda leaf: leaf.id))
         return Hypotheses(events.sequence, leaves, settled.unexamined, forgotten, outdated)
 
     def _parents(self, keyframe: Keyframe) -> list[Parent]:
         """The live hypotheses with their weights; of those that say the same, the heaviest, with the weight of all."""
-        parents = [self._parent(hypothesis) for hypothesis in sorted(self._hypothesis_states)]
+        parents = [self._parent(hypothesis) for hypothesis in sorted(self._state.hypothesis_states)]
         if len(parents) == 1:
             return parents
         poses = [self._estimates[parent.hypothesis].pose.mean for parent in parents]
@@ -251,24 +244,34 @@ class Tsbi:
         log_weight = math.log(max(probability, 1e-300)) + log_evidence
         area, hybrid_map = self._replica.robot_areas[hypothesis], self._replica.maps[hypothesis]
         return Parent(
-            hypothesis, area, hybrid_map, self._hypothesis_states[hypothesis], log_weight, probability, estimate.clutter
+            hypothesis,
+            area,
+            hybrid_map,
+            self._state.hypothesis_states[hypothesis],
+            log_weight,
+            probability,
+            estimate.clutter,
         )
 
     @property
     def _is_kidnapped(self) -> bool:
         """Whether the robot was displaced under one of the hypotheses, and is not found yet."""
-        return any(notes.tracked_pose is not None for notes in self._hypothesis_states.values())
+        found = [state.localization for state in self._state.hypothesis_states.values()]
+        return any(isinstance(one, Lost) and one.tracked_pose is not None for one in found)
 
     def _branch(self, parent: Parent, event: AreaEvent | None, keyframe: Keyframe) -> Branches:
         """The continuations of one hypothesis, each with its weight."""
         if keyframe.motion_unknown or keyframe.initial_pose is not None:
             come = begin_relocalization(self._branching, parent, keyframe, self._estimates[parent.hypothesis].pose.mean)
             return come if keyframe.mapping else accept_relocalization(come)
-        if self._revised_hypotheses:
-            return Branches([apply_revision(parent, leaf, keyframe.sequence) for leaf in self._revised_hypotheses])
-        if not keyframe.mapping and parent.state.lost_since is None:
-            return self._branch_without_mapping(parent, event, keyframe.sequence)
-        if not any(notes.lost_since is not None for notes in self._hypothesis_states.values()):
+        if self._state.revised_hypotheses:
+            return Branches(
+                [apply_revision(parent, leaf, keyframe.sequence) for leaf in self._state.revised_hypotheses]
+            )
+        if not keyframe.mapping and isinstance(parent.state.localization, Tracking):
+            found = parent.state.localization.relocalized_area
+            return self._branch_without_mapping(parent, event, keyframe.sequence, found)
+        if not any(notes.is_lost for notes in self._state.hypothesis_states.values()):
             displaced = spawn_kidnapped_hypothesis(self._branching, parent)
             if displaced is not None:
                 return displaced
@@ -276,16 +279,21 @@ class Tsbi:
             return self._branch_on_area_event(parent, event)
         return self._branch_without_area_event(parent, self._estimates[parent.hypothesis], keyframe)
 
-    def _branch_without_mapping(self, parent: Parent, event: AreaEvent | None, sequence: int) -> Branches:
+    def _branch_without_mapping(
+        self, parent: Parent, event: AreaEvent | None, sequence: int, relocalized_area: int | None
+    ) -> Branches:
         """The map stays as it is; the robot may go into another area of it, or be lost.
 
         What it mapped while it was lost is joined to the map in one place alone and leads nowhere, so that it goes over
         into the area where it was recognized as soon as that is sure.
+
+        :param relocalized_area: that area, if there is one.
         """
-        child, found = decide_without_mapping(self._branching, parent, sequence), parent.state.relocalized_area
-        if child.state.lost_since is not None:
+        child = decide_without_mapping(self._branching, parent, sequence)
+        if child.state.is_lost:
             return Branches([child])
-        if found is not None and len(self._hypothesis_states) == 1 and parent.hybrid_map.has_area(found):
+        found = relocalized_area
+        if found is not None and len(self._state.hypothesis_states) == 1 and parent.hybrid_map.has_area(found):
             return self._branching.move(parent, found)
         if event is not None and event.kind == "moved":
             return self._branching.move(parent, event.area)
@@ -301,18 +309,17 @@ class Tsbi:
 
     def _branch_without_area_event(self, parent: Parent, estimate: HypothesisEstimate, keyframe: Keyframe) -> Branches:
         """No area was left; but the robot may be in known ground that area abstraction does not know to be near."""
-        notes = replace(
-            parent.state.after_overlap(self._branching.find_unlinked_overlap(parent, estimate.pose.mean)),
-            relocalized_area=None,
-        )
+        overlap = self._branching.find_unlinked_overlap(parent, estimate.pose.mean)
+        lost = parent.state.localization if isinstance(parent.state.localization, Lost) else None
+        notes = replace(parent.state.after_overlap(overlap), localization=lost or Tracking())
         parent = replace(parent, state=notes)
         if notes.unlinked_overlap is not None and notes.unlinked_overlap[1] >= _OVERLAP_PERSISTENCE:
             return self._branching.link(parent, notes.unlinked_overlap[0], keyframe.scan, estimate.pose)
-        enough = self._options.recheck_keyframes if notes.pose_hint is None else 1
-        if len(notes.unmatched_keyframes) >= enough and notes.lost_since is not None:
+        enough = self._options.recheck_keyframes
+        if lost is not None and len(notes.unmatched_keyframes) >= (enough if lost.pose_hint is None else 1):
             looked = update_relocalization(self._branching, parent)
             return looked if keyframe.mapping else accept_relocalization(looked)
-        if len(notes.unmatched_keyframes) >= self._options.recheck_keyframes:
+        if len(notes.unmatched_keyframes) >= enough:
             return self._branching.recheck(parent)
         if notes.pending_candidates and len(notes.unmatched_keyframes) == _RETRY_KEYFRAMES:
             return self._branching.recheck(parent, notes.pending_candidates)
@@ -321,12 +328,11 @@ class Tsbi:
     def _reduce(self, sequence: int, children: Sequence[Child], branches: Sequence[Branches]) -> ReducedDistribution:
         generator = random_stream(self._seed, Purpose.HYPOTHESES, sequence)
         # Ground that was not looked at would show again by now, in the keyframes that are looked at.
-        if any(branch.closures_searched for branch in branches):
-            self._unexamined *= 0.5
+        searched = any(branch.closures_searched for branch in branches)
         return normalize_and_reduce(
             np.array([child.log_weight for child in children]),
             float(np.logaddexp.reduce([branch.log_skipped_weight for branch in branches])),
-            self._unexamined,
+            self._state.unexamined * (0.5 if searched else 1.0),
             self._options.max_hypotheses,
             self._options.drop_probability,
             generator,
@@ -341,17 +347,18 @@ class Tsbi:
             self._hypothesis(child, siblings[child.parent] > 1, float(probability))
             for child, probability in zip(chosen, probabilities, strict=True)
         ]
-        self._hypothesis_states = {leaf.id: child.state for leaf, child in zip(leaves, chosen, strict=True)}
-        if all(notes.lost_since is None for notes in self._hypothesis_states.values()):
+        states = {leaf.id: child.state for leaf, child in zip(leaves, chosen, strict=True)}
+        self._state = replace(self._state, hypothesis_states=states)
+        if not any(notes.is_lost for notes in states.values()):
             self._branching.end_global_localization()
         return leaves
 
     def _hypothesis(self, child: Child, branched: bool, probability: float) -> Hypothesis:
         hypothesis = child.parent
         if branched:
-            hypothesis = self._next_hypothesis
-            self._next_hypothesis += 1
-        lost, newest = child.state.lost_since, -1 if self._keyframe is None else self._keyframe.sequence
+            hypothesis = self._state.next_hypothesis
+            self._state = replace(self._state, next_hypothesis=hypothesis + 1)
+        found, newest = child.state.localization, -1 if self._keyframe is None else self._keyframe.sequence
         return Hypothesis(
             hypothesis,
             child.parent,
@@ -362,8 +369,8 @@ class Tsbi:
             child.arcs,
             removed_arcs=child.removed_arcs,
             area_merge=child.area_merge,
-            lost=lost is not None,
-            tracking_reset=lost is not None and lost > newest,
+            lost=isinstance(found, Lost),
+            tracking_reset=isinstance(found, Lost) and found.since > newest,
         )
 
     def _with_local_map(self, leaf: Hypothesis, child: Child) -> Hypothesis:
@@ -371,22 +378,28 @@ class Tsbi:
         if not child.reload_local_map:
             return leaf
         around = areas_around(self._replica.maps[leaf.id], leaf.area, self._branching.search.submap_radius)
+        global_poses = GlobalPoses(self._state.global_poses)
         poses = {
-            area: consistent_pose(belief, leaf.area, area, self._global_poses, self._branching.search.gating.gate)
+            area: consistent_pose(belief, leaf.area, area, global_poses, self._branching.search.gating.gate)
             for area, belief in around.items()
             if area != leaf.area
         }
-        self._hypothesis_states[leaf.id] = replace(self._hypothesis_states[leaf.id], local_area_poses=poses)
+        states = self._state.hypothesis_states
+        located = replace(states[leaf.id], local_area_poses=poses)
+        self._state = replace(self._state, hypothesis_states={**states, leaf.id: located})
         loaded = [LocalArea(area, pose) for area, pose in poses.items()]
         return replace(leaf, local_areas=(LocalArea(leaf.area, np.zeros(3)), *loaded))
 
     def _accept(self, accepted: ClosureDecision) -> None:
         """One hypothesis is definite: the others, and what was not examined, are gone."""
         if accepted.global_poses:
-            self._global_poses = GlobalPoses(accepted.global_poses)
+            self._state = replace(self._state, global_poses=accepted.global_poses)
         if accepted.hypothesis is None:
             return
         self._replica.apply_decision(accepted)
-        self._revised_hypotheses = accepted.revised_hypotheses
-        self._hypothesis_states = {accepted.hypothesis: self._hypothesis_states[accepted.hypothesis]}
-        self._unexamined = 0.0
+        self._state = replace(
+            self._state,
+            revised_hypotheses=accepted.revised_hypotheses,
+            hypothesis_states={accepted.hypothesis: self._state.hypothesis_states[accepted.hypothesis]},
+            unexamined=0.0,
+        )
