@@ -1,9 +1,9 @@
 """Every parameter of the system: the groups, and the rules that join them.
 
 Each parameter is declared once, in ``metric``, ``topological``, ``features``, ``places``, ``live`` or ``explorer``:
-default, unit, range and description. The ROS parameters, the YAML files, ``--set`` and docs/reference/parameters.md all follow
-from this tree, so a new parameter is one line here. Angles are in degrees, for the people who set them; the code that
-uses one calls ``math.radians`` there. After a change run ``scripts/generate_docs.py``, which brings
+default, unit, range and description. The ROS parameters, the YAML files, ``--set`` and docs/reference/parameters.md all
+follow from this tree, so a new parameter is one line here. Angles are in degrees, for the people who set them; the code
+that uses one calls ``math.radians`` there. After a change run ``scripts/generate_docs.py``, which brings
 config/hmt_slam.yaml and docs/reference/parameters.md up to date.
 """
 

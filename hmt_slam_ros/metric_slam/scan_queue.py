@@ -79,8 +79,8 @@ class ScanQueue:
             said += self._notice(
                 "order",
                 f"A scan is stamped {scan.stamp / 1e9:.6f} s, not after its predecessor "
-                f"({self._state.last_stamp / 1e9:.6f} s); scans are taken in the order of their arrival: check the clocks or "
-                "the order of the log.",
+                f"({self._state.last_stamp / 1e9:.6f} s); scans are taken in the order of their arrival: check the "
+                "clocks or the order of the log.",
             )
         if not scan.valid.any():
             said += self._notice(

@@ -1,8 +1,8 @@
 """A managed node of ROS 2: others may bring it up, halt it and take it down, state by state; by itself it comes up.
 
-docs/decisions/0034-managed-nodes.md says what the states mean. rclpy's part of it has three gaps that are filled here: an exception in
-a transition is passed over in silence, a transition that the state does not have ends the process, and nothing that was
-made for a state is destroyed with it.
+docs/decisions/0034-managed-nodes.md says what the states mean. rclpy's part of it has three gaps that are filled here:
+an exception in a transition is passed over in silence, a transition that the state does not have ends the process, and
+nothing that was made for a state is destroyed with it.
 """
 
 from __future__ import annotations
