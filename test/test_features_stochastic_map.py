@@ -9,7 +9,6 @@ from hmt_slam_ros.configuration.landmarks import FeatureParameters
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.landmarks.line_extraction import Lines
-from hmt_slam_ros.landmarks.line_fit import wrap_angle
 from hmt_slam_ros.landmarks.stochastic_map import LineMap
 from hmt_slam_ros.sensors.motion_model import RelativeMotion
 
@@ -39,7 +38,7 @@ def nees(error, covariance):
 
 def error_of(room, line, wall):
     alpha, r = room.lines[line]
-    return np.array([float(wrap_angle(alpha - wall[0])), r - wall[1]])
+    return np.array([float(se2.wrap(alpha - wall[0])), r - wall[1]])
 
 
 def test_pose_and_lines_are_as_far_off_as_they_say():

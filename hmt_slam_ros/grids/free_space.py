@@ -10,6 +10,7 @@ import numpy as np
 from numba import njit
 
 from hmt_slam_ros.arrays import Float64
+from hmt_slam_ros.geometry.se2_kernels import transform
 from hmt_slam_ros.grids.patches import FAR, PATCH, GridView, field_at
 
 # A beam passes a wall if nothing is known within this distance of it before and behind, m: others run along the wall.
@@ -38,12 +39,12 @@ def count_hits_and_violations(
     cos, sin = np.cos(pose[2]) / view.cell, np.sin(pose[2]) / view.cell
     half = 0.5 * view.table.shape[0] * PATCH
     u, v = pose[0] / view.cell + half, pose[1] / view.cell + half
-    from_u, from_v = u + cos * laser[0] - sin * laser[1], v + sin * laser[0] + cos * laser[1]
+    from_u, from_v = transform(u, v, cos, sin, laser[0], laser[1])
     apart, together = _SAMPLE_SPACING / view.cell, _MAX_SAMPLE_GAP / view.cell
     met, met_u, met_v = 0, -np.inf, -np.inf
     passed, passed_u, passed_v = 0, -np.inf, -np.inf
     for i in range(points.shape[0]):
-        to_u, to_v = u + cos * points[i, 0] - sin * points[i, 1], v + sin * points[i, 0] + cos * points[i, 1]
+        to_u, to_v = transform(u, v, cos, sin, points[i, 0], points[i, 1])
         if field_at(view, int(to_u), int(to_v)) < near and np.hypot(to_u - met_u, to_v - met_v) >= apart:
             met, met_u, met_v = met + 1, to_u, to_v
         share = _first_wall_passed(view, from_u, from_v, to_u, to_v)

@@ -8,6 +8,7 @@ import numpy as np
 from numba import njit
 
 from hmt_slam_ros.arrays import Float64, Int8, Int32, UInt32
+from hmt_slam_ros.geometry.se2_kernels import transform
 from hmt_slam_ros.grids.distance_field import (
     FieldWorkspace,
     has_bits,
@@ -58,8 +59,8 @@ def cell_coordinates(points: Float64, poses: Float64, cell: float, table_size: i
     for i in range(poses.shape[0]):
         cos, sin = np.cos(poses[i, 2]), np.sin(poses[i, 2])
         for n in range(points.shape[0]):
-            placed[i, n, 0] = (poses[i, 0] + cos * points[n, 0] - sin * points[n, 1]) / cell + half
-            placed[i, n, 1] = (poses[i, 1] + sin * points[n, 0] + cos * points[n, 1]) / cell + half
+            x, y = transform(poses[i, 0], poses[i, 1], cos, sin, points[n, 0], points[n, 1])
+            placed[i, n, 0], placed[i, n, 1] = x / cell + half, y / cell + half
     return placed
 
 

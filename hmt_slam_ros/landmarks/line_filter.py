@@ -23,6 +23,7 @@ from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.covariance import inverse, propagate_covariance
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.geometry.se2_kernels import rotate_back
 from hmt_slam_ros.landmarks.line_extraction import Lines, extract_for_map
 from hmt_slam_ros.landmarks.stochastic_map import LineAssociations, LineMap
 from hmt_slam_ros.registration.consistency import Agreement
@@ -105,9 +106,8 @@ def _count_beams(ends: Float64, laser: Float64, stretches: Float64, near: float)
 def _ends_on_wall(end: Float64, stretches: Float64, near: float) -> bool:
     for k in range(len(stretches)):
         cos, sin = math.cos(stretches[k, 0]), math.sin(stretches[k, 0])
-        along = cos * end[1] - sin * end[0]
-        off = cos * end[0] + sin * end[1] - stretches[k, 1]
-        if abs(off) < near and stretches[k, 2] - near < along < stretches[k, 3] + near:
+        across, along = rotate_back(cos, sin, end[0], end[1])
+        if abs(across - stretches[k, 1]) < near and stretches[k, 2] - near < along < stretches[k, 3] + near:
             return True
     return False
 
