@@ -1,4 +1,7 @@
-"""Where the other areas lie seen from one area: composition of arcs along the least uncertain path, Eq. (15)."""
+"""Where the other areas lie seen from one area: composition of arcs along the least uncertain path, Eq. (15).
+
+The cost of an arc depends on the path to it, so the searches of scipy and networkx, which weigh arcs once, do not do.
+"""
 
 from __future__ import annotations
 

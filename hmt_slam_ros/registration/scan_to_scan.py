@@ -292,6 +292,7 @@ def _nearest_point(
     # What is seen so many bins away is at least so far off: the chord grows by about this with each bin.
     squared_width = (2.0 * np.pi / count) ** 2 * (dx * dx + dy * dy)
     nearest, best = -1, gate * gate
+    # This comparison stands twice: as a function of its own it takes twice the time.
     k = bins[first + middle]
     if k >= 0:
         ex, ey = points[k, 0] - x, points[k, 1] - y
