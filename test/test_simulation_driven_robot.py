@@ -78,17 +78,6 @@ def test_without_a_command_it_stands_still():
     np.testing.assert_array_equal(robot.pose, still)
 
 
-def test_a_wall_that_is_put_up_is_seen_and_not_passed_until_it_is_gone():
-    robot = robot_in(start=np.zeros(3), dropout=0.0)
-    robot.close_doors(np.array([[2.0, -4.0, 2.0, 4.0]]))
-    assert robot.measure()[1].ranges[180] == pytest.approx(2.0, abs=0.1)
-    drive(robot, 0.6, 0.0, 60)
-    assert (robot.contacts, robot.pose[0]) == (1, pytest.approx(1.75, abs=0.013))
-    robot.close_doors(np.empty((0, 4)))
-    drive(robot, 0.6, 0.0, 30)
-    assert robot.pose[0] > 2.5
-
-
 @pytest.mark.parametrize("heading", [0.0, 0.4, 2.0, -2.8])
 def test_it_does_not_pass_a_wall_and_touches_it_once(heading):
     robot = robot_in(odometry=0.0, start=np.array([0.0, 0.0, heading]))

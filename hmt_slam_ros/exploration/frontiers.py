@@ -1,4 +1,7 @@
-"""The ground around an area: where a robot can go, and where what is known of it ends (frontiers; Yamauchi, 1997)."""
+"""The ground around an area: where a robot can go, and where what is known of it ends (frontiers; Yamauchi, 1997).
+
+One search of scipy's serves all paths of a grid. Roadmaps and policies have few nodes with names: networkx does there.
+"""
 
 from __future__ import annotations
 

@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from hmt_slam_ros.geometry import symmetric
+from hmt_slam_ros.geometry import se2_kernels, symmetric
 
 Matrix = NDArray[np.float64]
 
@@ -32,7 +32,7 @@ def rotate_covariance(matrix: Matrix, theta: float) -> Matrix:
 def propagate_covariance(covariance: Matrix, increment: NDArray[np.float64]) -> Matrix:
     """The covariance at the end of ``increment`` (3,), from that at its start: Ad^-1 C Ad^-T, right tangent frames."""
     cos, sin = np.cos(increment[2]), np.sin(increment[2])
-    x, y = -cos * increment[0] - sin * increment[1], sin * increment[0] - cos * increment[1]
+    x, y = se2_kernels.inverse_position(cos, sin, increment[0], increment[1])
     return _apply_adjoint(covariance, x, y, -increment[2])
 
 

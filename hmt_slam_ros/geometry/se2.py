@@ -15,6 +15,8 @@ from numba import njit
 from numba.extending import register_jitable
 from numpy.typing import ArrayLike, NDArray
 
+from hmt_slam_ros.geometry import se2_kernels
+
 Pose = NDArray[np.float64]
 
 _SMALL_ANGLE = 1e-5
@@ -24,7 +26,7 @@ def wrap(angle: ArrayLike) -> NDArray[np.float64]:
     """``angle`` brought into [-pi, pi)."""
     angle = np.asarray(angle, dtype=np.float64)
     if not angle.ndim:
-        return np.array(_wrap_one(angle.item()))
+        return np.array(se2_kernels.wrap(angle.item()))
     inside = (angle >= -np.pi) & (angle < np.pi)
     if inside.all():
         return angle.copy()
@@ -60,9 +62,8 @@ def _compose_each(a: Pose, b: Pose) -> Pose:
     found = np.empty((a.shape[0], 3))
     for n in range(a.shape[0]):
         cos, sin = np.cos(a[n, 2]), np.sin(a[n, 2])
-        found[n, 0] = a[n, 0] + cos * b[0] - sin * b[1]
-        found[n, 1] = a[n, 1] + sin * b[0] + cos * b[1]
-        found[n, 2] = _wrap_one(a[n, 2] + b[2])
+        found[n, 0], found[n, 1] = se2_kernels.transform(a[n, 0], a[n, 1], cos, sin, b[0], b[1])
+        found[n, 2] = se2_kernels.wrap(a[n, 2] + b[2])
     return found
 
 
@@ -70,15 +71,7 @@ def _compose_one(a: list[float], b: list[float]) -> Pose:
     cos, sin = math.cos(a[2]), math.sin(a[2])
     x = a[0] + cos * b[0] - sin * b[1]
     y = a[1] + sin * b[0] + cos * b[1]
-    return np.array((x, y, _wrap_one(a[2] + b[2])))
-
-
-@register_jitable
-def _wrap_one(angle: float) -> float:
-    if -math.pi <= angle < math.pi:
-        return angle
-    wrapped = (angle + math.pi) % (2.0 * math.pi) - math.pi
-    return wrapped if wrapped < math.pi else -math.pi
+    return np.array((x, y, se2_kernels.wrap(a[2] + b[2])))
 
 
 def inverse(a_T_b: ArrayLike) -> Pose:
@@ -94,7 +87,7 @@ def inverse(a_T_b: ArrayLike) -> Pose:
 
 def _inverse_one(a: list[float]) -> Pose:
     cos, sin = math.cos(a[2]), math.sin(a[2])
-    return np.array((-cos * a[0] - sin * a[1], sin * a[0] - cos * a[1], _wrap_one(-a[2])))
+    return np.array((-cos * a[0] - sin * a[1], sin * a[0] - cos * a[1], se2_kernels.wrap(-a[2])))
 
 
 def between(c_T_a: ArrayLike, c_T_b: ArrayLike) -> Pose:
@@ -108,7 +101,7 @@ def between(c_T_a: ArrayLike, c_T_b: ArrayLike) -> Pose:
 def _between_one(a: list[float], b: list[float]) -> Pose:
     cos, sin = math.cos(a[2]), math.sin(a[2])
     x, y = b[0] - a[0], b[1] - a[1]
-    return np.array((cos * x + sin * y, cos * y - sin * x, _wrap_one(b[2] - a[2])))
+    return np.array((cos * x + sin * y, cos * y - sin * x, se2_kernels.wrap(b[2] - a[2])))
 
 
 def transform(a_T_b: ArrayLike, points: ArrayLike) -> NDArray[np.float64]:
@@ -137,7 +130,7 @@ def exp(xi: ArrayLike) -> Pose:
 
 
 def _exp_one(x: float, y: float, omega: float) -> Pose:
-    return np.array((*exp_shift(x, y, omega), _wrap_one(omega)))
+    return np.array((*exp_shift(x, y, omega), se2_kernels.wrap(omega)))
 
 
 @register_jitable
@@ -165,7 +158,7 @@ def log(pose: ArrayLike) -> NDArray[np.float64]:
 
 
 def _log_one(x: float, y: float, angle: float) -> NDArray[np.float64]:
-    omega = _wrap_one(angle)
+    omega = se2_kernels.wrap(angle)
     half = 0.5 * omega
     half_cot = 1.0 - omega**2 / 12.0 if abs(omega) < _SMALL_ANGLE else half / math.tan(half)
     return np.array((half_cot * x + half * y, -half * x + half_cot * y, omega))

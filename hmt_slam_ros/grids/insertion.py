@@ -8,6 +8,7 @@ import numpy as np
 from numba import njit
 
 from hmt_slam_ros.arrays import Float64, Int8, Int32, UInt32
+from hmt_slam_ros.geometry.se2_kernels import transform
 from hmt_slam_ros.grids.distance_field import (
     FieldWorkspace,
     has_bits,
@@ -18,6 +19,7 @@ from hmt_slam_ros.grids.distance_field import (
     recompute_dirty,
 )
 from hmt_slam_ros.grids.patches import MASK, PATCH, SHIFT, PatchStore, writable_patch
+from hmt_slam_ros.grids.traversal import begin_walk, next_cell
 
 
 class InverseSensorModel(NamedTuple):
@@ -58,8 +60,8 @@ def cell_coordinates(points: Float64, poses: Float64, cell: float, table_size: i
     for i in range(poses.shape[0]):
         cos, sin = np.cos(poses[i, 2]), np.sin(poses[i, 2])
         for n in range(points.shape[0]):
-            placed[i, n, 0] = (poses[i, 0] + cos * points[n, 0] - sin * points[n, 1]) / cell + half
-            placed[i, n, 1] = (poses[i, 1] + sin * points[n, 0] + cos * points[n, 1]) / cell + half
+            x, y = transform(poses[i, 0], poses[i, 1], cos, sin, points[n, 0], points[n, 1])
+            placed[i, n, 0], placed[i, n, 1] = x / cell + half, y / cell + half
     return placed
 
 
@@ -94,29 +96,16 @@ def insert_beams(
     :param ends: likewise where they end; the first ``hits`` end on a surface.
     """
     for i in range(tables.shape[0]):
-        _insert_beams(tables[i], store, marks, work, origins[i], ends[i], hits, model)
-
-
-@njit(cache=True)
-def _insert_beams(
-    table: Int32,
-    store: PatchStore,
-    marks: BeamMasks,
-    work: FieldWorkspace,
-    origins: Float64,
-    ends: Float64,
-    hits: int,
-    model: InverseSensorModel,
-) -> None:
-    _mark_beams(marks, origins, ends, hits)
-    rows, columns = _patches_around(origins, ends, table.shape[0])
-    for tr in rows:
-        for tc in columns:
-            hit, passed = marks.hit[tr, tc], marks.passed[tr, tc]
-            if has_bits(hit) or has_bits(passed):
-                patch = writable_patch(table, store, tr, tc)
-                _update_odds(store.odds[patch], store.occupied[patch], hit, passed, model)
-    _update_field(table, store, marks, work, rows, columns)
+        table = tables[i]
+        _mark_beams(marks, origins[i], ends[i], hits)
+        rows, columns = _patches_around(origins[i], ends[i], table.shape[0])
+        for tr in rows:
+            for tc in columns:
+                hit, passed = marks.hit[tr, tc], marks.passed[tr, tc]
+                if has_bits(hit) or has_bits(passed):
+                    patch = writable_patch(table, store, tr, tc)
+                    _update_odds(store.odds[patch], store.occupied[patch], hit, passed, model)
+        _update_field(table, store, marks, work, rows, columns)
 
 
 @njit(cache=True)
@@ -167,32 +156,14 @@ def _mark_beams(marks: BeamMasks, origins: Float64, ends: Float64, hits: int) ->
 
 @njit(cache=True)
 def _mark_beam(passed: UInt32, from_x: float, from_y: float, to_x: float, to_y: float) -> None:
-    """Mark the cells from the laser to before the end point, by grid traversal (Amanatides and Woo 1987)."""
+    """Mark the cells from the laser to before the end point."""
     edge = passed.shape[0] * PATCH
-    column, row = int(np.floor(from_x)), int(np.floor(from_y))
-    steps = abs(int(np.floor(to_x)) - column) + abs(int(np.floor(to_y)) - row)
-    step_x, delta_x, next_x = _axis_steps(from_x, to_x)
-    step_y, delta_y, next_y = _axis_steps(from_y, to_y)
+    walk, steps = begin_walk(from_x, from_y, to_x, to_y)
     for _ in range(steps):
+        column, row = walk.column, walk.row
         if 0 <= column < edge and 0 <= row < edge:
             passed[row >> SHIFT, column >> SHIFT, row & MASK] |= np.uint32(1) << np.uint32(column & MASK)
-        if next_x < next_y:
-            next_x += delta_x
-            column += step_x
-        else:
-            next_y += delta_y
-            row += step_y
-
-
-@njit(cache=True)
-def _axis_steps(start: float, end: float) -> tuple[int, float, float]:
-    """Along one axis: the cell step, the beam's length per cell, and its length up to the first boundary."""
-    if end == start:
-        return 0, np.inf, np.inf
-    delta = 1.0 / abs(end - start)
-    if end > start:
-        return 1, delta, (np.floor(start) + 1.0 - start) * delta
-    return -1, delta, (start - np.floor(start)) * delta
+        walk = next_cell(walk)
 
 
 @njit(cache=True)

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.grids.traversal import begin_walk, next_cell
 from hmt_slam_ros.sensors import Scan
 
 OCCUPIED, FREE, UNKNOWN = np.uint8(0), np.uint8(254), np.uint8(205)
@@ -102,26 +103,14 @@ def _vote(
 
 @njit(cache=True)
 def _clear(start: NDArray[np.float64], end: NDArray[np.float64], scan: int, votes: NDArray[np.int32]) -> None:
-    """Walk all cells that the beam crosses, without its last one (Amanatides and Woo 1987)."""
-    x, y = start
-    j, i = math.floor(x), math.floor(y)
-    dx, dy = end[0] - x, end[1] - y
-    step_j, step_i = (1 if dx > 0 else -1), (1 if dy > 0 else -1)
-    # Share of the beam from one vertical, horizontal grid line to the next, and to the first of them.
-    period_x = 1.0 / abs(dx) if dx != 0.0 else np.inf
-    period_y = 1.0 / abs(dy) if dy != 0.0 else np.inf
-    next_x = (j + 1 - x if dx > 0 else x - j) * period_x if dx != 0.0 else np.inf
-    next_y = (i + 1 - y if dy > 0 else y - i) * period_y if dy != 0.0 else np.inf
-    for _ in range(abs(math.floor(end[0]) - j) + abs(math.floor(end[1]) - i)):
+    """Vote for all cells that the beam crosses, without its last one."""
+    walk, steps = begin_walk(start[0], start[1], end[0], end[1])
+    for _ in range(steps):
+        i, j = walk.row, walk.column
         if votes[_LAST_SCAN, i, j] != scan:
             votes[_LAST_SCAN, i, j] = scan
             votes[_MISSES, i, j] += 1
-        if next_x < next_y:
-            next_x += period_x
-            j += step_j
-        else:
-            next_y += period_y
-            i += step_i
+        walk = next_cell(walk)
 
 
 def write_map(directory: Path, image: OccupancyImage) -> None:

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from hmt_slam_ros.arrays import Bool, Float64
+from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.grids.patches import FAR, PATCH, GridView, field_at_four, odds_at
 from hmt_slam_ros.sensors import Scan
 
@@ -39,14 +39,11 @@ class VirtualScan(NamedTuple):
     :ivar incidence_cosine: shape (n,), cosine of the angle between each beam and the normal of the surface that it
         meets, at least 0.05. What a map errs by is across its surfaces, which makes a range err by as much divided by
         this.
-    :ivar ends_unknown: shape (n,), beams that come into unknown ground; the others meet a surface, or nothing within
-        reach.
     """
 
     scan: Scan
     free_range: Float64
     incidence_cosine: Float64
-    ends_unknown: Bool
 
 
 def cast_virtual_scan(view: GridView, pose: Float64, beams: int, reach: float, stamp: int = 0) -> VirtualScan:
@@ -61,7 +58,7 @@ def cast_virtual_scan(view: GridView, pose: Float64, beams: int, reach: float, s
     ranges, free, facing = np.empty(beams), np.empty(beams), np.empty(beams)
     _cast_beams(view, pose, step, reach, ranges, free, facing)
     scan = Scan(stamp, ranges.astype(np.float32), -math.pi, step, 0.0, float(np.float32(reach)) + view.cell)
-    return VirtualScan(scan, free, facing, np.isnan(ranges) & (free < reach))
+    return VirtualScan(scan, free, facing)
 
 
 @njit(cache=True)

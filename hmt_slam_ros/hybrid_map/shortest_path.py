@@ -1,4 +1,7 @@
-"""Where the other areas lie seen from one area: composition of arcs along the least uncertain path, Eq. (15)."""
+"""Where the other areas lie seen from one area: composition of arcs along the least uncertain path, Eq. (15).
+
+The cost of an arc depends on the path to it, so the searches of scipy and networkx, which weigh arcs once, do not do.
+"""
 
 from __future__ import annotations
 
@@ -12,6 +15,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from hmt_slam_ros.arrays import Bool, Float64, Int64
+from hmt_slam_ros.geometry import se2_kernels
 from hmt_slam_ros.geometry.covariance import inverse_pose_covariance, propagate_covariance
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.common_map import ArcTable
@@ -221,15 +225,15 @@ def _relax_arc(
 @njit(cache=True)
 def _inverse(pose: Float64) -> Float64:
     cos, sin = np.cos(pose[2]), np.sin(pose[2])
-    x, y = pose[0], pose[1]
-    return np.array((-cos * x - sin * y, sin * x - cos * y, -pose[2]))
+    x, y = se2_kernels.inverse_position(cos, sin, pose[0], pose[1])
+    return np.array((x, y, -pose[2]))
 
 
 @njit(cache=True)
 def _compose(a: Float64, b: Float64, result: Float64) -> None:
-    cos, sin, angle = np.cos(a[2]), np.sin(a[2]), a[2] + b[2]
-    result[0], result[1] = a[0] + cos * b[0] - sin * b[1], a[1] + sin * b[0] + cos * b[1]
-    result[2] = angle - 2.0 * np.pi * np.floor((angle + np.pi) / (2.0 * np.pi))
+    cos, sin = np.cos(a[2]), np.sin(a[2])
+    result[0], result[1] = se2_kernels.transform(a[0], a[1], cos, sin, b[0], b[1])
+    result[2] = se2_kernels.wrap_by_turns(a[2] + b[2])
 
 
 # Larger than a building, m, and all headings.

@@ -23,6 +23,15 @@ from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.covariance import inverse, propagate_covariance
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.geometry.se2_kernels import rotate_back
+from hmt_slam_ros.grids.free_space import (
+    BEHIND,
+    MAX_SAMPLE_GAP,
+    NO_SAMPLES,
+    SAMPLE_SPACING,
+    add_wall_hit,
+    add_wall_passed,
+)
 from hmt_slam_ros.landmarks.line_extraction import Lines, extract_for_map
 from hmt_slam_ros.landmarks.stochastic_map import LineAssociations, LineMap
 from hmt_slam_ros.registration.consistency import Agreement
@@ -42,12 +51,6 @@ def lines_of_scan(scan: Scan, configuration: Configuration) -> Lines:
 
 # A beam passes a wall if it does so at least so far from where the wall was seen to end, m.
 _END_MARGIN = 0.2
-# It ends at least so far behind it, m.
-_BEHIND = 0.4
-# Of walls, one sample every so many m counts.
-_SAMPLE_SPACING = 0.2
-# A wall was passed where samples of it are so near to each other, m.
-_MAX_SAMPLE_GAP = 0.6
 
 
 class BeamWallCounts(NamedTuple):
@@ -83,31 +86,25 @@ def _segment_array(stretches: Sequence[tuple[float, ...]]) -> Float64:
 @njit(cache=True)
 def _count_beams(ends: Float64, laser: Float64, stretches: Float64, near: float) -> tuple[int, int, int, int]:
     """:param stretches: alpha, r, begin and end of each, (m, 4)."""
-    ending = passing = met = passed = 0
-    met_at, passed_at = np.full(2, np.inf), np.full(2, np.inf)
+    ending = passing = 0
+    met, passed = NO_SAMPLES, NO_SAMPLES
     at = np.empty(2)
     for i in range(len(ends)):
         if _ends_on_wall(ends[i], stretches, near):
             ending += 1
-            if math.hypot(ends[i, 0] - met_at[0], ends[i, 1] - met_at[1]) >= _SAMPLE_SPACING:
-                met += 1
-                met_at[:] = ends[i, :2]
+            met = add_wall_hit(met, ends[i, 0], ends[i, 1], SAMPLE_SPACING)
         elif _passes_wall(ends[i], laser, stretches, at):
             passing += 1
-            between = math.hypot(at[0] - passed_at[0], at[1] - passed_at[1])
-            if between >= _SAMPLE_SPACING:
-                passed += between <= _MAX_SAMPLE_GAP
-                passed_at[:] = at
-    return ending, passing, met, passed
+            passed = add_wall_passed(passed, at[0], at[1], SAMPLE_SPACING, MAX_SAMPLE_GAP)
+    return ending, passing, met.total, passed.total
 
 
 @njit(cache=True)
 def _ends_on_wall(end: Float64, stretches: Float64, near: float) -> bool:
     for k in range(len(stretches)):
         cos, sin = math.cos(stretches[k, 0]), math.sin(stretches[k, 0])
-        along = cos * end[1] - sin * end[0]
-        off = cos * end[0] + sin * end[1] - stretches[k, 1]
-        if abs(off) < near and stretches[k, 2] - near < along < stretches[k, 3] + near:
+        across, along = rotate_back(cos, sin, end[0], end[1])
+        if abs(across - stretches[k, 1]) < near and stretches[k, 2] - near < along < stretches[k, 3] + near:
             return True
     return False
 
@@ -120,7 +117,7 @@ def _passes_wall(end: Float64, laser: Float64, stretches: Float64, at: Float64) 
         cos, sin = math.cos(stretches[k, 0]), math.sin(stretches[k, 0])
         before = stretches[k, 1] - cos * laser[0] - sin * laser[1]
         behind = cos * end[0] + sin * end[1] - stretches[k, 1]
-        if before <= 0.0 or behind < _BEHIND:
+        if before <= 0.0 or behind < BEHIND:
             continue
         share = before / (before + behind)
         x, y = laser[0] + share * (end[0] - laser[0]), laser[1] + share * (end[1] - laser[1])

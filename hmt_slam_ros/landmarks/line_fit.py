@@ -15,6 +15,7 @@ import numpy as np
 from numba import njit
 
 from hmt_slam_ros.arrays import Float64, Int32
+from hmt_slam_ros.geometry.se2_kernels import wrap_by_turns
 
 _STEPS = 6
 _PARALLEL = 1e-4  # a beam along the line says nothing of it
@@ -78,7 +79,7 @@ def write_normalized(alpha: float, r: float, aa: float, ar: float, rr: float, li
     if r < 0.0:
         alpha, r = alpha + math.pi, -r
         ar = -ar
-    line[0] = wrap_angle(alpha)
+    line[0] = wrap_by_turns(alpha)
     line[1], line[2], line[3], line[4] = r, aa, ar, rr
 
 
@@ -89,12 +90,6 @@ def variance_at(aa: float, ar: float, rr: float, along: float) -> float:
     :param along: where on the line the point is, m from the foot of the perpendicular.
     """
     return along * along * aa - 2.0 * along * ar + rr
-
-
-@njit(cache=True)
-def wrap_angle(angle: float) -> float:
-    """The angle in [-pi, pi)."""
-    return angle - 2.0 * math.pi * math.floor((angle + math.pi) / (2.0 * math.pi))
 
 
 @njit(cache=True)
@@ -193,9 +188,9 @@ def line_distance2(a: Float64, b: Float64) -> float:
 
     The second is taken in that of its two representations, (alpha, r) and (alpha + pi, -r), whose angle is nearer.
     """
-    turn = wrap_angle(b[0] - a[0])
+    turn = wrap_by_turns(b[0] - a[0])
     away, sign = b[1] - a[1], 1.0
     if abs(turn) > 0.5 * math.pi:
-        turn, away, sign = wrap_angle(turn - math.pi), -b[1] - a[1], -1.0
+        turn, away, sign = wrap_by_turns(turn - math.pi), -b[1] - a[1], -1.0
     aa, ar, rr = a[2] + b[2], a[3] + sign * b[3], a[4] + b[4]
     return (rr * turn * turn - 2.0 * ar * turn * away + aa * away * away) / (aa * rr - ar * ar)

@@ -175,11 +175,6 @@ class LineMap:
         """alpha and r of each line, shape (n, 2), rad and m; r of either sign."""
         return self.mean[3:].reshape(-1, 2)
 
-    def line_covariance(self, line: int) -> Float64:
-        """Of alpha and r of a line, shape (2, 2)."""
-        at = _state_slice(line)
-        return self.covariance[at, at]
-
     def predict(self, step: RelativeMotion) -> None:
         """The robot moved, Eqs. (7) and (8)."""
         x, y, _ = self.mean[:3]

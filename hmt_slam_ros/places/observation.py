@@ -39,6 +39,7 @@ from numba import njit
 
 from hmt_slam_ros.arrays import Float64, Int64
 from hmt_slam_ros.configuration.landmarks import FeatureParameters, PlaceParameters
+from hmt_slam_ros.geometry.se2_kernels import wrap_by_modulus
 from hmt_slam_ros.places.observation_graph import CONVEX, OPENINGS, TRACKS, LandmarkSequence, select_landmarks
 
 # Beyond so many deviations nothing is matched, and a landmark is not within reach.
@@ -258,7 +259,7 @@ def _forward_step(
         if here > 0.0:
             off = observed.forms[k] - landmarks.forms[own]
             if landmarks.tracks[own] < OPENINGS:
-                off = (off + math.pi) % (2.0 * math.pi) - math.pi
+                off = wrap_by_modulus(off)
             here *= _gaussian_density(off, form_variance + observed.variances[k, 1])
         paired += before * seen * here * matched[k]
         before = row[j + 1]

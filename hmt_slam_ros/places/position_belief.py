@@ -23,6 +23,7 @@ from numba import njit
 
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration.landmarks import PlaceParameters
+from hmt_slam_ros.geometry.se2_kernels import wrap_by_modulus
 from hmt_slam_ros.places.observation import ObservationModel, log_observation_ratios, log_unknown_ground_ratio
 from hmt_slam_ros.places.observation_graph import QUARTERS, LandmarkSequence
 from hmt_slam_ros.places.place_graph import PlaceGraph, StateTransitions
@@ -193,7 +194,7 @@ def _log_densities(arcs: StateTransitions, way: Float64, noise: Float64) -> Floa
             variance = arcs.variances[k, axis] + noise[axis]
             off = way[axis] - arcs.means[k, axis]
             if axis == 1:
-                off = (off + math.pi) % (2.0 * math.pi) - math.pi
+                off = wrap_by_modulus(off)
             found[k] -= 0.5 * (off * off / variance + math.log(2.0 * math.pi * variance))
     return found
 

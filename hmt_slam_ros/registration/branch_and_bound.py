@@ -15,6 +15,7 @@ import numpy as np
 from numba import njit
 
 from hmt_slam_ros.arrays import Bool, Float32, Float64, Int8, Int32, Int64
+from hmt_slam_ros.geometry.se2_kernels import rotate_back
 from hmt_slam_ros.registration.search_bounds import (
     BLOCK,
     LogRatioGrid,
@@ -134,9 +135,9 @@ def _rotate_points(window: SearchWindow, grid: LogRatioGrid, points: Float64) ->
         angle = window.mean[2] + window.turns[k]
         cos, sin = np.cos(angle) / grid.cell, np.sin(angle) / grid.cell
         for n in range(points.shape[0]):
-            dx, dy = points[n, 0] - window.mean[0], points[n, 1] - window.mean[1]
-            turned[k, n, 0] = cos * dx + sin * dy - grid.origin[0] / grid.cell
-            turned[k, n, 1] = cos * dy - sin * dx - grid.origin[1] / grid.cell
+            x, y = rotate_back(cos, sin, points[n, 0] - window.mean[0], points[n, 1] - window.mean[1])
+            turned[k, n, 0] = x - grid.origin[0] / grid.cell
+            turned[k, n, 1] = y - grid.origin[1] / grid.cell
     return turned
 
 
@@ -187,9 +188,9 @@ def sum_contradictions(
     for n in range(points.shape[0]):
         if total < least:
             break
-        dx, dy = points[n, 0] - x, points[n, 1] - y
-        c = int(np.floor((cos * dx + sin * dy - grid.origin[0]) / grid.cell))
-        r = int(np.floor((cos * dy - sin * dx - grid.origin[1]) / grid.cell))
+        seen_x, seen_y = rotate_back(cos, sin, points[n, 0] - x, points[n, 1] - y)
+        c = int(np.floor((seen_x - grid.origin[0]) / grid.cell))
+        r = int(np.floor((seen_y - grid.origin[1]) / grid.cell))
         if 0 <= c < columns and 0 <= r < rows:
             total += min(np.float32(0.0), grid.log_ratio[r, c])
     return total

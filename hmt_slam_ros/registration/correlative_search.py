@@ -11,6 +11,7 @@ import numpy as np
 from numba import njit
 
 from hmt_slam_ros.arrays import Float64, Int64
+from hmt_slam_ros.geometry.se2_kernels import transform
 from hmt_slam_ros.grids.patches import PATCH, GridView, field_at, odds_at
 from hmt_slam_ros.registration.scan_to_map import BeamModel, Prior, log_prior
 
@@ -60,9 +61,10 @@ def _find_cells(points: Float64, x: float, y: float, theta: float, view: GridVie
     """Write the columns and rows, each (n,), of the points at the pose (x, y, theta)."""
     cos, sin = np.cos(theta) / view.cell, np.sin(theta) / view.cell
     half = 0.5 * view.table.shape[0] * PATCH
+    u, v = x / view.cell + half, y / view.cell + half
     for n in range(points.shape[0]):
-        columns[n] = int(x / view.cell + half + cos * points[n, 0] - sin * points[n, 1])
-        rows[n] = int(y / view.cell + half + sin * points[n, 0] + cos * points[n, 1])
+        at_u, at_v = transform(u, v, cos, sin, points[n, 0], points[n, 1])
+        columns[n], rows[n] = int(at_u), int(at_v)
 
 
 @njit(cache=True)

@@ -26,7 +26,7 @@ from hmt_slam_ros.geometry.symmetric import (
     write_to_array,
 )
 from hmt_slam_ros.grids.patches import GridView
-from hmt_slam_ros.registration.scan_to_map import AlignmentSettings, Prior, linearize
+from hmt_slam_ros.registration.scan_to_map import AlignmentSettings, Prior, linearize, pose_difference
 
 # Neighbouring points farther apart than this, in m and as a share of the range, lie on different things.
 _GAP, _GAP_SHARE = 0.1, 0.05
@@ -50,7 +50,7 @@ def reject_dynamic(
     :param pose: shape (3,), ``map_T_base``, where things meet the map: the prior's mean, or where a match ended.
     """
     begins = _segment_starts(points)
-    predicted = _pose_difference(prior.mean, pose)
+    predicted = pose_difference(prior.mean[0], prior.mean[1], prior.mean[2], pose)
     informations, gradients, suspected = _segment_equations(points, begins, pose, predicted, prior, view, settings)
     if not suspected.any():
         return points
@@ -150,12 +150,6 @@ def _dynamic_segments(
         moved[worst] = True
         information = add_scaled(information, symmetric_from_array(informations[worst]), -1.0)
         gradient = _add_scaled_vector(gradient, _row(gradients, worst), -1.0)
-
-
-@njit(cache=True)
-def _pose_difference(mean: Float64, pose: Float64) -> Vector:
-    turn = (mean[2] - pose[2] + np.pi) % (2.0 * np.pi) - np.pi
-    return mean[0] - pose[0], mean[1] - pose[1], turn
 
 
 @njit(cache=True)

@@ -8,6 +8,7 @@ import numpy as np
 from numba import njit
 
 from hmt_slam_ros.arrays import Float64, Int32, Int64
+from hmt_slam_ros.geometry.se2_kernels import rotate_back, transform
 from hmt_slam_ros.registration.branch_and_bound import SearchCells
 from hmt_slam_ros.registration.search_bounds import LogRatioGrid, SearchWindow
 
@@ -133,8 +134,8 @@ def _log_ratio_at(surface: LogRatioGrid, points: _GridSamples, pose: Float64) ->
     cos, sin = np.cos(pose[2]), np.sin(pose[2])
     x0, y0 = pose[0] - surface.origin[0], pose[1] - surface.origin[1]
     for n in range(points.x.size):
-        u = (x0 + cos * points.x[n] - sin * points.y[n]) / surface.cell - 0.5
-        v = (y0 + sin * points.x[n] + cos * points.y[n]) / surface.cell - 0.5
+        x, y = transform(x0, y0, cos, sin, points.x[n], points.y[n])
+        u, v = x / surface.cell - 0.5, y / surface.cell - 0.5
         left, above = np.floor(u), np.floor(v)
         points.column[n], points.row[n] = np.int32(left), np.int32(above)
         points.right[n], points.down[n] = u - left, v - above
@@ -156,7 +157,7 @@ def _score_at(surface: LogRatioGrid, points: _GridSamples, window: SearchWindow,
     dx, dy = pose[0] - window.mean[0], pose[1] - window.mean[1]
     turn = pose[2] - window.mean[2]
     cos, sin = np.cos(window.mean[2]), np.sin(window.mean[2])
-    x, y = cos * dx + sin * dy, cos * dy - sin * dx
+    x, y = rotate_back(cos, sin, dx, dy)
     half_cot = 1.0 if abs(turn) < 1e-5 else 0.5 * turn / np.tan(0.5 * turn)
     twist = np.array((half_cot * x + 0.5 * turn * y, half_cot * y - 0.5 * turn * x, turn))
     exponent = 0.0
@@ -290,4 +291,5 @@ def _perturb(pose: Float64, twist: Float64) -> Float64:
     """``pose * exp(twist)`` for a small twist, to second order."""
     cos, sin = np.cos(pose[2]), np.sin(pose[2])
     x, y = twist[0] - 0.5 * twist[2] * twist[1], twist[1] + 0.5 * twist[2] * twist[0]
-    return np.array((pose[0] + cos * x - sin * y, pose[1] + sin * x + cos * y, pose[2] + twist[2]))
+    x, y = transform(pose[0], pose[1], cos, sin, x, y)
+    return np.array((x, y, pose[2] + twist[2]))

@@ -13,6 +13,7 @@ import numpy as np
 from numba import njit
 
 from hmt_slam_ros.arrays import Float64, Int32
+from hmt_slam_ros.geometry.se2_kernels import rotate, transform, wrap_by_modulus
 from hmt_slam_ros.geometry.symmetric import (
     Symmetric,
     Vector,
@@ -91,8 +92,8 @@ def log_ratio(points: Float64, x: float, y: float, theta: float, view: GridView,
     u, v = x / view.cell + half, y / view.cell + half
     total = 0.0
     for i in range(points.shape[0]):
-        column = int(u + cos * points[i, 0] - sin * points[i, 1])
-        row = int(v + sin * points[i, 0] + cos * points[i, 1])
+        at_u, at_v = transform(u, v, cos, sin, points[i, 0], points[i, 1])
+        column, row = int(at_u), int(at_v)
         distance = field_at(view, column, row)
         if odds_at(view, column, row) == 0:
             total += model.in_unknown[distance]
@@ -106,11 +107,11 @@ def matched_fraction(points: Float64, pose: Float64, view: GridView, near: int) 
     """Share of the points whose quantised distance to a surface is below ``near``."""
     cos, sin = np.cos(pose[2]) / view.cell, np.sin(pose[2]) / view.cell
     half = 0.5 * view.table.shape[0] * PATCH
+    u, v = pose[0] / view.cell + half, pose[1] / view.cell + half
     count = 0
     for i in range(points.shape[0]):
-        column = int(pose[0] / view.cell + half + cos * points[i, 0] - sin * points[i, 1])
-        row = int(pose[1] / view.cell + half + sin * points[i, 0] + cos * points[i, 1])
-        if field_at(view, column, row) < near:
+        at_u, at_v = transform(u, v, cos, sin, points[i, 0], points[i, 1])
+        if field_at(view, int(at_u), int(at_v)) < near:
             count += 1
     return count / max(1, points.shape[0])
 
@@ -125,8 +126,8 @@ def count_agreement(points: Float64, pose: Float64, view: GridView, near: int, f
     half = 0.5 * view.table.shape[0] * PATCH
     on, free = 0, 0
     for i in range(points.shape[0]):
-        column = int((pose[0] + cos * points[i, 0] - sin * points[i, 1]) / view.cell + half)
-        row = int((pose[1] + sin * points[i, 0] + cos * points[i, 1]) / view.cell + half)
+        x, y = transform(pose[0], pose[1], cos, sin, points[i, 0], points[i, 1])
+        column, row = int(x / view.cell + half), int(y / view.cell + half)
         distance = field_at(view, column, row)
         on += distance < near
         free += distance >= far and odds_at(view, column, row) < 0 and _is_surrounded_by_free(view, column, row)
@@ -143,13 +144,14 @@ def _is_surrounded_by_free(view: GridView, column: int, row: int) -> bool:
 @njit(cache=True)
 def log_prior(pose: Float64, prior: Prior) -> float:
     """-1/2 of the squared Mahalanobis distance, without the normaliser."""
-    difference = _difference(pose[0], pose[1], pose[2], prior.mean)
+    difference = pose_difference(pose[0], pose[1], pose[2], prior.mean)
     return -0.5 * dot(difference, multiply(symmetric_from_array(prior.information), difference))
 
 
 @njit(cache=True)
-def _difference(x: float, y: float, theta: float, mean: Float64) -> Vector:
-    return x - mean[0], y - mean[1], (theta - mean[2] + np.pi) % (2.0 * np.pi) - np.pi
+def pose_difference(x: float, y: float, theta: float, other: Float64) -> Vector:
+    """The pose (x, y, theta) less another (3,), number by number, m and rad."""
+    return x - other[0], y - other[1], wrap_by_modulus(theta - other[2])
 
 
 @njit(cache=True)
@@ -192,8 +194,7 @@ def linearize(
     # Sums in variables of their own stay in registers.
     xx = xy = xt = yy = yt = tt = gx = gy = gt = square = 0.0
     for n in range(points.shape[0]):
-        rx = cos * points[n, 0] - sin * points[n, 1]
-        ry = sin * points[n, 0] + cos * points[n, 1]
+        rx, ry = rotate(cos, sin, points[n, 0], points[n, 1])
         distance, gu, gv = _smooth_distance(view, (x + rx) / view.cell + half, (y + ry) / view.cell + half)
         if distance >= FAR - 1:
             continue
@@ -201,7 +202,7 @@ def linearize(
         jx, jy = gu * quantum / view.cell, gv * quantum / view.cell
         weight = 1.0 / ((1.0 + (distance / settings.robust_scale) ** 2) * settings.sigma**2)
         if points[n, 2] != 0.0 or points[n, 3] != 0.0:
-            normal_x, normal_y = cos * points[n, 2] - sin * points[n, 3], sin * points[n, 2] + cos * points[n, 3]
+            normal_x, normal_y = rotate(cos, sin, points[n, 2], points[n, 3])
             across = jx * normal_x + jy * normal_y
             jx, jy = across * normal_x, across * normal_y
             distance *= abs(across)
@@ -233,8 +234,8 @@ def misfit(points: Float64, pose: Float64, prior: Prior, view: GridView, setting
     cos, sin = np.cos(pose[2]), np.sin(pose[2])
     quantum, unseen, cost = view.radius / FAR, _UNKNOWN_DISTANCE * settings.robust_scale, 0.0
     for n in range(points.shape[0]):
-        u = (pose[0] + cos * points[n, 0] - sin * points[n, 1]) / view.cell + half
-        v = (pose[1] + sin * points[n, 0] + cos * points[n, 1]) / view.cell + half
+        x, y = transform(pose[0], pose[1], cos, sin, points[n, 0], points[n, 1])
+        u, v = x / view.cell + half, y / view.cell + half
         distance, _, _ = _smooth_distance(view, u, v)
         distance *= quantum
         if distance > unseen and odds_at(view, int(u + 0.5), int(v + 0.5)) == 0:
@@ -277,7 +278,7 @@ def align_into(
     known, information = symmetric_from_array(prior.information), Symmetric(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     for _ in range(settings.iterations):
         information, gradient, _ = linearize(points, x, y, theta, view, settings)
-        held = multiply(known, _difference(x, y, theta, prior.mean))
+        held = multiply(known, pose_difference(x, y, theta, prior.mean))
         slope = (
             gradient[0] + settings.inflation * held[0],
             gradient[1] + settings.inflation * held[1],

@@ -12,6 +12,7 @@ import numpy as np
 from numba import njit
 
 from hmt_slam_ros.arrays import Float32, Float64, Int8, Int32, Int64
+from hmt_slam_ros.geometry.se2_kernels import rotate
 
 
 class SearchWindow(NamedTuple):
@@ -161,8 +162,8 @@ def sample_cells(window: SearchWindow, surface: LogRatioGrid, samples: Float64) 
         angle = window.mean[2] + window.turns[k]
         cos, sin = np.cos(angle), np.sin(angle)
         for n in range(samples.shape[0]):
-            cells[k, n, 0] = np.floor((cos * samples[n, 0] - sin * samples[n, 1] + x0) / surface.cell)
-            cells[k, n, 1] = np.floor((sin * samples[n, 0] + cos * samples[n, 1] + y0) / surface.cell)
+            x, y = rotate(cos, sin, samples[n, 0], samples[n, 1])
+            cells[k, n, 0], cells[k, n, 1] = np.floor((x + x0) / surface.cell), np.floor((y + y0) / surface.cell)
     return cells
 
 

@@ -13,6 +13,7 @@ from numba import njit
 
 from hmt_slam_ros.arrays import Float64, Int8
 from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.geometry.se2_kernels import rotate_back, wrap_by_modulus
 from hmt_slam_ros.sensors.scan import Scan
 
 UNKNOWN, SURFACE, FREE = np.int8(0), np.int8(1), np.int8(2)
@@ -96,16 +97,14 @@ def _bin_ranges(points: Float64, starts: Float64, first: float, step: float, cou
 def _direction_index(x: float, y: float, first: float, step: float, count: int) -> int:
     """The number of the direction that is nearest to a point's, outside of 0 to count - 1 where there is none."""
     middle = first + 0.5 * step * (count - 1)
-    away = (math.atan2(y, x) - middle + math.pi) % (2.0 * math.pi) - math.pi
-    return round(away / step + 0.5 * (count - 1))
+    return round(wrap_by_modulus(math.atan2(y, x) - middle) / step + 0.5 * (count - 1))
 
 
 @njit(cache=True)
 def _direction_window(point: Float64, laser: Float64, first: float, step: float, count: int) -> tuple[float, int, int]:
     """Distance of a point from the laser, and the first and the last direction that are asked; 0, -1 for none."""
-    dx, dy = point[0] - laser[0], point[1] - laser[1]
     cos, sin = math.cos(laser[2]), math.sin(laser[2])
-    x, y = cos * dx + sin * dy, cos * dy - sin * dx
+    x, y = rotate_back(cos, sin, point[0] - laser[0], point[1] - laser[1])
     distance = math.hypot(x, y)
     if distance <= _HALF_WIDTH or distance > _MAX_RANGE:
         return distance, 0, -1

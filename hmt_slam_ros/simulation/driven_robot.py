@@ -16,7 +16,7 @@ from hmt_slam_ros.logs.stamps import NANOSECONDS
 from hmt_slam_ros.random_streams import Purpose, random_stream
 from hmt_slam_ros.sensors import Odometry, Scan
 from hmt_slam_ros.simulation.drive import ACCELERATION, TURN_ACCELERATION
-from hmt_slam_ros.simulation.laser import clearance, wall_index
+from hmt_slam_ros.simulation.laser import clearance
 from hmt_slam_ros.simulation.people import ReactivePeople
 from hmt_slam_ros.simulation.scenario import START, Scenario
 from hmt_slam_ros.simulation.wheels import add_odometry_noise
@@ -64,7 +64,6 @@ class DrivenRobot:
         self._per_reading = math.ceil(period / _STEP)
         self._seconds = period / self._per_reading
         self._walkers = ReactivePeople(scenario.people)
-        self._surfaces = scenario.surfaces
         self._command, self._command_end = (0.0, 0.0), 0
         self._is_in_contact = False
         self._step, self._reading = 0, 0
@@ -104,11 +103,6 @@ class DrivenRobot:
         self._pose_at_scan = se2.compose(pose, se2.between(self.pose, self._pose_at_scan))
         self.pose, self.velocity, self._is_in_contact = np.array(pose, dtype=np.float64), (0.0, 0.0), False
 
-    def close_doors(self, walls: NDArray[np.float64]) -> None:
-        """Put up walls (n, 4) in the building in place of those of the last time, as in `Building`, m; people pass."""
-        own = self.scenario.surfaces.walls
-        self._surfaces = wall_index(np.concatenate((own, walls))) if len(walls) else self.scenario.surfaces
-
     def advance(self) -> None:
         """Drive on to the next odometry reading."""
         for _ in range(self._per_reading):
@@ -124,7 +118,7 @@ class DrivenRobot:
         if between:
             return reading, None
         laser = self.scenario.laser
-        distances = laser.distances(self.pose[None], self._surfaces, self.people_discs)
+        distances = laser.distances(self.pose[None], self.scenario.surfaces, self.people_discs)
         return reading, laser.scan(number, stamp, distances)
 
     def true_poses(self, stamps: NDArray[np.int64]) -> NDArray[np.float64]:
@@ -165,7 +159,7 @@ class DrivenRobot:
     def _clearances(self, pose: NDArray[np.float64]) -> NDArray[np.float64]:
         """How far the nearest surface is from its middle there and here, shape (2,), m."""
         places = np.array([pose[:2], self.pose[:2]])
-        walls = clearance(self._surfaces.walls, places)
+        walls = clearance(self.scenario.surfaces.walls, places)
         people = (
             np.hypot(*(self.people_discs[None, :, :2] - places[:, None]).transpose(2, 0, 1)) - self.people_discs[:, 2]
         )

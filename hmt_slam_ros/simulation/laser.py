@@ -1,7 +1,7 @@
 """The laser of the simulated robot: ray casting, and noise.
 
-The walls lie in a uniform grid; a beam walks from cell to cell (Amanatides and Woo 1987) and stops at the first cell
-whose walls it meets.
+The walls lie in a uniform grid; a beam walks from cell to cell and stops at the first cell whose walls it meets. It has
+a direction and no end, so its steps are lengths, and it may begin outside of the grid.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from hmt_slam_ros.arrays import Bool, Float64, Int32, Int64
 from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.grids.traversal import GridWalk, next_cell
 from hmt_slam_ros.random_streams import Purpose, random_stream
 from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.simulation.settings import Settings
@@ -120,28 +121,28 @@ def _cast_ray(index: WallIndex, x: float, y: float, cos: float, sin: float, reac
         return math.inf
     column = min(max(int(gx + enter * cos), 0), columns - 1)
     row = min(max(int(gy + enter * sin), 0), rows - 1)
-    step_x, step_y = (1 if cos > 0.0 else -1), (1 if sin > 0.0 else -1)
-    per_x = 1.0 / abs(cos) if cos != 0.0 else math.inf
-    per_y = 1.0 / abs(sin) if sin != 0.0 else math.inf
-    next_x = (column + (cos > 0.0) - gx) / cos if cos != 0.0 else math.inf
-    next_y = (row + (sin > 0.0) - gy) / sin if sin != 0.0 else math.inf
+    step_x, per_x, next_x = _axis_steps(gx, cos, column)
+    step_y, per_y, next_y = _axis_steps(gy, sin, row)
+    walk = GridWalk(column, row, next_x, next_y, step_x, step_y, per_x, per_y)
     nearest = math.inf
-    while True:
-        number = row * columns + column
+    while 0 <= walk.column < columns and 0 <= walk.row < rows:
+        number = walk.row * columns + walk.column
         for place in range(index.starts[number], index.starts[number + 1]):
             nearest = min(nearest, _distance_to_wall(index.walls, index.members[place], x, y, cos, sin))
-        border = min(next_x, next_y)
+        border = min(walk.next_x, walk.next_y)
         if nearest <= border * index.cell or border > leave:
             break
-        if next_x < next_y:
-            column += step_x
-            next_x += per_x
-        else:
-            row += step_y
-            next_y += per_y
-        if not (0 <= column < columns and 0 <= row < rows):
-            break
+        walk = next_cell(walk)
     return nearest if nearest <= reach else math.inf
+
+
+@njit(cache=True)
+def _axis_steps(start: float, direction: float, cell: int) -> tuple[int, float, float]:
+    """Along one axis: the cell step, the length of a beam per cell, and its length up to the border of a cell."""
+    step = 1 if direction > 0.0 else -1
+    if direction == 0.0:
+        return step, math.inf, math.inf
+    return step, 1.0 / abs(direction), (cell + (direction > 0.0) - start) / direction
 
 
 @njit(cache=True)
