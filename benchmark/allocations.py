@@ -34,7 +34,7 @@ ARRAYS = {
     "geometry.se2._compose_each": (1, "the results"),
     "sensors.scan._beam_ends": (1, "the result"),
     "sensors.scan._valid_mask": (1, "the result"),
-    "sensors.surfels.extract_surfels": (
+    "sensors.scan.extract_surfels": (
         6,
         "the result, the same with shadows, which those are, beams, ranges, running sums",
     ),

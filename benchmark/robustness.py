@@ -16,7 +16,7 @@ from benchmark.scoring import FINAL, over_seeds, score
 from benchmark.settings import Settings
 from hmt_slam_ros.evaluation import RelationErrors, read_tum
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.hybrid_map.common_map import ArcValue
+from hmt_slam_ros.hybrid_map.hybrid_map import ArcValue
 from hmt_slam_ros.results.hmt_map import SavedMap, read_saved_map
 
 SEEDS = 5

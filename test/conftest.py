@@ -22,7 +22,7 @@ os.environ["ROS_PYTHON_CHECK_FIELDS"] = "1"
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 WAIT = 120.0  # s, for what normally takes less than one; a machine may be busy
-NODES = ("test_nodes_", "test_view_page", "test_package_compilation")  # files in which nodes run
+NODES = ("test_ros_", "test_view_page", "test_package_compilation")  # files in which nodes run
 
 
 @pytest.hookimpl(optionalhook=True)

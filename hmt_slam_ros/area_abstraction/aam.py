@@ -17,8 +17,7 @@ from hmt_slam_ros.area_abstraction.overlap_graph import OverlapGraph, Separation
 from hmt_slam_ros.area_abstraction.partition import AamState, AreaPolicy, JoinedGraph, Partition
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.hybrid_map.common_map import AreaPair, KeyframePoses, area_pair
-from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
+from hmt_slam_ros.hybrid_map.hybrid_map import AreaPair, HybridMap, KeyframePoses, area_pair
 from hmt_slam_ros.hybrid_map.keyframe_pruning import is_same_viewpoint, redundant_keyframes
 from hmt_slam_ros.hybrid_map.shortest_path import informative_arc
 from hmt_slam_ros.messages.map_changes import AreaMerge, PrunedKeyframe

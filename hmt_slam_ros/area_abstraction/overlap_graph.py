@@ -1,4 +1,13 @@
-"""The overlap graph of one area's keyframes, and what in it separates from the ground known before."""
+"""The overlap graph of one area's keyframes, and its normalized cut (Shi and Malik, PAMI 2000).
+
+With similarities A, cut(P1, P2) the sum of A over the pairs between the parts, and assoc(P, V) the sum over all pairs
+from P to the whole graph, pairs within P counting in both directions:
+
+    NCut(P1, P2) = cut(P1, P2) / assoc(P1, V) + cut(P1, P2) / assoc(P2, V),    in [0, 2].
+
+It is NCut = 0 where nothing is cut, also of a node without any similarity. A diagonal entry A_ii is what node i holds
+within itself: contracting nodes into one keeps the value of every cut that does not split them.
+"""
 
 from __future__ import annotations
 
@@ -7,9 +16,161 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
+from scipy.linalg import eigh
 
-from hmt_slam_ros.area_abstraction.normalized_cut import ncut, normalized_cut, recursive_cut
+# Similarity of neighbors in the order of the nodes, relative to the largest, that joins what is not connected.
+_CHAIN = 1e-6
+
+
+class Cut(NamedTuple):
+    """A bipartition.
+
+    :ivar side: shape (n,), True for the part P2; node 0 is always in P1.
+    :ivar value: NCut(P1, P2).
+    """
+
+    side: NDArray[np.bool_]
+    value: float
+
+
+@njit(cache=True)
+def ncut(similarity: NDArray[np.float64], side: NDArray[np.bool_]) -> float:
+    """NCut of a given bipartition.
+
+    :param similarity: shape (n, n), symmetric, not negative.
+    :param side: shape (n,), True for one part.
+    """
+    between, one, other = 0.0, 0.0, 0.0
+    for i in range(len(side)):
+        for j in range(len(side)):
+            if side[i]:
+                one += similarity[i, j]
+                between += 0.0 if side[j] else similarity[i, j]
+            else:
+                other += similarity[i, j]
+    return _value(between, one, other)
+
+
+@njit(cache=True)
+def _value(between: float, one: float, other: float) -> float:
+    return (between / one if one > 0.0 else 0.0) + (between / other if other > 0.0 else 0.0)
+
+
+def normalized_cut(
+    similarity: NDArray[np.float64], min_size: int = 1, sizes: NDArray[np.int64] | None = None
+) -> Cut | None:
+    """The best bipartition found: every prefix of every leading eigenvector's order is tried (a sweep cut).
+
+    :param similarity: shape (n, n), symmetric, not negative. The order of the nodes is that of time: only where the
+        graph falls apart does it decide, then a node without similarities stays with its neighbors in time.
+    :param min_size: smallest part allowed, in units of ``sizes``.
+    :param sizes: shape (n,), what each node counts; None for one each.
+    :returns: None where no bipartition has parts large enough.
+    """
+    n = len(similarity)
+    sizes = np.ones(n, np.int64) if sizes is None else sizes
+    if n < 2:
+        return None
+    best: Cut | None = None
+    for order in _orders(similarity):
+        cut = _sweep(similarity, order, min_size, sizes)
+        if cut is not None and (best is None or cut.value < best.value - 1e-12):
+            best = cut
+    return best
+
+
+def _orders(similarity: NDArray[np.float64]) -> list[NDArray[np.intp]]:
+    """Orders of the nodes along the leading solutions of (D - A) x = lambda D x, shape (n,) each."""
+    n = len(similarity)
+    chain = _CHAIN * max(float(similarity.max()), _CHAIN)
+    joined = similarity + chain * (np.eye(n, k=1) + np.eye(n, k=-1))
+    scale = 1.0 / np.sqrt(joined.sum(axis=1))
+    # x = D^-1/2 y with y an eigenvector of the symmetric I - D^-1/2 A D^-1/2.
+    laplacian = np.eye(n) - scale[:, None] * joined * scale
+    # Each component beyond the first has an eigenvalue near 0; the next solution bisects a component.
+    last = min(n - 1, _component_count(similarity) + 1)
+    vectors = eigh(laplacian, subset_by_index=(0, last))[1]
+    return [np.argsort(scale * vector, kind="stable") for vector in vectors.T]
+
+
+@njit(cache=True)
+def _component_count(similarity: NDArray[np.float64]) -> int:
+    """How many parts the graph falls into."""
+    n = len(similarity)
+    seen, waiting = np.zeros(n, np.bool_), np.empty(n, np.int64)
+    components = 0
+    for root in range(n):
+        if seen[root]:
+            continue
+        components += 1
+        seen[root], waiting[0], count = True, root, 1
+        while count:
+            count -= 1
+            node = waiting[count]
+            for other in range(n):
+                if similarity[node, other] > 0.0 and not seen[other]:
+                    seen[other], waiting[count] = True, other
+                    count += 1
+    return components
+
+
+def _sweep(
+    similarity: NDArray[np.float64], order: NDArray[np.intp], min_size: int, sizes: NDArray[np.int64]
+) -> Cut | None:
+    """The best of the bipartitions that divide ``order`` in two, or None where each has too small a part."""
+    size = np.cumsum(sizes[order])
+    allowed = (size[:-1] >= min_size) & (size[-1] - size[:-1] >= min_size)
+    if not allowed.any():
+        return None
+    values = np.where(allowed, _values_of_prefixes(similarity, order), np.inf)
+    prefix = order[: int(np.argmin(values)) + 1]
+    side = np.zeros(len(order), np.bool_)
+    side[prefix] = True
+    side ^= side[0]
+    return Cut(side, ncut(similarity, side))
+
+
+@njit(cache=True)
+def _values_of_prefixes(similarity: NDArray[np.float64], order: NDArray[np.intp]) -> NDArray[np.float64]:
+    """NCut of the first 1, 2, ... n - 1 nodes of an order and the others, shape (n - 1,)."""
+    values, to_prefix = np.empty(len(order) - 1), np.zeros(len(order))
+    total, assoc, within = similarity.sum(), 0.0, 0.0
+    for k in range(len(order) - 1):
+        node = order[k]
+        within += 2.0 * to_prefix[node] + similarity[node, node]
+        to_prefix += similarity[node]
+        assoc += similarity[node].sum()
+        values[k] = _value(max(assoc - within, 0.0), assoc, total - assoc)
+    return values
+
+
+def recursive_cut(
+    similarity: NDArray[np.float64], threshold: float, min_size: int = 1, sizes: NDArray[np.int64] | None = None
+) -> NDArray[np.int64]:
+    """Partition by cutting each part again, as a graph of its own, while its NCut is at most ``threshold``.
+
+    :param similarity: as for :func:`normalized_cut`.
+    :param threshold: largest NCut at which a part is cut, in [0, 2].
+    :param min_size: smallest part allowed, in units of ``sizes``.
+    :param sizes: shape (n,), what each node counts; None for one each.
+    :returns: shape (n,), the part of each node; parts are numbered in the order of their first nodes.
+    """
+    sizes = np.ones(len(similarity), np.int64) if sizes is None else sizes
+    labels = np.zeros(len(similarity), np.int64)
+    waiting, parts = [np.arange(len(similarity))], 0
+    while waiting:
+        nodes = waiting.pop()
+        cut = normalized_cut(similarity[np.ix_(nodes, nodes)], min_size, sizes[nodes])
+        if cut is not None and cut.value <= threshold:
+            waiting += [nodes[cut.side], nodes[~cut.side]]
+        else:
+            labels[nodes] = parts
+            parts += 1
+    first = np.unique(labels, return_index=True)[1]
+    rank = np.argsort(np.argsort(first))
+    return rank[labels]
 
 
 @dataclass(frozen=True, eq=False)

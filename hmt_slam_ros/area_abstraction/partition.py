@@ -19,7 +19,7 @@ from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.hybrid_map.common_map import AreaPair, KeyframePoses
+from hmt_slam_ros.hybrid_map.hybrid_map import AreaPair, KeyframePoses
 from hmt_slam_ros.hybrid_map.shortest_path import connected_neighbors
 from hmt_slam_ros.messages.messages import HypothesisEstimate, Keyframe
 from hmt_slam_ros.messages.replica import FIRST_AREA, FIRST_HYPOTHESIS, Replica, ReplicaState

@@ -18,8 +18,7 @@ from hmt_slam_ros.arrays import Bool, Float64, Int64
 from hmt_slam_ros.geometry import se2_kernels
 from hmt_slam_ros.geometry.covariance import inverse_pose_covariance, propagate_covariance
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.hybrid_map.common_map import ArcTable
-from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
+from hmt_slam_ros.hybrid_map.hybrid_map import ArcTable, HybridMap
 
 
 class ShortestPaths(NamedTuple):

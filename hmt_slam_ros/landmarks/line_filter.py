@@ -24,24 +24,25 @@ from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.covariance import inverse, propagate_covariance
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.geometry.se2_kernels import rotate_back
-from hmt_slam_ros.grids.free_space import (
+from hmt_slam_ros.landmarks.line_extraction import Lines, extract_for_map
+from hmt_slam_ros.landmarks.stochastic_map import LineAssociations, LineMap
+from hmt_slam_ros.registration.consistency import (
     BEHIND,
     MAX_SAMPLE_GAP,
     NO_SAMPLES,
     SAMPLE_SPACING,
+    Agreement,
+    ClutterEstimate,
+    MapAgreement,
     add_wall_hit,
     add_wall_passed,
 )
-from hmt_slam_ros.landmarks.line_extraction import Lines, extract_for_map
-from hmt_slam_ros.landmarks.stochastic_map import LineAssociations, LineMap
-from hmt_slam_ros.registration.consistency import Agreement
 from hmt_slam_ros.registration.match_covariance import MatchError
 from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.sensors.motion_model import NO_MOTION, Prediction, RelativeMotion
 from hmt_slam_ros.submap.line_map_state import PoseClones
 from hmt_slam_ros.submap.local_filter import FilterStep, LineFilterState, PlacedKeyframe, TrackedMotion
 from hmt_slam_ros.submap.local_mapping import LocalMapping, PreparedScan
-from hmt_slam_ros.submap.scan_evidence import ClutterEstimate, MapAgreement
 
 
 def lines_of_scan(scan: Scan, configuration: Configuration) -> Lines:

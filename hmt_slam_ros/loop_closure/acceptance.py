@@ -12,8 +12,14 @@ import numpy as np
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.hybrid_map.common_map import ArcValue, AreaPair, area_pair
-from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap, apply_sigma_floor, fuse_traversals
+from hmt_slam_ros.hybrid_map.hybrid_map import (
+    ArcValue,
+    AreaPair,
+    HybridMap,
+    apply_sigma_floor,
+    area_pair,
+    fuse_traversals,
+)
 from hmt_slam_ros.hybrid_map.shortest_path import is_uninformative
 from hmt_slam_ros.loop_closure.area_alignment import AreaAlignment
 from hmt_slam_ros.loop_closure.closure_history import Closure, MapSnapshot

@@ -16,7 +16,7 @@ from hmt_slam_ros.registration import scan_to_map
 from hmt_slam_ros.registration.area_to_area import MatchSettings, match_areas
 from hmt_slam_ros.registration.likelihood_grid import AreaGrid, GridModel, build_area_grid
 from hmt_slam_ros.sensors import Scan
-from hmt_slam_ros.sensors.surfels import transform_surfels
+from hmt_slam_ros.sensors.scan import transform_surfels
 from hmt_slam_ros.submap.local_mapping import LocalMapping
 
 # Factor on the covariance of what the match of two whole areas says: they are not quite rigid, and bend by more than

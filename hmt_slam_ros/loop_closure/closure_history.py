@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.hybrid_map.common_map import ArcValue, AreaPair, area_pair
-from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
+from hmt_slam_ros.hybrid_map.hybrid_map import ArcValue, AreaPair, HybridMap, area_pair
 from hmt_slam_ros.hybrid_map.shortest_path import shortest_path_beliefs
 from hmt_slam_ros.messages.map_changes import AreaMerge
 

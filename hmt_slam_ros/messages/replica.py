@@ -8,8 +8,7 @@ from dataclasses import dataclass, field
 from operator import attrgetter
 
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.hybrid_map.common_map import CommonMap, GraphState
-from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
+from hmt_slam_ros.hybrid_map.hybrid_map import CommonMap, GraphState, HybridMap
 from hmt_slam_ros.messages.map_changes import Arc, ArcEnds, AreaPose, MovedKeyframe
 from hmt_slam_ros.messages.messages import ClosureDecision, Hypotheses, Hypothesis, Keyframe
 from hmt_slam_ros.sensors import Scan

@@ -18,6 +18,7 @@ from hmt_slam_ros.hybrid_map.keyframe_pruning import ReplacementKeyframe, is_sam
 from hmt_slam_ros.lifelong.change_detection import RecentScan, append_recent_scan
 from hmt_slam_ros.messages.map_changes import AreaMerge, MovedKeyframe
 from hmt_slam_ros.messages.messages import Hypothesis, HypothesisEstimate, ScanPoses
+from hmt_slam_ros.registration.consistency import NO_EVIDENCE, ScanEvidence
 from hmt_slam_ros.registration.match_covariance import MatchError
 from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.submap.local_filter import (
@@ -29,7 +30,6 @@ from hmt_slam_ros.submap.local_filter import (
     PlacedKeyframe,
 )
 from hmt_slam_ros.submap.local_mapping import PreparedScan
-from hmt_slam_ros.submap.scan_evidence import NO_EVIDENCE, ScanEvidence
 
 _INITIAL_COVARIANCE = np.diag([1e-8, 1e-8, 1e-8])
 _IDENTITY = PoseGaussian.from_pose(np.zeros(3))

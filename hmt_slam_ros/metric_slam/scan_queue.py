@@ -7,8 +7,7 @@ from dataclasses import dataclass, field, replace
 
 from hmt_slam_ros.messages.messages import Message, Notice
 from hmt_slam_ros.sensors import Odometry, Scan
-from hmt_slam_ros.sensors.deskew import SweepCheck, SweepState
-from hmt_slam_ros.sensors.odometry import OdometryBuffer
+from hmt_slam_ros.sensors.odometry import OdometryBuffer, SweepCheck, SweepState
 
 # Odometry that has come before may only be late, by more scans than a paced robot runs ahead of its acknowledgements.
 _LATE = 4

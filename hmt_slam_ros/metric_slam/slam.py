@@ -46,8 +46,8 @@ from hmt_slam_ros.metric_slam.live_hypothesis import LiveHypothesis, LiveHypothe
 from hmt_slam_ros.metric_slam.odometry_monitor import OdometryMonitor, OdometryMonitorState
 from hmt_slam_ros.metric_slam.scan_queue import ScanQueue, ScanQueueState
 from hmt_slam_ros.sensors import Odometry, Scan
-from hmt_slam_ros.sensors.deskew import deskew_scan
 from hmt_slam_ros.sensors.motion_model import MotionModel, MotionState, Prediction
+from hmt_slam_ros.sensors.odometry import deskew_scan
 from hmt_slam_ros.submap.local_filter import FilterFactory, PlacedKeyframe
 from hmt_slam_ros.submap.local_mapping import LocalMapping, PreparedScan
 from hmt_slam_ros.submap.particle_filter import ParticleFilters

@@ -1,7 +1,7 @@
 """Scan to map: likelihood, and Gauss-Newton on the distance field, for one pose or a batch of particles.
 
 Poses are ``map_T_base`` (x, y, theta); points are (n, 2) in m in the base frame, surfels (n, 4) points with normals
-(``sensors/surfels.py``), which serve wherever points do. The likelihood of a beam is taken
+(``sensors/scan.py``), which serve wherever points do. The likelihood of a beam is taken
 relative to unknown space, so that 0 means "nothing known here", and maps of different extent compare.
 """
 

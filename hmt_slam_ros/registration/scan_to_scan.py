@@ -16,7 +16,7 @@ from hmt_slam_ros.arrays import Bool, Float64, Int32, Int64
 from hmt_slam_ros.configuration.topology import RefinementParameters
 from hmt_slam_ros.geometry.se2_kernels import rotate_back, transform
 from hmt_slam_ros.sensors import Scan
-from hmt_slam_ros.sensors.surfels import FlatnessLimits, fit_surface, running_sums
+from hmt_slam_ros.sensors.scan import FlatnessLimits, fit_surface, running_sums
 
 # A wall piece is fitted to the points within this reach of a point, or within three beams at one degree where that is
 # more, on at most so many beams to each side.

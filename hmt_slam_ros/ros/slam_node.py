@@ -21,14 +21,7 @@ from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.messages.documents import RobotStatus, decode
 from hmt_slam_ros.messages.map_changes import AreaPose, InitialPose
-from hmt_slam_ros.messages.messages import (
-    ClosureDecision,
-    EndOfLog,
-    Keyframe,
-    LocalEstimate,
-    Message,
-    PoseReset,
-)
+from hmt_slam_ros.messages.messages import ClosureDecision, EndOfLog, Keyframe, LocalEstimate, Message, PoseReset
 from hmt_slam_ros.messages.replica import FIRST_AREA
 from hmt_slam_ros.process_table import process_row
 from hmt_slam_ros.ros import conversions, topics

@@ -8,12 +8,12 @@ from typing import NamedTuple, Protocol
 
 from hmt_slam_ros.arrays import Float64, Int32
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.registration.consistency import ClutterEstimate, MapAgreement
 from hmt_slam_ros.registration.match_covariance import MatchError
 from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.sensors.motion_model import Prediction, RelativeMotion
 from hmt_slam_ros.submap.line_map_state import LineMapState
 from hmt_slam_ros.submap.local_mapping import PreparedScan
-from hmt_slam_ros.submap.scan_evidence import ClutterEstimate, MapAgreement
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,7 +18,7 @@ from hmt_slam_ros.grids.patches import FAR, PATCH
 from hmt_slam_ros.registration import scan_to_map
 from hmt_slam_ros.registration.match_covariance import MatchNoise
 from hmt_slam_ros.sensors import Scan
-from hmt_slam_ros.sensors.surfels import extract_surfels
+from hmt_slam_ros.sensors.scan import extract_surfels
 
 _ODDS_PER_NAT = 20.0
 

@@ -18,6 +18,7 @@ from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.grids.patches import GridView
 from hmt_slam_ros.random_streams import Purpose, random_stream
 from hmt_slam_ros.registration import scan_to_map
+from hmt_slam_ros.registration.consistency import ClutterEstimate, MapAgreement, compare_with_map
 from hmt_slam_ros.registration.match_covariance import estimate_match_error
 from hmt_slam_ros.registration.scan_to_map import Prior
 from hmt_slam_ros.sensors import Scan
@@ -31,7 +32,6 @@ from hmt_slam_ros.submap.local_filter import (
     TrackedMotion,
 )
 from hmt_slam_ros.submap.local_mapping import LocalMapping, PreparedScan
-from hmt_slam_ros.submap.scan_evidence import ClutterEstimate, MapAgreement, compare_with_map
 from hmt_slam_ros.submap.scan_matcher import ScanMatcher, map_information
 
 # Another particle takes the lead when it is more likely by this much, nats.

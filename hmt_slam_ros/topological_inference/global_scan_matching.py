@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.grids.free_space import count_hits_and_violations
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.hybrid_map.surroundings import (
     AreaPlace,
@@ -36,7 +35,7 @@ from hmt_slam_ros.hybrid_map.surroundings import (
 )
 from hmt_slam_ros.registration.area_to_area import MatchMode, MatchSettings, match_areas
 from hmt_slam_ros.registration.branch_and_bound import constrain_around
-from hmt_slam_ros.registration.consistency import Agreement
+from hmt_slam_ros.registration.consistency import Agreement, count_hits_and_violations
 from hmt_slam_ros.registration.likelihood_grid import AreaGrid
 from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.submap.local_mapping import LocalMapping

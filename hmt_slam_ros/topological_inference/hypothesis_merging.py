@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian, chi_square_gate
-from hmt_slam_ros.hybrid_map.common_map import ArcValue, AreaPair
-from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
+from hmt_slam_ros.hybrid_map.hybrid_map import ArcValue, AreaPair, HybridMap
 from hmt_slam_ros.hybrid_map.shortest_path import shortest_path_beliefs
 
 # Fine alignment brings together what lies so far apart.

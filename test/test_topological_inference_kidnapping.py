@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from ring_for_tsbi import RING, Run, ring_drive
-from test_process_tsbi_branching import OTHER, PATH, ROOM, rooms_apart
+from test_topological_inference_branching import OTHER, PATH, ROOM, rooms_apart
 from worlds import box, scan_in
 
 from hmt_slam_ros.configuration import Configuration

@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
-from test_output_folder import EVERY, SCANS, STAMPS, TRUTH, recorded, scan
+from test_results_output_folder import EVERY, SCANS, STAMPS, TRUTH, recorded, scan
 
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.results.final_map import final_map

@@ -5,7 +5,7 @@ import pytest
 from worlds import box, scan_in
 
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.sensors.surfels import extract_surfels, transform_surfels
+from hmt_slam_ros.sensors.scan import extract_surfels, transform_surfels
 
 REACH = 8.0
 CORRIDOR = np.array([[-100.0, -1.1, 100.0, -1.1], [-100.0, 1.1, 100.0, 1.1]])

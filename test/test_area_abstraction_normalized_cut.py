@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hmt_slam_ros.area_abstraction.normalized_cut import ncut, normalized_cut, recursive_cut
+from hmt_slam_ros.area_abstraction.overlap_graph import ncut, normalized_cut, recursive_cut
 
 
 def blocks(*sizes, within=1.0, between=0.0):

@@ -7,7 +7,7 @@ import time
 import numpy as np
 import pytest
 from logs_for_nodes import PACE, SECOND, corridor_bag
-from test_nodes_localization import NODES, Nodes
+from test_ros_localization import NODES, Nodes
 
 pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from conftest import Listener
 from logs_for_nodes import BEAMS, LASER, PACE, SECOND, START, Corridor, corridor_bag
-from test_nodes_localization import NODES, SCANS, Nodes, assert_true, mapped_corridor
+from test_ros_localization import NODES, SCANS, Nodes, assert_true, mapped_corridor
 
 pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
 

@@ -9,12 +9,11 @@ from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.landmarks.filter_selection import FilterSelector
 from hmt_slam_ros.landmarks.line_filter import LineFilter
-from hmt_slam_ros.registration.consistency import Agreement
+from hmt_slam_ros.registration.consistency import Agreement, MapAgreement
 from hmt_slam_ros.sensors.motion_model import Prediction, RelativeMotion
 from hmt_slam_ros.submap.local_filter import PlacedKeyframe
 from hmt_slam_ros.submap.local_mapping import LocalMapping, PreparedScan
 from hmt_slam_ros.submap.particle_filter import ParticleFilter
-from hmt_slam_ros.submap.scan_evidence import MapAgreement
 
 WALLS = {ParticleFilter: box(-12.02, -1.03, 12.01, 1.02), LineFilter: box(-2.51, -2.03, 2.52, 2.01)}
 TURN = np.array([0.0, 0.0, 0.3])

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import worlds
-from test_process_aam import OPTIONS, WORLD, drive_until_cut, estimate, exact, keyframe, stay
+from test_area_abstraction_aam import OPTIONS, WORLD, drive_until_cut, estimate, exact, keyframe, stay
 
 from hmt_slam_ros.area_abstraction.aam import Aam
 from hmt_slam_ros.area_abstraction.partition import AamState

@@ -5,8 +5,7 @@ import pytest
 
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian, fuse
-from hmt_slam_ros.hybrid_map.common_map import ArcValue, CommonMap
-from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
+from hmt_slam_ros.hybrid_map.hybrid_map import ArcValue, CommonMap, HybridMap
 
 
 def arc(x):

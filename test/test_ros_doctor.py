@@ -14,7 +14,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import LaserScan
-from test_nodes_states import SHUTDOWN, Manager
+from test_ros_states import SHUTDOWN, Manager
 
 from hmt_slam_ros.cli.main import main
 from hmt_slam_ros.open_log import open_log

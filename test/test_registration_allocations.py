@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numba import njit
-from test_local_map_matching import ALIGNMENT, MODEL, ROOM, mapped, seen
+from test_registration_scan_to_map import ALIGNMENT, MODEL, ROOM, mapped, seen
 
 from benchmark.allocations import ARRAYS, counted, requirements_on
 from hmt_slam_ros.configuration import Configuration

@@ -7,7 +7,7 @@ from xml.etree import ElementTree
 import networkx as nx
 import numpy as np
 import pytest
-from test_output_folder import COVARIANCE, MAP_T_AREA_1, recorded, write
+from test_results_output_folder import COVARIANCE, MAP_T_AREA_1, recorded, write
 
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry.gaussian import PoseGaussian

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from logs_for_nodes import PACE
-from test_nodes_localization import NODES, SCANS, Nodes, mapped_corridor
+from test_ros_localization import NODES, SCANS, Nodes, mapped_corridor
 
 pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
 

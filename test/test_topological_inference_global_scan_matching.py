@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from test_process_tsbi_branching import OTHER, PATH, ROOM
+from test_topological_inference_branching import OTHER, PATH, ROOM
 from worlds import box, scan_in
 
 from hmt_slam_ros.configuration import Configuration

@@ -3,11 +3,7 @@
 import numpy as np
 import pytest
 
-from hmt_slam_ros.area_abstraction.overlap_graph import (
-    OverlapGraph,
-    find_separation,
-    synchronize_graph,
-)
+from hmt_slam_ros.area_abstraction.overlap_graph import OverlapGraph, find_separation, synchronize_graph
 
 
 def graph_of(similarity, first=0):

@@ -6,7 +6,7 @@ import sys
 import numpy as np
 import pytest
 from logs_for_nodes import PACE
-from test_nodes_localization import SCANS, Nodes, initial_pose, mapped_corridor
+from test_ros_localization import SCANS, Nodes, initial_pose, mapped_corridor
 
 pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
 

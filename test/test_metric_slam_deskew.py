@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from test_process_slam import SECOND, Dialogue
+from test_metric_slam import SECOND, Dialogue
 from worlds import box, scan_in
 
 from hmt_slam_ros.geometry import se2

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from test_local_map_tracking import CORRIDOR, ROOM, mapped, predicted
+from test_submap_scan_matcher import CORRIDOR, ROOM, mapped, predicted
 from worlds import box, scan_in
 
 from hmt_slam_ros.configuration.tree import Configuration

@@ -20,7 +20,7 @@ from hmt_slam_ros.registration.scan_to_map import (
     make_beam_model,
     propose_all,
 )
-from hmt_slam_ros.sensors.surfels import extract_surfels
+from hmt_slam_ros.sensors.scan import extract_surfels
 
 CELL, RADIUS = 0.05, 0.5
 MODEL = make_beam_model(RADIUS, 0.1, 10.0, 0.1)

@@ -4,8 +4,8 @@ import re
 
 import numpy as np
 import pytest
-from test_local_map_tracking import with_niches
-from test_process_slam import WALLS, Dialogue
+from test_metric_slam import WALLS, Dialogue
+from test_submap_scan_matcher import with_niches
 from worlds import scan_in
 
 from hmt_slam_ros.geometry import se2

@@ -269,7 +269,7 @@ _SAVER = """
 import sys
 from pathlib import Path
 sys.path.insert(0, sys.argv[2])
-from test_persistence import written
+from test_saved_map import written
 from hmt_slam_ros.saved_map.folder import replace_folder
 
 target, turn = Path(sys.argv[1]), 0

@@ -11,8 +11,7 @@ from ring_for_tsbi import RING, Run, ring_drive
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian, chi_square_gate
-from hmt_slam_ros.hybrid_map.common_map import ArcValue
-from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
+from hmt_slam_ros.hybrid_map.hybrid_map import ArcValue, HybridMap
 from hmt_slam_ros.loop_closure.closure_history import (
     AcceptedPath,
     Closure,
