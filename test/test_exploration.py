@@ -363,5 +363,5 @@ def test_errands_as_they_are_written() -> None:
     assert parse_task("explore", EXPLORER_TASKS) == Task("explore")
     assert parse_task(" go room 3", EXPLORER_TASKS) == Task("go", "room 3")
     for text in ("go", "dance", "explore room 3", ""):
-        with pytest.raises(HmtSlamError, match=f"'{text}' is no errand: give one of explore, backtrack, stop, or go"):
+        with pytest.raises(HmtSlamError, match=f"'{text}' is no task: give one of explore, backtrack, stop, or go"):
             parse_task(text, EXPLORER_TASKS)

@@ -38,7 +38,7 @@ def set_mode(listener, mode):
 
 def stored(keyframes):
     """Whether keyframes were stored under any hypothesis."""
-    return [any(leaf.stored for leaf in head(message).leaves) for message in keyframes]
+    return [any(leaf.stored for leaf in head(message).estimates) for message in keyframes]
 
 
 def head(message):
