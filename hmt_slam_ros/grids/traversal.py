@@ -4,8 +4,9 @@ Maps of patches and images of whole maps take a beam from its laser to its end. 
 
 - simulated rays (:mod:`hmt_slam_ros.simulation.laser`) step alike, but begin where they enter the grid and have no
   end;
-- virtual scans and known walls (:mod:`hmt_slam_ros.grids.virtual_scan`, :mod:`hmt_slam_ros.registration.consistency`) jump
-  by the distance to the nearest surface, as they ask for surfaces and not for cells;
+- virtual scans and known walls (:mod:`hmt_slam_ros.grids.virtual_scan`,
+  :mod:`hmt_slam_ros.registration.consistency`) jump by the distance to the nearest surface, as they ask for surfaces
+  and not for cells;
 - log-ratio grids and lines of sight between keyframes (:mod:`hmt_slam_ros.registration.likelihood_grid`,
   :mod:`hmt_slam_ros.hybrid_map.surroundings`) sample a line at even steps, which may miss cells at their corners.
 """
