@@ -84,7 +84,7 @@ def test_a_trail_comes_back_bit_for_bit(rows, first):
     )
     back = conversions.scan_poses_from_message(sent(conversions.path_message(trail)))
     assert (back.hypothesis, back.first_scan) == (7, first)
-    for name in ("stamps", "anchors", "poses"):
+    for name in ("stamps", "keyframes", "poses"):
         assert np.array_equal(getattr(back, name), getattr(trail, name))
         assert getattr(back, name).dtype == getattr(trail, name).dtype
 

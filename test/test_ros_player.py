@@ -16,8 +16,8 @@ def play(player, until, step=0.001, acknowledge=True):
     """(time, measurement) of all that is handed out in ``until`` seconds."""
     out, now = [], 0.0
     while now < until and not player.has_ended:
-        while not player.has_ended and (wait := player.wait(now)) is not None and wait <= 0.0:
-            taken = player.take(now)
+        while not player.has_ended and (wait := player.seconds_until_due(now)) is not None and wait <= 0.0:
+            taken = player.take_next(now)
             out.append((now, taken))
             if acknowledge and isinstance(taken, Scan):
                 player.acknowledge(taken.stamp)

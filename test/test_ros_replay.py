@@ -219,7 +219,7 @@ def test_a_run_that_stands_still_names_the_node_it_waits_for(tmp_path):
         "from hmt_slam_ros.ros.replay import replay\n"
         "try:\n"
         f"    replay(Path({str(corridor_bag(tmp_path, 200))!r}), Path({str(tmp_path / 'out')!r}),\n"
-        "           load_configuration(settings=['robot.rate=1.0']), stall=15.0)\n"
+        "           load_configuration(settings=['robot.rate=1.0']), stall_timeout=15.0)\n"
         "except HmtSlamError as error:\n"
         "    sys.exit(str(error))\n"
     )
