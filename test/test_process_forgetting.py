@@ -108,7 +108,7 @@ def test_every_scan_keeps_its_pose_relative_to_a_keyframe_that_is_there(rounds):
 def test_a_record_instead_of_messages_tells_the_same(rounds):
     assert rounds.kept < 100 < len(rounds.run.recorder.keyframes)
     folded = rounds.folding.finish(rounds.log_state.stamps)
-    for name in ("trajectory", "online", "odometry"):
+    for name in ("trajectory", "online_trajectory", "odometry"):
         np.testing.assert_array_equal(getattr(folded, name), getattr(rounds.recording, name))
     assert folded.probabilities == rounds.recording.probabilities
     assert folded.area_poses.keys() == rounds.recording.area_poses.keys()

@@ -91,7 +91,7 @@ def test_a_look_finds_the_landmarks_gathered_at_the_events_before(drive, monkeyp
     for _ in range(steps):
         known = len(looked_at)
         # Two hypotheses, whose maps are the same up to there.
-        prior.look_ahead([(hybrid_map, before), (hybrid_map.branch(), before)])
+        prior.prefetch([(hybrid_map, before), (hybrid_map.branch(), before)])
         assert len(looked_at) - known <= math.ceil(before / steps)
     assert len(looked_at) == before
     assert prior.reweight(where, hybrid_map, seen, before).probabilities[0] < 0.8
