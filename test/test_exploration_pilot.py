@@ -207,7 +207,7 @@ def test_it_finds_out_where_it_is_and_stops_when_told_or_when_it_takes_too_long(
     robot = Robot(PilotProcess(CONFIGURATION, saved), (14.0, 0.0, math.pi), rtl="never")
     outcome = robot.do("localize")
     assert outcome.succeeded
-    assert outcome.text.startswith("find: the robot is at door ")
+    assert outcome.text.startswith("localize: the robot is at door ")
 
 
 def test_where_time_goes_back_the_robot_may_be_anywhere(saved):
