@@ -283,10 +283,10 @@ def awakened(log: Mapped, start: int) -> Awakening:
 
 def _known(run: LockStepRun) -> bool:
     """Whether the robot is sure of its place."""
-    told = run.recorder.hypotheses
-    if not told:
+    hypotheses = run.recorder.hypotheses
+    if not hypotheses:
         return False
-    return sum(leaf.probability for leaf in told[max(told)].hypotheses if not leaf.lost) >= SURE
+    return sum(leaf.probability for leaf in hypotheses[max(hypotheses)].hypotheses if not leaf.lost) >= SURE
 
 
 def _is_right(run: LockStepRun, before: Sequence[AreaPose], true: Float64) -> bool | None:
@@ -298,8 +298,10 @@ def _is_right(run: LockStepRun, before: Sequence[AreaPose], true: Float64) -> bo
     slam, last = run.lock_step.processes["slam"], run.recorder.last_estimate
     assert isinstance(slam, MetricSlam)
     assert last is not None
-    told = run.recorder.decisions
-    given = next((told[n].global_poses for n in sorted(told, reverse=True) if told[n].global_poses), before)
+    decisions = run.recorder.decisions
+    given = next(
+        (decisions[n].global_poses for n in sorted(decisions, reverse=True) if decisions[n].global_poses), before
+    )
     area = complete_area_poses(slam.replica.maps[slam.replica.best_hypothesis], given).get(last.area)
     if area is None:
         return None

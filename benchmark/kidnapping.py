@@ -135,13 +135,13 @@ class Watched:
 
     def lost(self) -> float:
         """Probability that the robot may be anywhere."""
-        told = self.run.recorder.hypotheses
-        return sum(leaf.probability for leaf in told[max(told)].hypotheses if leaf.lost)
+        hypotheses = self.run.recorder.hypotheses
+        return sum(leaf.probability for leaf in hypotheses[max(hypotheses)].hypotheses if leaf.lost)
 
     def sure(self) -> bool:
         """Whether the robot is sure of its place."""
-        told = self.run.recorder.hypotheses
-        return sum(leaf.probability for leaf in told[max(told)].hypotheses if not leaf.lost) >= SURE
+        hypotheses = self.run.recorder.hypotheses
+        return sum(leaf.probability for leaf in hypotheses[max(hypotheses)].hypotheses if not leaf.lost) >= SURE
 
     def right(self, true: NDArray[np.float64]) -> bool:
         """Whether the last estimate is where the map of before has the robot.
@@ -168,10 +168,10 @@ class Watched:
 
     def _areas(self) -> dict[int, NDArray[np.float64]]:
         """{area: ``map_T_area``, shape (3,)} as TLCA told last."""
-        told = self.run.recorder.decisions
-        for sequence in sorted(told, reverse=True):
-            if told[sequence].global_poses:
-                return {entry.area: entry.pose.mean for entry in told[sequence].global_poses}
+        decisions = self.run.recorder.decisions
+        for sequence in sorted(decisions, reverse=True):
+            if decisions[sequence].global_poses:
+                return {entry.area: entry.pose.mean for entry in decisions[sequence].global_poses}
         return {}
 
     def hear(self, true: NDArray[np.float64], travelled: float) -> Heard | None:
