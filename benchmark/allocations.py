@@ -20,7 +20,6 @@ PACKAGES = (
     "grids",
     "registration.scan_to_map",
     "registration.dynamic_rejection",
-    "registration.correlative_search",
     "registration.match_covariance",
     "submap",
 )
@@ -39,11 +38,11 @@ ARRAYS = {
         "the result, the same with shadows, which those are, beams, ranges, running sums",
     ),
     "registration.scan_to_map.propose_all": (4, "the results for all particles"),
-    "grids.insertion.cell_coordinates": (1, "the results for all particles"),
+    "grids.patch_pool.cell_coordinates": (1, "the results for all particles"),
     "submap.local_mapping._split_at_range": (7, "the results, distances and what leads to them"),
     "registration.scan_to_map.align": (2, "the results"),
     "registration.dynamic_rejection.reject_dynamic": (9, "the result, what each thing tells, those in doubt"),
-    "registration.correlative_search.correlative_search": (5, "the result, scores, a pose, the cells of the points"),
+    "registration.scan_to_map.correlative_search": (5, "the result, scores, a pose, the cells of the points"),
 }
 """{kernel: (arrays that a call makes at most, what they are)}; all others make none."""
 

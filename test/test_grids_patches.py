@@ -10,8 +10,7 @@ from worlds import box, scan_in
 
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.grids.distance_field import lowest_bit
-from hmt_slam_ros.grids.insertion import InverseSensorModel
-from hmt_slam_ros.grids.patch_pool import MappedBeams, PatchPool
+from hmt_slam_ros.grids.patch_pool import InverseSensorModel, MappedBeams, PatchPool
 from hmt_slam_ros.grids.patches import FAR, PATCH, field_at, odds_at
 
 CELL, RADIUS = 0.05, 0.5

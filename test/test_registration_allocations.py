@@ -15,8 +15,8 @@ from hmt_slam_ros.registration import scan_to_map
 
 BAG = Path(__file__).resolve().parents[1] / "data" / "malaga_one_loop"
 FREE = {
-    "grids.insertion.insert_beams",
-    "grids.insertion.patches_needed",
+    "grids.patch_pool.insert_beams",
+    "grids.patch_pool.patches_needed",
     "registration.scan_to_map.laplace_log_evidence",
     "registration.scan_to_map.log_prior",
 }

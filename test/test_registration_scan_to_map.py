@@ -7,14 +7,14 @@ from hypothesis import strategies as st
 from worlds import box, scan_in
 
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.grids.insertion import InverseSensorModel
-from hmt_slam_ros.grids.patch_pool import MappedBeams, PatchPool
+from hmt_slam_ros.grids.patch_pool import InverseSensorModel, MappedBeams, PatchPool
 from hmt_slam_ros.grids.patches import FAR, PATCH, field_at, odds_at
-from hmt_slam_ros.registration.correlative_search import Lattice, correlative_search
 from hmt_slam_ros.registration.scan_to_map import (
     AlignmentSettings,
+    Lattice,
     Prior,
     align,
+    correlative_search,
     count_agreement,
     log_ratio,
     make_beam_model,

@@ -18,28 +18,27 @@ from scipy.special import gammaincinv
 from hmt_slam_ros.geometry import se2
 
 _POSE_DOF = 3
+"""Degrees of freedom of a pose."""
 
 
 def chi_square_gate(probability: float, degrees_of_freedom: int = _POSE_DOF) -> float:
-    """The bound below which the squared Mahalanobis distance of true pairs stays with this probability.
+    """The quantile of chi-square: squared Mahalanobis distances of true pairs are below it with this probability.
 
-    It is the quantile of chi-square. scipy.stats, which has it too, takes half a second and 45 MB to load.
-
-    :param degrees_of_freedom: those of a pose unless others are given.
+    scipy.stats has it too, but takes half a second and 45 MB to load.
     """
     return 2.0 * float(gammaincinv(0.5 * degrees_of_freedom, probability))
 
 
-# The 95 % ellipse of a Gaussian in the plane is so many deviations large: the root of chi-square's quantile, 2 dof.
 ELLIPSE_95 = 2.4477
+"""Half axes of the 95 % ellipse of a position, in standard deviations: the root of chi-square's quantile, 2 dof."""
 
 
 class Ellipse(NamedTuple):
-    """Of a position, around it.
+    """An ellipse around a position.
 
-    :ivar semi_major: half axis, m.
-    :ivar semi_minor: half axis, m.
-    :ivar angle: of the longer one, rad.
+    :ivar semi_major: longer half axis, m.
+    :ivar semi_minor: shorter half axis, m.
+    :ivar angle: of the longer axis, rad.
     """
 
     semi_major: float
@@ -60,7 +59,7 @@ class PoseGaussian:
 
     @classmethod
     def from_pose(cls, pose: NDArray[np.float64]) -> PoseGaussian:
-        """The certainty that it is this pose, (3,)."""
+        """A belief without uncertainty, in the pose (3,)."""
         return cls(pose, np.zeros((3, 3)))
 
     def inverse(self) -> PoseGaussian:
@@ -77,7 +76,7 @@ class PoseGaussian:
         )
 
     def position_ellipse(self) -> Ellipse:
-        """In which the position of b lies with 95 %, in the axes of a."""
+        """The 95 % ellipse of the position of b, in the axes of a."""
         sin, cos = math.sin(self.mean[2]), math.cos(self.mean[2])
         turn = np.array([[cos, -sin], [sin, cos]])
         values, vectors = np.linalg.eigh(turn @ self.covariance[:2, :2] @ turn.T)
@@ -95,15 +94,16 @@ class PoseGaussian:
         return float(xi @ np.linalg.solve(spread, xi))
 
     def covariance_at(self, mean: NDArray[np.float64], ad: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
-        """This belief's covariance, shape (3, 3), carried into the tangent space of the nearby pose ``mean``."""
+        """This belief's covariance, shape (3, 3), in the tangent space of the nearby pose ``mean``, (3,)."""
         ad = se2.adjoint(se2.between(mean, self.mean)) if ad is None else ad
         return ad @ self.covariance @ ad.T
 
 
 def fuse(beliefs: list[PoseGaussian], iterations: int = 10) -> PoseGaussian:
-    """The normalised product of independent Gaussians over the same pose, Eq. (10).
+    """The normalized product of independent Gaussians over the same pose, Eq. (10).
 
-    Gauss-Newton on the manifold, started at the first mean; neither the order nor the direction of the poses matters.
+    Gauss-Newton on the manifold, started at the first mean. The result depends neither on the order of the beliefs nor
+    on the direction of the poses.
 
     :raises numpy.linalg.LinAlgError: where a covariance is singular.
     """
@@ -125,15 +125,15 @@ def fuse(beliefs: list[PoseGaussian], iterations: int = 10) -> PoseGaussian:
     return PoseGaussian(mean, covariance)
 
 
-def match_moments(weighed: Sequence[tuple[PoseGaussian, float]]) -> PoseGaussian:
+def match_moments(weighted: Sequence[tuple[PoseGaussian, float]]) -> PoseGaussian:
     """The second moment of several beliefs about the mean of the heaviest.
 
-    :param weighed: every belief with the log of its weight, at least one.
+    :param weighted: every belief with the log of its weight, at least one.
     """
-    total = np.logaddexp.reduce([log_weight for _, log_weight in weighed])
-    mean = max(weighed, key=lambda each: each[1])[0].mean
+    total = np.logaddexp.reduce([log_weight for _, log_weight in weighted])
+    mean = max(weighted, key=lambda pair: pair[1])[0].mean
     covariance = np.zeros((3, 3))
-    for belief, log_weight in weighed:
-        away = se2.log(se2.between(mean, belief.mean))
-        covariance += math.exp(log_weight - total) * (belief.covariance_at(mean) + np.outer(away, away))
+    for belief, log_weight in weighted:
+        offset = se2.log(se2.between(mean, belief.mean))
+        covariance += math.exp(log_weight - total) * (belief.covariance_at(mean) + np.outer(offset, offset))
     return PoseGaussian(mean, covariance)

@@ -1,12 +1,12 @@
-"""The distance field kept exact while cells become occupied and free again.
+"""The exact distance field of a map whose cells become occupied and free again.
 
-A cell that becomes occupied lowers the field around it. Where one becomes free, the rows of a patch in which it was the
-nearest are measured anew from all occupied cells in reach, by the separable transform of squared distances: along the
+A cell that becomes occupied lowers the field around it. Where a cell becomes free, the rows of patches in which it was
+the nearest are recomputed from all occupied cells in reach, by the separable transform of squared distances: along the
 rows first, then across (Felzenszwalb and Huttenlocher 2012).
 
-What is called for every cell is inlined: a call with arrays counts references to them, which costs as much as the work.
-Squared distances are integers, as the minimum of floats in place is compiled to a store under a mask, which takes AMD's
-processors ten times as long as a whole one.
+Functions that are called for every cell are inlined: a call with arrays counts references, which costs as much as the
+work. Squared distances are integers: for the minimum of floats the compiler emits a masked store, which is ten times
+slower on AMD's processors.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from hmt_slam_ros.grids.patches import FAR, MASK, PATCH, SHIFT, PatchStore, writ
 
 @intrinsic
 def lowest_bit(_context: Any, word: Any) -> Any:  # noqa: ANN401  numba's own types
-    """The number of the lowest bit that is set; a word without any has no answer."""
+    """The number of the lowest bit that is set; undefined for 0."""
 
     def count_trailing_zeros(context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:  # noqa: ANN401
         zeros = builder.cttz(arguments[0], cgutils.true_bit)
@@ -36,22 +36,22 @@ def lowest_bit(_context: Any, word: Any) -> Any:  # noqa: ANN401  numba's own ty
 @njit(cache=True)
 def has_bits(words: UInt32) -> bool:
     """Whether a bit is set in any of the words (n,)."""
-    found = np.uint32(0)
+    bits = np.uint32(0)
     for word in words:
-        found |= word
-    return found != 0
+        bits |= word
+    return bits != 0
 
 
 class FieldWorkspace(NamedTuple):
-    """Tables of distances, in cells around an occupied one, and room to work in; r is the field's radius in cells.
+    """Tables of distances around an occupied cell, and buffers; r is the field's radius in cells.
 
-    The tables have 31 columns of "far" on both sides, so that a row of a patch always takes 32 of theirs.
+    The tables have 31 columns of "far" on both sides, so that a row of a patch always overlaps 32 columns.
 
     :ivar quanta: shape (r^2 + 2,), the field's value of a squared distance; the last is FAR.
     :ivar stamp: shape (2r + 1, 2r + 63), the field's values around an occupied cell.
     :ivar squares: shape (2r + 63,), squared distances along a row.
     :ivar empty: shape (32, 32), the field of a patch never seen.
-    :ivar dirty: shape (T, T), a bit for each row of a patch that has to be measured anew; zeros between insertions.
+    :ivar dirty: shape (T, T), a bit for each row of a patch that has to be recomputed; zeros between insertions.
     :ivar across: shape (32,), squared distances to the occupied cells of one row.
     :ivar nearest: shape (32, 32), squared distances to the nearest occupied cells.
     """
@@ -66,7 +66,7 @@ class FieldWorkspace(NamedTuple):
 
 
 def make_field_workspace(table_size: int, cell: float, radius: float) -> FieldWorkspace:
-    """The tables for cells of edge ``cell``, m, and a field that ends at ``radius``, m."""
+    """The tables for cells of edge ``cell``, m, and a field of ``radius``, m."""
     reach = int(np.ceil(radius / cell))
     far = reach * reach + 1
     quanta = np.minimum(np.rint(np.sqrt(np.arange(far + 1)) * cell / radius * FAR), FAR).astype(np.uint8)
@@ -86,14 +86,14 @@ def make_field_workspace(table_size: int, cell: float, radius: float) -> FieldWo
 
 @njit(cache=True)
 def patches_in_reach(work: FieldWorkspace, table_size: int, patches: range) -> range:
-    """The rows of patches, or the columns of them, that the field around those in ``patches`` reaches."""
+    """The rows or columns of patches that the field around the range ``patches`` reaches."""
     margin = (work.stamp.shape[0] // 2 + MASK) >> SHIFT
     return range(max(0, patches.start - margin), min(table_size, patches.stop + margin))
 
 
 @njit(cache=True)
 def lower_field(table: Int32, store: PatchStore, work: FieldWorkspace, cells: UInt32, tr: int, tc: int) -> None:
-    """Enter the newly occupied cells of a patch, as bits of shape (32,)."""
+    """Lower the field around the newly occupied cells of a patch, bits of shape (32,)."""
     for r in patches_in_reach(work, table.shape[0], range(tr, tr + 1)):
         for c in patches_in_reach(work, table.shape[0], range(tc, tc + 1)):
             row, column = (tr - r) << SHIFT, (tc - c) << SHIFT
@@ -108,18 +108,18 @@ def lower_field(table: Int32, store: PatchStore, work: FieldWorkspace, cells: UI
 
 @njit(cache=True)
 def mark_dirty(table: Int32, store: PatchStore, work: FieldWorkspace, cells: UInt32, tr: int, tc: int) -> None:
-    """Mark the rows in which cells of a patch that became free, as bits of shape (32,), were the nearest."""
+    """Mark the rows in which newly free cells of a patch, bits of shape (32,), were the nearest."""
     for r in patches_in_reach(work, table.shape[0], range(tr, tr + 1)):
         for c in patches_in_reach(work, table.shape[0], range(tc, tc + 1)):
             patch = table[r, c]
             if patch >= 0:
-                alike = _rows_sharing_value(store.field[patch], work.stamp, cells, (tr - r) << SHIFT, (tc - c) << SHIFT)
-                work.dirty[r, c] |= alike
+                row, column = (tr - r) << SHIFT, (tc - c) << SHIFT
+                work.dirty[r, c] |= _rows_sharing_value(store.field[patch], work.stamp, cells, row, column)
 
 
 @njit(cache=True)
 def _span_in_reach(reach: int, at: int) -> tuple[int, int]:
-    """The rows or columns, from ... to, of a patch that begins ``at`` relative to another, which are in its reach."""
+    """The rows or columns, from ... to, of a patch that begins ``at`` relative to another and is in its reach."""
     return max(0, -reach - at), max(0, min(PATCH, PATCH + reach - at))
 
 
@@ -133,17 +133,14 @@ def _column_bits(begin: int, end: int) -> np.uint32:
 
 @njit(cache=True, inline="always")
 def _stamp_overlap(stamp: UInt8, row: int, column: int) -> tuple[int, int, int, int]:
-    """What the stamp around a cell in reach covers of a patch: its rows, from ... to.
-
-    And where the stamp lies on it: the stamp's row on row 0, and its column on column 0.
-    """
+    """Rows of a patch, from ... to, under the stamp around a cell, and the stamp's row and column at cell (0, 0)."""
     reach = stamp.shape[0] // 2
     return max(0, row - reach), min(PATCH, row + reach + 1), reach - row, MASK + reach - column
 
 
 @njit(cache=True)
 def _would_lower(field: UInt8, stamp: UInt8, cells: UInt32, row: int, column: int) -> bool:
-    """Whether cells, in a patch that begins at (row, column) relative to the field's, lower the field."""
+    """Whether cells lower the field, in a patch that begins at (row, column) relative to the field's."""
     reach = stamp.shape[0] // 2
     columns = _column_bits(*_span_in_reach(reach, column))
     begin, end = _span_in_reach(reach, row)
@@ -160,10 +157,10 @@ def _would_lower(field: UInt8, stamp: UInt8, cells: UInt32, row: int, column: in
 
 @njit(cache=True, inline="always")
 def _any_lower(field: UInt8, values: UInt8) -> bool:
-    found = False
+    lower = False
     for c in range(field.size):
-        found |= values[c] < field[c]
-    return found
+        lower |= values[c] < field[c]
+    return lower
 
 
 @njit(cache=True)
@@ -182,9 +179,9 @@ def _apply_stamps(field: UInt8, stamp: UInt8, cells: UInt32, row: int, column: i
 
 
 @njit(cache=True, inline="always")
-def _take_minimum(kept: UInt8 | Int32, values: UInt8 | Int32) -> None:
-    for c in range(kept.size):
-        kept[c] = min(kept[c], values[c])
+def _take_minimum(minimum: UInt8 | Int32, values: UInt8 | Int32) -> None:
+    for c in range(minimum.size):
+        minimum[c] = min(minimum[c], values[c])
 
 
 @njit(cache=True)
@@ -193,29 +190,29 @@ def _rows_sharing_value(field: UInt8, stamp: UInt8, cells: UInt32, row: int, col
     reach = stamp.shape[0] // 2
     columns = _column_bits(*_span_in_reach(reach, column))
     begin, end = _span_in_reach(reach, row)
-    alike = np.uint32(0)
+    rows = np.uint32(0)
     for r in range(begin, end):
         bits = cells[r] & columns
         while bits:
             top, bottom, above, left = _stamp_overlap(stamp, row + r, column + lowest_bit(bits))
             bits &= bits - np.uint32(1)
             for k in range(top, bottom):
-                alike |= np.uint32(_shares_value(field[k], stamp[above + k, left : left + PATCH])) << np.uint32(k)
-    return alike
+                rows |= np.uint32(_shares_value(field[k], stamp[above + k, left : left + PATCH])) << np.uint32(k)
+    return rows
 
 
 @njit(cache=True, inline="always")
 def _shares_value(field: UInt8, values: UInt8) -> bool:
     """Whether both have a value below FAR in common."""
-    found = False
+    shared = False
     for c in range(field.size):
-        found |= (values[c] == field[c]) & (values[c] < FAR)
-    return found
+        shared |= (values[c] == field[c]) & (values[c] < FAR)
+    return shared
 
 
 @njit(cache=True)
 def recompute_dirty(table: Int32, store: PatchStore, work: FieldWorkspace, rows: range, columns: range) -> None:
-    """Measure the dirty rows anew, in a part of the table and around it."""
+    """Recompute the dirty rows, in a part of the table and around it."""
     for tr in patches_in_reach(work, table.shape[0], rows):
         for tc in patches_in_reach(work, table.shape[0], columns):
             dirty = work.dirty[tr, tc]
@@ -227,7 +224,7 @@ def recompute_dirty(table: Int32, store: PatchStore, work: FieldWorkspace, rows:
 
 @njit(cache=True)
 def _write_rows(field: UInt8, rows: np.uint32, nearest: Int32, quanta: UInt8) -> None:
-    """Enter squared distances into rows, given as bits, of a field."""
+    """Write squared distances into rows, given as bits, of a field."""
     while rows:
         r = lowest_bit(rows)
         rows &= rows - np.uint32(1)
@@ -237,7 +234,7 @@ def _write_rows(field: UInt8, rows: np.uint32, nearest: Int32, quanta: UInt8) ->
 
 @njit(cache=True)
 def _find_nearest(table: Int32, store: PatchStore, work: FieldWorkspace, rows: np.uint32, tr: int, tc: int) -> None:
-    """Squared distances from the cells in rows, given as bits, of a patch to their nearest occupied ones."""
+    """Write to ``work`` the squared distances from cells of a patch, in rows given as bits, to the nearest occupied."""
     reach = work.stamp.shape[0] // 2
     top, bottom = lowest_bit(rows), PATCH
     while not rows >> np.uint32(bottom - 1):
@@ -246,22 +243,22 @@ def _find_nearest(table: Int32, store: PatchStore, work: FieldWorkspace, rows: n
     patches = patches_in_reach(work, table.shape[0], range(tc, tc + 1))
     first = tr << SHIFT
     for row in range(max(0, first + top - reach), min(table.shape[0] * PATCH, first + bottom + reach)):
-        found = False
+        any_occupied = False
         for t in patches:
             patch = table[row >> SHIFT, t]
             if patch >= 0 and store.occupied[patch, row & MASK]:
-                if not found:
+                if not any_occupied:
                     work.across[:] = work.quanta.size - 1
-                found = True
+                any_occupied = True
                 _measure_across(store.occupied[patch, row & MASK], (t - tc) << SHIFT, work.squares, work.across)
-        if found:
+        if any_occupied:
             begin, end = max(top, row - first - reach), min(bottom, row - first + reach + 1)
             _take_nearer(work.nearest[begin:end], work.across, begin - row + first)
 
 
 @njit(cache=True, inline="always")
 def _measure_across(occupied: np.uint32, column: int, squares: Int32, across: Int32) -> None:
-    """Squared distances from the columns of a patch to occupied ones of a patch that begins at ``column``."""
+    """Lower ``across`` to squared distances from columns to occupied ones of a patch that begins at ``column``."""
     reach = squares.size // 2 - MASK
     occupied &= _column_bits(*_span_in_reach(reach, column))
     while occupied:
@@ -272,7 +269,7 @@ def _measure_across(occupied: np.uint32, column: int, squares: Int32, across: In
 
 @njit(cache=True, inline="always")
 def _take_nearer(nearest: Int32, across: Int32, offset: int) -> None:
-    """Take what is nearer by way of the row ``offset`` rows before the first."""
+    """Lower squared distances to those by the row that is ``offset`` rows before the first."""
     for r in range(nearest.shape[0]):
         square = (r + offset) * (r + offset)
         for c in range(nearest.shape[1]):

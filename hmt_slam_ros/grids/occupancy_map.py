@@ -1,4 +1,4 @@
-"""The occupancy grid of the whole map from the keyframes' scans, in the form that nav2's map_server reads."""
+"""The occupancy grid of the whole map from the keyframes' scans, in the format of nav2's map_server."""
 
 from __future__ import annotations
 
@@ -19,11 +19,17 @@ from hmt_slam_ros.sensors import Scan
 
 OCCUPIED, FREE, UNKNOWN = np.uint8(0), np.uint8(254), np.uint8(205)
 
-# A wall that the laser grazes is passed by beams as well as hit, so it keeps its colour down to this share of hits.
 _OCCUPIED_RATIO = 0.4
-_MARGIN = 0.5  # m of unknown space around everything that was seen
+"""Share of hits from which a cell is occupied: beams that graze a wall pass its cells, too."""
+
+_MARGIN = 0.5
+"""Unknown space around all points, m."""
+
 _MAX_CELLS = 1 << 26
+"""Cells of an image at most."""
+
 _HITS, _MISSES, _LAST_SCAN = 0, 1, 2
+"""Layers of the votes."""
 
 
 class OccupancyImage(NamedTuple):
@@ -42,13 +48,13 @@ class OccupancyImage(NamedTuple):
 def occupancy_image(
     scans: Sequence[Scan], poses: NDArray[np.float64], resolution: float, max_range: float
 ) -> OccupancyImage:
-    """Count for every cell the scans that hit it and those that saw through it.
+    """The occupancy of each cell, from the number of scans that hit it and of those that passed it.
 
-    A beam without a return says nothing. One longer than ``max_range`` clears the way up to there.
+    A beam without a return has no effect. A beam longer than ``max_range`` clears cells up to there.
 
     :param scans: n scans.
     :param poses: shape (n, 3), ``map_T_base``, m and rad.
-    :param resolution: side of a cell, m; doubled until the image is of a size that a computer can hold.
+    :param resolution: side of a cell, m; doubled until the image has 2^26 cells at most.
     :param max_range: m.
     """
     beams = [_clip_beams(scan, pose, max_range) for scan, pose in zip(scans, poses, strict=True)]
@@ -67,10 +73,10 @@ def occupancy_image(
 
 
 def _classify(hits: NDArray[np.int32], misses: NDArray[np.int32]) -> NDArray[np.uint8]:
-    seen = hits + misses
+    votes = hits + misses
     pixels = np.full(hits.shape, UNKNOWN)
-    pixels[seen > 0] = FREE
-    pixels[(seen > 0) & (hits >= _OCCUPIED_RATIO * seen)] = OCCUPIED
+    pixels[votes > 0] = FREE
+    pixels[(votes > 0) & (hits >= _OCCUPIED_RATIO * votes)] = OCCUPIED
     return pixels
 
 
@@ -91,7 +97,7 @@ def _vote(
     scan: int,
     votes: NDArray[np.int32],
 ) -> None:
-    """One scan's votes: at most one per cell, and a hit goes before a miss. Coordinates in cells."""
+    """Add the votes of one scan: at most one per cell, hits before misses. Coordinates in cells."""
     for k in range(ends.shape[0]):
         i, j = math.floor(ends[k, 1]), math.floor(ends[k, 0])
         if returned[k] and votes[_LAST_SCAN, i, j] != scan:
@@ -103,7 +109,7 @@ def _vote(
 
 @njit(cache=True)
 def _clear(start: NDArray[np.float64], end: NDArray[np.float64], scan: int, votes: NDArray[np.int32]) -> None:
-    """Vote for all cells that the beam crosses, without its last one."""
+    """Add misses to all cells that a beam crosses, without its last cell."""
     walk, steps = begin_walk(start[0], start[1], end[0], end[1])
     for _ in range(steps):
         i, j = walk.row, walk.column
@@ -132,9 +138,9 @@ def write_map(directory: Path, image: OccupancyImage) -> None:
 
 
 def read_map(directory: Path) -> OccupancyImage:
-    """Read map.pgm and map.yaml as :func:`write_map` wrote them.
+    """The image in map.pgm and map.yaml as :func:`write_map` writes them.
 
-    :raises HmtSlamError: where they are missing or something else.
+    :raises HmtSlamError: where they are missing or have another form.
     """
     try:
         description = yaml.safe_load((directory / "map.yaml").read_text(encoding="utf-8"))

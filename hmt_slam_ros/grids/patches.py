@@ -1,10 +1,10 @@
 """Patches of cells: how they are found, shared and copied.
 
-A map is a table (T, T) of indices into a store of square patches; -1 is a patch never seen. Map frame and table are
-aligned: the origin lies at the corner between the four middle patches. Each patch holds, for 32 x 32 cells,
+A map is a table (T, T) of indices into a store of square patches; -1 is a patch never seen. The axes of map frame and
+table are the same, and the origin is the corner between the four middle patches. Each patch holds, for 32 x 32 cells,
 
 - ``odds``: int8, evidence of occupancy in units of 0.05 nats, positive occupied, negative free, 0 unknown;
-- ``field``: uint8, distance from the cell's centre to the nearest occupied cell's centre, 255 = the field's radius;
+- ``field``: uint8, distance from the cell's center to the nearest occupied cell's center, 255 = the field's radius;
 - ``occupied``: uint32 for each row, bit c is set where the odds of column c are positive.
 """
 
@@ -17,14 +17,20 @@ from numba import njit
 from hmt_slam_ros.arrays import Int8, Int32, Int64, UInt8, UInt32
 
 PATCH = 32
+"""Edge of a patch, cells: ``1 << SHIFT``, with the bits ``MASK`` for the cell within the patch."""
+
 SHIFT = 5
 MASK = 31
+
 NO_PATCH = -1
+"""Index of a patch never seen."""
+
 FAR = 255
+"""Largest value of the distance field: its radius and more."""
 
 
 class GridView(NamedTuple):
-    """One map as the kernels see it.
+    """One map, for the kernels.
 
     :ivar table: shape (T, T), indices into the pool.
     :ivar odds: shape (capacity, 32, 32), the pool's.
@@ -41,7 +47,7 @@ class GridView(NamedTuple):
 
 
 class PatchStore(NamedTuple):
-    """The arrays of the pool that change when a map is written to; ``free[:free_count[0]]`` are the free patches."""
+    """The arrays of the pool that writing to a map changes; ``free[:free_count[0]]`` are the free patches."""
 
     odds: Int8
     field: UInt8
@@ -67,7 +73,7 @@ def odds_at(view: GridView, column: int, row: int) -> int:
 
 @njit(cache=True)
 def field_at(view: GridView, column: int, row: int) -> int:
-    """The quantised distance at a cell, FAR outside the map."""
+    """The quantized distance at a cell, FAR outside the map."""
     if column < 0 or row < 0:
         return FAR
     tc, tr = column >> SHIFT, row >> SHIFT
@@ -81,7 +87,7 @@ def field_at(view: GridView, column: int, row: int) -> int:
 
 @njit(cache=True, inline="always")
 def field_at_four(view: GridView, column: int, row: int) -> tuple[int, int, int, int]:
-    """:func:`field_at` of a cell, of the next one in its row, and of these two in the next row."""
+    """:func:`field_at` of a cell, of the next cell in its row, and of both in the next row."""
     c, r, tc, tr = column & MASK, row & MASK, column >> SHIFT, row >> SHIFT
     if 0 <= tc < view.table.shape[1] and 0 <= tr < view.table.shape[0] and c < MASK and r < MASK:
         # All four lie in one patch.
@@ -100,7 +106,7 @@ def field_at_four(view: GridView, column: int, row: int) -> tuple[int, int, int,
 
 @njit(cache=True)
 def add_references(table: Int32, references: Int32) -> None:
-    """Count one reference more to every patch of a map."""
+    """Count one more reference to every patch of a map."""
     for row in range(table.shape[0]):
         for column in range(table.shape[1]):
             if table[row, column] >= 0:
@@ -109,7 +115,7 @@ def add_references(table: Int32, references: Int32) -> None:
 
 @njit(cache=True)
 def release_table(table: Int32, store: PatchStore) -> None:
-    """Empty a map's table; patches that no other table names are free again."""
+    """Empty a map's table; patches that no other table has are free again."""
     for row in range(table.shape[0]):
         for column in range(table.shape[1]):
             patch = table[row, column]
@@ -123,7 +129,7 @@ def release_table(table: Int32, store: PatchStore) -> None:
 
 @njit(cache=True)
 def writable_patch(table: Int32, store: PatchStore, row: int, column: int) -> int:
-    """The patch at a place of the table, made or unshared where needed."""
+    """The patch at a place of the table, a new one or a copy of a shared one where needed."""
     old = table[row, column]
     if old >= 0 and store.references[old] == 1:
         return old

@@ -1,14 +1,12 @@
-"""Which cells of a grid a beam crosses, one after the other (Amanatides and Woo 1987).
+"""The cells of a grid that a beam crosses, in order (Amanatides and Woo 1987).
 
-Maps of patches and images of whole maps take a beam from its laser to its end. Others follow beams differently:
+Maps of patches and occupancy images follow a beam from the laser to its end. Others follow beams differently:
 
-- simulated rays (:mod:`hmt_slam_ros.simulation.laser`) step alike, but begin where they enter the grid and have no
-  end;
+- simulated rays (:mod:`hmt_slam_ros.simulation.laser`) begin where they enter the grid, and have no end;
 - virtual scans and known walls (:mod:`hmt_slam_ros.grids.virtual_scan`,
-  :mod:`hmt_slam_ros.registration.consistency`) jump by the distance to the nearest surface, as they ask for surfaces
-  and not for cells;
-- log-ratio grids and lines of sight between keyframes (:mod:`hmt_slam_ros.registration.likelihood_grid`,
-  :mod:`hmt_slam_ros.hybrid_map.surroundings`) sample a line at even steps, which may miss cells at their corners.
+  :mod:`hmt_slam_ros.registration.consistency`) step by the distance to the nearest surface;
+- log-ratio grids and lines of sight (:mod:`hmt_slam_ros.registration.likelihood_grid`,
+  :mod:`hmt_slam_ros.hybrid_map.surroundings`) sample a line at even steps, which may miss corners of cells.
 """
 
 from __future__ import annotations
@@ -20,12 +18,12 @@ from numba import njit
 
 
 class GridWalk(NamedTuple):
-    """Where a beam is on its way through a grid.
+    """The current cell of a beam. Lengths are shares of the beam.
 
     :ivar column: of the cell, with ``row``.
-    :ivar next_x: how far along the beam the next border between columns is; ``next_y``, between rows.
+    :ivar next_x: length up to the next border between columns; ``next_y``, between rows.
     :ivar step_x: from one column to the next, -1, 0 or 1; ``step_y``, of rows.
-    :ivar delta_x: how far along the beam from one border between columns to the next; ``delta_y``, between rows.
+    :ivar delta_x: length between two borders of columns; ``delta_y``, of rows.
     """
 
     column: int
@@ -40,7 +38,7 @@ class GridWalk(NamedTuple):
 
 @njit(cache=True)
 def begin_walk(from_x: float, from_y: float, to_x: float, to_y: float) -> tuple[GridWalk, int]:
-    """A beam at its start, and how many steps there are to the cell of its end; in cells, along it in shares of it."""
+    """The cell in which a beam starts, and the number of steps to the cell of its end; coordinates in cells."""
     column, row = int(np.floor(from_x)), int(np.floor(from_y))
     step_x, delta_x, next_x = _axis_steps(from_x, to_x)
     step_y, delta_y, next_y = _axis_steps(from_y, to_y)
@@ -50,7 +48,7 @@ def begin_walk(from_x: float, from_y: float, to_x: float, to_y: float) -> tuple[
 
 @njit(cache=True)
 def _axis_steps(start: float, end: float) -> tuple[int, float, float]:
-    """Along one axis: the cell step, the beam's length per cell, and its length up to the first boundary."""
+    """Along one axis: the step in cells, the length per cell, and the length up to the first border."""
     if end == start:
         return 0, np.inf, np.inf
     delta = 1.0 / abs(end - start)
@@ -61,7 +59,7 @@ def _axis_steps(start: float, end: float) -> tuple[int, float, float]:
 
 @njit(cache=True)
 def next_cell(walk: GridWalk) -> GridWalk:
-    """The beam in the cell that it enters next."""
+    """The next cell of the beam."""
     column, row, next_x, next_y, step_x, step_y, delta_x, delta_y = walk
     if next_x < next_y:
         return GridWalk(column + step_x, row, next_x + delta_x, next_y, step_x, step_y, delta_x, delta_y)

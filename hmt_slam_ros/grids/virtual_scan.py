@@ -1,9 +1,8 @@
-"""The scan that a laser with a full circle of beams would take in a local map, whatever the robot's own laser sees.
+"""The scan that a laser with a full circle of beams would take in a local map.
 
-What is around the robot is in the map of the area, also what its laser does not see at the moment. A beam is followed
-by steps of the distance field (sphere tracing, Hart 1996) to the first surface, and there to where the field is least:
-that is in the middle of the occupied cells, not on the near side of the first of them, so that walls that are grazed
-are seen where they are. A beam that comes into ground of which nothing is known ends there without a return.
+A beam is followed by steps of the distance field (sphere tracing, Hart 1996) to the first surface, and there to the
+minimum of the field. The minimum is in the middle of the occupied cells, so grazed walls have no bias to the near side.
+A beam that enters unknown space ends there without a return.
 """
 
 from __future__ import annotations
@@ -18,27 +17,30 @@ from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.grids.patches import FAR, PATCH, GridView, field_at_four, odds_at
 from hmt_slam_ros.sensors import Scan
 
-# In cells: a beam meets a surface where the middle of an occupied cell is this near to it.
 _HIT_DISTANCE = 0.65
-# The longest step over ground that has to be known, and the shortest; and the one in search of the least distance.
+"""Distance from the middle of an occupied cell below which a beam meets a surface, cells."""
+
 _MAX_STEP, _MIN_STEP, _FINE_STEP = 2.0, 0.5, 0.1
-# Behind the first meeting with a surface the least distance is sought for so far.
+"""Longest and shortest step of a beam, and the step in search of the least distance, cells."""
+
 _BEHIND = 2.0
-# How fast the distance falls on the last stretch of a beam tells how it meets the surface; not below this.
+"""Search range for the least distance behind the first hit, cells."""
+
 _STRETCH, _GRAZING = 4.0, 0.05
-# Beams of a real scan leave holes between them, m; only more in a row is unknown.
+"""Length before a hit over which the incidence is measured, cells, and the smallest cosine of the incidence."""
+
 _MAX_HOLE = 0.3
+"""Unknown space in a row that a beam still crosses, m: beams of real scans leave such holes."""
 
 
 class VirtualScan(NamedTuple):
-    """A scan all around, and what is not known of it.
+    """A full circle of beams cast in a map.
 
-    :ivar scan: in the frame of the base at the pose from which it was cast; its first beam looks backwards. NaN where
+    :ivar scan: in the frame of the base at the pose from which it was cast; its first beam points backwards. NaN where
         the map shows no surface.
-    :ivar free_range: shape (n,), how far each beam goes through known space, m: to the surface where there is one.
+    :ivar free_range: shape (n,), length of each beam in known space, m: up to the surface where there is one.
     :ivar incidence_cosine: shape (n,), cosine of the angle between each beam and the normal of the surface that it
-        meets, at least 0.05. What a map errs by is across its surfaces, which makes a range err by as much divided by
-        this.
+        meets, at least 0.05. The error of a range is the error of the map across the surface, divided by this.
     """
 
     scan: Scan
@@ -47,41 +49,41 @@ class VirtualScan(NamedTuple):
 
 
 def cast_virtual_scan(view: GridView, pose: Float64, beams: int, reach: float, stamp: int = 0) -> VirtualScan:
-    """Cast a scan in a map.
+    """The virtual scan of a map.
 
     :param pose: ``map_T_base``, shape (3,), m and rad.
     :param beams: number of beams, evenly over the circle, 3 at least.
-    :param reach: how far they are followed, m.
+    :param reach: largest range, m.
     :param stamp: of the scan, ns.
     """
     step = 2.0 * math.pi / beams
-    ranges, free, facing = np.empty(beams), np.empty(beams), np.empty(beams)
-    _cast_beams(view, pose, step, reach, ranges, free, facing)
+    ranges, free, cosines = np.empty(beams), np.empty(beams), np.empty(beams)
+    _cast_beams(view, pose, step, reach, ranges, free, cosines)
     scan = Scan(stamp, ranges.astype(np.float32), -math.pi, step, 0.0, float(np.float32(reach)) + view.cell)
-    return VirtualScan(scan, free, facing)
+    return VirtualScan(scan, free, cosines)
 
 
 @njit(cache=True)
 def _cast_beams(
-    view: GridView, pose: Float64, step: float, reach: float, ranges: Float64, free: Float64, facing: Float64
+    view: GridView, pose: Float64, step: float, reach: float, ranges: Float64, free: Float64, cosines: Float64
 ) -> None:
-    """Write of each beam, (n,), its range, NaN without a surface, how far it is free, m, and how it faces a surface."""
+    """Write the range of each beam, (n,), m, NaN without a surface, its free range, and the cosine of its incidence."""
     half = 0.5 * view.table.shape[0] * PATCH
     u, v = pose[0] / view.cell + half, pose[1] / view.cell + half
     for k in range(len(ranges)):
         angle = pose[2] - math.pi + k * step
         du, dv = math.cos(angle), math.sin(angle)
-        met, known = _cast_beam(view, u, v, du, dv, reach / view.cell)
-        ranges[k], free[k], facing[k] = met * view.cell, known * view.cell, 1.0
-        if not math.isnan(met):
-            stretch = max(_MIN_STEP, min(met, _STRETCH))
-            back = met - stretch
-            facing[k] = min(1.0, max(_GRAZING, _distance(view, u + back * du, v + back * dv) / stretch))
+        hit, known = _cast_beam(view, u, v, du, dv, reach / view.cell)
+        ranges[k], free[k], cosines[k] = hit * view.cell, known * view.cell, 1.0
+        if not math.isnan(hit):
+            stretch = max(_MIN_STEP, min(hit, _STRETCH))
+            back = hit - stretch
+            cosines[k] = min(1.0, max(_GRAZING, _distance(view, u + back * du, v + back * dv) / stretch))
 
 
 @njit(cache=True)
 def _cast_beam(view: GridView, u: float, v: float, du: float, dv: float, reach: float) -> tuple[float, float]:
-    """Where a beam meets a surface, NaN for nowhere, and how far it is free; all in cells."""
+    """The range at which a beam meets a surface, NaN for none, and its free range, both in cells."""
     at, known, holes = 0.0, 0.0, _MAX_HOLE / view.cell
     while at < reach:
         column, row = math.floor(u + at * du), math.floor(v + at * dv)
@@ -109,7 +111,7 @@ def _distance(view: GridView, u: float, v: float) -> float:
 
 @njit(cache=True)
 def _nearest_minimum(view: GridView, u: float, v: float, du: float, dv: float, at: float) -> float:
-    """Where behind ``at`` the distance is least, before it grows again."""
+    """The first minimum of the distance behind the range ``at``, cells."""
     least, best, end = math.inf, at, at + _BEHIND
     while at < end:
         distance = _distance(view, u + at * du, v + at * dv)

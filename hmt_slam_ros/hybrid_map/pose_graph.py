@@ -22,7 +22,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import SuperLU, splu
 
 from hmt_slam_ros.arrays import Float64, Int32, Int64
-from hmt_slam_ros.geometry import se2, se2_kernels
+from hmt_slam_ros.geometry import se2
 
 _SMALL_ANGLE, _SERIES_ANGLE = 1e-4, 1e-2
 
@@ -61,7 +61,7 @@ def linearize(poses: Float64, sources: Int64, targets: Int64, measured: Float64)
 @njit(cache=True)
 def _between(a: Float64, b: Float64) -> tuple[float, float, float]:
     cos, sin = np.cos(a[2]), np.sin(a[2])
-    x, y = se2_kernels.rotate_back(cos, sin, b[0] - a[0], b[1] - a[1])
+    x, y = se2.rotate_back(cos, sin, b[0] - a[0], b[1] - a[1])
     angle = b[2] - a[2]
     return x, y, angle - 2.0 * np.pi * np.floor(angle / (2.0 * np.pi) + 0.5)
 

@@ -15,7 +15,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from hmt_slam_ros.arrays import Bool, Float64, Int64
-from hmt_slam_ros.geometry import se2_kernels
+from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.covariance import inverse_pose_covariance, propagate_covariance
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.hybrid_map import ArcTable, HybridMap
@@ -224,15 +224,15 @@ def _relax_arc(
 @njit(cache=True)
 def _inverse(pose: Float64) -> Float64:
     cos, sin = np.cos(pose[2]), np.sin(pose[2])
-    x, y = se2_kernels.inverse_position(cos, sin, pose[0], pose[1])
+    x, y = se2.inverse_position(cos, sin, pose[0], pose[1])
     return np.array((x, y, -pose[2]))
 
 
 @njit(cache=True)
 def _compose(a: Float64, b: Float64, result: Float64) -> None:
     cos, sin = np.cos(a[2]), np.sin(a[2])
-    result[0], result[1] = se2_kernels.transform(a[0], a[1], cos, sin, b[0], b[1])
-    result[2] = se2_kernels.wrap_by_turns(a[2] + b[2])
+    result[0], result[1] = se2.transform_point(a[0], a[1], cos, sin, b[0], b[1])
+    result[2] = se2.wrap_by_turns(a[2] + b[2])
 
 
 # Larger than a building, m, and all headings.

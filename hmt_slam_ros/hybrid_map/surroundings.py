@@ -24,7 +24,7 @@ from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.covariance import inverse_pose_covariance, propagate_covariance
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.geometry.se2_kernels import transform
+from hmt_slam_ros.geometry.se2 import transform_point
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.hybrid_map.shortest_path import ShortestPaths, shortest_path_beliefs
 from hmt_slam_ros.registration.likelihood_grid import AreaGrid, GridModel, Points, build_area_grid
@@ -135,10 +135,10 @@ def _transformed_positions(
         a, b, c = normal[n]
         turn = root[2, 0] * a + root[2, 1] * b + root[2, 2] * c
         x, y = se2.exp_shift(root[0, 0] * a, root[1, 0] * a + root[1, 1] * b, turn)
-        x, y = transform(mean[0], mean[1], cos, sin, x, y)
+        x, y = transform_point(mean[0], mean[1], cos, sin, x, y)
         turned_cos, turned_sin = np.cos(mean[2] + turn), np.sin(mean[2] + turn)
         for k in range(poses.shape[0]):
-            placed_x, placed_y = transform(x, y, turned_cos, turned_sin, poses[k, 0], poses[k, 1])
+            placed_x, placed_y = transform_point(x, y, turned_cos, turned_sin, poses[k, 0], poses[k, 1])
             positions[n, k, 0], positions[n, k, 1] = placed_x, placed_y
     return positions
 

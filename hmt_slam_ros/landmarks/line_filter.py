@@ -23,7 +23,7 @@ from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.covariance import inverse, propagate_covariance
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.geometry.se2_kernels import rotate_back
+from hmt_slam_ros.geometry.se2 import rotate_back
 from hmt_slam_ros.landmarks.line_extraction import Lines, extract_for_map
 from hmt_slam_ros.landmarks.stochastic_map import LineAssociations, LineMap
 from hmt_slam_ros.registration.consistency import (

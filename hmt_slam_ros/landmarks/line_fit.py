@@ -15,7 +15,7 @@ import numpy as np
 from numba import njit
 
 from hmt_slam_ros.arrays import Float64, Int32
-from hmt_slam_ros.geometry.se2_kernels import wrap_by_turns
+from hmt_slam_ros.geometry.se2 import wrap_by_turns
 
 _STEPS = 6
 _PARALLEL = 1e-4  # a beam along the line says nothing of it

@@ -39,7 +39,7 @@ from numba import njit
 
 from hmt_slam_ros.arrays import Float64, Int64
 from hmt_slam_ros.configuration.landmarks import FeatureParameters, PlaceParameters
-from hmt_slam_ros.geometry.se2_kernels import wrap_by_modulus
+from hmt_slam_ros.geometry.se2 import wrap_by_modulus
 from hmt_slam_ros.places.observation_graph import CONVEX, OPENINGS, TRACKS, LandmarkSequence, select_landmarks
 
 # Beyond so many deviations nothing is matched, and a landmark is not within reach.

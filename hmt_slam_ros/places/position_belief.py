@@ -23,7 +23,7 @@ from numba import njit
 
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration.landmarks import PlaceParameters
-from hmt_slam_ros.geometry.se2_kernels import wrap_by_modulus
+from hmt_slam_ros.geometry.se2 import wrap_by_modulus
 from hmt_slam_ros.places.observation import ObservationModel, log_observation_ratios, log_unknown_ground_ratio
 from hmt_slam_ros.places.observation_graph import QUARTERS, LandmarkSequence
 from hmt_slam_ros.places.place_graph import PlaceGraph, StateTransitions

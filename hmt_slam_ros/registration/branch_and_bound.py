@@ -15,7 +15,7 @@ import numpy as np
 from numba import njit
 
 from hmt_slam_ros.arrays import Bool, Float32, Float64, Int8, Int32, Int64
-from hmt_slam_ros.geometry.se2_kernels import rotate_back
+from hmt_slam_ros.geometry.se2 import rotate_back
 from hmt_slam_ros.registration.search_bounds import (
     BLOCK,
     LogRatioGrid,

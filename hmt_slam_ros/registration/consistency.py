@@ -27,7 +27,7 @@ import numpy as np
 from numba import njit
 
 from hmt_slam_ros.arrays import Float64
-from hmt_slam_ros.geometry.se2_kernels import transform
+from hmt_slam_ros.geometry.se2 import transform_point
 from hmt_slam_ros.grids.patches import FAR, PATCH, GridView, field_at
 from hmt_slam_ros.registration.scan_to_map import count_agreement
 
@@ -208,11 +208,11 @@ def count_hits_and_violations(
     cos, sin = np.cos(pose[2]) / view.cell, np.sin(pose[2]) / view.cell
     half = 0.5 * view.table.shape[0] * PATCH
     u, v = pose[0] / view.cell + half, pose[1] / view.cell + half
-    from_u, from_v = transform(u, v, cos, sin, laser[0], laser[1])
+    from_u, from_v = transform_point(u, v, cos, sin, laser[0], laser[1])
     apart, together = SAMPLE_SPACING / view.cell, MAX_SAMPLE_GAP / view.cell
     met, passed = NO_SAMPLES, NO_SAMPLES
     for i in range(points.shape[0]):
-        to_u, to_v = transform(u, v, cos, sin, points[i, 0], points[i, 1])
+        to_u, to_v = transform_point(u, v, cos, sin, points[i, 0], points[i, 1])
         if field_at(view, int(to_u), int(to_v)) < near:
             met = add_wall_hit(met, to_u, to_v, apart)
         share = _first_wall_passed(view, from_u, from_v, to_u, to_v)

@@ -12,19 +12,19 @@ import numpy as np
 from numba import njit
 
 from hmt_slam_ros.arrays import Bool, Float64, Int64
-from hmt_slam_ros.geometry.gaussian import chi_square_gate
-from hmt_slam_ros.geometry.symmetric import (
+from hmt_slam_ros.geometry.covariance import (
     Symmetric,
     Vector,
     add_scaled,
     dot,
-    inverse,
     multiply,
     sandwich,
     solve,
     symmetric_from_array,
+    symmetric_inverse,
     write_to_array,
 )
+from hmt_slam_ros.geometry.gaussian import chi_square_gate
 from hmt_slam_ros.grids.patches import GridView
 from hmt_slam_ros.registration.scan_to_map import AlignmentSettings, Prior, linearize, pose_difference
 
@@ -91,7 +91,7 @@ def _segment_equations(
     count = begins.size - 1
     informations, gradients, contradicts = np.empty((count, 3, 3)), np.empty((count, 3)), np.zeros(count, np.bool_)
     plain = AlignmentSettings(settings.sigma * np.sqrt(settings.inflation), np.inf, 1.0, 1)
-    covariance = inverse(symmetric_from_array(prior.information))
+    covariance = symmetric_inverse(symmetric_from_array(prior.information))
     there = predicted[0] == 0.0 and predicted[1] == 0.0 and predicted[2] == 0.0
     for k in range(count):
         own = points[begins[k] : begins[k + 1]]
@@ -139,7 +139,7 @@ def _dynamic_segments(
         for k in suspects:
             if not moved[k]:
                 own, told = symmetric_from_array(informations[k]), _row(gradients, k)
-                covariance = inverse(add_scaled(information, own, -1.0))
+                covariance = symmetric_inverse(add_scaled(information, own, -1.0))
                 surprise = _chi_square(
                     own, told, covariance, multiply(covariance, _add_scaled_vector(told, gradient, -1.0))
                 )

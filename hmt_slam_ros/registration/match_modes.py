@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 
 from hmt_slam_ros.arrays import Float64, Int32, Int64
-from hmt_slam_ros.geometry.se2_kernels import rotate_back, transform
+from hmt_slam_ros.geometry.se2 import rotate_back, transform_point
 from hmt_slam_ros.registration.branch_and_bound import SearchCells
 from hmt_slam_ros.registration.search_bounds import LogRatioGrid, SearchWindow
 
@@ -134,7 +134,7 @@ def _log_ratio_at(surface: LogRatioGrid, points: _GridSamples, pose: Float64) ->
     cos, sin = np.cos(pose[2]), np.sin(pose[2])
     x0, y0 = pose[0] - surface.origin[0], pose[1] - surface.origin[1]
     for n in range(points.x.size):
-        x, y = transform(x0, y0, cos, sin, points.x[n], points.y[n])
+        x, y = transform_point(x0, y0, cos, sin, points.x[n], points.y[n])
         u, v = x / surface.cell - 0.5, y / surface.cell - 0.5
         left, above = np.floor(u), np.floor(v)
         points.column[n], points.row[n] = np.int32(left), np.int32(above)
@@ -291,5 +291,5 @@ def _perturb(pose: Float64, twist: Float64) -> Float64:
     """``pose * exp(twist)`` for a small twist, to second order."""
     cos, sin = np.cos(pose[2]), np.sin(pose[2])
     x, y = twist[0] - 0.5 * twist[2] * twist[1], twist[1] + 0.5 * twist[2] * twist[0]
-    x, y = transform(pose[0], pose[1], cos, sin, x, y)
+    x, y = transform_point(pose[0], pose[1], cos, sin, x, y)
     return np.array((x, y, pose[2] + twist[2]))

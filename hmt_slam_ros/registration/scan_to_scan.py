@@ -14,7 +14,7 @@ from numba import njit
 
 from hmt_slam_ros.arrays import Bool, Float64, Int32, Int64
 from hmt_slam_ros.configuration.topology import RefinementParameters
-from hmt_slam_ros.geometry.se2_kernels import rotate_back, transform
+from hmt_slam_ros.geometry.se2 import rotate_back, transform_point
 from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.sensors.scan import FlatnessLimits, fit_surface, running_sums
 
@@ -249,7 +249,7 @@ def _add_points(
     for k in range(ones.starts[one], ones.starts[one + 1], every):
         seen += 1
         px, py = own[k, 0], own[k, 1]
-        x, y = transform(pose[0], pose[1], cos, sin, px, py)
+        x, y = transform_point(pose[0], pose[1], cos, sin, px, py)
         q = _nearest_point(points, bins, begin, end - begin, x, y, x - laser_x, y - laser_y, gate)
         if q < 0 or not flat[q]:
             continue

@@ -12,7 +12,7 @@ import numpy as np
 from numba import njit
 
 from hmt_slam_ros.arrays import Float32, Float64, Int8, Int32, Int64
-from hmt_slam_ros.geometry.se2_kernels import rotate
+from hmt_slam_ros.geometry.se2 import rotate
 
 
 class SearchWindow(NamedTuple):

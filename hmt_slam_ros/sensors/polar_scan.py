@@ -13,7 +13,7 @@ from numba import njit
 
 from hmt_slam_ros.arrays import Float64, Int8
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.geometry.se2_kernels import rotate_back, wrap_by_modulus
+from hmt_slam_ros.geometry.se2 import rotate_back, wrap_by_modulus
 from hmt_slam_ros.sensors.scan import Scan
 
 UNKNOWN, SURFACE, FREE = np.int8(0), np.int8(1), np.int8(2)

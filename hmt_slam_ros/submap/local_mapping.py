@@ -12,8 +12,7 @@ from numba import njit
 
 from hmt_slam_ros.arrays import Float64, Int32
 from hmt_slam_ros.configuration.tree import Configuration
-from hmt_slam_ros.grids.insertion import InverseSensorModel
-from hmt_slam_ros.grids.patch_pool import MappedBeams, PatchPool
+from hmt_slam_ros.grids.patch_pool import InverseSensorModel, MappedBeams, PatchPool
 from hmt_slam_ros.grids.patches import FAR, PATCH
 from hmt_slam_ros.registration import scan_to_map
 from hmt_slam_ros.registration.match_covariance import MatchNoise

@@ -21,7 +21,7 @@ from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.covariance import inverse, propagate_covariance, rotate_covariance
 from hmt_slam_ros.geometry.gaussian import PoseGaussian, chi_square_gate
 from hmt_slam_ros.grids.patches import GridView
-from hmt_slam_ros.registration import correlative_search, scan_to_map
+from hmt_slam_ros.registration import scan_to_map
 from hmt_slam_ros.registration.dynamic_rejection import reject_dynamic
 from hmt_slam_ros.sensors.motion_model import Prediction, RelativeMotion
 from hmt_slam_ros.submap.local_mapping import LocalMapping
@@ -168,7 +168,7 @@ class ScanMatcher:
         if not _exceeds_basin(covariance) and self._fits_map(points, match.pose, view):
             return match
         lattice = self._search_lattice(predicted)
-        starts = correlative_search.correlative_search(
+        starts = scan_to_map.correlative_search(
             points[:: max(1, len(points) // _SEARCH_POINTS)],
             prior,
             lattice,
@@ -215,7 +215,7 @@ class ScanMatcher:
         )
         return ScanMatch(pose, hessian, prior, step, log_evidence)
 
-    def _search_lattice(self, predicted: PoseGaussian) -> correlative_search.Lattice:
+    def _search_lattice(self, predicted: PoseGaussian) -> scan_to_map.Lattice:
         """The poses to search for around the one that is predicted."""
         settings, cell = self._settings, self._mapping.pool.cell
         reach = _REACH * np.sqrt(np.diag(rotate_covariance(predicted.covariance, predicted.mean[2])))
@@ -223,7 +223,7 @@ class ScanMatcher:
         reach[2] = np.clip(reach[2], math.radians(settings.search_angle), math.radians(settings.wide_angle))
         turn = math.radians(settings.search_step)
         counts = np.ceil(reach / np.array([2.0 * cell, 2.0 * cell, turn])).astype(np.int64)
-        return correlative_search.Lattice(2, turn, counts)
+        return scan_to_map.Lattice(2, turn, counts)
 
 
 def _predict_pose(before: PoseGaussian, step: RelativeMotion) -> PoseGaussian:
