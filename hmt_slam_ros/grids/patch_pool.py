@@ -167,7 +167,7 @@ class PatchPool:
         patches.release_table(table, self._store())
 
     def view(self, table: Int32) -> GridView:
-        """The map of ``table`` for the kernels; valid until the next"""
+        """The map of a table, for the kernels; valid until the next insertion."""
         return GridView(table, self.odds, self.field, self.cell, self.radius)
 
     def insert(self, tables: Int32, poses: Float64, beams: MappedBeams, model: InverseSensorModel) -> None:

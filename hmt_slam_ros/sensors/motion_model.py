@@ -1,9 +1,9 @@
-"""Where the robot goes between two scans, and how far that is to be trusted: by its odometry, by its inertia alone."""
+"""The robot's motion between two scans, with its covariance: by odometry, and by inertia alone."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import NamedTuple, TypeVar
 
@@ -15,20 +15,27 @@ from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.covariance import inverse, propagate_covariance
 from hmt_slam_ros.sensors.odometry import Odometry, OdometryBuffer
 
-# Weight of the newest scan in the mean time between scans, of late and over a while that outlasts a burst.
 _RECENT_WEIGHT, _LONG_TERM_WEIGHT = 0.1, 0.02
-# A time between two scans beyond this factor on the usual is one of stamps of arrival.
+"""Weight of the newest period between scans in the recent mean, and in the mean that outlasts a burst."""
+
 _IRREGULAR = 3.0
-# Weight of the past when odometry is judged once more.
+"""Factor on the mean period beyond which a period is left out: it is due to stamps of arrival."""
+
 _FORGETTING_FACTOR = 0.95
-# For about this time, in s, a robot goes on as it went, forward and aside, and turning.
+"""Weight of the past at each update of the odometry noise."""
+
 _TIME_CONSTANTS = np.array([2.0, 2.0, 1.0])
-# A velocity that is so many deviations from the one before was none.
+"""Time for which a velocity lasts, forward, aside and turning, s."""
+
 _JUMP = 10.0
-# A step beyond this many deviations says that something slipped, not how noisy the odometry is.
+"""Deviations of a velocity from the last one beyond which the velocity is unknown."""
+
 _OUTLIER = 3.0
-# Odometry with more than this many times the noise of its model is called noisy.
+"""Deviations beyond which a step counts as slip, not as noise of the odometry."""
+
 NOISY_FACTOR = 2.0
+"""Factor on the deviations of the odometry model from which odometry counts as noisy."""
+
 _DEGREES, _RADIANS = 180.0 / math.pi, math.pi / 180.0
 
 Length = TypeVar("Length", float, NDArray[np.float64])
@@ -50,7 +57,7 @@ class RelativeMotion(NamedTuple):
         return RelativeMotion(se2.compose(self.increment, other.increment), before + other.covariance)
 
     def fuse(self, other: RelativeMotion) -> RelativeMotion:
-        """The same motion, of which two sources tell independently: the product of both Gaussians."""
+        """The same motion from two independent sources: the product of both Gaussians."""
         gain = self.covariance @ inverse(self.covariance + other.covariance)
         difference = se2.log(se2.between(self.increment, other.increment))
         increment = se2.compose(self.increment, se2.exp(gain @ difference))
@@ -58,15 +65,15 @@ class RelativeMotion(NamedTuple):
 
 
 NO_MOTION = RelativeMotion(np.zeros(3), np.zeros((3, 3)))
-"""The robot stood still, for certain."""
+"""No motion, without uncertainty."""
 
 
 class Prediction(NamedTuple):
-    """The motion since the last scan, before this one is matched.
+    """The motion since the last scan, before this scan is matched.
 
-    :ivar odometry: what odometry says, None where it says nothing.
-    :ivar inertia: what the velocity says.
-    :ivar fused: what odometry says, and inertia as far as that is noisier than its model.
+    :ivar odometry: by odometry, None where that is unknown.
+    :ivar inertia: by the last velocity.
+    :ivar fused: by odometry, and by inertia as far as odometry is noisier than its model.
     """
 
     odometry: RelativeMotion | None
@@ -76,15 +83,15 @@ class Prediction(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class InertiaState:
-    """What is known of the robot's velocity.
+    """The belief over the robot's velocity.
 
     :ivar velocity: shape (3,), the body's twist, m/s, m/s, rad/s.
     :ivar covariance: of the velocity, shape (3, 3).
-    :ivar predicted_information: its information as predicted, before the last motion was observed, shape (3, 3).
+    :ivar predicted_information: information of the predicted velocity, before the last update, shape (3, 3).
     :ivar long_term_period: mean time between scans over a while, s, 0 before the second scan.
-    :ivar recent_period: mean time between scans of late, s, likewise.
-    :ivar last_interval: the time that the last prediction took for that between two scans, s.
-    :ivar interval_error: shape (3,), how far off the last prediction is if that time is not true, m, m, rad.
+    :ivar recent_period: mean time between the last scans, s, 0 before the second scan.
+    :ivar last_interval: time between scans that the last prediction assumed, s.
+    :ivar interval_error: shape (3,), error of the last prediction if that time is wrong, m, m, rad.
     """
 
     velocity: NDArray[np.float64]
@@ -97,107 +104,79 @@ class InertiaState:
 
 
 class Inertia:
-    """The robot's velocity, from the motions that scan matching found: a Kalman filter on the body's twist.
+    """The robot's velocity from matched motions: a Kalman filter on the twist of the base.
 
-    Stamps may be those of arrival, in bursts, while the scans were taken evenly; so the time between two scans is
-    taken to lie between its stamps' difference and the mean of late.
+    Stamps may be those of arrival, in bursts, while scans are taken evenly. So the time between two scans is taken for
+    the mean of the difference of their stamps and of the recent period.
+
+    :ivar state: the belief over the velocity.
     """
 
     def __init__(self, motion: MotionParameters, state: InertiaState | None = None) -> None:
         """:param state: to go on from."""
         self._acceleration = _squared_accelerations(motion)
         self._floor = increment_covariance(np.zeros(3), motion)
-        usual = self._acceleration * _TIME_CONSTANTS**2
-        self._prior_information = np.linalg.inv(usual)
-        state = state or InertiaState(np.zeros(3), usual, self._prior_information)
-        self._velocity, self._covariance, self._predicted_information = (
-            state.velocity,
-            state.covariance,
-            state.predicted_information,
-        )
-        self._long_term_period, self._recent_period = state.long_term_period, state.recent_period
-        self._last_interval, self._interval_error = state.last_interval, state.interval_error
-
-    @property
-    def state(self) -> InertiaState:
-        """All that is known."""
-        return InertiaState(
-            self._velocity,
-            self._covariance,
-            self._predicted_information,
-            self._long_term_period,
-            self._recent_period,
-            self._last_interval,
-            self._interval_error,
-        )
+        largest = self._acceleration * _TIME_CONSTANTS**2
+        self._prior_information = np.linalg.inv(largest)
+        self.state = state or InertiaState(np.zeros(3), largest, self._prior_information)
 
     def predict(self, seconds: float) -> RelativeMotion:
         """The motion of the next ``seconds`` since the last scan."""
-        self._update_periods(seconds)
-        self._last_interval = 0.5 * (seconds + self._recent_period)
-        self._interval_error = 0.5 * (seconds - self._recent_period) * self._velocity
-        changed = self._covariance + self._acceleration * self._last_interval**2
-        # However long it takes, the velocity stays within the usual.
-        self._predicted_information = inverse(changed) + self._prior_information
-        self._covariance = inverse(self._predicted_information)
-        lasting = _TIME_CONSTANTS * np.tanh(self._last_interval / _TIME_CONSTANTS)
-        spread = (
-            self._covariance * self._last_interval**2
-            + np.outer(self._interval_error, self._interval_error)
-            + self._floor
-        )
-        return RelativeMotion(se2.exp(self._velocity * lasting), spread)
-
-    def _update_periods(self, seconds: float) -> None:
-        """Take the time since the last scan into the means; the first one makes them."""
-        self._long_term_period = (
-            self._long_term_period + _LONG_TERM_WEIGHT * (seconds - self._long_term_period)
-            if self._long_term_period
-            else seconds
-        )
-        regular = self._long_term_period / _IRREGULAR < seconds < self._long_term_period * _IRREGULAR
-        newest = seconds if regular else self._long_term_period
-        self._recent_period = (
-            self._recent_period + _RECENT_WEIGHT * (newest - self._recent_period) if self._recent_period else newest
-        )
+        state = self.state
+        long_term = _moving_mean(state.long_term_period, seconds, _LONG_TERM_WEIGHT)
+        is_regular = long_term / _IRREGULAR < seconds < long_term * _IRREGULAR
+        recent = _moving_mean(state.recent_period, seconds if is_regular else long_term, _RECENT_WEIGHT)
+        interval, error = 0.5 * (seconds + recent), 0.5 * (seconds - recent) * state.velocity
+        # Over a long time the velocity stays within what the accelerations admit.
+        information = inverse(state.covariance + self._acceleration * interval**2) + self._prior_information
+        covariance = inverse(information)
+        self.state = InertiaState(state.velocity, covariance, information, long_term, recent, interval, error)
+        lasting = _TIME_CONSTANTS * np.tanh(interval / _TIME_CONSTANTS)
+        spread = covariance * interval**2 + np.outer(error, error) + self._floor
+        return RelativeMotion(se2.exp(state.velocity * lasting), spread)
 
     def observe(
         self, increment: NDArray[np.float64], information: NDArray[np.float64], odometry: RelativeMotion | None = None
     ) -> None:
-        """Learn from the motion that was predicted last.
+        """Update the velocity by the motion that was predicted last.
 
         :param increment: ``start_T_end`` (3,) as matched.
         :param information: of the match (3, 3), in the frame of its end; 0 along directions that scans do not show.
-        :param odometry: what odometry says of it.
+        :param odometry: the same motion by odometry.
         """
-        if self._last_interval <= 0.0:
+        state = self.state
+        if state.last_interval <= 0.0:
             return
         mean = se2.log(increment)
         if odometry is not None:
-            matched, told = information, inverse(odometry.covariance)
-            information = matched + told
-            mean = inverse(information) @ (matched @ mean + told @ se2.log(odometry.increment))
-        doubted = information @ self._interval_error
-        certain = information - np.outer(doubted, doubted) / (1.0 + self._interval_error @ doubted)
-        measured = certain * self._last_interval**2
-        self._covariance = inverse(self._predicted_information + measured)
-        residual = mean / self._last_interval - self._velocity
-        told = measured @ residual
-        if float(residual @ told - told @ self._covariance @ told) > _JUMP**2:
-            # One of the two poses was wrong, or the robot was carried: nothing is known of its velocity.
-            self._velocity, self._covariance = np.zeros(3), inverse(self._prior_information)
+            by_match, by_odometry = information, inverse(odometry.covariance)
+            information = by_match + by_odometry
+            mean = inverse(information) @ (by_match @ mean + by_odometry @ se2.log(odometry.increment))
+        # The error of the interval is common to all directions: Sherman-Morrison.
+        shared = information @ state.interval_error
+        information = information - np.outer(shared, shared) / (1.0 + state.interval_error @ shared)
+        measured = information * state.last_interval**2
+        covariance = inverse(state.predicted_information + measured)
+        residual = mean / state.last_interval - state.velocity
+        weighted = measured @ residual
+        if float(residual @ weighted - weighted @ covariance @ weighted) > _JUMP**2:
+            # One of the two poses was wrong, or the robot was carried: its velocity is unknown.
+            self.state = replace(state, velocity=np.zeros(3), covariance=inverse(self._prior_information))
         else:
-            self._velocity = self._velocity + self._covariance @ told
+            self.state = replace(state, velocity=state.velocity + covariance @ weighted, covariance=covariance)
+
+
+def _moving_mean(mean: float, newest: float, weight: float) -> float:
+    """The mean with a new value, or that value where there is no mean yet."""
+    return mean + weight * (newest - mean) if mean else newest
 
 
 @dataclass(frozen=True, eq=False)
 class OdometryNoiseState:
-    """What odometry turned out to be worth; at first, one step that was as the model says.
+    """Measured noise of the odometry relative to its model; at first that of one step as the model expects.
 
-    So the first few steps do not count for much.
-
-    :ivar weighted_ratios: shape (2,), weighted sums of the squared differences of late, of translation and rotation,
-        against what the model expects of them.
+    :ivar weighted_ratios: shape (2,), weighted sums of squared differences to the matches, of translation and rotation,
+        relative to those that the model expects.
     :ivar weights: shape (2,), the sums of these weights.
     """
 
@@ -206,57 +185,53 @@ class OdometryNoiseState:
 
 
 class OdometryNoise:
-    """How many times as noisy as its model the odometry turned out to be: factors on its deviations, at least 1.
+    """The noise of the odometry relative to its model: factors on its deviations, at least 1.
 
-    The squared difference between odometry and match over the steps of late, against what the model expects of it.
+    They are squared differences between odometry and match over the last steps, relative to what the model expects.
+
+    :ivar state: the sums over the last steps.
     """
 
     def __init__(self, state: OdometryNoiseState | None = None) -> None:
         """:param state: to go on from."""
-        state = state or OdometryNoiseState()
-        self._weighted_ratios, self._weights = state.weighted_ratios.copy(), state.weights.copy()
-        self._variance_factors = self._squared_factors()
-
-    @property
-    def state(self) -> OdometryNoiseState:
-        """All that is known."""
-        return OdometryNoiseState(self._weighted_ratios.copy(), self._weights.copy())
-
-    def _squared_factors(self) -> NDArray[np.float64]:
-        """On a covariance, shape (3, 3)."""
-        scale = self.factors[[0, 0, 1]]
-        return np.outer(scale, scale)
+        self.state = state or OdometryNoiseState()
 
     @property
     def factors(self) -> NDArray[np.float64]:
-        """On the deviation of translation and of rotation, shape (2,)."""
-        return np.sqrt(np.maximum(1.0, self._weighted_ratios / self._weights))
+        """Factors on the deviations of translation and of rotation, shape (2,)."""
+        return np.sqrt(np.maximum(1.0, self.state.weighted_ratios / self.state.weights))
+
+    @property
+    def _variance_factors(self) -> NDArray[np.float64]:
+        """Factors on a covariance, shape (3, 3)."""
+        scale = self.factors[[0, 0, 1]]
+        return np.outer(scale, scale)
 
     def scale(self, odometry: RelativeMotion) -> RelativeMotion:
-        """A step with the model's covariance, with that which it turned out to have."""
+        """A step with the measured noise, from one with the model's covariance."""
         return odometry._replace(covariance=odometry.covariance * self._variance_factors)
 
     def fuse(self, odometry: RelativeMotion, inertia: RelativeMotion) -> RelativeMotion:
-        """The step as inertia and odometry tell it together.
+        """The step by odometry and inertia together.
 
-        Up to twice the noise of the model, errors are also due to what lasts, such as floors and wrong radii; what is
-        beyond is taken to be independent from step to step, and is what inertia reduces.
+        Up to twice the noise of the model, errors are also due to lasting causes, such as floors and wrong radii. Noise
+        beyond that is taken for independent from step to step, and inertia reduces it.
 
         :param odometry: with the model's covariance.
         """
         if (self.factors <= NOISY_FACTOR).all():
             return self.scale(odometry)
-        usual = np.minimum(self.factors, NOISY_FACTOR)[[0, 0, 1]]
-        lasting = odometry.covariance * np.outer(usual, usual)
-        beyond = odometry._replace(covariance=odometry.covariance * self._variance_factors - lasting)
-        both = beyond.fuse(inertia)
-        return both._replace(covariance=both.covariance + lasting)
+        limited = np.minimum(self.factors, NOISY_FACTOR)[[0, 0, 1]]
+        lasting = odometry.covariance * np.outer(limited, limited)
+        independent = odometry._replace(covariance=odometry.covariance * self._variance_factors - lasting)
+        fused = independent.fuse(inertia)
+        return fused._replace(covariance=fused.covariance + lasting)
 
     def learn(self, odometry: RelativeMotion, matched: NDArray[np.float64], information: NDArray[np.float64]) -> None:
-        """Compare a step by odometry, with the model's covariance P, with the matched one.
+        """Update the noise by a step of odometry, with the model's covariance P, and the matched step.
 
-        A match of covariance R moves the estimate by P (P + R)^-1 of the difference. What that is expected to be, as
-        a share of P, is also how much the scans show of a direction, and the weight of the step.
+        A match of covariance R moves the estimate by P (P + R)^-1 of the difference. The expected square of that, as a
+        share of P, is also the share of a direction that the scans show, and the weight of the step.
 
         :param matched: ``start_T_end`` (3,).
         :param information: R^-1 in the frame of the end, shape (3, 3).
@@ -265,29 +240,28 @@ class OdometryNoise:
         expected = np.diag(np.linalg.solve(information + prior, information) @ odometry.covariance)
         squares = se2.log(se2.between(odometry.increment, matched)) ** 2
         shown = expected / np.diag(odometry.covariance)
+        ratios, weights = _FORGETTING_FACTOR * self.state.weighted_ratios, _FORGETTING_FACTOR * self.state.weights
         for k, rows in enumerate(([0, 1], [2])):
             weight = shown[rows].mean()
             ratio = squares[rows].sum() / max(expected[rows].sum(), 1e-12)
-            self._weighted_ratios[k] = _FORGETTING_FACTOR * self._weighted_ratios[k] + weight * min(
-                ratio, (_OUTLIER * self.factors[k]) ** 2
-            )
-            self._weights[k] = _FORGETTING_FACTOR * self._weights[k] + weight
-        self._variance_factors = self._squared_factors()
+            ratios[k] += weight * min(ratio, (_OUTLIER * self.factors[k]) ** 2)
+            weights[k] += weight
+        self.state = OdometryNoiseState(ratios, weights)
 
 
 @dataclass(frozen=True, eq=False)
 class MotionState:
-    """What is known of the motion between scans.
+    """State of the motion between scans.
 
     :ivar readings: the odometry readings that are still needed.
     :ivar odometry_pose: shape (3,), ``odom_T_base`` at the last scan, m and rad.
-    :ivar noise: what odometry turned out to be worth.
-    :ivar inertia: what is known of the velocity, None before the first scan.
+    :ivar noise: measured noise of the odometry.
+    :ivar inertia: belief over the velocity, None before the first scan.
     :ivar stamp: of the last scan, ns, None before the first.
     :ivar interpolation_gap: half the product of the times from the last scan to the readings around it, s^2, None where
         odometry does not enclose it.
-    :ivar since_keyframe: the motion by odometry since the last keyframe event, None where it is unknown.
-    :ivar last_motion: the motion by odometry to the last scan, likewise.
+    :ivar since_keyframe: motion by odometry since the last keyframe event, None where it is unknown.
+    :ivar last_motion: motion by odometry to the last scan, None where it is unknown.
     """
 
     readings: tuple[Odometry, ...] = ()
@@ -301,11 +275,10 @@ class MotionState:
 
 
 class MotionModel:
-    """Predicts the motion between scans, and learns from what scan matching makes of it.
+    """Prediction of the motion between scans, which learns from scan matching.
 
     :ivar odometry: the readings.
-    :ivar noise: what they turned out to be worth.
-    :ivar odometry_pose: ``odom_T_base`` (3,) at the last scan; where odometry said nothing, carried on as matched.
+    :ivar noise: measured noise of the readings.
     """
 
     def __init__(self, motion: MotionParameters, state: MotionState | None = None) -> None:
@@ -313,82 +286,80 @@ class MotionModel:
         state = state or MotionState()
         self.odometry = OdometryBuffer(state.readings)
         self.noise = OdometryNoise(state.noise)
-        self.odometry_pose = state.odometry_pose
         self._motion = motion
         self._inertia = Inertia(motion, state.inertia)
         self._squared_accelerations = _squared_accelerations(motion)
-        self._stamp, self._interpolation_gap = state.stamp, state.interpolation_gap
-        self._since_keyframe, self._last_motion = state.since_keyframe, state.last_motion
+        # All but the three parts above, which change in place.
+        self._state = replace(state, readings=(), noise=OdometryNoiseState(), inertia=None)
 
     @property
     def state(self) -> MotionState:
-        """All that is known."""
-        return MotionState(
-            self.odometry.readings,
-            self.odometry_pose,
-            self.noise.state,
-            self._inertia.state,
-            self._stamp,
-            self._interpolation_gap,
-            self._since_keyframe,
-            self._last_motion,
+        """The whole state, as a value."""
+        return replace(
+            self._state, readings=self.odometry.readings, noise=self.noise.state, inertia=self._inertia.state
         )
+
+    @property
+    def odometry_pose(self) -> NDArray[np.float64]:
+        """``odom_T_base`` (3,) at the last scan; where odometry is unknown, continued by the matched motion."""
+        return self._state.odometry_pose
 
     def predict(self, stamp: int) -> Prediction:
-        """The motion from the last scan to the one at ``stamp``, ns; at the first scan, which sets the start, none."""
-        step = self._odometry_motion(stamp)
-        if self._stamp is None:
-            self._stamp = stamp
+        """The motion from the last scan to the scan at ``stamp``, ns; none at the first scan."""
+        step, last, since = self._odometry_motion(stamp), self._state.stamp, self._state.since_keyframe
+        self._state = replace(self._state, stamp=stamp)
+        if last is None:
             return Prediction(None, NO_MOTION, NO_MOTION)
-        seconds = max(0.0, 1e-9 * (stamp - self._stamp))
-        self._stamp = stamp
-        if self._since_keyframe is not None:
-            self._since_keyframe = None if step is None else self._since_keyframe.compose(step)
-        inertia = self._inertia.predict(seconds)
-        self._last_motion = None if step is None else self.noise.scale(step)
-        return Prediction(self._last_motion, inertia, inertia if step is None else self.noise.fuse(step, inertia))
+        inertia = self._inertia.predict(max(0.0, 1e-9 * (stamp - last)))
+        if step is None:
+            self._state = replace(self._state, since_keyframe=None, last_motion=None)
+            return Prediction(None, inertia, inertia)
+        scaled = self.noise.scale(step)
+        self._state = replace(
+            self._state, since_keyframe=None if since is None else since.compose(step), last_motion=scaled
+        )
+        return Prediction(scaled, inertia, self.noise.fuse(step, inertia))
 
     def _odometry_motion(self, stamp: int) -> RelativeMotion | None:
-        """What odometry says of the motion from the last scan, None where it is unknown at either end."""
-        found, gap = self.odometry.pose_at(stamp), self._interpolation_gap
-        if found is None:
-            self._interpolation_gap = None
+        """The motion from the last scan by odometry, None where that is unknown at either end."""
+        interpolated = self.odometry.pose_at(stamp)
+        if interpolated is None:
+            self._state = replace(self._state, interpolation_gap=None)
             return None
-        before, (self.odometry_pose, self._interpolation_gap) = self.odometry_pose, found
-        if gap is None:
+        (pose, gap), last_pose, last_gap = interpolated, self._state.odometry_pose, self._state.interpolation_gap
+        self._state = replace(self._state, odometry_pose=pose, interpolation_gap=gap)
+        if last_gap is None:
             return None
-        increment = se2.between(before, self.odometry_pose)
+        increment = se2.between(last_pose, pose)
         covariance = increment_covariance(increment, self._motion)
-        return RelativeMotion(
-            increment, covariance + (gap**2 + self._interpolation_gap**2) * self._squared_accelerations
-        )
+        return RelativeMotion(increment, covariance + (last_gap**2 + gap**2) * self._squared_accelerations)
 
     def observe(
         self, increment: NDArray[np.float64], information: NDArray[np.float64], contradicted: bool = False
     ) -> None:
-        """Learn the velocity from the motion that was predicted last.
+        """Update the velocity by the motion that was predicted last.
 
         :param increment: ``start_T_end`` (3,) as matched.
         :param information: of the match (3, 3), in the frame of its end; 0 along directions that scans do not show.
         :param contradicted: whether the scan contradicts odometry.
         """
-        self._inertia.observe(increment, information, None if contradicted else self._last_motion)
-        if self._interpolation_gap is None:
-            self.odometry_pose = se2.compose(self.odometry_pose, increment)
+        self._inertia.observe(increment, information, None if contradicted else self._state.last_motion)
+        if self._state.interpolation_gap is None:
+            self._state = replace(self._state, odometry_pose=se2.compose(self.odometry_pose, increment))
 
     def observe_keyframe(self, increment: NDArray[np.float64], information: NDArray[np.float64]) -> None:
-        """Learn the noise of odometry from the motion since the last keyframe.
+        """Update the noise of odometry by the motion since the last keyframe.
 
         :param increment: (3,), as matched.
         :param information: of the keyframe's match, in its own frame, (3, 3).
         """
-        if self._since_keyframe is not None:
-            self.noise.learn(self._since_keyframe, increment, information)
-        self._since_keyframe = NO_MOTION
+        if self._state.since_keyframe is not None:
+            self.noise.learn(self._state.since_keyframe, increment, information)
+        self._state = replace(self._state, since_keyframe=NO_MOTION)
 
 
 def _squared_accelerations(motion: MotionParameters) -> NDArray[np.float64]:
-    """Squares of the accelerations that robots have, on the diagonal (3, 3), in m^2/s^4 and rad^2/s^4."""
+    """Squares of the robot's accelerations, on the diagonal (3, 3), m^2/s^4 and rad^2/s^4."""
     return np.diag([motion.acceleration**2, motion.acceleration**2, math.radians(motion.turn_acceleration) ** 2])
 
 
@@ -400,7 +371,7 @@ def increment_covariance(increment: NDArray[np.float64], motion: MotionParameter
 def path_covariance(distance: float, angle: float, motion: MotionParameters) -> NDArray[np.float64]:
     """Covariance (3, 3) of the odometry over a path, in the frame of its end, m and rad.
 
-    Standard deviations grow linearly with the distance (m) and the angle (rad) travelled; the lateral deviation equals
+    Standard deviations grow linearly with the distance (m) and the angle (rad) traveled; the lateral deviation equals
     the longitudinal one.
     """
     translation, rotation = path_standard_deviations(distance, angle, motion)
@@ -410,7 +381,7 @@ def path_covariance(distance: float, angle: float, motion: MotionParameters) -> 
 def path_standard_deviations(distance: Length, angle: Length, motion: MotionParameters) -> tuple[Length, Length]:
     """The deviations of translation (m), in either direction, and rotation (rad) that `path_covariance` squares.
 
-    :param distance: m, one or an array of them.
+    :param distance: m, a number or an array.
     :param angle: rad, likewise.
     """
     translation = (

@@ -1,9 +1,8 @@
 """Odometry readings, the pose between them, and the robot's motion during the sweep of a scan.
 
-The reference time is the stamp, that of the first beam: every scan keeps one stamp and gets its pose there, and the
-log's odometry, trajectory and relations need no second time. In between the motion is taken for steady. What that
-leaves is an eighth of the acceleration times the square of the sweep's duration: 1 mm and 0.1 degrees for a sweep of
-0.1 s, 1 m/s^2 and 90 degrees/s^2.
+The reference time of a scan is its stamp, that of the first beam. During the sweep the motion is taken for steady. The
+remaining error is an eighth of the acceleration times the square of the sweep's duration: 1 mm and 0.1 degrees for a
+sweep of 0.1 s, 1 m/s^2 and 90 degrees/s^2.
 """
 
 from __future__ import annotations
@@ -43,29 +42,29 @@ class OdometryBuffer:
 
     @property
     def readings(self) -> tuple[Odometry, ...]:
-        """Those that are not forgotten."""
+        """The readings that are still needed."""
         return tuple(self._readings)
 
     @property
     def is_empty(self) -> bool:
-        """Whether no reading ever came."""
+        """Whether there is no reading."""
         return not self._readings
 
     def add(self, reading: Odometry) -> None:
-        """Append a reading; one whose stamp goes back starts a new sequence."""
+        """Append a reading; a reading whose stamp goes back starts a new sequence."""
         if self._readings and reading.stamp < self._readings[-1].stamp:
             self._readings.clear()
         self._readings.append(reading)
 
     def covers(self, stamp: int) -> bool:
-        """Whether a reading at or after ``stamp`` (ns) has come."""
+        """Whether there is a reading at or after ``stamp`` (ns)."""
         return bool(self._readings) and self._readings[-1].stamp >= stamp
 
     def pose_at(self, stamp: int) -> tuple[NDArray[np.float64], float] | None:
         """``odom_T_base`` (3,) at ``stamp`` (ns), interpolated, or None where no two readings enclose it.
 
-        With it comes half the product of the times to both readings, s^2: the factor on a constant acceleration by
-        which the pose differs from the interpolated one. Readings before those that are needed are forgotten.
+        The second value is half the product of the times to both readings, s^2. Times a constant acceleration, it is
+        the error of the interpolated pose. Readings that are no longer needed are removed.
         """
         while len(self._readings) > 2 and self._readings[2].stamp <= stamp:
             self._readings.popleft()
@@ -75,11 +74,11 @@ class OdometryBuffer:
         return self._extrapolated_pose(stamp), 0.5e-18 * (stamp - first.stamp) * (second.stamp - stamp)
 
     def twist_between(self, start: int, end: int) -> NDArray[np.float64]:
-        """The motion of the base from ``start`` to ``end`` (ns) as a twist (3,); zeros where nothing is known of it.
+        """The motion of the base from ``start`` to ``end`` (ns) as a twist (3,); zeros where it is unknown.
 
-        After the newest reading the speed between the last two goes on, for as long as they lie apart.
+        The speed between the last two readings continues after the newest, for the time between the two.
 
-        :param start: not before the time for which :meth:`pose_at` was asked last.
+        :param start: not before the last argument of :meth:`pose_at`.
         """
         if len(self._readings) < 2:
             return np.zeros(3)
@@ -89,7 +88,7 @@ class OdometryBuffer:
         )
 
     def _extrapolated_pose(self, stamp: int) -> NDArray[np.float64]:
-        """``odom_T_base`` (3,): held before the first reading, interpolated, carried on after the last."""
+        """``odom_T_base`` (3,): constant before the first reading, interpolated, extrapolated after the last."""
         first, second = self._enclosing_readings(stamp)
         if stamp == second.stamp:
             return second.pose
@@ -99,7 +98,7 @@ class OdometryBuffer:
         return se2.interpolate(first.pose, second.pose, fraction)
 
     def _enclosing_readings(self, stamp: int) -> tuple[Odometry, Odometry]:
-        """The reading at or before ``stamp`` and the one after it; else the two first or the two last."""
+        """The readings at or before ``stamp`` and after it; else the two first or the two last."""
         first = second = self._readings[0]
         for reading in self._readings:
             first, second = second, reading
@@ -108,18 +107,23 @@ class OdometryBuffer:
         return first, second
 
 
-_MAX_SWEEP = 1.0  # s; scanners turn ten times faster
+_MAX_SWEEP = 1.0
+"""Longest duration of a sweep, s; scanners turn ten times faster."""
+
 _MIN_PERIODS, _PERIODS = 5, 9
-# Stamps jitter; a sweep may seem to be this much longer than the time from one scan to the next.
+"""Periods between scans from which a sweep is checked, and those that are kept for their median."""
+
 _JITTER = 1.2
+"""Duration of a sweep at most, as a factor on the median period: stamps jitter."""
+
 _NANOSECOND = 1e-9
 
 
 @dataclass(frozen=True)
 class SweepState:
-    """What is known of the times between scans.
+    """Times between scans.
 
-    :ivar periods: the last ones, s.
+    :ivar periods: the last times between two scans, s.
     :ivar last_stamp: of the last scan, ns, None before the first.
     """
 
@@ -128,9 +132,9 @@ class SweepState:
 
 
 class SweepCheck:
-    """Judges whether the sweeps of one laser's scans can have taken as long as they say.
+    """Check whether the sweeps of a laser can have the duration that ``time_increment`` gives.
 
-    The verdict depends on the sequence of the scans alone, so that it is the same however they mix with odometry.
+    The result depends on the sequence of scans alone, not on how they mix with odometry.
     """
 
     def __init__(self, state: SweepState | None = None) -> None:
@@ -141,11 +145,11 @@ class SweepCheck:
 
     @property
     def state(self) -> SweepState:
-        """All that is known."""
+        """The whole state, as a value."""
         return SweepState(tuple(self._periods), self._last_stamp)
 
     def check(self, scan: Scan) -> tuple[Scan, str | None]:
-        """The scan, and what is wrong with its ``time_increment``; where something is, the scan is without one."""
+        """The scan and the fault of its ``time_increment``, or None; a scan with a fault comes back without it."""
         if self._last_stamp is not None:
             self._periods.append((scan.stamp - self._last_stamp) * _NANOSECOND)
         self._last_stamp = scan.stamp
@@ -174,9 +178,9 @@ class SweepCheck:
 
 
 def deskew_scan(scan: Scan, odometry: OdometryBuffer, limits: RealTimeParameters) -> Scan:
-    """The scan with the motion that odometry has for its sweep.
+    """The scan with the motion of its sweep by odometry.
 
-    :param limits: odometry that moves faster was reset, and says nothing of the motion.
+    :param limits: odometry that moves faster was reset, and is not used.
     """
     if scan.end_stamp == scan.stamp:
         return scan

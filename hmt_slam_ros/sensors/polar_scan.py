@@ -1,6 +1,6 @@
-"""What a scan says of any place in its view: there is a surface, it is free, or nothing.
+"""Classification of points by a scan: on a surface, in free space, or unknown.
 
-One question serves furniture, doors and people alike: was the surface that one scan saw seen through by another?
+Change detection compares two scans by it: does one scan see through a surface of the other?
 """
 
 from __future__ import annotations
@@ -18,17 +18,23 @@ from hmt_slam_ros.sensors.scan import Scan
 
 UNKNOWN, SURFACE, FREE = np.int8(0), np.int8(1), np.int8(2)
 
-# A return this near (m) is of the same surface; a beam that goes on for this much behind a place has passed it.
 _SURFACE_DISTANCE, _PASS_DISTANCE = 0.15, 0.2
-# All beams within this distance to both sides are asked, m and as a share of the range: one that grazes an edge passes
-# it on one side only, and so does one whose pose is off by a degree.
+"""Distance of a return on the same surface at most, and length of a beam behind a point from which it passed it, m."""
+
 _HALF_WIDTH, _HALF_WIDTH_SHARE = 0.1, 0.01
-# What came to stand somewhere is not seen from behind; it is taken to be as deep as furniture, m.
+"""Distance to both sides within which all beams have to agree, m and as a share of the range.
+
+A beam that grazes an edge passes it on one side only, and so does a beam whose pose is off by a degree.
+"""
+
 _DEPTH = 1.0
-# The end of a beam, m, which shows from which side a surface was seen.
+"""Depth of an object that the laser sees from its front only, m: that of furniture."""
+
 _END_MARGIN = 0.05
-# Farther away than this, m, nothing is said.
+"""Last part of a beam that is always kept, m: it shows from which side a surface was seen."""
+
 _MAX_RANGE = 12.0
+"""Range beyond which a point is unknown, m."""
 
 
 class PolarScan(NamedTuple):
@@ -37,8 +43,8 @@ class PolarScan(NamedTuple):
     :ivar laser_pose: shape (3,), ``base_T_laser``, m and rad.
     :ivar first_angle: the first direction in the laser's frame, rad.
     :ivar angle_increment: from one direction to the next, rad; may be negative.
-    :ivar ranges: shape (n,), m, NaN where nothing came back.
-    :ivar starts: shape (n,), m; nearer than this nothing is said.
+    :ivar ranges: shape (n,), m, NaN without a return.
+    :ivar starts: shape (n,), range below which a beam shows nothing, m.
     """
 
     laser_pose: Float64
@@ -49,18 +55,18 @@ class PolarScan(NamedTuple):
 
 
 def to_polar_scan(scan: Scan) -> PolarScan:
-    """The view of a scan from where its laser was at the first beam."""
+    """The polar scan of a scan, from the pose of its laser at the first beam."""
     starts = np.zeros(scan.ranges.size) if scan.starts is None else scan.starts.astype(np.float64)
     if not scan.motion.any():
         ranges = np.where(scan.valid, scan.ranges, np.nan).astype(np.float64)
     else:
-        seen = se2.transform(se2.inverse(scan.laser_pose), scan.points)
-        ranges, starts = _bin_ranges(seen, starts[scan.valid], scan.angle_min, scan.angle_increment, scan.ranges.size)
+        points = se2.transform(se2.inverse(scan.laser_pose), scan.points)
+        ranges, starts = _bin_ranges(points, starts[scan.valid], scan.angle_min, scan.angle_increment, scan.ranges.size)
     return PolarScan(scan.laser_pose, scan.angle_min, scan.angle_increment, ranges, starts)
 
 
 def classify_points(scan: PolarScan, points: Float64) -> Int8:
-    """What a scan says of places.
+    """The classes of points by a scan.
 
     :param points: shape (n, 2), base frame of the scan, m.
     :returns: shape (n,), ``SURFACE``, ``FREE`` or ``UNKNOWN``.
@@ -71,9 +77,9 @@ def classify_points(scan: PolarScan, points: Float64) -> Int8:
 
 
 def occlusion_starts(scan: PolarScan, points: Float64) -> Float64:
-    """From where on the beams of a scan are behind the things whose faces are at some places that they pass.
+    """The range from which each beam is behind the objects whose front it passes.
 
-    :param points: as in :func:`classify_points`.
+    :param points: on the fronts of objects, as in :func:`classify_points`.
     :returns: shape (number of beams,), m from the laser; 0 for beams that pass none.
     """
     return _occlusion_starts(
@@ -83,7 +89,7 @@ def occlusion_starts(scan: PolarScan, points: Float64) -> Float64:
 
 @njit(cache=True)
 def _bin_ranges(points: Float64, starts: Float64, first: float, step: float, count: int) -> tuple[Float64, Float64]:
-    """The nearest of points (n, 2), laser frame, in every direction, and the start of its beam."""
+    """Range of the nearest of points (n, 2), laser frame, in every direction, and the start of its beam, m."""
     ranges, begins = np.full(count, np.nan), np.zeros(count)
     for n in range(points.shape[0]):
         k = _direction_index(points[n, 0], points[n, 1], first, step, count)
@@ -95,14 +101,14 @@ def _bin_ranges(points: Float64, starts: Float64, first: float, step: float, cou
 
 @njit(cache=True)
 def _direction_index(x: float, y: float, first: float, step: float, count: int) -> int:
-    """The number of the direction that is nearest to a point's, outside of 0 to count - 1 where there is none."""
+    """The number of the direction nearest to a point's; outside 0 to count - 1 where there is none."""
     middle = first + 0.5 * step * (count - 1)
     return round(wrap_by_modulus(math.atan2(y, x) - middle) / step + 0.5 * (count - 1))
 
 
 @njit(cache=True)
 def _direction_window(point: Float64, laser: Float64, first: float, step: float, count: int) -> tuple[float, int, int]:
-    """Distance of a point from the laser, and the first and the last direction that are asked; 0, -1 for none."""
+    """Distance of a point from the laser, and its first and last direction; 0, -1 for none."""
     cos, sin = math.cos(laser[2]), math.sin(laser[2])
     x, y = rotate_back(cos, sin, point[0] - laser[0], point[1] - laser[1])
     distance = math.hypot(x, y)
@@ -119,21 +125,21 @@ def _direction_window(point: Float64, laser: Float64, first: float, step: float,
 def _classify_points(
     points: Float64, laser: Float64, first: float, step: float, ranges: Float64, starts: Float64
 ) -> Int8:
-    found = np.zeros(points.shape[0], np.int8)
+    classes = np.zeros(points.shape[0], np.int8)
     for n in range(points.shape[0]):
         distance, begin, last = _direction_window(points[n], laser, first, step, ranges.size)
-        told, near, behind = 0, 0, 0
+        informative, near, behind = 0, 0, 0
         for k in range(begin, last + 1):
             if not np.isnan(ranges[k]):
                 off = ranges[k] * (k - begin - 0.5 * (last - begin)) * step
                 near += (ranges[k] - distance) ** 2 + off**2 <= _SURFACE_DISTANCE**2
-                told += starts[k] <= distance
+                informative += starts[k] <= distance
                 behind += starts[k] <= distance < ranges[k] - _PASS_DISTANCE
         if near:
-            found[n] = SURFACE
-        elif told > 1 and behind == told:
-            found[n] = FREE
-    return found
+            classes[n] = SURFACE
+        elif informative > 1 and behind == informative:
+            classes[n] = FREE
+    return classes
 
 
 @njit(cache=True)

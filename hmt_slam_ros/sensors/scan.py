@@ -1,9 +1,8 @@
-"""A laser scan that carries its own geometry, and its end points with the normals of the surfaces they lie on.
+"""A laser scan with its own geometry, and its end points with the normals of their surfaces.
 
-A wall tells a scan how far away it is, and nothing of where along it the robot is. The cells of a map do, falsely: far
-beams meet a wall so sparsely that their end points look like posts, a slanting wall has steps, a wall ends where the
-last scan did. So what a point may say of the pose is limited to the direction of its normal, which the scan itself
-shows. Points that lie on no surface, such as posts and corners, may say everything.
+A wall shows its distance, but not the robot's position along it. The cells of a map seem to show that, too: far end
+points look like posts, a slanting wall has steps, and a wall ends where the last scan ended. So a point with a normal
+informs the pose along that normal only. Points on no surface, such as posts and corners, inform it in all directions.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ def _directions(count: int, first: float, increment: float) -> NDArray[np.float6
 
 @njit(cache=True)
 def _beam_ends(ranges: Float32, directions: Float64, laser: Float64, valid: Bool) -> Float64:
-    """Where the valid beams of a laser at ``laser`` end, (k, 2)."""
+    """End points of the valid beams of a laser at ``laser``, (k, 2)."""
     ends, k = np.empty((valid.sum(), 2)), 0
     for n in range(ranges.size):
         if valid[n]:
@@ -43,7 +42,7 @@ def _beam_ends(ranges: Float32, directions: Float64, laser: Float64, valid: Bool
 
 @njit(cache=True)
 def _valid_mask(ranges: Float32, nearest: np.float32, farthest: np.float32) -> Bool:
-    """Which ranges are from ``nearest`` on and below ``farthest``; NaN is not."""
+    """Whether ranges are from ``nearest`` on and below ``farthest``; NaN is not."""
     valid = np.empty(ranges.size, np.bool_)
     for n in range(ranges.size):
         valid[n] = nearest <= ranges[n] < farthest
@@ -55,11 +54,11 @@ def _zeros() -> NDArray[np.float64]:
 
 
 class BeamRevision(NamedTuple):
-    """What a scan does not say any more, because the world changed.
+    """The parts of a scan that do not hold any more, because the world changed.
 
-    :ivar removed: numbers of the beams whose end is gone; they say nothing.
-    :ivar occluded: numbers of the beams in whose way something came to stand.
-    :ivar starts: from where on each of these still holds, m from the laser.
+    :ivar removed: numbers of the beams whose surface is gone; they show nothing.
+    :ivar occluded: numbers of the beams that a new object blocks.
+    :ivar starts: range from which each of these still holds, m.
     """
 
     removed: tuple[int, ...]
@@ -71,25 +70,25 @@ class BeamRevision(NamedTuple):
 class Scan:
     """One sweep of a planar range finder.
 
-    Angles, range limits and ``time_increment`` are kept in the precision of sensor_msgs/LaserScan, float32, so that a
-    log, the bag made from it and its replay are one and the same.
+    Angles, range limits and ``time_increment`` have the precision of sensor_msgs/LaserScan, float32, so that a log, the
+    bag made from it and its replay are the same.
 
-    Points and origins are those of the base at ``stamp``: a beam that came later is carried back along the motion, at
-    constant velocity in between.
+    Points and origins are in the frame of the base at ``stamp``. Later beams are corrected for the motion, at constant
+    velocity.
 
     :ivar stamp: time of the first beam, integer nanoseconds, increasing within one source.
-    :ivar ranges: shape (n,), float32, metres. NaN, inf, values below ``range_min`` and values at or beyond
+    :ivar ranges: shape (n,), float32, meters. NaN, inf, values below ``range_min`` and values at or beyond
         ``range_max`` are beams without a return.
     :ivar angle_min: angle of beam 0 in the laser frame, rad.
     :ivar angle_increment: angle from one beam to the next, rad; negative for a laser mounted upside down.
-    :ivar range_min: smallest valid range, metres.
-    :ivar range_max: smallest range that means "no return", metres.
+    :ivar range_min: smallest valid range, meters.
+    :ivar range_max: smallest range that means "no return", meters.
     :ivar laser_pose: shape (3,), ``base_T_laser`` as (x, y, theta) in m and rad.
     :ivar time_increment: seconds from one beam to the next, 0 where unknown.
-    :ivar motion: shape (3,), the base's motion from the first beam to the last as a twist, m, m, rad: its exponential
-        is the base at the last beam as seen from the base at the first. Zeros where it is not known.
-    :ivar starts: shape (n,), float32, m: nearer than this a beam says nothing any more, since something came to stand
-        in its way; smaller than its range. None where every beam says all from the laser on.
+    :ivar motion: shape (3,), twist of the base's motion from the first beam to the last, m, m, rad: its exponential is
+        the pose of the base at the last beam in the base at the first. Zeros where it is unknown.
+    :ivar starts: shape (n,), float32, range below which a beam does not hold any more, m, since a new object blocks it;
+        smaller than its range. None where all beams hold from the laser on.
     """
 
     stamp: int
@@ -125,20 +124,20 @@ class Scan:
 
     @cached_property
     def points(self) -> NDArray[np.float64]:
-        """End points of the beams with a return, shape (k, 2), metres, robot base frame."""
+        """End points of the beams with a return, shape (k, 2), meters, robot base frame."""
         return self._deskew(self._points_along_beams(self.ranges))
 
     def _points_along_beams(self, ranges: NDArray[np.float32]) -> NDArray[np.float64]:
-        """Places on the beams with a return, shape (k, 2), from the base at each beam.
+        """Points on the beams with a return, shape (k, 2), in the frame of the base at each beam.
 
-        :param ranges: shape (n,), how far from the laser, m.
+        :param ranges: shape (n,), distances from the laser, m.
         """
         first = self.angle_min + float(self.laser_pose[2])
         directions = _directions(self.ranges.size, first, self.angle_increment)
         return _beam_ends(ranges, directions, self.laser_pose, self.valid)
 
     def revise(self, revision: BeamRevision) -> Scan:
-        """The same scan with beams that say less; one and the same object for the same revision."""
+        """The scan without the parts that do not hold any more; the same object for the same revision."""
         if self._revised is None or self._revised[0] != revision:
             ranges = self.ranges.copy()
             ranges[list(revision.removed)] = np.nan
@@ -152,9 +151,9 @@ class Scan:
 
     @property
     def origins(self) -> NDArray[np.float64]:
-        """Where each of those beams begins to say something, shape (k, 2), metres, robot base frame.
+        """Start points of the beams with a return, shape (k, 2), meters, robot base frame.
 
-        That is where the laser was, but for ``starts``.
+        A beam starts at the laser, or at its ``starts``.
         """
         if self.starts is not None:
             return self._deskew(self._points_along_beams(self.starts))
@@ -164,31 +163,35 @@ class Scan:
 
     @property
     def beams(self) -> NDArray[np.float64]:
-        """From there to the end point, for each of those beams, shape (k, 2), metres, robot base frame."""
+        """Vectors from ``origins`` to ``points``, shape (k, 2), meters, robot base frame."""
         return self.points - self.origins
 
     def _deskew(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """One point (k, 2) for each beam with a return, from the base at that beam to the base at the first."""
+        """Points (k, 2), one on each beam with a return, from the base at that beam to the base at the first."""
         if not self.motion.any():
             return points
-        passed = np.flatnonzero(self.valid) / max(1, self.ranges.size - 1)
-        return se2.transform(se2.exp(passed[:, None] * self.motion), points)
+        fractions = np.flatnonzero(self.valid) / max(1, self.ranges.size - 1)
+        return se2.transform(se2.exp(fractions[:, None] * self.motion), points)
 
 
-# A surface is fitted to the points up to this far on each side, m, or to the next ones where beams are sparser.
 _REACH = 0.5
-# Neighbouring points farther apart than this share of their range lie on different surfaces.
+"""Distance of the points to each side to which a surface is fitted, m; the next points where beams are sparser."""
+
 _GAP = 0.4
-# Deviation of the points across a surface at most, m.
+"""Distance of neighboring points from which they are on different surfaces, as a share of their range."""
+
 _FLAT = 0.03
-# A point lies on the surface of those around it within so much, m, and within so many of their deviations across it.
+"""Largest deviation of the points across a surface, m."""
+
 _OFF, _DEVIATIONS = 0.03, 3.0
-# A point and one in front of it show two things if they are farther apart than this, in m and as a share of the range.
+"""Largest distance of a point from the surface around it, m, plus this many of the deviations across the surface."""
+
 _DEPTH_STEP, _DEPTH_STEP_SHARE = 0.1, 0.05
+"""Distance from which a point and a nearer neighbor are on two objects, m and as a share of the range."""
 
 
 class FlatnessLimits(NamedTuple):
-    """What points are taken for a wall.
+    """Limits within which points form a wall.
 
     :ivar min_along: deviation of the points along it at least, m.
     :ivar max_across_ratio: that across it at most, as a share of that along it.
@@ -199,39 +202,40 @@ class FlatnessLimits(NamedTuple):
 
 
 _FLATNESS = FlatnessLimits(0.1, 0.2)
+"""Limits for surfels."""
 
 
 @njit(cache=True)
 def extract_surfels(points: Float64, origins: Float64, stride: int = 1) -> Float64:
-    """Every so many of the points, with their normals, which all points show.
+    """One point out of ``stride``, with its normal, which is fitted to all points.
 
     :param points: shape (n, 2), m, in the order of the beams.
-    :param origins: shape (n, 2), where the laser was at each.
-    :returns: shape (k, 4): x, y, and the unit normal, of either sign, or zeros for a point on no surface. Points that
-        only show where the shadow of something nearer ends are left out.
+    :param origins: shape (n, 2), position of the laser at each.
+    :returns: shape (k, 4): x, y, and the unit normal, of either sign, or zeros for a point on no surface. Points at the
+        edge of the shadow of a nearer object are left out.
     """
-    found, beams = np.zeros((-(-len(points) // stride), 4)), points - origins
-    for k in range(len(found)):
-        found[k, 0], found[k, 1] = points[k * stride, 0], points[k * stride, 1]
-    return found[_find_normals(beams, np.hypot(beams[:, 0], beams[:, 1]), stride, found)]
+    surfels, beams = np.zeros((-(-len(points) // stride), 4)), points - origins
+    for k in range(len(surfels)):
+        surfels[k, 0], surfels[k, 1] = points[k * stride, 0], points[k * stride, 1]
+    return surfels[_find_normals(beams, np.hypot(beams[:, 0], beams[:, 1]), stride, surfels)]
 
 
 def transform_surfels(a_T_b: Float64, surfels: Float64) -> Float64:
     """Surfels (n, 4) of frame b in frame a, for one pose (3,)."""
-    turned = se2.transform((0.0, 0.0, a_T_b[2]), surfels[:, 2:])
-    return np.concatenate((se2.transform(a_T_b, surfels[:, :2]), turned), axis=1)
+    normals = se2.transform((0.0, 0.0, a_T_b[2]), surfels[:, 2:])
+    return np.concatenate((se2.transform(a_T_b, surfels[:, :2]), normals), axis=1)
 
 
 @njit(cache=True)
-def _find_normals(beams: Float64, ranges: Float64, stride: int, found: Float64) -> Bool:
-    """Write the normals of the surfaces around every so many points; at an edge, of the surface on one side of it.
+def _find_normals(beams: Float64, ranges: Float64, stride: int, surfels: Float64) -> Bool:
+    """Write the normals into surfels (k, 4); at an edge, the normal of the surface on one side of it.
 
     :param beams: shape (n, 2), m, from the laser to the points.
-    :returns: which of the points show more than a shadow.
+    :returns: whether each of the points shows more than the edge of a shadow, (k,).
     """
-    sums, shown = running_sums(beams, ranges), np.ones(len(found), np.bool_)
-    for k in range(len(found)):
-        i, normal = k * stride, found[k, 2:]
+    sums, shown = running_sums(beams, ranges), np.ones(len(surfels), np.bool_)
+    for k in range(len(surfels)):
+        i, normal = k * stride, surfels[k, 2:]
         low, high = _last_within(beams, ranges, i, -1, 1), _last_within(beams, ranges, i, 1, 1)
         if low < i < high and fit_surface(beams, sums, low, i, high, _FLATNESS, normal):
             continue
@@ -246,7 +250,7 @@ def _find_normals(beams: Float64, ranges: Float64, stride: int, found: Float64) 
 
 @njit(cache=True)
 def _last_within(beams: Float64, ranges: Float64, i: int, step: int, fewest: int) -> int:
-    """The first point of those that follow ``i`` without a gap that is out of reach, or else the last of them."""
+    """The first point out of reach of those that follow ``i`` without a gap, or else the last of them."""
     j = i
     while 0 <= j + step < len(beams):
         dx, dy = beams[j + step, 0] - beams[j, 0], beams[j + step, 1] - beams[j, 1]
@@ -261,9 +265,9 @@ def _last_within(beams: Float64, ranges: Float64, i: int, step: int, fewest: int
 
 @njit(cache=True)
 def running_sums(beams: Float64, ranges: Float64) -> Float64:
-    """Sums over the beams before each, shape (n + 1, 10).
+    """Sums over the beams before each beam, shape (n + 1, 10).
 
-    They are of cos^2, cos sin, sin^2, cos / r, sin / r over the directions, and of x, y, x^2, x y, y^2 over the points.
+    Columns are cos^2, cos sin, sin^2, cos / r, sin / r of the directions, and x, y, x^2, x y, y^2 of the points.
     """
     sums = np.zeros((len(beams) + 1, 10))
     for k in range(len(beams)):
@@ -279,22 +283,18 @@ def running_sums(beams: Float64, ranges: Float64) -> Float64:
 def fit_surface(
     beams: Float64, sums: Float64, low: int, own: int, high: int, wall: FlatnessLimits, normal: Float64
 ) -> bool:
-    """Fit a line to the points from ``low`` to ``high``; False where they, or the point itself, do not lie on one.
+    """Fit a line to the points from ``low`` to ``high``, and return whether they and the point ``own`` are on one.
 
-    On a line the inverse of the range is linear in the direction of the beam. The fit takes the ranges for uncertain
-    and the directions for exact: total least squares would turn all normals a little to the same side, and what is
-    seen ahead would draw the robot back. The point itself is left out of it, or its own error would turn its normal,
-    and the two together push along the wall.
+    On a line the inverse of the range is linear in the direction of the beam. Ranges are uncertain and directions exact
+    in this fit: total least squares would bias all normals to the same side. The point itself is left out, since its
+    own error would turn its normal.
 
     :param beams: shape (n, 2), m, from the laser to the points.
     :param sums: of :func:`running_sums`.
     :param normal: (2,), written to.
     """
-    xx, xy, yy = (
-        _sum_without(sums, 0, low, own, high),
-        _sum_without(sums, 1, low, own, high),
-        _sum_without(sums, 2, low, own, high),
-    )
+    xx, xy = _sum_without(sums, 0, low, own, high), _sum_without(sums, 1, low, own, high)
+    yy = _sum_without(sums, 2, low, own, high)
     x, y = _sum_without(sums, 3, low, own, high), _sum_without(sums, 4, low, own, high)
     across_x, across_y = yy * x - xy * y, xx * y - xy * x
     length = np.hypot(across_x, across_y)
@@ -322,13 +322,13 @@ def fit_surface(
 
 @njit(cache=True)
 def _sum_without(sums: Float64, column: int, low: int, own: int, high: int) -> float:
-    """The sum over the points from ``low`` to ``high`` without ``own``, which is one of them."""
+    """The sum over the points from ``low`` to ``high`` without the point ``own`` among them."""
     return sums[high + 1, column] - sums[low, column] - (sums[own + 1, column] - sums[own, column])
 
 
 @njit(cache=True)
 def _is_shadow_edge(beams: Float64, ranges: Float64, i: int) -> bool:
-    """Whether a point is beside one in front of it, so that the two do not show where it ends but where that does."""
+    """Whether a point is beside a nearer object, so that the gap shows the edge of that object."""
     limit = _DEPTH_STEP + _DEPTH_STEP_SHARE * ranges[i]
     for j in (i - 1, i + 1):
         if not 0 <= j < len(beams) or ranges[j] >= ranges[i]:
