@@ -12,7 +12,7 @@ pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, 
 from diagnostic_msgs.msg import DiagnosticArray
 
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.real_time_localization.correction import CorrectionSmoother
+from hmt_slam_ros.real_time_localization.rtl import CorrectionSmoother
 from hmt_slam_ros.ros import topics
 from hmt_slam_ros.ros.topics import DIAGNOSTICS
 

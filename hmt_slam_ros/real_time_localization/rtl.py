@@ -1,7 +1,7 @@
-"""Real-time localization: the robot's pose at the rate of the odometry, whatever the other processes are doing.
+"""Real-time localization: the robot's pose at the rate of the odometry, independent of the other processes.
 
 Section V of Blanco et al. 2008: while scans wait in metric SLAM's queue, the prior p(s_t+k | s_t, u) of the HMT pose
-is the last estimate carried on by the odometry since its scan.
+is the last estimate, propagated by the odometry since its scan.
 """
 
 from __future__ import annotations
@@ -24,11 +24,14 @@ from hmt_slam_ros.messages.replica import FIRST_AREA, GlobalPoses
 from hmt_slam_ros.sensors import Odometry
 from hmt_slam_ros.sensors.motion_model import path_covariance
 
-# Beyond the bounds of speed: two readings of one moment may differ by this much without a reset.
-_SLACK_DISTANCE = 0.5  # m
-_SLACK_ANGLE = math.radians(30.0)
-# Readings kept for an estimate that is still to come: half an hour at 50 Hz.
+_SLACK_DISTANCE, _SLACK_ANGLE = 0.5, math.radians(30.0)
+"""Jump of the odometry beyond the bounds of speed that is no reset yet, m and rad."""
+
 _READINGS_KEPT = 90_000
+"""Odometry readings that are kept without an estimate: half an hour at 50 Hz."""
+
+_MAX_CORRECTION, _MAX_CORRECTION_ANGLE = 2.0, math.radians(45.0)
+"""Largest correction that is shown little by little, m and rad; beyond it the robot is elsewhere."""
 
 
 class OdometryPathPoint(NamedTuple):
@@ -36,9 +39,9 @@ class OdometryPathPoint(NamedTuple):
 
     :ivar stamp: ns.
     :ivar measured: ``odom_T_base`` as measured, shape (3,).
-    :ivar reset_free: the same with the resets taken out, shape (3,).
+    :ivar reset_free: the same without resets, shape (3,).
     :ivar distance: path length since the start, m.
-    :ivar angle: sum of the turns since the start, both ways positive, rad.
+    :ivar angle: sum of the absolute turns since the start, rad.
     """
 
     stamp: int
@@ -47,27 +50,26 @@ class OdometryPathPoint(NamedTuple):
     distance: float
     angle: float
 
-    def with_measured(self, raw: NDArray[np.float64]) -> OdometryPathPoint:
+    def with_measured(self, pose: NDArray[np.float64]) -> OdometryPathPoint:
         """This reading with another measured pose nearby, shape (3,)."""
-        return self._replace(measured=raw, reset_free=se2.compose(self.reset_free, se2.between(self.measured, raw)))
+        return self._replace(measured=pose, reset_free=se2.compose(self.reset_free, se2.between(self.measured, pose)))
 
 
-# The map's frame is the first area's: known before TLCA has spoken.
 _FIRST_AREA_POSE = AreaPose(FIRST_AREA, PoseGaussian(np.zeros(3), np.zeros((3, 3))))
+"""The map frame is that of the first area, before TLCA has answered."""
 
 
 @dataclass(frozen=True, eq=False)
 class RtlState:
-    """RTL between two messages, at first before the first one.
+    """State of RTL between two messages, by default before the first.
 
     :ivar readings: odometry since the last estimate, and the reading before that.
     :ivar newest_estimate: metric SLAM's last estimate.
-    :ivar base_estimate: the last one whose area's place in the map is known, on which the pose rests.
+    :ivar base_estimate: the last estimate in an area whose pose in the map is known; the pose is based on it.
     :ivar base_reading: the reading at that estimate, None before the next reading.
-    :ivar area_poses: ``map_T_area`` as TLCA told it last, ordered by area.
-    :ivar base_area_pose: that of the area of ``base_estimate``, kept where another hypothesis leads, which may not
-        know it.
-    :ivar ambiguity: of TLCA's last answer, shape (3, 3).
+    :ivar area_poses: ``map_T_area`` in TLCA's last answer, ordered by area.
+    :ivar base_area_pose: that of the area of ``base_estimate``, which the hypothesis that leads now may not have.
+    :ivar ambiguity: in TLCA's last answer, shape (3, 3).
     """
 
     readings: tuple[OdometryPathPoint, ...] = ()
@@ -89,18 +91,18 @@ class Rtl:
         self._motion = configuration.motion
         self._settings = configuration.rtl
         self._readings = deque(state.readings, maxlen=_READINGS_KEPT)
-        # All but the readings, which come and go at the rate of the odometry.
+        # All but the readings, which change at the rate of the odometry.
         self._state = replace(state, readings=())
-        # Estimates of scans before this one are of before the robot arrived; a state is saved when none is under way.
+        # Estimates of earlier scans are from before a reset; a state is saved when none of these is pending.
         self._first_valid_scan = 0
 
     @property
     def state(self) -> RtlState:
-        """All that RTL knows, as a value."""
+        """The whole state, as a value."""
         return replace(self._state, readings=tuple(self._readings))
 
     def handle(self, message: Message) -> list[Message]:
-        """Take in one message; an odometry reading is answered with the pose at its stamp, once one is known."""
+        """The answer to a message: to an odometry reading, the pose at its stamp, once that is known."""
         if isinstance(message, Odometry):
             return self._on_odometry(message)
         if isinstance(message, LocalEstimate):
@@ -116,34 +118,34 @@ class Rtl:
             self._state = replace(self._state, newest_estimate=None, base_estimate=None, base_reading=None)
         return []
 
-    def _on_closure_decision(self, accepted: ClosureDecision) -> None:
-        self._state = replace(self._state, ambiguity=accepted.ambiguity)
-        if accepted.global_poses:
+    def _on_closure_decision(self, decision: ClosureDecision) -> None:
+        self._state = replace(self._state, ambiguity=decision.ambiguity)
+        if decision.global_poses:
             base, pose = self._state.base_estimate, self._state.base_area_pose
             if base is not None:
-                pose = GlobalPoses(accepted.global_poses).get(base.area, pose)
-            self._state = replace(self._state, area_poses=accepted.global_poses, base_area_pose=pose)
+                pose = GlobalPoses(decision.global_poses).get(base.area, pose)
+            self._state = replace(self._state, area_poses=decision.global_poses, base_area_pose=pose)
             self._update_base()
 
     def _on_odometry(self, reading: Odometry) -> list[Message]:
-        """Carry the path on to a reading; one that is not newer than its predecessor is passed over."""
+        """Append a reading to the path; a reading that is not newer than the last is ignored."""
         if not self._readings:
             self._readings.append(OdometryPathPoint(reading.stamp, reading.pose, reading.pose, 0.0, 0.0))
             return self._predict()
         last = self._readings[-1]
         if reading.stamp <= last.stamp:
             return []
-        said: list[Message] = []
+        notices: list[Message] = []
         step = se2.between(last.measured, reading.pose)
         distance, angle = math.hypot(step[0], step[1]), abs(float(step[2]))
         if self._is_reset(distance, angle, 1e-9 * (reading.stamp - last.stamp)):
-            said.append(_reset_notice(reading.stamp, distance, angle))
+            notices.append(_reset_notice(reading.stamp, distance, angle))
             step, distance, angle = np.zeros(3), 0.0, 0.0
-        smooth = se2.compose(last.reset_free, step)
+        reset_free = se2.compose(last.reset_free, step)
         self._readings.append(
-            OdometryPathPoint(reading.stamp, reading.pose, smooth, last.distance + distance, last.angle + angle)
+            OdometryPathPoint(reading.stamp, reading.pose, reset_free, last.distance + distance, last.angle + angle)
         )
-        return said + self._predict()
+        return notices + self._predict()
 
     def _is_reset(self, distance: float, angle: float, seconds: float) -> bool:
         return (
@@ -152,9 +154,9 @@ class Rtl:
         )
 
     def _update_base(self) -> None:
-        """Start from the newest estimate, and forget the readings before its scan.
+        """Base the pose on the newest estimate, and drop the readings before its scan.
 
-        An area that is new has no place in the map before TLCA's answer is here: until then the former estimate holds.
+        A new area has no pose in the map before TLCA's answer: until then the former estimate remains the base.
         """
         newest, base = self._state.newest_estimate, self._state.base_estimate
         if newest is None:
@@ -169,7 +171,7 @@ class Rtl:
             self._readings.popleft()
 
     def _predict(self) -> list[Message]:
-        """The estimate carried on by the odometry since its scan."""
+        """The estimate, propagated by the odometry since its scan."""
         estimate, start, now = self._state.base_estimate, self._state.base_reading, self._readings[-1]
         if estimate is None:
             return []
@@ -199,3 +201,42 @@ def _reset_notice(stamp: int, distance: float, angle: float) -> Notice:
         f"the odometry jumped by {distance:.2f} m and {math.degrees(angle):.0f} degrees at stamp {stamp} ns: taken for "
         "a reset, with the robot standing; if it does move so fast, raise rtl.max_speed or rtl.max_turn_rate",
     )
+
+
+class CorrectionSmoother:
+    """Smoothing of map -> odom, so that corrections of the pose reach it little by little.
+
+    The remaining correction is a motion of the robot, so that a turn does not swing a robot that is far from the origin
+    of the odometry. It decays as exp(-t / time_constant).
+    """
+
+    def __init__(self) -> None:
+        self._stamp = 0
+        self._map_T_odom: NDArray[np.float64] | None = None
+
+    def smooth(
+        self,
+        stamp: int,
+        map_T_odom: NDArray[np.float64],
+        odom_T_base: NDArray[np.float64],
+        time_constant: float,
+    ) -> NDArray[np.float64]:
+        """The smoothed ``map_T_odom``, shape (3,).
+
+        :param stamp: of the odometry, ns.
+        :param map_T_odom: as estimated, shape (3,).
+        :param odom_T_base: shape (3,).
+        :param time_constant: time in which a correction falls to a third, s; 0 for at once.
+        """
+        seconds = 1e-9 * (stamp - self._stamp)
+        if self._map_T_odom is None or time_constant <= 0.0 or seconds < 0.0:
+            self._map_T_odom = map_T_odom
+        else:
+            target = se2.compose(map_T_odom, odom_T_base)
+            remaining = se2.log(se2.between(target, se2.compose(self._map_T_odom, odom_T_base)))
+            if math.hypot(remaining[0], remaining[1]) > _MAX_CORRECTION or abs(remaining[2]) > _MAX_CORRECTION_ANGLE:
+                remaining = np.zeros(3)
+            base = se2.compose(target, se2.exp(math.exp(-seconds / time_constant) * remaining))
+            self._map_T_odom = se2.compose(base, se2.inverse(odom_T_base))
+        self._stamp = stamp
+        return self._map_T_odom

@@ -7,7 +7,7 @@ import sys
 from geometry_msgs.msg import PoseWithCovarianceStamped
 
 from hmt_slam_ros.messages.messages import RealTimePose
-from hmt_slam_ros.real_time_localization.correction import CorrectionSmoother
+from hmt_slam_ros.real_time_localization.rtl import CorrectionSmoother
 from hmt_slam_ros.ros import conversions, topics
 from hmt_slam_ros.ros.execution import run, set_realtime_priority
 from hmt_slam_ros.ros.map_services import spin
