@@ -1,10 +1,11 @@
-"""One live hypothesis inside metric SLAM: its filter, its keyframes, and what its scans are related to."""
+"""One live hypothesis inside metric SLAM: its filter, its keyframes, and the poses of its scans."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -32,17 +33,22 @@ from hmt_slam_ros.submap.local_filter import (
 from hmt_slam_ros.submap.local_mapping import PreparedScan
 
 _INITIAL_COVARIANCE = np.diag([1e-8, 1e-8, 1e-8])
+"""Covariance of the first pose in an area, m^2 and rad^2."""
+
 _IDENTITY = PoseGaussian.from_pose(np.zeros(3))
-# Doubt of a scan, nats, above which it contradicts what the robot should see: most who drive never meet one.
+
 _CONTRADICTION_NATS = 4.0
+"""Log-ratio of "displaced" to "in place" above which a scan contradicts the submap, nats.
+
+Such a scan triggers a keyframe (docs/decisions/0026-kidnapping-detection.md); docs/validation.md has its effect.
+"""
+
 _NO_ERROR = MatchError(_INITIAL_COVARIANCE, _INITIAL_COVARIANCE, np.zeros((3, 3)))
 
 
 @dataclass(frozen=True, eq=False)
 class KeyframeCovariances:
-    """Covariances by keyframe, in the order in which these came.
-
-    A hypothesis looks them up in a dictionary, of which this is the saved form: two arrays for thousands of keyframes.
+    """Covariances of keyframes, in order of time: the saved form of a dictionary, in two arrays.
 
     :ivar keyframes: shape (n,).
     :ivar covariances: shape (n, 3, 3), right tangent frame.
@@ -53,7 +59,7 @@ class KeyframeCovariances:
 
     @classmethod
     def from_dict(cls, covariances: Mapping[int, NDArray[np.float64]]) -> KeyframeCovariances:
-        """Of {keyframe: covariance}."""
+        """The saved form of {keyframe: covariance}."""
         rows = np.array(list(covariances.values())).reshape(-1, 3, 3)
         return cls(np.array(list(covariances), dtype=np.int64), rows)
 
@@ -64,16 +70,16 @@ class KeyframeCovariances:
 
 @dataclass(frozen=True, eq=False)
 class LastEvent:
-    """What is remembered of the last keyframe event of a hypothesis.
+    """The last keyframe event of a hypothesis.
 
-    :ivar pose: ``area_T_base`` then, shape (3,), m and rad.
-    :ivar motion: the motion between the last two keyframe events, as matched, shape (3,).
+    :ivar pose: ``area_T_base`` at the event, shape (3,), m and rad.
+    :ivar motion: the matched motion between the last two keyframe events, shape (3,).
     :ivar match_information: of the event's match alone, in the frame of its pose, shape (3, 3).
-    :ivar motion_error: of that motion.
-    :ivar anchor: the stored keyframe to which scans are now related.
+    :ivar motion_error: covariances of that motion.
+    :ivar anchor: the stored keyframe to which the poses of later scans are relative.
     :ivar pose_covariance: covariance of the pose in the area's frame, right tangent, shape (3, 3).
-    :ivar contradicted: whether the scan contradicted what the robot should have seen.
-    :ivar recent_scans: the scans that the next keyframe's is compared with, in mode lifelong.
+    :ivar contradicted: whether the scan contradicted the submap.
+    :ivar recent_scans: scans with which that of the next keyframe is compared, in mode lifelong.
     """
 
     pose: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
@@ -88,14 +94,13 @@ class LastEvent:
 
 @dataclass(frozen=True, eq=False)
 class LiveHypothesisState:
-    """One live hypothesis inside metric SLAM, as it is saved: what it holds in tables that grow is here as a value.
+    """One live hypothesis inside metric SLAM, in its saved form.
 
-    :ivar particle_filter: its particles, where its local map is a grid.
-    :ivar line_filter: its filter, where its local map is one of lines.
-    :ivar event: what is remembered of the last keyframe event.
-    :ivar step_covariances: what the step which led to a keyframe adds to the drift, of those stored since the area was
-        entered.
-    :ivar keyframe_covariances: of the poses of keyframes in their areas' frames, of all that are known.
+    :ivar particle_filter: its filter, where its local map is a grid.
+    :ivar line_filter: its filter, where its local map has lines.
+    :ivar event: the last keyframe event.
+    :ivar step_covariances: drift of the step to each keyframe that was stored since the robot entered the area.
+    :ivar keyframe_covariances: covariance of each keyframe's pose in its area, where it is known.
     :ivar scan_poses: (stamp, anchor, ``keyframe_T_base``) of the scans since the last keyframe event.
     """
 
@@ -109,10 +114,9 @@ class LiveHypothesisState:
 
 @dataclass
 class LiveHypothesis:
-    """A filter and what metric SLAM remembers beside it; in its tables as :class:`LiveHypothesisState` tells.
+    """One live hypothesis inside metric SLAM; attributes as in :class:`LiveHypothesisState`.
 
-    :ivar settings: when keyframes are taken, and how far their covariance is to be trusted.
-    :ivar event: what is remembered of the last keyframe event.
+    :ivar settings: when keyframes are taken.
     """
 
     filter: LocalFilter
@@ -126,7 +130,7 @@ class LiveHypothesis:
     def from_state(
         cls, filters: FilterFactory, settings: FilterParameters, state: LiveHypothesisState
     ) -> LiveHypothesis:
-        """The hypothesis of a state, whose patches are in the pool."""
+        """The hypothesis of a state; its patches are in the pool."""
         own = state.particle_filter or state.line_filter
         assert own is not None
         return cls(
@@ -139,11 +143,11 @@ class LiveHypothesis:
         )
 
     def state(self) -> LiveHypothesisState:
-        """All that is remembered; tables of grids name patches by their numbers in the pool."""
+        """The whole state, as a value; tables of grids have the numbers of patches in the pool."""
         own = self.filter.state
         return LiveHypothesisState(
             own if isinstance(own, ParticleFilterState) else None,
-            None if isinstance(own, ParticleFilterState) else own,
+            own if isinstance(own, LineFilterState) else None,
             self.event,
             KeyframeCovariances.from_dict(self.step_covariances),
             KeyframeCovariances.from_dict(self.keyframe_covariances),
@@ -152,104 +156,99 @@ class LiveHypothesis:
 
     def branch(self, hypothesis: int) -> LiveHypothesis:
         """A child with its own filter, in the same state."""
-        return LiveHypothesis(
-            self.filter.branch(hypothesis),
-            self.settings,
-            self.event,
-            dict(self.step_covariances),
-            dict(self.keyframe_covariances),
-            list(self.scan_poses),
+        return replace(
+            self,
+            filter=self.filter.branch(hypothesis),
+            step_covariances=dict(self.step_covariances),
+            keyframe_covariances=dict(self.keyframe_covariances),
+            scan_poses=list(self.scan_poses),
         )
 
-    def is_event_due(self, sighting: PreparedScan) -> bool:
-        """Whether the robot moved or turned far enough since the last keyframe event, or may have been displaced.
+    def is_event_due(self, prepared: PreparedScan) -> bool:
+        """Whether the robot moved far enough since the last keyframe event, or the scan is the first to contradict.
 
-        :param sighting: the newest one. Where it is the first that contradicts what the robot should see, it is where
-            the robot is now.
+        :param prepared: the newest scan.
         """
-        moved = se2.between(self.event.pose, self.filter.pose)
-        far = math.hypot(moved[0], moved[1]) >= self.settings.keyframe_distance
-        if far or abs(moved[2]) >= math.radians(self.settings.keyframe_angle):
+        motion = se2.between(self.event.pose, self.filter.pose)
+        is_far = math.hypot(motion[0], motion[1]) >= self.settings.keyframe_distance
+        if is_far or abs(motion[2]) >= math.radians(self.settings.keyframe_angle):
             return True
         if self.event.contradicted:
             return False
-        return (
-            self.filter.clutter_estimate.evaluate(self.filter.compare_scan(sighting)).log_kidnapping_ratio
-            > _CONTRADICTION_NATS
-        )
+        evidence = self.filter.clutter_estimate.evaluate(self.filter.compare_scan(prepared))
+        return evidence.log_kidnapping_ratio > _CONTRADICTION_NATS
 
     def process_keyframe(
         self,
         sequence: int,
-        sighting: PreparedScan,
+        prepared: PreparedScan,
         *,
         after_reset: bool = False,
         may_store: bool = True,
         is_informative: Callable[[], bool] | None = None,
     ) -> HypothesisEstimate:
-        """One filter step with a keyframe's scan, which enters the map where it adds something new.
+        """One filter step with the scan of a keyframe, which enters the map if it is informative.
 
         :param sequence: number of the keyframe event.
-        :param sighting: of the scan.
-        :param after_reset: whether nothing tells how the robot came there: the scan is matched with nothing.
+        :param prepared: the scan.
+        :param after_reset: whether tracking was reset: the scan is not matched.
         :param may_store: whether the hypothesis's map may change.
-        :param is_informative: asked after the filter step whether the scan adds something; a new place does if None.
+        :param is_informative: whether the scan is, called after the filter step; :meth:`is_new_viewpoint` if None.
         """
         if after_reset:
-            unmoved, nothing = np.zeros(3), np.zeros((3, 3))
-            step = FilterStep(unmoved, _NO_ERROR, nothing, float(len(self.filter.poses)), False)
+            step = FilterStep(np.zeros(3), _NO_ERROR, np.zeros((3, 3)), float(len(self.filter.poses)), False)
+            evidence = NO_EVIDENCE
         else:
-            step = self.filter.update(sighting, sequence)
-        judgement = NO_EVIDENCE if after_reset else self._scan_evidence(sighting)
+            step = self.filter.update(prepared, sequence)
+            evidence = self._scan_evidence(prepared)
         self.event = replace(
             self.event,
             motion=step.increment,
             match_information=step.information,
             motion_error=step.match_error,
-            contradicted=judgement.log_kidnapping_ratio > _CONTRADICTION_NATS,
+            contradicted=evidence.log_kidnapping_ratio > _CONTRADICTION_NATS,
             recent_scans=() if after_reset else self.event.recent_scans,
         )
-        # Of a displaced robot it is the first of where it is now.
+        # A scan that contradicts may be the first after a displacement.
         stored = after_reset or (may_store and ((is_informative or self.is_new_viewpoint)() or self.event.contradicted))
         self._propagate_covariance(sequence if stored else None)
         if stored:
-            self.filter.add_keyframe(sequence, sighting.scan)
+            self.filter.add_keyframe(sequence, prepared.scan)
         self.event = replace(self.event, pose=self.filter.pose, anchor=self._nearest_keyframe())
         return HypothesisEstimate(
             self.filter.hypothesis,
             self.filter.area,
             PoseGaussian(self.filter.pose, self.event.pose_covariance),
             stored,
-            judgement.log_evidence,
-            judgement.log_kidnapping_ratio,
+            evidence.log_evidence,
+            evidence.log_kidnapping_ratio,
             self.filter.clutter_estimate.clutter,
             step.effective_samples,
             self._revised_keyframes(sequence) if step.keyframes_moved and may_store else (),
         )
 
-    def _scan_evidence(self, sighting: PreparedScan) -> ScanEvidence:
-        """What the scan says of whether the robot is where the filter has it; learns from it what is usual."""
-        found = self.filter.compare_scan(sighting)
-        judgement = self.filter.clutter_estimate.evaluate(found)
-        self.filter.clutter_estimate = self.filter.clutter_estimate.update(found)
-        return judgement
+    def _scan_evidence(self, prepared: PreparedScan) -> ScanEvidence:
+        """Evidence of a scan for the pose of the filter; updates the clutter estimate."""
+        agreement = self.filter.compare_scan(prepared)
+        evidence = self.filter.clutter_estimate.evaluate(agreement)
+        self.filter.clutter_estimate = self.filter.clutter_estimate.update(agreement)
+        return evidence
 
     def add_recent_scan(self, scan: Scan) -> None:
-        """Compare what follows with a scan that was taken where the filter is."""
+        """Add a scan at the current pose to the recent scans."""
         recent = append_recent_scan(self.event.recent_scans, RecentScan(scan, self.filter.pose.copy()))
         self.event = replace(self.event, recent_scans=recent)
 
     def is_new_viewpoint(self) -> bool:
-        """Whether no keyframe of the local map was taken from nearby with a like heading."""
+        """Whether no keyframe of the local map has a similar position and heading."""
         if not self.filter.keyframes:
             return True
         relative = se2.between(self.filter.leading_keyframe_poses(), self.filter.pose)
         return not bool(np.any(is_same_viewpoint(relative, self.settings)))
 
     def _propagate_covariance(self, keyframe: int | None) -> None:
-        """Carry the drift on to the pose now, of a keyframe that is stored, or of none over ground that is mapped."""
-        ad = se2.adjoint(se2.between(self.filter.pose, self.event.pose))
-        covariance = ad @ self.event.pose_covariance @ ad.T
+        """Propagate the drift to the current pose: that of a stored keyframe, or on mapped ground if None."""
+        covariance = self._transported_covariance()
         if keyframe is None:
             covariance = self._map_bounded_covariance(covariance)
         else:
@@ -258,64 +257,70 @@ class LiveHypothesis:
             self.step_covariances[keyframe], self.keyframe_covariances[keyframe] = step, covariance
         self.event = replace(self.event, pose_covariance=covariance)
 
-    def _map_bounded_covariance(self, carried: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The drift where the map bounds it, as far as the match tells: the pose is as far off as the map is there."""
+    def _transported_covariance(self) -> NDArray[np.float64]:
+        """The covariance of the last event's pose, shape (3, 3), in the tangent space of the current pose."""
+        return PoseGaussian(self.event.pose, self.event.pose_covariance).covariance_at(self.filter.pose)
+
+    def _map_bounded_covariance(self, covariance: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The drift, shape (3, 3), bounded by the error of the map in the directions that the match determines."""
         gain = self.event.motion_error.gain
         free = np.eye(3) - gain
-        return (
-            gain @ self._map_covariance() @ gain.T + free @ carried @ free.T + self.event.motion_error.pose_covariance
-        )
+        bounded = gain @ self._map_covariance() @ gain.T + free @ covariance @ free.T
+        return bounded + self.event.motion_error.pose_covariance
 
     def _map_covariance(self) -> NDArray[np.float64]:
-        """How far off the map is here: covariance of the area's nearest keyframe, carried here; 0 where unknown."""
-        kept = self.filter.keyframes, self.filter.keyframe_areas, self.filter.leading_keyframe_poses()
-        own = [
+        """The error of the map here: the covariance of the area's nearest keyframe, shape (3, 3); 0 where unknown."""
+        rows = self.filter.keyframes, self.filter.keyframe_areas, self.filter.leading_keyframe_poses()
+        known = [
             (k, pose)
-            for k, area, pose in zip(*kept, strict=True)
+            for k, area, pose in zip(*rows, strict=True)
             if area == self.filter.area and k in self.keyframe_covariances
         ]
-        if not own:
+        if not known:
             return np.zeros((3, 3))
-        relative = se2.between(self.filter.pose, np.array([pose for _, pose in own]))
+        relative = se2.between(self.filter.pose, np.array([pose for _, pose in known]))
         nearest = int(np.argmin(np.hypot(relative[:, 0], relative[:, 1])))
         ad = se2.adjoint(relative[nearest])
-        covariance: NDArray[np.float64] = ad @ self.keyframe_covariances[own[nearest][0]] @ ad.T
+        covariance: NDArray[np.float64] = ad @ self.keyframe_covariances[known[nearest][0]] @ ad.T
         return covariance
 
     def _nearest_keyframe(self) -> int:
-        """The keyframe to which the scans to come are related."""
+        """The keyframe nearest to the current pose, with a radian counted as a meter."""
         relative = se2.between(self.filter.leading_keyframe_poses(), self.filter.pose)
         cost = np.hypot(relative[:, 0], relative[:, 1]) + np.abs(relative[:, 2])
         return self.filter.keyframes[int(np.argmin(cost))]
 
     def prune(self, keyframes: Collection[int]) -> None:
-        """Go on without some keyframes of known ground; scans related to them are related to those that stay.
+        """Remove keyframes; poses relative to them become relative to those that remain.
 
-        What they added to the local map stays there until that is loaded anew.
+        Their scans stay in the local map until it is reloaded.
         """
         if not keyframes:
             return
         for keyframe in keyframes:
             self.step_covariances.pop(keyframe, None)
             self.keyframe_covariances.pop(keyframe, None)
-        names, poses = list(self.filter.keyframes), self.filter.leading_keyframe_poses()
-        areas, placed = dict(zip(names, self.filter.keyframe_areas, strict=True)), dict(zip(names, poses, strict=True))
-        for lost in ({self.event.anchor} | {anchor for _, anchor, _ in self.scan_poses}) & set(keyframes):
-            staying = {k: at for k, at in placed.items() if k not in keyframes and areas[k] == areas[lost]}
-            self._replace_anchor(lost, nearest_replacement(placed[lost], staying))
+        names = list(self.filter.keyframes)
+        areas = dict(zip(names, self.filter.keyframe_areas, strict=True))
+        poses = dict(zip(names, self.filter.leading_keyframe_poses(), strict=True))
+        for pruned in ({self.event.anchor} | {anchor for _, anchor, _ in self.scan_poses}) & set(keyframes):
+            remaining = {k: pose for k, pose in poses.items() if k not in keyframes and areas[k] == areas[pruned]}
+            self._replace_anchor(pruned, nearest_replacement(poses[pruned], remaining))
         self.filter.drop_keyframes(keyframes)
 
-    def _replace_anchor(self, lost: int, held: ReplacementKeyframe) -> None:
-        """Relate to another keyframe what is related to one that is forgotten."""
+    def _replace_anchor(self, pruned: int, replacement: ReplacementKeyframe) -> None:
+        """Make poses relative to a pruned keyframe relative to its replacement."""
         self.scan_poses = [
-            (stamp, held.keyframe, se2.compose(held.pose, pose)) if anchor == lost else (stamp, anchor, pose)
+            (stamp, replacement.keyframe, se2.compose(replacement.pose, pose))
+            if anchor == pruned
+            else (stamp, anchor, pose)
             for stamp, anchor, pose in self.scan_poses
         ]
-        if self.event.anchor == lost:
-            self.event = replace(self.event, anchor=held.keyframe)
+        if self.event.anchor == pruned:
+            self.event = replace(self.event, anchor=replacement.keyframe)
 
     def _revised_keyframes(self, newest: int) -> tuple[MovedKeyframe, ...]:
-        # The messages must not hold on to the poses under all particles.
+        # A copy, so that messages do not keep the poses under all particles in memory.
         poses = self.filter.leading_keyframe_poses().copy()
         return tuple(
             MovedKeyframe(keyframe, self.filter.area, self.filter.area, poses[self.filter.keyframes.index(keyframe)])
@@ -324,13 +329,13 @@ class LiveHypothesis:
         )
 
     def add_scan_pose(self, stamp: int) -> None:
-        """Append the scan just processed to the trail."""
+        """Append the pose of the scan just processed."""
         anchor = self.event.anchor
         anchor_pose = self.filter.leading_keyframe_poses()[self.filter.keyframes.index(anchor)]
         self.scan_poses.append((stamp, anchor, se2.between(anchor_pose, self.filter.pose)))
 
     def take_scan_poses(self, first_scan: int) -> list[ScanPoses]:
-        """The trail as a message, if there is one, and begin it anew."""
+        """The poses of the scans since the last event as a message, if there are any; clears them."""
         if not self.scan_poses:
             return []
         stamps, anchors, poses = zip(*self.scan_poses, strict=True)
@@ -346,45 +351,37 @@ class LiveHypothesis:
         ]
 
     def pose_belief(self) -> PoseGaussian:
-        """The belief over ``area_T_base`` now."""
-        ad = se2.adjoint(se2.between(self.filter.pose, self.event.pose))
-        return PoseGaussian(self.filter.pose, ad @ self.event.pose_covariance @ ad.T + self.filter.tracking_covariance)
+        """The current belief over ``area_T_base``."""
+        return PoseGaussian(self.filter.pose, self._transported_covariance() + self.filter.tracking_covariance)
 
-    def change_area(self, leaf: Hypothesis, content: Sequence[PlacedKeyframe], filters: FilterFactory) -> None:
+    def change_area(self, hypothesis: Hypothesis, content: Sequence[PlacedKeyframe], filters: FilterFactory) -> None:
         """Change the reference frame and load the local map, as TSBI decided.
 
-        :param content: the keyframes of the areas that it names, in the frame of the robot's area.
-        :param filters: chooses the kind of local map of an area that is entered.
+        :param content: the keyframes of the hypothesis's local areas, in the frame of the robot's area.
+        :param filters: selects the kind of local map of a new area.
         """
-        entered = leaf.area != self.filter.area
-        if entered:
-            self.filter = filters.select(self.filter, leaf.area, content)
-        area_T_previous = np.zeros(3) if leaf.frame_change is None else leaf.frame_change.mean
-        self.filter.change_area(leaf.area, area_T_previous, content)
-        self._move_event(area_T_previous)
-        if entered and leaf.area_merge is None:
-            moved = {relabelled.keyframe for relabelled in leaf.moved_keyframes}
-            self.step_covariances = {
-                keyframe: step for keyframe, step in self.step_covariances.items() if keyframe in moved
-            }
-            covariance = self._rebase_covariances(leaf.frame_change or _IDENTITY)
+        is_entered = hypothesis.area != self.filter.area
+        if is_entered:
+            self.filter = filters.select(self.filter, hypothesis.area, content)
+        area_T_previous = np.zeros(3) if hypothesis.frame_change is None else hypothesis.frame_change.mean
+        self.filter.change_area(hypothesis.area, area_T_previous, content)
+        self._move_event(partial(se2.compose, area_T_previous))
+        if is_entered and hypothesis.area_merge is None:
+            moved = {change.keyframe for change in hypothesis.moved_keyframes}
+            self.step_covariances = {k: step for k, step in self.step_covariances.items() if k in moved}
+            covariance = self._rebase_covariances(hypothesis.frame_change or _IDENTITY)
             self.event = replace(self.event, pose_covariance=covariance)
         self.event = replace(self.event, anchor=self._nearest_keyframe())
 
-    def _move_event(self, area_T_previous: NDArray[np.float64]) -> None:
-        """Have the last event in another area's frame."""
-        self.event = replace(
-            self.event,
-            pose=se2.compose(area_T_previous, self.event.pose),
-            recent_scans=tuple(
-                RecentScan(look.scan, se2.compose(area_T_previous, look.pose)) for look in self.event.recent_scans
-            ),
-        )
+    def _move_event(self, move: Callable[[NDArray[np.float64]], NDArray[np.float64]]) -> None:
+        """Move the poses of the last event, each shape (3,)."""
+        recent = tuple(RecentScan(recent.scan, move(recent.pose)) for recent in self.event.recent_scans)
+        self.event = replace(self.event, pose=move(self.event.pose), recent_scans=recent)
 
     def merge(self, merged: AreaMerge, keyframes: Mapping[int, NDArray[np.float64]]) -> None:
-        """What is in an area is as uncertain in the one that it becomes part of as that is known relative to it.
+        """Add the uncertainty of an area's pose to covariances of what becomes part of another area with it.
 
-        :param keyframes: {keyframe: ``area_T_base``, shape (3,)} of the area.
+        :param keyframes: {keyframe: ``area_T_base``, shape (3,)} of the merged area.
         """
         for keyframe, pose in keyframes.items():
             if keyframe in self.keyframe_covariances:
@@ -395,9 +392,9 @@ class LiveHypothesis:
             self.event = replace(self.event, pose_covariance=belief.covariance)
 
     def _rebase_covariances(self, rebase: PoseGaussian) -> NDArray[np.float64]:
-        """The drift in the area that was entered, shape (3, 3); that of the keyframes that moved with the robot is set.
+        """The drift in the entered area, shape (3, 3); sets that of the keyframes that moved with the robot.
 
-        It is along these keyframes, or else by the map.
+        It accumulates along these keyframes; without them, the map bounds it.
 
         :param rebase: belief over ``area_T_previous``.
         """
@@ -409,32 +406,23 @@ class LiveHypothesis:
         poses = dict(zip(self.filter.keyframes, self.filter.leading_keyframe_poses(), strict=True))
         self.keyframe_covariances[moved[0]] = _INITIAL_COVARIANCE
         for previous, keyframe in pairwise(moved):
-            ad = se2.adjoint(se2.between(poses[keyframe], poses[previous]))
-            self.keyframe_covariances[keyframe] = (
-                ad @ self.keyframe_covariances[previous] @ ad.T + self.step_covariances[keyframe]
-            )
-        # TSBI knows how they lie in the area, and takes the drift from there on for what is added to it.
+            last = PoseGaussian(poses[previous], self.keyframe_covariances[previous])
+            self.keyframe_covariances[keyframe] = last.covariance_at(poses[keyframe]) + self.step_covariances[keyframe]
+        # TSBI has their poses in the area, and counts the drift from there on.
         return _propagated_covariance(rebase, self.event.pose) + _INITIAL_COVARIANCE
 
     def reload(self, content: Sequence[PlacedKeyframe]) -> None:
-        """Build the local map anew after TLCA refined its keyframes; the robot stays where it is from its anchor.
+        """Rebuild the local map after TLCA refined its keyframes; the pose of the robot in its anchor stays.
 
         :param content: all keyframes of the local map, in the frame of the robot's area.
         """
         before = self.filter.pose
         self.filter.reload(content, self.event.anchor)
         after = self.filter.pose
-        self.event = replace(
-            self.event,
-            pose=se2.compose(after, se2.between(before, self.event.pose)),
-            recent_scans=tuple(
-                RecentScan(look.scan, se2.compose(after, se2.between(before, look.pose)))
-                for look in self.event.recent_scans
-            ),
-        )
+        self._move_event(lambda pose: se2.compose(after, se2.between(before, pose)))
 
 
 def _propagated_covariance(rebase: PoseGaussian, pose: NDArray[np.float64]) -> NDArray[np.float64]:
-    """What the uncertainty of ``area_T_previous`` adds to the covariance (3, 3) of a pose in the area, (3,)."""
+    """The covariance (3, 3) that the uncertainty of ``area_T_previous`` adds to a pose in the area, (3,)."""
     known = PoseGaussian.from_pose(se2.between(rebase.mean, pose))
     return rebase.compose(known).covariance

@@ -42,9 +42,8 @@ from hmt_slam_ros.messages.messages import (
     TrackingReset,
 )
 from hmt_slam_ros.messages.replica import FIRST_AREA, FIRST_HYPOTHESIS, Replica, ReplicaState
+from hmt_slam_ros.metric_slam.intake import OdometryMonitor, OdometryMonitorState, ScanQueue, ScanQueueState
 from hmt_slam_ros.metric_slam.live_hypothesis import LiveHypothesis, LiveHypothesisState
-from hmt_slam_ros.metric_slam.odometry_monitor import OdometryMonitor, OdometryMonitorState
-from hmt_slam_ros.metric_slam.scan_queue import ScanQueue, ScanQueueState
 from hmt_slam_ros.sensors import Odometry, Scan
 from hmt_slam_ros.sensors.motion_model import MotionModel, MotionState, Prediction
 from hmt_slam_ros.sensors.odometry import deskew_scan
@@ -55,23 +54,23 @@ from hmt_slam_ros.submap.particle_filter import ParticleFilters
 
 @dataclass(frozen=True, eq=False)
 class SlamState:
-    """Metric SLAM between two messages, at first before the first scan.
+    """State of metric SLAM between two messages, by default before the first scan.
 
     :ivar replica: the maps of the live hypotheses.
-    :ivar motion: what is known of the motion between scans.
-    :ivar odometry_monitor: what was heard of odometry and scans.
+    :ivar motion: the motion between scans.
+    :ivar odometry_monitor: disagreements of odometry and scans.
     :ivar scan_queue: scans that wait for odometry, or for the answer to a keyframe event.
-    :ivar patches: of the grids of all particles, None where there is none.
-    :ivar live_hypotheses: {hypothesis: its filter and what is remembered beside it}.
-    :ivar keyframe_events: keyframe events.
-    :ivar awaiting_decision: whether the answer to the last one is due.
+    :ivar patches: of the grids of all particles, None without grids.
+    :ivar live_hypotheses: {hypothesis: its filter and keyframes}.
+    :ivar keyframe_events: number of keyframe events.
+    :ivar awaiting_decision: whether the answer to the last event is due.
     :ivar path_length: path length since the start, m.
-    :ivar processed_scans: scans that were given a pose.
-    :ivar dropped_scans: scans that were not.
-    :ivar first_unpublished_scan: number of the first scan that no trail was told of.
-    :ivar reset_pending: whether nothing tells how the robot comes to where the next scan is from.
+    :ivar processed_scans: number of scans with a pose.
+    :ivar dropped_scans: number of scans that were dropped.
+    :ivar first_unpublished_scan: number of the first scan whose pose is not published.
+    :ivar reset_pending: whether tracking restarts at the next scan.
     :ivar lost: whether the robot may be anywhere in the map, under all hypotheses.
-    :ivar initial_pose: where it is at the next scan as somebody says, None where nobody did.
+    :ivar initial_pose: pose at the next scan that a person gave, None without one.
     """
 
     replica: ReplicaState = field(default_factory=ReplicaState)
@@ -97,7 +96,7 @@ class MetricSlam:
     Consumes Scan, Odometry, PoseReset, Hypotheses, ClosureDecision, EndOfLog; produces TrackingReset, Keyframe,
     ScanPoses, LocalEstimate, Notice, EndOfRun.
 
-    :ivar mode: what is done with known ground; but a robot that may be anywhere maps what is around it.
+    :ivar mode: mapping, localization or lifelong; a lost robot maps its surroundings in every mode.
     """
 
     def __init__(
@@ -108,7 +107,7 @@ class MetricSlam:
     ) -> None:
         """:param state: to go on from.
 
-        :param filters: what makes the filters of areas.
+        :param filters: makes the factory of filters.
         """
         state = state or SlamState()
         self._configuration = configuration
@@ -139,20 +138,16 @@ class MetricSlam:
         if not state.live_hypotheses:
             first = self._filters.new(FIRST_HYPOTHESIS, FIRST_AREA)
             return {FIRST_HYPOTHESIS: LiveHypothesis(first, self._configuration.filter)}
-        grids = [
-            live.particle_filter.tables for live in state.live_hypotheses.values() if live.particle_filter is not None
-        ]
-        if state.patches is not None and grids:
-            self._mapping.pool.load(state.patches, np.concatenate(grids))
+        hypotheses = state.live_hypotheses
+        tables = [live.particle_filter.tables for live in hypotheses.values() if live.particle_filter is not None]
+        if state.patches is not None and tables:
+            self._mapping.pool.load(state.patches, np.concatenate(tables))
         settings = self._configuration.filter
-        return {
-            name: LiveHypothesis.from_state(self._filters, settings, live)
-            for name, live in state.live_hypotheses.items()
-        }
+        return {name: LiveHypothesis.from_state(self._filters, settings, live) for name, live in hypotheses.items()}
 
     @property
     def state(self) -> SlamState:
-        """All that metric SLAM knows, as a value."""
+        """The whole state, as a value."""
         live, patches = self._hypothesis_states()
         return replace(
             self._state,
@@ -165,7 +160,7 @@ class MetricSlam:
         )
 
     def _hypothesis_states(self) -> tuple[dict[int, LiveHypothesisState], PatchState | None]:
-        """The live hypotheses, with the patches of their grids, whose numbers are those in the tables."""
+        """The states of the live hypotheses, and the patches of their grids, whose numbers are in the tables."""
         states = {name: live.state() for name, live in self._live_hypotheses.items()}
         grids = {name: state.particle_filter for name, state in states.items() if state.particle_filter is not None}
         if not grids:
@@ -192,12 +187,12 @@ class MetricSlam:
 
     @property
     def keyframe_events(self) -> int:
-        """Keyframe events so far."""
+        """Number of keyframe events so far."""
         return self._state.keyframe_events
 
     @property
     def processed_scans(self) -> int:
-        """Scans that were given a pose."""
+        """Number of scans with a pose."""
         return self._state.processed_scans
 
     @property
@@ -207,12 +202,12 @@ class MetricSlam:
 
     @property
     def queued_scans(self) -> int:
-        """Scans in the queue."""
+        """Number of scans in the queue."""
         return len(self._scan_queue)
 
     @property
     def peak_map_bytes(self) -> int:
-        """What the maps of all particles took at most, bytes."""
+        """Largest memory of the maps of all particles, bytes."""
         return self._mapping.pool.peak_bytes
 
     @property
@@ -225,7 +220,7 @@ class MetricSlam:
         return self._live_hypotheses[self._replica.best_hypothesis]
 
     def handle(self, message: Message) -> list[Message]:
-        """Take in one message, work off what can be worked off, return what there is to say."""
+        """Process a message, and the scans that are ready then; returns the answers."""
         if isinstance(message, Odometry):
             self._scan_queue.add_odometry(message)
         elif isinstance(message, Scan):
@@ -242,15 +237,15 @@ class MetricSlam:
         return self._process_queue()
 
     def _process_queue(self) -> list[Message]:
-        said: list[Message] = []
+        answers: list[Message] = []
         while not self._state.awaiting_decision and self._scan_queue.is_ready(ended=self._ended):
-            said += self._process_scan(self._scan_queue.pop())
+            answers += self._process_scan(self._scan_queue.pop())
         if self._ended and not self._scan_queue and not self._state.awaiting_decision:
-            said += self._finish()
-        return said
+            answers += self._finish()
+        return answers
 
     def _reset_tracking(self) -> list[Message]:
-        """Forget how the robot came here; scans that still wait were taken before and are passed over."""
+        """Restart tracking at the next scan; scans that still wait are dropped, as they are from before."""
         self._motion, self._odometry_monitor = MotionModel(self._configuration.motion), OdometryMonitor()
         dropped = self._state.dropped_scans + len(self._scan_queue)
         self._scan_queue = self._scan_queue.empty_copy(self._motion.odometry)
@@ -259,165 +254,170 @@ class MetricSlam:
 
     def _process_scan(self, scan: Scan) -> list[Message]:
         prediction = self._motion.predict(scan.stamp)
-        sighting = PreparedScan(self._mapping, deskew_scan(scan, self._motion.odometry, self._configuration.rtl))
-        said: list[Message] = []
+        prepared = PreparedScan(self._mapping, deskew_scan(scan, self._motion.odometry, self._configuration.rtl))
+        messages: list[Message] = []
         if self._state.reset_pending:
             self._reset_filters(prediction)
         else:
-            said += self._track(sighting, prediction)
+            messages += self._track(prepared, prediction)
         if (
             self._state.reset_pending
             or self._state.initial_pose is not None
-            or self._best_hypothesis.is_event_due(sighting)
+            or self._best_hypothesis.is_event_due(prepared)
         ):
-            said += self._keyframe_event(sighting)
+            messages += self._keyframe_event(prepared)
         for live in self._live_hypotheses.values():
             live.add_scan_pose(scan.stamp)
         self._state = replace(self._state, processed_scans=self._state.processed_scans + 1)
-        return [*said, self._local_estimate(scan.stamp)]
+        return [*messages, self._local_estimate(scan.stamp)]
 
     def _reset_filters(self, prediction: Prediction) -> None:
-        """Draw every hypothesis where the motion since the last scan leads.
+        """Initialize every filter at its pose after the predicted motion.
 
-        Of a robot that was carried none is known; one that takes itself for lost may be wrong about that.
+        The motion of a carried robot is unknown and predicted as none; a robot that is lost may be so by mistake.
         """
         for live in self._live_hypotheses.values():
-            at = se2.compose(live.filter.pose, prediction.fused.increment)
-            live.filter.initialize(PoseGaussian.from_pose(at))
+            pose = se2.compose(live.filter.pose, prediction.fused.increment)
+            live.filter.initialize(PoseGaussian.from_pose(pose))
 
-    def _track(self, sighting: PreparedScan, prediction: Prediction) -> list[Message]:
-        """Move every hypothesis on to the scan, and learn from what the best one found."""
+    def _track(self, prepared: PreparedScan, prediction: Prediction) -> list[Message]:
+        """Match the scan under every hypothesis, and update the motion model by the best one."""
         tracked = {
-            hypothesis: live.filter.track(sighting, prediction) for hypothesis, live in self._live_hypotheses.items()
+            hypothesis: live.filter.track(prepared, prediction) for hypothesis, live in self._live_hypotheses.items()
         }
         best = tracked[self._replica.best_hypothesis]
         self._motion.observe(best.increment, best.information, best.contradicts_odometry)
         path_length = self._state.path_length + math.hypot(best.increment[0], best.increment[1])
         self._state = replace(self._state, path_length=path_length)
-        return self._notices(self._odometry_monitor.add_scan(sighting.scan.stamp, prediction.odometry, best))
+        return self._notices(self._odometry_monitor.add_scan(prepared.scan.stamp, prediction.odometry, best))
 
     @staticmethod
     def _notices(text: str | None) -> list[Message]:
         return [] if text is None else [Notice("slam", text)]
 
-    def _keyframe_event(self, sighting: PreparedScan) -> list[Message]:
-        sequence, scan = self._state.keyframe_events, sighting.scan
-        trails: list[Message] = self._take_scan_poses()
-        storing = self.is_mapping or self._state.lost
-        news: list[tuple[Changes, float]] = []
-        leaves = tuple(
+    def _keyframe_event(self, prepared: PreparedScan) -> list[Message]:
+        sequence, scan = self._state.keyframe_events, prepared.scan
+        scan_poses: list[Message] = self._take_scan_poses()
+        may_store = self.is_mapping or self._state.lost
+        changes: list[tuple[Changes, float]] = []
+        estimates = tuple(
             live.process_keyframe(
                 sequence,
-                sighting,
+                prepared,
                 after_reset=self._state.reset_pending,
-                may_store=storing,
-                is_informative=partial(self._shows_changes, live, scan, news) if self._is_lifelong else None,
+                may_store=may_store,
+                is_informative=partial(self._shows_changes, live, scan, changes) if self._is_lifelong else None,
             )
             for live in self._live_hypotheses.values()
         )
         last = self._best_hypothesis.event
         self._motion.observe_keyframe(last.motion, last.match_information)
-        carried, place = self._state.reset_pending and sequence > 0, self._state.initial_pose
+        after_reset, initial_pose = self._state.reset_pending, self._state.initial_pose
         keyframe = Keyframe(
-            sequence, scan, self._state.path_length, leaves, carried, place, self.is_mapping, combine_stale_beams(news)
+            sequence,
+            scan,
+            self._state.path_length,
+            estimates,
+            after_reset and sequence > 0,
+            initial_pose,
+            self.is_mapping,
+            combine_stale_beams(changes),
         )
         self._replica.add_keyframe(keyframe)
-        # With the scan of its arrival the robot is put where somebody says, with the next one it is looked for there,
-        # even if it stands still.
+        # An initial pose is kept for one more event: the next scan is searched for there, even if the robot stands.
         self._state = replace(
             self._state,
             keyframe_events=sequence + 1,
             awaiting_decision=True,
             reset_pending=False,
-            initial_pose=place if self._state.reset_pending else None,
+            initial_pose=initial_pose if after_reset else None,
         )
-        return [*trails, keyframe, *self._notices(self._odometry_monitor.check_noise(self._motion.noise))]
+        return [*scan_poses, keyframe, *self._notices(self._odometry_monitor.check_noise(self._motion.noise))]
 
     @property
     def _is_lifelong(self) -> bool:
-        """Whether the map is changed only where the world is new or has changed."""
+        """Whether the map changes only where the world is new or has changed."""
         return self.mode == "lifelong" and not self._state.lost
 
     def _shows_changes(self, live: LiveHypothesis, scan: Scan, found: list[tuple[Changes, float]]) -> bool:
-        """Whether a scan shows what a hypothesis's map does not hold; what was found is added."""
+        """Whether a scan shows changes of a hypothesis's map, which are appended with its probability."""
         own, hybrid_map = live.filter, self._replica.maps[live.filter.hypothesis]
-        placed = zip(own.keyframes, own.keyframe_areas, own.leading_keyframe_poses(), strict=True)
-        known = [PlacedKeyframe(k, area, self._replica.scans[k], pose) for k, area, pose in placed]
+        rows = zip(own.keyframes, own.keyframe_areas, own.leading_keyframe_poses(), strict=True)
+        known = [PlacedKeyframe(k, area, self._replica.scans[k], pose) for k, area, pose in rows]
         # A laser sees farther than the local map reaches.
         around = areas_around(hybrid_map, own.area, self._neighborhood, own.keyframe_areas)
         beyond = self._area_keyframes(own.hypothesis, {area: belief.mean for area, belief in around.items()})
-        news = detect_changes(RecentScan(scan, own.pose), live.event.recent_scans, [*known, *beyond])
+        changes = detect_changes(RecentScan(scan, own.pose), live.event.recent_scans, [*known, *beyond])
         live.add_recent_scan(scan)
-        found.append((news, self._replica.probabilities[own.hypothesis]))
-        return news.has_new_surface or news.has_changed_surface
+        found.append((changes, self._replica.probabilities[own.hypothesis]))
+        return changes.has_new_surface or changes.has_changed_surface
 
     def _take_scan_poses(self) -> list[Message]:
-        """The trails since the last event, of every hypothesis."""
-        said: list[Message] = [
-            trail
+        """The poses of the scans since the last event, of every hypothesis."""
+        scan_poses: list[Message] = [
+            message
             for live in self._live_hypotheses.values()
-            for trail in live.take_scan_poses(self._state.first_unpublished_scan)
+            for message in live.take_scan_poses(self._state.first_unpublished_scan)
         ]
         self._state = replace(self._state, first_unpublished_scan=self._state.processed_scans)
-        return said
+        return scan_poses
 
     def _local_estimate(self, stamp: int) -> LocalEstimate:
-        best = self._best_hypothesis
-        odometry = self._motion.odometry_pose
+        best, state = self._best_hypothesis, self._state
         return LocalEstimate(
             stamp,
-            self._state.processed_scans - 1,
+            state.processed_scans - 1,
             best.filter.area,
             best.pose_belief(),
-            odometry,
-            self._state.dropped_scans,
+            self._motion.odometry_pose,
+            state.dropped_scans,
         )
 
-    def _apply_hypotheses(self, hypotheses: Hypotheses) -> None:
+    def _apply_hypotheses(self, message: Hypotheses) -> None:
         """Branch, re-base and drop filters as TSBI decided."""
         for live in self._live_hypotheses.values():
-            live.prune({one.keyframe for one in hypotheses.pruned_keyframes})
-        for leaf in hypotheses.hypotheses:
-            if leaf.area_merge is not None:
-                keyframes = self._replica.maps[leaf.parent].keyframes(leaf.area_merge.area)
-                self._live_hypotheses[leaf.parent].merge(leaf.area_merge, keyframes)
-        self._replica.apply_hypotheses(hypotheses)
+            live.prune({pruned.keyframe for pruned in message.pruned_keyframes})
+        for hypothesis in message.hypotheses:
+            if hypothesis.area_merge is not None:
+                keyframes = self._replica.maps[hypothesis.parent].keyframes(hypothesis.area_merge.area)
+                self._live_hypotheses[hypothesis.parent].merge(hypothesis.area_merge, keyframes)
+        self._replica.apply_hypotheses(message)
         self._state = replace(
             self._state,
-            lost=all(leaf.lost for leaf in hypotheses.hypotheses),
-            reset_pending=self._state.reset_pending or all(leaf.tracking_reset for leaf in hypotheses.hypotheses),
+            lost=all(hypothesis.lost for hypothesis in message.hypotheses),
+            reset_pending=self._state.reset_pending or all(child.tracking_reset for child in message.hypotheses),
         )
         children = {}
-        for leaf in hypotheses.hypotheses:
-            parent = self._live_hypotheses[leaf.parent]
-            live = parent if leaf.id == leaf.parent else parent.branch(leaf.id)
-            if leaf.local_areas:
-                areas = {local.area: local.pose for local in leaf.local_areas}
-                live.change_area(leaf, self._area_keyframes(leaf.id, areas), self._filters)
-            children[leaf.id] = live
-        for live in children.values() if hypotheses.stale_beams else ():
-            if live.filter.keyframes[-1:] == [hypotheses.sequence]:
-                # What stands there now would have to be seen many times to outweigh what was seen before.
+        for hypothesis in message.hypotheses:
+            parent = self._live_hypotheses[hypothesis.parent]
+            live = parent if hypothesis.id == hypothesis.parent else parent.branch(hypothesis.id)
+            if hypothesis.local_areas:
+                areas = {local.area: local.pose for local in hypothesis.local_areas}
+                live.change_area(hypothesis, self._area_keyframes(hypothesis.id, areas), self._filters)
+            children[hypothesis.id] = live
+        for live in children.values() if message.stale_beams else ():
+            if live.filter.keyframes[-1:] == [message.sequence]:
+                # A reload, since one scan does not outweigh the former evidence in a grid.
                 live.reload(self._local_map_keyframes(live))
         self._replace_hypotheses(children)
 
-    def _apply_decision(self, accepted: ClosureDecision) -> None:
-        self._replica.apply_decision(accepted)
-        if accepted.hypothesis is not None:
-            live = self._live_hypotheses[accepted.hypothesis]
-            self._replace_hypotheses({accepted.hypothesis: live})
-            if accepted.moved_keyframes:
+    def _apply_decision(self, decision: ClosureDecision) -> None:
+        self._replica.apply_decision(decision)
+        if decision.hypothesis is not None:
+            live = self._live_hypotheses[decision.hypothesis]
+            self._replace_hypotheses({decision.hypothesis: live})
+            if decision.moved_keyframes:
                 live.reload(self._local_map_keyframes(live))
         self._state = replace(self._state, awaiting_decision=False)
 
-    def _replace_hypotheses(self, live: dict[int, LiveHypothesis]) -> None:
-        for hypothesis, old in self._live_hypotheses.items():
-            if live.get(hypothesis) is not old:
-                old.filter.release()
-        self._live_hypotheses = live
+    def _replace_hypotheses(self, children: dict[int, LiveHypothesis]) -> None:
+        for hypothesis, live in self._live_hypotheses.items():
+            if children.get(hypothesis) is not live:
+                live.filter.release()
+        self._live_hypotheses = children
 
     def _area_keyframes(self, hypothesis: int, areas: Mapping[int, NDArray[np.float64]]) -> list[PlacedKeyframe]:
-        """The keyframes of the areas that the local map has to hold, in the frame of the robot's area.
+        """The keyframes of areas for the local map, in the frame of the robot's area.
 
         :param areas: {area: ``robot_area_T_area``, shape (3,)}.
         """
@@ -429,12 +429,10 @@ class MetricSlam:
         ]
 
     def _local_map_keyframes(self, live: LiveHypothesis) -> list[PlacedKeyframe]:
-        """The local map's areas as they are now known."""
-        held = dict.fromkeys(live.filter.keyframe_areas)
-        reached = shortest_path_beliefs(self._replica.maps[live.filter.hypothesis], live.filter.area, targets=held)
-        return self._area_keyframes(
-            live.filter.hypothesis, {area: reached[area].mean for area in held if area in reached}
-        )
+        """The keyframes of the local map's areas, at their poses in the hybrid map."""
+        own, areas = live.filter, dict.fromkeys(live.filter.keyframe_areas)
+        beliefs = shortest_path_beliefs(self._replica.maps[own.hypothesis], own.area, targets=areas)
+        return self._area_keyframes(own.hypothesis, {area: beliefs[area].mean for area in areas if area in beliefs})
 
     def _finish(self) -> list[Message]:
         self._ended = False

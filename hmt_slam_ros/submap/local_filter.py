@@ -1,4 +1,4 @@
-"""What a filter of one hypothesis in its current area is to metric SLAM, whatever its map is made of."""
+"""The protocol of the filters of metric SLAM, whatever their maps are made of, and their states as values."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from hmt_slam_ros.submap.local_mapping import PreparedScan
 
 @dataclass(frozen=True, eq=False)
 class ParticleFilterState:
-    """M particles of one hypothesis in one area; the map frame is that of the area.
+    """State of M particles of one hypothesis in one area; the map frame is that of the area.
 
     :ivar hypothesis: id of the hypothesis.
     :ivar area: the current area.
@@ -27,16 +27,16 @@ class ParticleFilterState:
     :ivar keyframes: the local map's keyframes, ids.
     :ivar keyframe_areas: their areas.
     :ivar keyframe_poses: shape (M, K, 3), ``map_T_base`` of each under each particle.
-    :ivar tables: shape (M, T, T), of each particle's map the numbers of its patches, [row, column], -1 for one never
-        seen; the origin lies at the corner between the four middle ones.
+    :ivar tables: shape (M, T, T), numbers of the patches of each particle's map, [row, column], -1 for a patch never
+        seen; the origin is the corner between the four middle patches.
     :ivar predicted_poses: shape (M, 3), the poses as predicted by odometry and inertia since the last filter step.
-    :ivar last_poses: shape (M, 3), those at the last filter step.
-    :ivar motion_since_update: the predicted motion since then.
-    :ivar leader: the particle whose pose is the filter's.
+    :ivar last_poses: shape (M, 3), the poses at the last filter step.
+    :ivar motion_since_update: the predicted motion since the last filter step.
+    :ivar leader: number of the particle whose pose is the filter's.
     :ivar tracking_covariance: of the leader's motion since the last filter step, shape (3, 3), right tangent frame.
-    :ivar residual_covariance: covariance of the leader's pose that the scans since the last filter step leave,
-        likewise.
-    :ivar clutter_estimate: of the scans so far.
+    :ivar residual_covariance: of the leader's pose after the scans since the last filter step, shape (3, 3), right
+        tangent frame.
+    :ivar clutter_estimate: usual contradictions of scans so far.
     """
 
     hypothesis: int
@@ -58,20 +58,20 @@ class ParticleFilterState:
 
 @dataclass(frozen=True, eq=False)
 class LineFilterState:
-    """The belief of one hypothesis in one area whose local map is one of lines; its frame is that of the area.
+    """State of the line filter of one hypothesis in one area; the map frame is that of the area.
 
     :ivar hypothesis: id of the hypothesis.
     :ivar area: the current area.
-    :ivar line_map: over the robot's pose and the lines; its marks are the pose at the last filter step, and the
-        keyframes'.
+    :ivar line_map: belief over the robot's pose and the lines; its clones are the pose at the last filter step, and
+        those of the keyframes.
     :ivar keyframes: the local map's keyframes, ids.
     :ivar keyframe_areas: their areas.
-    :ivar reported_poses: shape (K, 3), ``map_T_base`` of each as it was told, m and rad.
+    :ivar reported_poses: shape (K, 3), ``map_T_base`` of each as last published, m and rad.
     :ivar last_covariance: of the robot's pose at the last filter step, shape (3, 3), right tangent frame.
-    :ivar motion_since_update: the predicted motion since then.
+    :ivar motion_since_update: the predicted motion since the last filter step.
     :ivar information: of the newest scan's known lines alone, in the frame of the pose, shape (3, 3).
     :ivar tracking_covariance: of the motion since the last filter step, shape (3, 3), right tangent frame.
-    :ivar clutter_estimate: of the scans so far.
+    :ivar clutter_estimate: usual contradictions of scans so far.
     """
 
     hypothesis: int
@@ -98,11 +98,11 @@ class PlacedKeyframe:
 
 
 class TrackedMotion(NamedTuple):
-    """What tracking made of a prediction.
+    """Result of tracking: the matched motion since the last scan.
 
     :ivar increment: the matched motion, ``start_T_end``, shape (3,).
     :ivar information: of the match, for correlated beams, in the frame of its end, shape (3, 3).
-    :ivar contradicts_odometry: whether there was odometry and the scan contradicts it.
+    :ivar contradicts_odometry: whether the scan contradicts the odometry, if there was any.
     """
 
     increment: Float64
@@ -112,13 +112,13 @@ class TrackedMotion(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class FilterStep:
-    """What a filter step found.
+    """Result of a filter step.
 
-    :ivar increment: the motion of what leads since the last step, ``start_T_end``, shape (3,).
-    :ivar match_error: of that motion.
+    :ivar increment: the motion since the last step, ``start_T_end``, shape (3,).
+    :ivar match_error: covariances of that motion.
     :ivar information: of the match alone, for correlated beams, in the frame of the pose, shape (3, 3).
     :ivar effective_samples: ESS before resampling.
-    :ivar keyframes_moved: whether keyframe poses differ from those told.
+    :ivar keyframes_moved: whether keyframe poses differ from those published.
     """
 
     increment: Float64
@@ -129,14 +129,14 @@ class FilterStep:
 
 
 class LocalFilter(Protocol):
-    """The belief over the robot's pose and the map of what is around it; the map frame is that of the area.
+    """The belief over the robot's pose and its submap; the map frame is that of the area.
 
     :ivar hypothesis: id of the hypothesis.
     :ivar area: the current area.
     :ivar keyframes: the local map's keyframes, ids.
     :ivar keyframe_areas: their areas.
     :ivar tracking_covariance: of the motion since the last filter step, shape (3, 3), right tangent frame.
-    :ivar clutter_estimate: of the scans so far.
+    :ivar clutter_estimate: usual contradictions of scans so far.
     """
 
     hypothesis: int
@@ -148,7 +148,7 @@ class LocalFilter(Protocol):
 
     @property
     def state(self) -> ParticleFilterState | LineFilterState:
-        """All that the filter remembers."""
+        """The whole state, as a value."""
         ...
 
     @property
@@ -170,38 +170,38 @@ class LocalFilter(Protocol):
         ...
 
     def release(self) -> None:
-        """Give up the map; the filter is not used any more."""
+        """Free the map; the filter is not used afterwards."""
         ...
 
     def initialize(self, pose: PoseGaussian) -> None:
-        """The robot stands at ``map_T_base``, known so well, and is predicted from there."""
+        """Set the belief over ``map_T_base``, and predict from there."""
         ...
 
     def track(self, prepared: PreparedScan, prediction: Prediction) -> TrackedMotion:
-        """A pose for a scan between two keyframes."""
+        """Match a scan between two keyframes."""
         ...
 
     def update(self, prepared: PreparedScan, step: int) -> FilterStep:
-        """The filter step with a keyframe's scan, which was tracked before.
+        """The filter step with the scan of a keyframe, which was tracked before.
 
         :param step: number of the keyframe event, for the random streams.
         """
         ...
 
     def compare_scan(self, prepared: PreparedScan) -> MapAgreement:
-        """A scan in the map, where that has the robot."""
+        """Agreement of a scan with the map, at the current pose."""
         ...
 
     def add_keyframe(self, keyframe: int, scan: Scan) -> None:
-        """Enter a scan into the map where the robot is."""
+        """Insert a scan into the map at the current pose."""
         ...
 
     def drop_keyframes(self, keyframes: Collection[int]) -> None:
-        """Forget keyframes, but not what the map holds of them."""
+        """Remove keyframes, but not their scans from the map."""
         ...
 
     def change_area(self, area: int, area_T_previous: Float64, content: Sequence[PlacedKeyframe]) -> None:
-        """Go over to the frame of another area and load its local map.
+        """Change to the frame of another area and load its local map.
 
         :param area: the area now.
         :param area_T_previous: shape (3,).
@@ -210,19 +210,19 @@ class LocalFilter(Protocol):
         ...
 
     def reload(self, content: Sequence[PlacedKeyframe], anchor: int) -> None:
-        """Build the local map anew after its keyframes moved; the robot stays where it is from one of them.
+        """Rebuild the local map after its keyframes moved; the pose of the robot in one of them stays.
 
         :param content: all keyframes of the local map.
-        :param anchor: the keyframe by which the robot's place is known.
+        :param anchor: the keyframe relative to which the robot stays.
         """
         ...
 
 
 class FilterFactory(Protocol):
-    """Makes filters, and chooses their kind for each area."""
+    """Makes filters, and selects their kind for each area."""
 
     def new(self, hypothesis: int, area: int) -> LocalFilter:
-        """A filter that knows nothing yet."""
+        """A filter with an empty map."""
         ...
 
     def restore(self, state: ParticleFilterState | LineFilterState) -> LocalFilter:
@@ -233,11 +233,11 @@ class FilterFactory(Protocol):
         ...
 
     def select(self, own: LocalFilter, area: int, content: Sequence[PlacedKeyframe]) -> LocalFilter:
-        """The filter to go on with: ``own``, or one of another kind that has the robot where ``own`` has it.
+        """The filter for the next area: ``own``, or a filter of another kind with the same belief over the pose.
 
-        It knows nothing of what is around the robot until it changes to the area. ``own`` is given up if it is not it.
+        A new filter has an empty map until it changes to the area, and ``own`` is released.
 
-        :param area: the one that is entered.
-        :param content: keyframes in its frame, of which those of the area tell what it is.
+        :param area: the area that is entered.
+        :param content: keyframes in its frame; those of the area show its kind.
         """
         ...

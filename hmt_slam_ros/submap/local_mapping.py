@@ -1,4 +1,4 @@
-"""What all filters of a process share: pool of patches, models of the laser, how a scan enters a map."""
+"""The parts that all filters of a process share: the pool of patches, models of the laser, and prepared scans."""
 
 from __future__ import annotations
 
@@ -20,12 +20,13 @@ from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.sensors.scan import extract_surfels
 
 _ODDS_PER_NAT = 20.0
+"""Quanta of the odds in a nat."""
 
 T = TypeVar("T")
 
 
 class LocalMapping:
-    """What all filters of a process share: the pool of patches, the beam model, the settings."""
+    """The pool of patches, the models of the laser and the settings that all filters of a process share."""
 
     def __init__(self, configuration: Configuration) -> None:
         self.configuration = configuration
@@ -47,24 +48,24 @@ class LocalMapping:
         self.hit_distance = int(match.matched_distance / local_map.field_radius * FAR)
 
     def matching_surfels(self, scan: Scan) -> Float64:
-        """The surfels that are matched: within the map's range, evenly thinned; shape (n, 4), base frame."""
+        """Surfels for matching: within the map's range, evenly thinned; shape (n, 4), base frame."""
         beams = self.mapped_beams(scan)
         count = len(beams.hits)
         stride = -(-count // self.configuration.matching.max_points)
         return extract_surfels(beams.hits, beams.origins[:count], max(1, stride))
 
     def mapped_beams(self, scan: Scan) -> MappedBeams:
-        """The part of a scan within the map's range."""
+        """The beams of a scan within the map's range."""
         return MappedBeams(*_split_at_range(scan.points, scan.origins, self.configuration.local_map.max_range))
 
     def insert_scan(self, tables: Int32, poses: Float64, scan: Scan) -> None:
-        """Enter a scan into maps (m, T, T), into each at its own ``map_T_base`` (m, 3)."""
+        """Insert a scan into maps (m, T, T), each at its own ``map_T_base`` (m, 3)."""
         self.pool.insert(tables, poses, self.mapped_beams(scan), self._inverse_sensor_model)
 
 
 @njit(cache=True)
 def _split_at_range(points: Float64, origins: Float64, limit: float) -> tuple[Float64, Float64, Float64]:
-    """Those of the points (n, 2) within a limit of their origins (n, 2), the others at the limit, and their origins."""
+    """Points (n, 2) within a limit of their origins (n, 2), the others cut off at the limit, and their origins."""
     distance = np.hypot(points[:, 0] - origins[:, 0], points[:, 1] - origins[:, 1])
     near = (distance <= limit).sum()
     within, beyond, ordered = np.empty((near, 2)), np.empty((len(points) - near, 2)), np.empty((len(points), 2))
@@ -83,7 +84,7 @@ def _split_at_range(points: Float64, origins: Float64, limit: float) -> tuple[Fl
 
 
 class PreparedScan:
-    """A scan and what filters of either kind make of it, once for all of them and only where one asks for it.
+    """A scan with values derived from it, computed once for all filters and only on demand.
 
     :ivar scan: the scan.
     """
@@ -95,17 +96,17 @@ class PreparedScan:
 
     @cached_property
     def surfels(self) -> Float64:
-        """What is matched with a grid, shape (n, 4), base frame."""
+        """Surfels for matching with a grid, shape (n, 4), base frame."""
         return self._mapping.matching_surfels(self.scan)
 
     def derived(self, make: Callable[[Scan, Configuration], T]) -> T:
-        """What a function makes of the scan, worked out once for all filters that ask for it."""
+        """The value that a function derives from the scan."""
         if make not in self._derived:
             self._derived[make] = make(self.scan, self._mapping.configuration)
-        found: T = self._derived[make]
-        return found
+        value: T = self._derived[make]
+        return value
 
     @property
     def laser_position(self) -> Float64:
-        """Where the beams begin, shape (2,), likewise."""
+        """Position of the laser, shape (2,), base frame."""
         return self.scan.laser_pose[:2]

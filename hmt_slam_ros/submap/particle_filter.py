@@ -1,12 +1,13 @@
 """The Rao-Blackwellized particle filter of one hypothesis in its current area, second step of Eq. (6).
 
-Every particle has a pose, its own map in shared patches, and its own poses of the keyframes taken since the area was
-entered. The map frame is the frame of the current area.
+Every particle has a pose, its own map in shared patches, and its own poses of the keyframes since the robot entered the
+area. The map frame is the frame of the current area.
 """
 
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -34,26 +35,12 @@ from hmt_slam_ros.submap.local_filter import (
 from hmt_slam_ros.submap.local_mapping import LocalMapping, PreparedScan
 from hmt_slam_ros.submap.scan_matcher import ScanMatcher, map_information
 
-# Another particle takes the lead when it is more likely by this much, nats.
 _LEAD_MARGIN = 3.0
+"""Log-likelihood ratio from which another particle takes the lead, nats."""
 
 
 class ParticleFilter:
-    """M particles of one hypothesis in one area.
-
-    :ivar hypothesis: id of the hypothesis.
-    :ivar area: the current area; the map frame is its frame.
-    :ivar poses: shape (M, 3), ``map_T_base``.
-    :ivar log_weights: shape (M,), nats, the largest is 0.
-    :ivar keyframes: the local map's keyframes, ids.
-    :ivar keyframe_areas: their areas.
-    :ivar keyframe_poses: shape (M, K, 3), ``map_T_base`` of each under each particle.
-    :ivar leader: the particle whose pose is the filter's.
-    :ivar tracking_covariance: of the leader's motion since the last filter step, shape (3, 3), right tangent frame.
-    :ivar residual_covariance: covariance of the leader's pose that the scans since the last filter step leave,
-        likewise.
-    :ivar clutter_estimate: of the scans so far.
-    """
+    """M particles of one hypothesis in one area; attributes as in :class:`ParticleFilterState`."""
 
     def __init__(self, mapping: LocalMapping, hypothesis: int, area: int) -> None:
         self.mapping = mapping
@@ -77,20 +64,20 @@ class ParticleFilter:
 
     @classmethod
     def from_state(cls, mapping: LocalMapping, state: ParticleFilterState) -> ParticleFilter:
-        """The filter of a state, whose patches are in the pool and count its tables already."""
-        found = cls(mapping, state.hypothesis, state.area)
-        found.poses, found.log_weights = state.poses, state.log_weights
-        found.keyframes, found.keyframe_areas = list(state.keyframes), list(state.keyframe_areas)
-        found.keyframe_poses, found._tables = state.keyframe_poses, state.tables
-        found._predicted_poses, found._last_poses = state.predicted_poses, state.last_poses
-        found._motion_since_update = state.motion_since_update
-        found.leader, found.tracking_covariance = state.leader, state.tracking_covariance
-        found.residual_covariance, found.clutter_estimate = state.residual_covariance, state.clutter_estimate
-        return found
+        """The filter of a state; its patches are in the pool, which counts the tables already."""
+        own = cls(mapping, state.hypothesis, state.area)
+        own.poses, own.log_weights = state.poses, state.log_weights
+        own.keyframes, own.keyframe_areas = list(state.keyframes), list(state.keyframe_areas)
+        own.keyframe_poses, own._tables = state.keyframe_poses, state.tables
+        own._predicted_poses, own._last_poses = state.predicted_poses, state.last_poses
+        own._motion_since_update = state.motion_since_update
+        own.leader, own.tracking_covariance = state.leader, state.tracking_covariance
+        own.residual_covariance, own.clutter_estimate = state.residual_covariance, state.clutter_estimate
+        return own
 
     @property
     def state(self) -> ParticleFilterState:
-        """All but the patches, to which the tables refer by their numbers in the pool."""
+        """The state without the patches; the tables have their numbers in the pool."""
         return ParticleFilterState(
             self.hypothesis,
             self.area,
@@ -120,25 +107,17 @@ class ParticleFilter:
 
     def branch(self, hypothesis: int) -> ParticleFilter:
         """A filter of the same state for a child hypothesis; maps are shared until written to."""
-        child = ParticleFilter(self.mapping, hypothesis, self.area)
-        child.poses, child.log_weights = self.poses.copy(), self.log_weights.copy()
-        child.keyframes, child.keyframe_areas = list(self.keyframes), list(self.keyframe_areas)
-        child.keyframe_poses = self.keyframe_poses.copy()
-        child._tables = np.stack([self.mapping.pool.share(table) for table in self._tables])
-        child._predicted_poses, child._last_poses = self._predicted_poses.copy(), self._last_poses.copy()
-        child._motion_since_update = self._motion_since_update
-        child.leader, child.tracking_covariance = self.leader, self.tracking_covariance
-        child.residual_covariance = self.residual_covariance
-        child.clutter_estimate = self.clutter_estimate
-        return child
+        # The tables alone are written to in place.
+        tables = np.stack([self.mapping.pool.share(table) for table in self._tables])
+        return ParticleFilter.from_state(self.mapping, replace(self.state, hypothesis=hypothesis, tables=tables))
 
     def release(self) -> None:
-        """Give the maps back."""
+        """Free the maps."""
         for table in self._tables:
             self.mapping.pool.release(table)
 
     def track(self, prepared: PreparedScan, prediction: Prediction) -> TrackedMotion:
-        """Move all particles by the leader's matched increment: a pose for a scan between two keyframes."""
+        """Match a scan between two keyframes, and move all particles by the leader's motion."""
         points = prepared.surfels
         before, view = PoseGaussian(self.pose, self.residual_covariance), self._leading_view()
         match = self._matcher.match(points, before, prediction, view)
@@ -146,19 +125,19 @@ class ParticleFilter:
         self._motion_since_update = self._motion_since_update.compose(match.predicted_motion)
         leg = PoseGaussian(self._predicted_poses[self.leader], self._motion_since_update.covariance)
         match = self._matcher.check_since_keyframe(points, match, leg, self._motion_since_update, view)
-        moved = se2.between(before.mean, match.pose)
-        self.poses = se2.compose(self.poses, moved)
+        increment = se2.between(before.mean, match.pose)
+        self.poses = se2.compose(self.poses, increment)
         information = map_information(self._motion_since_update.covariance, match.pose[2])
         information = information + match.hessian / self.mapping.alignment.inflation
         self.residual_covariance = self._matcher.covariance(match)
         self.tracking_covariance = rotate_covariance(inverse(information), -match.pose[2])
-        return TrackedMotion(moved, self._matcher.information(match), match.contradicts_odometry)
+        return TrackedMotion(increment, self._matcher.information(match), match.contradicts_odometry)
 
     def _leading_view(self) -> GridView:
         return self.mapping.pool.view(self._tables[self.leader])
 
     def update(self, prepared: PreparedScan, step: int) -> FilterStep:
-        """Draw every particle from its optimal proposal, weigh it, resample where ESS fell below its bound.
+        """Draw every particle from its optimal proposal, weight it, and resample where the ESS is low.
 
         :param prepared: of the keyframe's scan.
         :param step: number of the keyframe event, for the random streams.
@@ -166,10 +145,10 @@ class ParticleFilter:
         points, settings = prepared.surfels, self.mapping.configuration
         prior = map_information(self._motion_since_update.covariance, self.pose[2])
         view, predicted = self._leading_view(), Prior(self._predicted_poses[self.leader], prior)
-        still = self._matcher.static_points(points, predicted, self._motion_since_update.covariance, view)
-        drawn = scan_to_map.propose_all(
+        static = self._matcher.static_points(points, predicted, self._motion_since_update.covariance, view)
+        proposals = scan_to_map.propose_all(
             points,
-            still,
+            static,
             self.poses,
             self._predicted_poses,
             prior,
@@ -180,56 +159,56 @@ class ParticleFilter:
             settings.matching.sharpness,
             settings.matching.temper,
         )
-        self.log_weights = self.log_weights + drawn.evidences
+        self.log_weights = self.log_weights + proposals.evidences
         self.log_weights -= self.log_weights.max()
         leader = self._elect_leader()
-        random = random_stream(settings.seed, Purpose.PARTICLES, step).standard_normal(drawn.modes.shape)
-        self.poses = drawn.modes + np.einsum("mij,mj->mi", np.linalg.cholesky(drawn.covariances), random)
+        random = random_stream(settings.seed, Purpose.PARTICLES, step).standard_normal(proposals.modes.shape)
+        self.poses = proposals.modes + np.einsum("mij,mj->mi", np.linalg.cholesky(proposals.covariances), random)
         # The leader keeps the mode, so that the published path has no sampling noise.
-        self.poses[leader] = drawn.modes[leader]
+        self.poses[leader] = proposals.modes[leader]
         self.poses[:, 2] = se2.wrap(self.poses[:, 2])
         error = estimate_match_error(
-            still,
+            static,
             self.poses[leader],
-            drawn.hessians[leader],
+            proposals.hessians[leader],
             prior,
             self.mapping.pool.view(self._tables[leader]),
             self.mapping.alignment,
             self.mapping.match_noise,
         )
-        information = rotate_covariance(settings.matching.temper * drawn.hessians[leader], -self.poses[leader, 2])
+        information = rotate_covariance(settings.matching.temper * proposals.hessians[leader], -self.poses[leader, 2])
         effective = 1.0 / float(np.sum(_normalize_weights(self.log_weights) ** 2))
-        moved = se2.between(self._last_poses[leader], self.poses[leader])
-        changed, self.leader = leader != self.leader, leader
+        increment = se2.between(self._last_poses[leader], self.poses[leader])
+        leader_changed, self.leader = leader != self.leader, leader
         if effective < settings.filter.ess_fraction * len(self.poses):
             self._resample(step)
         self._restart_prediction()
-        return FilterStep(moved, error, information, effective, changed)
+        return FilterStep(increment, error, information, effective, leader_changed)
 
     def compare_scan(self, prepared: PreparedScan) -> MapAgreement:
-        """A scan in the map of the leader, where that has the robot."""
+        """Agreement of a scan with the leader's map, at its pose."""
         return compare_with_map(
             prepared.surfels, prepared.laser_position, self.pose, self._leading_view(), self.mapping.hit_distance
         )
 
     def _elect_leader(self) -> int:
-        """The particle of largest weight; where none is clearly more likely, the one that led before.
+        """The particle of largest weight; the last leader where no other is clearly more likely.
 
-        Along a corridor nothing tells the particles apart, and the pose would jump from one to the other.
+        Along a corridor all particles fit alike, and the pose would jump from one to the other.
         """
         heaviest = int(np.argmax(self.log_weights))
         lead = self.log_weights[heaviest] - self.log_weights[self.leader]
         return heaviest if lead > _LEAD_MARGIN else self.leader
 
     def _restart_prediction(self) -> None:
-        """Predict from here."""
+        """Predict from the current poses."""
         self._predicted_poses = self.poses.copy()
         self._last_poses = self.poses.copy()
         self._motion_since_update = NO_MOTION
         self.residual_covariance = NO_MOTION.covariance
 
     def initialize(self, pose: PoseGaussian) -> None:
-        """All particles stand at the mean of ``map_T_base``, and predict from there; its covariance is left open."""
+        """Set all particles to the mean of ``map_T_base``, with its covariance as the residual one."""
         self.poses = np.repeat(pose.mean[None], len(self.poses), axis=0)
         self.log_weights = np.zeros(len(self.poses))
         self.tracking_covariance = np.zeros((3, 3))
@@ -237,7 +216,7 @@ class ParticleFilter:
         self.residual_covariance = pose.covariance
 
     def _resample(self, step: int) -> None:
-        """Systematic resampling; the leader is kept, and stands first afterwards."""
+        """Systematic resampling; the leader is kept, and is the first particle afterwards."""
         weights = _normalize_weights(self.log_weights)
         offset = random_stream(self.mapping.configuration.seed, Purpose.RESAMPLING, step).random()
         positions = (np.arange(len(weights)) + offset) / len(weights)
@@ -254,21 +233,21 @@ class ParticleFilter:
         self.leader = 0
 
     def add_keyframe(self, keyframe: int, scan: Scan) -> None:
-        """Enter the scan into every particle's map at that particle's pose."""
+        """Insert a scan into every particle's map at that particle's pose."""
         self.mapping.insert_scan(self._tables, self.poses, scan)
         self.keyframes.append(keyframe)
         self.keyframe_areas.append(self.area)
         self.keyframe_poses = np.concatenate((self.keyframe_poses, self.poses[:, None]), axis=1)
 
     def drop_keyframes(self, keyframes: Collection[int]) -> None:
-        """Forget keyframes, but not what the maps hold of them."""
-        kept = [k for k, keyframe in enumerate(self.keyframes) if keyframe not in keyframes]
-        self.keyframes = [self.keyframes[k] for k in kept]
-        self.keyframe_areas = [self.keyframe_areas[k] for k in kept]
-        self.keyframe_poses = self.keyframe_poses[:, kept]
+        """Remove keyframes, but not their scans from the maps."""
+        remaining = [k for k, keyframe in enumerate(self.keyframes) if keyframe not in keyframes]
+        self.keyframes = [self.keyframes[k] for k in remaining]
+        self.keyframe_areas = [self.keyframe_areas[k] for k in remaining]
+        self.keyframe_poses = self.keyframe_poses[:, remaining]
 
     def change_area(self, area: int, area_T_previous: Float64, content: Sequence[PlacedKeyframe]) -> None:
-        """Go over to the frame of another area and load its local map, the same for all particles.
+        """Change to the frame of another area and load its local map, the same for all particles.
 
         :param area: the area now.
         :param area_T_previous: shape (3,).
@@ -281,27 +260,27 @@ class ParticleFilter:
         self._load_submap(content)
 
     def reload(self, content: Sequence[PlacedKeyframe], anchor: int) -> None:
-        """Build the local map anew after its keyframes moved; all particles stay where they are from one of them.
+        """Rebuild the local map after its keyframes moved; the poses of all particles in one of them stay.
 
         :param content: all keyframes of the local map.
-        :param anchor: the keyframe by which the robot's place is known.
+        :param anchor: the keyframe relative to which the particles stay.
         """
         before = self.keyframe_poses[:, self.keyframes.index(anchor)]
-        seen = [se2.between(before, poses) for poses in (self.poses, self._predicted_poses, self._last_poses)]
+        relative = [se2.between(before, poses) for poses in (self.poses, self._predicted_poses, self._last_poses)]
         self._load_submap(content)
         after = self.keyframe_poses[:, self.keyframes.index(anchor)]
-        self.poses, self._predicted_poses, self._last_poses = (se2.compose(after, poses) for poses in seen)
+        self.poses, self._predicted_poses, self._last_poses = (se2.compose(after, poses) for poses in relative)
 
     def _load_submap(self, content: Sequence[PlacedKeyframe]) -> None:
         self.release()
         table = self.mapping.pool.empty_table()
-        for placed in content:
-            self.mapping.insert_scan(table[None], placed.pose[None], placed.scan)
+        for keyframe in content:
+            self.mapping.insert_scan(table[None], keyframe.pose[None], keyframe.scan)
         count = len(self.poses)
         self._tables = np.stack([table] + [self.mapping.pool.share(table) for _ in range(count - 1)])
-        self.keyframes = [placed.keyframe for placed in content]
-        self.keyframe_areas = [placed.area for placed in content]
-        poses = np.array([placed.pose for placed in content]).reshape(-1, 3)
+        self.keyframes = [keyframe.keyframe for keyframe in content]
+        self.keyframe_areas = [keyframe.area for keyframe in content]
+        poses = np.array([keyframe.pose for keyframe in content]).reshape(-1, 3)
         self.keyframe_poses = np.repeat(poses[None], count, axis=0)
 
 
@@ -311,7 +290,7 @@ def _normalize_weights(log_weights: Float64) -> Float64:
 
 
 class ParticleFilters:
-    """Makes particle filters for all areas."""
+    """The factory of particle filters, for all areas."""
 
     def __init__(self, mapping: LocalMapping) -> None:
         """:raises HmtSlamError: where ``local_map.kind`` asks for lines."""
@@ -321,7 +300,7 @@ class ParticleFilters:
         self._mapping = mapping
 
     def new(self, hypothesis: int, area: int) -> LocalFilter:
-        """A filter that knows nothing yet."""
+        """A filter with an empty map."""
         return ParticleFilter(self._mapping, hypothesis, area)
 
     def restore(self, state: ParticleFilterState | LineFilterState) -> LocalFilter:
@@ -334,5 +313,5 @@ class ParticleFilters:
         return ParticleFilter.from_state(self._mapping, state)
 
     def select(self, own: LocalFilter, area: int, content: Sequence[PlacedKeyframe]) -> LocalFilter:  # noqa: ARG002
-        """The filter to go on with, which is ``own`` in every area."""
+        """The filter for the next area, which is always ``own``."""
         return own

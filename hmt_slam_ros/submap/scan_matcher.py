@@ -1,12 +1,11 @@
-"""Where a scan was taken: matching from what odometry predicts, and from inertia where the scans contradict that.
+"""Matching of a scan with the submap, from the pose that odometry predicts, or from inertia where odometry fails.
 
-Odometry is right or, with a small probability, says nothing about the motion (wheels slip, readings are lost); then
-inertia predicts it. Each of the two is a prior; the one under which scan and map have the larger evidence is believed.
-In a corridor that looks the same all along, both fit, and odometry as the sharper prior wins.
+Odometry is right or, with a small probability, uninformative (slip, lost readings); then inertia predicts the motion.
+Each of the two is a prior, and the prior under which scan and map have the larger evidence wins. In a uniform corridor
+both fit, and odometry as the sharper prior wins.
 
-Where a corridor tells little, a scan fits in many places a little, and a pose that were certain after each scan would
-stay in the first of them while the robot drives on. So what the scans leave open is carried on to the next one, and
-where that is much, the best of all fits around is looked for.
+The uncertainty that a match leaves is propagated to the next scan. Otherwise, where a corridor shows little, the pose
+would stay at the first poor fit while the robot drives on. Where the uncertainty is large, the match is searched for.
 """
 
 from __future__ import annotations
@@ -27,27 +26,33 @@ from hmt_slam_ros.sensors.motion_model import Prediction, RelativeMotion
 from hmt_slam_ros.submap.local_mapping import LocalMapping
 
 _SEARCH_POINTS = 90
-# Peaks of a search that are refined.
+"""Points of a scan that a search uses, about."""
+
 _PEAKS = 4
-# Farther from the prediction than this, in m and rad, Gauss-Newton may end in another minimum.
+"""Peaks of a search that are refined."""
+
 _MAX_DISTANCE, _MAX_ANGLE = 0.2, math.radians(6.0)
-# Deviations of the prediction to which a search reaches.
+"""Error of a prediction beyond which Gauss-Newton may end in another minimum, m and rad."""
+
 _REACH = 2.5
-# Matches whose evidence differs by less than this, nats, may as well be each other.
+"""Range of a search, in deviations of the prediction."""
+
 _AMBIGUOUS = 3.0
-# Odometry whose distance from the match is within this share of all is not doubted.
+"""Difference of the evidence below which two matches are equally good, nats."""
+
 _GATE = chi_square_gate(0.999)
+"""Squared Mahalanobis distance of match and odometry up to which they agree."""
 
 
 class ScanMatch(NamedTuple):
-    """A scan matched under one prior.
+    """The match of a scan under one prior.
 
     :ivar pose: the mode, ``map_T_base``, shape (3,).
     :ivar hessian: information of the points at the mode, map coordinates, shape (3, 3).
     :ivar prior: over poses.
-    :ivar predicted_motion: the motion that the prior came from.
+    :ivar predicted_motion: the motion behind the prior.
     :ivar log_evidence: of scan and map under the prior, nats.
-    :ivar contradicts_odometry: whether the scan contradicts the odometry that there was.
+    :ivar contradicts_odometry: whether the scan contradicts the odometry, if there was any.
     """
 
     pose: Float64
@@ -59,7 +64,7 @@ class ScanMatch(NamedTuple):
 
 
 class ScanMatcher:
-    """Matches scans against one map after another, with the settings of a process."""
+    """Matches scans with maps."""
 
     def __init__(self, mapping: LocalMapping) -> None:
         self._mapping = mapping
@@ -68,10 +73,10 @@ class ScanMatcher:
         self._log_fault, self._log_no_fault = math.log(self._fault_probability), math.log1p(-self._fault_probability)
 
     def match(self, points: Float64, before: PoseGaussian, prediction: Prediction, view: GridView) -> ScanMatch:
-        """The scan's pose.
+        """The match of a scan under the better of two priors.
 
         :param points: surfels of the scan, shape (n, 4), base frame.
-        :param before: ``map_T_base`` at the last scan.
+        :param before: belief over ``map_T_base`` at the last scan.
         """
         if prediction.odometry is None:
             return self._match_with_prior(points, before, prediction.inertia, view)
@@ -79,75 +84,71 @@ class ScanMatcher:
         if self._agrees_with_prediction(points, by_odometry, view):
             return by_odometry
         by_inertia = self._match_with_prior(points, before, prediction.inertia, view)
-        right = by_odometry.log_evidence + self._log_no_fault
+        log_odometry = by_odometry.log_evidence + self._log_no_fault
         if not self._fits_map(points, by_inertia.pose, view):
-            # Unknown space has evidence 0: what was found has to be part of the map as well.
-            right = max(0.0, right)
-        if by_inertia.log_evidence + self._log_fault > right:
+            # Unknown space has evidence 0, which a match outside the map has to exceed.
+            log_odometry = max(0.0, log_odometry)
+        if by_inertia.log_evidence + self._log_fault > log_odometry:
             return self._fuse_with_slip(points, before, prediction, by_inertia, view)
-        return (
-            by_odometry if by_odometry.hessian.any() else self._inflate_if_unobserved(by_odometry, prediction.inertia)
-        )
+        return by_odometry if by_odometry.hessian.any() else self._with_fault(by_odometry, prediction.inertia)
 
     def check_since_keyframe(
         self, points: Float64, match: ScanMatch, leg: PoseGaussian, step: RelativeMotion, view: GridView
     ) -> ScanMatch:
-        """The match, or another one where it contradicts the motion predicted since the last keyframe and need not.
+        """The match, or a match that agrees with the motion predicted since the last keyframe, if that is better.
 
-        What walks along a corridor draws the robot with it a little by every scan, of which no single one contradicts
-        odometry; all of them together do. Without what contradicts the leg, the scan is matched from where that leads
-        as well, and the match so far is believed if odometry has failed and the scan shows it.
+        A person who walks along a corridor pulls the match a little in every scan. No single scan contradicts odometry
+        then, but their sum does. So the scan is also matched from the leg's prediction, without the points that
+        contradict it. The first match stands if the evidence for it outweighs an odometry fault.
 
-        :param leg: belief over ``map_T_base`` by the leg's prediction.
+        :param leg: belief over ``map_T_base`` by the prediction since the last keyframe.
         :param step: that prediction.
         """
         prior = _map_prior(leg)
         if match.contradicts_odometry or _mahalanobis2(match.pose, prior) <= _GATE:
             return match
-        still = reject_dynamic(points, match.pose, prior, view, self._mapping.alignment)
-        otherwise = self._refine(points, still, prior.mean, prior, step, view)
-        if not self._fits_map(points, otherwise.pose, view) or _mahalanobis2(otherwise.pose, prior) > _GATE:
+        static = reject_dynamic(points, match.pose, prior, view, self._mapping.alignment)
+        other = self._refine(points, static, prior.mean, prior, step, view)
+        if not self._fits_map(points, other.pose, view) or _mahalanobis2(other.pose, prior) > _GATE:
             return match
-        right = otherwise.log_evidence + self._log_no_fault
-        return otherwise if right > match.log_evidence + self._log_fault else match
+        log_odometry = other.log_evidence + self._log_no_fault
+        return other if log_odometry > match.log_evidence + self._log_fault else match
 
     def _fuse_with_slip(
-        self, points: Float64, before: PoseGaussian, prediction: Prediction, found: ScanMatch, view: GridView
+        self, points: Float64, before: PoseGaussian, prediction: Prediction, match: ScanMatch, view: GridView
     ) -> ScanMatch:
-        """The match with odometry widened along what the scan contradicts; along a corridor it still tells how far."""
+        """The match with odometry, widened along what the scan contradicts: in a corridor it still informs the rest."""
         odometry = prediction.odometry
         assert odometry is not None
         predicted = se2.compose(before.mean, odometry.increment)
-        information = rotate_covariance(found.hessian, -predicted[2])
-        shown = np.linalg.solve(information + inverse(odometry.covariance), information)
-        difference = shown @ se2.log(se2.between(predicted, found.pose))
+        information = rotate_covariance(match.hessian, -predicted[2])
+        gain = np.linalg.solve(information + inverse(odometry.covariance), information)
+        difference = gain @ se2.log(se2.between(predicted, match.pose))
         widened = RelativeMotion(odometry.increment, odometry.covariance + np.outer(difference, difference))
         step = widened.fuse(prediction.inertia)
         prior = _map_prior(_predict_pose(before, step))
-        return self._refine(points, points, found.pose, prior, step, view)._replace(contradicts_odometry=True)
+        return self._refine(points, points, match.pose, prior, step, view)._replace(contradicts_odometry=True)
 
-    def _inflate_if_unobserved(self, match: ScanMatch, inertia: RelativeMotion) -> ScanMatch:
-        """Odometry where no scan proves it: its covariance is that of both predictions, each by its probability."""
+    def _with_fault(self, match: ScanMatch, inertia: RelativeMotion) -> ScanMatch:
+        """A match without evidence for odometry: its covariance is that of both predictions, by their probabilities."""
         step = match.predicted_motion
         difference = se2.log(se2.between(step.increment, inertia.increment))
-        otherwise = inertia.covariance + np.outer(difference, difference)
-        return match._replace(
-            predicted_motion=RelativeMotion(step.increment, step.covariance + self._fault_probability * otherwise)
-        )
+        fault = self._fault_probability * (inertia.covariance + np.outer(difference, difference))
+        return match._replace(predicted_motion=RelativeMotion(step.increment, step.covariance + fault))
 
     def covariance(self, match: ScanMatch) -> Float64:
-        """Of the pose, shape (3, 3), right tangent frame.
+        """Covariance of the pose, shape (3, 3), right tangent frame.
 
-        Tempered: one scan after the other is matched with the same map, and errs as the one before.
+        Tempered, since successive scans are matched with the same map and have common errors.
         """
         return inverse(
             rotate_covariance(self._settings.temper * match.hessian + match.prior.information, -match.pose[2])
         )
 
     def information(self, match: ScanMatch) -> Float64:
-        """What the match alone tells of the motion since the scan before, in the frame of the pose, shape (3, 3).
+        """Information of the match alone on the motion since the last scan, in the frame of the pose, shape (3, 3).
 
-        For correlated beams, but not tempered: where two scans err alike, their difference does not.
+        For correlated beams, but not tempered: common errors of two scans cancel in their difference.
         """
         return rotate_covariance(match.hessian / self._mapping.alignment.inflation, -match.pose[2])
 
@@ -161,7 +162,7 @@ class ScanMatcher:
     def _match_with_prior(
         self, points: Float64, before: PoseGaussian, step: RelativeMotion, view: GridView
     ) -> ScanMatch:
-        """The pose under one prior; where that is wide, or the prediction leads to a poor fit, search around it."""
+        """The match under one prior; with a search where the prior is wide, or the prediction leads to a poor fit."""
         predicted = _predict_pose(before, step)
         prior, covariance = _map_prior(predicted), predicted.covariance
         match = self._refine(points, self.static_points(points, prior, covariance, view), prior.mean, prior, step, view)
@@ -177,46 +178,44 @@ class ScanMatcher:
             self._settings.temper,
             _PEAKS,
         )
-        found = [self._refine(points, points, start, prior, step, view) for start in starts]
-        best = self._least_misfit(points, [match, *found], view)
+        refined = [self._refine(points, points, start, prior, step, view) for start in starts]
+        best = self._least_misfit(points, [match, *refined], view)
         # Relative to unknown space: where nothing fits, the scan shows nothing of the map.
         unmatched = ScanMatch(prior.mean, np.zeros((3, 3)), prior, step, self._log_fault)
-        return max([unmatched, best], key=lambda one: one.log_evidence)
+        return max([unmatched, best], key=lambda candidate: candidate.log_evidence)
 
-    def _least_misfit(self, points: Float64, found: list[ScanMatch], view: GridView) -> ScanMatch:
-        """The match of the least misfit among those that the evidence, which forgives much, does not tell apart."""
-        least = max(match.log_evidence for match in found) - _AMBIGUOUS
-        alike = [match for match in found if match.log_evidence >= least]
-        if len(alike) == 1:
-            return alike[0]
+    def _least_misfit(self, points: Float64, matches: list[ScanMatch], view: GridView) -> ScanMatch:
+        """The match of least misfit among those of about the largest evidence, which is robust but not precise."""
+        least = max(match.log_evidence for match in matches) - _AMBIGUOUS
+        candidates = [match for match in matches if match.log_evidence >= least]
+        if len(candidates) == 1:
+            return candidates[0]
         alignment = self._mapping.alignment
-        return min(alike, key=lambda one: scan_to_map.misfit(points, one.pose, one.prior, view, alignment))
+        return min(candidates, key=lambda match: scan_to_map.misfit(points, match.pose, match.prior, view, alignment))
 
     def static_points(self, points: Float64, prior: scan_to_map.Prior, covariance: Float64, view: GridView) -> Float64:
-        """The points to be matched under a prior: all where its covariance is too wide to tell what moved."""
-        return (
-            points
-            if _exceeds_basin(covariance)
-            else reject_dynamic(points, prior.mean, prior, view, self._mapping.alignment)
-        )
+        """The points on static objects; all where the covariance of the prior is too wide to decide."""
+        if _exceeds_basin(covariance):
+            return points
+        return reject_dynamic(points, prior.mean, prior, view, self._mapping.alignment)
 
     def _refine(
         self,
         points: Float64,
-        still: Float64,
+        static: Float64,
         start: Float64,
         prior: scan_to_map.Prior,
         step: RelativeMotion,
         view: GridView,
     ) -> ScanMatch:
-        pose, hessian = scan_to_map.align(still, start, prior, view, self._mapping.alignment)
+        pose, hessian = scan_to_map.align(static, start, prior, view, self._mapping.alignment)
         log_evidence = scan_to_map.laplace_log_evidence(
             points, pose, hessian, prior, view, self._mapping.beam_model, self._settings.temper
         )
         return ScanMatch(pose, hessian, prior, step, log_evidence)
 
     def _search_lattice(self, predicted: PoseGaussian) -> scan_to_map.Lattice:
-        """The poses to search for around the one that is predicted."""
+        """The lattice of poses around the prediction."""
         settings, cell = self._settings, self._mapping.pool.cell
         reach = _REACH * np.sqrt(np.diag(rotate_covariance(predicted.covariance, predicted.mean[2])))
         reach[:2] = np.clip(reach[:2], settings.search_distance, settings.wide_distance)
@@ -241,7 +240,7 @@ def _map_prior(predicted: PoseGaussian) -> scan_to_map.Prior:
 
 
 def _exceeds_basin(covariance: Float64) -> bool:
-    """Whether a pose of this covariance, in its own frame, may be beyond Gauss-Newton's basin."""
+    """Whether a pose of this covariance, in its own frame, may be outside the basin of Gauss-Newton."""
     (xx, xy, _), (_, yy, _), (_, _, turn) = covariance.tolist()
     largest = 0.5 * (xx + yy) + math.hypot(0.5 * (xx - yy), xy)
     return largest > (_MAX_DISTANCE / _REACH) ** 2 or turn > (_MAX_ANGLE / _REACH) ** 2

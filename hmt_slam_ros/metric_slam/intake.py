@@ -1,0 +1,276 @@
+"""Scans and odometry on their way into metric SLAM: the queue of scans, and notices of faults, once for each."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass, field, replace
+
+from hmt_slam_ros.arrays import Float64
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.messages.messages import Message, Notice
+from hmt_slam_ros.sensors import Odometry, Scan
+from hmt_slam_ros.sensors.motion_model import NO_MOTION, NOISY_FACTOR, OdometryNoise, RelativeMotion
+from hmt_slam_ros.sensors.odometry import OdometryBuffer, SweepCheck, SweepState
+from hmt_slam_ros.submap.local_filter import TrackedMotion
+
+_LATE = 4
+"""Factor on the scans that may wait once there was odometry: more than a paced robot sends without acknowledgement."""
+
+_QUIET = 1.0
+"""Time without a contradiction that ends a disagreement, s."""
+
+_PAUSE = 60.0
+"""Time between two notices of disagreements at least, s."""
+
+_DISTANCE, _ANGLE = 0.2, math.radians(10.0)
+"""Difference of the motions over a disagreement from which it is reported, m and rad; less is due to stamps."""
+
+_GROWTH = math.radians(1.0)
+"""Growth of the difference in heading from scan to scan above which a disagreement goes on, rad."""
+
+_SECOND = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class ScanQueueState:
+    """State of the queue between two messages.
+
+    :ivar scans: scans that wait.
+    :ivar last_stamp: of the last scan received, ns, -1 before the first.
+    :ivar sweeps: the times between scans.
+    :ivar reported_faults: faults that were reported.
+    :ivar waits_for_odometry: whether scans wait for odometry.
+    """
+
+    scans: tuple[Scan, ...] = ()
+    last_stamp: int = -1
+    sweeps: SweepState = field(default_factory=SweepState)
+    reported_faults: frozenset[str] = frozenset()
+    waits_for_odometry: bool = True
+
+
+class ScanQueue:
+    """The queue of scans that wait for odometry, or for the answer to a keyframe event."""
+
+    def __init__(self, max_waiting: int, odometry: OdometryBuffer, state: ScanQueueState) -> None:
+        """:param max_waiting: scans that may wait for the first odometry.
+
+        :param odometry: the readings for which scans wait.
+        :param state: to go on from.
+        """
+        self._max_waiting = max_waiting
+        self._odometry = odometry
+        self._scans = deque(state.scans)
+        self._sweeps = SweepCheck(state.sweeps)
+        # All but the two parts above, which change in place.
+        self._state = replace(state, scans=(), sweeps=SweepState())
+
+    def __len__(self) -> int:
+        return len(self._scans)
+
+    @property
+    def state(self) -> ScanQueueState:
+        """The whole state, as a value."""
+        return replace(self._state, scans=tuple(self._scans), sweeps=self._sweeps.state)
+
+    def empty_copy(self, odometry: OdometryBuffer) -> ScanQueue:
+        """An empty queue, for scans of any other time, which reports no fault again.
+
+        :param odometry: the readings for which scans wait.
+        """
+        return ScanQueue(self._max_waiting, odometry, ScanQueueState(reported_faults=self._state.reported_faults))
+
+    def add_odometry(self, odometry: Odometry) -> None:
+        """Add a reading."""
+        self._odometry.add(odometry)
+        if not self._state.waits_for_odometry:
+            self._state = replace(self._state, waits_for_odometry=True)
+
+    def add_scan(self, scan: Scan) -> list[Message]:
+        """Add a scan; returns notices of its faults, once for each fault."""
+        notices: list[Message] = []
+        scan, fault = self._sweeps.check(scan)
+        if fault is not None:
+            notices += self._notice("sweep", fault)
+        if scan.stamp <= self._state.last_stamp:
+            notices += self._notice(
+                "order",
+                f"A scan is stamped {scan.stamp / 1e9:.6f} s, not after its predecessor "
+                f"({self._state.last_stamp / 1e9:.6f} s); scans are taken in the order of their arrival: check the "
+                "clocks or the order of the log.",
+            )
+        if not scan.valid.any():
+            notices += self._notice(
+                "empty",
+                f"The scan at {scan.stamp / 1e9:.6f} s has no return between {scan.range_min:g} and {scan.range_max:g} "
+                "m; such scans are placed by odometry alone: check the laser and its range limits.",
+            )
+        self._scans.append(scan)
+        self._state = replace(self._state, last_stamp=scan.stamp)
+        return notices + self._stop_waiting()
+
+    def is_ready(self, *, ended: bool) -> bool:
+        """Whether the next scan can be processed: its odometry is known, or it does not wait for odometry.
+
+        :param ended: whether the odometry has ended.
+        """
+        return bool(self._scans) and (
+            ended or not self._state.waits_for_odometry or self._odometry.covers(self._scans[0].end_stamp)
+        )
+
+    def pop(self) -> Scan:
+        """The next scan."""
+        return self._scans.popleft()
+
+    def _stop_waiting(self) -> list[Message]:
+        """Process scans without odometry until there is a reading, where too many wait."""
+        first = self._scans[0]
+        too_many = len(self._scans) > self._max_waiting * (1 if self._odometry.is_empty else _LATE)
+        if not too_many or not self._state.waits_for_odometry or self._odometry.covers(first.end_stamp):
+            return []
+        self._state = replace(self._state, waits_for_odometry=False)
+        return self._notice(
+            "odometry",
+            f"{len(self._scans)} scans wait for odometry at {first.stamp / 1e9:.6f} s and are matched without from "
+            "here on, until there is a reading: check the odometry topic and its stamps.",
+        )
+
+    def _notice(self, fault: str, text: str) -> list[Message]:
+        if fault in self._state.reported_faults:
+            return []
+        self._state = replace(self._state, reported_faults=self._state.reported_faults | {fault})
+        return [Notice("slam", text)]
+
+
+@dataclass(frozen=True, eq=False)
+class OdometryDisagreement:
+    """The motion by odometry and by scans, from the first contradiction until both agree again.
+
+    :ivar begin: stamp of the scan before the first contradiction, ns.
+    :ivar last_contradiction: stamp of the last scan that contradicts odometry, ns.
+    :ivar end: stamp of the last scan up to which the difference in heading grew, ns.
+    :ivar odometry_motion: the motion from ``begin`` to ``end`` by odometry, shape (3,), m and rad.
+    :ivar scan_motion: the same by the scans.
+    :ivar odometry_motion_now: the motion from ``begin`` to the last scan by odometry, shape (3,), m and rad.
+    :ivar scan_motion_now: the same by the scans.
+    """
+
+    begin: int
+    last_contradiction: int
+    end: int
+    odometry_motion: Float64
+    scan_motion: Float64
+    odometry_motion_now: Float64
+    scan_motion_now: Float64
+
+    @classmethod
+    def from_stamp(cls, begin: int) -> OdometryDisagreement:
+        """A disagreement that begins at a stamp."""
+        return cls(begin, begin, begin, *[NO_MOTION.increment] * 4)
+
+    def extend(self, stamp: int, step: RelativeMotion, tracked: TrackedMotion) -> OdometryDisagreement:
+        """The disagreement with one more scan."""
+        odometry = se2.compose(self.odometry_motion_now, step.increment)
+        scans = se2.compose(self.scan_motion_now, tracked.increment)
+        if tracked.contradicts_odometry:
+            return OdometryDisagreement(self.begin, stamp, stamp, odometry, scans, odometry, scans)
+        extended = replace(self, odometry_motion_now=odometry, scan_motion_now=scans)
+        last_angle = _motion_difference(self.odometry_motion, self.scan_motion)[1]
+        if _motion_difference(odometry, scans)[1] > last_angle + _GROWTH:
+            return replace(extended, end=stamp, odometry_motion=odometry, scan_motion=scans)
+        return extended
+
+    def is_significant(self) -> bool:
+        """Whether the motions differ, and not only the stamps."""
+        distance, angle = _motion_difference(self.odometry_motion, self.scan_motion)
+        return distance >= _DISTANCE or angle >= _ANGLE
+
+
+@dataclass(frozen=True, eq=False)
+class OdometryMonitorState:
+    """State of the monitor between two scans.
+
+    :ivar last_stamp: stamp of the last scan, ns.
+    :ivar disagreement: the current one, None where odometry and scans agree.
+    :ivar last_notice: end of the last disagreement that was reported, s, None before the first.
+    :ivar unreported: number of disagreements since then that were not reported.
+    :ivar noise_reported: whether noisy odometry was reported.
+    """
+
+    last_stamp: int = 0
+    disagreement: OdometryDisagreement | None = None
+    last_notice: float | None = None
+    unreported: int = 0
+    noise_reported: bool = False
+
+
+class OdometryMonitor:
+    """Notices of odometry that contradicts the scans, or that is noisier than its model."""
+
+    def __init__(self, state: OdometryMonitorState | None = None) -> None:
+        """:param state: to go on from."""
+        self._state = state or OdometryMonitorState()
+
+    @property
+    def state(self) -> OdometryMonitorState:
+        """The whole state, as a value."""
+        return self._state
+
+    def add_scan(self, stamp: int, step: RelativeMotion | None, tracked: TrackedMotion) -> str | None:
+        """Update the disagreement by a scan; returns the notice of one that has ended, if it is due.
+
+        :param stamp: of the scan, ns.
+        :param step: motion by odometry since the last scan, None where it is unknown.
+        """
+        episode = self._state.disagreement
+        if tracked.contradicts_odometry and episode is None:
+            episode = OdometryDisagreement.from_stamp(self._state.last_stamp)
+        self._state = replace(self._state, last_stamp=stamp, disagreement=episode)
+        if episode is None:
+            return None
+        lasts = tracked.contradicts_odometry or (stamp - episode.last_contradiction) * _SECOND <= _QUIET
+        if step is None or not lasts:
+            return self.end_disagreement()
+        self._state = replace(self._state, disagreement=episode.extend(stamp, step, tracked))
+        return None
+
+    def end_disagreement(self) -> str | None:
+        """End the current disagreement; returns its notice, if it is significant and the last notice is old."""
+        episode, self._state = self._state.disagreement, replace(self._state, disagreement=None)
+        if episode is None or not episode.is_significant():
+            return None
+        last, unreported = self._state.last_notice, self._state.unreported
+        if last is not None and episode.end * _SECOND - last < _PAUSE:
+            self._state = replace(self._state, unreported=unreported + 1)
+            return None
+        since = f" ({unreported} times more since it was last said)" if unreported else ""
+        self._state = replace(self._state, last_notice=episode.end * _SECOND, unreported=0)
+        return (
+            f"odometry {_motion_text(episode.odometry_motion)} from {episode.begin * _SECOND:.3f} s to "
+            f"{episode.end * _SECOND:.3f} s, where the scans say that it {_motion_text(episode.scan_motion)}{since}: "
+            "the scans are believed; look for slipping wheels and late stamps."
+        )
+
+    def check_noise(self, noise: OdometryNoise) -> str | None:
+        """The notice of odometry that is much noisier than its model, once."""
+        translation, rotation = noise.factors
+        if self._state.noise_reported or max(translation, rotation) < NOISY_FACTOR:
+            return None
+        self._state = replace(self._state, noise_reported=True)
+        return (
+            f"odometry and scans differ {translation:.1f} times as much in distance and {rotation:.1f} times as much "
+            "in heading as the noise model of odometry expects, so it is trusted less: raise "
+            "motion.rotation_from_rotation and its neighbors if it stays so."
+        )
+
+
+def _motion_difference(odometry: Float64, scans: Float64) -> tuple[float, float]:
+    """Distance, m, and angle, rad, between two motions."""
+    difference = se2.between(odometry, scans)
+    return math.hypot(difference[0], difference[1]), abs(float(difference[2]))
+
+
+def _motion_text(increment: Float64) -> str:
+    distance = math.hypot(increment[0], increment[1])
+    return f"turned by {math.degrees(increment[2]):.0f} degrees and went {distance:.2f} m"
