@@ -1,7 +1,7 @@
-"""Where does one area's map lie in another's, and how well does it fit? All modes, and the evidence integral.
+"""Area to area: all modes of the pose of one area's map in another's, and the evidence integral.
 
 The second factor pair of Eq. (6), integrated over x: the integral of p(x | gamma) p(z | x, gamma) / p(z | unknown).
-Blanco et al. leave it to an expectation over samples of the prior; a lattice does it without variance.
+Blanco et al. take an expectation over samples of the prior; a lattice has no variance.
 """
 
 from __future__ import annotations
@@ -23,30 +23,37 @@ from hmt_slam_ros.registration.branch_and_bound import PositionConstraint, Searc
 from hmt_slam_ros.registration.likelihood_grid import AreaGrid
 from hmt_slam_ros.registration.search_bounds import LogRatioGrid, SearchWindow, make_search_window
 
-# Peaks of one cluster have passes at most this deep, nats.
 _MAX_SADDLE_DEPTH = 3.0
-# A cell is kept where it alone could hold this share of the prior's weight.
+"""Depth of the pass between two peaks of one cluster at most, nats."""
+
 _NEGLIGIBLE_SHARE = 1e-5
+"""Share of the prior's mass that a cell could have alone, below which it is dropped."""
+
 _TURN_LIMITS = (math.radians(0.2), math.radians(2.0))
-# Share of the prior's information in what matching alone says of a direction of which it says nothing.
+"""Smallest and largest angle between turns of a search, rad."""
+
 _WEAK_PRIOR_SHARE = 0.01
+"""Share of the prior's information in the result of matching alone, for directions that a match does not determine."""
+
 _SAME_MODE_GATE = chi_square_gate(0.95)
-# Modes this far below the best are looked at, nats: the best may lie in the place of another area.
+"""Squared Mahalanobis distance below which two modes are the same."""
+
 _MARGIN = 20.0
+"""Log-mass below that of the best mode down to which modes are used, nats: the best may be in another area's place."""
 
 
 @dataclass(frozen=True)
 class MatchSettings:
-    """How a match is searched for.
+    """Settings of a search.
 
     :ivar temper: exponent on the likelihood of the surface samples, which are not quite independent.
-    :ivar gate: squared Mahalanobis distance from the prior up to which is searched, 3 degrees of freedom.
-    :ivar margin: modes this far below the best, in nats, are still returned.
-    :ivar max_modes: at most this many modes are worked out, the heaviest; some may turn out to be the same.
+    :ivar gate: largest squared Mahalanobis distance from the prior, 3 degrees of freedom.
+    :ivar margin: log-mass below that of the best mode down to which modes are returned, nats.
+    :ivar max_modes: largest number of modes, the heaviest; some of them may be merged.
     :ivar sigma_floor: smallest deviation of a mode's translation, m.
     :ivar angle_floor: smallest deviation of a mode's angle, rad.
-    :ivar check_reverse: whether surfaces of the candidate in what is free space to the query speak against a pose.
-    :ivar min_log_ratio: poses at which the samples' log-ratio is less than this on average are not looked for, nats.
+    :ivar min_log_ratio: smallest mean log-ratio of the samples at a pose, nats.
+    :ivar check_reverse: whether surfaces of the candidate in free space of the query count against a pose.
     """
 
     temper: float = 0.1
@@ -70,10 +77,10 @@ class MatchSettings:
 
 
 class MatchMode(NamedTuple):
-    """One way in which the query fits into the candidate.
+    """One fit of the query into the candidate.
 
     :ivar pose: belief over ``candidate_T_query``: prior and match.
-    :ivar measured: the same from the match alone, for an arc to which the prior's arcs are still joined.
+    :ivar measured: the same from the match alone, for an arc that is fused with those of the prior.
     :ivar log_mass: log of the mode's part of the evidence integral, nats.
     """
 
@@ -87,13 +94,13 @@ class AreaMatch:
     """The fit of a query into a candidate.
 
     :ivar log_evidence: log of the integral of p(x) (p(z | x, candidate) / p(z | unknown))^temper over the gate, nats;
-        -inf where nothing in the gate is worth mentioning.
+        -inf where all of it is negligible.
     """
 
     log_evidence: float = -math.inf
     _find_modes: Callable[[], tuple[MatchMode, ...]] = tuple
 
-    # Some ask for the evidence alone.
+    # On demand: for some comparisons the evidence is enough.
     @cached_property
     def modes(self) -> tuple[MatchMode, ...]:
         """By falling mass."""
@@ -108,36 +115,35 @@ def match_areas(
     bounds: Float64 | None = None,
     constraint: PositionConstraint | None = None,
 ) -> AreaMatch:
-    """Find all poses of the query in the candidate that the prior admits.
+    """All poses of the query in the candidate that the prior admits.
 
     :param query: the map of the keyframes in question, in the frame of their reference keyframe.
     :param candidate: the map of the candidate and its surroundings.
     :param prior: belief over ``candidate_T_query``.
-    :param bounds: shape (2, 2), the smallest and the largest (x, y) in the candidate where the middle of the query's
-        points may be, m; what lies beyond is not searched.
-    :param constraint: where one of the query's keyframes has to be, if anywhere.
+    :param bounds: shape (2, 2), the smallest and the largest (x, y) in the candidate for the middle of the query's
+        points, m.
+    :param constraint: limits on the positions of the query's keyframes, if any.
     """
-    searched = _search(query, candidate, prior, settings, bounds, constraint)
-    if searched is None:
+    result = _search(query, candidate, prior, settings, bounds, constraint)
+    if result is None:
         return AreaMatch()
-    return AreaMatch(float(np.logaddexp.reduce(searched.masses)), lambda: tuple(_modes(searched)))
+    return AreaMatch(float(np.logaddexp.reduce(result.masses)), lambda: tuple(_modes(result)))
 
 
 def best_pose(
     query: AreaGrid, candidate: AreaGrid, prior: PoseGaussian, settings: MatchSettings
 ) -> tuple[Float64, float] | None:
-    """Where the heaviest mode of :func:`match_areas` peaks, ``candidate_T_query``, and the log of its mass; None
-    without one.
+    """The peak ``candidate_T_query`` of the heaviest mode of :func:`match_areas`, and its log-mass; None without modes.
 
-    That costs a fraction of the mode with its covariance.
+    It costs a fraction of the mode with its covariance.
     """
-    searched = _search(query, candidate, prior, settings)
-    if searched is None:
+    result = _search(query, candidate, prior, settings)
+    if result is None:
         return None
-    labels, totals = _cluster(searched)
+    labels, totals = _cluster(result)
     inside = labels == totals.argmax()
-    peak = _find_peak(searched.problem, searched.masses[inside], searched.poses[inside])
-    return se2.compose(peak, se2.inverse(searched.problem.to_middle.mean)), float(totals.max())
+    peak = _find_peak(result.problem, result.masses[inside], result.poses[inside])
+    return se2.compose(peak, se2.inverse(result.problem.to_middle.mean)), float(totals.max())
 
 
 def _search(
@@ -146,37 +152,37 @@ def _search(
     prior: PoseGaussian,
     settings: MatchSettings,
     bounds: Float64 | None = None,
-    ground: PositionConstraint | None = None,
+    constraint: PositionConstraint | None = None,
 ) -> _SearchResult | None:
     if not query.points.size or not candidate.points.size:
         return None
-    # About the middle of the samples turns and shifts are least correlated, and the lattice of turns coarsest.
+    # In the middle of the samples turns and shifts are least correlated, and the lattice of turns is coarsest.
     middle = query.points.mean(axis=0)
     to_middle = PoseGaussian.from_pose(np.array([*middle, 0.0]))
-    centred = query.shift_origin(middle)
+    centered = query.shift_origin(middle)
     prior = prior.compose(to_middle)
-    turn = _turn_step(candidate.cell, centred.points)
+    turn = _turn_step(candidate.cell, centered.points)
     window = make_search_window(prior.mean, prior.covariance, candidate.cell, turn, settings.gate, bounds)
     surface, log_cell = _fine_grid(candidate), _log_cell_mass(prior, candidate.cell, turn)
-    back_points = _reachable_points(candidate.points[: None if settings.check_reverse else 0], window, centred)
+    back_points = _reachable_points(candidate.points[: None if settings.check_reverse else 0], window, centered)
     threshold = max(
         math.log(_NEGLIGIBLE_SHARE) - min(0.0, log_cell), settings.temper * settings.min_log_ratio * len(query.points)
     )
     cells = search_cells(
         window,
         _coarse_grid(candidate),
-        centred.points,
-        _coarse_grid(centred),
+        centered.points,
+        _coarse_grid(centered),
         back_points,
         settings.temper,
         threshold,
         settings.margin,
-        None if ground is None else ground._replace(keyframes=ground.keyframes - middle),
+        None if constraint is None else constraint._replace(keyframes=constraint.keyframes - middle),
     )
     if not cells.score.size:
         return None
-    problem = _MatchProblem(surface, centred.points, window, prior, settings, to_middle)
-    masses, poses = match_modes.integrate_cells(surface, centred.points, window, cells, settings.temper)
+    problem = _MatchProblem(surface, centered.points, window, prior, settings, to_middle)
+    masses, poses = match_modes.integrate_cells(surface, centered.points, window, cells, settings.temper)
     return _SearchResult(problem, cells, masses + log_cell, poses)
 
 
@@ -191,7 +197,7 @@ class _MatchProblem:
 
 
 class _SearchResult(NamedTuple):
-    """Where the query may lie: cells, the log of the mass of each, (n,), and the best pose found in it, (n, 3)."""
+    """Cells of a search, the log-mass of each, (n,), and the best pose in it, (n, 3)."""
 
     problem: _MatchProblem
     cells: SearchCells
@@ -230,18 +236,18 @@ def _reachable_points(points: Float64, window: SearchWindow, query: AreaGrid) ->
     return points[near]
 
 
-def _cluster(searched: _SearchResult) -> tuple[Int64, Float64]:
-    """The cluster of every cell, and the log of the mass of every cluster."""
-    labels = match_modes.cluster_cells(searched.cells, _MAX_SADDLE_DEPTH)
+def _cluster(result: _SearchResult) -> tuple[Int64, Float64]:
+    """The cluster of every cell, and the log-mass of every cluster."""
+    labels = match_modes.cluster_cells(result.cells, _MAX_SADDLE_DEPTH)
     totals = np.full(labels.max() + 1, -np.inf)
-    np.logaddexp.at(totals, labels, searched.masses)
+    np.logaddexp.at(totals, labels, result.masses)
     return labels, totals
 
 
-def _modes(searched: _SearchResult) -> list[MatchMode]:
-    """The modes by falling mass, coinciding ones merged."""
-    problem, _, masses, poses = searched
-    labels, totals = _cluster(searched)
+def _modes(result: _SearchResult) -> list[MatchMode]:
+    """The modes by falling mass, without duplicates."""
+    problem, _, masses, poses = result
+    labels, totals = _cluster(result)
     floor = totals.max() - problem.settings.margin
     modes: list[MatchMode] = []
     for label in np.argsort(-totals, kind="stable")[: problem.settings.max_modes]:
@@ -252,13 +258,13 @@ def _modes(searched: _SearchResult) -> list[MatchMode]:
 
 
 def _add_or_merge(modes: list[MatchMode], mode: MatchMode) -> None:
-    """Append a mode, or merge it with one that says the same; the heavier one, which is there first, keeps its mean."""
+    """Append a mode, or merge it with the same mode, which is heavier and keeps its mean."""
     for place, other in enumerate(modes):
         if other.pose.mahalanobis2(mode.pose) < _SAME_MODE_GATE:
-            both = (other, mode)
+            pair = (other, mode)
             modes[place] = MatchMode(
-                match_moments([(each.pose, each.log_mass) for each in both]),
-                match_moments([(each.measured, each.log_mass) for each in both]),
+                match_moments([(member.pose, member.log_mass) for member in pair]),
+                match_moments([(member.measured, member.log_mass) for member in pair]),
                 float(np.logaddexp(other.log_mass, mode.log_mass)),
             )
             return
@@ -268,30 +274,29 @@ def _add_or_merge(modes: list[MatchMode], mode: MatchMode) -> None:
 def _fit_mode(problem: _MatchProblem, masses: Float64, poses: Float64) -> MatchMode:
     """Peak, covariances and mass of a cluster of cells.
 
-    The curvature at the peak gives the covariance of a sharp mode; cells that lie farther away than that explains, as
-    those along a corridor do, widen it.
+    The curvature at the peak gives the covariance of a sharp mode. Cells farther away than that, as along a corridor,
+    widen it.
     """
     settings, window = problem.settings, problem.window
     peak = _find_peak(problem, masses, poses)
     span = 0.3 * window.cell
-    bend = match_modes.curvature(
-        problem.surface, problem.samples, peak, np.array([span, span, _radian_step(problem, span)])
-    )
-    matched = _positive_part(settings.temper * bend)
-    held = np.linalg.inv(problem.prior.covariance_at(peak))
-    posterior = np.linalg.inv(matched + held)
+    step = np.array([span, span, _radian_step(problem, span)])
+    curvature = match_modes.curvature(problem.surface, problem.samples, peak, step)
+    by_match = _positive_part(settings.temper * curvature)
+    by_prior = np.linalg.inv(problem.prior.covariance_at(peak))
+    posterior = np.linalg.inv(by_match + by_prior)
     spread = _excess_covariance(problem, peak, masses, poses, posterior)
     floor = np.diag([settings.sigma_floor**2, settings.sigma_floor**2, settings.angle_floor**2])
     peak = np.array([peak[0], peak[1], float(se2.wrap(peak[2]))])
     return MatchMode(
         PoseGaussian(peak, posterior + spread + floor),
-        PoseGaussian(peak, np.linalg.inv(matched + _WEAK_PRIOR_SHARE * held) + spread + floor),
+        PoseGaussian(peak, np.linalg.inv(by_match + _WEAK_PRIOR_SHARE * by_prior) + spread + floor),
         float(np.logaddexp.reduce(masses)),
     )
 
 
 def _find_peak(problem: _MatchProblem, masses: Float64, poses: Float64) -> Float64:
-    """Where a cluster of cells is highest."""
+    """The pose at which a cluster of cells is highest, shape (3,)."""
     window, heaviest = problem.window, poses[int(np.argmax(masses))]
     step = np.array([window.cell / 6.0, window.cell / 6.0, _radian_step(problem, window.cell / 6.0)])
     return match_modes.climb_to_peak(
@@ -308,19 +313,19 @@ def _radian_step(problem: _MatchProblem, distance: float) -> float:
 def _excess_covariance(
     problem: _MatchProblem, peak: Float64, masses: Float64, poses: Float64, explained: Float64
 ) -> Float64:
-    """How much wider the cells of a cluster lie around the peak than ``explained`` and the lattice account for."""
-    away = se2.log(se2.between(peak, poses))
+    """The covariance of the cells of a cluster around the peak, beyond ``explained`` and that of the lattice."""
+    offsets = se2.log(se2.between(peak, poses))
     weights = np.exp(masses - np.logaddexp.reduce(masses))
-    second = np.einsum("n,ni,nj->ij", weights, away, away)
-    turn = float(problem.window.turns[1] - problem.window.turns[0]) if problem.window.turns.size > 1 else 0.0
-    lattice = np.diag([problem.window.cell**2, problem.window.cell**2, turn**2]) / 12.0
-    return _positive_part(second - explained - lattice)
+    second_moment = np.einsum("n,ni,nj->ij", weights, offsets, offsets)
+    cell, turn = problem.window.cell, match_modes.turn_step(problem.window)
+    lattice = np.diag([cell**2, cell**2, turn**2]) / 12.0
+    return _positive_part(second_moment - explained - lattice)
 
 
 def _positive_part(matrix: Float64) -> Float64:
     """The nearest positive semidefinite matrix to a symmetric one, both (3, 3) over (m, m, rad).
 
-    Angles are scaled to the metres that they move a point ten metres away, so that the axes compare.
+    Angles are scaled to the meters by which they move a point ten meters away, so that the axes compare.
     """
     scale = np.array([1.0, 1.0, 10.0])
     values, vectors = np.linalg.eigh(0.5 * (matrix + matrix.T) * np.outer(scale, scale))
@@ -328,6 +333,6 @@ def _positive_part(matrix: Float64) -> Float64:
 
 
 def _mode_in_query_frame(mode: MatchMode, to_middle: PoseGaussian) -> MatchMode:
-    """The mode of the query's own frame from that of its middle."""
-    back = to_middle.inverse()
-    return MatchMode(mode.pose.compose(back), mode.measured.compose(back), mode.log_mass)
+    """The mode in the query's own frame, from that in its middle."""
+    from_middle = to_middle.inverse()
+    return MatchMode(mode.pose.compose(from_middle), mode.measured.compose(from_middle), mode.log_mass)

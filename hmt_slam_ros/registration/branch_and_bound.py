@@ -1,9 +1,9 @@
-"""Branch and bound over relative poses: every cell of the search window whose score can matter.
+"""Branch and bound over relative poses: all cells of the search window within a margin of the best score.
 
 The window is a lattice of turns and shifts around the prior's mean. A node is a square of 2^h x 2^h shifts at one turn.
-Its bound reads, for each sample, the largest log-ratio that any of its shifts could read (Olson 2009, Hess et al.
-2016), and adds the largest prior density in the square, so no cell is lost. Unlike those, the search does not stop
-at the best cell: it returns all within a margin of it.
+Its bound is the sum over the samples of the largest log-ratio at any of its shifts (Olson 2009, Hess et al. 2016), plus
+the largest prior density in the square, so no cell is lost. Unlike those, the search returns all cells within a margin
+of the best, not the best alone.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ from hmt_slam_ros.registration.search_bounds import (
 
 
 class PositionConstraint(NamedTuple):
-    """Where a keyframe of the query is, one of them at least.
+    """Cells in which at least one keyframe of the query has to be.
 
-    :ivar allowed: above 0 where it may be, candidate frame.
-    :ivar keyframes: shape (m, 2), positions of the keyframes, m, query frame; none where they may be anywhere.
+    :ivar allowed: above 0 in these cells, candidate frame.
+    :ivar keyframes: shape (m, 2), positions of the keyframes, m, query frame; none without a constraint.
     """
 
     allowed: LogRatioGrid
@@ -42,9 +42,9 @@ class PositionConstraint(NamedTuple):
 
 
 class ConstraintPyramid(NamedTuple):
-    """A ground, as a search asks for it.
+    """A position constraint, prepared for a search.
 
-    :ivar levels: running maxima of its cells, as of :class:`search_bounds.Pyramid`, and their ``margin``.
+    :ivar levels: running maxima of its cells, as in :class:`search_bounds.Pyramid`, with their ``margin``.
     :ivar keyframes: shape (turns, m, 2), column and row of every keyframe without a shift.
     """
 
@@ -54,13 +54,12 @@ class ConstraintPyramid(NamedTuple):
 
 
 def constrain_around(known: Float64, keyframes: Float64, radius: float, cell: float) -> PositionConstraint:
-    """The ground around the positions ``known``, shape (n, 2), m.
+    """The constraint to within ``radius``, m, of the positions ``known``, shape (n, 2), m.
 
     :param keyframes: shape (m, 2), m, query frame.
-    :param radius: how far around, m.
     :param cell: edge of a cell, m.
     """
-    # A keyframe anywhere in a cell may be in reach.
+    # With a keyframe anywhere in a cell.
     reach = radius + cell
     origin = np.floor((known.min(axis=0) - reach) / cell) * cell
     columns, rows = np.ceil((known.max(axis=0) + reach - origin) / cell).astype(np.int64) + 1
@@ -70,19 +69,19 @@ def constrain_around(known: Float64, keyframes: Float64, radius: float, cell: fl
 
 
 def no_constraint(cell: float) -> PositionConstraint:
-    """No limits."""
+    """The constraint that admits all positions."""
     return PositionConstraint(LogRatioGrid(np.zeros((1, 1), np.float32), np.zeros(2), cell), np.zeros((0, 2)))
 
 
-def build_constraint_pyramid(ground: PositionConstraint, window: SearchWindow, height: int) -> ConstraintPyramid:
-    """A ground for a search of a window down from squares of edge ``2**height``."""
-    levels = build_pyramid(ground.allowed.log_ratio, height)
-    return ConstraintPyramid(levels.levels, levels.margin, sample_cells(window, ground.allowed, ground.keyframes))
+def build_constraint_pyramid(constraint: PositionConstraint, window: SearchWindow, height: int) -> ConstraintPyramid:
+    """A constraint for a search of a window down from squares of edge ``2**height``."""
+    pyramid, cells = build_pyramid(constraint.allowed.log_ratio, height), constraint.allowed
+    return ConstraintPyramid(pyramid.levels, pyramid.margin, sample_cells(window, cells, constraint.keyframes))
 
 
 @njit(cache=True)
 def _mark_disks(cells: Float32, known: Float64, reach: float) -> None:
-    """Mark what is within ``reach`` cells of one of the positions ``known``, shape (n, 2), cells."""
+    """Mark the cells within ``reach`` cells of the positions ``known``, shape (n, 2), cells."""
     rows, columns = cells.shape
     for n in range(known.shape[0]):
         x, y = known[n, 0], known[n, 1]
@@ -92,9 +91,9 @@ def _mark_disks(cells: Float32, known: Float64, reach: float) -> None:
 
 
 @njit(cache=True)
-def is_admissible(ground: ConstraintPyramid, height: int, k: int, i: int, j: int) -> bool:
-    """Whether a keyframe is on the ground at turn ``k`` somewhere in the square of shifts that begins at (i, j)."""
-    level, margin, cells = ground.levels[height], ground.margin, ground.keyframes[k]
+def is_admissible(constraint: ConstraintPyramid, height: int, k: int, i: int, j: int) -> bool:
+    """Whether a keyframe meets the constraint at turn ``k`` in the square of shifts that begins at (i, j)."""
+    level, margin, cells = constraint.levels[height], constraint.margin, constraint.keyframes[k]
     rows, columns = np.uint32(level.shape[0]), np.uint32(level.shape[1])
     for n in range(cells.shape[0]):
         x, y = np.uint32(cells[n, 0] + i + margin), np.uint32(cells[n, 1] + j + margin)
@@ -104,13 +103,13 @@ def is_admissible(ground: ConstraintPyramid, height: int, k: int, i: int, j: int
 
 
 class ReverseCheck(NamedTuple):
-    """What is checked.
+    """The check of the candidate's surface points in the free space of the query.
 
     :ivar grid: the query's.
     :ivar points: shape (m, 2), the candidate's surface points, m, candidate frame.
-    :ivar rotated_points: shape (turns, m, 2), the same as the query sees them without a shift, cells of the grid.
-    :ivar negative: of the grid's cells and ``reach`` beyond, whether one within ``reach`` has a log-ratio below 0.
-    :ivar reach: cells by which the shifts of a block move a point from where it lies at its middle, at most, and one.
+    :ivar rotated_points: shape (turns, m, 2), the same in the query's frame without a shift, cells of the grid.
+    :ivar negative: for cells of the grid and ``reach`` beyond, whether a cell within ``reach`` has a log-ratio below 0.
+    :ivar reach: largest distance between a point at a shift of a block and at its middle, plus one, cells.
     """
 
     grid: LogRatioGrid
@@ -130,15 +129,15 @@ def make_reverse_check(window: SearchWindow, grid: LogRatioGrid, points: Float64
 
 @njit(cache=True)
 def _rotate_points(window: SearchWindow, grid: LogRatioGrid, points: Float64) -> Float32:
-    turned = np.empty((window.turns.size, points.shape[0], 2), np.float32)
+    rotated = np.empty((window.turns.size, points.shape[0], 2), np.float32)
     for k in range(window.turns.size):
         angle = window.mean[2] + window.turns[k]
         cos, sin = np.cos(angle) / grid.cell, np.sin(angle) / grid.cell
         for n in range(points.shape[0]):
             x, y = rotate_back(cos, sin, points[n, 0] - window.mean[0], points[n, 1] - window.mean[1])
-            turned[k, n, 0] = x - grid.origin[0] / grid.cell
-            turned[k, n, 1] = y - grid.origin[1] / grid.cell
-    return turned
+            rotated[k, n, 0] = x - grid.origin[0] / grid.cell
+            rotated[k, n, 1] = y - grid.origin[1] / grid.cell
+    return rotated
 
 
 @njit(cache=True)
@@ -159,16 +158,16 @@ def _near_negative(log_ratio: Float32, reach: int) -> Bool:
 
 @njit(cache=True)
 def gather_block_points(check: ReverseCheck, window: SearchWindow, node: tuple[int, int, int], points: Float64) -> int:
-    """Put those that may contradict at a shift of the block that begins at ``node`` into ``points``: how many."""
-    negative, turned = check.negative, check.rotated_points[node[0]]
+    """Write to ``points`` those that may contradict in the block that begins at ``node``; returns their number."""
+    negative, rotated = check.negative, check.rotated_points[node[0]]
     angle, ratio = window.mean[2] + window.turns[node[0]], window.cell / check.grid.cell
     cos, sin = ratio * np.cos(angle), ratio * np.sin(angle)
     x, y = node[1] + 0.5 * (BLOCK - 1), node[2] + 0.5 * (BLOCK - 1)
     across, along = np.float32(check.reach - cos * x - sin * y), np.float32(check.reach - cos * y + sin * x)
     rows, columns = np.uint32(negative.shape[0]), np.uint32(negative.shape[1])
     count = 0
-    for n in range(turned.shape[0]):
-        c, r = np.uint32(np.int32(turned[n, 0] + across)), np.uint32(np.int32(turned[n, 1] + along))
+    for n in range(rotated.shape[0]):
+        c, r = np.uint32(np.int32(rotated[n, 0] + across)), np.uint32(np.int32(rotated[n, 1] + along))
         if c < columns and r < rows and negative[r, c]:
             points[count] = check.points[n]
             count += 1
@@ -179,7 +178,7 @@ def gather_block_points(check: ReverseCheck, window: SearchWindow, node: tuple[i
 def sum_contradictions(
     grid: LogRatioGrid, window: SearchWindow, cell: tuple[int, int, int], points: Float64, least: float
 ) -> float:
-    """Sum of the negative log-ratios that points meet in the query's grid at a cell, as far as to ``least``."""
+    """Sum of the negative log-ratios of points in the query's grid at a cell, stopped below ``least``."""
     angle = window.mean[2] + window.turns[cell[0]]
     cos, sin = np.cos(angle), np.sin(angle)
     x, y = window.mean[0] + cell[1] * window.cell, window.mean[1] + cell[2] * window.cell
@@ -188,23 +187,24 @@ def sum_contradictions(
     for n in range(points.shape[0]):
         if total < least:
             break
-        seen_x, seen_y = rotate_back(cos, sin, points[n, 0] - x, points[n, 1] - y)
-        c = int(np.floor((seen_x - grid.origin[0]) / grid.cell))
-        r = int(np.floor((seen_y - grid.origin[1]) / grid.cell))
+        query_x, query_y = rotate_back(cos, sin, points[n, 0] - x, points[n, 1] - y)
+        c = int(np.floor((query_x - grid.origin[0]) / grid.cell))
+        r = int(np.floor((query_y - grid.origin[1]) / grid.cell))
         if 0 <= c < columns and 0 <= r < rows:
             total += min(np.float32(0.0), grid.log_ratio[r, c])
     return total
 
 
-_MIN_HEIGHT, _MAX_HEIGHT = 2, 5  # heights of the coarsest nodes; of the lowest, the squares are blocks
+_MIN_HEIGHT, _MAX_HEIGHT = 2, 5
+"""Heights of the coarsest nodes; squares of the lowest are blocks."""
 
 
 class SearchCells(NamedTuple):
-    """Cells of the window, in the order in which they were found.
+    """Cells of the window, in the order of the search.
 
     :ivar indices: shape (n, 3), int64, (k, i, j).
     :ivar score: shape (n,), nats: tempered log-ratio plus the prior's exponent.
-    :ivar contradiction: shape (n,), nats, at most 0: the part of the score that the reverse check took.
+    :ivar contradiction: shape (n,), nats, at most 0: the part of the score from the reverse check.
     """
 
     indices: Int64
@@ -213,9 +213,9 @@ class SearchCells(NamedTuple):
 
 
 class _SearchProblem(NamedTuple):
-    """What is searched; the members are the arguments of :func:`search_cells`.
+    """A search problem; the members are the arguments of :func:`search_cells`.
 
-    :ivar cells: where the samples are, see :func:`sample_cells`.
+    :ivar cells: of the samples, see :func:`sample_cells`.
     """
 
     window: SearchWindow
@@ -239,15 +239,15 @@ def search_cells(
     margin: float,
     constraint: PositionConstraint | None = None,
 ) -> SearchCells:
-    """All cells of the window whose score is within ``margin`` of the best and not below ``threshold``.
+    """All cells of the window with a score within ``margin`` of the best and not below ``threshold``.
 
-    :param window: where to search; its cell is that of ``surface``.
+    :param window: the lattice of poses; its cell is that of ``surface``.
     :param surface: the candidate's grid.
     :param samples: shape (n, 2), the query's surface points, m, query frame.
     :param reverse_grid: the query's grid, for the reverse check.
     :param reverse_samples: shape (m, 2), the candidate's surface points, m, candidate frame.
     :param temper: factor on the summed log-ratios.
-    :param constraint: where one of the query's keyframes has to be, if anywhere.
+    :param constraint: limits on the positions of the query's keyframes, if any.
     """
     if (window.first > window.last).any():
         return SearchCells(np.empty((0, 3), dtype=np.int64), np.empty(0), np.empty(0))
@@ -263,14 +263,14 @@ def search_cells(
         temper,
         margin,
     )
-    found = _search_depth_first(task, height, threshold)
-    kept = found[found[:, 3] >= max(threshold, found[:, 3].max(initial=-np.inf) - margin)]
-    return SearchCells(kept[:, :3].astype(np.int64), kept[:, 3].copy(), kept[:, 4].copy())
+    cells = _search_depth_first(task, height, threshold)
+    cells = cells[cells[:, 3] >= max(threshold, cells[:, 3].max(initial=-np.inf) - margin)]
+    return SearchCells(cells[:, :3].astype(np.int64), cells[:, 3].copy(), cells[:, 4].copy())
 
 
 @njit(cache=True)
 def _search_depth_first(task: _SearchProblem, height: int, threshold: float) -> Float64:
-    """Depth first, best bound first: (k, i, j, score, contradiction) of cells, a superset of those wanted."""
+    """Cells (k, i, j, score, contradiction), a superset of the result; depth first, best bound first."""
     nodes, coarse = _coarse_nodes(task, height)
     stack, bounds = np.empty((4 * height + 8, 4), dtype=np.int64), np.empty(4 * height + 8)
     found, count = np.empty((1024, 5)), 0
@@ -295,7 +295,7 @@ def _search_depth_first(task: _SearchProblem, height: int, threshold: float) -> 
 
 @njit(cache=True)
 def _coarse_nodes(task: _SearchProblem, height: int) -> tuple[Int64, Float64]:
-    """The coarsest nodes of all turns: (k, i, j) and their bounds."""
+    """The coarsest nodes (k, i, j) of all turns, and their bounds."""
     window, side = task.window, 2**height
     across, along = (window.last - window.first) // side + 1
     nodes = np.empty((window.turns.size * across * along, 3), dtype=np.int64)
@@ -323,7 +323,7 @@ def _push_quarters(
     height: int,
     least: float,
 ) -> int:
-    """Push those of a node's four squares that may matter, the most promising on top; the new stack size."""
+    """Push a node's four squares with a bound of ``least``, the best on top; returns the new size of the stack."""
     window, side = task.window, 2**height
     k, i, j = node
     steps = quarter_bounds(task.bounds.levels[height], task.bounds.margin, task.cells[k], i, j, side)
@@ -357,9 +357,9 @@ def _push_quarters(
 def _take_cells(
     task: _SearchProblem, node: tuple[int, int, int], points: Float64, found: Float64, count: int, least: float
 ) -> tuple[int, float]:
-    """Append the cells of a block that reach ``least``: how many are found then, and what the next have to reach.
+    """Append the cells of a block with a score of ``least``; returns the number of cells, and the new ``least``.
 
-    :param points: where the block's points are put, no shorter than ``task.reverse.points``.
+    :param points: buffer for the block's points, no shorter than ``task.reverse.points``.
     """
     window = task.window
     near = -1
@@ -376,14 +376,12 @@ def _take_cells(
                 continue
             if near < 0:
                 near = gather_block_points(task.reverse, window, node, points)
-            against = sum_contradictions(
-                task.reverse.grid, window, (k, x, y), points[:near], (least - score) / task.temper
-            )
-            taken = task.temper * against
-            score += taken
+            limit = (least - score) / task.temper
+            contradiction = task.temper * sum_contradictions(task.reverse.grid, window, (k, x, y), points[:near], limit)
+            score += contradiction
             if score >= least:
                 found[count, 0], found[count, 1], found[count, 2] = k, x, y
-                found[count, 3], found[count, 4] = score, taken
+                found[count, 3], found[count, 4] = score, contradiction
                 count += 1
                 least = max(least, score - task.margin)
     return count, least

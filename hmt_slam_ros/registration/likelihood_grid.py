@@ -1,4 +1,4 @@
-"""What the keyframes of an area say of the space around them: surface, free, or unknown, as log-likelihood ratios."""
+"""Likelihood grid of an area: log-likelihood ratios of surface, free and unknown space around its keyframes."""
 
 from __future__ import annotations
 
@@ -16,28 +16,29 @@ from hmt_slam_ros.sensors import Scan
 
 Points = NDArray[np.float64]
 
-# Neighbouring end points of one scan at most this far apart (m) lie on one surface, which is filled in between them.
 _MAX_GAP = 0.3
-# Log-ratio above which a sample is on a known surface, and below which in free space: 0.25 m from a surface and more.
+"""Distance of neighboring end points of a scan up to which the surface between them is filled, m."""
+
 _ON_SURFACE, _IN_FREE_SPACE = 0.3, -0.5
-# Half cells from a sample to the free space on every side of it, where it is said to be in free space.
+"""Log-ratios from which a sample is on a known surface, and in free space: 0.25 m or more from a surface."""
+
 _MARGIN = 3
+"""Distance in which cells on every side of a sample have to be free, so that it is in free space, half cells."""
 
 
 @dataclass(frozen=True)
 class GridModel:
-    """How likely a surface is measured at a place, relative to a place of which nothing is known.
+    """The model of the likelihood of a surface at a place, relative to unknown space.
 
-    A constant p(z | unknown) is no background for a building, where a wall at some distance to the side is what one
-    expects anyway. So ``surface_ratio`` is far below what the sensor's precision would give: it says how much more
-    often a surface is met where the map has one than where the building might have one.
+    A building has walls beside walls, so a constant p(z | unknown) is no background. ``surface_ratio`` is therefore far
+    below that of the sensor's precision: it compares a surface of the map with one that the building might have.
 
     :ivar cell: edge of a cell, m.
     :ivar sigma: deviation of an end point from the surface, m.
     :ivar surface_ratio: p(z | surface at distance 0) / p(z | unknown), above 1.
     :ivar free_ratio: p(z | known free) / p(z | unknown), below 1.
-    :ivar max_range: end points farther than this from the laser are not used, m.
-    :ivar spacing: edge of the voxels that leave one sample each, m.
+    :ivar max_range: largest range of end points, m.
+    :ivar spacing: edge of the voxels, which have one sample each, m.
     """
 
     cell: float = 0.1
@@ -69,11 +70,10 @@ class AreaGrid:
     :ivar cell: edge of a cell, m.
     :ivar log_ratio: shape (rows, columns), float32, indexed [y, x]: log p(z | map) / p(z | unknown) of a surface
         measured in the cell; above 0 near a surface, below 0 in free space, 0 where nothing is known.
-    :ivar fine_log_ratio: shape (2 rows, 2 columns), float32, the same at the centres of cells half as long; smooth
-        enough to be interpolated, and ``log_ratio`` is the mean of four.
+    :ivar fine_log_ratio: shape (2 rows, 2 columns), float32, the same at the centers of cells half as long; smooth
+        enough for interpolation, and ``log_ratio`` is the mean of four.
     :ivar free: shape (rows, columns), whether a beam passed through the cell.
-    :ivar points: shape (n, 2), one surface point a voxel, m, area frame: samples far enough apart to count as
-        independent.
+    :ivar points: shape (n, 2), one surface point per voxel, m, area frame: nearly independent samples.
     """
 
     origin: Points
@@ -85,15 +85,15 @@ class AreaGrid:
 
     @property
     def nbytes(self) -> int:
-        """Memory that the grid takes."""
+        """Memory of the grid, bytes."""
         return self.log_ratio.nbytes + self.fine_log_ratio.nbytes + self.free.nbytes + self.points.nbytes
 
     def shift_origin(self, shift: Points) -> AreaGrid:
-        """The same grid in a frame whose origin lies at ``shift``, shape (2,), of this one and is not turned."""
+        """The same grid in a parallel frame with its origin at ``shift``, shape (2,), of this frame."""
         return replace(self, origin=self.origin - shift, points=self.points - shift)
 
     def compare(self, points: Points, pose: NDArray[np.float64]) -> Agreement:
-        """How surface samples of another map lie in this one.
+        """Agreement of surface samples of another map with this one.
 
         :param points: shape (n, 2), m.
         :param pose: ``grid_T_points``, shape (3,).
@@ -103,29 +103,29 @@ class AreaGrid:
 
 
 def build_area_grid(scans: Sequence[Scan], poses: NDArray[np.float64], model: GridModel) -> AreaGrid:
-    """The grid of the keyframes that were taken at ``poses``.
+    """The grid of keyframes.
 
     :param scans: the keyframes' scans.
     :param poses: shape (len(scans), 3), ``area_T_base``.
     """
-    hits, lasers, of = _end_points(scans, poses, model.max_range)
+    hits, lasers, numbers = _end_points(scans, poses, model.max_range)
     if not len(hits):
         return _empty_grid(model.cell)
     reach = 5.0 * model.sigma
-    everything = np.concatenate((hits, lasers))
-    # The corner is a multiple of the cell, so that grids of one area agree on where cells lie.
-    origin = np.floor((everything.min(axis=0) - reach) / model.cell) * model.cell
-    columns, rows = np.ceil((everything.max(axis=0) + reach - origin) / model.cell).astype(np.int64) + 1
+    points = np.concatenate((hits, lasers))
+    # The corner is a multiple of the cell, so that cells of all grids of an area coincide.
+    origin = np.floor((points.min(axis=0) - reach) / model.cell) * model.cell
+    columns, rows = np.ceil((points.max(axis=0) + reach - origin) / model.cell).astype(np.int64) + 1
     free = np.zeros((rows, columns), dtype=np.bool_)
     _mark_free(free, origin, model.cell, lasers, hits)
     fine = np.full((2 * rows, 2 * columns), np.inf, dtype=np.float32)
-    _lower_distances(fine, origin, 0.5 * model.cell, _fill_gaps(hits, of, 0.5 * model.cell), reach)
+    _lower_distances(fine, origin, 0.5 * model.cell, _fill_gaps(hits, numbers, 0.5 * model.cell), reach)
     _convert_to_log_ratio(fine, free, model.sigma, model.surface_ratio, model.free_ratio)
     return AreaGrid(origin, model.cell, _downsample(fine), fine, free, thin_points(hits, model.spacing))
 
 
 def surface_points(scan: Scan, model: GridModel) -> Points:
-    """The surface points of one scan, one a voxel, m, base frame, shape (n, 2)."""
+    """The surface points of a scan, one per voxel, m, base frame, shape (n, 2)."""
     return thin_points(_end_points([scan], np.zeros((1, 3)), model.max_range)[0], model.spacing)
 
 
@@ -137,15 +137,15 @@ def _empty_grid(cell: float) -> AreaGrid:
 def _end_points(
     scans: Sequence[Scan], poses: NDArray[np.float64], max_range: float
 ) -> tuple[Points, Points, NDArray[np.int64]]:
-    """End points and where the laser was at each of them, area frame, (n, 2), and the scan that each is of, (n,)."""
-    of = np.repeat(np.arange(len(scans)), [len(scan.points) for scan in scans])
+    """End points and the position of the laser at each, area frame, (n, 2), and the number of its scan, (n,)."""
+    numbers = np.repeat(np.arange(len(scans)), [len(scan.points) for scan in scans])
     points, origins = (
         np.concatenate([np.zeros((0, 2)), *parts])
         for parts in ([scan.points for scan in scans], [scan.origins for scan in scans])
     )
     near = np.hypot(*(points - origins).T) <= max_range
-    of = of[near]
-    return se2.transform(poses[of], points[near]), se2.transform(poses[of], origins[near]), of
+    numbers = numbers[near]
+    return se2.transform(poses[numbers], points[near]), se2.transform(poses[numbers], origins[near]), numbers
 
 
 def thin_points(points: Points, spacing: float) -> Points:
@@ -160,32 +160,35 @@ def thin_points(points: Points, spacing: float) -> Points:
 
 
 @njit(cache=True)
-def _fill_gaps(points: Points, of: NDArray[np.int64], step: float) -> Points:
-    """Points in the order of the beams, with the gaps along the surfaces of each scan filled."""
+def _fill_gaps(points: Points, scans: NDArray[np.int64], step: float) -> Points:
+    """Points in the order of the beams, with the gaps along the surfaces of each scan filled.
+
+    :param scans: number of the scan of each point, shape (n,).
+    """
     counts = np.ones(points.shape[0], np.int64)
     for k in range(points.shape[0] - 1):
         length = np.hypot(points[k + 1, 0] - points[k, 0], points[k + 1, 1] - points[k, 1])
-        if of[k] == of[k + 1] and length <= _MAX_GAP:
+        if scans[k] == scans[k + 1] and length <= _MAX_GAP:
             counts[k] = int(np.ceil(length / step))
-    joined = np.empty((counts.sum(), 2))
+    filled = np.empty((counts.sum(), 2))
     place = 0
     for k in range(points.shape[0]):
         for i in range(counts[k]):
-            joined[place] = points[k]
+            filled[place] = points[k]
             if i > 0:
-                joined[place] += (points[k + 1] - points[k]) * (i / counts[k])
+                filled[place] += (points[k + 1] - points[k]) * (i / counts[k])
             place += 1
-    return joined
+    return filled
 
 
 @njit(cache=True)
 def _convert_to_log_ratio(
     fine: NDArray[np.float32], free: NDArray[np.bool_], sigma: float, surface_ratio: float, free_ratio: float
 ) -> None:
-    """From squared distances, for cells half as long as those of ``free``: a blend from the surface to what is beside.
+    """Convert squared distances, in cells half as long as those of ``free``, to a blend of surface and free space.
 
-    Free space counts in full only from two or three sigma on: beams that graze a wall see free space right up to it,
-    and unlike flanks would draw a match away from the wall.
+    Free space counts in full from two or three sigma on: beams that graze a wall see free space right up to it, and
+    unequal flanks would pull a match away from the wall.
     """
     log_free, far = np.log(free_ratio), np.float32(14.0 * sigma**2)
     for r in range(fine.shape[0]):
@@ -214,7 +217,7 @@ def _downsample(fine: NDArray[np.float32]) -> NDArray[np.float32]:
 
 @njit(cache=True)
 def _mark_free(free: NDArray[np.bool_], origin: Points, cell: float, lasers: Points, points: Points) -> None:
-    """Mark the cells between the laser and one cell before each end point."""
+    """Mark the cells from the laser to one cell before each end point."""
     for k in range(points.shape[0]):
         x0, y0 = (lasers[k, 0] - origin[0]) / cell, (lasers[k, 1] - origin[1]) / cell
         dx = (points[k, 0] - origin[0]) / cell - x0
@@ -226,7 +229,7 @@ def _mark_free(free: NDArray[np.bool_], origin: Points, cell: float, lasers: Poi
 
 @njit(cache=True)
 def _lower_distances(distance2: NDArray[np.float32], origin: Points, cell: float, points: Points, reach: float) -> None:
-    """Lower every cell near a point to the squared distance from its centre to that point, m^2."""
+    """Lower every cell near a point to the squared distance from its center to that point, m^2."""
     span = int(np.ceil(reach / cell))
     rows, columns = distance2.shape
     area, squares = np.float32(cell * cell), np.empty(2 * span + 1, np.float32)
@@ -239,8 +242,8 @@ def _lower_distances(distance2: NDArray[np.float32], origin: Points, cell: float
             squares[c] = (np.float32(c) - left) * (np.float32(c) - left)
         for r in range(max(0, row - span), min(rows, row + span + 1)):
             up = np.float32((r - y) ** 2)
-            # A part whose index begins at 0, and a choice instead of a branch: the compiler takes eight cells at once.
-            # The 0 keeps it from storing under a mask, which takes AMD's processors ten times as long.
+            # A slice, and a choice instead of a branch, so that the compiler vectorizes. The added 0 prevents a masked
+            # store, which is ten times slower on AMD's processors.
             part = distance2[r, first:last]
             for c in range(last - first):
                 d2 = (squares[c] + up) * area
@@ -260,6 +263,6 @@ def _count_agreement(points: Points, fine: NDArray[np.float32], origin: Points, 
 
 @njit(cache=True)
 def _free_around(fine: NDArray[np.float32], row: int, column: int) -> bool:
-    """Whether it is free to all sides: along the edge of what a beam passed there may be a wall that it grazed."""
+    """Whether it is free on all sides: at the edge of free space there may be a wall that a beam grazed."""
     across = max(fine[row, column - _MARGIN], fine[row, column + _MARGIN])
     return bool(max(across, fine[row - _MARGIN, column], fine[row + _MARGIN, column]) < _IN_FREE_SPACE)

@@ -1,19 +1,17 @@
-"""How far off a match against the map is, and how much of that lasts.
+"""The error of a match with the map, and the part of it that adds to the drift.
 
-The information H of a match takes beams for independent. They are not: a wall that a grid has half a cell off misleads
-all beams that hit it, and so does a cupboard that was moved. How much they mislead shows in the match itself. Blocks of
-neighbouring beams each pull with a gradient g; were their errors independent, the sum over the beams of g g^T would be
-H, and the sum over the blocks, J, is what it really is (the sandwich covariance of Huber 1967, by clusters). With the
-prediction's information P, of which the match is believed 1 / c of its H, the estimate has
+The information H of a match takes beams for independent. They are not: an error of the map misleads all beams that hit
+the same wall. Blocks of neighboring beams each have a gradient g. With independent errors, the sum of g g^T over the
+beams is H; the sum over the blocks, J, is the measured one (the sandwich covariance of Huber 1967, by clusters). With
+the information P of the prediction and the inflation c of the match,
 
     S = (P + H / c)^-1,    covariance S (P + (a H + b J) / c^2) S.
 
-What lasts of it is less, as the map is older than the last scan: a keyframe is laid onto what several before it made,
-its own error has the weight of one of them, and the next keyframe corrects it. Of the error of step k, k + n has
+Later keyframes correct a part of this error, since several earlier keyframes made the map. The remaining part is
 
     (1 + (m - 1) A)^-1,    A = S H / c,
 
-where m is the age of the map in keyframes, and all of it along directions A in which the match says nothing.
+where m is the age of the map in keyframes. Along directions that the match does not determine, all of it remains.
 """
 
 from __future__ import annotations
@@ -28,16 +26,16 @@ from hmt_slam_ros.geometry.covariance import inverse, rotate_covariance
 from hmt_slam_ros.grids.patches import GridView
 from hmt_slam_ros.registration.scan_to_map import AlignmentSettings, linearize
 
-# Neighbouring beams in a block: what is wrong with one is wrong with all.
 _BLOCK = 16
+"""Neighboring beams in a block, whose errors are common."""
 
 
 class MatchNoise(NamedTuple):
-    """What the errors of matches are taken to be.
+    """The model of the errors of matches.
 
-    :ivar beam_noise: a, the part of the information that is noise of single beams.
-    :ivar block_noise: b, the weight of what blocks of beams show.
-    :ivar map_age: m, of the map that a keyframe is matched against, in keyframes.
+    :ivar beam_noise: a, weight of the noise of single beams.
+    :ivar block_noise: b, weight of the scatter of blocks of beams.
+    :ivar map_age: m, age of the map with which a keyframe is matched, in keyframes.
     """
 
     beam_noise: float
@@ -49,8 +47,8 @@ class MatchError(NamedTuple):
     """Covariances (3, 3) of a matched step, in the frame of its end.
 
     :ivar pose_covariance: of the pose in the map.
-    :ivar drift_covariance: of what the pose adds to the drift of all poses after it.
-    :ivar gain: A, how much of the pose the match determines.
+    :ivar drift_covariance: of the part that adds to the drift of all later poses.
+    :ivar gain: A, the share of the pose that the match determines.
     """
 
     pose_covariance: Float64
@@ -79,11 +77,11 @@ def estimate_match_error(
     _add_scatter(points, pose, view, settings, scatter)
     prior, hessian, scatter = (rotate_covariance(matrix, -pose[2]) for matrix in (prior, hessian, scatter))
     spread = inverse(prior + share * hessian)
-    pulled = share * share * (noise.beam_noise * hessian + noise.block_noise * scatter)
-    matched = spread @ (prior + pulled) @ spread
+    noise_information = share * share * (noise.beam_noise * hessian + noise.block_noise * scatter)
+    covariance = spread @ (prior + noise_information) @ spread
     gain = spread @ (share * hessian)
-    lasts = np.linalg.inv(np.eye(3) + (noise.map_age - 1.0) * gain)
-    return MatchError(matched, lasts @ matched @ lasts.T, gain)
+    remaining = np.linalg.inv(np.eye(3) + (noise.map_age - 1.0) * gain)
+    return MatchError(covariance, remaining @ covariance @ remaining.T, gain)
 
 
 @njit(cache=True)

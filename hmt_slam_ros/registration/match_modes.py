@@ -1,4 +1,4 @@
-"""From the cells that a search kept to modes: clusters, their mass by quadrature, their peak and its curvature."""
+"""Modes of a match from the cells of a search: clusters, their mass by quadrature, peak and curvature."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from hmt_slam_ros.geometry.se2 import rotate_back, transform_point
 from hmt_slam_ros.registration.branch_and_bound import SearchCells
 from hmt_slam_ros.registration.search_bounds import LogRatioGrid, SearchWindow
 
-# Of a search's cells, at most this many are divided for the quadrature; the others count with their centre alone.
 _DIVIDED = 400
+"""Cells that are divided for the quadrature, the highest ones; all others count by their center."""
 
 
 def cluster_cells(cells: SearchCells, saddle: float) -> Int64:
     """The cluster of every cell, shape (n,), numbered from 0 by falling height of the peaks.
 
-    Two peaks stay apart where the lower one rises by more than ``saddle`` nats above the pass between them.
+    Two peaks are two clusters if the lower one is more than ``saddle`` nats above the pass between them.
     """
     order = np.argsort(-cells.score, kind="stable")
     at = cells.indices - cells.indices.min(axis=0) + 1
@@ -37,7 +37,7 @@ def cluster_cells(cells: SearchCells, saddle: float) -> Int64:
 
 @njit(cache=True)
 def _flood_from_peaks(order: Int64, by_key: Int64, keys: Int64, sides: Int64, score: Float64, saddle: float) -> Int64:
-    """Flood from the top: the peak (a cell) that every cell belongs to.
+    """The peak (a cell) to which every cell belongs, by flooding from the top.
 
     :param keys: ascending, of the cells ``by_key``.
     """
@@ -58,7 +58,7 @@ def _flood_from_peaks(order: Int64, by_key: Int64, keys: Int64, sides: Int64, sc
 @njit(cache=True)
 def _rows_around(keys: Int64, sides: Int64) -> Int32:
     """The cells around every cell, by key: first and last + 1 in each of nine rows of three, shape (n, 9, 2)."""
-    found = np.empty((keys.size, 9, 2), np.int32)
+    rows = np.empty((keys.size, 9, 2), np.int32)
     for row in range(9):
         middle = ((row // 3 - 1) * sides[1] + row % 3 - 1) * sides[2]
         first, last = 0, 0
@@ -67,8 +67,8 @@ def _rows_around(keys: Int64, sides: Int64) -> Int32:
                 first += 1
             while last < keys.size and keys[last] <= keys[n] + middle + 1:
                 last += 1
-            found[n, row, 0], found[n, row, 1] = first, last
-    return found
+            rows[n, row, 0], rows[n, row, 1] = first, last
+    return rows
 
 
 @njit(cache=True)
@@ -81,7 +81,7 @@ def _peak_of(above: Int64, cell: int) -> int:
 
 @njit(cache=True)
 def _merge_peaks(above: Int64, cell: int, other: int, score: Float64, saddle: float) -> None:
-    """Give the lower of two peaks that meet at ``cell`` to the higher, unless it stands out."""
+    """Merge two peaks that meet at ``cell`` into the higher, unless the lower is prominent."""
     a, b = _peak_of(above, cell), _peak_of(above, other)
     if score[a] < score[b] or (score[a] == score[b] and a > b):
         a, b = b, a
@@ -90,11 +90,11 @@ def _merge_peaks(above: Int64, cell: int, other: int, score: Float64, saddle: fl
 
 
 class _GridSamples(NamedTuple):
-    """Samples, and where they lie in a grid of cells (n,).
+    """Samples, and their positions in a grid.
 
     :ivar x: shape (n,), m, as ``y``.
-    :ivar column: shape (n,), of the cell whose centre is to the left; ``row``, of that which is above.
-    :ivar right: shape (n,), distance from that centre, cells; ``down``, the same.
+    :ivar column: shape (n,), of the cell whose center is to the left; ``row``, of the cell above.
+    :ivar right: shape (n,), distance from that center, cells; ``down``, the same.
     """
 
     x: Float64
@@ -108,14 +108,8 @@ class _GridSamples(NamedTuple):
 @njit(cache=True)
 def _grid_samples(samples: Float64) -> _GridSamples:
     n = samples.shape[0]
-    return _GridSamples(
-        samples[:, 0].copy(),
-        samples[:, 1].copy(),
-        np.empty(n, np.int32),
-        np.empty(n, np.int32),
-        np.empty(n),
-        np.empty(n),
-    )
+    x, y = samples[:, 0].copy(), samples[:, 1].copy()
+    return _GridSamples(x, y, np.empty(n, np.int32), np.empty(n, np.int32), np.empty(n), np.empty(n))
 
 
 @njit(cache=True)
@@ -130,7 +124,7 @@ def log_ratio_at(surface: LogRatioGrid, samples: Float64, pose: Float64) -> floa
 
 @njit(cache=True)
 def _log_ratio_at(surface: LogRatioGrid, points: _GridSamples, pose: Float64) -> float:
-    """In two loops, as the compiler takes several samples at once in the first."""
+    """:func:`log_ratio_at` of prepared samples, in two loops: the compiler vectorizes the first."""
     cos, sin = np.cos(pose[2]), np.sin(pose[2])
     x0, y0 = pose[0] - surface.origin[0], pose[1] - surface.origin[1]
     for n in range(points.x.size):
@@ -173,28 +167,27 @@ def _score_at(surface: LogRatioGrid, points: _GridSamples, window: SearchWindow,
 def integrate_cells(
     surface: LogRatioGrid, samples: Float64, window: SearchWindow, cells: SearchCells, temper: float
 ) -> tuple[Float64, Float64]:
-    """log of the mean of exp(score) over every cell, shape (n,), and the best pose found in it, shape (n, 3).
+    """Log of the mean of exp(score) over every cell, shape (n,), and the best pose in it, shape (n, 3).
 
-    The cells are divided as finely as the narrower of prior and likelihood asks for.
+    Cells are divided by the deviations of the prior: more where the prior is narrower than a cell.
     """
     widths = 1.0 / np.linalg.norm(window.information_root, axis=0)  # conditional deviations of the prior
-    divisions = np.array(
-        [_division_count(window.cell / widths[:2].min()), _division_count(_turn_step(window) / widths[2])]
-    )
-    order = np.argsort(-cells.score, kind="stable")
+    turn = turn_step(window)
+    divisions = np.array([_division_count(window.cell / widths[:2].min()), _division_count(turn / widths[2])])
     means, poses = cells.score.copy(), _cell_centers(window, cells)
-    inside = order[:_DIVIDED]
-    fine = _integrate_divided(surface, samples, window, temper, poses[inside], divisions, _turn_step(window))
-    means[inside], poses[inside] = fine[0] + cells.contradiction[inside], fine[1]
+    divided = np.argsort(-cells.score, kind="stable")[:_DIVIDED]
+    fine = _integrate_divided(surface, samples, window, temper, poses[divided], divisions, turn)
+    means[divided], poses[divided] = fine[0] + cells.contradiction[divided], fine[1]
     return means, poses
 
 
-def _turn_step(window: SearchWindow) -> float:
+def turn_step(window: SearchWindow) -> float:
+    """The angle between two turns of a window, rad; 0 for a single turn."""
     return float(window.turns[1] - window.turns[0]) if window.turns.size > 1 else 0.0
 
 
 def _division_count(ratio: float) -> int:
-    """3, 5 or 7 divisions, so that a step is at most 1.5 of the prior's deviations where that is possible."""
+    """3, 5 or 7 divisions, so that a step is 1.5 deviations of the prior at most, where possible."""
     return 3 if ratio <= 4.5 else (5 if ratio <= 7.5 else 7)
 
 
@@ -211,20 +204,20 @@ def _integrate_divided(
     samples: Float64,
     window: SearchWindow,
     temper: float,
-    centres: Float64,
+    centers: Float64,
     divisions: Int64,
     turn: float,
 ) -> tuple[Float64, Float64]:
     count, turns = divisions
-    means, best = np.empty(centres.shape[0]), centres.copy()
+    means, best = np.empty(centers.shape[0]), centers.copy()
     points, scores = _grid_samples(samples), np.empty(count * count * turns)
     pose = np.empty(3)
-    for n in range(centres.shape[0]):
+    for n in range(centers.shape[0]):
         top = -np.inf
         for s in range(scores.size):
-            pose[0] = centres[n, 0] + window.cell * ((s % count + 0.5) / count - 0.5)
-            pose[1] = centres[n, 1] + window.cell * ((s // count % count + 0.5) / count - 0.5)
-            pose[2] = centres[n, 2] + turn * ((s // (count * count) + 0.5) / turns - 0.5)
+            pose[0] = centers[n, 0] + window.cell * ((s % count + 0.5) / count - 0.5)
+            pose[1] = centers[n, 1] + window.cell * ((s // count % count + 0.5) / count - 0.5)
+            pose[2] = centers[n, 2] + turn * ((s // (count * count) + 0.5) / turns - 0.5)
             scores[s] = _score_at(surface, points, window, temper, pose)
             if scores[s] > top:
                 top = scores[s]
@@ -243,7 +236,7 @@ def climb_to_peak(
     step: Float64,
     finest: float,
 ) -> Float64:
-    """The highest pose near ``start``, by a pattern search over the 26 neighbours with halving steps.
+    """The highest pose near ``start``, by a pattern search over the 26 neighbors with halving steps.
 
     :param step: shape (3,), first steps in m, m and rad.
     :param finest: smallest share of the first steps.
@@ -252,10 +245,10 @@ def climb_to_peak(
     best, height = start.copy(), _score_at(surface, points, window, temper, start)
     share = 1.0
     while share >= finest:
-        centre = best.copy()
+        center = best.copy()
         moved = False
         for s in range(27):
-            pose = centre + share * step * np.array((s % 3 - 1.0, s // 3 % 3 - 1.0, s // 9 - 1.0))
+            pose = center + share * step * np.array((s % 3 - 1.0, s // 3 % 3 - 1.0, s // 9 - 1.0))
             score = _score_at(surface, points, window, temper, pose)
             if score > height:
                 best, height, moved = pose, score, True

@@ -1,8 +1,8 @@
-"""Scan to map: likelihood, and Gauss-Newton on the distance field, for one pose or a batch of particles.
+"""Scan to map: likelihood, Gauss-Newton on the distance field, and a search where the prior is wide.
 
 Poses are ``map_T_base`` (x, y, theta); points are (n, 2) in m in the base frame, surfels (n, 4) points with normals
-(``sensors/scan.py``), which serve wherever points do. The likelihood of a beam is taken
-relative to unknown space, so that 0 means "nothing known here", and maps of different extent compare.
+(``sensors/scan.py``), which serve wherever points do. The likelihood of a beam is relative to unknown space: 0 means
+"nothing known here", and maps of different extent compare.
 """
 
 from __future__ import annotations
@@ -28,17 +28,18 @@ from hmt_slam_ros.geometry.covariance import (
 from hmt_slam_ros.geometry.se2 import rotate, transform_point, wrap_by_modulus
 from hmt_slam_ros.grids.patches import FAR, PATCH, GridView, field_at, field_at_four, odds_at
 
-# Distance from its surface at which a point in unknown space counts, as a share of the robust scale.
 _UNKNOWN_DISTANCE = 0.6
-# Cells from a point to the free space on every side of it, where it is said to be in free space.
+"""Distance from a surface that a point in unknown space has in the misfit, as a share of the robust scale."""
+
 _MARGIN = 3
+"""Distance in which cells on every side of a point have to be free, so that the point is in free space, cells."""
 
 
 class BeamModel(NamedTuple):
-    """Log-likelihood ratio of an end point, tabulated over the quantised distance to the nearest surface.
+    """Log-likelihood ratio of an end point, tabulated over the quantized distance to the nearest surface.
 
-    :ivar in_unknown: shape (256,), nats, where the cell of the end point was never seen.
-    :ivar in_known: shape (256,), nats, where it was: far from surfaces the map contradicts the beam.
+    :ivar in_unknown: shape (256,), nats, in cells never seen.
+    :ivar in_known: shape (256,), nats, in all other cells: far from surfaces the map contradicts the beam.
     """
 
     in_unknown: Float64
@@ -57,11 +58,11 @@ class Prior(NamedTuple):
 
 
 class AlignmentSettings(NamedTuple):
-    """How Gauss-Newton weighs the beams.
+    """The weights of beams in Gauss-Newton.
 
     :ivar sigma: deviation of an end point from its surface, m.
     :ivar robust_scale: scale of the Cauchy weight, m.
-    :ivar inflation: of how many beams only one tells something of its own; the prior outweighs the others.
+    :ivar inflation: number of correlated beams that count as one.
     :ivar iterations: steps at most.
     """
 
@@ -104,7 +105,7 @@ def log_ratio(points: Float64, x: float, y: float, theta: float, view: GridView,
 
 @njit(cache=True)
 def matched_fraction(points: Float64, pose: Float64, view: GridView, near: int) -> float:
-    """Share of the points whose quantised distance to a surface is below ``near``."""
+    """Share of the points whose quantized distance to a surface is below ``near``."""
     cos, sin = np.cos(pose[2]) / view.cell, np.sin(pose[2]) / view.cell
     half = 0.5 * view.table.shape[0] * PATCH
     u, v = pose[0] / view.cell + half, pose[1] / view.cell + half
@@ -118,9 +119,9 @@ def matched_fraction(points: Float64, pose: Float64, view: GridView, near: int) 
 
 @njit(cache=True)
 def count_agreement(points: Float64, pose: Float64, view: GridView, near: int, far: int) -> tuple[int, int]:
-    """How many of the points are on a known surface, and how many in space that is known to be free.
+    """The number of points on known surfaces, and of those in known free space.
 
-    :param near: quantised distance to a surface below which a point is on it; ``far``: from which it is off.
+    :param near: quantized distance to a surface below which a point is on it; ``far``: from which it is not.
     """
     cos, sin = np.cos(pose[2]), np.sin(pose[2])
     half = 0.5 * view.table.shape[0] * PATCH
@@ -136,14 +137,14 @@ def count_agreement(points: Float64, pose: Float64, view: GridView, near: int, f
 
 @njit(cache=True)
 def _is_surrounded_by_free(view: GridView, column: int, row: int) -> bool:
-    """Whether it is free to all sides: along the edge of what a beam passed there may be a wall that it grazed."""
+    """Whether it is free on all sides: at the edge of free space there may be a wall that a beam grazed."""
     across = max(odds_at(view, column - _MARGIN, row), odds_at(view, column + _MARGIN, row))
     return bool(max(across, odds_at(view, column, row - _MARGIN), odds_at(view, column, row + _MARGIN)) < 0)
 
 
 @njit(cache=True)
 def log_prior(pose: Float64, prior: Prior) -> float:
-    """-1/2 of the squared Mahalanobis distance, without the normaliser."""
+    """-1/2 of the squared Mahalanobis distance, without the normalizer."""
     difference = pose_difference(pose[0], pose[1], pose[2], prior.mean)
     return -0.5 * dot(difference, multiply(symmetric_from_array(prior.information), difference))
 
@@ -186,7 +187,7 @@ def linearize(
 ) -> tuple[Symmetric, Vector, float]:
     """Normal equations of the surfels (n, 4) at the pose (x, y, theta): J' W J and J' W r; and r' W r.
 
-    Distance and gradient of a point on a surface count by what they have in the direction of its normal.
+    Of the distance and gradient of a point with a normal, the component along the normal counts.
     """
     half = 0.5 * view.table.shape[0] * PATCH - 0.5
     quantum = view.radius / FAR
@@ -223,10 +224,10 @@ def linearize(
 
 @njit(cache=True)
 def misfit(points: Float64, pose: Float64, prior: Prior, view: GridView, settings: AlignmentSettings) -> float:
-    """What :func:`align` minimises, at a pose, nats; but a point counts by its distance in any direction.
+    """The cost that :func:`align` minimizes, at a pose, nats, but with distances in any direction.
 
-    One in unknown space counts as if its surface were at ``_UNKNOWN_DISTANCE``: were it worse, new space ahead would
-    draw the robot back, were it better, nothing would keep it in the map.
+    A point in unknown space has ``_UNKNOWN_DISTANCE``: with more, new space ahead would pull the robot back, with less,
+    nothing would keep it in the map.
 
     :param points: (n, 2) or surfels (n, 4).
     """
@@ -250,7 +251,7 @@ def align(
 ) -> tuple[Float64, Float64]:
     """Gauss-Newton on the distance field with a Gaussian prior.
 
-    Minimises sum rho(d(T p)^2) / (inflation sigma^2) + (T - prior)' information (T - prior), rho being Cauchy's.
+    Minimizes sum rho(d(T p)^2) / (inflation sigma^2) + (T - prior)' information (T - prior), rho being Cauchy's.
 
     :param points: surfels (n, 4).
     :param start: (3,) pose to start from.
@@ -273,18 +274,18 @@ def align_into(
 ) -> None:
     """:func:`align` with its results written into ``mode`` and ``hessian``."""
     if points.shape[1] != 4:
-        raise ValueError("points are aligned with their normals: give surfels (n, 4)")
+        raise ValueError("points are aligned with their normals: pass surfels (n, 4)")
     x, y, theta = start[0], start[1], start[2]
     known, information = symmetric_from_array(prior.information), Symmetric(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     for _ in range(settings.iterations):
         information, gradient, _ = linearize(points, x, y, theta, view, settings)
-        held = multiply(known, pose_difference(x, y, theta, prior.mean))
-        slope = (
-            gradient[0] + settings.inflation * held[0],
-            gradient[1] + settings.inflation * held[1],
-            gradient[2] + settings.inflation * held[2],
+        by_prior = multiply(known, pose_difference(x, y, theta, prior.mean))
+        total = (
+            gradient[0] + settings.inflation * by_prior[0],
+            gradient[1] + settings.inflation * by_prior[1],
+            gradient[2] + settings.inflation * by_prior[2],
         )
-        step = solve(add_scaled(information, known, settings.inflation), slope)
+        step = solve(add_scaled(information, known, settings.inflation), total)
         x, y, theta = x - step[0], y - step[1], theta - step[2]
         if abs(step[0]) + abs(step[1]) < 1e-4 and abs(step[2]) < 1e-4:
             break
@@ -323,11 +324,11 @@ def propose_all(
 ) -> Proposals:
     """The optimal proposal of every particle, p(x_t | x_{t-1}, u, z, map), as a Gaussian around its mode.
 
-    Its covariance is that of Gauss-Newton, which asks of each beam only what the surface that it hit can tell. The
-    likelihood itself would not do: along a corridor it varies with the cells of the map, and not with the pose.
+    Its covariance is that of Gauss-Newton, in which each beam informs the pose along its normal. The likelihood would
+    not do: along a corridor it varies with the cells of the map, not with the pose.
 
-    :param points: surfels (n, 4), which all count as evidence.
-    :param static_points: surfels (k, 4), those of them that are matched.
+    :param points: surfels (n, 4) for the evidence.
+    :param static_points: surfels (k, 4) among them for the match.
     :param starts: (m, 3) poses to start matching from; ``priors``: (m, 3) poses that odometry predicts.
     :param tables: (m, T, T), the particles' maps; ``view`` is any view of the same pool.
     :param sharpness: exponent on the likelihood in the proposal.
@@ -344,7 +345,7 @@ def propose_all(
         write_to_array(
             symmetric_inverse(add_scaled(known, symmetric_from_array(hessians[i]), sharpness)), covariances[i]
         )
-    # In a loop of its own: together with two arrays of points the compiler makes the alignment half as fast.
+    # In a separate loop: with two arrays of points in one loop, the compiled alignment is half as fast.
     for i in range(m):
         own = GridView(tables[i], view.odds, view.field, view.cell, view.radius)
         prior = Prior(priors[i], information)
@@ -353,7 +354,7 @@ def propose_all(
 
 
 class Lattice(NamedTuple):
-    """The poses that a search tries: around a centre, along the axes of the map and in heading.
+    """The poses of a search: around a center, along the axes of the map and in heading.
 
     :ivar stride: from one pose to the next, cells.
     :ivar turn: from one heading to the next, rad.
@@ -372,7 +373,7 @@ def correlative_search(
     """The highest peaks of tempered likelihood ratio times prior on a lattice around the prior's mean (Olson 2009).
 
     :param most: how many peaks at most.
-    :returns: (k, 3) poses, the best first; no two are neighbours or neighbours' neighbours on the lattice.
+    :returns: (k, 3) poses, the best first, at least three steps of the lattice apart.
     """
     counts = lattice.counts
     sizes = (2 * counts[0] + 1, 2 * counts[1] + 1, 2 * counts[2] + 1)
@@ -405,7 +406,7 @@ def _find_cells(points: Float64, x: float, y: float, theta: float, view: GridVie
 
 @njit(cache=True)
 def _log_ratio_of_cells(columns: Int64, rows: Int64, right: int, up: int, view: GridView, model: BeamModel) -> float:
-    """Sum of the log-likelihood ratios of end points in these cells, all shifted, nats."""
+    """Sum of the log-likelihood ratios of end points in cells that are all shifted alike, nats."""
     total = 0.0
     for n in range(columns.size):
         distance = field_at(view, columns[n] + right, rows[n] + up)
@@ -417,18 +418,18 @@ def _log_ratio_of_cells(columns: Int64, rows: Int64, right: int, up: int, view: 
 
 
 @njit(cache=True)
-def _extract_peaks(scores: Float64, centre: Float64, lattice: Lattice, cell: float, most: int) -> Float64:
-    """The poses (k, 3) of the highest scores, each at least three steps from those before it; empties ``scores``."""
-    found = np.empty((most, 3))
+def _extract_peaks(scores: Float64, center: Float64, lattice: Lattice, cell: float, most: int) -> Float64:
+    """The poses (k, 3) of the highest scores, at least three steps apart; overwrites ``scores``."""
+    peaks = np.empty((most, 3))
     counts, apart = lattice.counts, lattice.stride * cell
     for n in range(most):
         best = np.argmax(scores)
         i, rest = divmod(best, scores.shape[1] * scores.shape[2])
         j, k = divmod(rest, scores.shape[2])
         if scores[i, j, k] == -np.inf:
-            return found[:n]
-        found[n, 0] = centre[0] + apart * (i - counts[0])
-        found[n, 1] = centre[1] + apart * (j - counts[1])
-        found[n, 2] = centre[2] + lattice.turn * (k - counts[2])
+            return peaks[:n]
+        peaks[n, 0] = center[0] + apart * (i - counts[0])
+        peaks[n, 1] = center[1] + apart * (j - counts[1])
+        peaks[n, 2] = center[2] + lattice.turn * (k - counts[2])
         scores[max(0, i - 2) : i + 3, max(0, j - 2) : j + 3, max(0, k - 2) : k + 3] = -np.inf
-    return found
+    return peaks

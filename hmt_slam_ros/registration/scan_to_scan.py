@@ -1,7 +1,7 @@
-"""Scan to scan: point-to-line registration of scans as surfaces, many pairs in one compiled call.
+"""Scan to scan: point-to-line registration of scans, many pairs in one compiled call.
 
-The error of a point p of one scan that meets the wall point q of another, with normal n, is n^T (T p - q) with T the
-pose of the one scan seen from the other; Cauchy's weight takes what does not fit out.
+A point p of one scan is paired with a wall point q of another, with normal n. Its error is n^T (T p - q), with T the
+pose of the first scan in the other. Outliers have a small Cauchy weight.
 """
 
 from __future__ import annotations
@@ -18,22 +18,31 @@ from hmt_slam_ros.geometry.se2 import rotate_back, transform_point
 from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.sensors.scan import FlatnessLimits, fit_surface, running_sums
 
-# A wall piece is fitted to the points within this reach of a point, or within three beams at one degree where that is
-# more, on at most so many beams to each side.
-_REACH, _REACH_PER_METRE, _BEAMS = 0.25, 0.045, 8
+_REACH, _REACH_PER_METER, _BEAMS = 0.25, 0.045, 8
+"""Distance to each side of a point within which a wall is fitted, m, and as a share of the range (three beams at one
+degree) where that is more; and largest number of beams to each side."""
+
 _FLATNESS = FlatnessLimits(0.04, 0.5)
+"""Limits for walls."""
+
+_MAX_BINS = 20
+"""Bins of bearing that are searched to each side at most."""
+
+_SAME_WALL = 0.7
+"""Cosine of the angle between two normals from which they are of the same wall."""
+
 _EMPTY = -1
 
 
 class ScanSurfaces(NamedTuple):
-    """The end points of n scans, one scan after the other in the order of their beams.
+    """The end points of n scans, concatenated in the order of their beams.
 
     :ivar starts: shape (n + 1,), scan i has the points ``starts[i]`` to before ``starts[i + 1]``.
     :ivar points: shape (k, 2), m, base frame of their scan.
     :ivar normals: shape (k, 2), unit vectors towards the laser.
-    :ivar is_flat: shape (k,), whether the point lies on a piece of wall, so that its normal means something.
-    :ivar lasers: shape (n, 2), m, where the lasers stood in the base frames.
-    :ivar bins: shape (b,), the point seen in each bin of bearing, -1 for none; of several the nearest.
+    :ivar is_flat: shape (k,), whether the point is on a wall and has a normal.
+    :ivar lasers: shape (n, 2), m, positions of the lasers in the base frames.
+    :ivar bins: shape (b,), the nearest point in each bin of bearing, -1 for none.
     :ivar bin_starts: shape (n + 1,), scan i has the bins ``bin_starts[i]`` to before ``bin_starts[i + 1]``; they
         divide the full circle evenly from bearing 0 on.
     """
@@ -48,21 +57,20 @@ class ScanSurfaces(NamedTuple):
 
 
 def extract_surfaces(scans: Sequence[Scan], max_range: float, max_points: int) -> ScanSurfaces:
-    """Find the surfaces of scans.
+    """The surfaces of scans.
 
-    :param max_range: returns from farther away are left out, m.
-    :param max_points: of each scan at most so many points are kept, evenly thinned; normals are fitted to all.
+    :param max_range: largest range of points, m.
+    :param max_points: largest number of points of a scan, evenly thinned; normals are fitted to all points.
     """
     points, normals, flat, resolution = [], [], [], []
     for scan in scans:
-        seen = scan.points
-        near = np.hypot(*(seen - scan.laser_pose[:2]).T) <= max_range
-        seen = np.ascontiguousarray(seen[near])
-        found, on_wall = _fit_normals(seen, scan.laser_pose[:2].copy())
-        stride = max(1, -(-len(seen) // max_points))
-        points.append(seen[::stride])
-        normals.append(found[::stride])
-        flat.append(on_wall[::stride])
+        near = np.hypot(*(scan.points - scan.laser_pose[:2]).T) <= max_range
+        ends = np.ascontiguousarray(scan.points[near])
+        fitted, is_flat = _fit_normals(ends, scan.laser_pose[:2].copy())
+        stride = max(1, -(-len(ends) // max_points))
+        points.append(ends[::stride])
+        normals.append(fitted[::stride])
+        flat.append(is_flat[::stride])
         resolution.append(max(1, int(2.0 * np.pi / (abs(scan.angle_increment) * stride or 2.0 * np.pi))))
     starts = _offsets([len(part) for part in points])
     bin_starts = _offsets(resolution)
@@ -85,13 +93,13 @@ def _offsets(counts: Sequence[int]) -> Int64:
 
 @njit(cache=True)
 def _fit_normals(points: Float64, laser: Float64) -> tuple[Float64, Bool]:
-    """Normals (n, 2) of the wall pieces around the points, and whether there is one (n,)."""
+    """Normals (n, 2) of the walls around the points, and whether there is a wall (n,)."""
     normals, flat, normal = np.zeros_like(points), np.zeros(len(points), np.bool_), np.empty(2)
     beams = points - laser
     ranges = np.hypot(beams[:, 0], beams[:, 1])
     sums = running_sums(beams, ranges)
     for i in range(len(points)):
-        reach = max(_REACH, _REACH_PER_METRE * ranges[i])
+        reach = max(_REACH, _REACH_PER_METER * ranges[i])
         low, high = _last_in_reach(points, i, -1, reach), _last_in_reach(points, i, 1, reach)
         if high - low < 2 or not fit_surface(beams, sums, low, i, high, _FLATNESS, normal):
             continue
@@ -103,7 +111,7 @@ def _fit_normals(points: Float64, laser: Float64) -> tuple[Float64, Bool]:
 
 @njit(cache=True)
 def _last_in_reach(points: Float64, i: int, step: int, reach: float) -> int:
-    """The last of the points that follow each other from i on, downwards or upwards, within reach of it."""
+    """The last of the successive points from i on, downwards or upwards, within reach of point i."""
     last = i
     for k in range(i + step, i + step * (_BEAMS + 1), step):
         if k < 0 or k >= len(points):
@@ -117,7 +125,7 @@ def _last_in_reach(points: Float64, i: int, step: int, reach: float) -> int:
 
 @njit(cache=True)
 def _bin_points(points: Float64, starts: Int64, lasers: Float64, bin_starts: Int64) -> Int32:
-    """The nearest point of each scan in each of its bins of bearing."""
+    """The nearest point of each scan in each of its bins of bearing, -1 for none."""
     bins = np.full(bin_starts[-1], _EMPTY, np.int32)
     for scan in range(len(lasers)):
         count = bin_starts[scan + 1] - bin_starts[scan]
@@ -156,17 +164,12 @@ def _bearing(x: float, y: float) -> float:
     return -angle if y < 0.0 else angle
 
 
-# Bins of bearing searched to each side at most, and the cosine of the angle between walls that are the same at least.
-_MAX_BINS = 20
-_SAME_WALL = 0.7
-
-
 class Weighting(NamedTuple):
-    """How the points count.
+    """The weights of points.
 
     :ivar sigma: deviation of a point from its wall, m.
     :ivar robust_scale: scale of Cauchy's weight, m.
-    :ivar temper: exponent on the likelihood, since neighbouring beams and overlapping pairs are correlated.
+    :ivar temper: exponent on the likelihood, since neighboring beams and overlapping pairs are correlated.
     """
 
     sigma: float
@@ -175,7 +178,7 @@ class Weighting(NamedTuple):
 
 
 def weighting_from_options(options: RefinementParameters) -> Weighting:
-    """How points count, as configured."""
+    """The weights of points, as configured."""
     return Weighting(options.sigma, options.robust_scale, options.temper)
 
 
@@ -190,15 +193,15 @@ def normal_equations(
     weights: Weighting,
     stride: int,
 ) -> tuple[Float64, Float64, Float64]:
-    """Linearise the registration of pairs of scans at given relative poses.
+    """The normal equations of the registration of pairs of scans at given relative poses.
 
     :param source_indices: shape (m,), the scan of ``sources`` whose points are registered in each pair.
-    :param target_indices: shape (m,), the scan of ``targets`` with whose walls.
-    :param relative: shape (m, 3), ``other_T_one``, m and rad.
-    :param gate: points farther apart than this do not meet, m.
-    :param stride: 1 for all points, k for one out of k, which counts for as many.
+    :param target_indices: shape (m,), the scan of ``targets`` whose walls are used.
+    :param relative: shape (m, 3), ``target_T_source``, m and rad.
+    :param gate: largest distance of a point from its wall point, m.
+    :param stride: 1 for all points, k for one out of k, with k times the weight.
     :returns: information (m, 3, 3) and gradient (m, 3) of half the squared error in the right tangent of
-        ``other_T_one``, and the share (m,) of the points that meet a wall.
+        ``target_T_source``, and the share (m,) of the points with a wall.
     """
     m = len(source_indices)
     information, gradient, share = np.zeros((m, 3, 3)), np.zeros((m, 3)), np.zeros(m)
@@ -220,34 +223,35 @@ def normal_equations(
 
 @njit(cache=True)
 def _add_points(
-    ones: ScanSurfaces,
-    one: int,
-    others: ScanSurfaces,
-    other: int,
+    sources: ScanSurfaces,
+    source: int,
+    targets: ScanSurfaces,
+    target: int,
     pose: Float64,
     gate: float,
     weights: Weighting,
-    every: int,
+    stride: int,
     information: Float64,
     gradient: Float64,
 ) -> float:
-    """Enter the points of scan ``one`` that meet walls of scan ``other``, ``pose`` being ``other_T_one``.
+    """Write the normal equations of the points of scan ``source`` with walls of scan ``target``.
 
+    :param pose: ``target_T_source``, shape (3,).
     :param information: shape (3, 3), ``gradient`` (3,): written to.
-    :returns: the share of the points that meet a wall.
+    :returns: the share of the points with a wall.
     """
     cos, sin = np.cos(pose[2]), np.sin(pose[2])
-    most, sharpness = every * weights.temper / weights.sigma**2, 1.0 / weights.robust_scale
+    largest, sharpness = stride * weights.temper / weights.sigma**2, 1.0 / weights.robust_scale
     # Sums in variables of their own stay in registers.
     xx = xy = xt = yy = yt = tt = gx = gy = gt = 0.0
-    seen = met = 0
-    # Taken from their tuples once: each time counts references to them.
-    own, own_normals, own_flat = ones.points, ones.normals, ones.is_flat
-    points, normals, flat, bins = others.points, others.normals, others.is_flat, others.bins
-    laser_x, laser_y = others.lasers[other, 0], others.lasers[other, 1]
-    begin, end = others.bin_starts[other], others.bin_starts[other + 1]
-    for k in range(ones.starts[one], ones.starts[one + 1], every):
-        seen += 1
+    total = matched = 0
+    # Taken from their tuples once, since each access counts references to them.
+    own, own_normals, own_flat = sources.points, sources.normals, sources.is_flat
+    points, normals, flat, bins = targets.points, targets.normals, targets.is_flat, targets.bins
+    laser_x, laser_y = targets.lasers[target, 0], targets.lasers[target, 1]
+    begin, end = targets.bin_starts[target], targets.bin_starts[target + 1]
+    for k in range(sources.starts[source], sources.starts[source + 1], stride):
+        total += 1
         px, py = own[k, 0], own[k, 1]
         x, y = transform_point(pose[0], pose[1], cos, sin, px, py)
         q = _nearest_point(points, bins, begin, end - begin, x, y, x - laser_x, y - laser_y, gate)
@@ -257,10 +261,10 @@ def _add_points(
         jx, jy = rotate_back(cos, sin, nx, ny)
         if own_flat[k] and jx * own_normals[k, 0] + jy * own_normals[k, 1] < _SAME_WALL:
             continue
-        met += 1
+        matched += 1
         jt = jy * px - jx * py
         error = nx * (x - points[q, 0]) + ny * (y - points[q, 1])
-        weight = most / (1.0 + (error * sharpness) ** 2)
+        weight = largest / (1.0 + (error * sharpness) ** 2)
         wx, wy, wt = weight * jx, weight * jy, weight * jt
         xx += wx * jx
         xy += wx * jy
@@ -276,34 +280,34 @@ def _add_points(
     information[0, 2] = information[2, 0] = xt
     information[1, 2] = information[2, 1] = yt
     gradient[0], gradient[1], gradient[2] = gx, gy, gt
-    return met / max(1, seen)
+    return matched / max(1, total)
 
 
 @njit(cache=True, inline="always")
 def _nearest_point(
     points: Float64, bins: Int32, first: int, count: int, x: float, y: float, dx: float, dy: float, gate: float
 ) -> int:
-    """The point of a scan nearest to (x, y) in its base frame, among those seen in that direction; -1 for none.
+    """The point of a scan nearest to (x, y) in its base frame, among those of similar bearing; -1 for none.
 
     :param bins: see :class:`ScanSurfaces`; those of the scan are ``count`` from ``first`` on.
     :param dx: from the laser to (x, y), ``dy``.
     """
     middle = bin_index(dx, dy, count)
-    # What is seen so many bins away is at least so far off: the chord grows by about this with each bin.
+    # Squared width of a bin: a lower bound of the distance to a point grows by about this with each bin.
     squared_width = (2.0 * np.pi / count) ** 2 * (dx * dx + dy * dy)
     nearest, best = -1, gate * gate
-    # This comparison stands twice: as a function of its own it takes twice the time.
+    # This comparison is repeated below, since a call takes twice the time.
     k = bins[first + middle]
     if k >= 0:
         ex, ey = points[k, 0] - x, points[k, 1] - y
         squared = ex * ex + ey * ey
         if squared < best:
             best, nearest = squared, k
-    # To one side and then to the other, as far as that may bring something nearer.
+    # To one side and then to the other, while a nearer point is possible.
     for step in (-1, 1):
         place = middle
-        for passed in range(min(_MAX_BINS, count // 2)):
-            if passed * passed * squared_width >= best:
+        for distance in range(min(_MAX_BINS, count // 2)):
+            if distance * distance * squared_width >= best:
                 break
             place += step
             if place < 0:

@@ -1,7 +1,7 @@
-"""The lattice of relative poses that a search looks through, and bounds of the score on squares of it.
+"""The lattice of relative poses of a search, and bounds of the score on squares of it.
 
-The pyramid is of bytes, rounded up, so that a level of a large map stays in the processor's cache; and neighbouring
-squares are read together, sample by sample, which costs hardly more than one of them.
+The pyramid has bytes, rounded up, so that a level of a large map stays in the processor's cache. Neighboring squares
+are read together, sample by sample, which costs hardly more than a single square.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class SearchWindow(NamedTuple):
 def make_search_window(
     mean: Float64, covariance: Float64, cell: float, turn: float, gate: float, bounds: Float64 | None = None
 ) -> SearchWindow:
-    """The smallest lattice that holds the gate's ellipsoid, as far as it lies within bounds.
+    """The smallest lattice that contains the gate's ellipsoid, within bounds.
 
     :param mean: shape (3,), ``candidate_T_query``.
     :param covariance: shape (3, 3), right tangent frame.
@@ -84,21 +84,22 @@ def prior_bound(window: SearchWindow, k: int, i: int, j: int, side: int) -> floa
     whitening, offset = window.whitening[k], window.offsets[k]
     half = 0.5 * (side - 1) * window.cell
     x, y = i * window.cell + half, j * window.cell + half
-    centre, spread_plus, spread_minus = 0.0, 0.0, 0.0
+    center, spread_plus, spread_minus = 0.0, 0.0, 0.0
     for r in range(3):
         a, b = whitening[r, 0], whitening[r, 1]
-        centre += (a * x + b * y + offset[r]) ** 2
+        center += (a * x + b * y + offset[r]) ** 2
         spread_plus += ((a + b) * half) ** 2
         spread_minus += ((a - b) * half) ** 2
-    # Triangle inequality: the norm over the square is at least that at its centre less that of the farthest corner.
-    nearest = max(0.0, np.sqrt(centre) - np.sqrt(max(spread_plus, spread_minus)))
+    # Triangle inequality: the norm over the square is at least that at its center less that of the farthest corner.
+    nearest = max(0.0, np.sqrt(center) - np.sqrt(max(spread_plus, spread_minus)))
     return -np.inf if nearest * nearest > window.gate else -0.5 * nearest * nearest
 
 
 BLOCK = 4
 """Edge of a block of cells, a power of 2."""
 
-_TOP = 64  # the largest log-ratio in steps; what is below -128 steps is counted as that
+_TOP = 64
+"""The largest log-ratio in steps; log-ratios below -128 steps are rounded up to that."""
 
 
 class LogRatioGrid(NamedTuple):
@@ -144,7 +145,7 @@ def _round_up(log_ratio: Float32, scale: float, steps: Int8) -> None:
 
 @njit(cache=True)
 def _widen(below: Int8, above: Int8, side: int) -> None:
-    """Maxima over squares twice as large; the last rows and columns are beyond the grid and stay 0."""
+    """Write maxima over squares twice as large; the last rows and columns are outside the grid and stay 0."""
     rows, columns = below.shape[0] - side, below.shape[1] - side
     for r in range(rows):
         first, right = below[r, :columns], below[r, side:]
@@ -167,12 +168,12 @@ def sample_cells(window: SearchWindow, surface: LogRatioGrid, samples: Float64) 
     return cells
 
 
-# Unsigned, a negative index is a large one: one comparison tells whether it lies in the grid.
+# Below, an unsigned negative index is a large one: a single comparison tests whether it is in the grid.
 
 
 @njit(cache=True)
 def square_bound(level: Int8, margin: int, cells: Int32, i: int, j: int) -> int:
-    """What the samples (n, 2) read at most in the square of shifts that begins at (i, j), steps.
+    """Bound of the sum over the samples (n, 2) in the square of shifts that begins at (i, j), steps.
 
     :param level: of the pyramid, for squares of this size.
     """
@@ -205,7 +206,7 @@ def quarter_bounds(
 
 @njit(cache=True)
 def add_block(log_ratio: Float32, cells: Int32, i: int, j: int, totals: Float64) -> None:
-    """Add the log-ratios that the samples (n, 2) read at every shift of the block that begins at (i, j), nats.
+    """Add the log-ratios at the samples (n, 2) for every shift of the block that begins at (i, j), nats.
 
     :param totals: shape (BLOCK, BLOCK), [j, i].
     """
