@@ -1,21 +1,19 @@
-"""What scans and maps contradict: the consistency tests of Eq. (6), the free-space check, and scans in submaps.
+"""Consistency of scans and maps: the likelihood ratio of "same place" to "similar place", from contradictions.
 
-Corridors look like corridors: that one fits into another says little, however many beams say so, as those that made
-buildings put walls beside walls. Whether it is the same one shows in what cannot be: surfaces where the map knows free
-space. In the same place few are, as doors move and people walk; in a place that only looks alike, an opening is missing
-here and a pillar stands there. Neighbouring samples are of one door or pillar, so that a stretch of wall counts as one;
-and some places have changed more than others, so that the share that contradicts is not the same everywhere: both
-together are the beta-binomial distribution.
+Corridors look like corridors, so a good fit says little. Contradictions decide: surfaces where a map knows free space,
+or known walls that a beam passes. In the same place they are few, since doors move and people walk; in a similar place
+an opening is missing or a pillar stands. Neighboring samples are on one object, so a stretch of wall counts as one; and
+the rate of contradictions differs between places. Both together give the beta-binomial distribution
+(docs/decisions/0016-contradiction-evidence.md).
 
-Who walks by, what was put there and a door that was closed end a beam early. Only what was taken away lets it pass, or
-that it was not sent from there: where people walk, this tells best whether the robot is where it should be.
+People, new objects and closed doors end a beam early. Only a removed object lets it pass, or a wrong pose: among
+people, passed walls are the best evidence for a displaced robot.
 
-Maps of lines (:mod:`hmt_slam_ros.landmarks.line_filter`) find the walls differently and count them alike. Three other
-checks ask something else:
+Line maps (:mod:`hmt_slam_ros.landmarks.line_filter`) find walls differently and count them alike. Other checks differ:
 
-- whether the end of a beam, not its way, is in free space (``count_agreement`` of ``scan_to_map`` and of area grids);
-- by how much that speaks against a match, as a sum of log-ratios (``branch_and_bound``);
-- what one scan says of a place without any map (:mod:`hmt_slam_ros.sensors.polar_scan`).
+- whether the end of a beam is in free space (``count_agreement`` of ``scan_to_map`` and of area grids);
+- the sum of log-ratios against a match (``branch_and_bound``);
+- the class of a point by one scan, without a map (:mod:`hmt_slam_ros.sensors.polar_scan`).
 """
 
 from __future__ import annotations
@@ -33,12 +31,11 @@ from hmt_slam_ros.registration.scan_to_map import count_agreement
 
 
 class Agreement(NamedTuple):
-    """Surface samples in a map.
+    """Counts of surface samples in a map.
 
-    :ivar samples: how many there are.
-    :ivar on_surface: how many are on known surfaces.
-    :ivar in_free_space: how many contradict: they are in space that is known to be free, or behind a wall that is
-        known.
+    :ivar samples: number of samples.
+    :ivar on_surface: samples on known surfaces.
+    :ivar in_free_space: samples that contradict: in known free space, or behind a known wall.
     """
 
     samples: int
@@ -47,18 +44,18 @@ class Agreement(NamedTuple):
 
     @property
     def matched_share(self) -> float:
-        """Share of all samples that are on known surfaces."""
+        """Share of the samples on known surfaces."""
         return self.on_surface / max(1, self.samples)
 
 
 class ConsistencyTest(NamedTuple):
-    """Which share of the samples contradicts a map: beta distributions over independent stretches of wall.
+    """Likelihood ratio of contradictions: beta distributions of their rate over independent stretches of wall.
 
-    Both have the same second parameter, so that the ratio falls with every contradiction.
+    Both distributions have the same second parameter, so that the ratio falls with every contradiction.
 
-    :ivar extra_rate: by how much the share is larger in a place that looks alike, where the samples fit best.
-    :ivar concentration: after about as many stretches a place is known by what contradicts there.
-    :ivar correlated_samples: samples that count as one.
+    :ivar extra_rate: rate of contradictions in a similar place, at the best fit, less that in the same place.
+    :ivar concentration: number of stretches after which the rate of a place is known.
+    :ivar correlated_samples: number of samples that count as one stretch.
     """
 
     extra_rate: float
@@ -66,43 +63,80 @@ class ConsistencyTest(NamedTuple):
     correlated_samples: float
 
     def log_likelihood_ratio(self, found: Agreement, usual: float) -> float:
-        """log p(found | same place) / p(found | alike), nats.
+        """log p(found | same place) / p(found | similar place), nats.
 
-        :param usual: share that contradicts in the same place.
+        :param usual: rate of contradictions in the same place.
         """
         on, free = found.on_surface / self.correlated_samples, found.in_free_space / self.correlated_samples
-        same, alike = usual * self.concentration, (usual + self.extra_rate) * self.concentration
-        return self._log_probability(same, on, free) - self._log_probability(alike, on, free)
+        same, similar = usual * self.concentration, (usual + self.extra_rate) * self.concentration
+        return self._log_probability(same, on, free) - self._log_probability(similar, on, free)
 
     def _log_probability(self, a: float, on: float, free: float) -> float:
         return _log_beta(a + free, self.concentration + on) - _log_beta(a, self.concentration)
 
 
+def _log_beta(a: float, b: float) -> float:
+    return math.lgamma(a) + math.lgamma(b) - math.lgamma(a + b)
+
+
 MAP_IN_MAP = ConsistencyTest(extra_rate=0.03, concentration=500.0, correlated_samples=5.0)
-"""The surfaces of one map, one sample every 0.2 m, in another."""
+"""Surfaces of one map, a sample every 0.2 m, in another.
+
+Rates are shares of samples. The values understate contradictions on purpose, since real buildings have more than the
+training worlds: docs/reports/2026-11-22-evidence.md.
+"""
 
 SCAN_IN_STORED_MAP = ConsistencyTest(extra_rate=0.03, concentration=500.0, correlated_samples=10.0)
-"""The surfaces of one scan, one sample every 0.2 m, in a map of long before; the next scan sees half of them again."""
+"""Surfaces of one scan, a sample every 0.2 m, in a stored map; half of them are in the next scan, too.
+
+As ``MAP_IN_MAP``, with twice the correlation. Its effect on relocalization: docs/validation.md.
+"""
 
 SCAN_IN_SUBMAP = ConsistencyTest(extra_rate=0.03, concentration=500.0, correlated_samples=20.0)
-"""The beams of one scan in the map of what the robot saw around: the scans before and after see the same."""
+"""Beams of one scan in the submap; the scans before and after have the same beams.
+
+Chosen on training data, without a report: docs/decisions/0016-contradiction-evidence.md.
+"""
 
 WALLS_OF_SUBMAP = ConsistencyTest(extra_rate=0.1, concentration=500.0, correlated_samples=5.0)
-"""The known walls that the beams of one scan end on or pass, one sample every 0.2 m, seen from there or from anywhere
-else."""
+"""Known walls that the beams of one scan hit or pass, a sample every 0.2 m, from the same place or from any other.
+
+Chosen on training data; it detects kidnapping: docs/decisions/0026-kidnapping-detection.md.
+"""
 
 WALLS_OF_MAP = ConsistencyTest(extra_rate=0.01, concentration=500.0, correlated_samples=20.0)
-"""The same of two maps, the walls of each and the scans of the other, where the surfaces fit: most scans of a map see
-the same walls, and where another place fits, hardly a wall is not where it should be."""
+"""Walls of each of two maps and scans of the other, where their surfaces fit.
+
+Most scans of a map have the same walls, and in a similar place that fits, hardly a wall is passed: 1 % in ``nested``,
+up to 6 % in ``office``, none in the right place (docs/validation.md, "Carried while it drives").
+"""
+
+WALLS_OUTLIER_RATE = 0.001
+"""Smallest share of the walls that are passed in another map of the same place."""
+
+_CLEARANCE = 0.2
+"""Distance before and behind a wall that has to be clear of surfaces where a beam passes, m: else it runs along it."""
+
+BEHIND = 0.4
+"""Length of a beam behind a wall from which it passes the wall, m."""
+
+SAMPLE_SPACING = 0.2
+"""Distance between samples of surfaces, m."""
+
+MAX_SAMPLE_GAP = 0.6
+"""Distance between two samples of a passed wall at most, m: a single sample may be the jamb of a door."""
+
+_STEP = 0.7
+"""Step along a beam near surfaces, cells."""
 
 
 class OutlierRate(NamedTuple):
-    """What contradicted so far where a hypothesis has the robot: some buildings are full of clutter.
+    """Rate of contradictions so far, at the poses of a hypothesis: some buildings are full of clutter.
 
-    One that is wrong learns from its own contradictions too, but a few scans weigh little against all before.
+    A wrong hypothesis learns from its own contradictions, too, but a few scans change the rate little.
 
-    :ivar inliers: stretches on known surfaces.
-    :ivar outliers: stretches that contradicted.
+    :ivar inliers: stretches on known surfaces; at first a prior of 100.
+    :ivar outliers: stretches that contradicted; at first a prior of 0.75.
     """
 
     inliers: float = 100.0
@@ -110,22 +144,26 @@ class OutlierRate(NamedTuple):
 
     @property
     def rate(self) -> float:
-        """Share that contradicts."""
+        """Share of the stretches that contradict."""
         return self.outliers / (self.inliers + self.outliers)
 
     def update(self, found: Agreement, correlated_samples: float) -> OutlierRate:
-        """With one more scan counted."""
+        """The rate with one more scan."""
         return OutlierRate(
             self.inliers + found.on_surface / correlated_samples,
             self.outliers + found.in_free_space / correlated_samples,
         )
 
 
+MAPS_OUTLIER_RATE = OutlierRate().rate
+"""Share of a map's surfaces that contradict another map of the same place: the initial rate, as comparisons are few."""
+
+
 class Clutter(NamedTuple):
-    """What speaks against the place in which a hypothesis has the robot, usually.
+    """Usual contradictions at the poses of a hypothesis.
 
     :ivar beam_outlier_rate: share of the beams that contradict its map.
-    :ivar wall_outlier_rate: share of the known walls that they pass.
+    :ivar wall_outlier_rate: share of the known walls that beams pass.
     """
 
     beam_outlier_rate: float = 0.0
@@ -135,38 +173,11 @@ class Clutter(NamedTuple):
 NO_CLUTTER = Clutter()
 
 
-WALLS_OUTLIER_RATE = 0.001
-"""Share of the walls that are passed in another map of the same place, at least."""
-
-MAPS_OUTLIER_RATE = OutlierRate().rate
-"""Share of a map's surfaces that contradict another map of the same place: as a run begins, since maps are compared too
-seldom to learn it."""
-
-
-def _log_beta(a: float, b: float) -> float:
-    return math.lgamma(a) + math.lgamma(b) - math.lgamma(a + b)
-
-
-# A beam passes a wall if nothing is known within this distance of it before and behind, m: others run along the wall.
-_CLEARANCE = 0.2
-BEHIND = 0.4
-"""A beam that passes a wall ends at least so far behind it, m."""
-
-SAMPLE_SPACING = 0.2
-"""Of surfaces, one sample every so many m counts."""
-
-MAX_SAMPLE_GAP = 0.6
-"""A wall was passed where samples of it are so near to each other, m: a single one may be the jamb of a door."""
-
-# Part of a cell by which a beam is followed near surfaces.
-_STEP = 0.7
-
-
 class WallSamples(NamedTuple):
-    """Samples of walls, taken in the order of the beams.
+    """Samples of walls, in the order of the beams.
 
-    :ivar total: how many count.
-    :ivar x: where the last of all is, with ``y``, m or cells.
+    :ivar total: number of samples.
+    :ivar x: position of the last sample, with ``y``, m or cells.
     """
 
     total: int
@@ -179,7 +190,7 @@ NO_SAMPLES = WallSamples(0, -np.inf, -np.inf)
 
 @njit(cache=True)
 def add_wall_hit(samples: WallSamples, x: float, y: float, spacing: float) -> WallSamples:
-    """With the end of one more beam on a wall, if it is not too near to the last sample."""
+    """The samples with the end of one more beam on a wall, unless it is too near to the last sample."""
     if np.hypot(x - samples.x, y - samples.y) < spacing:
         return samples
     return WallSamples(samples.total + 1, x, y)
@@ -187,7 +198,7 @@ def add_wall_hit(samples: WallSamples, x: float, y: float, spacing: float) -> Wa
 
 @njit(cache=True)
 def add_wall_passed(samples: WallSamples, x: float, y: float, spacing: float, gap: float) -> WallSamples:
-    """With the place where one more beam passes a wall: one that is too far from the last sample does not count."""
+    """The samples with the point where one more beam passes a wall; it counts only near the last sample."""
     between = np.hypot(x - samples.x, y - samples.y)
     if between < spacing:
         return samples
@@ -198,33 +209,33 @@ def add_wall_passed(samples: WallSamples, x: float, y: float, spacing: float, ga
 def count_hits_and_violations(
     points: Float64, laser: Float64, pose: Float64, view: GridView, near: int
 ) -> tuple[int, int]:
-    """How many samples of known surfaces the beams of a scan end on, and of how many they pass.
+    """The number of samples of known surfaces that the beams of a scan hit, and of those that they pass.
 
     :param points: ends of the beams in their order, shape (n, 2 or more), m, base frame.
-    :param laser: where the beams begin, shape (2,), likewise.
+    :param laser: position of the laser, shape (2,), m, base frame.
     :param pose: ``map_T_base``, shape (3,).
-    :param near: quantised distance to a surface below which a beam ends on it.
+    :param near: quantized distance to a surface below which a beam ends on it.
     """
     cos, sin = np.cos(pose[2]) / view.cell, np.sin(pose[2]) / view.cell
     half = 0.5 * view.table.shape[0] * PATCH
     u, v = pose[0] / view.cell + half, pose[1] / view.cell + half
     from_u, from_v = transform_point(u, v, cos, sin, laser[0], laser[1])
-    apart, together = SAMPLE_SPACING / view.cell, MAX_SAMPLE_GAP / view.cell
-    met, passed = NO_SAMPLES, NO_SAMPLES
+    spacing, gap = SAMPLE_SPACING / view.cell, MAX_SAMPLE_GAP / view.cell
+    hit, passed = NO_SAMPLES, NO_SAMPLES
     for i in range(points.shape[0]):
         to_u, to_v = transform_point(u, v, cos, sin, points[i, 0], points[i, 1])
         if field_at(view, int(to_u), int(to_v)) < near:
-            met = add_wall_hit(met, to_u, to_v, apart)
+            hit = add_wall_hit(hit, to_u, to_v, spacing)
         share = _first_wall_passed(view, from_u, from_v, to_u, to_v)
         if share >= 0.0:
             wall_u, wall_v = from_u + share * (to_u - from_u), from_v + share * (to_v - from_v)
-            passed = add_wall_passed(passed, wall_u, wall_v, apart, together)
-    return met.total, passed.total
+            passed = add_wall_passed(passed, wall_u, wall_v, spacing, gap)
+    return hit.total, passed.total
 
 
 @njit(cache=True)
 def _first_wall_passed(view: GridView, from_u: float, from_v: float, to_u: float, to_v: float) -> float:
-    """Share of a beam, in cells, up to the first wall that it passes; -1 where it passes none."""
+    """Share of a beam up to the first wall that it passes, -1 for none; coordinates in cells."""
     length = max(np.hypot(to_u - from_u, to_v - from_v), 1e-9)
     du, dv = (to_u - from_u) / length, (to_v - from_v) / length
     clear, behind, quantum = _CLEARANCE / view.cell, BEHIND / view.cell, view.radius / (FAR * view.cell)
@@ -244,10 +255,10 @@ def _first_wall_passed(view: GridView, from_u: float, from_v: float, to_u: float
 
 
 class MapAgreement(NamedTuple):
-    """A scan in a map.
+    """Agreement of a scan with a map.
 
-    :ivar ends: of its beams, on surfaces and in free space.
-    :ivar walls: samples of known ones that beams end on, and that they pass.
+    :ivar ends: ends of its beams, on surfaces and in free space.
+    :ivar walls: samples of known walls that beams hit, and that they pass.
     """
 
     ends: Agreement
@@ -255,10 +266,10 @@ class MapAgreement(NamedTuple):
 
 
 class ScanEvidence(NamedTuple):
-    """What a scan says of whether the robot is there.
+    """Evidence of a scan for the pose of the robot.
 
-    :ivar log_evidence: log p(scan | it is) / p(scan | it is in a place that looks alike), nats.
-    :ivar log_kidnapping_ratio: log p(scan | it was displaced before it) / p(scan | it was not), nats.
+    :ivar log_evidence: log p(scan | there) / p(scan | in a similar place), nats.
+    :ivar log_kidnapping_ratio: log p(scan | displaced before it) / p(scan | not displaced), nats.
     """
 
     log_evidence: float
@@ -269,10 +280,10 @@ NO_EVIDENCE = ScanEvidence(0.0, 0.0)
 
 
 class ClutterEstimate(NamedTuple):
-    """What scans were like so far where a hypothesis has the robot.
+    """Rates of contradictions so far, at the poses of a hypothesis.
 
-    :ivar beam_outliers: what contradicted its map.
-    :ivar wall_outliers: which of its walls the beams passed.
+    :ivar beam_outliers: of the beams with its map.
+    :ivar wall_outliers: of its walls with the beams.
     """
 
     beam_outliers: OutlierRate = OutlierRate()
@@ -280,18 +291,18 @@ class ClutterEstimate(NamedTuple):
 
     @property
     def clutter(self) -> Clutter:
-        """What contradicts usually."""
+        """The rates alone."""
         return Clutter(self.beam_outliers.rate, self.wall_outliers.rate)
 
     def evaluate(self, found: MapAgreement) -> ScanEvidence:
-        """What a scan says."""
+        """The evidence of a scan."""
         log_evidence = SCAN_IN_SUBMAP.log_likelihood_ratio(found.ends, self.beam_outliers.rate)
         return ScanEvidence(
             log_evidence, -log_evidence - WALLS_OF_SUBMAP.log_likelihood_ratio(found.walls, self.wall_outliers.rate)
         )
 
     def update(self, found: MapAgreement) -> ClutterEstimate:
-        """With one more scan."""
+        """The estimate with one more scan."""
         return ClutterEstimate(
             self.beam_outliers.update(found.ends, SCAN_IN_SUBMAP.correlated_samples),
             self.wall_outliers.update(found.walls, WALLS_OF_SUBMAP.correlated_samples),
@@ -299,13 +310,13 @@ class ClutterEstimate(NamedTuple):
 
 
 def compare_with_map(points: Float64, laser: Float64, pose: Float64, view: GridView, near: int) -> MapAgreement:
-    """Lay a scan into a map.
+    """The agreement of a scan with a map.
 
     :param points: surfels of the scan, shape (n, 4), m, base frame.
-    :param laser: where the beams begin, shape (2,), likewise.
+    :param laser: position of the laser, shape (2,), m, base frame.
     :param pose: ``map_T_base``, shape (3,).
-    :param near: quantised distance to a surface below which a beam ends on it.
+    :param near: quantized distance to a surface below which a beam ends on it.
     """
-    met, passed = count_hits_and_violations(points, laser, pose, view, near)
+    hit, passed = count_hits_and_violations(points, laser, pose, view, near)
     ends = Agreement(len(points), *count_agreement(points, pose, view, near, 2 * near))
-    return MapAgreement(ends, Agreement(met + passed, met, passed))
+    return MapAgreement(ends, Agreement(hit + passed, hit, passed))

@@ -14,6 +14,7 @@ from numba import njit
 
 from hmt_slam_ros.arrays import Bool, Float64, Int32, Int64
 from hmt_slam_ros.configuration.topology import RefinementParameters
+from hmt_slam_ros.geometry.covariance import Symmetric, write_to_array
 from hmt_slam_ros.geometry.se2 import rotate_back, transform_point
 from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.sensors.scan import FlatnessLimits, fit_surface, running_sums
@@ -275,10 +276,7 @@ def _add_points(
         gx += wx * error
         gy += wy * error
         gt += wt * error
-    information[0, 0], information[1, 1], information[2, 2] = xx, yy, tt
-    information[0, 1] = information[1, 0] = xy
-    information[0, 2] = information[2, 0] = xt
-    information[1, 2] = information[2, 1] = yt
+    write_to_array(Symmetric(xx, xy, xt, yy, yt, tt), information)
     gradient[0], gradient[1], gradient[2] = gx, gy, gt
     return matched / max(1, total)
 

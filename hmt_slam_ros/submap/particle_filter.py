@@ -137,11 +137,7 @@ class ParticleFilter:
         return self.mapping.pool.view(self._tables[self.leader])
 
     def update(self, prepared: PreparedScan, step: int) -> FilterStep:
-        """Draw every particle from its optimal proposal, weight it, and resample where the ESS is low.
-
-        :param prepared: of the keyframe's scan.
-        :param step: number of the keyframe event, for the random streams.
-        """
+        """Draw every particle from its optimal proposal, weight it, and resample where the ESS is low."""
         points, settings = prepared.surfels, self.mapping.configuration
         prior = map_information(self._motion_since_update.covariance, self.pose[2])
         view, predicted = self._leading_view(), Prior(self._predicted_poses[self.leader], prior)
@@ -247,12 +243,7 @@ class ParticleFilter:
         self.keyframe_poses = self.keyframe_poses[:, remaining]
 
     def change_area(self, area: int, area_T_previous: Float64, content: Sequence[PlacedKeyframe]) -> None:
-        """Change to the frame of another area and load its local map, the same for all particles.
-
-        :param area: the area now.
-        :param area_T_previous: shape (3,).
-        :param content: all keyframes of the local map, in the new frame.
-        """
+        """Change to the frame of another area and load its local map, the same for all particles."""
         self.area = area
         self.poses = se2.compose(area_T_previous, self.poses)
         self._predicted_poses = se2.compose(area_T_previous, self._predicted_poses)
@@ -260,11 +251,7 @@ class ParticleFilter:
         self._load_submap(content)
 
     def reload(self, content: Sequence[PlacedKeyframe], anchor: int) -> None:
-        """Rebuild the local map after its keyframes moved; the poses of all particles in one of them stay.
-
-        :param content: all keyframes of the local map.
-        :param anchor: the keyframe relative to which the particles stay.
-        """
+        """Rebuild the local map after its keyframes moved; the poses of all particles in the anchor stay."""
         before = self.keyframe_poses[:, self.keyframes.index(anchor)]
         relative = [se2.between(before, poses) for poses in (self.poses, self._predicted_poses, self._last_poses)]
         self._load_submap(content)
@@ -306,7 +293,7 @@ class ParticleFilters:
     def restore(self, state: ParticleFilterState | LineFilterState) -> LocalFilter:
         """The filter of a state; the patches of its grids are in the pool.
 
-        :raises HmtSlamError: where its local map is one of lines.
+        :raises HmtSlamError: where its local map has lines.
         """
         if isinstance(state, LineFilterState):
             raise HmtSlamError("the saved map has local maps of lines: go on from it with its own local_map.kind")
