@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import gammaincinv
 
+from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.geometry import se2
 
 _POSE_DOF = 3
@@ -54,11 +54,11 @@ class PoseGaussian:
     :ivar covariance: shape (3, 3), right tangent frame.
     """
 
-    mean: NDArray[np.float64]
-    covariance: NDArray[np.float64]
+    mean: Float64
+    covariance: Float64
 
     @classmethod
-    def from_pose(cls, pose: NDArray[np.float64]) -> PoseGaussian:
+    def from_pose(cls, pose: Float64) -> PoseGaussian:
         """A belief without uncertainty, in the pose (3,)."""
         return cls(pose, np.zeros((3, 3)))
 
@@ -93,7 +93,7 @@ class PoseGaussian:
         spread = self.covariance_at(other.mean, ad) + other.covariance
         return float(xi @ np.linalg.solve(spread, xi))
 
-    def covariance_at(self, mean: NDArray[np.float64], ad: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
+    def covariance_at(self, mean: Float64, ad: Float64 | None = None) -> Float64:
         """This belief's covariance, shape (3, 3), in the tangent space of the nearby pose ``mean``, (3,)."""
         ad = se2.adjoint(se2.between(mean, self.mean)) if ad is None else ad
         return ad @ self.covariance @ ad.T

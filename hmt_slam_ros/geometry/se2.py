@@ -13,9 +13,9 @@ import math
 import numpy as np
 from numba import njit
 from numba.extending import register_jitable
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Pose = NDArray[np.float64]
+from hmt_slam_ros.arrays import Float64
 
 _SMALL_ANGLE = 1e-5
 """Angle below which series replace quotients by the angle, rad."""
@@ -75,7 +75,7 @@ def wrap_by_turns(angle: float) -> float:
     return angle - 2.0 * math.pi * math.floor((angle + math.pi) / (2.0 * math.pi))
 
 
-def wrap(angle: ArrayLike) -> NDArray[np.float64]:
+def wrap(angle: ArrayLike) -> Float64:
     """The angles in [-pi, pi), rad, of the shape of ``angle``."""
     angle = np.asarray(angle, dtype=np.float64)
     if not angle.ndim:
@@ -88,7 +88,7 @@ def wrap(angle: ArrayLike) -> NDArray[np.float64]:
     return np.where(inside, angle, np.where(wrapped < np.pi, wrapped, -np.pi))
 
 
-def compose(a_T_b: ArrayLike, b_T_c: ArrayLike) -> Pose:
+def compose(a_T_b: ArrayLike, b_T_c: ArrayLike) -> Float64:
     """``a_T_c``, from ``a_T_b`` and ``b_T_c``."""
     a, b = np.asarray(a_T_b, dtype=np.float64), np.asarray(b_T_c, dtype=np.float64)
     if a.ndim == b.ndim == 1:
@@ -101,7 +101,7 @@ def compose(a_T_b: ArrayLike, b_T_c: ArrayLike) -> Pose:
     return _stack(x, y, wrap(a[..., 2] + b[..., 2]))
 
 
-def _stack(*parts: NDArray[np.float64]) -> NDArray[np.float64]:
+def _stack(*parts: Float64) -> Float64:
     """``np.stack`` along a new last axis, in a third of its time."""
     result = np.empty((*parts[0].shape, len(parts)))
     for k, part in enumerate(parts):
@@ -110,7 +110,7 @@ def _stack(*parts: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 @njit(cache=True)
-def _compose_each(a: Pose, b: Pose) -> Pose:
+def _compose_each(a: Float64, b: Float64) -> Float64:
     poses = np.empty((a.shape[0], 3))
     for n in range(a.shape[0]):
         cos, sin = np.cos(a[n, 2]), np.sin(a[n, 2])
@@ -119,14 +119,14 @@ def _compose_each(a: Pose, b: Pose) -> Pose:
     return poses
 
 
-def _compose_single(a: list[float], b: list[float]) -> Pose:
+def _compose_single(a: list[float], b: list[float]) -> Float64:
     cos, sin = math.cos(a[2]), math.sin(a[2])
     x = a[0] + cos * b[0] - sin * b[1]
     y = a[1] + sin * b[0] + cos * b[1]
     return np.array((x, y, wrap_angle(a[2] + b[2])))
 
 
-def inverse(a_T_b: ArrayLike) -> Pose:
+def inverse(a_T_b: ArrayLike) -> Float64:
     """``b_T_a``."""
     a = np.asarray(a_T_b, dtype=np.float64)
     if a.ndim == 1:
@@ -137,12 +137,12 @@ def inverse(a_T_b: ArrayLike) -> Pose:
     return _stack(x, y, wrap(-a[..., 2]))
 
 
-def _inverse_single(a: list[float]) -> Pose:
+def _inverse_single(a: list[float]) -> Float64:
     cos, sin = math.cos(a[2]), math.sin(a[2])
     return np.array((-cos * a[0] - sin * a[1], sin * a[0] - cos * a[1], wrap_angle(-a[2])))
 
 
-def between(c_T_a: ArrayLike, c_T_b: ArrayLike) -> Pose:
+def between(c_T_a: ArrayLike, c_T_b: ArrayLike) -> Float64:
     """``a_T_b``, from the poses of a and b in a common frame."""
     a, b = np.asarray(c_T_a, dtype=np.float64), np.asarray(c_T_b, dtype=np.float64)
     if a.ndim == b.ndim == 1:
@@ -150,13 +150,13 @@ def between(c_T_a: ArrayLike, c_T_b: ArrayLike) -> Pose:
     return compose(inverse(a), b)
 
 
-def _between_single(a: list[float], b: list[float]) -> Pose:
+def _between_single(a: list[float], b: list[float]) -> Float64:
     cos, sin = math.cos(a[2]), math.sin(a[2])
     x, y = b[0] - a[0], b[1] - a[1]
     return np.array((cos * x + sin * y, cos * y - sin * x, wrap_angle(b[2] - a[2])))
 
 
-def transform(a_T_b: ArrayLike, points: ArrayLike) -> NDArray[np.float64]:
+def transform(a_T_b: ArrayLike, points: ArrayLike) -> Float64:
     """Points (n, 2) of frame b in frame a, for one pose (3,), or one for each point (n, 3)."""
     a, p = np.asarray(a_T_b, dtype=np.float64), np.asarray(points, dtype=np.float64)
     cos, sin = np.cos(a[..., 2]), np.sin(a[..., 2])
@@ -165,7 +165,7 @@ def transform(a_T_b: ArrayLike, points: ArrayLike) -> NDArray[np.float64]:
     return _stack(x, y)
 
 
-def exp(xi: ArrayLike) -> Pose:
+def exp(xi: ArrayLike) -> Float64:
     """The motion of the twist (..., 3) of (v_x, v_y, omega) over unit time."""
     xi = np.asarray(xi, dtype=np.float64)
     if xi.ndim == 1:
@@ -181,7 +181,7 @@ def exp(xi: ArrayLike) -> Pose:
     return _stack(x, y, wrap(omega))
 
 
-def _exp_single(x: float, y: float, omega: float) -> Pose:
+def _exp_single(x: float, y: float, omega: float) -> Float64:
     return np.array((*exp_shift(x, y, omega), wrap_angle(omega)))
 
 
@@ -195,7 +195,7 @@ def exp_shift(x: float, y: float, omega: float) -> tuple[float, float]:
     return a * x - b * y, b * x + a * y
 
 
-def log(pose: ArrayLike) -> NDArray[np.float64]:
+def log(pose: ArrayLike) -> Float64:
     """The twist (..., 3) with ``exp(twist) == pose`` and |omega| <= pi."""
     pose = np.asarray(pose, dtype=np.float64)
     if pose.ndim == 1:
@@ -209,14 +209,14 @@ def log(pose: ArrayLike) -> NDArray[np.float64]:
     return _stack(x, y, omega)
 
 
-def _log_single(x: float, y: float, angle: float) -> NDArray[np.float64]:
+def _log_single(x: float, y: float, angle: float) -> Float64:
     omega = wrap_angle(angle)
     half = 0.5 * omega
     half_cot = 1.0 - omega**2 / 12.0 if abs(omega) < _SMALL_ANGLE else half / math.tan(half)
     return np.array((half_cot * x + half * y, -half * x + half_cot * y, omega))
 
 
-def adjoint(pose: ArrayLike) -> NDArray[np.float64]:
+def adjoint(pose: ArrayLike) -> Float64:
     """Ad_T, shape (..., 3, 3), with ``T exp(xi) = exp(Ad_T xi) T``."""
     pose = np.asarray(pose, dtype=np.float64)
     if pose.ndim == 1:
@@ -229,12 +229,12 @@ def adjoint(pose: ArrayLike) -> NDArray[np.float64]:
     return ad
 
 
-def _adjoint_single(pose: list[float]) -> NDArray[np.float64]:
+def _adjoint_single(pose: list[float]) -> Float64:
     cos, sin = math.cos(pose[2]), math.sin(pose[2])
     return np.array(((cos, -sin, pose[1]), (sin, cos, -pose[0]), (0.0, 0.0, 1.0)))
 
 
-def right_jacobian_inverse(xi: ArrayLike) -> NDArray[np.float64]:
+def right_jacobian_inverse(xi: ArrayLike) -> Float64:
     """J, shape (..., 3, 3), with ``log(exp(xi) exp(delta)) = xi + J delta`` to first order in delta."""
     xi = np.asarray(xi, dtype=np.float64)
     omega = xi[..., 2]
@@ -249,7 +249,7 @@ def right_jacobian_inverse(xi: ArrayLike) -> NDArray[np.float64]:
     return np.eye(3) + 0.5 * ad + quadratic[..., None, None] * (ad @ ad)
 
 
-def best_fit(a: ArrayLike, b: ArrayLike) -> Pose:
+def best_fit(a: ArrayLike, b: ArrayLike) -> Float64:
     """The motion T, shape (3,), for which ``compose(T, a)`` is nearest to ``b``, both (n, 3) with n >= 1.
 
     Least squares over the positions, with a radian of heading counted as a meter.
@@ -262,6 +262,6 @@ def best_fit(a: ArrayLike, b: ArrayLike) -> Pose:
     return np.array([*(b[:, :2].mean(axis=0) - rotated), float(wrap(angle))])
 
 
-def interpolate(start: ArrayLike, end: ArrayLike, fraction: ArrayLike) -> Pose:
+def interpolate(start: ArrayLike, end: ArrayLike, fraction: ArrayLike) -> Float64:
     """The pose at ``fraction`` of the motion from ``start`` to ``end``, at a constant twist."""
     return compose(start, exp(np.asarray(fraction)[..., None] * log(between(start, end))))

@@ -10,8 +10,8 @@ from typing import NamedTuple
 import numpy as np
 import yaml
 from numba import njit
-from numpy.typing import NDArray
 
+from hmt_slam_ros.arrays import Bool, Float64, Int32, UInt8
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.grids.traversal import begin_walk, next_cell
@@ -40,14 +40,12 @@ class OccupancyImage(NamedTuple):
     :ivar origin: shape (2,), lower left corner of the image in the map frame, m.
     """
 
-    pixels: NDArray[np.uint8]
+    pixels: UInt8
     resolution: float
-    origin: NDArray[np.float64]
+    origin: Float64
 
 
-def occupancy_image(
-    scans: Sequence[Scan], poses: NDArray[np.float64], resolution: float, max_range: float
-) -> OccupancyImage:
+def occupancy_image(scans: Sequence[Scan], poses: Float64, resolution: float, max_range: float) -> OccupancyImage:
     """The occupancy of each cell, from the number of scans that hit it and of those that passed it.
 
     A beam without a return has no effect. A beam longer than ``max_range`` clears cells up to there.
@@ -72,7 +70,7 @@ def occupancy_image(
     return OccupancyImage(_classify(votes[_HITS], votes[_MISSES])[::-1], resolution, origin)
 
 
-def _classify(hits: NDArray[np.int32], misses: NDArray[np.int32]) -> NDArray[np.uint8]:
+def _classify(hits: Int32, misses: Int32) -> UInt8:
     votes = hits + misses
     pixels = np.full(hits.shape, UNKNOWN)
     pixels[votes > 0] = FREE
@@ -80,9 +78,7 @@ def _classify(hits: NDArray[np.int32], misses: NDArray[np.int32]) -> NDArray[np.
     return pixels
 
 
-def _clip_beams(
-    scan: Scan, pose: NDArray[np.float64], max_range: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
+def _clip_beams(scan: Scan, pose: Float64, max_range: float) -> tuple[Float64, Float64, Bool]:
     """Starts and ends (k, 2) of the valid beams cut off at ``max_range``, and whether each end is a return."""
     ranges = np.hypot(*scan.beams.T)
     cut = scan.beams * (np.minimum(ranges, max_range) / np.maximum(ranges, 1e-9))[:, None] + scan.origins
@@ -91,11 +87,11 @@ def _clip_beams(
 
 @njit(cache=True)
 def _vote(
-    starts: NDArray[np.float64],
-    ends: NDArray[np.float64],
-    returned: NDArray[np.bool_],
+    starts: Float64,
+    ends: Float64,
+    returned: Bool,
     scan: int,
-    votes: NDArray[np.int32],
+    votes: Int32,
 ) -> None:
     """Add the votes of one scan: at most one per cell, hits before misses. Coordinates in cells."""
     for k in range(ends.shape[0]):
@@ -108,7 +104,7 @@ def _vote(
 
 
 @njit(cache=True)
-def _clear(start: NDArray[np.float64], end: NDArray[np.float64], scan: int, votes: NDArray[np.int32]) -> None:
+def _clear(start: Float64, end: Float64, scan: int, votes: Int32) -> None:
     """Add misses to all cells that a beam crosses, without its last cell."""
     walk, steps = begin_walk(start[0], start[1], end[0], end[1])
     for _ in range(steps):

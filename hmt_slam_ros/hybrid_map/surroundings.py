@@ -27,7 +27,7 @@ from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.geometry.se2 import transform_point
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.hybrid_map.shortest_path import ShortestPaths, shortest_path_beliefs
-from hmt_slam_ros.registration.likelihood_grid import AreaGrid, GridModel, Points, build_area_grid
+from hmt_slam_ros.registration.likelihood_grid import AreaGrid, GridModel, build_area_grid
 from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.sensors.polar_scan import FREE, classify_points, to_polar_scan
 
@@ -407,7 +407,7 @@ class GridCache:
         self._grids.move_to_end(key)
         return self._grids[key]
 
-    def static_points(self, keyframes: Mapping[int, Pose]) -> Points:
+    def static_points(self, keyframes: Mapping[int, Pose]) -> Float64:
         """Surface points of the keyframes, shape (n, 2), m, that none of them sees through: nobody who walked by."""
         points = self.grid(keyframes).points
         passed = np.zeros(len(points), dtype=np.bool_)

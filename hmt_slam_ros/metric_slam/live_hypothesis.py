@@ -9,9 +9,8 @@ from functools import partial
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
-from hmt_slam_ros.arrays import Int64
+from hmt_slam_ros.arrays import Float64, Int64
 from hmt_slam_ros.configuration.metric_slam import FilterParameters
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
@@ -55,15 +54,15 @@ class KeyframeCovariances:
     """
 
     keyframes: Int64
-    covariances: NDArray[np.float64]
+    covariances: Float64
 
     @classmethod
-    def from_dict(cls, covariances: Mapping[int, NDArray[np.float64]]) -> KeyframeCovariances:
+    def from_dict(cls, covariances: Mapping[int, Float64]) -> KeyframeCovariances:
         """The saved form of {keyframe: covariance}."""
         rows = np.array(list(covariances.values())).reshape(-1, 3, 3)
         return cls(np.array(list(covariances), dtype=np.int64), rows)
 
-    def to_dict(self) -> dict[int, NDArray[np.float64]]:
+    def to_dict(self) -> dict[int, Float64]:
         """{keyframe: covariance}."""
         return dict(zip(self.keyframes.tolist(), self.covariances, strict=True))
 
@@ -82,12 +81,12 @@ class LastEvent:
     :ivar recent_scans: scans with which that of the next keyframe is compared, in mode lifelong.
     """
 
-    pose: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
-    motion: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
-    match_information: NDArray[np.float64] = field(default_factory=lambda: np.zeros((3, 3)))
+    pose: Float64 = field(default_factory=lambda: np.zeros(3))
+    motion: Float64 = field(default_factory=lambda: np.zeros(3))
+    match_information: Float64 = field(default_factory=lambda: np.zeros((3, 3)))
     motion_error: MatchError = _NO_ERROR
     anchor: int = 0
-    pose_covariance: NDArray[np.float64] = field(default_factory=_INITIAL_COVARIANCE.copy)
+    pose_covariance: Float64 = field(default_factory=_INITIAL_COVARIANCE.copy)
     contradicted: bool = False
     recent_scans: tuple[RecentScan, ...] = ()
 
@@ -109,7 +108,7 @@ class LiveHypothesisState:
     event: LastEvent
     step_covariances: KeyframeCovariances
     keyframe_covariances: KeyframeCovariances
-    scan_poses: tuple[tuple[int, int, NDArray[np.float64]], ...]
+    scan_poses: tuple[tuple[int, int, Float64], ...]
 
 
 @dataclass
@@ -122,9 +121,9 @@ class LiveHypothesis:
     filter: LocalFilter
     settings: FilterParameters
     event: LastEvent = field(default_factory=LastEvent)
-    step_covariances: dict[int, NDArray[np.float64]] = field(default_factory=dict)
-    keyframe_covariances: dict[int, NDArray[np.float64]] = field(default_factory=dict)
-    scan_poses: list[tuple[int, int, NDArray[np.float64]]] = field(default_factory=list)
+    step_covariances: dict[int, Float64] = field(default_factory=dict)
+    keyframe_covariances: dict[int, Float64] = field(default_factory=dict)
+    scan_poses: list[tuple[int, int, Float64]] = field(default_factory=list)
 
     @classmethod
     def from_state(
@@ -257,18 +256,18 @@ class LiveHypothesis:
             self.step_covariances[keyframe], self.keyframe_covariances[keyframe] = step, covariance
         self.event = replace(self.event, pose_covariance=covariance)
 
-    def _transported_covariance(self) -> NDArray[np.float64]:
+    def _transported_covariance(self) -> Float64:
         """The covariance of the last event's pose, shape (3, 3), in the tangent space of the current pose."""
         return PoseGaussian(self.event.pose, self.event.pose_covariance).covariance_at(self.filter.pose)
 
-    def _map_bounded_covariance(self, covariance: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _map_bounded_covariance(self, covariance: Float64) -> Float64:
         """The drift, shape (3, 3), bounded by the error of the map in the directions that the match determines."""
         gain = self.event.motion_error.gain
         free = np.eye(3) - gain
         bounded = gain @ self._map_covariance() @ gain.T + free @ covariance @ free.T
         return bounded + self.event.motion_error.pose_covariance
 
-    def _map_covariance(self) -> NDArray[np.float64]:
+    def _map_covariance(self) -> Float64:
         """The error of the map here: the covariance of the area's nearest keyframe, shape (3, 3); 0 where unknown."""
         rows = self.filter.keyframes, self.filter.keyframe_areas, self.filter.leading_keyframe_poses()
         known = [
@@ -281,7 +280,7 @@ class LiveHypothesis:
         relative = se2.between(self.filter.pose, np.array([pose for _, pose in known]))
         nearest = int(np.argmin(np.hypot(relative[:, 0], relative[:, 1])))
         ad = se2.adjoint(relative[nearest])
-        covariance: NDArray[np.float64] = ad @ self.keyframe_covariances[known[nearest][0]] @ ad.T
+        covariance: Float64 = ad @ self.keyframe_covariances[known[nearest][0]] @ ad.T
         return covariance
 
     def _nearest_keyframe(self) -> int:
@@ -373,12 +372,12 @@ class LiveHypothesis:
             self.event = replace(self.event, pose_covariance=covariance)
         self.event = replace(self.event, anchor=self._nearest_keyframe())
 
-    def _move_event(self, move: Callable[[NDArray[np.float64]], NDArray[np.float64]]) -> None:
+    def _move_event(self, move: Callable[[Float64], Float64]) -> None:
         """Move the poses of the last event, each shape (3,)."""
         recent = tuple(RecentScan(recent.scan, move(recent.pose)) for recent in self.event.recent_scans)
         self.event = replace(self.event, pose=move(self.event.pose), recent_scans=recent)
 
-    def merge(self, merged: AreaMerge, keyframes: Mapping[int, NDArray[np.float64]]) -> None:
+    def merge(self, merged: AreaMerge, keyframes: Mapping[int, Float64]) -> None:
         """Add the uncertainty of an area's pose to covariances of what becomes part of another area with it.
 
         :param keyframes: {keyframe: ``area_T_base``, shape (3,)} of the merged area.
@@ -391,7 +390,7 @@ class LiveHypothesis:
             belief = merged.pose.compose(PoseGaussian(self.event.pose, self.event.pose_covariance))
             self.event = replace(self.event, pose_covariance=belief.covariance)
 
-    def _rebase_covariances(self, rebase: PoseGaussian) -> NDArray[np.float64]:
+    def _rebase_covariances(self, rebase: PoseGaussian) -> Float64:
         """The drift in the entered area, shape (3, 3); sets that of the keyframes that moved with the robot.
 
         It accumulates along these keyframes; without them, the map bounds it.
@@ -422,7 +421,7 @@ class LiveHypothesis:
         self._move_event(lambda pose: se2.compose(after, se2.between(before, pose)))
 
 
-def _propagated_covariance(rebase: PoseGaussian, pose: NDArray[np.float64]) -> NDArray[np.float64]:
+def _propagated_covariance(rebase: PoseGaussian, pose: Float64) -> Float64:
     """The covariance (3, 3) that the uncertainty of ``area_T_previous`` adds to a pose in the area, (3,)."""
     known = PoseGaussian.from_pose(se2.between(rebase.mean, pose))
     return rebase.compose(known).covariance

@@ -12,8 +12,8 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
@@ -211,7 +211,7 @@ class MetricSlam:
         return self._mapping.pool.peak_bytes
 
     @property
-    def particles(self) -> tuple[int, NDArray[np.float64]]:
+    def particles(self) -> tuple[int, Float64]:
         """Area of the most probable hypothesis and the poses of its particles, ``area_T_base``, shape (M, 3)."""
         return self._best_hypothesis.filter.area, self._best_hypothesis.filter.poses
 
@@ -416,7 +416,7 @@ class MetricSlam:
                 live.filter.release()
         self._live_hypotheses = children
 
-    def _area_keyframes(self, hypothesis: int, areas: Mapping[int, NDArray[np.float64]]) -> list[PlacedKeyframe]:
+    def _area_keyframes(self, hypothesis: int, areas: Mapping[int, Float64]) -> list[PlacedKeyframe]:
         """The keyframes of areas for the local map, in the frame of the robot's area.
 
         :param areas: {area: ``robot_area_T_area``, shape (3,)}.

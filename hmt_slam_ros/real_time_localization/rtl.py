@@ -13,8 +13,8 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
@@ -45,12 +45,12 @@ class OdometryPathPoint(NamedTuple):
     """
 
     stamp: int
-    measured: NDArray[np.float64]
-    reset_free: NDArray[np.float64]
+    measured: Float64
+    reset_free: Float64
     distance: float
     angle: float
 
-    def with_measured(self, pose: NDArray[np.float64]) -> OdometryPathPoint:
+    def with_measured(self, pose: Float64) -> OdometryPathPoint:
         """This reading with another measured pose nearby, shape (3,)."""
         return self._replace(measured=pose, reset_free=se2.compose(self.reset_free, se2.between(self.measured, pose)))
 
@@ -78,7 +78,7 @@ class RtlState:
     base_reading: OdometryPathPoint | None = None
     area_poses: tuple[AreaPose, ...] = (_FIRST_AREA_POSE,)
     base_area_pose: PoseGaussian = _FIRST_AREA_POSE.pose
-    ambiguity: NDArray[np.float64] = field(default_factory=partial(np.zeros, (3, 3)))
+    ambiguity: Float64 = field(default_factory=partial(np.zeros, (3, 3)))
 
 
 class Rtl:
@@ -212,15 +212,15 @@ class CorrectionSmoother:
 
     def __init__(self) -> None:
         self._stamp = 0
-        self._map_T_odom: NDArray[np.float64] | None = None
+        self._map_T_odom: Float64 | None = None
 
     def smooth(
         self,
         stamp: int,
-        map_T_odom: NDArray[np.float64],
-        odom_T_base: NDArray[np.float64],
+        map_T_odom: Float64,
+        odom_T_base: Float64,
         time_constant: float,
-    ) -> NDArray[np.float64]:
+    ) -> Float64:
         """The smoothed ``map_T_odom``, shape (3,).
 
         :param stamp: of the odometry, ns.

@@ -7,14 +7,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from hmt_slam_ros.arrays import Bool, Float32, Float64, Int64
 from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.registration.consistency import Agreement
 from hmt_slam_ros.sensors import Scan
-
-Points = NDArray[np.float64]
 
 _MAX_GAP = 0.3
 """Distance of neighboring end points of a scan up to which the surface between them is filled, m."""
@@ -76,23 +74,23 @@ class AreaGrid:
     :ivar points: shape (n, 2), one surface point per voxel, m, area frame: nearly independent samples.
     """
 
-    origin: Points
+    origin: Float64
     cell: float
-    log_ratio: NDArray[np.float32]
-    fine_log_ratio: NDArray[np.float32]
-    free: NDArray[np.bool_]
-    points: Points
+    log_ratio: Float32
+    fine_log_ratio: Float32
+    free: Bool
+    points: Float64
 
     @property
     def nbytes(self) -> int:
         """Memory of the grid, bytes."""
         return self.log_ratio.nbytes + self.fine_log_ratio.nbytes + self.free.nbytes + self.points.nbytes
 
-    def shift_origin(self, shift: Points) -> AreaGrid:
+    def shift_origin(self, shift: Float64) -> AreaGrid:
         """The same grid in a parallel frame with its origin at ``shift``, shape (2,), of this frame."""
         return replace(self, origin=self.origin - shift, points=self.points - shift)
 
-    def compare(self, points: Points, pose: NDArray[np.float64]) -> Agreement:
+    def compare(self, points: Float64, pose: Float64) -> Agreement:
         """Agreement of surface samples of another map with this one.
 
         :param points: shape (n, 2), m.
@@ -102,7 +100,7 @@ class AreaGrid:
         return Agreement(len(points), on, free)
 
 
-def build_area_grid(scans: Sequence[Scan], poses: NDArray[np.float64], model: GridModel) -> AreaGrid:
+def build_area_grid(scans: Sequence[Scan], poses: Float64, model: GridModel) -> AreaGrid:
     """The grid of keyframes.
 
     :param scans: the keyframes' scans.
@@ -124,7 +122,7 @@ def build_area_grid(scans: Sequence[Scan], poses: NDArray[np.float64], model: Gr
     return AreaGrid(origin, model.cell, _downsample(fine), fine, free, thin_points(hits, model.spacing))
 
 
-def surface_points(scan: Scan, model: GridModel) -> Points:
+def surface_points(scan: Scan, model: GridModel) -> Float64:
     """The surface points of a scan, one per voxel, m, base frame, shape (n, 2)."""
     return thin_points(_end_points([scan], np.zeros((1, 3)), model.max_range)[0], model.spacing)
 
@@ -134,9 +132,7 @@ def _empty_grid(cell: float) -> AreaGrid:
     return AreaGrid(np.zeros(2), cell, nothing[:1, :1], nothing, np.zeros((1, 1), np.bool_), np.zeros((0, 2)))
 
 
-def _end_points(
-    scans: Sequence[Scan], poses: NDArray[np.float64], max_range: float
-) -> tuple[Points, Points, NDArray[np.int64]]:
+def _end_points(scans: Sequence[Scan], poses: Float64, max_range: float) -> tuple[Float64, Float64, Int64]:
     """End points and the position of the laser at each, area frame, (n, 2), and the number of its scan, (n,)."""
     numbers = np.repeat(np.arange(len(scans)), [len(scan.points) for scan in scans])
     points, origins = (
@@ -148,7 +144,7 @@ def _end_points(
     return se2.transform(poses[numbers], points[near]), se2.transform(poses[numbers], origins[near]), numbers
 
 
-def thin_points(points: Points, spacing: float) -> Points:
+def thin_points(points: Float64, spacing: float) -> Float64:
     """The mean point of every occupied voxel, shape (n, 2), ordered by voxel."""
     if not len(points):
         return points
@@ -160,8 +156,8 @@ def thin_points(points: Points, spacing: float) -> Points:
 
 
 @njit(cache=True)
-def _fill_gaps(points: Points, scans: NDArray[np.int64], step: float) -> Points:
-    """Points in the order of the beams, with the gaps along the surfaces of each scan filled.
+def _fill_gaps(points: Float64, scans: Int64, step: float) -> Float64:
+    """Float64 in the order of the beams, with the gaps along the surfaces of each scan filled.
 
     :param scans: number of the scan of each point, shape (n,).
     """
@@ -182,9 +178,7 @@ def _fill_gaps(points: Points, scans: NDArray[np.int64], step: float) -> Points:
 
 
 @njit(cache=True)
-def _convert_to_log_ratio(
-    fine: NDArray[np.float32], free: NDArray[np.bool_], sigma: float, surface_ratio: float, free_ratio: float
-) -> None:
+def _convert_to_log_ratio(fine: Float32, free: Bool, sigma: float, surface_ratio: float, free_ratio: float) -> None:
     """Convert squared distances, in cells half as long as those of ``free``, to a blend of surface and free space.
 
     Free space counts in full from two or three sigma on: beams that graze a wall see free space right up to it, and
@@ -205,7 +199,7 @@ def _convert_to_log_ratio(
 
 
 @njit(cache=True)
-def _downsample(fine: NDArray[np.float32]) -> NDArray[np.float32]:
+def _downsample(fine: Float32) -> Float32:
     """The means of squares of four cells, in a tenth of numpy's time."""
     coarse = np.empty((fine.shape[0] // 2, fine.shape[1] // 2), np.float32)
     for r in range(coarse.shape[0]):
@@ -216,7 +210,7 @@ def _downsample(fine: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 @njit(cache=True)
-def _mark_free(free: NDArray[np.bool_], origin: Points, cell: float, lasers: Points, points: Points) -> None:
+def _mark_free(free: Bool, origin: Float64, cell: float, lasers: Float64, points: Float64) -> None:
     """Mark the cells from the laser to one cell before each end point."""
     for k in range(points.shape[0]):
         x0, y0 = (lasers[k, 0] - origin[0]) / cell, (lasers[k, 1] - origin[1]) / cell
@@ -228,7 +222,7 @@ def _mark_free(free: NDArray[np.bool_], origin: Points, cell: float, lasers: Poi
 
 
 @njit(cache=True)
-def _lower_distances(distance2: NDArray[np.float32], origin: Points, cell: float, points: Points, reach: float) -> None:
+def _lower_distances(distance2: Float32, origin: Float64, cell: float, points: Float64, reach: float) -> None:
     """Lower every cell near a point to the squared distance from its center to that point, m^2."""
     span = int(np.ceil(reach / cell))
     rows, columns = distance2.shape
@@ -251,7 +245,7 @@ def _lower_distances(distance2: NDArray[np.float32], origin: Points, cell: float
 
 
 @njit(cache=True)
-def _count_agreement(points: Points, fine: NDArray[np.float32], origin: Points, cell: float) -> tuple[int, int]:
+def _count_agreement(points: Float64, fine: Float32, origin: Float64, cell: float) -> tuple[int, int]:
     on, free = 0, 0
     for n in range(points.shape[0]):
         column, row = int(np.floor((points[n, 0] - origin[0]) / cell)), int(np.floor((points[n, 1] - origin[1]) / cell))
@@ -262,7 +256,7 @@ def _count_agreement(points: Points, fine: NDArray[np.float32], origin: Points, 
 
 
 @njit(cache=True)
-def _free_around(fine: NDArray[np.float32], row: int, column: int) -> bool:
+def _free_around(fine: Float32, row: int, column: int) -> bool:
     """Whether it is free on all sides: at the edge of free space there may be a wall that a beam grazed."""
     across = max(fine[row, column - _MARGIN], fine[row, column + _MARGIN])
     return bool(max(across, fine[row - _MARGIN, column], fine[row + _MARGIN, column]) < _IN_FREE_SPACE)

@@ -8,8 +8,8 @@ from functools import partial
 from typing import NamedTuple, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration.metric_slam import MotionParameters
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.covariance import inverse, propagate_covariance
@@ -38,7 +38,7 @@ NOISY_FACTOR = 2.0
 
 _DEGREES, _RADIANS = 180.0 / math.pi, math.pi / 180.0
 
-Length = TypeVar("Length", float, NDArray[np.float64])
+Length = TypeVar("Length", float, Float64)
 
 
 class RelativeMotion(NamedTuple):
@@ -48,8 +48,8 @@ class RelativeMotion(NamedTuple):
     :ivar covariance: shape (3, 3), in the frame of its end.
     """
 
-    increment: NDArray[np.float64]
-    covariance: NDArray[np.float64]
+    increment: Float64
+    covariance: Float64
 
     def compose(self, other: RelativeMotion) -> RelativeMotion:
         """Both motions, one after the other."""
@@ -94,13 +94,13 @@ class InertiaState:
     :ivar interval_error: shape (3,), error of the last prediction if that time is wrong, m, m, rad.
     """
 
-    velocity: NDArray[np.float64]
-    covariance: NDArray[np.float64]
-    predicted_information: NDArray[np.float64]
+    velocity: Float64
+    covariance: Float64
+    predicted_information: Float64
     long_term_period: float = 0.0
     recent_period: float = 0.0
     last_interval: float = 0.0
-    interval_error: NDArray[np.float64] = field(default_factory=partial(np.zeros, 3))
+    interval_error: Float64 = field(default_factory=partial(np.zeros, 3))
 
 
 class Inertia:
@@ -135,9 +135,7 @@ class Inertia:
         spread = covariance * interval**2 + np.outer(error, error) + self._floor
         return RelativeMotion(se2.exp(state.velocity * lasting), spread)
 
-    def observe(
-        self, increment: NDArray[np.float64], information: NDArray[np.float64], odometry: RelativeMotion | None = None
-    ) -> None:
+    def observe(self, increment: Float64, information: Float64, odometry: RelativeMotion | None = None) -> None:
         """Update the velocity by the motion that was predicted last.
 
         :param increment: ``start_T_end`` (3,) as matched.
@@ -180,8 +178,8 @@ class OdometryNoiseState:
     :ivar weights: shape (2,), the sums of these weights.
     """
 
-    weighted_ratios: NDArray[np.float64] = field(default_factory=partial(np.ones, 2))
-    weights: NDArray[np.float64] = field(default_factory=partial(np.ones, 2))
+    weighted_ratios: Float64 = field(default_factory=partial(np.ones, 2))
+    weights: Float64 = field(default_factory=partial(np.ones, 2))
 
 
 class OdometryNoise:
@@ -197,12 +195,12 @@ class OdometryNoise:
         self.state = state or OdometryNoiseState()
 
     @property
-    def factors(self) -> NDArray[np.float64]:
+    def factors(self) -> Float64:
         """Factors on the deviations of translation and of rotation, shape (2,)."""
         return np.sqrt(np.maximum(1.0, self.state.weighted_ratios / self.state.weights))
 
     @property
-    def _variance_factors(self) -> NDArray[np.float64]:
+    def _variance_factors(self) -> Float64:
         """Factors on a covariance, shape (3, 3)."""
         scale = self.factors[[0, 0, 1]]
         return np.outer(scale, scale)
@@ -227,7 +225,7 @@ class OdometryNoise:
         fused = independent.fuse(inertia)
         return fused._replace(covariance=fused.covariance + lasting)
 
-    def learn(self, odometry: RelativeMotion, matched: NDArray[np.float64], information: NDArray[np.float64]) -> None:
+    def learn(self, odometry: RelativeMotion, matched: Float64, information: Float64) -> None:
         """Update the noise by a step of odometry, with the model's covariance P, and the matched step.
 
         A match of covariance R moves the estimate by P (P + R)^-1 of the difference. The expected square of that, as a
@@ -265,7 +263,7 @@ class MotionState:
     """
 
     readings: tuple[Odometry, ...] = ()
-    odometry_pose: NDArray[np.float64] = field(default_factory=partial(np.zeros, 3))
+    odometry_pose: Float64 = field(default_factory=partial(np.zeros, 3))
     noise: OdometryNoiseState = field(default_factory=OdometryNoiseState)
     inertia: InertiaState | None = None
     stamp: int | None = None
@@ -300,7 +298,7 @@ class MotionModel:
         )
 
     @property
-    def odometry_pose(self) -> NDArray[np.float64]:
+    def odometry_pose(self) -> Float64:
         """``odom_T_base`` (3,) at the last scan; where odometry is unknown, continued by the matched motion."""
         return self._state.odometry_pose
 
@@ -334,9 +332,7 @@ class MotionModel:
         covariance = increment_covariance(increment, self._motion)
         return RelativeMotion(increment, covariance + (last_gap**2 + gap**2) * self._squared_accelerations)
 
-    def observe(
-        self, increment: NDArray[np.float64], information: NDArray[np.float64], contradicted: bool = False
-    ) -> None:
+    def observe(self, increment: Float64, information: Float64, contradicted: bool = False) -> None:
         """Update the velocity by the motion that was predicted last.
 
         :param increment: ``start_T_end`` (3,) as matched.
@@ -347,7 +343,7 @@ class MotionModel:
         if self._state.interpolation_gap is None:
             self._state = replace(self._state, odometry_pose=se2.compose(self.odometry_pose, increment))
 
-    def observe_keyframe(self, increment: NDArray[np.float64], information: NDArray[np.float64]) -> None:
+    def observe_keyframe(self, increment: Float64, information: Float64) -> None:
         """Update the noise of odometry by the motion since the last keyframe.
 
         :param increment: (3,), as matched.
@@ -358,17 +354,17 @@ class MotionModel:
         self._state = replace(self._state, since_keyframe=NO_MOTION)
 
 
-def _squared_accelerations(motion: MotionParameters) -> NDArray[np.float64]:
+def _squared_accelerations(motion: MotionParameters) -> Float64:
     """Squares of the robot's accelerations, on the diagonal (3, 3), m^2/s^4 and rad^2/s^4."""
     return np.diag([motion.acceleration**2, motion.acceleration**2, math.radians(motion.turn_acceleration) ** 2])
 
 
-def increment_covariance(increment: NDArray[np.float64], motion: MotionParameters) -> NDArray[np.float64]:
+def increment_covariance(increment: Float64, motion: MotionParameters) -> Float64:
     """Covariance (3, 3) of an odometry increment in the frame of its end, m and rad."""
     return path_covariance(math.hypot(increment[0], increment[1]), abs(float(se2.wrap(increment[2]))), motion)
 
 
-def path_covariance(distance: float, angle: float, motion: MotionParameters) -> NDArray[np.float64]:
+def path_covariance(distance: float, angle: float, motion: MotionParameters) -> Float64:
     """Covariance (3, 3) of the odometry over a path, in the frame of its end, m and rad.
 
     Standard deviations grow linearly with the distance (m) and the angle (rad) traveled; the lateral deviation equals

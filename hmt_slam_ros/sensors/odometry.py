@@ -14,8 +14,8 @@ from dataclasses import dataclass, replace
 from statistics import median
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration.robot import RealTimeParameters
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.sensors.scan import Scan
@@ -30,7 +30,7 @@ class Odometry:
     """
 
     stamp: int
-    pose: NDArray[np.float64]
+    pose: Float64
 
 
 class OdometryBuffer:
@@ -60,7 +60,7 @@ class OdometryBuffer:
         """Whether there is a reading at or after ``stamp`` (ns)."""
         return bool(self._readings) and self._readings[-1].stamp >= stamp
 
-    def pose_at(self, stamp: int) -> tuple[NDArray[np.float64], float] | None:
+    def pose_at(self, stamp: int) -> tuple[Float64, float] | None:
         """``odom_T_base`` (3,) at ``stamp`` (ns), interpolated, or None where no two readings enclose it.
 
         The second value is half the product of the times to both readings, s^2. Times a constant acceleration, it is
@@ -73,7 +73,7 @@ class OdometryBuffer:
         first, second = self._enclosing_readings(stamp)
         return self._extrapolated_pose(stamp), 0.5e-18 * (stamp - first.stamp) * (second.stamp - stamp)
 
-    def twist_between(self, start: int, end: int) -> NDArray[np.float64]:
+    def twist_between(self, start: int, end: int) -> Float64:
         """The motion of the base from ``start`` to ``end`` (ns) as a twist (3,); zeros where it is unknown.
 
         The speed between the last two readings continues after the newest, for the time between the two.
@@ -87,7 +87,7 @@ class OdometryBuffer:
             se2.between(self._extrapolated_pose(min(start, limit)), self._extrapolated_pose(min(end, limit)))
         )
 
-    def _extrapolated_pose(self, stamp: int) -> NDArray[np.float64]:
+    def _extrapolated_pose(self, stamp: int) -> Float64:
         """``odom_T_base`` (3,): constant before the first reading, interpolated, extrapolated after the last."""
         first, second = self._enclosing_readings(stamp)
         if stamp == second.stamp:

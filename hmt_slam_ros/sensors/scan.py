@@ -13,7 +13,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from hmt_slam_ros.arrays import Bool, Float32, Float64
 from hmt_slam_ros.geometry import se2
@@ -22,7 +21,7 @@ _MICROSECONDS = 1e6
 
 
 @lru_cache(maxsize=4)
-def _directions(count: int, first: float, increment: float) -> NDArray[np.float64]:
+def _directions(count: int, first: float, increment: float) -> Float64:
     """Unit vectors (n, 2) of evenly spaced angles, rad; the same for all scans of a laser."""
     angles = first + increment * np.arange(count)
     return np.stack((np.cos(angles), np.sin(angles)), axis=1)
@@ -49,7 +48,7 @@ def _valid_mask(ranges: Float32, nearest: np.float32, farthest: np.float32) -> B
     return valid
 
 
-def _zeros() -> NDArray[np.float64]:
+def _zeros() -> Float64:
     return np.zeros(3)
 
 
@@ -92,15 +91,15 @@ class Scan:
     """
 
     stamp: int
-    ranges: NDArray[np.float32]
+    ranges: Float32
     angle_min: float
     angle_increment: float
     range_min: float
     range_max: float
-    laser_pose: NDArray[np.float64] = field(default_factory=_zeros)
+    laser_pose: Float64 = field(default_factory=_zeros)
     time_increment: float = 0.0
-    motion: NDArray[np.float64] = field(default_factory=_zeros)
-    starts: NDArray[np.float32] | None = None
+    motion: Float64 = field(default_factory=_zeros)
+    starts: Float32 | None = None
     _revised: tuple[BeamRevision, Scan] | None = field(default=None, init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -118,16 +117,16 @@ class Scan:
         return self.stamp + 1000 * round(self.sweep_duration * _MICROSECONDS)
 
     @cached_property
-    def valid(self) -> NDArray[np.bool_]:
+    def valid(self) -> Bool:
         """Beams with a return, shape (n,)."""
         return _valid_mask(self.ranges, np.float32(max(self.range_min, 1e-3)), np.float32(self.range_max))
 
     @cached_property
-    def points(self) -> NDArray[np.float64]:
+    def points(self) -> Float64:
         """End points of the beams with a return, shape (k, 2), meters, robot base frame."""
         return self._deskew(self._points_along_beams(self.ranges))
 
-    def _points_along_beams(self, ranges: NDArray[np.float32]) -> NDArray[np.float64]:
+    def _points_along_beams(self, ranges: Float32) -> Float64:
         """Points on the beams with a return, shape (k, 2), in the frame of the base at each beam.
 
         :param ranges: shape (n,), distances from the laser, m.
@@ -150,7 +149,7 @@ class Scan:
         return self._revised[1]
 
     @property
-    def origins(self) -> NDArray[np.float64]:
+    def origins(self) -> Float64:
         """Start points of the beams with a return, shape (k, 2), meters, robot base frame.
 
         A beam starts at the laser, or at its ``starts``.
@@ -162,11 +161,11 @@ class Scan:
         return self._deskew(origins)
 
     @property
-    def beams(self) -> NDArray[np.float64]:
+    def beams(self) -> Float64:
         """Vectors from ``origins`` to ``points``, shape (k, 2), meters, robot base frame."""
         return self.points - self.origins
 
-    def _deskew(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _deskew(self, points: Float64) -> Float64:
         """Points (k, 2), one on each beam with a return, from the base at that beam to the base at the first."""
         if not self.motion.any():
             return points

@@ -149,56 +149,44 @@ class LocalFilter(Protocol):
     @property
     def state(self) -> ParticleFilterState | LineFilterState:
         """The whole state, as a value."""
-        ...
 
     @property
     def pose(self) -> Float64:
         """``map_T_base``, shape (3,)."""
-        ...
 
     @property
     def poses(self) -> Float64:
         """``map_T_base`` of its samples, shape (M, 3)."""
-        ...
 
     def leading_keyframe_poses(self) -> Float64:
         """``map_T_base`` of the local map's keyframes, shape (K, 3)."""
-        ...
 
     def branch(self, hypothesis: int) -> LocalFilter:
         """A filter of the same state for a child hypothesis."""
-        ...
 
     def release(self) -> None:
         """Free the map; the filter is not used afterwards."""
-        ...
 
     def initialize(self, pose: PoseGaussian) -> None:
         """Set the belief over ``map_T_base``, and predict from there."""
-        ...
 
     def track(self, prepared: PreparedScan, prediction: Prediction) -> TrackedMotion:
         """Match a scan between two keyframes."""
-        ...
 
     def update(self, prepared: PreparedScan, step: int) -> FilterStep:
         """The filter step with the scan of a keyframe, which was tracked before.
 
         :param step: number of the keyframe event, for the random streams.
         """
-        ...
 
     def compare_scan(self, prepared: PreparedScan) -> MapAgreement:
         """Agreement of a scan with the map, at the current pose."""
-        ...
 
     def add_keyframe(self, keyframe: int, scan: Scan) -> None:
         """Insert a scan into the map at the current pose."""
-        ...
 
     def drop_keyframes(self, keyframes: Collection[int]) -> None:
         """Remove keyframes, but not their scans from the map."""
-        ...
 
     def change_area(self, area: int, area_T_previous: Float64, content: Sequence[PlacedKeyframe]) -> None:
         """Change to the frame of another area and load its local map.
@@ -207,7 +195,6 @@ class LocalFilter(Protocol):
         :param area_T_previous: shape (3,).
         :param content: all keyframes of the local map, in the new frame.
         """
-        ...
 
     def reload(self, content: Sequence[PlacedKeyframe], anchor: int) -> None:
         """Rebuild the local map after its keyframes moved; the pose of the robot in one of them stays.
@@ -215,7 +202,6 @@ class LocalFilter(Protocol):
         :param content: all keyframes of the local map.
         :param anchor: the keyframe relative to which the robot stays.
         """
-        ...
 
 
 class FilterFactory(Protocol):
@@ -223,14 +209,12 @@ class FilterFactory(Protocol):
 
     def new(self, hypothesis: int, area: int) -> LocalFilter:
         """A filter with an empty map."""
-        ...
 
     def restore(self, state: ParticleFilterState | LineFilterState) -> LocalFilter:
         """The filter of a state; the patches of grids are in the pool.
 
         :raises HmtSlamError: for a state of a kind that this factory does not make.
         """
-        ...
 
     def select(self, own: LocalFilter, area: int, content: Sequence[PlacedKeyframe]) -> LocalFilter:
         """The filter for the next area: ``own``, or a filter of another kind with the same belief over the pose.
@@ -240,4 +224,3 @@ class FilterFactory(Protocol):
         :param area: the area that is entered.
         :param content: keyframes in its frame; those of the area show its kind.
         """
-        ...
