@@ -43,9 +43,9 @@ def test_a_slip_in_a_turn_does_not_lose_the_robot_and_is_said_once(rate, slip):
         slipped = np.radians(slip) * np.array([0.0, 0.0, 1.0 / rate]) * (7.0 < stamp / SECOND - 1.0 <= 8.0)
         odometry = se2.compose(odometry, se2.compose(se2.between(before, pose), slipped))
         before = pose
-        dialogue.tell(Odometry(stamp, odometry), scan)
+        dialogue.send(Odometry(stamp, odometry), scan)
         truths.append(pose)
-    dialogue.tell(EndOfLog())
+    dialogue.send(EndOfLog())
     distance, angle = errors(dialogue, truths)
     assert distance < 0.08
     assert angle < 1.5
@@ -60,9 +60,9 @@ def test_a_slip_in_a_turn_does_not_lose_the_robot_and_is_said_once(rate, slip):
 def test_without_odometry_the_robot_is_tracked_from_its_first_scan_on(rate):
     dialogue, truths = Dialogue(), []
     for _, pose, scan in turning_drive(rate):
-        dialogue.tell(scan)
+        dialogue.send(scan)
         truths.append(pose)
-    dialogue.tell(EndOfLog())
+    dialogue.send(EndOfLog())
     assert len(dialogue.of(LocalEstimate)) == len(truths)
     distance, angle = errors(dialogue, truths)
     assert distance < 0.08
@@ -74,7 +74,7 @@ def test_without_odometry_the_robot_is_tracked_from_its_first_scan_on(rate):
 def test_without_odometry_no_scan_waits_once_patience_is_lost():
     dialogue = Dialogue()
     for k, (_, _, scan) in enumerate(turning_drive(5.0)):
-        dialogue.tell(scan)
+        dialogue.send(scan)
         waited = dialogue.slam.queued_scans
         assert waited == (k + 1 if k < 15 else 0)
 
@@ -83,9 +83,9 @@ def test_odometry_that_falls_silent_and_comes_back_is_used_again():
     dialogue, truths = Dialogue(), []
     for k, (stamp, pose, scan) in enumerate(turning_drive(5.0)):
         messages = [scan] if 30 <= k < 70 else [Odometry(stamp, pose), scan]
-        dialogue.tell(*messages)
+        dialogue.send(*messages)
         truths.append(pose)
-    dialogue.tell(EndOfLog())
+    dialogue.send(EndOfLog())
     distance, angle = errors(dialogue, truths)
     assert distance < 0.08
     assert angle < 1.5
@@ -96,9 +96,9 @@ def test_readings_that_are_missing_here_and_there_are_bridged():
     random = np.random.default_rng(0)
     dialogue, truths = Dialogue(), []
     for stamp, pose, scan in turning_drive(5.0):
-        dialogue.tell(*([scan] if random.random() < 0.3 else [Odometry(stamp, pose), scan]))
+        dialogue.send(*([scan] if random.random() < 0.3 else [Odometry(stamp, pose), scan]))
         truths.append(pose)
-    dialogue.tell(EndOfLog())
+    dialogue.send(EndOfLog())
     distance, angle = errors(dialogue, truths)
     assert distance < 0.08
     assert angle < 1.5
@@ -113,9 +113,9 @@ def test_noise_beyond_the_model_is_learnt_and_said_once():
         error = np.array([0.08, 0.08, np.radians(4.0)]) * random.standard_normal(3)
         odometry = se2.compose(odometry, se2.compose(se2.between(before, pose), error))
         before = pose
-        dialogue.tell(Odometry(stamp, odometry), scan)
+        dialogue.send(Odometry(stamp, odometry), scan)
         truths.append(pose)
-    dialogue.tell(EndOfLog())
+    dialogue.send(EndOfLog())
     distance, angle = errors(dialogue, truths)
     assert distance < 0.1
     assert angle < 2.0
@@ -128,8 +128,8 @@ def test_without_odometry_a_robot_that_sets_off_along_a_corridor_is_followed(see
     speeds = np.concatenate((np.zeros(15), np.arange(0.0, 0.6, 0.15), np.full(60, 0.6)))
     for k, x in enumerate(0.2 * np.cumsum(speeds)):
         truths.append(np.array([x, 0.0, 0.0]))
-        dialogue.tell(scan_in(walls, truths[-1], stamp=SECOND + k * SECOND // 5, noise=0.01, seed=k))
-    dialogue.tell(EndOfLog())
+        dialogue.send(scan_in(walls, truths[-1], stamp=SECOND + k * SECOND // 5, noise=0.01, seed=k))
+    dialogue.send(EndOfLog())
     distance, angle = errors(dialogue, truths)
     assert distance < 0.3
     assert angle < 1.5

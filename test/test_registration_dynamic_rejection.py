@@ -41,11 +41,11 @@ def test_in_a_corridor_the_robot_goes_where_odometry_leads_and_not_with_a_person
     for k in range(1, 17):
         truth = k * STEP
         scan = scan_in(np.concatenate((CORRIDOR, person(3.0 + pace * k))), truth, beams=361, noise=0.01, seed=k)
-        sighting = PreparedScan(mapping, scan)
-        tracked = area_filter.track(sighting, predicted(step))
+        prepared = PreparedScan(mapping, scan)
+        tracked = area_filter.track(prepared, predicted(step))
         assert not tracked.contradicts_odometry
         if k % 4 == 0:
-            area_filter.update(sighting, k)
+            area_filter.update(prepared, k)
             area_filter.add_keyframe(k, scan)
         np.testing.assert_allclose(area_filter.pose, truth, atol=0.08)
 
@@ -59,11 +59,11 @@ def test_nobody_draws_the_robot_along_by_steps_that_noisy_odometry_does_not_cont
     for k in range(1, 25):
         truth = k * STEP
         scan = scan_in(np.concatenate((CORRIDOR, person(6.0 + pace * k))), truth, beams=361, noise=0.01, seed=k)
-        sighting = PreparedScan(mapping, scan)
-        area_filter.track(sighting, predicted(step))
+        prepared = PreparedScan(mapping, scan)
+        area_filter.track(prepared, predicted(step))
         off.append(np.hypot(*(area_filter.pose - truth)[:2]))
         if k % 6 == 0:
-            area_filter.update(sighting, k)
+            area_filter.update(prepared, k)
             area_filter.add_keyframe(k, scan)
     # Odometry is believed to four deviations of the six steps between two keyframes; without that, 1.8 m.
     assert max(off) < 4.1 * np.sqrt(6.0) * deviation

@@ -28,9 +28,9 @@ def driven(walls, truth, seed):
         noise = se2.exp(np.sqrt(np.diag(ODOMETRY)) * random.standard_normal(3))
         step = RelativeMotion(se2.compose(se2.between(truth[k - 1], truth[k]), noise), ODOMETRY)
         scan = scan_in(walls, truth[k], noise=0.015, seed=1000 * seed + k)
-        sighting = PreparedScan(mapping, scan)
-        area_filter.track(sighting, Prediction(step, step, step))
-        steps.append(area_filter.update(sighting, k))
+        prepared = PreparedScan(mapping, scan)
+        area_filter.track(prepared, Prediction(step, step, step))
+        steps.append(area_filter.update(prepared, k))
         area_filter.add_keyframe(k, scan)
     return area_filter.leading_keyframe_poses(), steps
 

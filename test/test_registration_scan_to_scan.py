@@ -24,7 +24,7 @@ from hmt_slam_ros.results.final_map import register_scans
 
 OPTIONS = RefinementParameters()
 CORRIDOR = np.array([[-200.0, -1.0, 200.0, -1.0], [-200.0, 1.0, 200.0, 1.0]])
-# Through the door and back, every half metre.
+# Through the door and back, every half meter.
 TRUTH = np.concatenate((drive((2.0, 2.0), (5.0, 3.0), (9.0, 3.0)), drive((9.0, 3.2), (5.0, 3.2), (2.0, 2.5))))
 
 

@@ -35,11 +35,11 @@ def driven(mapping, odometry_error=(0.0, 0.0, 0.0), steps=60, hypothesis=0):
     for k in range(1, steps):
         truth = se2.compose(truth, STEP)
         scan = scan_in(ROOM, truth, noise=0.01, seed=k)
-        sighting = PreparedScan(mapping, scan)
-        area_filter.track(sighting, predicted(STEP + np.asarray(odometry_error)))
+        prepared = PreparedScan(mapping, scan)
+        area_filter.track(prepared, predicted(STEP + np.asarray(odometry_error)))
         if k % 5 == 0:
             events += 1
-            area_filter.update(sighting, events)
+            area_filter.update(prepared, events)
             area_filter.add_keyframe(events, scan)
     return area_filter, truth
 

@@ -40,8 +40,8 @@ def predicted(odometry, inertia=STILL):
 
 
 def track(area_filter, walls, truth, odometry, inertia=STILL):
-    sighting = PreparedScan(area_filter.mapping, scan_in(walls, truth, noise=0.01))
-    return area_filter.track(sighting, predicted(odometry, inertia))
+    prepared = PreparedScan(area_filter.mapping, scan_in(walls, truth, noise=0.01))
+    return area_filter.track(prepared, predicted(odometry, inertia))
 
 
 def error_of(pose, truth):
@@ -86,8 +86,8 @@ def test_in_a_corridor_that_looks_the_same_all_along_odometry_tells_how_far(mapp
         # The velocity has it that the robot stands; and people hide a third of the walls.
         scan = scan_in(CORRIDOR, truth, noise=0.01, seed=k)
         scan.ranges[60:120] = 0.9
-        sighting = PreparedScan(mapping, scan)
-        tracked = area_filter.track(sighting, predicted(RelativeMotion(np.array([0.3, 0.0, 0.0]), SURE)))
+        prepared = PreparedScan(mapping, scan)
+        tracked = area_filter.track(prepared, predicted(RelativeMotion(np.array([0.3, 0.0, 0.0]), SURE)))
         assert not tracked.contradicts_odometry
     assert area_filter.pose[0] == pytest.approx(3.0, abs=0.1)
 
@@ -96,8 +96,8 @@ def test_a_scan_that_shows_nothing_of_the_map_is_placed_by_odometry(mapping):
     area_filter = mapped(mapping, ROOM, [(0, 0, 0)])
     elsewhere = box(-1.0, -0.6, 14.0, 0.9)
     area_filter.poses[:] = area_filter._predicted_poses[:] = (40.0, 0.0, 0.0)
-    sighting = PreparedScan(mapping, scan_in(elsewhere, np.zeros(3)))
-    tracked = area_filter.track(sighting, predicted(RelativeMotion(np.array([0.3, 0.0, 0.1]), SURE)))
+    prepared = PreparedScan(mapping, scan_in(elsewhere, np.zeros(3)))
+    tracked = area_filter.track(prepared, predicted(RelativeMotion(np.array([0.3, 0.0, 0.1]), SURE)))
     np.testing.assert_allclose(area_filter.pose, [40.3, 0.0, 0.1], atol=1e-6)
     np.testing.assert_allclose(tracked.information, 0.0, atol=1e-9)
     assert not tracked.contradicts_odometry
@@ -168,11 +168,11 @@ def test_what_the_scans_leave_open_is_carried_on_until_the_next_keyframe(mapping
 def test_a_turn_that_odometry_missed_in_a_pause_is_found_by_a_scan_that_fits_there_and_not_here(mapping, beams):
     area_filter = mapped(mapping, ROOM, [(0, 0, 0)])
     truth = np.array([0.0, -0.45, -1.4])
-    sighting = PreparedScan(mapping, scan_in(ROOM, truth, beams=beams, noise=0.01))
+    prepared = PreparedScan(mapping, scan_in(ROOM, truth, beams=beams, noise=0.01))
     prediction = predicted(
         RelativeMotion(np.array([0.0, 0.0, -0.4]), SURE), RelativeMotion(np.array([0.0, -0.2, -1.6]), 16.0 * VAGUE)
     )
-    tracked = area_filter.track(sighting, prediction)
+    tracked = area_filter.track(prepared, prediction)
     distance, angle = error_of(area_filter.pose, truth)
     assert distance < 0.1
     assert angle < 2.0
