@@ -183,9 +183,9 @@ def test_the_trails_hold_every_scan_once_and_lead_to_its_pose():
         poses[keyframe.sequence] = keyframe.estimates[0].pose.mean
         poses |= {r.keyframe: r.pose for r in keyframe.estimates[0].revised_keyframes}
     rows = [
-        (trail.first_scan + k, se2.compose(poses[int(anchor)], pose))
-        for trail in dialogue.of(ScanPoses)
-        for k, (anchor, pose) in enumerate(zip(trail.keyframes, trail.poses, strict=True))
+        (message.first_scan + k, se2.compose(poses[int(anchor)], pose))
+        for message in dialogue.of(ScanPoses)
+        for k, (anchor, pose) in enumerate(zip(message.keyframes, message.poses, strict=True))
     ]
     assert [scan for scan, _ in rows] == list(range(60))
     errors = np.array([se2.between(t, p) for t, (_, p) in zip(truths, rows, strict=True)])

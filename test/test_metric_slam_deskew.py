@@ -64,7 +64,7 @@ class Drive(NamedTuple):
         return float(np.sqrt(np.mean(np.sum(self.errors[:, :2] ** 2, axis=1))))
 
 
-def driven(sweep, has_increment):
+def driven(sweep, timed):
     """A drive with a laser whose sweep takes so many seconds, and says so or not."""
     odometry, dialogue = list(readings()), Dialogue()
     for k in range(SCANS):
@@ -72,7 +72,7 @@ def driven(sweep, has_increment):
         poses = true_pose(begin + sweep * np.linspace(0.0, 1.0, BEAMS))
         stamp = SECOND + round(begin * SECOND)
         scan = scan_in(WALLS, poses, stamp, BEAMS, 1.5 * np.pi, noise=0.01, seed=k, sweep=sweep)
-        dialogue.send(scan if has_increment else replace(scan, time_increment=0.0))
+        dialogue.send(scan if timed else replace(scan, time_increment=0.0))
         while odometry and odometry[0].stamp < stamp + PERIOD * SECOND:
             dialogue.send(odometry.pop(0))
     dialogue.send(EndOfLog())
@@ -87,9 +87,9 @@ def driven(sweep, has_increment):
 @pytest.fixture(scope="module")
 def drives():
     return {
-        "standing": driven(0.0, has_increment=True),
-        "skewed": driven(0.1, has_increment=False),
-        "deskewed": driven(0.1, has_increment=True),
+        "standing": driven(0.0, timed=True),
+        "skewed": driven(0.1, timed=False),
+        "deskewed": driven(0.1, timed=True),
     }
 
 

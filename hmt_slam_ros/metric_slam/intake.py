@@ -244,7 +244,7 @@ class OdometryMonitor:
         if last is not None and episode.end * _SECOND - last < _PAUSE:
             self._state = replace(self._state, unreported=unreported + 1)
             return None
-        since = f" ({unreported} times more since it was last said)" if unreported else ""
+        since = f" ({unreported} times more since the last notice)" if unreported else ""
         self._state = replace(self._state, last_notice=episode.end * _SECOND, unreported=0)
         return (
             f"odometry {_motion_text(episode.odometry_motion)} from {episode.begin * _SECOND:.3f} s to "
