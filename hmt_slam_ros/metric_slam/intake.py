@@ -206,16 +206,14 @@ class OdometryMonitorState:
 
 
 class OdometryMonitor:
-    """Notices of odometry that contradicts the scans, or that is noisier than its model."""
+    """Notices of odometry that contradicts the scans, or that is noisier than its model.
+
+    :ivar state: the whole state, as a value.
+    """
 
     def __init__(self, state: OdometryMonitorState | None = None) -> None:
         """:param state: to go on from."""
-        self._state = state or OdometryMonitorState()
-
-    @property
-    def state(self) -> OdometryMonitorState:
-        """The whole state, as a value."""
-        return self._state
+        self.state = state or OdometryMonitorState()
 
     def add_scan(self, stamp: int, step: RelativeMotion | None, tracked: TrackedMotion) -> str | None:
         """Update the disagreement by a scan; returns the notice of one that has ended, if it is due.
@@ -223,29 +221,29 @@ class OdometryMonitor:
         :param stamp: of the scan, ns.
         :param step: motion by odometry since the last scan, None where it is unknown.
         """
-        episode = self._state.disagreement
+        episode = self.state.disagreement
         if tracked.contradicts_odometry and episode is None:
-            episode = OdometryDisagreement.from_stamp(self._state.last_stamp)
-        self._state = replace(self._state, last_stamp=stamp, disagreement=episode)
+            episode = OdometryDisagreement.from_stamp(self.state.last_stamp)
+        self.state = replace(self.state, last_stamp=stamp, disagreement=episode)
         if episode is None:
             return None
         lasts = tracked.contradicts_odometry or (stamp - episode.last_contradiction) * _SECOND <= _QUIET
         if step is None or not lasts:
             return self.end_disagreement()
-        self._state = replace(self._state, disagreement=episode.extend(stamp, step, tracked))
+        self.state = replace(self.state, disagreement=episode.extend(stamp, step, tracked))
         return None
 
     def end_disagreement(self) -> str | None:
         """End the current disagreement; returns its notice, if it is significant and the last notice is old."""
-        episode, self._state = self._state.disagreement, replace(self._state, disagreement=None)
+        episode, self.state = self.state.disagreement, replace(self.state, disagreement=None)
         if episode is None or not episode.is_significant():
             return None
-        last, unreported = self._state.last_notice, self._state.unreported
+        last, unreported = self.state.last_notice, self.state.unreported
         if last is not None and episode.end * _SECOND - last < _PAUSE:
-            self._state = replace(self._state, unreported=unreported + 1)
+            self.state = replace(self.state, unreported=unreported + 1)
             return None
         since = f" ({unreported} times more since the last notice)" if unreported else ""
-        self._state = replace(self._state, last_notice=episode.end * _SECOND, unreported=0)
+        self.state = replace(self.state, last_notice=episode.end * _SECOND, unreported=0)
         return (
             f"odometry {_motion_text(episode.odometry_motion)} from {episode.begin * _SECOND:.3f} s to "
             f"{episode.end * _SECOND:.3f} s, where the scans say that it {_motion_text(episode.scan_motion)}{since}: "
@@ -255,9 +253,9 @@ class OdometryMonitor:
     def check_noise(self, noise: OdometryNoise) -> str | None:
         """The notice of odometry that is much noisier than its model, once."""
         translation, rotation = noise.factors
-        if self._state.noise_reported or max(translation, rotation) < NOISY_FACTOR:
+        if self.state.noise_reported or max(translation, rotation) < NOISY_FACTOR:
             return None
-        self._state = replace(self._state, noise_reported=True)
+        self.state = replace(self.state, noise_reported=True)
         return (
             f"odometry and scans differ {translation:.1f} times as much in distance and {rotation:.1f} times as much "
             "in heading as the noise model of odometry expects, so it is trusted less: raise "

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from hmt_slam_ros.arrays import Bool, Float32, Float64, Int8, Int32, Int64
+from hmt_slam_ros.arrays import Bool, Float32, Float64, Int32, Int64
 from hmt_slam_ros.geometry.se2 import rotate_back
 from hmt_slam_ros.registration.search_bounds import (
     BLOCK,
@@ -44,12 +44,11 @@ class PositionConstraint(NamedTuple):
 class ConstraintPyramid(NamedTuple):
     """A position constraint, prepared for a search.
 
-    :ivar levels: running maxima of its cells, as in :class:`search_bounds.Pyramid`, with their ``margin``.
+    :ivar pyramid: running maxima of its cells.
     :ivar keyframes: shape (turns, m, 2), column and row of every keyframe without a shift.
     """
 
-    levels: Int8
-    margin: int
+    pyramid: Pyramid
     keyframes: Int32
 
 
@@ -75,8 +74,8 @@ def no_constraint(cell: float) -> PositionConstraint:
 
 def build_constraint_pyramid(constraint: PositionConstraint, window: SearchWindow, height: int) -> ConstraintPyramid:
     """A constraint for a search of a window down from squares of edge ``2**height``."""
-    pyramid, cells = build_pyramid(constraint.allowed.log_ratio, height), constraint.allowed
-    return ConstraintPyramid(pyramid.levels, pyramid.margin, sample_cells(window, cells, constraint.keyframes))
+    pyramid = build_pyramid(constraint.allowed.log_ratio, height)
+    return ConstraintPyramid(pyramid, sample_cells(window, constraint.allowed, constraint.keyframes))
 
 
 @njit(cache=True)
@@ -93,7 +92,7 @@ def _mark_disks(cells: Float32, known: Float64, reach: float) -> None:
 @njit(cache=True)
 def is_admissible(constraint: ConstraintPyramid, height: int, k: int, i: int, j: int) -> bool:
     """Whether a keyframe meets the constraint at turn ``k`` in the square of shifts that begins at (i, j)."""
-    level, margin, cells = constraint.levels[height], constraint.margin, constraint.keyframes[k]
+    level, margin, cells = constraint.pyramid.levels[height], constraint.pyramid.margin, constraint.keyframes[k]
     rows, columns = np.uint32(level.shape[0]), np.uint32(level.shape[1])
     for n in range(cells.shape[0]):
         x, y = np.uint32(cells[n, 0] + i + margin), np.uint32(cells[n, 1] + j + margin)

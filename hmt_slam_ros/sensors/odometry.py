@@ -135,24 +135,20 @@ class SweepCheck:
     """Check whether the sweeps of a laser can have the duration that ``time_increment`` gives.
 
     The result depends on the sequence of scans alone, not on how they mix with odometry.
+
+    :ivar state: the times between the last scans.
     """
 
     def __init__(self, state: SweepState | None = None) -> None:
         """:param state: to go on from."""
-        state = state or SweepState()
-        self._periods = deque(state.periods, maxlen=_PERIODS)
-        self._last_stamp = state.last_stamp
-
-    @property
-    def state(self) -> SweepState:
-        """The whole state, as a value."""
-        return SweepState(tuple(self._periods), self._last_stamp)
+        self.state = state or SweepState()
 
     def check(self, scan: Scan) -> tuple[Scan, str | None]:
         """The scan and the fault of its ``time_increment``, or None; a scan with a fault comes back without it."""
-        if self._last_stamp is not None:
-            self._periods.append((scan.stamp - self._last_stamp) * _NANOSECOND)
-        self._last_stamp = scan.stamp
+        periods, last = self.state.periods, self.state.last_stamp
+        if last is not None:
+            periods = (*periods, (scan.stamp - last) * _NANOSECOND)[-_PERIODS:]
+        self.state = SweepState(periods, scan.stamp)
         fault = self._fault(scan)
         if fault is None:
             return scan, None
@@ -169,11 +165,12 @@ class SweepCheck:
                 f"so that its {scan.ranges.size} beams would take {scan.sweep_duration:.2f} s, more than "
                 f"{_MAX_SWEEP:g} s"
             )
-        if len(self._periods) < _MIN_PERIODS or scan.sweep_duration <= _JITTER * median(self._periods):
+        periods = self.state.periods
+        if len(periods) < _MIN_PERIODS or scan.sweep_duration <= _JITTER * median(periods):
             return None
         return (
             f"so that its {scan.ranges.size} beams would take {scan.sweep_duration:.3f} s, longer than the "
-            f"{median(self._periods):.3f} s from one scan to the next"
+            f"{median(periods):.3f} s from one scan to the next"
         )
 
 

@@ -8,7 +8,7 @@ informs the pose along that normal only. Points on no surface, such as posts and
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 from typing import NamedTuple
 
 import numpy as np
@@ -46,10 +46,6 @@ def _valid_mask(ranges: Float32, nearest: np.float32, farthest: np.float32) -> B
     for n in range(ranges.size):
         valid[n] = nearest <= ranges[n] < farthest
     return valid
-
-
-def _zeros() -> Float64:
-    return np.zeros(3)
 
 
 class BeamRevision(NamedTuple):
@@ -96,9 +92,9 @@ class Scan:
     angle_increment: float
     range_min: float
     range_max: float
-    laser_pose: Float64 = field(default_factory=_zeros)
+    laser_pose: Float64 = field(default_factory=partial(np.zeros, 3))
     time_increment: float = 0.0
-    motion: Float64 = field(default_factory=_zeros)
+    motion: Float64 = field(default_factory=partial(np.zeros, 3))
     starts: Float32 | None = None
     _revised: tuple[BeamRevision, Scan] | None = field(default=None, init=False, repr=False)
 
