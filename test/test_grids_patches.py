@@ -1,4 +1,4 @@
-"""The shared patches: what a scan leaves in the map, and that maps never write into each other."""
+"""Shared patches: the insertion of scans, and that maps never write into each other."""
 
 import numpy as np
 import pytest

@@ -65,7 +65,7 @@ class Drive(NamedTuple):
 
 
 def driven(sweep, timed):
-    """A drive with a laser whose sweep takes so many seconds, and says so or not."""
+    """A drive with a laser whose sweep takes ``sweep`` seconds; ``timed`` scans have a time increment."""
     odometry, dialogue = list(readings()), Dialogue()
     for k in range(SCANS):
         begin = k * PERIOD

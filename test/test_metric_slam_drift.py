@@ -22,7 +22,7 @@ AGAIN = drive((0.1, 0.1), (8.1, 0.1))
 
 
 class Drive:
-    """A hypothesis that is driven in a corridor."""
+    """A hypothesis of a robot in a corridor."""
 
     def __init__(self):
         configuration = Configuration()
@@ -32,7 +32,7 @@ class Drive:
         self.to(THERE[0])
 
     def to(self, pose):
-        """Drive to a pose and take a keyframe there; what it says."""
+        """Drive to a pose and take a keyframe there; returns its estimate."""
         step = RelativeMotion(se2.between(self.truth, pose), ODOMETRY)
         sequence, self.truth = len(self.scans), pose
         scan = self.scans[sequence] = scan_in(CORRIDOR, pose, noise=0.01, seed=sequence)

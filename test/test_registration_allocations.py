@@ -1,4 +1,4 @@
-"""That the loops over beams, particles and steps take no memory, and that the count of it would tell."""
+"""The loops over beams, particles and steps take no memory, and the count detects it if they do."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""What contradicts: surfaces where the map knows free space."""
+"""Contradictions: surfaces where the map knows free space."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Movers: what walked on since it entered the map does not draw the robot after it."""
+"""Dynamic rejection: objects that moved since they entered the map do not pull the match."""
 
 import numpy as np
 import pytest

@@ -110,7 +110,7 @@ def test_a_bare_corridor_tells_nothing_of_the_direction_along_it() -> None:
 
 
 def test_noise_does_not_shorten_a_bare_corridor() -> None:
-    """A pair has next to no say along it; hundreds that err to the same side would move keyframes all the same."""
+    """A pair informs hardly along the corridor; hundreds with a common error would still move keyframes."""
     ahead, pulls, informations = np.array([3.0, 0.1, 0.0]), [], []
     for seed in range(150):
         scans = [
@@ -271,9 +271,9 @@ def test_a_way_that_keeps_apart_is_held_by_the_walls_that_both_ways_see(seed: in
         drifted.append(se2.compose(drifted[-1], increment))
     start = np.array(drifted)
     seen, near, pairs = ways_paired(np.zeros(60, dtype=np.int64), {0: {0}}, start)
-    alone, held = (refine_jointly(seen, start, those, motion, OPTIONS) for those in (near, pairs))
-    # Seen: 0.041 to 0.106 m alone, 0.019 to 0.047 m held.
-    assert errors(held, WAYS)[0] < 0.7 * errors(alone, WAYS)[0]
+    alone, joint = (refine_jointly(seen, start, those, motion, OPTIONS) for those in (near, pairs))
+    # Seen: 0.041 to 0.106 m alone, 0.019 to 0.047 m jointly.
+    assert errors(joint, WAYS)[0] < 0.7 * errors(alone, WAYS)[0]
 
 
 def test_of_many_keyframes_the_nearest_are_found_also_where_headings_lie_on_both_sides_of_half_a_turn() -> None:

@@ -1,4 +1,4 @@
-"""The normals that a scan shows of what it sees."""
+"""The normals of surfaces in a scan."""
 
 import numpy as np
 import pytest

@@ -17,7 +17,7 @@ from hmt_slam_ros.submap.particle_filter import ParticleFilter
 ROOM = np.concatenate((box(-6.02, -4.03, 6.03, 7.01), box(3.51, 1.02, 4.53, 2.52), box(-4.02, 3.03, -3.52, 7.01)))
 STEP = np.array([0.1, 0.0, 0.05])
 COVARIANCE = np.diag([0.02, 0.02, 0.01]) ** 2
-# About what the velocity tells of the next 0.2 s.
+# About the covariance of the prediction by inertia over 0.2 s.
 INERTIA = RelativeMotion(STEP, np.diag([0.03, 0.03, 0.04]) ** 2)
 
 

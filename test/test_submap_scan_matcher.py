@@ -13,7 +13,7 @@ from hmt_slam_ros.submap.particle_filter import ParticleFilter
 ROOM = np.concatenate((box(-6.02, -4.03, 6.03, 7.01), box(3.51, 1.02, 4.53, 2.52), box(-4.02, 3.03, -3.52, 7.01)))
 CORRIDOR = np.array([[-100.0, -1.22, 100.0, -1.22], [-100.0, 1.22, 100.0, 1.22]])
 SURE = np.diag([0.02, 0.02, 0.01]) ** 2
-# What the velocity tells of the next second or so.
+# About the covariance of the prediction by inertia over a second.
 VAGUE = np.diag([0.5, 0.5, 1.0]) ** 2
 STILL = RelativeMotion(np.zeros(3), VAGUE)
 
