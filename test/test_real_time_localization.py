@@ -1,4 +1,4 @@
-"""Real-time localisation: dead reckoning since the last estimate, in the area and in the map."""
+"""Real-time localization: dead reckoning since the last estimate, in the area and in the map."""
 
 import math
 

@@ -9,7 +9,8 @@ from worlds import box, scan_in
 from hmt_slam_ros.configuration.robot import RealTimeParameters
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.sensors import Odometry, Scan
-from hmt_slam_ros.sensors.odometry import OdometryBuffer, SweepCheck, deskew_scan
+from hmt_slam_ros.sensors.motion_model import OdometryBuffer, deskew_scan
+from hmt_slam_ros.sensors.scan import SweepCheck
 
 ROOM = box(-3, -4, 5, 4)
 START = np.array([0.5, -0.3, 0.4])

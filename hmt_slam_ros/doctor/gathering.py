@@ -20,7 +20,7 @@ from hmt_slam_ros.doctor.statistics import (
 from hmt_slam_ros.logs import Log
 from hmt_slam_ros.logs.records import LogRecord
 from hmt_slam_ros.sensors import Odometry, Scan
-from hmt_slam_ros.sensors.odometry import SweepCheck
+from hmt_slam_ros.sensors.scan import SweepCheck
 
 
 class Gatherer:

@@ -7,8 +7,10 @@ informs the pose along that normal only. Points on no surface, such as posts and
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache, partial
+from statistics import median
 from typing import NamedTuple
 
 import numpy as np
@@ -167,6 +169,71 @@ class Scan:
             return points
         fractions = np.flatnonzero(self.valid) / max(1, self.ranges.size - 1)
         return se2.transform(se2.exp(fractions[:, None] * self.motion), points)
+
+
+_MAX_SWEEP = 1.0
+"""Longest duration of a sweep, s; scanners turn ten times faster."""
+
+_MIN_PERIODS, _PERIODS = 5, 9
+"""Periods between scans from which a sweep is checked, and those that are kept for their median."""
+
+_JITTER = 1.2
+"""Duration of a sweep at most, as a factor on the median period: stamps jitter."""
+
+
+@dataclass(frozen=True)
+class SweepState:
+    """Times between scans.
+
+    :ivar periods: the last times between two scans, s.
+    :ivar last_stamp: of the last scan, ns, None before the first.
+    """
+
+    periods: tuple[float, ...] = ()
+    last_stamp: int | None = None
+
+
+class SweepCheck:
+    """Check whether the sweeps of a laser can have the duration that ``time_increment`` gives.
+
+    The result depends on the sequence of scans alone, not on how they mix with odometry.
+
+    :ivar state: the times between the last scans.
+    """
+
+    def __init__(self, state: SweepState | None = None) -> None:
+        """:param state: to go on from."""
+        self.state = state or SweepState()
+
+    def check(self, scan: Scan) -> tuple[Scan, str | None]:
+        """The scan and the fault of its ``time_increment``, or None; a scan with a fault comes back without it."""
+        periods, last = self.state.periods, self.state.last_stamp
+        if last is not None:
+            periods = (*periods, (scan.stamp - last) * 1e-9)[-_PERIODS:]
+        self.state = SweepState(periods, scan.stamp)
+        fault = self._fault(scan)
+        if fault is None:
+            return scan, None
+        return replace(scan, time_increment=0.0), (
+            f"The scan at {scan.stamp * 1e-9:.6f} s has time_increment = {scan.time_increment:g} s, {fault}; "
+            "such scans are taken as if measured at one moment: correct it in the laser's driver, or set it to 0."
+        )
+
+    def _fault(self, scan: Scan) -> str | None:
+        if not (math.isfinite(scan.time_increment) and scan.time_increment >= 0.0):
+            return "which is no time from one beam to the next"
+        if scan.sweep_duration > _MAX_SWEEP:
+            return (
+                f"so that its {scan.ranges.size} beams would take {scan.sweep_duration:.2f} s, more than "
+                f"{_MAX_SWEEP:g} s"
+            )
+        periods = self.state.periods
+        if len(periods) < _MIN_PERIODS or scan.sweep_duration <= _JITTER * median(periods):
+            return None
+        return (
+            f"so that its {scan.ranges.size} beams would take {scan.sweep_duration:.3f} s, longer than the "
+            f"{median(periods):.3f} s from one scan to the next"
+        )
 
 
 _REACH = 0.5

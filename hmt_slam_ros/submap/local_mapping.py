@@ -1,26 +1,59 @@
-"""The parts that all filters of a process share: the pool of patches, models of the laser, and prepared scans."""
+"""The parts that all filters of a process share: the pool of patches, models of the laser, and the scan matcher.
+
+A scan is matched with the submap from the pose that odometry predicts, or from inertia where odometry fails.
+
+Odometry is right or, with a small probability, uninformative (slip, lost readings); then inertia predicts the motion.
+Each of the two is a prior, and the prior under which scan and map have the larger evidence wins. In a uniform corridor
+both fit, and odometry as the sharper prior wins.
+
+The uncertainty that a match leaves is propagated to the next scan. Otherwise, where a corridor shows little, the pose
+would stay at the first poor fit while the robot drives on. Where the uncertainty is large, the match is searched for.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
 from functools import cached_property
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numba import njit
 
 from hmt_slam_ros.arrays import Float64, Int32
 from hmt_slam_ros.configuration.tree import Configuration
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.geometry.covariance import inverse, propagate_covariance, rotate_covariance
+from hmt_slam_ros.geometry.gaussian import PoseGaussian, chi_square_gate
 from hmt_slam_ros.grids.patch_pool import InverseSensorModel, MappedBeams, PatchPool
-from hmt_slam_ros.grids.patches import FAR, PATCH
+from hmt_slam_ros.grids.patches import FAR, PATCH, GridView
 from hmt_slam_ros.registration import scan_to_map
+from hmt_slam_ros.registration.dynamic_rejection import reject_dynamic
 from hmt_slam_ros.registration.match_covariance import MatchNoise
 from hmt_slam_ros.sensors import Scan
+from hmt_slam_ros.sensors.motion_model import Prediction, RelativeMotion
 from hmt_slam_ros.sensors.scan import extract_surfels
 
 _ODDS_PER_NAT = 20.0
 """Quanta of the odds in a nat."""
+
+_SEARCH_POINTS = 90
+"""Points of a scan that a search uses, about."""
+
+_PEAKS = 4
+"""Peaks of a search that are refined."""
+
+_MAX_DISTANCE, _MAX_ANGLE = 0.2, math.radians(6.0)
+"""Error of a prediction beyond which Gauss-Newton may end in another minimum, m and rad."""
+
+_REACH = 2.5
+"""Range of a search, in deviations of the prediction."""
+
+_AMBIGUOUS = 3.0
+"""Difference of the evidence below which two matches are equally good, nats."""
+
+_GATE = chi_square_gate(0.999)
+"""Squared Mahalanobis distance of match and odometry up to which they agree."""
 
 T = TypeVar("T")
 
@@ -110,3 +143,210 @@ class PreparedScan:
     def laser_position(self) -> Float64:
         """Position of the laser, shape (2,), base frame."""
         return self.scan.laser_pose[:2]
+
+
+class ScanMatch(NamedTuple):
+    """The match of a scan under one prior.
+
+    :ivar pose: the mode, ``map_T_base``, shape (3,).
+    :ivar hessian: information of the points at the mode, map coordinates, shape (3, 3).
+    :ivar prior: over poses.
+    :ivar predicted_motion: the motion behind the prior.
+    :ivar log_evidence: of scan and map under the prior, nats.
+    :ivar contradicts_odometry: whether the scan contradicts the odometry, if there was any.
+    """
+
+    pose: Float64
+    hessian: Float64
+    prior: scan_to_map.Prior
+    predicted_motion: RelativeMotion
+    log_evidence: float
+    contradicts_odometry: bool = False
+
+
+class ScanMatcher:
+    """Matches scans with maps."""
+
+    def __init__(self, mapping: LocalMapping) -> None:
+        self._mapping = mapping
+        self._settings = mapping.configuration.matching
+        self._fault_probability = mapping.configuration.motion.fault_probability
+        self._log_fault, self._log_no_fault = math.log(self._fault_probability), math.log1p(-self._fault_probability)
+
+    def match(self, points: Float64, before: PoseGaussian, prediction: Prediction, view: GridView) -> ScanMatch:
+        """The match of a scan under the better of two priors.
+
+        :param points: surfels of the scan, shape (n, 4), base frame.
+        :param before: belief over ``map_T_base`` at the last scan.
+        """
+        if prediction.odometry is None:
+            return self._match_with_prior(points, before, prediction.inertia, view)
+        by_odometry = self._match_with_prior(points, before, prediction.fused, view)
+        if self._agrees_with_prediction(points, by_odometry, view):
+            return by_odometry
+        by_inertia = self._match_with_prior(points, before, prediction.inertia, view)
+        log_odometry = by_odometry.log_evidence + self._log_no_fault
+        if not self._fits_map(points, by_inertia.pose, view):
+            # Unknown space has evidence 0, which a match outside the map has to exceed.
+            log_odometry = max(0.0, log_odometry)
+        if by_inertia.log_evidence + self._log_fault > log_odometry:
+            return self._fuse_with_slip(points, before, prediction, by_inertia, view)
+        return by_odometry if by_odometry.hessian.any() else self._with_fault(by_odometry, prediction.inertia)
+
+    def check_since_keyframe(
+        self, points: Float64, match: ScanMatch, leg: PoseGaussian, step: RelativeMotion, view: GridView
+    ) -> ScanMatch:
+        """The match, or a match that agrees with the motion predicted since the last keyframe, if that is better.
+
+        A person who walks along a corridor pulls the match a little in every scan. No single scan contradicts odometry
+        then, but their sum does. So the scan is also matched from the leg's prediction, without the points that
+        contradict it. The first match stands if the evidence for it outweighs an odometry fault.
+
+        :param leg: belief over ``map_T_base`` by the prediction since the last keyframe.
+        :param step: that prediction.
+        """
+        prior = _map_prior(leg)
+        if match.contradicts_odometry or _mahalanobis2(match.pose, prior) <= _GATE:
+            return match
+        static = reject_dynamic(points, match.pose, prior, view, self._mapping.alignment)
+        other = self._refine(points, static, prior.mean, prior, step, view)
+        if not self._fits_map(points, other.pose, view) or _mahalanobis2(other.pose, prior) > _GATE:
+            return match
+        log_odometry = other.log_evidence + self._log_no_fault
+        return other if log_odometry > match.log_evidence + self._log_fault else match
+
+    def _fuse_with_slip(
+        self, points: Float64, before: PoseGaussian, prediction: Prediction, match: ScanMatch, view: GridView
+    ) -> ScanMatch:
+        """The match with odometry, widened along what the scan contradicts: in a corridor it still informs the rest."""
+        odometry = prediction.odometry
+        assert odometry is not None
+        predicted = se2.compose(before.mean, odometry.increment)
+        information = rotate_covariance(match.hessian, -predicted[2])
+        gain = np.linalg.solve(information + inverse(odometry.covariance), information)
+        difference = gain @ se2.log(se2.between(predicted, match.pose))
+        widened = RelativeMotion(odometry.increment, odometry.covariance + np.outer(difference, difference))
+        step = widened.fuse(prediction.inertia)
+        prior = _map_prior(_predict_pose(before, step))
+        return self._refine(points, points, match.pose, prior, step, view)._replace(contradicts_odometry=True)
+
+    def _with_fault(self, match: ScanMatch, inertia: RelativeMotion) -> ScanMatch:
+        """A match without evidence for odometry: its covariance is that of both predictions, by their probabilities."""
+        step = match.predicted_motion
+        difference = se2.log(se2.between(step.increment, inertia.increment))
+        fault = self._fault_probability * (inertia.covariance + np.outer(difference, difference))
+        return match._replace(predicted_motion=RelativeMotion(step.increment, step.covariance + fault))
+
+    def covariance(self, match: ScanMatch) -> Float64:
+        """Covariance of the pose, shape (3, 3), right tangent frame.
+
+        Tempered, since successive scans are matched with the same map and have common errors.
+        """
+        return inverse(
+            rotate_covariance(self._settings.temper * match.hessian + match.prior.information, -match.pose[2])
+        )
+
+    def information(self, match: ScanMatch) -> Float64:
+        """Information of the match alone on the motion since the last scan, in the frame of the pose, shape (3, 3).
+
+        For correlated beams, but not tempered: common errors of two scans cancel in their difference.
+        """
+        return rotate_covariance(match.hessian / self._mapping.alignment.inflation, -match.pose[2])
+
+    def _agrees_with_prediction(self, points: Float64, match: ScanMatch, view: GridView) -> bool:
+        return _mahalanobis2(match.pose, match.prior) <= _GATE and self._fits_map(points, match.pose, view)
+
+    def _fits_map(self, points: Float64, pose: Float64, view: GridView) -> bool:
+        share = scan_to_map.matched_fraction(points, pose, view, self._mapping.hit_distance)
+        return not len(points) or share >= self._settings.matched_fraction
+
+    def _match_with_prior(
+        self, points: Float64, before: PoseGaussian, step: RelativeMotion, view: GridView
+    ) -> ScanMatch:
+        """The match under one prior; with a search where the prior is wide, or the prediction leads to a poor fit."""
+        predicted = _predict_pose(before, step)
+        prior, covariance = _map_prior(predicted), predicted.covariance
+        match = self._refine(points, self.static_points(points, prior, covariance, view), prior.mean, prior, step, view)
+        if not _exceeds_basin(covariance) and self._fits_map(points, match.pose, view):
+            return match
+        lattice = self._search_lattice(predicted)
+        starts = scan_to_map.correlative_search(
+            points[:: max(1, len(points) // _SEARCH_POINTS)],
+            prior,
+            lattice,
+            view,
+            self._mapping.beam_model,
+            self._settings.temper,
+            _PEAKS,
+        )
+        refined = [self._refine(points, points, start, prior, step, view) for start in starts]
+        best = self._least_misfit(points, [match, *refined], view)
+        # Relative to unknown space: where nothing fits, the scan shows nothing of the map.
+        unmatched = ScanMatch(prior.mean, np.zeros((3, 3)), prior, step, self._log_fault)
+        return max([unmatched, best], key=lambda candidate: candidate.log_evidence)
+
+    def _least_misfit(self, points: Float64, matches: list[ScanMatch], view: GridView) -> ScanMatch:
+        """The match of least misfit among those of about the largest evidence, which is robust but not precise."""
+        least = max(match.log_evidence for match in matches) - _AMBIGUOUS
+        candidates = [match for match in matches if match.log_evidence >= least]
+        if len(candidates) == 1:
+            return candidates[0]
+        alignment = self._mapping.alignment
+        return min(candidates, key=lambda match: scan_to_map.misfit(points, match.pose, match.prior, view, alignment))
+
+    def static_points(self, points: Float64, prior: scan_to_map.Prior, covariance: Float64, view: GridView) -> Float64:
+        """The points on static objects; all where the covariance of the prior is too wide to decide."""
+        if _exceeds_basin(covariance):
+            return points
+        return reject_dynamic(points, prior.mean, prior, view, self._mapping.alignment)
+
+    def _refine(
+        self,
+        points: Float64,
+        static: Float64,
+        start: Float64,
+        prior: scan_to_map.Prior,
+        step: RelativeMotion,
+        view: GridView,
+    ) -> ScanMatch:
+        pose, hessian = scan_to_map.align(static, start, prior, view, self._mapping.alignment)
+        log_evidence = scan_to_map.laplace_log_evidence(
+            points, pose, hessian, prior, view, self._mapping.beam_model, self._settings.temper
+        )
+        return ScanMatch(pose, hessian, prior, step, log_evidence)
+
+    def _search_lattice(self, predicted: PoseGaussian) -> scan_to_map.Lattice:
+        """The lattice of poses around the prediction."""
+        settings, cell = self._settings, self._mapping.pool.cell
+        reach = _REACH * np.sqrt(np.diag(rotate_covariance(predicted.covariance, predicted.mean[2])))
+        reach[:2] = np.clip(reach[:2], settings.search_distance, settings.wide_distance)
+        reach[2] = np.clip(reach[2], math.radians(settings.search_angle), math.radians(settings.wide_angle))
+        turn = math.radians(settings.search_step)
+        counts = np.ceil(reach / np.array([2.0 * cell, 2.0 * cell, turn])).astype(np.int64)
+        return scan_to_map.Lattice(2, turn, counts)
+
+
+def _predict_pose(before: PoseGaussian, step: RelativeMotion) -> PoseGaussian:
+    covariance = propagate_covariance(before.covariance, step.increment) + step.covariance
+    return PoseGaussian(se2.compose(before.mean, step.increment), covariance)
+
+
+def _mahalanobis2(pose: Float64, prior: scan_to_map.Prior) -> float:
+    """Squared Mahalanobis distance of a pose from a prior's mean."""
+    return -2.0 * scan_to_map.log_prior(pose, prior)
+
+
+def _map_prior(predicted: PoseGaussian) -> scan_to_map.Prior:
+    return scan_to_map.Prior(predicted.mean, map_information(predicted.covariance, predicted.mean[2]))
+
+
+def _exceeds_basin(covariance: Float64) -> bool:
+    """Whether a pose of this covariance, in its own frame, may be outside the basin of Gauss-Newton."""
+    (xx, xy, _), (_, yy, _), (_, _, turn) = covariance.tolist()
+    largest = 0.5 * (xx + yy) + math.hypot(0.5 * (xx - yy), xy)
+    return largest > (_MAX_DISTANCE / _REACH) ** 2 or turn > (_MAX_ANGLE / _REACH) ** 2
+
+
+def map_information(covariance: Float64, theta: float) -> Float64:
+    """Inverse, in the map frame, of a covariance in the body's tangent frame, both (3, 3)."""
+    return inverse(rotate_covariance(covariance, theta))

@@ -32,8 +32,7 @@ from hmt_slam_ros.submap.local_filter import (
     PlacedKeyframe,
     TrackedMotion,
 )
-from hmt_slam_ros.submap.local_mapping import LocalMapping, PreparedScan
-from hmt_slam_ros.submap.scan_matcher import ScanMatcher, map_information
+from hmt_slam_ros.submap.local_mapping import LocalMapping, PreparedScan, ScanMatcher, map_information
 
 _LEAD_MARGIN = 3.0
 """Log-likelihood ratio from which another particle takes the lead, nats."""
