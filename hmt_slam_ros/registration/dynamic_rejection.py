@@ -31,7 +31,7 @@ _GAP, _GAP_SHARE = 0.1, 0.05
 """Distance of neighboring points from which they are on two segments, m and as a share of the range."""
 
 _GATE = chi_square_gate(0.999)
-"""Chi-square beyond which a segment has moved: one static segment in a thousand exceeds it."""
+"""Chi-square beyond which a segment has moved, 3 degrees of freedom: docs/decisions/0007-dynamic-rejection.md."""
 
 _RIDGE = 1e-9
 """Share of its trace that is added to the diagonal of a singular covariance."""

@@ -27,7 +27,7 @@ from hmt_slam_ros.grids.patches import GridView
 from hmt_slam_ros.registration.scan_to_map import AlignmentSettings, linearize
 
 _BLOCK = 16
-"""Neighboring beams in a block, whose errors are common."""
+"""Neighboring beams in a block, whose errors are common: docs/decisions/0005-match-covariance.md."""
 
 
 class MatchNoise(NamedTuple):

@@ -19,7 +19,10 @@ from hmt_slam_ros.sensors.scan import Scan
 UNKNOWN, SURFACE, FREE = np.int8(0), np.int8(1), np.int8(2)
 
 _SURFACE_DISTANCE, _PASS_DISTANCE = 0.15, 0.2
-"""Distance of a return on the same surface at most, and length of a beam behind a point from which it passed it, m."""
+"""Distance of a return on the same surface at most, and length of a beam behind a point from which it passed it, m.
+
+These and the next ones: docs/decisions/0029-change-detection.md.
+"""
 
 _HALF_WIDTH, _HALF_WIDTH_SHARE = 0.1, 0.01
 """Distance to both sides within which all beams have to agree, m and as a share of the range.

@@ -44,16 +44,19 @@ _PEAKS = 4
 """Peaks of a search that are refined."""
 
 _MAX_DISTANCE, _MAX_ANGLE = 0.2, math.radians(6.0)
-"""Error of a prediction beyond which Gauss-Newton may end in another minimum, m and rad."""
+"""Error of a prediction beyond which Gauss-Newton may end in another minimum, m and rad.
+
+Beyond it, and for poor fits, a search is used: docs/decisions/0006-pose-between-keyframes.md.
+"""
 
 _REACH = 2.5
 """Range of a search, in deviations of the prediction."""
 
 _AMBIGUOUS = 3.0
-"""Difference of the evidence below which two matches are equally good, nats."""
+"""Difference of the evidence below which two matches are equally good, nats: decision 0006."""
 
 _GATE = chi_square_gate(0.999)
-"""Squared Mahalanobis distance of match and odometry up to which they agree."""
+"""Squared Mahalanobis distance of match and odometry up to which they agree, 3 degrees of freedom."""
 
 T = TypeVar("T")
 

@@ -35,7 +35,7 @@ from hmt_slam_ros.submap.local_filter import (
 from hmt_slam_ros.submap.local_mapping import LocalMapping, PreparedScan, ScanMatcher, map_information
 
 _LEAD_MARGIN = 3.0
-"""Log-likelihood ratio from which another particle takes the lead, nats."""
+"""Log-likelihood ratio from which another particle leads, nats: docs/decisions/0006-pose-between-keyframes.md."""
 
 
 class ParticleFilter:
