@@ -26,10 +26,10 @@ PACKAGES = (
 """Whose kernels run for every scan, for every particle and for every beam."""
 
 ARRAYS = {
-    "geometry.covariance.propagate_covariance": (2, "the result, half of the product"),
-    "geometry.covariance.inverse": (1, "the result"),
-    "geometry.covariance.inverse_pose_covariance": (2, "the result, half of the product"),
-    "geometry.covariance.rotate_covariance": (2, "the result, half of the product"),
+    "geometry.gaussian.propagate_covariance": (2, "the result, half of the product"),
+    "geometry.gaussian.matrix_inverse": (1, "the result"),
+    "geometry.gaussian.inverse_pose_covariance": (2, "the result, half of the product"),
+    "geometry.gaussian.rotate_covariance": (2, "the result, half of the product"),
     "geometry.se2._compose_each": (1, "the results"),
     "sensors.scan._beam_ends": (1, "the result"),
     "sensors.scan._valid_mask": (1, "the result"),

@@ -9,13 +9,17 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
+from numba import njit
 from scipy.special import gammaincinv
 
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.geometry.se2 import inverse_position
+
+Vector: TypeAlias = tuple[float, float, float]
 
 _POSE_DOF = 3
 """Degrees of freedom of a pose."""
@@ -137,3 +141,154 @@ def match_moments(weighted: Sequence[tuple[PoseGaussian, float]]) -> PoseGaussia
         offset = se2.log(se2.between(mean, belief.mean))
         covariance += math.exp(log_weight - total) * (belief.covariance_at(mean) + np.outer(offset, offset))
     return PoseGaussian(mean, covariance)
+
+
+# Kernels on covariances and information matrices (3, 3), of which every scan needs many: numpy spends its time on calls
+# for matrices so small. Kernels that may not take memory for each matrix hold its upper triangle as six numbers.
+
+
+class Symmetric(NamedTuple):
+    """The upper triangle of a symmetric matrix (3, 3) over (x, y, theta)."""
+
+    xx: float
+    xy: float
+    xt: float
+    yy: float
+    yt: float
+    tt: float
+
+
+@njit(cache=True)
+def symmetric_from_array(matrix: Float64) -> Symmetric:
+    """The upper triangle of an array (3, 3)."""
+    return Symmetric(matrix[0, 0], matrix[0, 1], matrix[0, 2], matrix[1, 1], matrix[1, 2], matrix[2, 2])
+
+
+@njit(cache=True)
+def write_to_array(a: Symmetric, matrix: Float64) -> None:
+    """Write the whole matrix into an array (3, 3)."""
+    matrix[0, 0], matrix[1, 1], matrix[2, 2] = a.xx, a.yy, a.tt
+    matrix[0, 1] = matrix[1, 0] = a.xy
+    matrix[0, 2] = matrix[2, 0] = a.xt
+    matrix[1, 2] = matrix[2, 1] = a.yt
+
+
+@njit(cache=True)
+def add_scaled(a: Symmetric, b: Symmetric, factor: float) -> Symmetric:
+    """a + factor b."""
+    return Symmetric(
+        a.xx + factor * b.xx,
+        a.xy + factor * b.xy,
+        a.xt + factor * b.xt,
+        a.yy + factor * b.yy,
+        a.yt + factor * b.yt,
+        a.tt + factor * b.tt,
+    )
+
+
+@njit(cache=True)
+def multiply(a: Symmetric, v: Vector) -> Vector:
+    """a v."""
+    x, y, t = v
+    return a.xx * x + a.xy * y + a.xt * t, a.xy * x + a.yy * y + a.yt * t, a.xt * x + a.yt * y + a.tt * t
+
+
+@njit(cache=True)
+def dot(v: Vector, w: Vector) -> float:
+    """v' w."""
+    return v[0] * w[0] + v[1] * w[1] + v[2] * w[2]
+
+
+@njit(cache=True)
+def sandwich(a: Symmetric, b: Symmetric) -> Symmetric:
+    """a b a."""
+    x, y, t = (a.xx, a.xy, a.xt), (a.xy, a.yy, a.yt), (a.xt, a.yt, a.tt)
+    bx, by, bt = multiply(b, x), multiply(b, y), multiply(b, t)
+    return Symmetric(dot(x, bx), dot(x, by), dot(x, bt), dot(y, by), dot(y, bt), dot(t, bt))
+
+
+@njit(cache=True)
+def symmetric_inverse(a: Symmetric) -> Symmetric:
+    """The inverse of a positive definite matrix, by cofactors."""
+    xx, xy, xt = a.yy * a.tt - a.yt * a.yt, a.yt * a.xt - a.xy * a.tt, a.xy * a.yt - a.yy * a.xt
+    scale = 1.0 / (a.xx * xx + a.xy * xy + a.xt * xt)
+    yy, yt, tt = a.xx * a.tt - a.xt * a.xt, a.xy * a.xt - a.xx * a.yt, a.xx * a.yy - a.xy * a.xy
+    return Symmetric(scale * xx, scale * xy, scale * xt, scale * yy, scale * yt, scale * tt)
+
+
+@njit(cache=True)
+def _decompose(a: Symmetric) -> tuple[Vector, Vector]:
+    """L D L' of a positive definite matrix: the diagonal of D, and the entries xy, xt and yt of L."""
+    xy, xt = a.xy / a.xx, a.xt / a.xx
+    yy = a.yy - xy * a.xy
+    yt = (a.yt - xt * a.xy) / yy
+    return (a.xx, yy, a.tt - xt * a.xt - yt * yt * yy), (xy, xt, yt)
+
+
+@njit(cache=True)
+def solve(a: Symmetric, v: Vector) -> Vector:
+    """a^-1 v for a positive definite matrix, exact also where cofactors would cancel."""
+    (xx, yy, tt), (xy, xt, yt) = _decompose(a)
+    y = v[1] - xy * v[0]
+    t = (v[2] - xt * v[0] - yt * y) / tt
+    y = y / yy - yt * t
+    return v[0] / xx - xy * y - xt * t, y, t
+
+
+@njit(cache=True)
+def determinant(a: Symmetric) -> float:
+    """The determinant of a positive definite matrix."""
+    diagonal, _ = _decompose(a)
+    return diagonal[0] * diagonal[1] * diagonal[2]
+
+
+@njit(cache=True)
+def matrix_inverse(matrix: Float64) -> Float64:
+    """The inverse of a positive definite matrix, by cofactors."""
+    result = np.empty((3, 3))
+    write_to_array(symmetric_inverse(symmetric_from_array(matrix)), result)
+    return result
+
+
+@njit(cache=True)
+def rotate_covariance(matrix: Float64, theta: float) -> Float64:
+    """A covariance or information of a frame, in the frame in which its angle is ``theta``, rad."""
+    return _apply_adjoint(matrix, 0.0, 0.0, theta)
+
+
+@njit(cache=True)
+def propagate_covariance(covariance: Float64, increment: Float64) -> Float64:
+    """The covariance at the end of ``increment`` (3,), from that at its start: Ad^-1 C Ad^-T, right tangent frames."""
+    cos, sin = np.cos(increment[2]), np.sin(increment[2])
+    x, y = inverse_position(cos, sin, increment[0], increment[1])
+    return _apply_adjoint(covariance, x, y, -increment[2])
+
+
+@njit(cache=True)
+def inverse_pose_covariance(covariance: Float64, pose: Float64) -> Float64:
+    """The covariance of the inverse of ``pose`` (3,): Ad C Ad^T, right tangent frames."""
+    return _apply_adjoint(covariance, pose[0], pose[1], pose[2])
+
+
+@njit(cache=True)
+def _apply_adjoint(covariance: Float64, x: float, y: float, theta: float) -> Float64:
+    """Ad C Ad^T for the pose (x, y, theta)."""
+    cos, sin = np.cos(theta), np.sin(theta)
+    ad = ((cos, -sin, y), (sin, cos, -x), (0.0, 0.0, 1.0))
+    half = (_row_times(ad[0], covariance), _row_times(ad[1], covariance), _row_times(ad[2], covariance))
+    result = np.empty((3, 3))
+    for i in range(3):
+        for j in range(3):
+            result[i, j] = half[i][0] * ad[j][0] + half[i][1] * ad[j][1] + half[i][2] * ad[j][2]
+    return result
+
+
+@njit(cache=True)
+def _row_times(row: tuple[float, float, float], matrix: Float64) -> tuple[float, float, float]:
+    """A row (3,) times a matrix."""
+    x, y, z = row
+    return (
+        x * matrix[0, 0] + y * matrix[1, 0] + z * matrix[2, 0],
+        x * matrix[0, 1] + y * matrix[1, 1] + z * matrix[2, 1],
+        x * matrix[0, 2] + y * matrix[1, 2] + z * matrix[2, 2],
+    )

@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 from hmt_slam_ros.arrays import Bool, Float64, Int64
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.geometry.covariance import inverse_pose_covariance, propagate_covariance
-from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.geometry.gaussian import PoseGaussian, inverse_pose_covariance, propagate_covariance
 from hmt_slam_ros.hybrid_map.hybrid_map import ArcTable, HybridMap
 
 

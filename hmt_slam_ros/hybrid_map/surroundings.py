@@ -22,8 +22,7 @@ from scipy.special import ndtri
 
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.geometry.covariance import inverse_pose_covariance, propagate_covariance
-from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.geometry.gaussian import PoseGaussian, inverse_pose_covariance, propagate_covariance
 from hmt_slam_ros.geometry.se2 import transform_point
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.hybrid_map.shortest_path import ShortestPaths, shortest_path_beliefs

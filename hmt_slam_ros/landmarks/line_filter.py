@@ -21,8 +21,7 @@ from numba import njit
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.geometry.covariance import inverse, propagate_covariance
-from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.geometry.gaussian import PoseGaussian, matrix_inverse, propagate_covariance
 from hmt_slam_ros.geometry.se2 import rotate_back
 from hmt_slam_ros.landmarks.line_extraction import Lines, extract_for_map
 from hmt_slam_ros.landmarks.stochastic_map import LineAssociations, LineMap
@@ -234,7 +233,9 @@ class LineFilter:
         self.line_map = believed.line_map
         self._motion_since_update = self._motion_since_update.compose(believed.motion)
         self._information = _line_information(lines, believed.associations)
-        self.tracking_covariance = inverse(inverse(self._motion_since_update.covariance) + self._information)
+        self.tracking_covariance = matrix_inverse(
+            matrix_inverse(self._motion_since_update.covariance) + self._information
+        )
         return TrackedMotion(se2.between(before, self.pose), self._information, contradicted)
 
     def _most_likely_posterior(self, lines: Lines, prediction: Prediction) -> tuple[_MapPosterior, bool]:
@@ -258,7 +259,7 @@ class LineFilter:
         """What the scans since the last keyframe came to."""
         here = self.line_map.pose
         moved = se2.between(self.line_map.clones.poses[0], here.mean)
-        matched = inverse(inverse(self._motion_since_update.covariance) + self._information)
+        matched = matrix_inverse(matrix_inverse(self._motion_since_update.covariance) + self._information)
         # What the pose in the area's frame became less certain by.
         lasting = _positive_part(here.covariance - propagate_covariance(self._last_covariance, moved))
         error = MatchError(matched, lasting, matched @ self._information)

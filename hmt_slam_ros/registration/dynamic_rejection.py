@@ -11,10 +11,11 @@ import numpy as np
 from numba import njit
 
 from hmt_slam_ros.arrays import Bool, Float64, Int64
-from hmt_slam_ros.geometry.covariance import (
+from hmt_slam_ros.geometry.gaussian import (
     Symmetric,
     Vector,
     add_scaled,
+    chi_square_gate,
     dot,
     multiply,
     sandwich,
@@ -23,7 +24,6 @@ from hmt_slam_ros.geometry.covariance import (
     symmetric_inverse,
     write_to_array,
 )
-from hmt_slam_ros.geometry.gaussian import chi_square_gate
 from hmt_slam_ros.grids.patches import GridView
 from hmt_slam_ros.registration.scan_to_map import AlignmentSettings, Prior, linearize, pose_difference
 

@@ -22,7 +22,7 @@ import numpy as np
 from numba import njit
 
 from hmt_slam_ros.arrays import Float64
-from hmt_slam_ros.geometry.covariance import inverse, rotate_covariance
+from hmt_slam_ros.geometry.gaussian import matrix_inverse, rotate_covariance
 from hmt_slam_ros.grids.patches import GridView
 from hmt_slam_ros.registration.scan_to_map import AlignmentSettings, linearize
 
@@ -76,7 +76,7 @@ def estimate_match_error(
     share, scatter = 1.0 / settings.inflation, np.zeros((3, 3))
     _add_scatter(points, pose, view, settings, scatter)
     prior, hessian, scatter = (rotate_covariance(matrix, -pose[2]) for matrix in (prior, hessian, scatter))
-    spread = inverse(prior + share * hessian)
+    spread = matrix_inverse(prior + share * hessian)
     noise_information = share * share * (noise.beam_noise * hessian + noise.block_noise * scatter)
     covariance = spread @ (prior + noise_information) @ spread
     gain = spread @ (share * hessian)

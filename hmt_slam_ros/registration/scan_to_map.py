@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 
 from hmt_slam_ros.arrays import Float64, Int32, Int64
-from hmt_slam_ros.geometry.covariance import (
+from hmt_slam_ros.geometry.gaussian import (
     Symmetric,
     Vector,
     add_scaled,

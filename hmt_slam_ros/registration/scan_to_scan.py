@@ -14,7 +14,7 @@ from numba import njit
 
 from hmt_slam_ros.arrays import Bool, Float64, Int32, Int64
 from hmt_slam_ros.configuration.topology import RefinementParameters
-from hmt_slam_ros.geometry.covariance import Symmetric, write_to_array
+from hmt_slam_ros.geometry.gaussian import Symmetric, write_to_array
 from hmt_slam_ros.geometry.se2 import rotate_back, transform_point
 from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.sensors.scan import FlatnessLimits, fit_surface, running_sums

@@ -20,7 +20,7 @@ from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration.metric_slam import MotionParameters
 from hmt_slam_ros.configuration.robot import RealTimeParameters
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.geometry.covariance import inverse, propagate_covariance
+from hmt_slam_ros.geometry.gaussian import matrix_inverse, propagate_covariance
 from hmt_slam_ros.sensors.scan import Scan
 
 _RECENT_WEIGHT, _LONG_TERM_WEIGHT = 0.1, 0.02
@@ -168,7 +168,7 @@ class RelativeMotion(NamedTuple):
 
     def fuse(self, other: RelativeMotion) -> RelativeMotion:
         """The same motion from two independent sources: the product of both Gaussians."""
-        gain = self.covariance @ inverse(self.covariance + other.covariance)
+        gain = self.covariance @ matrix_inverse(self.covariance + other.covariance)
         difference = se2.log(se2.between(self.increment, other.increment))
         increment = se2.compose(self.increment, se2.exp(gain @ difference))
         return RelativeMotion(increment, self.covariance - gain @ self.covariance)
@@ -238,8 +238,8 @@ class Inertia:
         recent = _moving_mean(state.recent_period, seconds if is_regular else long_term, _RECENT_WEIGHT)
         interval, error = 0.5 * (seconds + recent), 0.5 * (seconds - recent) * state.velocity
         # Over a long time the velocity stays within what the accelerations admit.
-        information = inverse(state.covariance + self._acceleration * interval**2) + self._prior_information
-        covariance = inverse(information)
+        information = matrix_inverse(state.covariance + self._acceleration * interval**2) + self._prior_information
+        covariance = matrix_inverse(information)
         self.state = InertiaState(state.velocity, covariance, information, long_term, recent, interval, error)
         lasting = _TIME_CONSTANTS * np.tanh(interval / _TIME_CONSTANTS)
         spread = covariance * interval**2 + np.outer(error, error) + self._floor
@@ -257,19 +257,19 @@ class Inertia:
             return
         mean = se2.log(increment)
         if odometry is not None:
-            by_match, by_odometry = information, inverse(odometry.covariance)
+            by_match, by_odometry = information, matrix_inverse(odometry.covariance)
             information = by_match + by_odometry
-            mean = inverse(information) @ (by_match @ mean + by_odometry @ se2.log(odometry.increment))
+            mean = matrix_inverse(information) @ (by_match @ mean + by_odometry @ se2.log(odometry.increment))
         # The error of the interval is common to all directions: Sherman-Morrison.
         shared = information @ state.interval_error
         information = information - np.outer(shared, shared) / (1.0 + state.interval_error @ shared)
         measured = information * state.last_interval**2
-        covariance = inverse(state.predicted_information + measured)
+        covariance = matrix_inverse(state.predicted_information + measured)
         residual = mean / state.last_interval - state.velocity
         weighted = measured @ residual
         if float(residual @ weighted - weighted @ covariance @ weighted) > _JUMP**2:
             # One of the two poses was wrong, or the robot was carried: its velocity is unknown.
-            self.state = replace(state, velocity=np.zeros(3), covariance=inverse(self._prior_information))
+            self.state = replace(state, velocity=np.zeros(3), covariance=matrix_inverse(self._prior_information))
         else:
             self.state = replace(state, velocity=state.velocity + covariance @ weighted, covariance=covariance)
 
@@ -344,7 +344,7 @@ class OdometryNoise:
         :param matched: ``start_T_end`` (3,).
         :param information: R^-1 in the frame of the end, shape (3, 3).
         """
-        prior = inverse(odometry.covariance)
+        prior = matrix_inverse(odometry.covariance)
         expected = np.diag(np.linalg.solve(information + prior, information) @ odometry.covariance)
         squares = se2.log(se2.between(odometry.increment, matched)) ** 2
         shown = expected / np.diag(odometry.covariance)

@@ -23,8 +23,13 @@ from numba import njit
 from hmt_slam_ros.arrays import Float64, Int32
 from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.geometry.covariance import inverse, propagate_covariance, rotate_covariance
-from hmt_slam_ros.geometry.gaussian import PoseGaussian, chi_square_gate
+from hmt_slam_ros.geometry.gaussian import (
+    PoseGaussian,
+    chi_square_gate,
+    matrix_inverse,
+    propagate_covariance,
+    rotate_covariance,
+)
 from hmt_slam_ros.grids.patch_pool import InverseSensorModel, MappedBeams, PatchPool
 from hmt_slam_ros.grids.patches import FAR, PATCH, GridView
 from hmt_slam_ros.registration import scan_to_map
@@ -226,7 +231,7 @@ class ScanMatcher:
         assert odometry is not None
         predicted = se2.compose(before.mean, odometry.increment)
         information = rotate_covariance(match.hessian, -predicted[2])
-        gain = np.linalg.solve(information + inverse(odometry.covariance), information)
+        gain = np.linalg.solve(information + matrix_inverse(odometry.covariance), information)
         difference = gain @ se2.log(se2.between(predicted, match.pose))
         widened = RelativeMotion(odometry.increment, odometry.covariance + np.outer(difference, difference))
         step = widened.fuse(prediction.inertia)
@@ -245,7 +250,7 @@ class ScanMatcher:
 
         Tempered, since successive scans are matched with the same map and have common errors.
         """
-        return inverse(
+        return matrix_inverse(
             rotate_covariance(self._settings.temper * match.hessian + match.prior.information, -match.pose[2])
         )
 
@@ -352,4 +357,4 @@ def _exceeds_basin(covariance: Float64) -> bool:
 
 def map_information(covariance: Float64, theta: float) -> Float64:
     """Inverse, in the map frame, of a covariance in the body's tangent frame, both (3, 3)."""
-    return inverse(rotate_covariance(covariance, theta))
+    return matrix_inverse(rotate_covariance(covariance, theta))

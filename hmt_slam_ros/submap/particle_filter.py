@@ -14,8 +14,7 @@ import numpy as np
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.geometry.covariance import inverse, rotate_covariance
-from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.geometry.gaussian import PoseGaussian, matrix_inverse, rotate_covariance
 from hmt_slam_ros.grids.patches import GridView
 from hmt_slam_ros.random_streams import Purpose, random_stream
 from hmt_slam_ros.registration import scan_to_map
@@ -129,7 +128,7 @@ class ParticleFilter:
         information = map_information(self._motion_since_update.covariance, match.pose[2])
         information = information + match.hessian / self.mapping.alignment.inflation
         self.residual_covariance = self._matcher.covariance(match)
-        self.tracking_covariance = rotate_covariance(inverse(information), -match.pose[2])
+        self.tracking_covariance = rotate_covariance(matrix_inverse(information), -match.pose[2])
         return TrackedMotion(increment, self._matcher.information(match), match.contradicts_odometry)
 
     def _leading_view(self) -> GridView:

@@ -1,14 +1,14 @@
-"""Kernels on covariances, with arrays and without, against numpy."""
+"""Kernels on covariances of geometry.gaussian, with arrays and without, against numpy."""
 
 import numpy as np
 import pytest
 
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.geometry.covariance import (
+from hmt_slam_ros.geometry.gaussian import (
     add_scaled,
     determinant,
     dot,
-    inverse,
+    matrix_inverse,
     multiply,
     propagate_covariance,
     rotate_covariance,
@@ -32,8 +32,8 @@ def covariance(random):
 
 def test_the_inverse_is_the_inverse(random):
     matrix = covariance(random)
-    np.testing.assert_allclose(inverse(matrix) @ matrix, np.eye(3), atol=1e-6)
-    np.testing.assert_array_equal(inverse(matrix), inverse(matrix).T)
+    np.testing.assert_allclose(matrix_inverse(matrix) @ matrix, np.eye(3), atol=1e-6)
+    np.testing.assert_array_equal(matrix_inverse(matrix), matrix_inverse(matrix).T)
 
 
 def test_a_turn_is_the_adjoint_of_a_rotation(random):
