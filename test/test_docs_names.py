@@ -63,7 +63,7 @@ def test_every_file_that_is_named_exists(page):
         assert any((folder / name).is_file() for folder in (PACKAGE, ROOT)), name
 
 
-@pytest.mark.parametrize("page", [ROOT / "README.md", DOCS / "accuracy.md", DOCS / "validation.md", *PAGES], ids=str)
+@pytest.mark.parametrize("page", [ROOT / "README.md", DOCS / "reports" / "accuracy.md", DOCS / "reports" / "validation.md", *PAGES], ids=str)
 def test_every_measurement_that_is_named_exists(page):
     text = page.read_text(encoding="utf-8")
     kinds = {kind for names in re.findall(r"-m benchmark ((?:[a-z]+ ?)+)", text) for kind in names.split()}

@@ -1,6 +1,6 @@
 """Which simulated worlds are mapped, and by which seeds.
 
-The model of the inference is fitted on training seeds alone; what docs/validation.md states was measured on validation
+The model of the inference is fitted on training seeds alone; what docs/reports/validation.md states was measured on validation
 seeds, which nobody looks at in order to choose anything.
 """
 
