@@ -9,6 +9,7 @@ import pytest
 
 import hmt_slam_ros
 from benchmark.__main__ import _GROUPS, MEASUREMENTS
+from benchmark.report import ACCURACY, VALIDATION
 from hmt_slam_ros.process_table import DOCUMENTS
 
 PACKAGE = Path(hmt_slam_ros.__file__).parent
@@ -63,7 +64,7 @@ def test_every_file_that_is_named_exists(page):
         assert any((folder / name).is_file() for folder in (PACKAGE, ROOT)), name
 
 
-@pytest.mark.parametrize("page", [ROOT / "README.md", DOCS / "reports" / "accuracy.md", DOCS / "reports" / "validation.md", *PAGES], ids=str)
+@pytest.mark.parametrize("page", [ROOT / "README.md", ACCURACY, VALIDATION, *PAGES], ids=str)
 def test_every_measurement_that_is_named_exists(page):
     text = page.read_text(encoding="utf-8")
     kinds = {kind for names in re.findall(r"-m benchmark ((?:[a-z]+ ?)+)", text) for kind in names.split()}

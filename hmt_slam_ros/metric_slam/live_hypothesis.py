@@ -33,8 +33,6 @@ from hmt_slam_ros.submap.local_mapping import PreparedScan
 
 _INITIAL_COVARIANCE = np.diag([1e-8, 1e-8, 1e-8])
 _IDENTITY = PoseGaussian.from_pose(np.zeros(3))
-# Doubt of a scan, nats, above which it contradicts what the robot should see: most who drive never meet one.
-_CONTRADICTION_NATS = 4.0
 _NO_ERROR = MatchError(_INITIAL_COVARIANCE, _INITIAL_COVARIANCE, np.zeros((3, 3)))
 
 
@@ -175,7 +173,7 @@ class LiveHypothesis:
             return False
         return (
             self.filter.clutter_estimate.evaluate(self.filter.compare_scan(sighting)).log_kidnapping_ratio
-            > _CONTRADICTION_NATS
+            > self.settings.contradiction_evidence
         )
 
     def process_keyframe(
@@ -206,7 +204,7 @@ class LiveHypothesis:
             motion=step.increment,
             match_information=step.information,
             motion_error=step.match_error,
-            contradicted=judgement.log_kidnapping_ratio > _CONTRADICTION_NATS,
+            contradicted=judgement.log_kidnapping_ratio > self.settings.contradiction_evidence,
             recent_scans=() if after_reset else self.event.recent_scans,
         )
         # Of a displaced robot it is the first of where it is now.
