@@ -57,11 +57,20 @@ def test_every_class_that_is_named_exists(page):
         assert not member or member in classes()[name], f"{name}.{member}"
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda path: path.name)
+@pytest.mark.parametrize("page", [ACCURACY, VALIDATION, *PAGES], ids=lambda path: path.name)
 def test_every_file_that_is_named_exists(page):
     text = page.read_text(encoding="utf-8")
     for name in re.findall(r"`((?:[a-z_]+/)*[a-z_0-9]+\.py)`", text):
         assert any((folder / name).is_file() for folder in (PACKAGE, ROOT)), name
+
+
+@pytest.mark.parametrize("page", sorted((DOCS / "concepts").glob("*.md")), ids=lambda path: path.name)
+def test_a_concept_lists_each_of_its_files_once(page):
+    _, _, table = page.read_text(encoding="utf-8").partition("## Where it lives")
+    listed = re.findall(r"`([a-z_/0-9]+\.py)`", "\n".join(re.findall(r"^\|([^|]*)\|", table, re.MULTILINE)))
+    assert len(listed) >= 5
+    assert len(listed) == len(set(listed))
+    assert all((PACKAGE / name).is_file() for name in listed)
 
 
 @pytest.mark.parametrize("page", [ROOT / "README.md", ACCURACY, VALIDATION, *PAGES], ids=str)
