@@ -1,4 +1,4 @@
-"""Parameters of lines, landmarks and kinds of areas, and of the belief over places."""
+"""Parameters of lines, landmarks and classes of areas, and of the belief over places."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from hmt_slam_ros.configuration.parameter import parameter
 
 @dataclass(frozen=True)
 class FeatureParameters:
-    """Lines: what a scan shows of walls, and what a room's map makes of it."""
+    """Lines of walls in scans, line maps of rooms, and landmarks."""
 
     range_deviation: float = parameter(
         0.015, "Deviation of a range, which the covariance of a line follows from.", 1e-4, 0.5, "m"
@@ -42,16 +42,16 @@ class FeatureParameters:
         3, "A line of a map that fewer scans than this showed is forgotten at the first one that does not.", 1, 100
     )
     corner_angle: float = parameter(
-        15.0, "Two walls that meet make a corner up to so much from a right angle.", 0.1, 45.0, "deg"
+        15.0, "Two walls that meet make a corner up to this much from a right angle.", 0.1, 45.0, "deg"
     )
-    corner_gap: float = parameter(0.2, "Both walls of a corner are seen up to so near to it.", 0.01, 2.0, "m")
+    corner_gap: float = parameter(0.2, "Both walls of a corner are seen up to this near to it.", 0.01, 2.0, "m")
     landmark_size: float = parameter(
         0.2, "Length of each of a landmark's two walls at which its confidence is 1 - 1/e.", 0.01, 10.0, "m"
     )
     opening_min: float = parameter(0.6, "Width of an opening at least.", 0.1, 10.0, "m")
     opening_max: float = parameter(3.0, "Width of an opening at most.", 0.1, 50.0, "m")
     opening_depth: float = parameter(
-        0.8, "So far behind the wall an opening is free; niches are less deep.", 0.1, 10.0, "m"
+        0.8, "An opening is free up to this far behind the wall; niches are less deep.", 0.1, 10.0, "m"
     )
     opening_bias: float = parameter(
         3.3,
@@ -108,10 +108,10 @@ class FeatureParameters:
 
 @dataclass(frozen=True)
 class PlaceParameters:
-    """Places: landmarks along hallways, and the robot's belief over where among them it is."""
+    """Landmarks along hallways, and the belief over places."""
 
-    reach: float = parameter(2.0, "Landmarks count that are so far ahead or back along the hallway.", 0.5, 100.0, "m")
-    aside: float = parameter(2.0, "Landmarks count that are so far to its sides.", 0.1, 100.0, "m")
+    reach: float = parameter(2.0, "Landmarks count up to this far ahead or back along the hallway.", 0.5, 100.0, "m")
+    aside: float = parameter(2.0, "Landmarks count up to this far to its sides.", 0.1, 100.0, "m")
     detection: float = parameter(
         0.955, "Probability p_det that a landmark within reach is extracted, if it is there.", 0.01, 0.99
     )

@@ -28,7 +28,7 @@ class RealTimeParameters:
 
 @dataclass(frozen=True)
 class RobotParameters:
-    """The simulated robot that replays a log, or drives."""
+    """The robot node, which replays a log or simulates a driven robot."""
 
     drive: str = parameter(
         "log",
@@ -52,7 +52,7 @@ class RobotParameters:
 
 @dataclass(frozen=True)
 class ExplorerParameters:
-    """The explorer: the robot, which the pilot drives as well, and when it gives something up."""
+    """The explorer, and the robot that explorer and pilot drive."""
 
     drive: str = parameter(
         "velocities",
@@ -68,7 +68,7 @@ class ExplorerParameters:
     acceleration: float = parameter(0.5, "Acceleration at most, to brake as well.", 0.05, 10.0, "m/s^2")
     turn_acceleration: float = parameter(90.0, "Acceleration of a turn at most.", 1.0, 1000.0, "deg/s^2")
     radius: float = parameter(0.25, "Radius of the robot.", 0.01, 2.0, "m")
-    margin: float = parameter(0.05, "Distance that it keeps from what it sees.", 0.0, 1.0, "m")
+    margin: float = parameter(0.05, "Distance that it keeps from obstacles.", 0.0, 1.0, "m")
     door: float = parameter(1.75, "An opening up to this wide is a door, a wider one a hallway.", 0.5, 5.0, "m")
     stuck_timeout: float = parameter(
         15.0, "A goal is given up if the robot has not come nearer for this long.", 1.0, 600.0, "s"
@@ -77,7 +77,7 @@ class ExplorerParameters:
 
 @dataclass(frozen=True)
 class PilotParameters:
-    """The pilot, who goes by the belief over places: whether it drives the robot, and when it gives up."""
+    """The pilot, which localizes and drives by the belief over places."""
 
     drives: bool = parameter(
         True, "Take tasks and drive; otherwise only publish the place of a robot that others drive."

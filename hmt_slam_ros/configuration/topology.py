@@ -1,4 +1,4 @@
-"""Parameters of the topological processes, and of the refinement of what they accept."""
+"""Parameters of the topological processes and of the refinement."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class InferenceParameters:
         1,
         100000,
     )
-    max_modes: int = parameter(3, "Ways to fit one known area that become hypotheses of their own.", 1, 100)
+    max_modes: int = parameter(3, "Modes of the match into one known area that become hypotheses.", 1, 100)
     gate_probability: float = parameter(
         0.999, "Share of true revisits that the chi-square gate on the arc prior admits.", 0.5, 0.999999
     )
