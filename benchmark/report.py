@@ -26,8 +26,9 @@ _MANY = 5  # seeds, more of which are not listed one by one
 # Both change what a run costs.
 _VARIABLES = ("OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
 
-ACCURACY = ROOT / "docs" / "accuracy.md"
-VALIDATION = ROOT / "docs" / "validation.md"
+REPORTS = ROOT / "docs" / "reports"
+ACCURACY = REPORTS / "accuracy.md"
+VALIDATION = REPORTS / "validation.md"
 IMAGES = ROOT / "docs" / "images"
 
 
@@ -227,4 +228,4 @@ def shown(report: Report, out: Path) -> str:
     """
     for name in report.illustrations:
         shutil.copy(out / name, IMAGES / name)
-    return "".join(f"\n\n![{report.pictures[name]}](images/{name})" for name in report.illustrations)
+    return "".join(f"\n\n![{report.pictures[name]}](../images/{name})" for name in report.illustrations)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
 from xml.etree import ElementTree
@@ -36,7 +37,11 @@ myst_dmath_allow_digits = False
 # Static analysis: the API pages need neither ROS nor numba. Without the extension the site lacks these pages alone.
 HAS_API = find_spec("autoapi") is not None
 if HAS_API:
+    from astroid.brain import brain_numpy_ndarray
+
     extensions += ["sphinx.ext.autodoc", "autoapi.extension"]
+    # astroid parses its text of the class ndarray at every annotation that names it, for half of the build's time.
+    brain_numpy_ndarray.extract_node = cache(brain_numpy_ndarray.extract_node)
 autoapi_dirs = [str(ROOT / PACKAGE)]
 autoapi_root = "reference/api"
 autoapi_options = ["members", "undoc-members", "show-module-summary"]

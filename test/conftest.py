@@ -23,6 +23,8 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 
 WAIT = 120.0  # s, for what normally takes less than one; a machine may be busy
 NODES = ("test_ros_", "test_view_page", "test_package_compilation")  # files in which nodes run
+# Files that take longest begin first, so that no worker is left alone with one.
+LONG = ("test_docs_site", "test_offline_going_on", "test_whole_run", "test_benchmark_policies", "test_exploration.py")
 
 
 @pytest.hookimpl(optionalhook=True)
@@ -36,8 +38,9 @@ def pytest_xdist_make_scheduler(config, log):
     class NodesInTurn(LoadFileScheduling):
         def _assign_work_unit(self, node):
             runs_nodes = node is self.nodes[0]
-            for file in self.workqueue:
-                if file.rpartition("/")[2].startswith(NODES) == runs_nodes:
+            names = {file: file.rpartition("/")[2] for file in self.workqueue}
+            for file in sorted(names, key=lambda file: not names[file].startswith(LONG)):
+                if names[file].startswith(NODES) == runs_nodes:
                     self.workqueue.move_to_end(file, last=False)
                     break
             super()._assign_work_unit(node)

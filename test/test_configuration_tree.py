@@ -23,7 +23,7 @@ from hmt_slam_ros.configuration.tree import CONSISTENCY_RULES
 from hmt_slam_ros.errors import HmtSlamError
 
 ROOT = Path(__file__).resolve().parents[1]
-LEAVES = flat_parameters(Configuration())
+PARAMETERS = flat_parameters(Configuration())
 
 words = st.text("abcdefgh_", min_size=1, max_size=6)
 trees = st.recursive(
@@ -33,20 +33,20 @@ trees = st.recursive(
 )
 
 
-def values_of(leaf: FlatParameter) -> st.SearchStrategy:
-    if leaf.choices:
-        return st.sampled_from(leaf.choices)
-    if leaf.kind is bool:
+def values_of(parameter: FlatParameter) -> st.SearchStrategy:
+    if parameter.choices:
+        return st.sampled_from(parameter.choices)
+    if parameter.kind is bool:
         return st.booleans()
-    if leaf.kind is int:
-        return st.integers(int(leaf.low), int(leaf.high))
-    return st.floats(leaf.low, leaf.high)
+    if parameter.kind is int:
+        return st.integers(int(parameter.low), int(parameter.high))
+    return st.floats(parameter.low, parameter.high)
 
 
 @st.composite
 def some_changes(draw: st.DrawFn) -> dict:
-    chosen = draw(st.lists(st.sampled_from(LEAVES), unique_by=lambda leaf: leaf.name, max_size=6))
-    return {leaf.name: draw(values_of(leaf)) for leaf in chosen}
+    chosen = draw(st.lists(st.sampled_from(PARAMETERS), unique_by=lambda parameter: parameter.name, max_size=6))
+    return {parameter.name: draw(values_of(parameter)) for parameter in chosen}
 
 
 def changed_or_none(changes: dict) -> Configuration | None:
@@ -95,24 +95,28 @@ def test_yaml_reads_every_number_back_as_the_same_float(value: float) -> None:
     assert read == value
 
 
-@pytest.mark.parametrize("leaf", LEAVES, ids=lambda leaf: leaf.name)
-def test_every_parameter_is_declared_in_full(leaf: FlatParameter) -> None:
-    assert type(leaf.value) in (bool, int, float, str)
-    assert leaf.description.endswith(".")
-    if leaf.kind in (int, float):
-        assert leaf.low is not None
-        assert leaf.high is not None
-        assert leaf.low <= leaf.value <= leaf.high
-    if leaf.choices:
-        assert leaf.value in leaf.choices
+@pytest.mark.parametrize("parameter", PARAMETERS, ids=lambda parameter: parameter.name)
+def test_every_parameter_is_declared_in_full(parameter: FlatParameter) -> None:
+    assert type(parameter.value) in (bool, int, float, str)
+    assert parameter.description.endswith(".")
+    if parameter.kind in (int, float):
+        assert parameter.low is not None
+        assert parameter.high is not None
+        assert parameter.low <= parameter.value <= parameter.high
+    if parameter.choices:
+        assert parameter.value in parameter.choices
 
 
-@pytest.mark.parametrize("leaf", [leaf for leaf in LEAVES if leaf.kind in (int, float)], ids=lambda leaf: leaf.name)
-def test_a_value_beyond_either_bound_is_refused_with_the_range(leaf: FlatParameter) -> None:
-    for value in (leaf.kind(leaf.low - 1), leaf.kind(leaf.high + 1)):
+@pytest.mark.parametrize(
+    "parameter",
+    [parameter for parameter in PARAMETERS if parameter.kind in (int, float)],
+    ids=lambda parameter: parameter.name,
+)
+def test_a_value_beyond_either_bound_is_refused_with_the_range(parameter: FlatParameter) -> None:
+    for value in (parameter.kind(parameter.low - 1), parameter.kind(parameter.high + 1)):
         with pytest.raises(HmtSlamError, match=r"is out of range: use .* from .* to") as fault:
-            with_changes(Configuration(), {leaf.name: value})
-        assert f"{leaf.name} = {value}" in one_sentence(fault)
+            with_changes(Configuration(), {parameter.name: value})
+        assert f"{parameter.name} = {value}" in one_sentence(fault)
 
 
 def test_the_defaults_obey_every_rule() -> None:

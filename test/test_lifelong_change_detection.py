@@ -43,7 +43,8 @@ def keyframes(walls):
 def news(before, now, looks=None):
     """What a scan now says of a map of before."""
     scan = RecentScan(scan_in(now, NOW, stamp=10 * SECOND, beams=361), NOW)
-    return detect_changes(scan, looks_in(now, now, now) if looks is None else looks, keyframes(before))
+    recent = looks_in(now, now, now) if looks is None else looks
+    return detect_changes(scan, recent, keyframes(before), Configuration().filter)
 
 
 def ends(keyframe, beams):

@@ -237,10 +237,10 @@ def test_scans_that_the_map_does_not_hold_are_remembered_as_long_as_they_are_dou
 
 def test_scans_that_contradict_add_up_and_are_remembered_in_the_next_area():
     notes = HypothesisState().after_scan(5, -0.3).after_scan(6, 8.0).after_scan(7, 5.0).after_scan(8, 1.2)
-    odds, since = notes.kidnapping_test
+    odds, since = notes.kidnapping_test(1e-5)
     assert since == 6
     assert odds == pytest.approx(PRIOR + 7.0 + 4.0 + 0.2)
-    assert notes.after_area_change({}).kidnapping_test == (odds, since)
+    assert notes.after_area_change({}).kidnapping_test(1e-5) == (odds, since)
 
 
 def test_what_contradicts_at_every_keyframe_is_clutter():
@@ -248,7 +248,7 @@ def test_what_contradicts_at_every_keyframe_is_clutter():
     for event in range(20):
         notes = notes.after_scan(event, 0.9)
     assert not notes.kidnapping_evidence
-    assert notes.kidnapping_test == (-math.inf, 0)
+    assert notes.kidnapping_test(1e-5) == (-math.inf, 0)
 
 
 def test_a_doubt_passes_with_scans_that_fit():
@@ -259,7 +259,7 @@ def test_a_doubt_passes_with_scans_that_fit():
 
 
 def test_what_contradicted_a_little_before_is_another_matter():
-    assert HypothesisState().after_scan(5, 2.0).after_scan(6, 9.0).after_scan(7, 6.0).kidnapping_test[1] == 6
+    assert HypothesisState().after_scan(5, 2.0).after_scan(6, 9.0).after_scan(7, 6.0).kidnapping_test(1e-5)[1] == 6
 
 
 def test_what_a_displaced_robot_saw_is_not_forgotten_at_the_same_event():

@@ -1,7 +1,7 @@
 """Which simulated worlds are mapped, and by which seeds.
 
-The model of the inference is fitted on training seeds alone; what docs/validation.md states was measured on validation
-seeds, which nobody looks at in order to choose anything.
+The model of the inference is fitted on training seeds alone. docs/reports/validation.md has validation seeds only; they
+choose nothing.
 """
 
 from __future__ import annotations

@@ -36,8 +36,8 @@ from hmt_slam_ros.sensors import Scan
 
 # An area's overlap with a scan is that of the best few keyframes among those taken nearest to it.
 _NEAREST, _BEST = 8, 3
-# Keyframes that one place of an area may hold, and keyframe events for which all that is new stays.
-_MAX_IN_PLACE, _RECENT = 2, 30
+# Keyframe events for which all that is new stays.
+_RECENT = 30
 # Where an arc moved keyframes by less than this share of the radius of overlap, overlaps are not measured again.
 _REMEASURE_SHARE = 0.1
 
@@ -176,7 +176,10 @@ class Aam:
             *(k for k in placed if k > newest - _RECENT),
             *self._state.partitions[hypothesis].new_keyframes,
         }
-        return tuple(PrunedKeyframe(k, area) for k in redundant_keyframes(placed, kept, _MAX_IN_PLACE, self._filter))
+        return tuple(
+            PrunedKeyframe(k, area)
+            for k in redundant_keyframes(placed, kept, self._options.keyframes_per_place, self._filter)
+        )
 
     def _sense(self, scan: Scan) -> SensedSpace:
         return SensedSpace.from_scan(scan, self._max_range, self._options.overlap_points)

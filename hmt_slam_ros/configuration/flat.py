@@ -1,6 +1,6 @@
 """The configuration tree as a list of dotted names, checked changes to it, and its reading from a YAML file.
 
-A value that cannot be is refused with one sentence: the name, the value, what is allowed, and what to do.
+An impossible value is refused with one sentence: the name, the value, the allowed values, and the remedy.
 """
 
 from __future__ import annotations
@@ -27,13 +27,14 @@ class FlatParameter:
     """One parameter with its dotted name, as ROS declares it.
 
     :ivar name: dotted name such as ``filter.particles``.
-    :ivar value: value in the configuration that was asked.
+    :ivar value: value in the given configuration.
     :ivar default: value where nobody sets one; its type is the type of the parameter.
     :ivar description: one sentence.
     :ivar unit: SI unit or degrees, "" for none.
     :ivar low: smallest value allowed, inclusive, or None.
     :ivar high: largest value allowed, inclusive, or None.
     :ivar choices: the words allowed for a str, () for any.
+    :ivar expert: whether it is a threshold that few robots need to change.
     """
 
     name: str
@@ -44,6 +45,7 @@ class FlatParameter:
     low: float | None
     high: float | None
     choices: tuple[str, ...]
+    expert: bool
 
     @property
     def kind(self) -> type:
@@ -67,7 +69,7 @@ def _parameters_below(node: DataclassInstance, prefix: str) -> Iterator[FlatPara
 
 def as_flat(configuration: Configuration) -> dict[str, Value]:
     """Dotted name -> value."""
-    return {leaf.name: leaf.value for leaf in flat_parameters(configuration)}
+    return {parameter.name: parameter.value for parameter in flat_parameters(configuration)}
 
 
 def as_nested(configuration: Configuration) -> dict[str, Any]:
@@ -79,16 +81,16 @@ def nest(flat: Mapping[str, Any]) -> dict[str, Any]:
     """Dictionaries nested at the dots of the names."""
     tree: dict[str, Any] = {}
     for name, value in flat.items():
-        *rooms, last = name.split(".")
+        *groups, last = name.split(".")
         node = tree
-        for step in rooms:
+        for step in groups:
             node = node.setdefault(step, {})
         node[last] = value
     return tree
 
 
 def flatten(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """The inverse of :func:`nested`; an empty dictionary vanishes."""
+    """The inverse of :func:`nest`; an empty dictionary vanishes."""
     flat: dict[str, Any] = {}
     for name, value in tree.items():
         if isinstance(value, Mapping):
@@ -119,7 +121,7 @@ def apply_changes(tree: Node, changes: Mapping[str, Any], document: str) -> Node
     :param document: where the names are described.
     :raises HmtSlamError: for an unknown name, a value of the wrong type or out of range.
     """
-    known = {leaf.name: leaf for leaf in flat_parameters(tree)}
+    known = {parameter.name: parameter for parameter in flat_parameters(tree)}
     checked = {name: _check_value(_find_parameter(name, known, document), value) for name, value in changes.items()}
     return _replace_values(tree, nest(checked))
 
@@ -146,46 +148,47 @@ def nearest_names(name: str, known: Mapping[str, FlatParameter]) -> list[str]:
     return (same_ending + [near for near in difflib.get_close_matches(name, known) if near not in same_ending])[:3]
 
 
-def _check_value(leaf: FlatParameter, value: object) -> Value:
-    typed = _convert_type(leaf, value)
-    if leaf.choices and typed not in leaf.choices:
-        raise HmtSlamError(f"{leaf.name} = {value} is not a choice: use {' or '.join(leaf.choices)}")
-    if not isinstance(typed, str) and not _is_in_range(leaf, typed):
-        raise HmtSlamError(
-            f"{leaf.name} = {value} is out of range: use {allowed_values(leaf)} (the default is {leaf.default})"
-        )
+def _check_value(parameter: FlatParameter, value: object) -> Value:
+    typed = _convert_type(parameter, value)
+    if parameter.choices and typed not in parameter.choices:
+        raise HmtSlamError(f"{parameter.name} = {value} is not a choice: use {' or '.join(parameter.choices)}")
+    if not isinstance(typed, str) and not _is_in_range(parameter, typed):
+        allowed, default = allowed_values(parameter), parameter.default
+        raise HmtSlamError(f"{parameter.name} = {value} is out of range: use {allowed} (the default is {default})")
     return typed
 
 
-def _convert_type(leaf: FlatParameter, value: object) -> Value:
-    if leaf.kind is float and type(value) is int:
+def _convert_type(parameter: FlatParameter, value: object) -> Value:
+    if parameter.kind is float and type(value) is int:
         return float(value)
-    if type(value) is leaf.kind:
+    if type(value) is parameter.kind:
         return cast(Value, value)
-    raise HmtSlamError(f"{leaf.name} = {value!r} is not {_KIND_NAMES[leaf.kind]}: use {allowed_values(leaf)}")
+    raise HmtSlamError(
+        f"{parameter.name} = {value!r} is not {_KIND_NAMES[parameter.kind]}: use {allowed_values(parameter)}"
+    )
 
 
-def _is_in_range(leaf: FlatParameter, value: float) -> bool:
+def _is_in_range(parameter: FlatParameter, value: float) -> bool:
     if not math.isfinite(value):
         return False
-    return (leaf.low is None or value >= leaf.low) and (leaf.high is None or value <= leaf.high)
+    return (parameter.low is None or value >= parameter.low) and (parameter.high is None or value <= parameter.high)
 
 
 _KIND_NAMES = {bool: "true or false", int: "a whole number", float: "a number", str: "a word"}
 
 
-def allowed_values(leaf: FlatParameter) -> str:
+def allowed_values(parameter: FlatParameter) -> str:
     """The values that the parameter admits, in words."""
-    if leaf.choices:
-        return " or ".join(leaf.choices)
-    if leaf.low is None and leaf.high is None:
-        return _KIND_NAMES[leaf.kind]
-    unit = f" {leaf.unit}" if leaf.unit else ""
-    if leaf.high is None:
-        return f"{_KIND_NAMES[leaf.kind]}, {leaf.low:g}{unit} or more"
-    if leaf.low is None:
-        return f"{_KIND_NAMES[leaf.kind]}, {leaf.high:g}{unit} or less"
-    return f"{_KIND_NAMES[leaf.kind]} from {format_number(leaf.low)} to {format_number(leaf.high)}{unit}"
+    if parameter.choices:
+        return " or ".join(parameter.choices)
+    if parameter.low is None and parameter.high is None:
+        return _KIND_NAMES[parameter.kind]
+    unit = f" {parameter.unit}" if parameter.unit else ""
+    if parameter.high is None:
+        return f"{_KIND_NAMES[parameter.kind]}, {parameter.low:g}{unit} or more"
+    if parameter.low is None:
+        return f"{_KIND_NAMES[parameter.kind]}, {parameter.high:g}{unit} or less"
+    return f"{_KIND_NAMES[parameter.kind]} from {format_number(parameter.low)} to {format_number(parameter.high)}{unit}"
 
 
 def format_number(value: float) -> str:
@@ -289,7 +292,7 @@ def parse_setting(setting: str, tree: DataclassInstance | None = None) -> tuple[
     if not equals:
         raise HmtSlamError(f"'{setting}' is no setting: write name=value, such as filter.particles=12")
     name, text = name.strip(), text.strip()
-    kinds = {leaf.name: leaf.kind for leaf in flat_parameters(tree or Configuration())}
+    kinds = {parameter.name: parameter.kind for parameter in flat_parameters(tree or Configuration())}
     try:
         return name, _READERS[kinds.get(name, str)](text)
     except ValueError:

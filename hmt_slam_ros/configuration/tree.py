@@ -1,10 +1,8 @@
 """Every parameter of the system: the groups, and the rules that join them.
 
-Each parameter is declared once, in ``metric``, ``topological``, ``features``, ``places``, ``live`` or ``explorer``:
-default, unit, range and description. The ROS parameters, the YAML files, ``--set`` and docs/reference/parameters.md all
-follow from this tree, so a new parameter is one line here. Angles are in degrees, for the people who set them; the code
-that uses one calls ``math.radians`` there. After a change run ``scripts/generate_docs.py``, which brings
-config/hmt_slam.yaml and docs/reference/parameters.md up to date.
+Each parameter is declared once, in its group's class, with default, description, range and unit. ROS parameters, YAML
+files, ``--set`` and docs/reference/parameters.md follow from this tree. Angles are in degrees; the code that uses one
+converts it. After a change run ``scripts/generate_docs.py``.
 """
 
 from __future__ import annotations
@@ -32,17 +30,16 @@ from hmt_slam_ros.configuration.topology import (
 
 @dataclass(frozen=True)
 class Configuration:
-    """All parameters. Build one with ``loading.load_configuration`` or ``flat.with_changes``, which check it.
+    """All parameters. ``load_configuration`` and ``with_changes`` make checked ones.
 
     :ivar seed: the one seed that all random numbers are derived from.
-    :ivar mode: what is done with known ground.
+    :ivar mode: what is stored of known ground.
     """
 
-    seed: int = parameter(0, "Seed of all random numbers of a run.", low=0, high=2**31 - 1)
+    seed: int = parameter(0, "Seed of all random numbers of a run.", 0, 2**31 - 1)
     mode: str = parameter(
         "mapping",
-        "Whether the map grows, or the robot only finds its place in a map that stays as it was loaded, or the map "
-        "follows a world that changes: it is added to only where something is new, and what is no more is left out.",
+        "Whether the map grows, stays as it was loaded, or follows a world that changes (lifelong).",
         choices=("mapping", "localization", "lifelong"),
     )
     motion: MotionParameters = field(default_factory=MotionParameters)

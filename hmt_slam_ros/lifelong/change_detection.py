@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmt_slam_ros.arrays import Bool
+from hmt_slam_ros.configuration.metric_slam import FilterParameters
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.messages.map_changes import StaleBeams
 from hmt_slam_ros.sensors import Scan
@@ -33,8 +34,6 @@ MAX_AREA_SIGMA = 0.3
 
 MAX_KEYFRAME_DISTANCE = 18.0
 """Keyframes farther away than this, m, say nothing within that reach."""
-# Surface that has to be new, m: where nothing was known, and where free space was. A person is 0.4 m wide, so is a box.
-_MIN_NEW_LENGTH, _MIN_CHANGED_LENGTH = 0.5, 0.3
 # Samples of surface, m.
 _SAMPLE = 0.1
 # Share of the scan that has to lie on known surfaces, for the map and not the robot to be elsewhere than thought.
@@ -97,23 +96,26 @@ def append_recent_scan(recent: tuple[RecentScan, ...], newest: RecentScan) -> tu
     return (*recent, newest)[-_RECENT_SCANS:]
 
 
-def detect_changes(now: RecentScan, recent: Sequence[RecentScan], known: Sequence[PlacedKeyframe]) -> Changes:
+def detect_changes(
+    now: RecentScan, recent: Sequence[RecentScan], known: Sequence[PlacedKeyframe], settings: FilterParameters
+) -> Changes:
     """Compare a scan with a hypothesis's map around the robot.
 
     :param recent: the last ones before it.
     :param known: the keyframes of the map.
+    :param settings: lengths of surface that have to be new or changed.
     """
     around = [one for one in known if np.hypot(*(one.pose - now.pose)[:2]) <= MAX_KEYFRAME_DISTANCE]
     here = _points_in_reach(se2.transform(now.pose, now.scan.points), now.pose)
     held = _point_visibility(here, [RecentScan(one.scan, one.pose) for one in around])
     before = _point_visibility(here, recent)
     stays = before.surface & ~before.free
-    new = _surface_length(here[stays & ~held.surface & ~held.free]) >= _MIN_NEW_LENGTH
+    new = _surface_length(here[stays & ~held.surface & ~held.free]) >= settings.new_surface
     if held.surface.sum() < _MIN_EXPLAINED_FRACTION * len(here):
         return Changes(new, False, {})
-    changed = _surface_length(here[stays & ~held.surface & held.free]) >= _MIN_CHANGED_LENGTH
+    changed = _surface_length(here[stays & ~held.surface & held.free]) >= settings.changed_surface
     against = here[stays & held.free]
-    against = against[: len(against) if _surface_length(against) >= _MIN_CHANGED_LENGTH else 0]
+    against = against[: len(against) if _surface_length(against) >= settings.changed_surface else 0]
     return Changes(
         new,
         changed,

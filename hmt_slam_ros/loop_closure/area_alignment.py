@@ -19,10 +19,6 @@ from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.sensors.scan import transform_surfels
 from hmt_slam_ros.submap.local_mapping import LocalMapping
 
-# Factor on the covariance of what the match of two whole areas says: they are not quite rigid, and bend by more than
-# the width of their walls.
-_NONRIGID_INFLATION = 10.0
-
 PlacedScan: TypeAlias = tuple[Scan, NDArray[np.float64]]
 
 
@@ -40,6 +36,7 @@ class AreaAlignment:
         self._mapping = LocalMapping(configuration)
         self._alignment = self._mapping.alignment._replace(inflation=1.0 / configuration.matching.temper)
         self._gate = chi_square_gate(configuration.tsbi.gate_probability)
+        self._inflation = configuration.tlca.alignment_inflation
 
     def align(
         self, known: Sequence[PlacedScan], joined: Sequence[PlacedScan], closure: PoseGaussian
@@ -64,7 +61,7 @@ class AreaAlignment:
         ]
         offset = self._refine_offset(np.concatenate(start), closure, found, self._mapping.pool.view(table))
         self._mapping.pool.release(table)
-        covariance = min(_NONRIGID_INFLATION * found.covariance, closure.covariance, key=np.linalg.det)
+        covariance = min(self._inflation * found.covariance, closure.covariance, key=np.linalg.det)
         return PoseGaussian(se2.compose(offset, found.mean), covariance)
 
     def _build_grid(self, placed: Sequence[PlacedScan]) -> AreaGrid:

@@ -35,13 +35,6 @@ _INITIAL_COVARIANCE = np.diag([1e-8, 1e-8, 1e-8])
 """Covariance of the first pose in an area, m^2 and rad^2."""
 
 _IDENTITY = PoseGaussian.from_pose(np.zeros(3))
-
-_CONTRADICTION_NATS = 4.0
-"""Log-ratio of "displaced" to "in place" above which a scan contradicts the submap, nats.
-
-Such a scan triggers a keyframe (docs/decisions/0026-kidnapping-detection.md); docs/validation.md has its effect.
-"""
-
 _NO_ERROR = MatchError(_INITIAL_COVARIANCE, _INITIAL_COVARIANCE, np.zeros((3, 3)))
 
 
@@ -175,7 +168,7 @@ class LiveHypothesis:
         if self.event.contradicted:
             return False
         evidence = self.filter.clutter_estimate.evaluate(self.filter.compare_scan(prepared))
-        return evidence.log_kidnapping_ratio > _CONTRADICTION_NATS
+        return evidence.log_kidnapping_ratio > self.settings.contradiction_evidence
 
     def process_keyframe(
         self,
@@ -205,7 +198,7 @@ class LiveHypothesis:
             motion=step.increment,
             match_information=step.information,
             motion_error=step.match_error,
-            contradicted=evidence.log_kidnapping_ratio > _CONTRADICTION_NATS,
+            contradicted=evidence.log_kidnapping_ratio > self.settings.contradiction_evidence,
             recent_scans=() if after_reset else self.event.recent_scans,
         )
         # A scan that contradicts may be the first after a displacement.

@@ -346,7 +346,7 @@ class MetricSlam:
         # A laser sees farther than the local map reaches.
         around = areas_around(hybrid_map, own.area, self._neighborhood, own.keyframe_areas)
         beyond = self._area_keyframes(own.hypothesis, {area: belief.mean for area, belief in around.items()})
-        changes = detect_changes(RecentScan(scan, own.pose), live.event.recent_scans, [*known, *beyond])
+        changes = detect_changes(RecentScan(scan, own.pose), live.event.recent_scans, [*known, *beyond], live.settings)
         live.add_recent_scan(scan)
         found.append((changes, self._replica.probabilities[own.hypothesis]))
         return changes.has_new_surface or changes.has_changed_surface

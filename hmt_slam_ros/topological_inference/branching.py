@@ -128,6 +128,7 @@ class Branching:
     :ivar search: finds and compares known areas.
     :ivar landmarks: what they say of places and loops, where they are asked.
     :ivar unstored_scans: {keyframe event: scan} of those that no map holds and that may be looked for.
+    :ivar options: the parameters of the inference.
     """
 
     def __init__(
@@ -146,7 +147,7 @@ class Branching:
         scans = ChainMap(self.unstored_scans, replica.scans)
         self.search = ClosureSearch(configuration, scans)
         self.landmarks = None if landmarks is None else landmarks(configuration, scans)
-        self._options = configuration.tsbi
+        self.options = configuration.tsbi
         self._replica = replica
         sigma, angle = configuration.tlca.arc_sigma_floor, math.radians(configuration.tlca.arc_angle_floor)
         self._covariance_floor = np.diag([sigma**2, sigma**2, angle**2])
@@ -254,7 +255,7 @@ class Branching:
 
         :param only: known areas beside which keyframes fitted: whether the newest are in one of them now.
         """
-        newest = sorted(parent.state.covariances)[-self._options.recheck_keyframes :]
+        newest = sorted(parent.state.covariances)[-self.options.recheck_keyframes :]
         placed = parent.hybrid_map.keyframes(parent.area)
         keyframes = [k for k in (newest if only else parent.state.unmatched_keyframes) if k in placed]
         query = self.query(parent, keyframes)
@@ -278,8 +279,8 @@ class Branching:
     ) -> AreaComparison:
         """The comparison with known areas, of which a hypothesis may examine the more the more probable it is."""
         most = min(
-            self._options.max_candidates,
-            max(MIN_EXAMINED_AREAS, math.ceil(self._options.max_comparisons * parent.probability)),
+            self.options.max_candidates,
+            max(MIN_EXAMINED_AREAS, math.ceil(self.options.max_comparisons * parent.probability)),
         )
         return self.search.compare(
             parent.hybrid_map, parent.area, query, parent.state.matched_keyframes, excluded, most, only

@@ -70,8 +70,6 @@ def _draw_stratified(weights: NDArray[np.float64], count: int, offset: float) ->
 
 Covariance = NDArray[np.float64]
 
-# Log-probability per keyframe that wheels and scans both lose the robot: once in 50 km.
-_LOG_KIDNAPPING_PRIOR = math.log(1e-5)
 # Of the nats by which a scan contradicts, so many are no news: who stands there does so at the next keyframe too.
 _CUSUM_DRIFT = 1.0
 # Keyframe events for which a doubt is kept.
@@ -198,19 +196,18 @@ class HypothesisState:
             self, kidnapping_evidence=doubts, unstored_poses={k: at for k, at in spots.items() if k in doubts}
         )
 
-    @property
-    def kidnapping_test(self) -> tuple[float, int]:
+    def kidnapping_test(self, prior: float) -> tuple[float, int]:
         """Log-odds that the robot was displaced of late, and the first keyframe event after that.
 
         The events since then speak for that together (the test of Page 1954).
+
+        :param prior: probability of a displacement per keyframe event.
         """
         if not self.kidnapping_evidence:
             return -math.inf, 0
         most = max(self.kidnapping_evidence.values())
         first = min(event for event, nats in self.kidnapping_evidence.items() if nats >= _ONSET_SHARE * most)
-        return _LOG_KIDNAPPING_PRIOR + sum(
-            nats for event, nats in self.kidnapping_evidence.items() if event >= first
-        ), first
+        return math.log(prior) + sum(nats for event, nats in self.kidnapping_evidence.items() if event >= first), first
 
     def after_keyframe(self, keyframe: int, covariance: Covariance) -> HypothesisState:
         """After a keyframe entered the robot's area."""

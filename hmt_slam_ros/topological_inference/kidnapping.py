@@ -27,16 +27,19 @@ from hmt_slam_ros.topological_inference.relocalization import (
     prefers_tracked_pose,
 )
 
-# Log-odds of a displacement from which on it is a hypothesis, of hypotheses of at least such a probability, with at
-# least so many keyframes.
-_LOG_ODDS, _PROBABILITY, _KEYFRAMES = math.log(3e-5), 0.05, 3
+# A displacement becomes a hypothesis for parents of at least such a probability, with at least so many keyframes.
+_PROBABILITY, _KEYFRAMES = 0.05, 3
 
 
 def spawn_kidnapped_hypothesis(branching: Branching, parent: Parent) -> Branches | None:
     """To go on, or to have been displaced; None where that is not probable enough to be asked."""
-    log_odds, since = parent.state.kidnapping_test
+    log_odds, since = parent.state.kidnapping_test(branching.options.kidnapping_prior)
     late = _keyframes_since(parent, since)
-    if log_odds < _LOG_ODDS or parent.probability < _PROBABILITY or len(late) < _KEYFRAMES:
+    if (
+        log_odds < math.log(branching.options.kidnapping_odds)
+        or parent.probability < _PROBABILITY
+        or len(late) < _KEYFRAMES
+    ):
         return None
     child = _kidnapped_child(branching, parent, late, log_odds)
     noted = replace(parent.state, kidnapping_evidence={})
@@ -51,7 +54,7 @@ def decide_without_mapping(branching: Branching, parent: Parent, event: int) -> 
 
     :param event: the newest; metric SLAM arrives at the next one then.
     """
-    log_odds, since = parent.state.kidnapping_test
+    log_odds, since = parent.state.kidnapping_test(branching.options.kidnapping_prior)
     notes = parent.state
     if log_odds > 0.0:
         if _confirms_tracked_pose(branching, parent, since):
@@ -73,7 +76,8 @@ def _confirms_tracked_pose(branching: Branching, parent: Parent, since: int) -> 
     first = min(seen)
     poses = {keyframe: se2.between(seen[first], pose) for keyframe, pose in seen.items()}
     where = branching.localize_globally(parent, poses, first)
-    return prefers_tracked_pose(parent.hybrid_map, where, PoseInArea(parent.area, first, seen[first]), poses)
+    tracked = PoseInArea(parent.area, first, seen[first])
+    return prefers_tracked_pose(parent.hybrid_map, where, tracked, poses, branching.options)
 
 
 def _keyframes_since(parent: Parent, event: int) -> list[int]:
@@ -95,6 +99,6 @@ def _kidnapped_child(branching: Branching, parent: Parent, keyframes: Sequence[i
     child = branching.enter_area(
         parent, query, area, origin, uninformative_belief(query.belief.mean), log_odds + credit
     )
-    sighted = decisive_candidate(where, query.poses)
+    sighted = decisive_candidate(where, query.poses, branching.options)
     lost = Lost(keyframes[0], candidate=sighted, tracked_pose=claim, counted_evidence=credit)
     return replace(child, state=replace(child.state, kidnapping_evidence={}, localization=lost))

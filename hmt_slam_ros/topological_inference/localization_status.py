@@ -9,9 +9,6 @@ import numpy as np
 
 from hmt_slam_ros.topological_inference.global_localization import UNMAPPED_PRIOR, PoseDistribution
 
-# Probability that the robot may be anywhere in the map, up to which it is said to know its place.
-_MAX_LOST_PROBABILITY = 0.1
-
 
 class LocalizationStatus(NamedTuple):
     """What is known of the robot's place.
@@ -38,13 +35,18 @@ class HypothesisSummary(NamedTuple):
 
 
 def summarize_localization(
-    summaries: Iterable[HypothesisSummary], unexamined: float, known: int, distribution: PoseDistribution | None
+    summaries: Iterable[HypothesisSummary],
+    unexamined: float,
+    known: int,
+    distribution: PoseDistribution | None,
+    max_lost_probability: float,
 ) -> LocalizationStatus:
     """What hypotheses say together.
 
     :param unexamined: probability that none of them is right.
     :param known: number of areas in which a robot that may be anywhere can be.
     :param distribution: what is known of the place of such a robot, None before it was looked for.
+    :param max_lost_probability: probability of lost hypotheses up to which the robot counts as localized.
     """
     areas: dict[int, float] = {}
     lost = 0.0
@@ -56,7 +58,7 @@ def summarize_localization(
     open_places = [lost * share for share in _lost_distribution(known, distribution)]
     shares = np.array([*areas.values(), *open_places, unexamined])
     shares = shares[shares > 0.0]
-    return LocalizationStatus(lost <= _MAX_LOST_PROBABILITY, abs(float(shares @ np.log(shares))))
+    return LocalizationStatus(lost <= max_lost_probability, abs(float(shares @ np.log(shares))))
 
 
 def _lost_distribution(known: int, distribution: PoseDistribution | None) -> list[float]:

@@ -15,6 +15,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from hmt_slam_ros.configuration.topology import InferenceParameters
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
@@ -31,11 +32,6 @@ Pose = NDArray[np.float64]
 KIDNAPPED_UNMAPPED_PRIOR = 0.5
 """Probability that a robot that was carried while it maps is where the map does not reach."""
 
-# Probability that a place needs to have at two looks in a row, and at one look where somebody says so.
-_ACCEPTANCE, _ACCEPTANCE_WITH_HINT = 0.8, 0.9
-# Share of what a robot sees that was carried while it maps, which has to be known where it is found: half a building
-# may be like the other half, which nobody has seen.
-_MIN_KNOWN_SHARE = 0.7
 # Two looks found the same place where they have a keyframe within so much of each other, m and rad.
 _SAME_DISTANCE, _SAME_ANGLE = 1.0, math.radians(15.0)
 # So many keyframes that fit nowhere near where somebody says, in this probability, refute it.
@@ -153,11 +149,11 @@ def update_relocalization(branching: Branching, parent: Parent) -> Branches:
     if len(keyframes) >= _REFUTING_KEYFRAMES and float(where.probabilities.sum()) < 1.0 - _REFUTING_PROBABILITY:
         lost = replace(lost, pose_hint=None)
     best = where.best
-    if best is None or not _is_decisive(*best, mapping=lost.tracked_pose is not None):
+    if best is None or not _is_decisive(*best, branching.options, mapping=lost.tracked_pose is not None):
         return Branches([_unmoved_child(noted, replace(lost, candidate=None))], True, pose_distribution=where)
     located, probability = best
     sighted = replace(lost, candidate=_pose_in_area(located, poses, max(poses)))
-    by_hint = told is not None and probability >= _ACCEPTANCE_WITH_HINT
+    by_hint = told is not None and probability >= branching.options.hint_probability
     if not by_hint and not _confirms_candidate(parent.hybrid_map, lost, located, poses):
         return Branches([_unmoved_child(noted, sighted)], True, pose_distribution=where)
     return Branches(_split_at_candidate(noted, sighted, reference, *best), True, pose_distribution=where)
@@ -249,7 +245,11 @@ def log_bayes_factor(
 
 
 def prefers_tracked_pose(
-    hybrid_map: HybridMap, distribution: PoseDistribution, tracked_pose: PoseInArea, poses: Mapping[int, Pose]
+    hybrid_map: HybridMap,
+    distribution: PoseDistribution,
+    tracked_pose: PoseInArea,
+    poses: Mapping[int, Pose],
+    options: InferenceParameters,
 ) -> bool:
     """Whether a robot is rather where a claim has it than in any other place of the map, and most of it is known there.
 
@@ -262,7 +262,7 @@ def prefers_tracked_pose(
         (located.agreement.matched_share for located, one in zip(distribution.candidates, there, strict=True) if one),
         default=0.0,
     )
-    return known >= _MIN_KNOWN_SHARE and bool(shares[there].sum() > shares[~there].sum())
+    return known >= options.relocalization_share and bool(shares[there].sum() > shares[~there].sum())
 
 
 def _candidates_at(
@@ -276,24 +276,27 @@ def _candidates_at(
     return np.array(found, dtype=np.bool_)
 
 
-def decisive_candidate(distribution: PoseDistribution, poses: Mapping[int, Pose]) -> PoseInArea | None:
+def decisive_candidate(
+    distribution: PoseDistribution, poses: Mapping[int, Pose], options: InferenceParameters
+) -> PoseInArea | None:
     """Where a look found a robot that was carried while it maps, if it did.
 
     :param poses: {keyframe: ``reference_T_base``} of those that were located.
     """
     best = distribution.best
-    if best is None or not _is_decisive(*best, mapping=True):
+    if best is None or not _is_decisive(*best, options, mapping=True):
         return None
     return _pose_in_area(best[0], poses, max(poses))
 
 
-def _is_decisive(candidate: PoseCandidate, probability: float, *, mapping: bool) -> bool:
+def _is_decisive(candidate: PoseCandidate, probability: float, options: InferenceParameters, *, mapping: bool) -> bool:
     """Whether a look tells where the robot is.
 
     :param mapping: whether it was carried while it maps.
     """
-    known = _MIN_KNOWN_SHARE if mapping else 0.0
-    return probability >= _ACCEPTANCE and candidate.agreement.matched_share >= known and is_certain(candidate)
+    known = options.relocalization_share if mapping else 0.0
+    found = probability >= options.relocalization_probability
+    return found and candidate.agreement.matched_share >= known and is_certain(candidate)
 
 
 def _pose_in_area(candidate: PoseCandidate, poses: Mapping[int, Pose], keyframe: int) -> PoseInArea:

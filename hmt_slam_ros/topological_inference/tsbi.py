@@ -143,9 +143,9 @@ class Tsbi:
         known = sum(
             since is None or any(k < since for k in hybrid_map.keyframes(area)) for area in hybrid_map.area_ids()
         )
-        return summarize_localization(
-            standings, self._state.unexamined, known, None if arriving else self._pose_distribution
-        )
+        distribution = None if arriving else self._pose_distribution
+        allowed = self._options.lost_probability
+        return summarize_localization(standings, self._state.unexamined, known, distribution, allowed)
 
     def handle(self, message: Message) -> list[Message]:
         """Learn from ``Keyframe`` and ``ClosureDecision``; answer ``AreaEvents`` with ``Hypotheses``."""
