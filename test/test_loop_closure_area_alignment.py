@@ -6,7 +6,7 @@ import worlds
 
 from hmt_slam_ros.configuration import Configuration, with_changes
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.loop_closure.area_alignment import AreaAlignment
+from hmt_slam_ros.loop_closure.acceptance import AreaAlignment
 
 ROOMS = worlds.two_rooms()
 # An endless corridor leaves the direction along it open.

@@ -7,7 +7,7 @@ from benchmark.lattice import Lattice, LatticeScans
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map import surroundings
-from hmt_slam_ros.topological_inference.admission import Query
+from hmt_slam_ros.topological_inference.candidate_gating import Query
 from hmt_slam_ros.topological_inference.closure_search import ClosureSearch
 
 HERE = 210  # in the middle of the lattice

@@ -6,7 +6,7 @@ import pytest
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
-from hmt_slam_ros.topological_inference.hypothesis_merging import LocalizedHypothesis, merge_equivalent
+from hmt_slam_ros.topological_inference.hypothesis_tree import LocalizedHypothesis, merge_equivalent
 
 SHARP, VAGUE = np.diag([0.05, 0.05, 0.01]) ** 2, np.diag([2.0, 2.0, 0.2]) ** 2
 STEP = np.array([10.0, 0.0, 0.0])

@@ -18,8 +18,11 @@ from hmt_slam_ros.messages.messages import AreaEvents, Keyframe, PrunedKeyframe
 from hmt_slam_ros.topological_inference import relocalization
 from hmt_slam_ros.topological_inference.global_localization import PoseDistribution
 from hmt_slam_ros.topological_inference.hypothesis_tree import FalseAlarm, HypothesisState, Lost, PoseInArea, Tracking
-from hmt_slam_ros.topological_inference.kidnapping import decide_without_mapping, spawn_kidnapped_hypothesis
-from hmt_slam_ros.topological_inference.relocalization import KIDNAPPED_UNMAPPED_PRIOR
+from hmt_slam_ros.topological_inference.relocalization import (
+    KIDNAPPED_UNMAPPED_PRIOR,
+    decide_without_mapping,
+    spawn_kidnapped_hypothesis,
+)
 from hmt_slam_ros.topological_inference.tsbi import Tsbi
 
 FAR, HERE = (30.0, 20.0), (0.0, 0.0)

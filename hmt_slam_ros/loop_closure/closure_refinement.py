@@ -14,9 +14,8 @@ from scipy.sparse.csgraph import connected_components
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.hybrid_map.global_map import consistent_map
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
-from hmt_slam_ros.hybrid_map.pose_graph import Edges
+from hmt_slam_ros.hybrid_map.pose_graph import Edges, consistent_map
 from hmt_slam_ros.hybrid_map.shortest_path import connected_neighbors
 from hmt_slam_ros.loop_closure.joint_refinement import (
     ScanPairs,

@@ -20,8 +20,8 @@ import numpy as np
 
 from hmt_slam_ros.configuration.topology import LoopClosureParameters
 from hmt_slam_ros.geometry.gaussian import PoseGaussian, chi_square_gate
-from hmt_slam_ros.hybrid_map.global_map import total_arc_chi2
 from hmt_slam_ros.hybrid_map.hybrid_map import AreaPair, HybridMap
+from hmt_slam_ros.hybrid_map.pose_graph import total_arc_chi2
 from hmt_slam_ros.loop_closure.closure_history import (
     AcceptedPath,
     Closure,

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian, chi_square_gate
-from hmt_slam_ros.hybrid_map.global_map import consistent_map, shortest_path_map
 from hmt_slam_ros.hybrid_map.hybrid_map import AreaPair, HybridMap
+from hmt_slam_ros.hybrid_map.pose_graph import consistent_map, shortest_path_map
 from hmt_slam_ros.hybrid_map.shortest_path import shortest_path_beliefs
 from hmt_slam_ros.loop_closure.acceptance import Acceptance, PendingArc, pending_arc
 from hmt_slam_ros.loop_closure.closure_history import (

@@ -28,11 +28,10 @@ from hmt_slam_ros.messages.messages import Hypothesis
 from hmt_slam_ros.messages.replica import FIRST_AREA, Replica
 from hmt_slam_ros.registration.consistency import NO_CLUTTER, Clutter
 from hmt_slam_ros.sensors import Scan
-from hmt_slam_ros.topological_inference.admission import Query
+from hmt_slam_ros.topological_inference.candidate_gating import Query
 from hmt_slam_ros.topological_inference.closure_search import AreaComparison, ClosureSearch, Fit, SearchState
-from hmt_slam_ros.topological_inference.global_localization import PoseDistribution, PoseHint
+from hmt_slam_ros.topological_inference.global_localization import LandmarkEvidence, PoseDistribution, PoseHint
 from hmt_slam_ros.topological_inference.hypothesis_tree import HypothesisState, Lost, relative_covariance
-from hmt_slam_ros.topological_inference.landmark_evidence import LandmarkEvidence
 
 
 @dataclass(frozen=True, eq=False)

@@ -36,25 +36,27 @@ from hmt_slam_ros.topological_inference.branching import (
     apply_revision,
     merge_areas,
 )
-from hmt_slam_ros.topological_inference.global_localization import PoseDistribution
-from hmt_slam_ros.topological_inference.hypothesis_merging import LocalizedHypothesis, merge_equivalent
+from hmt_slam_ros.topological_inference.global_localization import (
+    HypothesisSummary,
+    LocalizationStatus,
+    PoseDistribution,
+    summarize_localization,
+)
 from hmt_slam_ros.topological_inference.hypothesis_tree import (
     HypothesisState,
+    LocalizedHypothesis,
     Lost,
     PoseInArea,
     ReducedDistribution,
     Tracking,
+    merge_equivalent,
     normalize_and_reduce,
-)
-from hmt_slam_ros.topological_inference.kidnapping import decide_without_mapping, spawn_kidnapped_hypothesis
-from hmt_slam_ros.topological_inference.localization_status import (
-    HypothesisSummary,
-    LocalizationStatus,
-    summarize_localization,
 )
 from hmt_slam_ros.topological_inference.relocalization import (
     accept_relocalization,
     begin_relocalization,
+    decide_without_mapping,
+    spawn_kidnapped_hypothesis,
     update_relocalization,
 )
 
