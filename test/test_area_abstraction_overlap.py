@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from hmt_slam_ros.area_abstraction.overlap import SensedSpace, overlaps, sensed_overlaps, sensed_points
+from hmt_slam_ros.area_abstraction.overlap_graph import SensedSpace, overlaps, sensed_overlaps, sensed_points
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.sensors import Scan
 
