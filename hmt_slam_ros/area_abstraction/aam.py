@@ -9,7 +9,6 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hmt_slam_ros.area_abstraction.doors import DoorTracker, OpeningDetector
 from hmt_slam_ros.area_abstraction.overlap_graph import (
@@ -21,6 +20,7 @@ from hmt_slam_ros.area_abstraction.overlap_graph import (
     synchronize_graph,
 )
 from hmt_slam_ros.area_abstraction.partition import AamState, AreaPolicy, JoinedGraph, Partition
+from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.hybrid_map.hybrid_map import AreaPair, HybridMap, KeyframePoses, area_pair
@@ -234,7 +234,7 @@ class Aam:
                 return AreaEvent(hypothesis, "merged", (), area, value, into)
         return None
 
-    def _joined_graph(self, hypothesis: int, pair: AreaPair, arc: NDArray[np.float64]) -> JoinedGraph:
+    def _joined_graph(self, hypothesis: int, pair: AreaPair, arc: Float64) -> JoinedGraph:
         """The joined graph of two areas with the arc ``arc``; only overlaps that are not known are measured."""
         partition, (into, area) = self._state.partitions[hypothesis], pair
         second, before = self._keyframes(hypothesis, area), partition.joined_graphs.get(pair)
@@ -284,7 +284,7 @@ class Aam:
                 overlaps_by_area[area] = self._area_overlap(hybrid_map, area, pose, newest)
         return overlaps_by_area
 
-    def _area_overlap(self, hybrid_map: HybridMap, area: int, pose: NDArray[np.float64], newest: int) -> float:
+    def _area_overlap(self, hybrid_map: HybridMap, area: int, pose: Float64, newest: int) -> float:
         """Overlap of the newest scan, taken at ``pose`` = ``area_T_base``, with an area."""
         others = {k: other for k, other in hybrid_map.keyframes(area).items() if k != newest}
         if not others:
@@ -378,7 +378,7 @@ class Aam:
     def _synchronize_graph(self, poses: KeyframePoses, graph: OverlapGraph, *others: OverlapGraph) -> OverlapGraph:
         """The overlap graph of keyframes, {keyframe: pose}, measuring only what none of the graphs holds."""
 
-        def measure(keyframe: int, others: tuple[int, ...]) -> NDArray[np.float64]:
+        def measure(keyframe: int, others: tuple[int, ...]) -> Float64:
             other_poses = np.array([poses[other] for other in others]).reshape(-1, 3)
             other_points = [self._sensed_space(other).points for other in others]
             points, radius = self._sensed_space(keyframe).points, self._options.overlap_radius

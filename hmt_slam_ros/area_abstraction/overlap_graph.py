@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from scipy.linalg import eigh
 from scipy.sparse.csgraph import connected_components
 
+from hmt_slam_ros.arrays import Bool, Float64, Int32, Int64
 from hmt_slam_ros.geometry import se2_kernels
 from hmt_slam_ros.sensors import Scan
 
@@ -41,7 +42,7 @@ _OLD_GROUND = -1
 """Node of the contracted old ground."""
 
 
-def sensed_points(scan: Scan, max_range: float, count: int = 180) -> NDArray[np.float64]:
+def sensed_points(scan: Scan, max_range: float, count: int = 180) -> Float64:
     """At most ``count`` end points of a scan, evenly over its returns no farther than ``max_range`` from the laser.
 
     :returns: shape (k, 2), m, robot base frame.
@@ -59,7 +60,7 @@ class SensedSpace(NamedTuple):
     :ivar max_range: largest range of points, m.
     """
 
-    points: NDArray[np.float64]
+    points: Float64
     max_range: float
 
     @classmethod
@@ -69,12 +70,8 @@ class SensedSpace(NamedTuple):
 
 
 def sensed_overlaps(
-    one: SensedSpace,
-    pose: NDArray[np.float64],
-    others: Sequence[SensedSpace],
-    other_poses: NDArray[np.float64],
-    radius: float,
-) -> NDArray[np.float64]:
+    one: SensedSpace, pose: Float64, others: Sequence[SensedSpace], other_poses: Float64, radius: float
+) -> Float64:
     """Overlap of one scan with each of several others as :func:`overlaps`, or of free space if neither has points.
 
     The latter falls linearly from 1 to 0 at the sum of their ranges, nearly as the common part of two discs.
@@ -91,13 +88,7 @@ def sensed_overlaps(
     return shares
 
 
-def overlaps(
-    points: NDArray[np.float64],
-    pose: NDArray[np.float64],
-    others: Sequence[NDArray[np.float64]],
-    other_poses: NDArray[np.float64],
-    radius: float,
-) -> NDArray[np.float64]:
+def overlaps(points: Float64, pose: Float64, others: Sequence[Float64], other_poses: Float64, radius: float) -> Float64:
     """Overlap of one scan with each of several others.
 
     :param points: shape (k, 2), m, base frame of the one scan.
@@ -115,13 +106,8 @@ def overlaps(
 
 @njit(cache=True)
 def _overlaps(
-    points: NDArray[np.float64],
-    pose: NDArray[np.float64],
-    stacked: NDArray[np.float64],
-    ends: NDArray[np.int64],
-    other_poses: NDArray[np.float64],
-    radius: float,
-) -> NDArray[np.float64]:
+    points: Float64, pose: Float64, stacked: Float64, ends: Int64, other_poses: Float64, radius: float
+) -> Float64:
     """:func:`overlaps` for points stacked over the others, each ending before ``ends[j]``."""
     result = np.zeros(ends.size)
     if not len(points):
@@ -138,9 +124,7 @@ def _overlaps(
 
 
 @njit(cache=True)
-def _transform_points(
-    points: NDArray[np.float64], pose: NDArray[np.float64], other_pose: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _transform_points(points: Float64, pose: Float64, other_pose: Float64) -> Float64:
     """Points of the base at ``other_pose`` in the frame of the base at ``pose``."""
     cos, sin = np.cos(pose[2]), np.sin(pose[2])
     x, y = se2_kernels.rotate_back(cos, sin, other_pose[0] - pose[0], other_pose[1] - pose[1])
@@ -163,12 +147,12 @@ class _PointGrid(NamedTuple):
     low_x: float
     low_y: float
     edge: float
-    last_point: NDArray[np.int32]
-    previous_point: NDArray[np.int32]
+    last_point: Int32
+    previous_point: Int32
 
 
 @njit(cache=True)
-def _fill_grid(points: NDArray[np.float64], radius: float) -> _PointGrid:
+def _fill_grid(points: Float64, radius: float) -> _PointGrid:
     low_x, low_y = points[:, 0].min(), points[:, 1].min()
     extent = max(points[:, 0].max() - low_x, points[:, 1].max() - low_y)
     edge = max(2.0 * radius, extent / _MAX_CELLS)
@@ -183,12 +167,7 @@ def _fill_grid(points: NDArray[np.float64], radius: float) -> _PointGrid:
 
 @njit(cache=True)
 def _overlap(
-    points: NDArray[np.float64],
-    grid: _PointGrid,
-    others: NDArray[np.float64],
-    radius: float,
-    matched_by: NDArray[np.int64],
-    number: int,
+    points: Float64, grid: _PointGrid, others: Float64, radius: float, matched_by: Int64, number: int
 ) -> float:
     """Overlap of the points in the grid with others in the same frame.
 
@@ -226,12 +205,12 @@ class Cut(NamedTuple):
     :ivar value: NCut(P1, P2).
     """
 
-    side: NDArray[np.bool_]
+    side: Bool
     value: float
 
 
 @njit(cache=True)
-def ncut(similarity: NDArray[np.float64], side: NDArray[np.bool_]) -> float:
+def ncut(similarity: Float64, side: Bool) -> float:
     """NCut of a given bipartition.
 
     :param similarity: shape (n, n), symmetric, not negative.
@@ -253,9 +232,7 @@ def _ncut_value(cut: float, assoc: float, other_assoc: float) -> float:
     return (cut / assoc if assoc > 0.0 else 0.0) + (cut / other_assoc if other_assoc > 0.0 else 0.0)
 
 
-def normalized_cut(
-    similarity: NDArray[np.float64], min_size: int = 1, sizes: NDArray[np.int64] | None = None
-) -> Cut | None:
+def normalized_cut(similarity: Float64, min_size: int = 1, sizes: Int64 | None = None) -> Cut | None:
     """The best bipartition found: every prefix of every leading eigenvector's order is tried (a sweep cut).
 
     :param similarity: shape (n, n), symmetric, not negative, in the order of time. That decides only where the graph
@@ -276,7 +253,7 @@ def normalized_cut(
     return best
 
 
-def _orders(similarity: NDArray[np.float64]) -> list[NDArray[np.intp]]:
+def _orders(similarity: Float64) -> list[NDArray[np.intp]]:
     """Orders of the nodes along the leading solutions of (D - A) x = lambda D x, shape (n,) each."""
     n = len(similarity)
     chain = _CHAIN_SIMILARITY * max(float(similarity.max()), _CHAIN_SIMILARITY)
@@ -290,9 +267,7 @@ def _orders(similarity: NDArray[np.float64]) -> list[NDArray[np.intp]]:
     return [np.argsort(scale * vector, kind="stable") for vector in vectors.T]
 
 
-def _sweep(
-    similarity: NDArray[np.float64], order: NDArray[np.intp], min_size: int, sizes: NDArray[np.int64]
-) -> Cut | None:
+def _sweep(similarity: Float64, order: NDArray[np.intp], min_size: int, sizes: Int64) -> Cut | None:
     """The best of the bipartitions that divide ``order`` in two, or None if each has too small a part."""
     size = np.cumsum(sizes[order])
     allowed = (size[:-1] >= min_size) & (size[-1] - size[:-1] >= min_size)
@@ -307,7 +282,7 @@ def _sweep(
 
 
 @njit(cache=True)
-def _prefix_ncuts(similarity: NDArray[np.float64], order: NDArray[np.intp]) -> NDArray[np.float64]:
+def _prefix_ncuts(similarity: Float64, order: NDArray[np.intp]) -> Float64:
     """NCut of the first 1, 2, ... n - 1 nodes of an order and the others, shape (n - 1,)."""
     values, to_prefix = np.empty(len(order) - 1), np.zeros(len(order))
     total, assoc, within = similarity.sum(), 0.0, 0.0
@@ -320,9 +295,7 @@ def _prefix_ncuts(similarity: NDArray[np.float64], order: NDArray[np.intp]) -> N
     return values
 
 
-def recursive_cut(
-    similarity: NDArray[np.float64], threshold: float, min_size: int = 1, sizes: NDArray[np.int64] | None = None
-) -> NDArray[np.int64]:
+def recursive_cut(similarity: Float64, threshold: float, min_size: int = 1, sizes: Int64 | None = None) -> Int64:
     """The partition by cutting each part again, as a graph of its own, while its NCut is at most ``threshold``.
 
     :param similarity: as for :func:`normalized_cut`.
@@ -356,7 +329,7 @@ class OverlapGraph:
     """
 
     keyframes: tuple[int, ...] = ()
-    similarity: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0)))
+    similarity: Float64 = field(default_factory=lambda: np.zeros((0, 0)))
 
     def subgraph(self, keep: Collection[int]) -> OverlapGraph:
         """The graph of those of its keyframes that are in ``keep``."""
@@ -377,7 +350,7 @@ class OverlapGraph:
         labels = np.array([segment_labels.get(keyframe, 0) for keyframe in self.keyframes])
         return OverlapGraph(self.keyframes, np.where(labels[:, None] == labels, 1.0, factor) * self.similarity)
 
-    def overlaps_with(self, keyframe: int, others: Sequence[int]) -> NDArray[np.float64]:
+    def overlaps_with(self, keyframe: int, others: Sequence[int]) -> Float64:
         """Overlaps of a keyframe with others, shape (number of others,), NaN where either is not in this graph."""
         if keyframe not in self.keyframes:
             return np.full(len(others), np.nan)
@@ -387,7 +360,7 @@ class OverlapGraph:
         return np.where(keyframes[columns] == wanted, similarity, np.nan)
 
 
-MeasureOverlaps = Callable[[int, tuple[int, ...]], NDArray[np.float64]]
+MeasureOverlaps = Callable[[int, tuple[int, ...]], Float64]
 
 
 def synchronize_graph(
@@ -465,9 +438,7 @@ def min_ncut(graph: OverlapGraph, part: Collection[int], min_size: int) -> float
     return min(ncut(graph.similarity, side), np.inf if cut is None else cut.value)
 
 
-def _contract(
-    graph: OverlapGraph, new_keyframes: Collection[int]
-) -> tuple[NDArray[np.float64], NDArray[np.int64], list[int]]:
+def _contract(graph: OverlapGraph, new_keyframes: Collection[int]) -> tuple[Float64, Int64, list[int]]:
     """Similarities (m, m), sizes (m,) and ids of the old ground, if there is any, and the new keyframes."""
     nodes = [keyframe for keyframe in graph.keyframes if keyframe in new_keyframes]
     is_new = np.array([keyframe in new_keyframes for keyframe in graph.keyframes])

@@ -10,7 +10,6 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hmt_slam_ros.area_abstraction.doors import DoorTracker, OpeningDetector, OpeningView
 from hmt_slam_ros.area_abstraction.overlap_graph import OverlapGraph, Separation, find_separation, min_ncut
@@ -38,12 +37,12 @@ class JoinedGraph:
     :ivar min_ncut: smallest normalized cut of the graph.
     """
 
-    arc: NDArray[np.float64]
+    arc: Float64
     graph: int
     second_keyframes: frozenset[int]
     min_ncut: float
 
-    def max_displacement(self, arc: NDArray[np.float64], poses: KeyframePoses) -> float:
+    def max_displacement(self, arc: Float64, poses: KeyframePoses) -> float:
         """Largest distance by which another arc moves the keyframes of area b, {keyframe: pose in b}, m."""
         points = np.array([pose[:2] for pose in poses.values()]).reshape(-1, 2)
         return float(np.hypot(*(se2.transform(arc, points) - se2.transform(self.arc, points)).T).max(initial=0.0))

@@ -12,13 +12,12 @@ from dataclasses import dataclass, field
 from typing import NamedTuple, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hmt_slam_ros.arrays import Bool, Float64, Int32, Int64
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian, fuse
 
-KeyframePoses = Mapping[int, NDArray[np.float64]]
+KeyframePoses = Mapping[int, Float64]
 AreaPair = tuple[int, int]
 
 Array = TypeVar("Array", Int32, Float64)
@@ -267,7 +266,7 @@ def apply_sigma_floor(belief: PoseGaussian, sigma: float, angle: float) -> PoseG
     :param angle: smallest deviation of the heading, rad.
     """
     missing = np.array([sigma, sigma, angle]) ** 2 - np.diag(belief.covariance)
-    covariance: NDArray[np.float64] = belief.covariance + np.diag(np.maximum(missing, 0.0))
+    covariance: Float64 = belief.covariance + np.diag(np.maximum(missing, 0.0))
     return PoseGaussian(belief.mean, covariance)
 
 
@@ -281,7 +280,7 @@ class HybridMap:
     """
 
     common: CommonMap = field(default_factory=CommonMap)
-    changed_areas: dict[int, dict[int, NDArray[np.float64]]] = field(default_factory=dict)
+    changed_areas: dict[int, dict[int, Float64]] = field(default_factory=dict)
     changed_arcs: dict[AreaPair, ArcValue | None] = field(default_factory=dict)
 
     def branch(self) -> HybridMap:
@@ -336,7 +335,7 @@ class HybridMap:
         extents[is_changed] = [extent(self.changed_areas[area]) for area in areas[is_changed].tolist()]
         return extents
 
-    def set_keyframe(self, keyframe: int, area: int, pose: NDArray[np.float64]) -> None:
+    def set_keyframe(self, keyframe: int, area: int, pose: Float64) -> None:
         """Put a keyframe into an area at ``area_T_base``; an area that does not exist is created."""
         self._writable_area(area)[keyframe] = pose
 
@@ -344,7 +343,7 @@ class HybridMap:
         """Remove a keyframe from an area."""
         del self._writable_area(area)[keyframe]
 
-    def _writable_area(self, area: int) -> dict[int, NDArray[np.float64]]:
+    def _writable_area(self, area: int) -> dict[int, Float64]:
         if area not in self.changed_areas:
             self.changed_areas[area] = dict(self.common.areas.get(area, {}))
         return self.changed_areas[area]

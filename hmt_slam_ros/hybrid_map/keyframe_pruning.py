@@ -10,12 +10,12 @@ from collections.abc import Collection, Mapping
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hmt_slam_ros.arrays import Bool, Float64
 from hmt_slam_ros.configuration.metric_slam import FilterParameters
 from hmt_slam_ros.geometry import se2
 
-Pose = NDArray[np.float64]
+Pose = Float64
 
 _VIEWPOINT_FRACTION = 0.8
 """Size of a viewpoint relative to the distance of keyframes, below 1 as the filter may move a keyframe a little."""
@@ -28,7 +28,7 @@ class ReplacementKeyframe(NamedTuple):
     pose: Pose
 
 
-def is_same_viewpoint(relative: NDArray[np.float64], settings: FilterParameters) -> NDArray[np.bool_]:
+def is_same_viewpoint(relative: Float64, settings: FilterParameters) -> Bool:
     """Which poses are at the base's viewpoint: near it, and with a similar heading.
 
     :param relative: shape (..., 3), ``base_T_other``, m and rad.

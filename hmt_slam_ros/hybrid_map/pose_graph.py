@@ -15,7 +15,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 from scipy.sparse import csc_matrix, diags
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import SuperLU, splu
@@ -198,10 +197,10 @@ class Edges:
     :ivar covariances: shape (m, 3, 3), right tangent frame, regular.
     """
 
-    sources: NDArray[np.int64]
-    targets: NDArray[np.int64]
-    poses: NDArray[np.float64]
-    covariances: NDArray[np.float64]
+    sources: Int64
+    targets: Int64
+    poses: Float64
+    covariances: Float64
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,20 +215,15 @@ class Solution:
     :ivar steps: steps taken.
     """
 
-    poses: NDArray[np.float64]
-    covariances: NDArray[np.float64] | None
+    poses: Float64
+    covariances: Float64 | None
     chi2: float
-    edge_chi2: NDArray[np.float64]
+    edge_chi2: Float64
     steps: int
 
 
 def optimize(
-    initial: NDArray[np.float64],
-    edges: Edges,
-    fixed: int = 0,
-    *,
-    marginals: bool = True,
-    tolerance: float = _MIN_GAIN,
+    initial: Float64, edges: Edges, fixed: int = 0, *, marginals: bool = True, tolerance: float = _MIN_GAIN
 ) -> Solution:
     """The most likely poses of a pose graph.
 
@@ -264,7 +258,7 @@ def optimize(
     return Solution(poses, covariances, state.cost, state.chi2, steps)
 
 
-def relative_covariances(poses: NDArray[np.float64], edges: Edges, between: NDArray[np.int64]) -> NDArray[np.float64]:
+def relative_covariances(poses: Float64, edges: Edges, between: Int64) -> Float64:
     """Covariances of the poses of nodes j seen from nodes i, right tangent frame, shape (k, 3, 3).
 
     :param poses: shape (n, 3), that agree best with the edges.
@@ -287,10 +281,10 @@ def relative_covariances(poses: NDArray[np.float64], edges: Edges, between: NDAr
 class _State:
     """The problem at given poses: residuals (m, 3), Jacobians (m, 3, 3), chi2 (m,), and the cost, which is its sum."""
 
-    residuals: NDArray[np.float64]
-    of_source: NDArray[np.float64]
-    of_target: NDArray[np.float64]
-    chi2: NDArray[np.float64]
+    residuals: Float64
+    of_source: Float64
+    of_target: Float64
+    chi2: Float64
     cost: float
 
 
@@ -318,13 +312,13 @@ class _System:
                 f"no edges join node {isolated[0]} with the fixed node {fixed}, so it has no definite pose"
             )
 
-    def evaluate(self, poses: NDArray[np.float64]) -> _State:
+    def evaluate(self, poses: Float64) -> _State:
         """Residuals, Jacobians and cost at given poses, shape (n, 3)."""
         residuals, of_source, of_target = linearize(poses, self._edges.sources, self._edges.targets, self._edges.poses)
         chi2 = np.einsum("mi,mij,mj->m", residuals, self._information, residuals)
         return _State(residuals, of_source, of_target, chi2, float(chi2.sum()))
 
-    def step(self, state: _State, damping: float) -> NDArray[np.float64]:
+    def step(self, state: _State, damping: float) -> Float64:
         """The step of every pose in its right tangent space, shape (n, 3)."""
         weighted = np.einsum("mij,mj->mi", self._information, state.residuals)
         gradient = np.zeros((self._nodes, 3))
@@ -342,7 +336,7 @@ class _System:
         # Symmetric and positive definite: no pivoting, so that the fill follows the graph.
         return splu(hessian, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
 
-    def marginals(self, state: _State) -> NDArray[np.float64]:
+    def marginals(self, state: _State) -> Float64:
         """The diagonal blocks of the inverse of the normal matrix, shape (n, 3, 3); zero for the fixed node."""
         covariances = np.zeros((self._nodes, 3, 3))
         if not self._free.size:
@@ -359,7 +353,7 @@ class _System:
         covariances[self._free] = blocks.reshape(-1, 3, 3)
         return 0.5 * (covariances + covariances.transpose(0, 2, 1))
 
-    def joint_covariance(self, state: _State, nodes: NDArray[np.int64]) -> NDArray[np.float64]:
+    def joint_covariance(self, state: _State, nodes: Int64) -> Float64:
         """The joint covariance of some nodes, ascending, shape (3 k, 3 k); zero for the fixed node."""
         row = np.full(self._nodes, -1)
         row[self._free] = np.arange(self._free.size)

@@ -12,7 +12,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from hmt_slam_ros.arrays import Bool, Float64, Int64
 from hmt_slam_ros.geometry import se2_kernels
@@ -223,7 +222,7 @@ def _compose(a: Float64, b: Float64, result: Float64) -> None:
     result[2] = se2_kernels.wrap_by_turns(a[2] + b[2])
 
 
-def uninformative_belief(mean: NDArray[np.float64]) -> PoseGaussian:
+def uninformative_belief(mean: Float64) -> PoseGaussian:
     """A belief that admits any pose in a building.
 
     :param mean: shape (3,), where the area is drawn meanwhile.

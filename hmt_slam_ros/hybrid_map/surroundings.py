@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from hmt_slam_ros.arrays import Bool, Float32, Float64, Int64
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
@@ -23,7 +23,7 @@ from hmt_slam_ros.registration.likelihood_grid import AreaGrid, GridModel, Point
 from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.sensors.polar_scan import FREE, classify_points, to_polar_scan
 
-Pose = NDArray[np.float64]
+Pose = Float64
 
 NO_AREA = -1
 """Stands for no area in arrays of areas."""
@@ -55,12 +55,12 @@ class AreaPlace:
     """
 
     area: int
-    keyframe_areas: NDArray[np.int64]
-    positions: NDArray[np.float64]
+    keyframe_areas: Int64
+    positions: Float64
     grid: AreaGrid
 
 
-def containing_area(place: AreaPlace, poses: NDArray[np.float64], radius: float) -> int | None:
+def containing_area(place: AreaPlace, poses: Float64, radius: float) -> int | None:
     """The area in whose place most of the keyframes lie, or None where most lie in no place.
 
     :param poses: shape (m, 3), ``area_T_base`` of the keyframes in the place's frame.
@@ -70,7 +70,7 @@ def containing_area(place: AreaPlace, poses: NDArray[np.float64], radius: float)
     return None if area == NO_AREA else area
 
 
-def containing_areas(place: AreaPlace, positions: NDArray[np.float64], radius: float) -> NDArray[np.int64]:
+def containing_areas(place: AreaPlace, positions: Float64, radius: float) -> Int64:
     """The area in whose place most of m positions (n, m, 2) lie, or ``NO_AREA``; shape (n,). Of equals the smallest.
 
     :param radius: largest distance to a keyframe of the place, m.
@@ -94,14 +94,8 @@ def containing_areas(place: AreaPlace, positions: NDArray[np.float64], radius: f
 
 @njit(cache=True)
 def _nearest_visible(
-    positions: NDArray[np.float64],
-    keyframes: NDArray[np.float64],
-    radius: float,
-    log_ratio: NDArray[np.float32],
-    free: NDArray[np.bool_],
-    origin: NDArray[np.float64],
-    cell: float,
-) -> NDArray[np.int64]:
+    positions: Float64, keyframes: Float64, radius: float, log_ratio: Float32, free: Bool, origin: Float64, cell: float
+) -> Int64:
     """Index of the nearest keyframe within ``radius`` that is visible from every position, or -1."""
     found = np.full(positions.shape[0], -1)
     distance2 = np.empty(keyframes.shape[0])
@@ -119,14 +113,7 @@ def _nearest_visible(
 
 
 @njit(cache=True)
-def _is_visible(
-    start: NDArray[np.float64],
-    end: NDArray[np.float64],
-    log_ratio: NDArray[np.float32],
-    free: NDArray[np.bool_],
-    origin: NDArray[np.float64],
-    cell: float,
-) -> bool:
+def _is_visible(start: Float64, end: Float64, log_ratio: Float32, free: Bool, origin: Float64, cell: float) -> bool:
     """Whether no known surface lies between two points, and most of the line is known as free."""
     rows, columns = free.shape
     steps = int(np.ceil(np.hypot(end[0] - start[0], end[1] - start[1]) / (0.5 * cell))) + 1
@@ -172,7 +159,7 @@ def areas_around(
     return found
 
 
-def stack_poses(poses: Mapping[int, Pose]) -> NDArray[np.float64]:
+def stack_poses(poses: Mapping[int, Pose]) -> Float64:
     """The poses as an array, shape (n, 3)."""
     return np.array(list(poses.values())).reshape(-1, 3)
 
@@ -182,12 +169,12 @@ def has_same_poses(first: Mapping[int, Pose], second: Mapping[int, Pose]) -> boo
     return first.keys() == second.keys() and all(np.array_equal(pose, second[k]) for k, pose in first.items())
 
 
-def keyframe_positions(hybrid_map: HybridMap, area: int, pose: Pose) -> NDArray[np.float64]:
+def keyframe_positions(hybrid_map: HybridMap, area: int, pose: Pose) -> Float64:
     """Positions of an area's keyframes, shape (n, 2), m, where the area's frame is at ``pose``."""
     return se2.transform(pose, stack_poses(hybrid_map.keyframes(area))[:, :2])
 
 
-def min_distance(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
+def min_distance(a: Float64, b: Float64) -> float:
     """Distance between the nearest points of two sets (n, 2), (m, 2), m; inf where one is empty."""
     between = a[:, None] - b[None]
     return float(np.hypot(between[..., 0], between[..., 1]).min(initial=np.inf))

@@ -13,16 +13,15 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from hmt_slam_ros.arrays import Bool
+from hmt_slam_ros.arrays import Bool, Float64
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.messages.map_changes import StaleBeams
 from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.sensors.polar_scan import FREE, SURFACE, classify_points, occlusion_starts, to_polar_scan
 from hmt_slam_ros.submap.local_filter import PlacedKeyframe
 
-Points = NDArray[np.float64]
+Points = Float64
 
 _RECENT_SCANS = 3
 """Number of recent scans."""
@@ -64,7 +63,7 @@ class RecentScan:
     """
 
     scan: Scan
-    pose: NDArray[np.float64]
+    pose: Float64
 
 
 class Changes(NamedTuple):
@@ -157,7 +156,7 @@ def _combine_keyframe(keyframe: int, staleness: Sequence[tuple[BeamStaleness, fl
     return StaleBeams(keyframe, tuple(removed.tolist()), tuple(occluded.tolist()), tuple(starts.tolist()))
 
 
-def _points_in_reach(points: Points, pose: NDArray[np.float64]) -> Points:
+def _points_in_reach(points: Points, pose: Float64) -> Points:
     near: Points = points[np.hypot(*(points - pose[:2]).T) <= _REACH]
     return near
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian, chi_square_gate, match_moments
@@ -37,7 +37,7 @@ from hmt_slam_ros.submap.local_mapping import LocalMapping
 _NONRIGID_INFLATION = 10.0
 """Factor on the covariance of the match of two areas: they bend by more than the width of their walls."""
 
-PlacedScan: TypeAlias = tuple[Scan, NDArray[np.float64]]
+PlacedScan: TypeAlias = tuple[Scan, Float64]
 KeyframeScans: TypeAlias = Mapping[int, Scan]
 ArcKeyframes: TypeAlias = dict[AreaPair, frozenset[int]]
 
@@ -87,9 +87,7 @@ class AreaAlignment:
         poses = np.array([pose for _, pose in scans]).reshape(-1, 3)
         return build_area_grid([scan for scan, _ in scans], poses, self._model)
 
-    def _refine_offset(
-        self, points: NDArray[np.float64], closure: PoseGaussian, matched: PoseGaussian, view: GridView
-    ) -> NDArray[np.float64]:
+    def _refine_offset(self, points: Float64, closure: PoseGaussian, matched: PoseGaussian, view: GridView) -> Float64:
         """The motion in the area's frame, shape (3,), that improves the match, or none if it leaves its gate.
 
         The closure holds the directions that walls leave open.

@@ -14,7 +14,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 from scipy.sparse import csc_matrix
 from scipy.sparse.csgraph import connected_components
 
@@ -101,14 +100,14 @@ def linked_areas(hybrid_map: HybridMap) -> dict[int, frozenset[int]]:
 
 
 def nearest_keyframes(
-    poses: NDArray[np.float64],
-    areas: NDArray[np.int64],
-    query_poses: NDArray[np.float64],
-    query_areas: NDArray[np.int64],
+    poses: Float64,
+    areas: Int64,
+    query_poses: Float64,
+    query_areas: Int64,
     linked: Mapping[int, Collection[int]],
     reach: float,
     count: int,
-) -> list[NDArray[np.int64]]:
+) -> list[Int64]:
     """The nearest keyframes around given poses, in position and heading, in linked areas.
 
     :param poses: shape (n, 3), of the keyframes; ``areas`` (n,) theirs.
@@ -135,8 +134,8 @@ def certain_areas(hybrid_map: HybridMap, deviation: float) -> dict[int, frozense
 def add_distant_pairs(
     pairs: ScanPairs,
     surfaces: ScanSurfaces,
-    poses: NDArray[np.float64],
-    areas: NDArray[np.int64],
+    poses: Float64,
+    areas: Int64,
     certain: Mapping[int, Collection[int]],
     options: RefinementParameters,
 ) -> ScanPairs:
@@ -160,8 +159,8 @@ def add_distant_pairs(
 def _most_overlapping(
     row: int,
     surfaces: ScanSurfaces,
-    poses: NDArray[np.float64],
-    areas: NDArray[np.int64],
+    poses: Float64,
+    areas: Int64,
     certain: Mapping[int, Collection[int]],
     options: RefinementParameters,
 ) -> list[int]:
@@ -206,7 +205,7 @@ def _nearest_rows(
     return rows
 
 
-def scan_pairs(around: list[NDArray[np.int64]], min_share: float) -> ScanPairs:
+def scan_pairs(around: list[Int64], min_share: float) -> ScanPairs:
     """Every pair of different rows; of row i with each of ``around[i]``."""
     pairs = {(min(i, j), max(i, j)) for i, rows in enumerate(around) for j in rows.tolist() if i != j}
     return ScanPairs(np.array(sorted(pairs), dtype=np.int64).reshape(-1, 2), np.full(len(pairs), min_share))
@@ -214,12 +213,12 @@ def scan_pairs(around: list[NDArray[np.int64]], min_share: float) -> ScanPairs:
 
 def refine_jointly(
     surfaces: ScanSurfaces,
-    poses: NDArray[np.float64],
+    poses: Float64,
     pairs: ScanPairs,
     motion_edges: Edges,
     options: RefinementParameters,
     fixed: int = 0,
-) -> NDArray[np.float64]:
+) -> Float64:
     """The poses that agree best with all registrations and the motion between them.
 
     :param surfaces: of n scans.
@@ -239,11 +238,11 @@ def refine_jointly(
 
 def relative_beliefs(
     surfaces: ScanSurfaces,
-    poses: NDArray[np.float64],
+    poses: Float64,
     pairs: ScanPairs,
     motion_edges: Edges,
     options: RefinementParameters,
-    between: NDArray[np.int64],
+    between: Int64,
 ) -> list[PoseGaussian]:
     """Beliefs over refined poses relative to each other, ``i_T_j``.
 
@@ -261,11 +260,11 @@ def relative_beliefs(
     return list(map(PoseGaussian, means, relative_covariances(poses, edges, between)))
 
 
-def _invert(matrices: NDArray[np.float64]) -> NDArray[np.float64]:
+def _invert(matrices: Float64) -> Float64:
     return np.linalg.inv(matrices).astype(np.float64, copy=False)
 
 
-def _drop_weak_directions(information: NDArray[np.float64]) -> NDArray[np.float64]:
+def _drop_weak_directions(information: Float64) -> Float64:
     """Information (m, 3, 3) without directions along which there is next to none."""
     scale = np.outer(_SCALE, _SCALE)
     values, vectors = np.linalg.eigh(information * scale)
@@ -274,12 +273,7 @@ def _drop_weak_directions(information: NDArray[np.float64]) -> NDArray[np.float6
 
 
 def _register_pairs(
-    surfaces: ScanSurfaces,
-    poses: NDArray[np.float64],
-    pairs: ScanPairs,
-    gate: float,
-    stride: int,
-    options: RefinementParameters,
+    surfaces: ScanSurfaces, poses: Float64, pairs: ScanPairs, gate: float, stride: int, options: RefinementParameters
 ) -> Edges:
     """One Gauss-Newton step of every pair on its own, as edges from the second scan to the first."""
     first, second = pairs.rows.T
@@ -312,7 +306,7 @@ class RefinedClosure:
         areas were refined; else it is that of the arc.
     """
 
-    keyframes: dict[int, dict[int, NDArray[np.float64]]]
+    keyframes: dict[int, dict[int, Float64]]
     arcs: dict[tuple[int, int], PoseGaussian]
 
 
@@ -359,7 +353,7 @@ class ClosureRefinement:
         self,
         refined: RefinedClosure,
         surfaces: ScanSurfaces,
-        poses: NDArray[np.float64],
+        poses: Float64,
         pairs: ScanPairs,
         motion_edges: Edges,
         ids: list[int],
@@ -382,7 +376,7 @@ class ClosureRefinement:
             arcs[a, b] = PoseGaussian(refined.arcs[a, b].mean, covariance)
         return replace(refined, arcs=refined.arcs | arcs)
 
-    def _scan_pairs(self, poses: NDArray[np.float64], areas: NDArray[np.int64]) -> ScanPairs:
+    def _scan_pairs(self, poses: Float64, areas: Int64) -> ScanPairs:
         """The keyframes that may overlap; all these areas are at most two arcs apart."""
         linked = dict.fromkeys(areas.tolist(), frozenset(areas.tolist()))
         count = self._options.neighbors + 1
@@ -414,7 +408,7 @@ class ClosureRefinement:
             step = se2.between(poses[first], poses[second])
             yield first, second, PoseGaussian(step, self._step_covariance(step, second - first))
 
-    def _step_covariance(self, step: NDArray[np.float64], number_difference: int) -> NDArray[np.float64]:
+    def _step_covariance(self, step: Float64, number_difference: int) -> Float64:
         if number_difference > _SAME_TRAVERSAL:
             return np.diag([self._options.first_gate, self._options.first_gate, _NEW_TRAVERSAL_ANGLE]) ** 2
         return path_covariance(float(np.hypot(step[0], step[1])), abs(float(step[2])), self._motion)
@@ -453,7 +447,7 @@ def _stack_edges(edges: Iterable[KeyframeEdge], ids: list[int]) -> Edges:
 
 
 def _split_by_area(
-    hybrid_map: HybridMap, poses: Mapping[int, NDArray[np.float64]], areas: list[int], closed: Collection[int]
+    hybrid_map: HybridMap, poses: Mapping[int, Float64], areas: list[int], closed: Collection[int]
 ) -> RefinedClosure:
     """Keyframes in the frames of their areas, and the arcs between these frames."""
     frames = {

@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian, chi_square_gate
@@ -46,13 +46,11 @@ class PoseAmbiguity:
         if no arc joins the area with the first}.
     """
 
-    def __init__(self, area_frames: Mapping[FrameKey, NDArray[np.float64] | None] | None = None) -> None:
+    def __init__(self, area_frames: Mapping[FrameKey, Float64 | None] | None = None) -> None:
         """:param area_frames: to continue from."""
         self.area_frames = dict(area_frames or {})
 
-    def second_moment(
-        self, replica: Replica, poses: Mapping[int, NDArray[np.float64]], versions: Mapping[int, int]
-    ) -> NDArray[np.float64]:
+    def second_moment(self, replica: Replica, poses: Mapping[int, Float64], versions: Mapping[int, int]) -> Float64:
         """The second moment of the robot's pose under all live hypotheses, about its pose under the most probable one.
 
         p(x) = sum_h P(h) p(x | h) has the covariance of its peaks besides that within each. Frames are composed along
@@ -83,7 +81,7 @@ class PoseAmbiguity:
         return moment
 
 
-def _area_frame(hybrid_map: HybridMap, area: int) -> NDArray[np.float64] | None:
+def _area_frame(hybrid_map: HybridMap, area: int) -> Float64 | None:
     """``map_T_area``, or None if no arc joins the area with the first."""
     belief = shortest_path_beliefs(hybrid_map, FIRST_AREA, targets=(area,)).get(area)
     return None if belief is None else belief.mean
@@ -132,12 +130,12 @@ class TlcaState:
     replica: ReplicaState = field(default_factory=ReplicaState)
     paths: Mapping[int, TopologicalPath] = field(default_factory=lambda: {FIRST_HYPOTHESIS: TopologicalPath()})
     path_length: float = 0.0
-    poses: Mapping[int, NDArray[np.float64]] = field(default_factory=lambda: {FIRST_HYPOTHESIS: np.zeros(3)})
+    poses: Mapping[int, Float64] = field(default_factory=lambda: {FIRST_HYPOTHESIS: np.zeros(3)})
     change_count: int = 0
     published_change: int = -1
     reported_arcs: frozenset[AreaPair] = frozenset()
     closure_revision: ClosureRevisionState = field(default_factory=ClosureRevisionState)
-    area_frames: Mapping[FrameKey, NDArray[np.float64] | None] = field(default_factory=dict)
+    area_frames: Mapping[FrameKey, Float64 | None] = field(default_factory=dict)
 
 
 class Tlca:
@@ -330,5 +328,5 @@ class Tlca:
         ]
 
 
-def _rebase_pose(pose: NDArray[np.float64], hypothesis: Hypothesis) -> NDArray[np.float64]:
+def _rebase_pose(pose: Float64, hypothesis: Hypothesis) -> Float64:
     return pose if hypothesis.frame_change is None else se2.compose(hypothesis.frame_change.mean, pose)

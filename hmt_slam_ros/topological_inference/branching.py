@@ -14,8 +14,8 @@ from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry import se2
@@ -60,11 +60,11 @@ class Parent:
     probability: float = 1.0
     clutter: Clutter = NO_CLUTTER
 
-    def local_area_poses(self) -> dict[int, NDArray[np.float64]]:
+    def local_area_poses(self) -> dict[int, Float64]:
         """{area: ``area_T_other``} of the submap's other areas."""
         return {area: pose for area, pose in self.state.local_area_poses.items() if self.hybrid_map.has_area(area)}
 
-    def covariance(self, keyframe: int) -> NDArray[np.float64]:
+    def covariance(self, keyframe: int) -> Float64:
         """The covariance of a keyframe's pose in the robot's area, shape (3, 3)."""
         return self.state.covariances.get(keyframe, np.zeros((3, 3)))
 
@@ -165,7 +165,7 @@ class Branching:
         self.unstored_scans.update(state.unstored_scans)
 
     def localize_globally(
-        self, parent: Parent, poses: Mapping[int, NDArray[np.float64]], before: int, pose_hint: PoseHint | None = None
+        self, parent: Parent, poses: Mapping[int, Float64], before: int, pose_hint: PoseHint | None = None
     ) -> PoseDistribution:
         """The distribution of the keyframes' pose in the whole map.
 
@@ -212,9 +212,7 @@ class Branching:
         """Begin an event, within which hypotheses share the numbers of new areas with the same keyframes."""
         self._new_areas = {}
 
-    def reweight_by_known_ground(
-        self, parent: Parent, pose: NDArray[np.float64], points: NDArray[np.float64], keyframe: int
-    ) -> Parent:
+    def reweight_by_known_ground(self, parent: Parent, pose: Float64, points: Float64, keyframe: int) -> Parent:
         """The hypothesis with the evidence of the newest scan for the known ground around it.
 
         :param points: the scan's surface points, shape (n, 2), m, base frame.
@@ -292,7 +290,7 @@ class Branching:
         )
         return Branches([child])
 
-    def find_unlinked_overlap(self, parent: Parent, pose: NDArray[np.float64]) -> int | None:
+    def find_unlinked_overlap(self, parent: Parent, pose: Float64) -> int | None:
         """The area of the submap in whose place the robot is, where no arc joins it to the robot's area.
 
         Area abstraction only follows arcs and would not notice.
@@ -421,7 +419,7 @@ def _make_arc(parent: Parent, area: int, belief: PoseGaussian) -> Arc:
     return Arc(parent.area, area, belief, closure)
 
 
-def _frame_change(query: Query, entry: PoseGaussian, covariances: Mapping[int, NDArray[np.float64]]) -> PoseGaussian:
+def _frame_change(query: Query, entry: PoseGaussian, covariances: Mapping[int, Float64]) -> PoseGaussian:
     """``area_T_previous`` with the uncertainty of the newest keyframe in the area, so that its drift continues."""
     newest, pose = list(query.poses.items())[-1]
     belief = PoseGaussian(se2.compose(entry.mean, pose), covariances[newest])

@@ -15,10 +15,9 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 from scipy.special import ndtri
 
-from hmt_slam_ros.arrays import Float64
+from hmt_slam_ros.arrays import Bool, Float64, Int64
 from hmt_slam_ros.configuration.topology import InferenceParameters
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.covariance import inverse_pose_covariance, propagate_covariance
@@ -34,7 +33,7 @@ from hmt_slam_ros.hybrid_map.surroundings import (
     stack_poses,
 )
 
-Pose = NDArray[np.float64]
+Pose = Float64
 
 _MAX_EXAMINED = 64
 """Most areas whose keyframes are examined, where the arcs admit many."""
@@ -64,7 +63,7 @@ class Query:
     poses: Mapping[int, Pose]
 
     @property
-    def poses_in_area(self) -> NDArray[np.float64]:
+    def poses_in_area(self) -> Float64:
         """``area_T_base`` of the keyframes, shape (n, 3)."""
         return se2.compose(self.belief.mean, stack_poses(self.poses))
 
@@ -113,7 +112,7 @@ class CandidateGating:
         is_elsewhere = ~np.isin(paths.areas, [*excluded, *within, *unexamined])
         return within, unexamined, _spread_out(paths.areas[is_elsewhere], _MAX_NEGATIVES).tolist()
 
-    def _entry_bounds(self, hybrid_map: HybridMap, paths: ShortestPaths, query: Query) -> NDArray[np.float64]:
+    def _entry_bounds(self, hybrid_map: HybridMap, paths: ShortestPaths, query: Query) -> Float64:
         lever = float(np.hypot(*stack_poses(query.poses)[:, :2].T).max())
         reach = hybrid_map.extents(paths.areas) + lever + self._options.place_radius
         return quick_entry_bounds(paths, query.belief, lever, reach, self._options.prior_scale, math.sqrt(self.gate))
@@ -156,7 +155,7 @@ class CandidateGating:
         return min_distance(positions, known) <= self._options.place_radius + math.sqrt(self.gate) * spread
 
 
-def _spread_out(areas: NDArray[np.int64], count: int) -> NDArray[np.int64]:
+def _spread_out(areas: Int64, count: int) -> Int64:
     """Some areas from all over the map: those whose numbers are divisible by the largest powers of two.
 
     The choice hardly changes from cut to cut, so that grids of these areas stay cached. One area more or less changes
@@ -202,7 +201,7 @@ class EntryPrior(NamedTuple):
     median_mahalanobis2: float
 
 
-def entry_prior(place: AreaPlace, belief: PoseGaussian, poses: NDArray[np.float64], radius: float) -> EntryPrior:
+def entry_prior(place: AreaPlace, belief: PoseGaussian, poses: Float64, radius: float) -> EntryPrior:
     """The probability that keyframes lie in a place.
 
     :param belief: over ``area_T_reference``.
@@ -214,9 +213,7 @@ def entry_prior(place: AreaPlace, belief: PoseGaussian, poses: NDArray[np.float6
     return EntryPrior(float(np.mean(is_inside)), float(np.median(distances)) if is_inside.any() else 0.0)
 
 
-def sampled_entry_bound(
-    known: NDArray[np.float64], belief: PoseGaussian, poses: NDArray[np.float64], radius: float
-) -> float:
+def sampled_entry_bound(known: Float64, belief: PoseGaussian, poses: Float64, radius: float) -> float:
     """Upper bound on the probability of :func:`entry_prior`: that one keyframe is near one of the area's.
 
     :param known: shape (k, 2), positions of the area's keyframes, m.
@@ -225,15 +222,13 @@ def sampled_entry_bound(
     return float(np.mean(_any_near(_sampled_positions(belief, poses), known, radius)))
 
 
-def _sampled_positions(belief: PoseGaussian, poses: NDArray[np.float64]) -> NDArray[np.float64]:
+def _sampled_positions(belief: PoseGaussian, poses: Float64) -> Float64:
     """Positions of keyframes (m, 3) under draws from the belief over their reference, shape (draws, m, 2)."""
     return _transformed_positions(_normal_points(), belief.mean, np.linalg.cholesky(belief.covariance), poses)
 
 
 @njit(cache=True)
-def _transformed_positions(
-    normal: NDArray[np.float64], mean: NDArray[np.float64], root: NDArray[np.float64], poses: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _transformed_positions(normal: Float64, mean: Float64, root: Float64, poses: Float64) -> Float64:
     """Positions of the poses (m, 3) after ``mean exp(root normal)``, for each of n points (n, 3); shape (n, m, 2)."""
     positions = np.empty((normal.shape[0], poses.shape[0], 2))
     cos, sin = np.cos(mean[2]), np.sin(mean[2])
@@ -249,7 +244,7 @@ def _transformed_positions(
 
 
 @njit(cache=True)
-def _any_near(positions: NDArray[np.float64], known: NDArray[np.float64], radius: float) -> NDArray[np.bool_]:
+def _any_near(positions: Float64, known: Float64, radius: float) -> Bool:
     """Which of n draws of m positions (n, m, 2) have one within ``radius`` of one of (k, 2), shape (n,)."""
     near = np.zeros(positions.shape[0], np.bool_)
     for n in range(positions.shape[0]):
@@ -265,7 +260,7 @@ def _any_near(positions: NDArray[np.float64], known: NDArray[np.float64], radius
 
 
 @cache
-def _normal_points() -> NDArray[np.float64]:
+def _normal_points() -> Float64:
     """Standard normal points of a low-discrepancy sequence, shape (draws, 3), the first one 0; always the same.
 
     They are the multiples of powers of the number g with g^4 = g + 1, which generalizes the golden ratio.

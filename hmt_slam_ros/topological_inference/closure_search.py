@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
@@ -47,7 +47,7 @@ from hmt_slam_ros.topological_inference.place_recognition import (
     best_shares,
 )
 
-Pose = NDArray[np.float64]
+Pose = Float64
 
 _OLD_EVENTS = 30
 """Keyframe events after which a keyframe counts as known ground."""
@@ -142,9 +142,7 @@ class ClosureSearch:
         self._whole_map_cache.clear()
         self._descriptors.clear()
 
-    def tracked_area(
-        self, hybrid_map: HybridMap, area: int, around: Mapping[int, Pose], poses: NDArray[np.float64]
-    ) -> int | None:
+    def tracked_area(self, hybrid_map: HybridMap, area: int, around: Mapping[int, Pose], poses: Float64) -> int | None:
         """The area in whose place most of the poses lie, among areas of certain position; None for no area.
 
         :param area: the area in whose frame the poses are.
@@ -181,12 +179,12 @@ class ClosureSearch:
         modes = match_areas(query, place.grid, prior, self._settings).modes
         return modes[0].measured if modes else None
 
-    def surface_points(self, scan: Scan) -> NDArray[np.float64]:
+    def surface_points(self, scan: Scan) -> Float64:
         """Surface points of a scan, shape (n, 2), m, base frame."""
         return surface_points(scan, self._model)
 
     def known_ground_log_ratio(
-        self, hybrid_map: HybridMap, poses: Mapping[int, Pose], points: NDArray[np.float64], pose: Pose, keyframe: int
+        self, hybrid_map: HybridMap, poses: Mapping[int, Pose], points: Float64, pose: Pose, keyframe: int
     ) -> float:
         """log p(scan | the robot is there) / p(scan | it is in a similar place), by old keyframes, nats.
 

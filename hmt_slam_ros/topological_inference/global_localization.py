@@ -13,9 +13,8 @@ from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
-from hmt_slam_ros.arrays import Float64
+from hmt_slam_ros.arrays import Bool, Float64
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
@@ -32,7 +31,7 @@ from hmt_slam_ros.registration.consistency import (
 from hmt_slam_ros.topological_inference.global_scan_matching import GlobalScanMatcher, PoseCandidate
 from hmt_slam_ros.topological_inference.place_recognition import PerceptualAliasing
 
-Pose = NDArray[np.float64]
+Pose = Float64
 
 UNMAPPED_PRIOR = 0.2
 """Prior probability that a lost robot is on unmapped ground."""
@@ -78,7 +77,7 @@ class PoseDistribution(NamedTuple):
     """
 
     candidates: tuple[PoseCandidate, ...]
-    probabilities: NDArray[np.float64]
+    probabilities: Float64
 
     @property
     def best(self) -> tuple[PoseCandidate, float] | None:
@@ -88,7 +87,7 @@ class PoseDistribution(NamedTuple):
         n = int(self.probabilities.argmax())
         return self.candidates[n], float(self.probabilities[n])
 
-    def reweight(self, log_weights: Sequence[float] | NDArray[np.float64]) -> PoseDistribution:
+    def reweight(self, log_weights: Sequence[float] | Float64) -> PoseDistribution:
         """The distribution after more evidence for every candidate, relative to unmapped ground, nats."""
         unmapped = max(1.0 - float(self.probabilities.sum()), _MIN_PROBABILITY)
         logs = np.log(np.maximum(self.probabilities, _MIN_PROBABILITY)) + log_weights
@@ -102,7 +101,7 @@ class PoseDistribution(NamedTuple):
         unmapped = max(0.0, 1.0 - float(self.probabilities.sum()))
         return PoseDistribution(self.candidates, weights / max(unmapped + float(weights.sum()), _MIN_PROBABILITY))
 
-    def with_false_alarm(self, at_tracked_pose: NDArray[np.bool_], probability: float, areas: int) -> PoseDistribution:
+    def with_false_alarm(self, at_tracked_pose: Bool, probability: float, areas: int) -> PoseDistribution:
         """The distribution for a robot that may not have been moved.
 
         At the tracked pose its scans are as likely as on new ground at least, since furniture may have been moved.
@@ -176,7 +175,7 @@ def localize_globally(
     return PoseDistribution(tuple(candidates), _probabilities(log_weights))
 
 
-def _probabilities(log_weights: Sequence[float]) -> NDArray[np.float64]:
+def _probabilities(log_weights: Sequence[float]) -> Float64:
     """Probabilities of candidates beside unmapped ground, shape (len(log_weights),)."""
     weights = np.exp(np.array([*log_weights, math.log(UNMAPPED_PRIOR)]))
     return (weights / weights.sum())[:-1]
@@ -266,37 +265,23 @@ class LocalizationStatus(NamedTuple):
     entropy: float
 
 
-class HypothesisSummary(NamedTuple):
-    """A live hypothesis.
-
-    :ivar probability: its own.
-    :ivar area: the robot's.
-    :ivar lost: whether the robot may be anywhere.
-    """
-
-    probability: float
-    area: int
-    lost: bool
-
-
 def summarize_localization(
-    summaries: Iterable[HypothesisSummary], unexamined: float, known: int, distribution: PoseDistribution | None
+    area_probabilities: Mapping[int, float],
+    lost: float,
+    unexamined: float,
+    known: int,
+    distribution: PoseDistribution | None,
 ) -> LocalizationStatus:
     """The localization status of all hypotheses together.
 
-    :param unexamined: probability that none of them is right.
+    :param area_probabilities: {area: probability that a tracked robot is in it}.
+    :param lost: probability of the lost hypotheses.
+    :param unexamined: probability that no hypothesis is right.
     :param known: number of areas in which a lost robot can be.
     :param distribution: of the pose of a lost robot; None before the first search.
     """
-    areas: dict[int, float] = {}
-    lost = 0.0
-    for summary in summaries:
-        if summary.lost:
-            lost += summary.probability
-        else:
-            areas[summary.area] = areas.get(summary.area, 0.0) + summary.probability
     lost_areas = [lost * probability for probability in _lost_distribution(known, distribution)]
-    probabilities = np.array([*areas.values(), *lost_areas, unexamined])
+    probabilities = np.array([*area_probabilities.values(), *lost_areas, unexamined])
     probabilities = probabilities[probabilities > 0.0]
     entropy = abs(float(probabilities @ np.log(probabilities)))
     return LocalizationStatus(lost <= _MAX_LOST_PROBABILITY, entropy)

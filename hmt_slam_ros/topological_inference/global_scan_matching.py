@@ -15,8 +15,8 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hmt_slam_ros.arrays import Float64, Int64
 from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
@@ -38,7 +38,7 @@ from hmt_slam_ros.registration.likelihood_grid import AreaGrid
 from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.submap.local_mapping import LocalMapping
 
-Pose = NDArray[np.float64]
+Pose = Float64
 
 _MAX_SIGMA = 0.2
 """Largest deviation of the position of a certain candidate, m."""
@@ -87,9 +87,7 @@ def is_certain(candidate: PoseCandidate) -> bool:
     return variance <= _MAX_SIGMA**2
 
 
-def query_bounds(
-    positions: NDArray[np.float64], query: AreaGrid, poses: Mapping[int, NDArray[np.float64]], radius: float
-) -> NDArray[np.float64]:
+def query_bounds(positions: Float64, query: AreaGrid, poses: Mapping[int, Float64], radius: float) -> Float64:
     """Smallest and largest (x, y) of the query's centroid with a query keyframe near a position, shape (2, 2).
 
     :param positions: shape (n, 2), m.
@@ -136,7 +134,7 @@ class FreeSpaceCheck:
 
 def _count_in_map(
     mapping: LocalMapping, map_scans: list[Scan], map_poses: Pose, scans: list[Scan], poses: Pose
-) -> NDArray[np.int64]:
+) -> Int64:
     """Samples on which beams of scans end, and which they pass, in a map of other scans, shape (2,).
 
     :param map_poses: shape (len(map_scans), 3); ``poses`` is that of ``scans``.
@@ -228,12 +226,7 @@ class GlobalScanMatcher:
         )
 
     def _match_region(
-        self,
-        place: AreaPlace,
-        query: AreaGrid,
-        poses: Mapping[int, Pose],
-        areas: Collection[int],
-        min_log_ratio: float,
+        self, place: AreaPlace, query: AreaGrid, poses: Mapping[int, Pose], areas: Collection[int], min_log_ratio: float
     ) -> Iterator[PoseCandidate]:
         """Matches of the keyframes into areas of a region, in the frame of its reference.
 

@@ -9,16 +9,15 @@ from functools import cached_property
 from typing import Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from hmt_slam_ros.arrays import Float64
+from hmt_slam_ros.arrays import Float64, Int64
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian, chi_square_gate
 from hmt_slam_ros.hybrid_map.hybrid_map import ArcValue, AreaPair, HybridMap
 from hmt_slam_ros.hybrid_map.shortest_path import shortest_path_beliefs
 from hmt_slam_ros.topological_inference.global_localization import PoseHint
 
-Covariance = NDArray[np.float64]
+Covariance = Float64
 
 _LOG_KIDNAPPING_PRIOR = math.log(1e-5)
 """Log-probability of a kidnapping per keyframe: once in 50 km."""
@@ -55,11 +54,11 @@ class Reduction(NamedTuple):
     :ivar weights: shape (n,), their new weights, with the sum of all the old ones.
     """
 
-    indices: NDArray[np.int64]
-    weights: NDArray[np.float64]
+    indices: Int64
+    weights: Float64
 
 
-def reduce_hypotheses(weights: NDArray[np.float64], most: int, generator: np.random.Generator) -> Reduction:
+def reduce_hypotheses(weights: Float64, most: int, generator: np.random.Generator) -> Reduction:
     """At most ``most`` hypotheses, by the resampling of Fearnhead and Clifford (2003).
 
     Those heavier than a threshold c keep their weight; of the others a stratified draw keeps some at weight c. No
@@ -81,7 +80,7 @@ def reduce_hypotheses(weights: NDArray[np.float64], most: int, generator: np.ran
     return Reduction(kept, np.where(weights[kept] >= c, weights[kept], weights[light].sum() / max(1, draws)))
 
 
-def threshold(weights: NDArray[np.float64], most: int) -> float:
+def threshold(weights: Float64, most: int) -> float:
     """The c with sum of min(w / c, 1) = N, for more than N positive weights, shape (m,)."""
     descending = np.sort(weights)[::-1]
     rest = np.cumsum(descending[::-1])[::-1]
@@ -93,7 +92,7 @@ def threshold(weights: NDArray[np.float64], most: int) -> float:
     return float(descending[most - 1])
 
 
-def _draw_stratified(weights: NDArray[np.float64], count: int, offset: float) -> NDArray[np.int64]:
+def _draw_stratified(weights: Float64, count: int, offset: float) -> Int64:
     """``count`` different indices, each drawn in proportion to its weight, none of which exceeds the stride."""
     edges = np.cumsum(weights) / weights.sum() * count
     edges[-1] = count
@@ -182,7 +181,7 @@ class HypothesisState:
 
     covariances: Mapping[int, Covariance] = field(default_factory=dict)
     matched_keyframes: Mapping[int, frozenset[int]] = field(default_factory=dict)
-    local_area_poses: Mapping[int, NDArray[np.float64]] = field(default_factory=dict)
+    local_area_poses: Mapping[int, Float64] = field(default_factory=dict)
     unmatched_keyframes: tuple[int, ...] = ()
     pending_candidates: tuple[int, ...] = ()
     unlinked_overlap: tuple[int, int] | None = None
@@ -267,7 +266,7 @@ class HypothesisState:
 
 
 def relative_covariance(
-    whole: Covariance, reference: Covariance, reference_T_base: NDArray[np.float64], floor: Covariance
+    whole: Covariance, reference: Covariance, reference_T_base: Float64, floor: Covariance
 ) -> Covariance:
     """Covariance of ``reference_T_base``, shape (3, 3), if that of ``area_T_base`` includes that of the reference.
 
@@ -288,18 +287,13 @@ class ReducedDistribution(NamedTuple):
     :ivar unexamined: probability of what was not examined, or dropped as too improbable.
     """
 
-    indices: NDArray[np.int64]
-    probabilities: NDArray[np.float64]
+    indices: Int64
+    probabilities: Float64
     unexamined: float
 
 
 def normalize_and_reduce(
-    log_weights: NDArray[np.float64],
-    log_skipped: float,
-    unexamined: float,
-    most: int,
-    least: float,
-    generator: np.random.Generator,
+    log_weights: Float64, log_skipped: float, unexamined: float, most: int, least: float, generator: np.random.Generator
 ) -> ReducedDistribution:
     """The distribution of hypotheses, without the improbable ones, reduced to N.
 
@@ -331,11 +325,11 @@ class LocalizedHypothesis:
 
     hybrid_map: HybridMap
     area: int
-    pose: NDArray[np.float64]
+    pose: Float64
     nearby_areas: Collection[int]
 
     @cached_property
-    def poses_in_areas(self) -> Mapping[int, NDArray[np.float64]]:
+    def poses_in_areas(self) -> Mapping[int, Float64]:
         """{area: ``area_T_base``} of the areas relative to which the robot's pose is certain."""
         beliefs = shortest_path_beliefs(self.hybrid_map, self.area, cost_limit=_MAX_VARIANCE)
         return {area: se2.between(belief.mean, self.pose) for area, belief in beliefs.items()}

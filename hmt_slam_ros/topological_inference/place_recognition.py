@@ -20,7 +20,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 from scipy.special import softmax
 
 from hmt_slam_ros.arrays import Float64
@@ -154,7 +153,7 @@ class NegativeSample(NamedTuple):
     """A place in which the keyframes do not lie: its grid, and ``map_T_base`` of a robot there, shape (3,)."""
 
     grid: AreaGrid
-    pose: NDArray[np.float64]
+    pose: Float64
 
 
 def best_shares(query: AreaGrid, negatives: Iterable[NegativeSample], settings: MatchSettings) -> list[float]:

@@ -16,8 +16,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hmt_slam_ros.arrays import Bool, Float64
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
@@ -29,7 +29,7 @@ from hmt_slam_ros.topological_inference.global_localization import PoseDistribut
 from hmt_slam_ros.topological_inference.global_scan_matching import PoseCandidate, is_certain
 from hmt_slam_ros.topological_inference.hypothesis_tree import FalseAlarm, Lost, PoseInArea, Tracking
 
-Pose = NDArray[np.float64]
+Pose = Float64
 
 KIDNAPPED_UNMAPPED_PRIOR = 0.5
 """Prior probability that a robot kidnapped during mapping is on unmapped ground."""
@@ -299,7 +299,7 @@ def prefers_tracked_pose(
 
 def _candidates_at(
     hybrid_map: HybridMap, distribution: PoseDistribution, pose: PoseInArea, poses: Mapping[int, Pose]
-) -> NDArray[np.bool_]:
+) -> Bool:
     """Which candidates are at a pose, shape (len(distribution.candidates),)."""
     found = [
         _is_same_place(hybrid_map, _pose_in_area(candidate, poses, pose.keyframe), pose)

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.hybrid_map.surroundings import areas_around, consistent_pose
@@ -37,7 +37,6 @@ from hmt_slam_ros.topological_inference.branching import (
     merge_areas,
 )
 from hmt_slam_ros.topological_inference.global_localization import (
-    HypothesisSummary,
     LocalizationStatus,
     PoseDistribution,
     summarize_localization,
@@ -137,10 +136,12 @@ class Tsbi:
         """Whether the robot is localized, and the entropy of the belief over its area."""
         is_reset = (-1 if self._keyframe is None else self._keyframe.sequence) < self._reset_event
         states = self._state.hypothesis_states
-        summaries = [
-            HypothesisSummary(probability, self._replica.robot_areas[h], is_reset or states[h].is_lost)
-            for h, probability in self._replica.probabilities.items()
-        ]
+        areas, lost = defaultdict[int, float](float), 0.0
+        for hypothesis, probability in self._replica.probabilities.items():
+            if is_reset or states[hypothesis].is_lost:
+                lost += probability
+            else:
+                areas[self._replica.robot_areas[hypothesis]] += probability
         best = self._replica.best_hypothesis
         localization, hybrid_map = states[best].localization, self._replica.maps[best]
         since = self._reset_event if is_reset else localization.since if isinstance(localization, Lost) else None
@@ -148,7 +149,7 @@ class Tsbi:
             since is None or any(k < since for k in hybrid_map.keyframes(area)) for area in hybrid_map.area_ids()
         )
         distribution = None if is_reset else self._pose_distribution
-        return summarize_localization(summaries, self._state.unexamined, known, distribution)
+        return summarize_localization(areas, lost, self._state.unexamined, known, distribution)
 
     def handle(self, message: Message) -> list[Message]:
         """Learn from ``Keyframe`` and ``ClosureDecision``; answer ``AreaEvents`` with ``Hypotheses``."""
@@ -340,7 +341,7 @@ class Tsbi:
         )
 
     def _surviving_hypotheses(
-        self, children: Sequence[Child], survivors: Sequence[Child], probabilities: NDArray[np.float64]
+        self, children: Sequence[Child], survivors: Sequence[Child], probabilities: Float64
     ) -> list[Hypothesis]:
         """The surviving hypotheses; an only child keeps the id of its parent, others get new ones."""
         siblings = Counter(child.parent for child in children)
