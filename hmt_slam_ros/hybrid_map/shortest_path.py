@@ -158,8 +158,8 @@ def _dijkstra(
         while side >= 0:
             there, arc = np.int64(table.opposite_area[side]), side // 2
             if not _has_cheaper_path(reached, there, cost):
-                k = low + np.searchsorted(changed.targets[low:high], there)
-                if k == high or changed.targets[k] != there:
+                found = low + np.searchsorted(changed.targets[low:high], there)
+                if found == high or changed.targets[found] != there:
                     mean, covariance = table.means[arc], table.covariances[arc]
                     last = _relax_arc(row, there, mean, covariance, side % 2 == 1, cost, limit, reached, last, queue)
             side = np.int64(table.next_side[side])
