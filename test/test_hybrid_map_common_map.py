@@ -1,4 +1,4 @@
-"""The map that hypotheses share: what is asked of it, and its arcs as arrays."""
+"""The common map of hypotheses: queries, and its arcs as arrays."""
 
 import numpy as np
 import pytest
@@ -22,7 +22,7 @@ def star():
     return common
 
 
-def test_the_neighbours_of_an_area_are_those_that_arcs_join_to_it(star):
+def test_the_neighbors_of_an_area_are_those_that_arcs_join_to_it(star):
     assert sorted(star.neighbors(40)) == list(range(40))
     assert sorted(star.neighbors(3)) == [4, 40]
     assert star.neighbors(0) == [40]

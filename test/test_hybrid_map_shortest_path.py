@@ -124,7 +124,7 @@ def test_own_arcs_replace_common_ones_and_beliefs_are_those_of_composition():
     found = shortest_path_beliefs(hybrid_map, 20)
     assert len(found) == 40
     for area, belief in list(found.items())[1:]:
-        # Every belief is that of a neighbour that was found before, carried on by the arc that counts.
+        # Every belief is that of a neighbor found before, composed with an arc.
         before = [b for b in hybrid_map.neighbors(area) if list(found).index(b) < list(found).index(area)]
         ways = [found[b].compose(hybrid_map.arc(b, area)) for b in before]
         assert any(

@@ -1,4 +1,4 @@
-"""Which areas are surely around, the grids that are kept of them, and the look of places."""
+"""Areas around an area, their cached grids, and places."""
 
 import numpy as np
 import pytest

@@ -30,8 +30,8 @@ def room(*things):
     return np.concatenate((ROOM, *things))
 
 
-def looks_in(*worlds, apart=SECOND):
-    """A look from each place of the way, in the world as it is at that time."""
+def scans_in(*worlds, apart=SECOND):
+    """A scan from each pose of the path, in the world at that time."""
     pairs = enumerate(zip(worlds, WAY, strict=False))
     return tuple(RecentScan(scan_in(walls, pose, stamp=n * apart, beams=361), pose) for n, (walls, pose) in pairs)
 
@@ -40,10 +40,10 @@ def keyframes(walls):
     return [PlacedKeyframe(n, 0, scan_in(walls, pose, beams=361), pose) for n, pose in enumerate(WAY)]
 
 
-def news(before, now, looks=None):
-    """What a scan now says of a map of before."""
+def changes(before, now, recent=None):
+    """The changes between a scan now and a map of before."""
     scan = RecentScan(scan_in(now, NOW, stamp=10 * SECOND, beams=361), NOW)
-    return detect_changes(scan, looks_in(now, now, now) if looks is None else looks, keyframes(before))
+    return detect_changes(scan, scans_in(now, now, now) if recent is None else recent, keyframes(before))
 
 
 def ends(keyframe, beams):
@@ -72,13 +72,13 @@ def test_a_view_of_a_laser_that_hangs_upside_down_or_moves_in_the_sweep_is_the_s
 
 
 def test_an_unchanged_room_is_no_news():
-    found = news(room(CUPBOARD), room(CUPBOARD))
+    found = changes(room(CUPBOARD), room(CUPBOARD))
     assert (found.has_new_surface, found.has_changed_surface) == (False, False)
     assert not any(late.seen_through.any() or late.starts.any() for late in found.stale_beams.values())
 
 
 def test_furniture_that_came_is_stored_and_beams_that_pass_it_are_out_of_date():
-    found = news(room(), room(CUPBOARD))
+    found = changes(room(), room(CUPBOARD))
     assert found.has_changed_surface
     for keyframe in keyframes(room()):
         late = found.stale_beams[keyframe.keyframe]
@@ -89,7 +89,7 @@ def test_furniture_that_came_is_stored_and_beams_that_pass_it_are_out_of_date():
 
 
 def test_of_furniture_that_is_gone_every_beam_is_out_of_date():
-    found = news(room(CUPBOARD), room())
+    found = changes(room(CUPBOARD), room())
     for keyframe in keyframes(room(CUPBOARD)):
         gone = found.stale_beams[keyframe.keyframe].seen_through
         on = np.zeros(361, dtype=bool)
@@ -99,31 +99,31 @@ def test_of_furniture_that_is_gone_every_beam_is_out_of_date():
 
 
 def test_who_walks_through_is_no_news():
-    """A person as wide as the cupboard, elsewhere at every look."""
+    """A person as wide as the cupboard, elsewhere in every scan."""
     at = [box(x, -1.0, x + 0.4, -0.6) for x in (1.0, 1.6, 2.2)]
-    found = news(room(), room(box(2.8, -1.0, 3.2, -0.6)), looks_in(*(room(person) for person in at)))
+    found = changes(room(), room(box(2.8, -1.0, 3.2, -0.6)), scans_in(*(room(person) for person in at)))
     assert (found.has_new_surface, found.has_changed_surface) == (False, False)
     assert not any(late.seen_through.any() or late.starts.any() for late in found.stale_beams.values())
 
 
 def test_a_robot_that_is_elsewhere_takes_nothing_for_out_of_date():
-    found = news(room(), room() * [0.6, 0.4, 0.6, 0.4])
+    found = changes(room(), room() * [0.6, 0.4, 0.6, 0.4])
     assert not found.has_changed_surface
     assert not found.stale_beams
 
 
 def test_looks_are_a_second_apart_and_few():
-    looks = ()
-    for look in looks_in(*[room()] * 4, apart=SECOND // 2):
-        looks = append_recent_scan(looks, look)
-    assert [look.scan.stamp for look in looks] == [0, SECOND]
+    recent = ()
+    for recent_scan in scans_in(*[room()] * 4, apart=SECOND // 2):
+        recent = append_recent_scan(recent, recent_scan)
+    assert [recent_scan.scan.stamp for recent_scan in recent] == [0, SECOND]
     for n in range(5):
-        looks = append_recent_scan(looks, RecentScan(scan_in(room(), NOW, stamp=(2 + n) * SECOND), NOW))
-    assert len(looks) == 3
+        recent = append_recent_scan(recent, RecentScan(scan_in(room(), NOW, stamp=(2 + n) * SECOND), NOW))
+    assert len(recent) == 3
 
 
 def test_hypotheses_have_to_agree_on_what_is_out_of_date():
-    one, other = news(room(CUPBOARD), room()), news(room(), room())
+    one, other = changes(room(CUPBOARD), room()), changes(room(), room())
     assert combine_stale_beams([(one, 0.97), (other, 0.03)])
     assert combine_stale_beams([(one, 0.6), (other, 0.4)]) == ()
     assert combine_stale_beams([]) == ()
@@ -161,7 +161,7 @@ MIDDLE, END = 70, 110
 
 
 def read(run, records):
-    """What a run says of keyframes meanwhile, and its state then."""
+    """The keyframes of a run meanwhile, and its state then."""
     for record in records:
         run.process_record(record)
     return [run.recorder.keyframes[k] for k in sorted(run.recorder.keyframes)], run.state
@@ -182,15 +182,15 @@ def visits(tmp_path_factory):
     writer.write_state(middle)
     writer.finish(LIFELONG)
     rest = records[ends[1] : ends[2]]
-    said, after = read(run, rest)
-    return before, folder, rest, said, after
+    messages, after = read(run, rest)
+    return before, folder, rest, messages, after
 
 
 def test_every_process_leaves_the_same_beams_out_and_little_is_stored(visits):
-    before, _, _, said, after = visits
-    stored = [any(leaf.stored for leaf in message.estimates) for message in said]
+    before, _, _, messages, after = visits
+    stored = [any(leaf.stored for leaf in message.estimates) for message in messages]
     assert 0 < sum(stored) < 0.4 * len(stored)
-    assert all(message.mapping for message in said)
+    assert all(message.mapping for message in messages)
     scans = after.processes["slam"].replica.scans
     for replica in (
         after.processes["aam"].replica,
@@ -200,9 +200,9 @@ def test_every_process_leaves_the_same_beams_out_and_little_is_stored(visits):
     ):
         assert replica.scans.keys() == scans.keys()
         assert all(scan is scans[keyframe] for keyframe, scan in replica.scans.items())
-    told = [one for message in said for one in message.stale_beams]
-    assert all(isinstance(one, StaleBeams) for one in told)
-    old = [one for one in told if one.keyframe in before.processes["slam"].replica.scans and one.keyframe in scans]
+    stale = [one for message in messages for one in message.stale_beams]
+    assert all(isinstance(one, StaleBeams) for one in stale)
+    old = [one for one in stale if one.keyframe in before.processes["slam"].replica.scans and one.keyframe in scans]
     assert len(old) > 10
     for one in old:
         assert not scans[one.keyframe].valid[list(one.removed)].any()
@@ -214,11 +214,11 @@ def test_every_process_leaves_the_same_beams_out_and_little_is_stored(visits):
 
 
 def test_a_run_that_goes_on_from_its_state_says_the_same(visits):
-    _, folder, rest, said, _ = visits
+    _, folder, rest, messages, _ = visits
     middle, _ = read_run_state(folder)
     assert any(live.event.recent_scans for live in middle.processes["slam"].live_hypotheses.values())
     again, _ = read(LockStepRun(LIFELONG, state=middle), rest)
-    same = said[-len(again) :]
+    same = messages[-len(again) :]
     assert [encode(KeyframeHeader.from_keyframe(one)) for one in again] == [
         encode(KeyframeHeader.from_keyframe(one)) for one in same
     ]

@@ -1,4 +1,4 @@
-"""Keyframes that joined an area are laid where they fit best."""
+"""Keyframes that joined an area are aligned with it."""
 
 import numpy as np
 import pytest
@@ -27,7 +27,7 @@ def placed(walls, poses, beams=180):
 
 
 def claimed(error, covariance=LOOSE):
-    """What a closure says that is wrong by ``error``: both areas have the same frame."""
+    """A closure that is wrong by ``error``: both areas have the same frame."""
     return PoseGaussian(np.array(error), covariance)
 
 

@@ -1,4 +1,4 @@
-"""Hypotheses that say the same are told from those that do not."""
+"""Equivalent hypotheses are told apart from others."""
 
 import numpy as np
 import pytest
@@ -36,9 +36,9 @@ def in_next_area(pose):
     return se2.between(STEP, pose)
 
 
-def with_sharp_arc(claim):
-    claim.hybrid_map.set_arc(0, 1, PoseGaussian(STEP, SHARP), closure=False)
-    return claim
+def with_sharp_arc(hypothesis):
+    hypothesis.hybrid_map.set_arc(0, 1, PoseGaussian(STEP, SHARP), closure=False)
+    return hypothesis
 
 
 def test_the_same_place_entered_by_one_area_or_by_the_next_is_one_claim():
@@ -56,15 +56,15 @@ def test_modes_that_part_by_less_than_is_mended_are_one_claim(offset, same):
 
 def test_known_ground_is_a_claim_of_its_own():
     tracked = LocalizedHypothesis(chain(), 0, POSE, {0})
-    recognised = entered(0, POSE)
-    assert not tracked.is_equivalent(recognised)
-    assert not recognised.is_equivalent(tracked)
+    recognized = entered(0, POSE)
+    assert not tracked.is_equivalent(recognized)
+    assert not recognized.is_equivalent(tracked)
 
 
-def with_another_loop(claim, covariance=SHARP):
-    """The same, and the robot's area is said to lie beside area 2 as well."""
-    claim.hybrid_map.set_arc(claim.area, 2, PoseGaussian(2.0 * STEP, covariance), closure=True)
-    return claim
+def with_another_loop(hypothesis, covariance=SHARP):
+    """The same with an arc from the robot's area to area 2."""
+    hypothesis.hybrid_map.set_arc(hypothesis.area, 2, PoseGaussian(2.0 * STEP, covariance), closure=True)
+    return hypothesis
 
 
 @pytest.mark.parametrize("covariance", [SHARP, 100.0 * SHARP])
@@ -76,9 +76,9 @@ def test_a_further_loop_is_a_claim_of_its_own(covariance):
 
 def test_a_loop_that_one_hypothesis_closes_by_two_arcs_and_one_by_the_second_is_one_claim():
     direct, around = entered(0, POSE), with_another_loop(entered(0, POSE))
-    for claim in (direct, around):
-        claim.hybrid_map.set_arc(0, 1, PoseGaussian(STEP, SHARP), closure=False)
-        claim.hybrid_map.set_arc(1, 2, PoseGaussian(STEP, SHARP), closure=False)
+    for hypothesis in (direct, around):
+        hypothesis.hybrid_map.set_arc(0, 1, PoseGaussian(STEP, SHARP), closure=False)
+        hypothesis.hybrid_map.set_arc(1, 2, PoseGaussian(STEP, SHARP), closure=False)
     assert direct.is_equivalent(around)
     assert around.is_equivalent(direct)
 

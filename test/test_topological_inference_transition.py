@@ -1,4 +1,4 @@
-"""The transition model: where the arcs alone say that the robot is."""
+"""The transition model: the probability of areas by the arcs alone."""
 
 import math
 
@@ -24,7 +24,7 @@ CORRIDORS = np.concatenate((box(-1.0, -1.0, 21.0, 1.0), box(-1.0, 1.0, 21.0, 3.0
 
 
 def place(first=0.0, last=8.0, border=5.0):
-    """Keyframes every metre along the lower corridor; those beyond ``border`` belong to area 7, the others to 3."""
+    """Keyframes every meter along the lower corridor; those beyond ``border`` belong to area 7, the others to 3."""
     x = np.arange(first, last + 0.1)
     poses = np.stack((x, np.zeros_like(x), np.zeros_like(x)), axis=1)
     scans = [scan_in(CORRIDORS, pose, field_of_view=2 * np.pi, beams=361) for pose in poses]
@@ -32,7 +32,7 @@ def place(first=0.0, last=8.0, border=5.0):
 
 
 def keyframes(x, y=0.0, count=4):
-    """Keyframes half a metre apart that begin at (x, y)."""
+    """Keyframes half a meter apart that begin at (x, y)."""
     return np.array([[x + 0.5 * k, y, 0.0] for k in range(count)])
 
 
@@ -95,7 +95,7 @@ def test_the_probability_is_that_of_the_gaussian():
     assert share == pytest.approx(0.5 * (1.0 + math.erf((10.0 - 9.0) / 0.8 / math.sqrt(2.0))), abs=0.02)
 
 
-def test_neighbouring_areas_share_the_probability(corridor):
+def test_neighboring_areas_share_the_probability(corridor):
     other = AreaPlace(7, corridor.keyframe_areas, corridor.positions, corridor.grid)
     prior = PoseGaussian(np.array([4.0, 0.0, 0.0]), np.diag([0.5, 0.1, 0.003]) ** 2)
     shares = [entry_prior(p, prior, keyframes(0.5), RADIUS).probability for p in (corridor, other)]
@@ -137,20 +137,20 @@ def test_a_place_at_the_edge_of_the_belief_is_made_of_poses_that_are_far_off(cor
     assert far.median_mahalanobis2 > near.median_mahalanobis2 + 1.0
 
 
-@pytest.mark.parametrize(("asked", "keyframe"), [((0.0, 0.0), (0.0, 0.0)), ((2.0, 0.5), (1.5, 0.0))])
-def test_the_quick_bound_lets_all_pass_that_are_near_and_few_others(asked, keyframe):
+@pytest.mark.parametrize(("query_position", "keyframe"), [((0.0, 0.0), (0.0, 0.0)), ((2.0, 0.5), (1.5, 0.0))])
+def test_the_quick_bound_lets_all_pass_that_are_near_and_few_others(query_position, keyframe):
     rng = np.random.default_rng(2)
     square = rng.normal(size=(200, 3, 3)) * np.array([0.3, 0.3, 0.05])[:, None]
     found = ShortestPaths(np.arange(200), rng.uniform(-9.0, 9.0, size=(200, 3)), square @ square.transpose(0, 2, 1))
     query = PoseGaussian(np.array([1.0, 2.0, 0.3]), np.diag([0.1, 0.2, 0.05]) ** 2)
-    lever, extent = np.hypot(*asked), np.hypot(*keyframe)
+    lever, extent = np.hypot(*query_position), np.hypot(*keyframe)
     bounds = quick_entry_bounds(found, query, lever, np.full(200, extent + lever + 2.0), 2.0, 2.0)
     passed = bounds > 0.0
     near = []
     for mean, covariance in zip(found.means, found.covariances, strict=True):
         prior = PoseGaussian(mean, covariance).inverse().compose(query)
         spread = np.sqrt(np.linalg.eigvalsh(prior.covariance[:2, :2])[-1]) + lever * np.sqrt(prior.covariance[2, 2])
-        near.append(np.hypot(*(se2.transform(prior.mean, np.array(asked)) - keyframe)) <= 2.0 + 4.0 * spread)
+        near.append(np.hypot(*(se2.transform(prior.mean, np.array(query_position)) - keyframe)) <= 2.0 + 4.0 * spread)
     assert passed[near].all()
     assert 20 < sum(near) < 180
     # Where the query and the area are points, the bound is the distance itself.
