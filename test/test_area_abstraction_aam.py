@@ -116,7 +116,7 @@ def test_the_frame_of_the_area_does_not_matter():
     assert here.score == pytest.approx(there.score, abs=1e-9)
 
 
-def test_every_keyframe_is_answered_once_and_nothing_else_is():
+def test_every_keyframe_has_one_answer():
     process = aam()
     assert len(process.handle(keyframe(0, THERE[0], estimate(0, 0, np.zeros(3))))) == 1
     assert process.handle(stay(0, 0)) == []
@@ -223,7 +223,7 @@ def test_a_short_look_into_the_other_area_is_no_move():
     assert len(moves_about(aam(confirmations=1), poses)) == 8 - 1
 
 
-def test_the_robots_own_keyframes_stay_where_they_are_and_become_known_ground():
+def test_new_keyframes_stay_at_a_move_and_become_old_ground():
     process = aam(confirmations=1, min_cluster=3)
     k, _, event = drive_back(process)
     process.handle(stay(k, 0, area=event.area))
@@ -334,7 +334,7 @@ def test_another_room_stays_an_area_of_its_own_when_the_loop_is_closed():
     assert [event.kind for event in answer.events if event.kind == "merged"] == []
 
 
-def test_the_question_comes_again_when_the_robot_leaves_one_of_the_two_and_waits_for_one_hypothesis():
+def test_a_merge_is_evaluated_again_on_leaving_and_with_one_hypothesis_only():
     process = aam()
     _, k = closed(process, AGAIN)
     in_two, in_zero = se2.between(AGAIN[0], AGAIN[-1]), se2.between(THERE[0], AGAIN[-1])

@@ -47,14 +47,14 @@ def all_around(process, poses=THROUGH):
         return None
 
 
-def test_by_both_the_door_makes_a_cut_of_what_is_none():
+def test_with_the_policy_both_a_door_makes_a_cut():
     assert drive_until_cut(by_policy("both", ncut_threshold=0.5), THROUGH)[0].keyframes[0] == 10
     assert all_around(by_policy("ncut", ncut_threshold=0.5)) is None
     assert all_around(by_policy("both", ncut_threshold=0.5, portal_factor=1.0)) is None
 
 
 @pytest.mark.parametrize("stop", [3, 9, 12])
-def test_what_openings_were_seen_and_passed_is_part_of_the_state(stop, tmp_path):
+def test_openings_and_crossings_are_part_of_the_state(stop, tmp_path):
     options = {"ncut_threshold": 0.5}
     (event, k), process = looking_ahead(by_policy("both", **options)), by_policy("both", **options)
     assert looking_ahead(process, THROUGH[:stop]) is None

@@ -52,7 +52,7 @@ def ends(keyframe, beams):
     return points[beams[keyframe.scan.valid]]
 
 
-def test_a_view_tells_surface_from_free_space_and_from_what_is_hidden():
+def test_a_polar_scan_separates_surface_free_space_and_occluded_space():
     view = to_polar_scan(scan_in(room(CUPBOARD), NOW, beams=361))
     places = np.array([[2.0, 1.0], [1.0, 0.5], [4.0, 2.0], [5.0, -2.0], [-1.0, 0.0], [4.8, -1.0], [2.0, 0.45]])
     assert classify_points(view, places).tolist() == [SURFACE, FREE, UNKNOWN, SURFACE, UNKNOWN, UNKNOWN, SURFACE]
@@ -98,7 +98,7 @@ def test_of_furniture_that_is_gone_every_beam_is_out_of_date():
         assert (on == gone).mean() > 0.98
 
 
-def test_who_walks_through_is_no_news():
+def test_people_who_walk_by_are_no_change():
     """A person as wide as the cupboard, elsewhere in every scan."""
     at = [box(x, -1.0, x + 0.4, -0.6) for x in (1.0, 1.6, 2.2)]
     found = changes(room(), room(box(2.8, -1.0, 3.2, -0.6)), scans_in(*(room(person) for person in at)))
@@ -106,13 +106,13 @@ def test_who_walks_through_is_no_news():
     assert not any(late.seen_through.any() or late.starts.any() for late in found.stale_beams.values())
 
 
-def test_a_robot_that_is_elsewhere_takes_nothing_for_out_of_date():
+def test_a_wrong_pose_makes_no_beams_stale():
     found = changes(room(), room() * [0.6, 0.4, 0.6, 0.4])
     assert not found.has_changed_surface
     assert not found.stale_beams
 
 
-def test_looks_are_a_second_apart_and_few():
+def test_recent_scans_are_few_and_a_second_apart():
     recent = ()
     for recent_scan in scans_in(*[room()] * 4, apart=SECOND // 2):
         recent = append_recent_scan(recent, recent_scan)
@@ -122,7 +122,7 @@ def test_looks_are_a_second_apart_and_few():
     assert len(recent) == 3
 
 
-def test_hypotheses_have_to_agree_on_what_is_out_of_date():
+def test_hypotheses_have_to_agree_on_stale_beams():
     one, other = changes(room(CUPBOARD), room()), changes(room(), room())
     assert combine_stale_beams([(one, 0.97), (other, 0.03)])
     assert combine_stale_beams([(one, 0.6), (other, 0.4)]) == ()
@@ -138,7 +138,7 @@ def test_beams_are_left_out_of_a_scan_once_for_all_who_hold_it():
 
 
 @pytest.mark.parametrize("motion", [0.0, 0.1])
-def test_what_is_behind_a_thing_that_came_stays_in_the_map_and_what_is_before_it_is_not_free_any_more(motion):
+def test_an_occluded_beam_keeps_its_end_and_loses_the_free_space_before_it(motion):
     poses = np.stack((np.linspace(0.0, motion, 361), np.zeros(361), np.zeros(361)), axis=1)
     scan = dataclasses.replace(scan_in(room(), poses, beams=361), motion=np.array([motion, 0.0, 0.0]))
     thing = np.array([[2.0, 0.0], [2.0, 0.1]])
@@ -188,7 +188,7 @@ def visits(tmp_path_factory):
 
 def test_every_process_leaves_the_same_beams_out_and_little_is_stored(visits):
     before, _, _, messages, after = visits
-    stored = [any(leaf.stored for leaf in message.estimates) for message in messages]
+    stored = [any(estimate.stored for estimate in message.estimates) for message in messages]
     assert 0 < sum(stored) < 0.4 * len(stored)
     assert all(message.mapping for message in messages)
     scans = after.processes["slam"].replica.scans
@@ -213,7 +213,7 @@ def test_every_process_leaves_the_same_beams_out_and_little_is_stored(visits):
         assert (starts >= np.float32(one.starts)).all()
 
 
-def test_a_run_that_goes_on_from_its_state_says_the_same(visits):
+def test_a_run_that_continues_from_its_state_has_the_same_messages(visits):
     _, folder, rest, messages, _ = visits
     middle, _ = read_run_state(folder)
     assert any(live.event.recent_scans for live in middle.processes["slam"].live_hypotheses.values())

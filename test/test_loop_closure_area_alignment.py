@@ -38,7 +38,7 @@ def test_a_displaced_group_of_scans_is_moved_back(alignment, error):
     assert abs(np.degrees(found[2])) < 0.3
 
 
-def test_what_was_seen_since_decides_along_a_wall():
+def test_later_keyframes_determine_the_pose_along_a_wall():
     """A step downhill would stay where the closure is, for the wall alone fits there as well."""
     walls = np.vstack([CORRIDOR, [[14.0, 0.0, 14.0, 2.0]]])
     alignment = AreaAlignment(with_changes(Configuration(), {"local_map.max_range": 5.0}))

@@ -94,7 +94,7 @@ def test_a_closure_that_claims_to_be_certain_is_not_moved_beyond_its_gate():
     assert verdict.moved_keyframes == ()
 
 
-def test_a_loop_is_spread_over_its_arcs_or_left_open_as_asked_for():
+def test_a_loop_error_is_distributed_or_left_open_as_configured():
     quarter = np.radians(88.0)
     step = [2.0, 0.0, quarter]
 
@@ -116,7 +116,7 @@ def test_a_loop_is_spread_over_its_arcs_or_left_open_as_asked_for():
     assert np.ptp(turns) > 5.0
 
 
-def test_an_arc_that_refuses_to_fit_is_told_once():
+def test_an_inconsistent_arc_is_reported_once():
     play = Play()
     play.start()
     for area in (1, 2, 3):
@@ -156,7 +156,7 @@ def two_loops(play, false_closure):
     return play.step(Hypothesis(0, 0, 1.0, 4, None, (), (other,)))
 
 
-def test_a_contradiction_is_told_to_tsbi_and_the_map_is_not_bent_by_it():
+def test_a_contradiction_requests_a_revision_without_global_poses():
     play = Play(arc_sigma_floor=1e-4, arc_angle_floor=1e-3)
     before = two_loops(play, false_closure=True)
     assert before.hypothesis == 0

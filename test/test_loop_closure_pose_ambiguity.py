@@ -31,7 +31,7 @@ def test_one_hypothesis_is_not_ambiguous():
 
 
 @pytest.mark.parametrize("probability", [0.7, 0.9])
-def test_it_is_what_the_others_are_away_by_their_probability(probability):
+def test_it_is_the_squared_distance_of_the_others_by_their_probability(probability):
     away = se2.compose(ELSEWHERE, se2.inverse(THERE))
     np.testing.assert_allclose(verdict_of(probability).ambiguity, (1.0 - probability) * np.outer(away, away))
 

@@ -56,7 +56,7 @@ def closed(hybrid_map, event, near, far, error=(0.0, 0.0, 0.0), log_odds=4.6):
     return Closure((event, (min(near, far), max(near, far))), near, far, belief, log_odds, MapSnapshot({}, {}))
 
 
-def account_of(hybrid_map, history, closures, area):
+def path_of(hybrid_map, history, closures, area):
     hybrid_map.commit()
     return AcceptedPath(hybrid_map, history, tuple(closures), area, np.zeros(3))
 
@@ -71,7 +71,7 @@ def drive_with(*found, areas=8, area=7):
     for event, near, far, error in found:
         closures.append(closed(hybrid_map, event, near, far, error))
         history += (PathStep(event, near, near, (closures[-1].pair,)),)
-    return account_of(hybrid_map, history, closures, area)
+    return path_of(hybrid_map, history, closures, area)
 
 
 def find_inconsistency(path, event):
@@ -137,7 +137,7 @@ def joined():
         PathStep(43, 0, 1, ()),
         PathStep(50, 1, 4, ((1, 4),), frozenset({50})),
     )
-    return account_of(hybrid_map, history, [closure], 4)
+    return path_of(hybrid_map, history, [closure], 4)
 
 
 def in_frame_of(hybrid_map, *areas):
@@ -148,7 +148,7 @@ def in_frame_of(hybrid_map, *areas):
     return pose
 
 
-def test_what_was_stored_in_areas_that_were_entered_falsely_becomes_an_area_of_its_own():
+def test_keyframes_stored_after_a_false_closure_become_a_separate_area():
     before = joined()
     found = withdraw_closure(before, before.closures[0].closure_id, 9)
     hybrid_map = found.hybrid_map
@@ -198,7 +198,7 @@ def test_a_link_that_the_robot_never_crossed_is_only_taken_out():
     assert before.hybrid_map.arc(0, 6) is not None
 
 
-def test_what_a_refinement_moved_goes_back_and_what_was_stored_since_goes_with_it():
+def test_a_rollback_restores_moved_keyframes_and_moves_later_ones_along():
     hybrid_map, history = corridor(4)
     bent = np.array([0.3, 0.2, 0.05])
     closure = closed(hybrid_map, 40, 3, 0)
@@ -212,7 +212,7 @@ def test_what_a_refinement_moved_goes_back_and_what_was_stored_since_goes_with_i
     hybrid_map.set_keyframe(45, 4, np.zeros(3))
     hybrid_map.set_arc(3, 4, PoseGaussian(se2.compose(bent, reached), ODOMETRY), closure=False)
     history += (PathStep(40, 3, 3, ((0, 3),)), PathStep(45, 3, 4, ((3, 4),), frozenset({45})))
-    path = account_of(hybrid_map, history, [replace(closure, snapshot=undo)], 4)
+    path = path_of(hybrid_map, history, [replace(closure, snapshot=undo)], 4)
     found = undo_refinements(path, closure.closure_id)
     placed = found.hybrid_map.keyframes(3)
     for k in (30, 31):
@@ -257,7 +257,7 @@ def test_a_closure_beside_which_another_observation_of_its_arc_is_fused_is_not_w
     assert closures == ()
 
 
-def test_what_a_refinement_moved_goes_back_after_an_area_became_part_of_another():
+def test_a_rollback_after_a_merge():
     hybrid_map, history = corridor(4)
     bent = np.array([0.3, 0.2, 0.05])
     former = {k: (k // 10, hybrid_map.keyframes(k // 10)[k].copy()) for k in (20, 21, 30, 31)}
@@ -265,7 +265,7 @@ def test_what_a_refinement_moved_goes_back_after_an_area_became_part_of_another(
         hybrid_map.set_keyframe(k, area, se2.compose(bent, pose))
     arcs = {pair: hybrid_map.arc_value(*pair) for pair in ((1, 2), (2, 3))}
     closure = replace(closed(hybrid_map, 40, 2, 0), snapshot=MapSnapshot(former, arcs))
-    path = account_of(hybrid_map, history, [closure], 2)
+    path = path_of(hybrid_map, history, [closure], 2)
     history, closures = apply_area_merge(path, AreaMerge(3, 2, path.hybrid_map.arc(2, 3)))
     assert set(closures[0].snapshot.keyframes) == {20, 21}
     assert set(closures[0].snapshot.arcs) == {(1, 2)}

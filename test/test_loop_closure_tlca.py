@@ -16,7 +16,7 @@ def test_the_first_area_lies_at_the_origin_of_the_map_with_hardly_any_uncertaint
     assert 0.0 < np.trace(poses_of(verdict)[0].covariance) < 1e-6
 
 
-def test_nothing_is_said_where_nothing_changed():
+def test_without_changes_no_poses_are_published():
     play = Play()
     play.start()
     verdict = play.step(places=[(0, 0, [0.5, 0.0, 0.0])])

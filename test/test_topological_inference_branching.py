@@ -101,7 +101,7 @@ def test_a_recognized_area_is_entered_at_the_pose_of_the_match():
     assert np.sqrt(arc.pose.covariance[0, 0]) < 0.2
 
 
-def test_the_robot_is_told_to_be_as_uncertain_in_the_area_as_its_newest_keyframe():
+def test_the_frame_change_has_the_uncertainty_of_the_newest_keyframe():
     parent, branching, newest = rooms_apart((ROOM, ROOM), ((0.4, 0.3),), 0.7)
     grown = {k: (1.0 + k - newest[0]) * np.diag([1e-3, 2e-3, 1e-4]) for k in newest}
     parent = replace(parent, state=replace(parent.state, covariances=grown))
@@ -154,14 +154,14 @@ def approaching(xs):
     return parent, branching, newest
 
 
-def test_keyframes_that_see_an_area_but_are_not_in_its_place_yet_are_asked_again():
+def test_keyframes_beside_the_place_of_an_area_make_it_a_pending_candidate():
     parent, branching, newest = approaching((8.7, 8.2, 7.7, 7.2, 6.7, 6.2))
     branches = branching.cut(parent, newest)
     assert [child.area for child in branches.children] == [parent.area + 1]
     assert 0 not in branches.children[0].state.matched_keyframes
 
 
-def test_whether_the_robot_is_in_known_ground_now_is_asked_of_the_newest_keyframes():
+def test_a_recheck_of_pending_candidates_compares_the_newest_keyframes():
     parent, branching, _ = approaching((6.2, 5.6, 5.0, 4.4, 3.8, 3.2))
     parent = replace(parent, state=replace(parent.state, unmatched_keyframes=(), pending_candidates=(0,)))
     stay, joined = branching.recheck(parent, (0,)).children

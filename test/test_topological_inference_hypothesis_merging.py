@@ -83,13 +83,13 @@ def test_a_loop_that_one_hypothesis_closes_by_two_arcs_and_one_by_the_second_is_
     assert around.is_equivalent(direct)
 
 
-def test_what_a_hypothesis_is_uncertain_of_it_does_not_claim():
+def test_uncertain_poses_imply_no_closure():
     assert not entered(0, POSE).is_equivalent(entered(1, in_next_area(POSE)))
 
 
 def test_the_heaviest_stands_for_all_that_say_the_same():
-    claims = [entered(0, POSE), entered(1, POSE), entered(0, POSE + 0.01)]
+    hypotheses = [entered(0, POSE), entered(1, POSE), entered(0, POSE + 0.01)]
     weights = np.log([0.2, 0.3, 0.5])
-    found = merge_equivalent(claims, weights)
+    found = merge_equivalent(hypotheses, weights)
     assert list(found) == [2, 1]
     np.testing.assert_allclose(np.exp(list(found.values())), [0.7, 0.3])

@@ -57,6 +57,6 @@ def test_descriptors_share_the_probability_among_areas(descriptors):
     assert probabilities[7] > 0.6
 
 
-def test_what_looks_more_alike_than_the_median_speaks_for_the_place():
+def test_more_similarity_than_the_median_is_evidence_for_an_area():
     ratios = descriptor_log_ratio(np.array([-1.0, 0.0, 1.0]))
     assert ratios[0] < ratios[1] == RATIO_AT_MEDIAN < 0.0 < ratios[2]

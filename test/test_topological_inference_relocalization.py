@@ -42,7 +42,7 @@ def begin(office):
     return [scan for scan in office.scans if office.records[scan].measurement.stamp in known][60]
 
 
-def carried(office, records, scans):
+def run_in_map(office, records, scans):
     """A run that started in a map and read so many scans."""
     run = LockStepRun(Configuration(), state=office.state)
     run.lock_step.feed(PoseReset())
@@ -54,9 +54,9 @@ def carried(office, records, scans):
     return run
 
 
-def test_it_begins_a_new_area_to_which_an_arc_leads_that_tells_nothing(office, begin):
+def test_it_begins_a_new_area_with_an_uninformative_arc(office, begin):
     before = Replica.from_state(office.state.processes["tsbi"].replica)
-    run = carried(office, office.records[begin:], 10)
+    run = run_in_map(office, office.records[begin:], 10)
     replica = Replica.from_state(run.state.processes["tsbi"].replica)
     (hypothesis,) = run.recorder.hypotheses[max(run.recorder.hypotheses)].hypotheses
     assert hypothesis.lost
@@ -69,7 +69,7 @@ def test_it_begins_a_new_area_to_which_an_arc_leads_that_tells_nothing(office, b
 
 
 @pytest.mark.parametrize(("kind", "share"), [("whole", 0.15), ("whole", 0.7), ("first half", 0.5)])
-def test_it_is_recognized_where_it_is(maps, kind, share):
+def test_it_is_relocalized_at_its_pose(maps, kind, share):
     log = maps[kind]
     found = awakened(log, log.starts[int(share * len(log.starts))])
     assert found.right
@@ -97,7 +97,7 @@ def test_in_the_map_of_the_first_half_it_wakes_up_in_the_second_near_keyframes_o
     assert np.hypot(*(log.truth - whole.truth)[:, :2].T).max() < 0.5
 
 
-def test_it_is_not_believed_to_be_where_one_look_alone_finds_it(office, begin, monkeypatch):
+def test_a_single_search_does_not_relocalize_it(office, begin, monkeypatch):
     """Every other search is 5 m off."""
     searches, found = [], ClosureSearch.localize_globally
 
@@ -112,7 +112,7 @@ def test_it_is_not_believed_to_be_where_one_look_alone_finds_it(office, begin, m
         return searches[-1]._replace(candidates=tuple(moved))
 
     monkeypatch.setattr(ClosureSearch, "localize_globally", off_at_times)
-    run = carried(office, office.records[begin:], 150)
+    run = run_in_map(office, office.records[begin:], 150)
     (hypothesis,) = run.recorder.hypotheses[max(run.recorder.hypotheses)].hypotheses
     assert sum(search_result.best is not None and search_result.best[1] > 0.9 for search_result in searches) >= 3
     assert hypothesis.lost
@@ -120,11 +120,11 @@ def test_it_is_not_believed_to_be_where_one_look_alone_finds_it(office, begin, m
 
 @pytest.mark.parametrize("seed", [4, 5, 6, 7])
 def test_in_a_building_that_it_does_not_know_it_stays_lost(office, seed):
-    run = carried(office, open_log(f"sim:grid,seed={seed},size=0.7").records(), 150)
+    run = run_in_map(office, open_log(f"sim:grid,seed={seed},size=0.7").records(), 150)
     assert all(hypothesis.lost for hypothesis in run.recorder.hypotheses[max(run.recorder.hypotheses)].hypotheses)
 
 
-def test_a_robot_that_stands_still_is_recognized_where_somebody_says_that_it_is(office, begin):
+def test_a_standing_robot_is_relocalized_at_an_initial_pose(office, begin):
     """At a keyframe; the initial pose is 0.4 m and 6 degrees off."""
     replica = Replica.from_state(office.state.processes["tsbi"].replica)
     hybrid_map = replica.maps[replica.best_hypothesis]
@@ -148,12 +148,12 @@ def test_a_robot_that_stands_still_is_recognized_where_somebody_says_that_it_is(
 
 
 def test_scans_are_counted_on_and_odometry_begins_anew(office, begin):
-    run = carried(office, office.records[begin:], 25)
+    run = run_in_map(office, office.records[begin:], 25)
     assert run.state.processes["slam"].processed_scans == office.state.processes["slam"].processed_scans + 25
     assert run.state.processes["slam"].dropped_scans == 0
 
 
-def test_one_that_is_carried_while_it_maps_notices_and_is_recognized():
+def test_a_robot_kidnapped_during_mapping_is_relocalized():
     found = kidnapped(CARRIED)
     assert found.noticed <= SOON
     assert found.again <= FAR
@@ -161,7 +161,7 @@ def test_one_that_is_carried_while_it_maps_notices_and_is_recognized():
     assert max(found.errors) < 0.1
 
 
-def test_one_that_is_carried_while_it_stores_nothing_notices_and_is_recognized(office):
+def test_a_robot_kidnapped_in_localization_is_relocalized(office):
     run = LockStepRun(Configuration(mode="localization"), state=office.state)
     run.lock_step.feed(PoseReset())
     log = open_log(CARRIED)
@@ -184,6 +184,6 @@ def test_one_that_is_carried_while_it_stores_nothing_notices_and_is_recognized(o
     assert run.state.processes["slam"].dropped_scans == 0
 
 
-def test_an_arc_that_tells_nothing_is_told_from_the_least_certain_one_between_areas():
+def test_an_uninformative_arc_differs_from_the_least_certain_one_between_areas():
     assert is_uninformative(uninformative_belief(np.array([3.0, 4.0, 1.0])))
     assert not is_uninformative(PoseGaussian(np.zeros(3), np.diag([100.0, 100.0, 1.0]) ** 2))

@@ -61,7 +61,7 @@ def test_a_parallel_corridor_behind_a_wall_is_another_place(corridor):
     assert containing_area(corridor, keyframes(1.0, 1.6), RADIUS) is None
 
 
-def test_where_most_keyframes_lie_decides(corridor):
+def test_most_keyframes_decide(corridor):
     assert containing_area(corridor, keyframes(9.0, count=5), RADIUS) == 7  # up to 11 m, place up to 10 m
     assert containing_area(corridor, keyframes(9.6, count=5), RADIUS) is None
 
@@ -110,7 +110,7 @@ def test_known_and_new_sum_to_one():
         assert sum(model.known.values()) + model.new == pytest.approx(1.0)
 
 
-def test_new_ground_has_what_the_known_places_leave():
+def test_new_ground_has_the_remaining_probability():
     model = transition_model({1: 0.2, 4: 0.3}, 0.05)
     assert model.new == pytest.approx(0.5)
     assert model.known == pytest.approx({1: 0.2, 4: 0.3})

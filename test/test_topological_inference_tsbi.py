@@ -225,13 +225,13 @@ def odds_after_return(keyframes, apart):
     return first / second / 1.5
 
 
-def test_a_scan_speaks_for_known_ground_where_it_agrees_and_against_it_where_it_does_not():
+def test_a_scan_is_evidence_for_or_against_known_ground():
     in_the_wall, in_new_ground = odds_after_return(60, [0.0, 0.8, 0.0]), odds_after_return(60, [50.0, 0.0, 0.0])
     assert 1.05 < in_new_ground < 2.0
     assert in_the_wall > 2.0 * in_new_ground
 
 
-def test_what_was_seen_just_before_is_no_known_ground():
+def test_recent_keyframes_are_no_known_ground():
     assert odds_after_return(12, [50.0, 0.0, 0.0]) == pytest.approx(1.0)
 
 
