@@ -2,7 +2,7 @@
 
 Blanco et al. name robot awakening as future work: a topological loop closure whose prior is uninformative. All
 keyframes since the robot was lost are matched into every area, at all positions in its place and all headings. Each
-search computes the probabilities anew from the same prior, so every scan counts once.
+search computes the probabilities again from the same prior, so every scan counts once.
 """
 
 from __future__ import annotations

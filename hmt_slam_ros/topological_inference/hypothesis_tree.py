@@ -130,7 +130,7 @@ class Tracking:
     """The pose of the robot in the map is known.
 
     :ivar relocalized_area: the known area in which it was relocalized, until it changes its area; else None.
-    :ivar kind: tells it from ``Lost`` in a document.
+    :ivar kind: distinguishes it from ``Lost`` in a document.
     """
 
     relocalized_area: int | None = None
@@ -148,7 +148,7 @@ class Lost:
     :ivar tracked_pose: the pose at ``since`` without a kidnapping, in mapping; else None.
     :ivar counted_evidence: log Bayes factor for a pose elsewhere that is in the hypothesis's weight, nats; None after
         a relocalized hypothesis was split off.
-    :ivar kind: tells it from ``Tracking`` in a document.
+    :ivar kind: distinguishes it from ``Tracking`` in a document.
     """
 
     since: int

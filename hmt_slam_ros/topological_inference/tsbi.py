@@ -122,7 +122,7 @@ class Tsbi:
         self._state = replace(state, replica=ReplicaState(), branching=BranchingState())
         self._keyframe: Keyframe | None = None
         self._estimates: dict[int, HypothesisEstimate] = {}
-        # Not part of the state, since the next search computes them anew.
+        # Not part of the state, since the next search computes them again.
         self._reset_event = -1
         self._pose_distribution: PoseDistribution | None = None
 
