@@ -14,7 +14,7 @@ from benchmark.allocations import counted, requirements_on, told
 from benchmark.logs import BUNDLED, opened
 from benchmark.report import Report, table
 from benchmark.settings import Settings
-from hmt_slam_ros.area_abstraction.overlap import overlaps, sensed_points
+from hmt_slam_ros.area_abstraction.overlap_graph import overlaps, sensed_points
 from hmt_slam_ros.configuration import Configuration, load_configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian

@@ -23,12 +23,12 @@ from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import chi_square_gate
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.hybrid_map.shortest_path import shortest_path_beliefs
-from hmt_slam_ros.hybrid_map.surroundings import Transition, areas_around
+from hmt_slam_ros.hybrid_map.surroundings import areas_around
 from hmt_slam_ros.messages.replica import FIRST_HYPOTHESIS, Replica
 from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.simulation import open_simulated
-from hmt_slam_ros.topological_inference.admission import AreaCandidate, Query
 from hmt_slam_ros.topological_inference.branching import Branching, Child, Parent
+from hmt_slam_ros.topological_inference.candidate_gating import AreaCandidate, Query, Transition
 from hmt_slam_ros.topological_inference.closure_search import AreaComparison, ClosureSearch
 from hmt_slam_ros.topological_inference.hypothesis_tree import HypothesisState
 from hmt_slam_ros.topological_inference.tsbi import Tsbi

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from hmt_slam_ros.submap.local_filter import FilterFactory
     from hmt_slam_ros.submap.local_mapping import LocalMapping
     from hmt_slam_ros.topological_inference.branching import Branching
-    from hmt_slam_ros.topological_inference.landmark_evidence import LandmarkEvidence
+    from hmt_slam_ros.topological_inference.global_localization import LandmarkEvidence
     from hmt_slam_ros.topological_inference.tsbi import Tsbi, TsbiState
 
 

@@ -21,7 +21,7 @@ SIGMA = np.diag([0.05, 0.05, np.radians(0.5)]) ** 2
 def misled(area, known, deviations):
     """What makes the children of hypotheses, once falsely: from ``area`` a loop is closed to ``known``.
 
-    :param deviations: by how many deviations of what the arcs say of it the place is wrong, in its worst direction.
+    :param deviations: error of the place in deviations of the arcs' belief, in its worst direction.
     """
 
     class Misled(Branching):
@@ -35,9 +35,9 @@ def misled(area, known, deviations):
             values, vectors = np.linalg.eigh(belief.covariance)
             wrong = se2.compose(belief.mean, se2.exp(deviations * np.sqrt(values[-1]) * vectors[:, -1]))
             arc = Arc(area, known, PoseGaussian(wrong, SIGMA), closure=True)
-            notes = parent.state.after_matching((), ())
+            state = parent.state.after_matching((), ())
             return Branches(
-                [Child(parent.hypothesis, parent.log_weight, area, notes, arcs=(arc,), reload_local_map=True)]
+                [Child(parent.hypothesis, parent.log_weight, area, state, arcs=(arc,), reload_local_map=True)]
             )
 
     return Misled

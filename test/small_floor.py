@@ -51,7 +51,7 @@ def seen_at(pose, rng, barred=None):
 def charted(crossing_driven=True, again=()):
     """The chart, the map that it is of, and what its areas show.
 
-    :param again: places, m along the hallway, where the robot looks once more afterwards, and where it is barred then.
+    :param again: places, m along the hallway, where the robot scans once more afterwards, and where it is barred then.
     """
     hybrid_map, scans = mapped(crossing_driven)
     rng = np.random.default_rng(2)

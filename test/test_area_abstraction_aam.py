@@ -38,8 +38,8 @@ def estimate(hypothesis, area, pose, stored=True):
     return HypothesisEstimate(hypothesis, area, exact(pose), stored, 0.0, 0.0, Clutter(), 12.0)
 
 
-def keyframe(k, world_pose, *leaves):
-    return Keyframe(k, worlds.scan_at(WORLD, world_pose), 0.5 * k, leaves)
+def keyframe(k, world_pose, *estimates):
+    return Keyframe(k, worlds.scan_at(WORLD, world_pose), 0.5 * k, estimates)
 
 
 def stay(k, *hypotheses, area=0):
@@ -116,7 +116,7 @@ def test_the_frame_of_the_area_does_not_matter():
     assert here.score == pytest.approx(there.score, abs=1e-9)
 
 
-def test_every_keyframe_is_answered_once_and_nothing_else_is():
+def test_every_keyframe_has_one_answer():
     process = aam()
     assert len(process.handle(keyframe(0, THERE[0], estimate(0, 0, np.zeros(3))))) == 1
     assert process.handle(stay(0, 0)) == []
@@ -184,8 +184,8 @@ def drive_back(process):
     """Drive back into the first room over known ground until something happens; (keyframe, world pose, event)."""
     back = worlds.drive((7.5, 2.0), (7.5, 3.0), (5.0, 3.0), (1.0, 2.0))
     for k, pose in enumerate(back, start=answered_in_first_room(process)):
-        leaf = estimate(0, 1, se2.between(THERE[0], pose), stored=False)
-        (answer,) = process.handle(keyframe(k, pose, leaf))
+        own_estimate = estimate(0, 1, se2.between(THERE[0], pose), stored=False)
+        (answer,) = process.handle(keyframe(k, pose, own_estimate))
         if answer.events:
             return k, pose, answer.events[0]
         process.handle(stay(k, 0, area=1))
@@ -200,11 +200,11 @@ def test_a_robot_that_returns_over_an_arc_has_moved_into_the_known_area():
 
 
 def moves_about(process, poses):
-    """The areas that the robot is said to move into while it goes to and fro on known ground, at first in area 1."""
+    """Areas of move events while the robot drives back and forth on known ground, at first in area 1."""
     area, moves = 1, []
     for k, pose in enumerate(poses, start=answered_in_first_room(process)):
-        leaf = estimate(0, area, se2.between(THERE[0], pose), stored=False)
-        (answer,) = process.handle(keyframe(k, pose, leaf))
+        own_estimate = estimate(0, area, se2.between(THERE[0], pose), stored=False)
+        (answer,) = process.handle(keyframe(k, pose, own_estimate))
         moves += [event.area for event in answer.events]
         area = moves[-1] if moves else 1
         process.handle(stay(k, 0, area=area))
@@ -218,16 +218,16 @@ def test_the_margin_keeps_a_robot_that_dithers_in_the_door_from_flapping():
 
 
 def test_a_short_look_into_the_other_area_is_no_move():
-    looks = np.array([[7.5, 3.0, np.pi], [5.0, 3.0, np.pi]] * 4)
-    assert moves_about(aam(confirmations=2), looks) == []
-    assert len(moves_about(aam(confirmations=1), looks)) == 8 - 1
+    poses = np.array([[7.5, 3.0, np.pi], [5.0, 3.0, np.pi]] * 4)
+    assert moves_about(aam(confirmations=2), poses) == []
+    assert len(moves_about(aam(confirmations=1), poses)) == 8 - 1
 
 
-def test_the_robots_own_keyframes_stay_where_they_are_and_become_known_ground():
+def test_new_keyframes_stay_at_a_move_and_become_old_ground():
     process = aam(confirmations=1, min_cluster=3)
     k, _, event = drive_back(process)
     process.handle(stay(k, 0, area=event.area))
-    # In room 0 again: its keyframes are known ground and cannot leave it, however few of them are asked for.
+    # In room 0 again: its keyframes are old ground and cannot leave it, however small the smallest cluster is.
     for step, pose in enumerate(worlds.drive((4.0, 4.0), (4.0, 2.0)), start=k + 1):
         (answer,) = process.handle(keyframe(step, pose, estimate(0, 0, se2.between(THERE[0], pose))))
         cut = [event for event in answer.events if event.kind == "cut"]
@@ -334,7 +334,7 @@ def test_another_room_stays_an_area_of_its_own_when_the_loop_is_closed():
     assert [event.kind for event in answer.events if event.kind == "merged"] == []
 
 
-def test_the_question_comes_again_when_the_robot_leaves_one_of_the_two_and_waits_for_one_hypothesis():
+def test_a_merge_is_evaluated_again_on_leaving_and_with_one_hypothesis_only():
     process = aam()
     _, k = closed(process, AGAIN)
     in_two, in_zero = se2.between(AGAIN[0], AGAIN[-1]), se2.between(THERE[0], AGAIN[-1])

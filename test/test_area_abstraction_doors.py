@@ -13,13 +13,13 @@ from hmt_slam_ros.landmarks.landmarks import CONCAVE_CORNER, OPENING, ScanLandma
 from hmt_slam_ros.landmarks.opening_detection import LandmarkOpenings
 
 FEATURES = FeatureParameters()
-# Beams that tell nothing: so no landmark is missed.
+# Beams without returns: no landmark is missed.
 BLIND = Rays(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), np.zeros(0), np.zeros(0, np.bool_))
 DOOR, OTHER = (3.2, 0.0, 0.0), (6.2, 0.0, 0.0)
 
 
 def shown(pose, openings, confidence=0.9, kind=OPENING):
-    """What a keyframe shows of openings, as landmarks with beams that tell nothing else."""
+    """The openings that a keyframe shows, as landmarks with beams without returns."""
     poses = np.array([se2.between(pose, np.array(one)) for one in openings]).reshape(-1, 3)
     count = len(poses)
     covariances = np.tile(np.diag([0.02, 0.02, 0.01]) ** 2, (count, 1, 1))
@@ -46,7 +46,7 @@ def test_the_path_passes_an_opening_that_only_keyframes_before_it_saw():
 
 
 @pytest.mark.parametrize("how", [{"confidence": 0.3}, {"kind": CONCAVE_CORNER}, {"y": 0.8}])
-def test_nothing_else_is_a_passage(how):
+def test_other_paths_are_no_crossings(how):
     way = go(DoorTracker(), 0.5 * np.arange(10), [DOOR], **how)
     assert way.crossings == ()
     assert set(way.segment_labels(range(10)).values()) == {0}
@@ -65,7 +65,7 @@ def test_both_faces_of_a_wall_are_passed_at_once():
     assert len(go(DoorTracker(), 0.5 * np.arange(10), [DOOR, (3.6, 0.0, np.pi)]).crossings) == 1
 
 
-def test_an_opening_that_shows_late_was_passed_where_the_path_passed_it():
+def test_an_opening_detected_late_is_crossed_at_the_right_event():
     seen_from_behind = (3.2, 0.0, np.pi)
     way = go(DoorTracker(), 0.5 * np.arange(10), [seen_from_behind])
     (passage,) = way.crossings
@@ -73,13 +73,13 @@ def test_an_opening_that_shows_late_was_passed_where_the_path_passed_it():
     assert se2.wrap(passage.pose[2]) == pytest.approx(0.0, abs=1e-6)
 
 
-def test_what_is_far_behind_is_forgotten_but_not_that_it_was_passed():
+def test_distant_openings_are_dropped_but_not_their_crossings():
     way = go(DoorTracker(), 0.5 * np.arange(25), [DOOR])
     assert way.openings == ()
     assert len(way.crossings) == 1
 
 
-def test_in_another_frame_all_is_where_it_was():
+def test_a_tracker_in_another_frame():
     frame = np.array([5.0, -3.0, 2.0])
     way = go(DoorTracker(), 0.5 * np.arange(6), [DOOR]).transform(frame)
     for event, x in ((6, 3.0), (7, 3.5)):
@@ -89,7 +89,7 @@ def test_in_another_frame_all_is_where_it_was():
     np.testing.assert_allclose(passage.pose, se2.compose(frame, np.array(DOOR)), atol=1e-6)
 
 
-def test_a_robot_that_was_moved_passes_nothing_on_its_way():
+def test_a_broken_path_crosses_nothing():
     way = go(DoorTracker(), 0.5 * np.arange(6), [DOOR]).break_path()
     assert go(way, 3.5 + 0.5 * np.arange(4), [DOOR], first=6).crossings == ()
 

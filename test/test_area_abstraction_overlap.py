@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from hmt_slam_ros.area_abstraction.overlap import SensedSpace, overlaps, sensed_overlaps, sensed_points
+from hmt_slam_ros.area_abstraction.overlap_graph import SensedSpace, overlaps, sensed_overlaps, sensed_points
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.sensors import Scan
 
@@ -94,7 +94,7 @@ def test_scans_that_saw_free_space_only_overlap_the_less_the_farther_apart_they_
     np.testing.assert_array_equal(sensed_overlaps(seen, HERE, [blank, seen], poses[3:].repeat(2, 0), 0.2), [0.0, 1.0])
 
 
-def test_nothing_to_compare_with_gives_no_values():
+def test_without_other_scans_there_are_no_values():
     assert overlaps(wall(0, 5), HERE, [], np.empty((0, 3)), 0.2).shape == (0,)
 
 

@@ -17,13 +17,13 @@ def rooms(*sizes, between=0.02):
 
 
 class Meter:
-    """Measures |i - j| / 100 and remembers what it was asked."""
+    """Measures |i - j| / 100 and records the pairs."""
 
     def __init__(self):
-        self.asked = []
+        self.pairs = []
 
     def __call__(self, keyframe, others):
-        self.asked += [(keyframe, other) for other in others]
+        self.pairs += [(keyframe, other) for other in others]
         return np.array([abs(keyframe - other) / 100.0 for other in others])
 
 
@@ -50,7 +50,7 @@ def test_every_overlap_is_measured_once():
     graph = OverlapGraph()
     for count in range(1, 7):
         graph = synchronize_graph(graph, range(count), meter)
-    assert len(meter.asked) == len({frozenset(pair) for pair in meter.asked}) == 15
+    assert len(meter.pairs) == len({frozenset(pair) for pair in meter.pairs}) == 15
     assert_measured(graph)
 
 
@@ -59,7 +59,7 @@ def test_keyframes_that_come_over_bring_their_overlaps_along():
     entered = synchronize_graph(OverlapGraph(), range(3), Meter())
     meter = Meter()
     both = synchronize_graph(entered, [0, 1, 2, 13, 14, 15], meter, left)
-    assert sorted(meter.asked) == [(k, other) for k in (13, 14, 15) for other in (0, 1, 2)]
+    assert sorted(meter.pairs) == [(k, other) for k in (13, 14, 15) for other in (0, 1, 2)]
     assert_measured(both)
 
 
@@ -94,7 +94,7 @@ def test_known_ground_counts_as_many_keyframes_as_it_holds():
 
 
 def test_a_robot_back_on_known_ground_does_not_separate():
-    # The newest keyframe looks like the first room again; the room between was the robot's own.
+    # The newest keyframe resembles the first room again; the room between is new.
     label = np.array([0] * 6 + [1] * 6 + [0])
     graph = graph_of(np.where(label[:, None] == label, 0.8, 0.02))
     assert find_separation(graph, range(13), 12, 0.35, 5) is None

@@ -32,8 +32,8 @@ def configured(policy, **changes):
 def looking_ahead(process, poses=THROUGH, first=0):
     """The event of the first cut, where the laser sees half a circle; and its keyframe."""
     for k, pose in enumerate(poses[first:], start=first):
-        leaf = estimate(0, 0, se2.between(poses[0], pose))
-        (answer,) = process.handle(Keyframe(k, worlds.scan_in(WORLD, pose, beams=361), 0.5 * k, (leaf,)))
+        own_estimate = estimate(0, 0, se2.between(poses[0], pose))
+        (answer,) = process.handle(Keyframe(k, worlds.scan_in(WORLD, pose, beams=361), 0.5 * k, (own_estimate,)))
         if answer.events:
             return answer.events[0], k
         process.handle(stay(k, 0))
@@ -47,14 +47,14 @@ def all_around(process, poses=THROUGH):
         return None
 
 
-def test_by_both_the_door_makes_a_cut_of_what_is_none():
+def test_with_the_policy_both_a_door_makes_a_cut():
     assert drive_until_cut(by_policy("both", ncut_threshold=0.5), THROUGH)[0].keyframes[0] == 10
     assert all_around(by_policy("ncut", ncut_threshold=0.5)) is None
     assert all_around(by_policy("both", ncut_threshold=0.5, portal_factor=1.0)) is None
 
 
 @pytest.mark.parametrize("stop", [3, 9, 12])
-def test_what_openings_were_seen_and_passed_is_part_of_the_state(stop, tmp_path):
+def test_openings_and_crossings_are_part_of_the_state(stop, tmp_path):
     options = {"ncut_threshold": 0.5}
     (event, k), process = looking_ahead(by_policy("both", **options)), by_policy("both", **options)
     assert looking_ahead(process, THROUGH[:stop]) is None
@@ -76,7 +76,7 @@ def test_a_state_of_another_policy_goes_on_by_the_own_one():
 
 @pytest.mark.parametrize(("policy", "merged"), [("ncut", True), ("both", False)])
 def test_areas_with_an_opening_between_them_are_not_one(policy, merged):
-    """Played: a closure joins the two rooms, and by a radius of overlap of metres nothing separates them."""
+    """Played: a closure joins the two rooms, and by a radius of overlap of meters nothing separates them."""
     process = by_policy("both", ncut_threshold=0.5, portal_factor=0.01)
     event, k = drive_until_cut(process, THROUGH)
     poses = {i: se2.between(THROUGH[0], THROUGH[i]) for i in event.keyframes}
@@ -86,8 +86,8 @@ def test_areas_with_an_opening_between_them_are_not_one(policy, merged):
     process.handle(ClosureDecision(k, 0, (arc,)))
     changed = {"ncut_threshold": 0.3, "overlap_radius": 2.0, "min_cluster": 5, "portal_factor": 0.01}
     process = area_abstraction(configured(policy, **changed), process.state)
-    leaf = estimate(0, 1, poses[k], stored=False)
-    (answer,) = process.handle(keyframe(k + 1, THROUGH[k], leaf))
+    own_estimate = estimate(0, 1, poses[k], stored=False)
+    (answer,) = process.handle(keyframe(k + 1, THROUGH[k], own_estimate))
     assert [event.kind for event in answer.events] == ["merged"] * merged
 
 

@@ -69,7 +69,7 @@ def test_the_map_of_later_laps_is_no_larger(rounds):
     assert rounds.keyframes[-1] <= 1.03 * rounds.keyframes[2], rounds.keyframes
 
 
-def test_what_is_forgotten_was_stored_before_and_is_gone_in_every_process(rounds):
+def test_pruned_keyframes_were_stored_and_are_gone_in_every_process(rounds):
     state, gone = rounds.run.state, {one.keyframe for one in rounds.ears.forgotten}
     assert len(gone) >= 4 * (LAPS - 2)
     for replica in (
@@ -105,7 +105,7 @@ def test_every_scan_keeps_its_pose_relative_to_a_keyframe_that_is_there(rounds):
     assert away.max() < 0.3
 
 
-def test_a_record_instead_of_messages_tells_the_same(rounds):
+def test_a_record_has_the_same_keyframes_as_the_messages(rounds):
     assert rounds.kept < 100 < len(rounds.run.recorder.keyframes)
     folded = rounds.folding.finish(rounds.log_state.stamps)
     for name in ("trajectory", "online_trajectory", "odometry"):

@@ -22,7 +22,7 @@ SETTINGS = FilterParameters(keyframe_distance=0.5, keyframe_angle=20.0)
         ([0.1, 0.0, math.radians(-16.1)], False),
     ],
 )
-def test_a_place_is_what_metric_slam_takes_for_one(relative, same):
+def test_a_viewpoint_is_that_of_metric_slam(relative, same):
     assert is_same_viewpoint(np.array(relative), SETTINGS) == same
 
 
@@ -46,12 +46,12 @@ def test_of_many_passes_as_many_keyframes_stay_as_a_place_may_hold():
     assert left == [*range(20, 30)]
 
 
-def test_what_is_to_stay_does_and_others_go_instead():
+def test_protected_keyframes_stay_and_others_are_pruned_instead():
     gone = redundant_keyframes(passes(3), [0, 1], 2, SETTINGS)
     assert sorted(gone) == [2, 3, 4, 5, 6]
 
 
-def test_where_no_place_is_too_full_nothing_goes():
+def test_without_crowded_viewpoints_nothing_is_pruned():
     assert redundant_keyframes(passes(2), [], 2, SETTINGS) == []
     assert redundant_keyframes({}, [], 2, SETTINGS) == []
 

@@ -6,9 +6,8 @@ from scipy.stats import chi2
 
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian, fuse
-from hmt_slam_ros.hybrid_map.global_map import consistent_map, shortest_path_map
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
-from hmt_slam_ros.hybrid_map.pose_graph import Edges, optimize, relative_covariances
+from hmt_slam_ros.hybrid_map.pose_graph import Edges, consistent_map, optimize, relative_covariances, shortest_path_map
 
 SPREAD = np.diag([0.05**2, 0.03**2, 0.01**2])
 

@@ -74,7 +74,7 @@ def test_areas_beyond_the_cost_limit_are_left_out():
     assert list(shortest_path_beliefs(hybrid_map, 0, cost_limit=3 * 2 * 0.1**2 + 1e-6)) == [0, 1, 2, 3]
 
 
-def test_no_more_areas_than_asked_for_are_returned():
+def test_at_most_max_areas_are_returned():
     found = shortest_path_beliefs(chain(*[arc(1.0, 0.0, 0.0, sigma) for sigma in (0.1, 0.2, 0.3, 0.4)]), 2, max_areas=3)
     assert list(found) == [2, 1, 0]
 
@@ -104,7 +104,7 @@ def test_the_tree_costs_what_the_best_of_all_paths_costs_in_a_random_graph():
         assert found[area].covariance[0, 0] == pytest.approx(variance, rel=1e-4)
 
 
-def test_the_search_ends_where_all_that_is_wanted_is_found():
+def test_the_search_ends_when_all_targets_are_found():
     hybrid_map = chain(*[arc(1.0, 0.0, 0.0)] * 6)
     assert set(shortest_path_beliefs(hybrid_map, 1, targets=(0, 3))) == {0, 1, 2, 3}
     assert set(shortest_path_beliefs(hybrid_map, 1, targets=(77,))) == set(range(7))
@@ -124,7 +124,7 @@ def test_own_arcs_replace_common_ones_and_beliefs_are_those_of_composition():
     found = shortest_path_beliefs(hybrid_map, 20)
     assert len(found) == 40
     for area, belief in list(found.items())[1:]:
-        # Every belief is that of a neighbour that was found before, carried on by the arc that counts.
+        # Every belief is that of a neighbor found before, composed with an arc.
         before = [b for b in hybrid_map.neighbors(area) if list(found).index(b) < list(found).index(area)]
         ways = [found[b].compose(hybrid_map.arc(b, area)) for b in before]
         assert any(

@@ -1,4 +1,4 @@
-"""Which areas are surely around, the grids that are kept of them, and the look of places."""
+"""Areas around an area, their cached grids, and places."""
 
 import numpy as np
 import pytest
@@ -7,14 +7,11 @@ from worlds import box, scan_in
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
-from hmt_slam_ros.hybrid_map.shortest_path import ShortestPaths
 from hmt_slam_ros.hybrid_map.surroundings import (
     GridCache,
     Neighborhood,
     areas_around,
     consistent_pose,
-    quick_entry_bounds,
-    sampled_entry_bound,
 )
 from hmt_slam_ros.registration.likelihood_grid import GridModel
 
@@ -56,38 +53,6 @@ def test_an_area_beyond_reach_does_not_hide_one_behind_it():
 
 def test_excluded_areas_are_left_out():
     assert list(areas_around(chain(0.05), 0, NEAR, excluded={1})) == [0]
-
-
-@pytest.mark.parametrize(("asked", "keyframe"), [((0.0, 0.0), (0.0, 0.0)), ((2.0, 0.5), (1.5, 0.0))])
-def test_the_quick_bound_lets_all_pass_that_are_near_and_few_others(asked, keyframe):
-    rng = np.random.default_rng(2)
-    square = rng.normal(size=(200, 3, 3)) * np.array([0.3, 0.3, 0.05])[:, None]
-    found = ShortestPaths(np.arange(200), rng.uniform(-9.0, 9.0, size=(200, 3)), square @ square.transpose(0, 2, 1))
-    query = PoseGaussian(np.array([1.0, 2.0, 0.3]), np.diag([0.1, 0.2, 0.05]) ** 2)
-    lever, extent = np.hypot(*asked), np.hypot(*keyframe)
-    bounds = quick_entry_bounds(found, query, lever, np.full(200, extent + lever + 2.0), 2.0, 2.0)
-    passed = bounds > 0.0
-    near = []
-    for mean, covariance in zip(found.means, found.covariances, strict=True):
-        prior = PoseGaussian(mean, covariance).inverse().compose(query)
-        spread = np.sqrt(np.linalg.eigvalsh(prior.covariance[:2, :2])[-1]) + lever * np.sqrt(prior.covariance[2, 2])
-        near.append(np.hypot(*(se2.transform(prior.mean, np.array(asked)) - keyframe)) <= 2.0 + 4.0 * spread)
-    assert passed[near].all()
-    assert 20 < sum(near) < 180
-    # Where the query and the area are points, the bound is the distance itself.
-    assert passed.sum() == sum(near) if lever == 0.0 else sum(near) < passed.sum() < 200
-
-
-@pytest.mark.parametrize("away", [0.0, 6.0, 15.0, 30.0])
-def test_the_quick_bound_is_one_on_the_probability_of_an_area_far_from_certain(away):
-    spread = np.diag([6.0, 4.0, 0.1]) ** 2
-    found = ShortestPaths(np.array([3]), np.array([[away, 1.0, 0.5]]), spread[None])
-    query = PoseGaussian(np.array([0.0, 0.0, 1.0]), 0.01 * np.eye(3))
-    (bound,) = quick_entry_bounds(found, query, 1.0, np.array([3.0]), 1.5, 4.0)
-    prior = PoseGaussian(found.means[0], spread).inverse().compose(query)
-    poses = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
-    exact = sampled_entry_bound(np.zeros((1, 2)), PoseGaussian(prior.mean, 1.5**2 * prior.covariance), poses, 2.0)
-    assert exact <= bound <= max(10.0 * exact, 0.01)
 
 
 def test_a_global_pose_that_agrees_with_the_arcs_is_taken():
@@ -137,5 +102,5 @@ def test_the_grids_that_are_kept_take_bounded_memory(views):
 
 def test_the_grids_that_are_kept_are_forgotten_when_they_are_needed_no_more(views):
     first = views.grid({0: np.zeros(3)})
-    views.forget()
+    views.clear()
     assert views.grid({0: np.zeros(3)}) is not first

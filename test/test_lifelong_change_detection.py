@@ -30,8 +30,8 @@ def room(*things):
     return np.concatenate((ROOM, *things))
 
 
-def looks_in(*worlds, apart=SECOND):
-    """A look from each place of the way, in the world as it is at that time."""
+def scans_in(*worlds, apart=SECOND):
+    """A scan from each pose of the path, in the world at that time."""
     pairs = enumerate(zip(worlds, WAY, strict=False))
     return tuple(RecentScan(scan_in(walls, pose, stamp=n * apart, beams=361), pose) for n, (walls, pose) in pairs)
 
@@ -40,11 +40,12 @@ def keyframes(walls):
     return [PlacedKeyframe(n, 0, scan_in(walls, pose, beams=361), pose) for n, pose in enumerate(WAY)]
 
 
-def news(before, now, looks=None):
-    """What a scan now says of a map of before."""
+def changes(before, now, recent=None):
+    """The changes between a scan now and a map of before."""
     scan = RecentScan(scan_in(now, NOW, stamp=10 * SECOND, beams=361), NOW)
-    recent = looks_in(now, now, now) if looks is None else looks
-    return detect_changes(scan, recent, keyframes(before), Configuration().filter)
+    return detect_changes(
+        scan, scans_in(now, now, now) if recent is None else recent, keyframes(before), Configuration().filter
+    )
 
 
 def ends(keyframe, beams):
@@ -53,7 +54,7 @@ def ends(keyframe, beams):
     return points[beams[keyframe.scan.valid]]
 
 
-def test_a_view_tells_surface_from_free_space_and_from_what_is_hidden():
+def test_a_polar_scan_separates_surface_free_space_and_occluded_space():
     view = to_polar_scan(scan_in(room(CUPBOARD), NOW, beams=361))
     places = np.array([[2.0, 1.0], [1.0, 0.5], [4.0, 2.0], [5.0, -2.0], [-1.0, 0.0], [4.8, -1.0], [2.0, 0.45]])
     assert classify_points(view, places).tolist() == [SURFACE, FREE, UNKNOWN, SURFACE, UNKNOWN, UNKNOWN, SURFACE]
@@ -73,13 +74,13 @@ def test_a_view_of_a_laser_that_hangs_upside_down_or_moves_in_the_sweep_is_the_s
 
 
 def test_an_unchanged_room_is_no_news():
-    found = news(room(CUPBOARD), room(CUPBOARD))
+    found = changes(room(CUPBOARD), room(CUPBOARD))
     assert (found.has_new_surface, found.has_changed_surface) == (False, False)
     assert not any(late.seen_through.any() or late.starts.any() for late in found.stale_beams.values())
 
 
 def test_furniture_that_came_is_stored_and_beams_that_pass_it_are_out_of_date():
-    found = news(room(), room(CUPBOARD))
+    found = changes(room(), room(CUPBOARD))
     assert found.has_changed_surface
     for keyframe in keyframes(room()):
         late = found.stale_beams[keyframe.keyframe]
@@ -90,7 +91,7 @@ def test_furniture_that_came_is_stored_and_beams_that_pass_it_are_out_of_date():
 
 
 def test_of_furniture_that_is_gone_every_beam_is_out_of_date():
-    found = news(room(CUPBOARD), room())
+    found = changes(room(CUPBOARD), room())
     for keyframe in keyframes(room(CUPBOARD)):
         gone = found.stale_beams[keyframe.keyframe].seen_through
         on = np.zeros(361, dtype=bool)
@@ -99,32 +100,32 @@ def test_of_furniture_that_is_gone_every_beam_is_out_of_date():
         assert (on == gone).mean() > 0.98
 
 
-def test_who_walks_through_is_no_news():
-    """A person as wide as the cupboard, elsewhere at every look."""
+def test_people_who_walk_by_are_no_change():
+    """A person as wide as the cupboard, elsewhere in every scan."""
     at = [box(x, -1.0, x + 0.4, -0.6) for x in (1.0, 1.6, 2.2)]
-    found = news(room(), room(box(2.8, -1.0, 3.2, -0.6)), looks_in(*(room(person) for person in at)))
+    found = changes(room(), room(box(2.8, -1.0, 3.2, -0.6)), scans_in(*(room(person) for person in at)))
     assert (found.has_new_surface, found.has_changed_surface) == (False, False)
     assert not any(late.seen_through.any() or late.starts.any() for late in found.stale_beams.values())
 
 
-def test_a_robot_that_is_elsewhere_takes_nothing_for_out_of_date():
-    found = news(room(), room() * [0.6, 0.4, 0.6, 0.4])
+def test_a_wrong_pose_makes_no_beams_stale():
+    found = changes(room(), room() * [0.6, 0.4, 0.6, 0.4])
     assert not found.has_changed_surface
     assert not found.stale_beams
 
 
-def test_looks_are_a_second_apart_and_few():
-    looks = ()
-    for look in looks_in(*[room()] * 4, apart=SECOND // 2):
-        looks = append_recent_scan(looks, look)
-    assert [look.scan.stamp for look in looks] == [0, SECOND]
+def test_recent_scans_are_few_and_a_second_apart():
+    recent = ()
+    for recent_scan in scans_in(*[room()] * 4, apart=SECOND // 2):
+        recent = append_recent_scan(recent, recent_scan)
+    assert [recent_scan.scan.stamp for recent_scan in recent] == [0, SECOND]
     for n in range(5):
-        looks = append_recent_scan(looks, RecentScan(scan_in(room(), NOW, stamp=(2 + n) * SECOND), NOW))
-    assert len(looks) == 3
+        recent = append_recent_scan(recent, RecentScan(scan_in(room(), NOW, stamp=(2 + n) * SECOND), NOW))
+    assert len(recent) == 3
 
 
-def test_hypotheses_have_to_agree_on_what_is_out_of_date():
-    one, other = news(room(CUPBOARD), room()), news(room(), room())
+def test_hypotheses_have_to_agree_on_stale_beams():
+    one, other = changes(room(CUPBOARD), room()), changes(room(), room())
     assert combine_stale_beams([(one, 0.97), (other, 0.03)])
     assert combine_stale_beams([(one, 0.6), (other, 0.4)]) == ()
     assert combine_stale_beams([]) == ()
@@ -139,7 +140,7 @@ def test_beams_are_left_out_of_a_scan_once_for_all_who_hold_it():
 
 
 @pytest.mark.parametrize("motion", [0.0, 0.1])
-def test_what_is_behind_a_thing_that_came_stays_in_the_map_and_what_is_before_it_is_not_free_any_more(motion):
+def test_an_occluded_beam_keeps_its_end_and_loses_the_free_space_before_it(motion):
     poses = np.stack((np.linspace(0.0, motion, 361), np.zeros(361), np.zeros(361)), axis=1)
     scan = dataclasses.replace(scan_in(room(), poses, beams=361), motion=np.array([motion, 0.0, 0.0]))
     thing = np.array([[2.0, 0.0], [2.0, 0.1]])
@@ -162,7 +163,7 @@ MIDDLE, END = 70, 110
 
 
 def read(run, records):
-    """What a run says of keyframes meanwhile, and its state then."""
+    """The keyframes of a run meanwhile, and its state then."""
     for record in records:
         run.process_record(record)
     return [run.recorder.keyframes[k] for k in sorted(run.recorder.keyframes)], run.state
@@ -183,15 +184,15 @@ def visits(tmp_path_factory):
     writer.write_state(middle)
     writer.finish(LIFELONG)
     rest = records[ends[1] : ends[2]]
-    said, after = read(run, rest)
-    return before, folder, rest, said, after
+    messages, after = read(run, rest)
+    return before, folder, rest, messages, after
 
 
 def test_every_process_leaves_the_same_beams_out_and_little_is_stored(visits):
-    before, _, _, said, after = visits
-    stored = [any(leaf.stored for leaf in message.estimates) for message in said]
+    before, _, _, messages, after = visits
+    stored = [any(estimate.stored for estimate in message.estimates) for message in messages]
     assert 0 < sum(stored) < 0.4 * len(stored)
-    assert all(message.mapping for message in said)
+    assert all(message.mapping for message in messages)
     scans = after.processes["slam"].replica.scans
     for replica in (
         after.processes["aam"].replica,
@@ -201,9 +202,9 @@ def test_every_process_leaves_the_same_beams_out_and_little_is_stored(visits):
     ):
         assert replica.scans.keys() == scans.keys()
         assert all(scan is scans[keyframe] for keyframe, scan in replica.scans.items())
-    told = [one for message in said for one in message.stale_beams]
-    assert all(isinstance(one, StaleBeams) for one in told)
-    old = [one for one in told if one.keyframe in before.processes["slam"].replica.scans and one.keyframe in scans]
+    stale = [one for message in messages for one in message.stale_beams]
+    assert all(isinstance(one, StaleBeams) for one in stale)
+    old = [one for one in stale if one.keyframe in before.processes["slam"].replica.scans and one.keyframe in scans]
     assert len(old) > 10
     for one in old:
         assert not scans[one.keyframe].valid[list(one.removed)].any()
@@ -214,12 +215,12 @@ def test_every_process_leaves_the_same_beams_out_and_little_is_stored(visits):
         assert (starts >= np.float32(one.starts)).all()
 
 
-def test_a_run_that_goes_on_from_its_state_says_the_same(visits):
-    _, folder, rest, said, _ = visits
+def test_a_run_that_continues_from_its_state_has_the_same_messages(visits):
+    _, folder, rest, messages, _ = visits
     middle, _ = read_run_state(folder)
     assert any(live.event.recent_scans for live in middle.processes["slam"].live_hypotheses.values())
     again, _ = read(LockStepRun(LIFELONG, state=middle), rest)
-    same = said[-len(again) :]
+    same = messages[-len(again) :]
     assert [encode(KeyframeHeader.from_keyframe(one)) for one in again] == [
         encode(KeyframeHeader.from_keyframe(one)) for one in same
     ]

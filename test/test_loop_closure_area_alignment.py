@@ -1,4 +1,4 @@
-"""Keyframes that joined an area are laid where they fit best."""
+"""Keyframes that joined an area are aligned with it."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,7 @@ import worlds
 
 from hmt_slam_ros.configuration import Configuration, with_changes
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.loop_closure.area_alignment import AreaAlignment
+from hmt_slam_ros.loop_closure.acceptance import AreaAlignment
 
 ROOMS = worlds.two_rooms()
 # An endless corridor leaves the direction along it open.
@@ -27,7 +27,7 @@ def placed(walls, poses, beams=180):
 
 
 def claimed(error, covariance=LOOSE):
-    """What a closure says that is wrong by ``error``: both areas have the same frame."""
+    """A closure that is wrong by ``error``: both areas have the same frame."""
     return PoseGaussian(np.array(error), covariance)
 
 
@@ -38,7 +38,7 @@ def test_a_displaced_group_of_scans_is_moved_back(alignment, error):
     assert abs(np.degrees(found[2])) < 0.3
 
 
-def test_what_was_seen_since_decides_along_a_wall():
+def test_later_keyframes_determine_the_pose_along_a_wall():
     """A step downhill would stay where the closure is, for the wall alone fits there as well."""
     walls = np.vstack([CORRIDOR, [[14.0, 0.0, 14.0, 2.0]]])
     alignment = AreaAlignment(with_changes(Configuration(), {"local_map.max_range": 5.0}))

@@ -56,7 +56,7 @@ def closed(hybrid_map, event, near, far, error=(0.0, 0.0, 0.0), log_odds=4.6):
     return Closure((event, (min(near, far), max(near, far))), near, far, belief, log_odds, MapSnapshot({}, {}))
 
 
-def account_of(hybrid_map, history, closures, area):
+def path_of(hybrid_map, history, closures, area):
     hybrid_map.commit()
     return AcceptedPath(hybrid_map, history, tuple(closures), area, np.zeros(3))
 
@@ -71,51 +71,51 @@ def drive_with(*found, areas=8, area=7):
     for event, near, far, error in found:
         closures.append(closed(hybrid_map, event, near, far, error))
         history += (PathStep(event, near, near, (closures[-1].pair,)),)
-    return account_of(hybrid_map, history, closures, area)
+    return path_of(hybrid_map, history, closures, area)
 
 
-def doubt_of(account, event):
-    return ClosureConsistencyCheck(account, BOUND, 100).find_inconsistency(
-        [c.closure_id for c in account.closures if c.closure_id[0] == event], 0.01
+def find_inconsistency(path, event):
+    return ClosureConsistencyCheck(path, BOUND, 100).find_inconsistency(
+        [c.closure_id for c in path.closures if c.closure_id[0] == event], 0.01
     )
 
 
 def test_closures_that_agree_raise_no_doubt():
-    account = drive_with((80, 7, 0, (0.05, 0.0, 0.0)), (81, 6, 1, (0.0, -0.05, 0.0)), (82, 7, 2, (0.0, 0.0, 0.0)))
-    assert doubt_of(account, 82) is None
+    path = drive_with((80, 7, 0, (0.05, 0.0, 0.0)), (81, 6, 1, (0.0, -0.05, 0.0)), (82, 7, 2, (0.0, 0.0, 0.0)))
+    assert find_inconsistency(path, 82) is None
 
 
 def test_a_false_closure_is_found_when_true_ones_contradict_it():
     """It fits the odometry alone."""
-    account = drive_with((80, 6, 0, FALSE))
-    assert doubt_of(account, 80) is None
-    account = drive_with((80, 6, 0, FALSE), (81, 7, 1, TRUE))
-    doubt = doubt_of(account, 81)
-    assert doubt.closure.closure_id[0] == 81
-    assert doubt.excess_chi2 > BOUND
-    assert [c.closure_id[0] for c in doubt.explanations[0].false_closures] == [80]
-    assert doubt.explanations[0].probability > 0.9
+    path = drive_with((80, 6, 0, FALSE))
+    assert find_inconsistency(path, 80) is None
+    path = drive_with((80, 6, 0, FALSE), (81, 7, 1, TRUE))
+    inconsistency = find_inconsistency(path, 81)
+    assert inconsistency.closure.closure_id[0] == 81
+    assert inconsistency.excess_chi2 > BOUND
+    assert [c.closure_id[0] for c in inconsistency.explanations[0].false_closures] == [80]
+    assert inconsistency.explanations[0].probability > 0.9
 
 
 def test_where_two_closures_contradict_each_other_both_may_be_false():
-    account = drive_with((80, 6, 0, FALSE), (81, 7, 1, (-2.2, 0.0, 0.0)))
-    doubt = doubt_of(account, 81)
-    assert sorted(c.closure_id[0] for e in doubt.explanations for c in e.false_closures) == [80, 81]
-    assert [e.probability for e in doubt.explanations] == pytest.approx([0.5, 0.5], abs=0.01)
+    path = drive_with((80, 6, 0, FALSE), (81, 7, 1, (-2.2, 0.0, 0.0)))
+    inconsistency = find_inconsistency(path, 81)
+    assert sorted(c.closure_id[0] for e in inconsistency.explanations for c in e.false_closures) == [80, 81]
+    assert [e.probability for e in inconsistency.explanations] == pytest.approx([0.5, 0.5], abs=0.01)
 
 
 def test_the_odds_at_which_a_closure_was_accepted_speak_for_it():
-    account = drive_with((80, 6, 0, FALSE), (81, 7, 1, (-2.2, 0.0, 0.0)))
-    closures = (account.closures[0], replace(account.closures[1], log_odds=10.0))
-    doubt = doubt_of(replace(account, closures=closures), 81)
-    assert [[c.closure_id[0] for c in e.false_closures] for e in doubt.explanations] == [[80]]
+    path = drive_with((80, 6, 0, FALSE), (81, 7, 1, (-2.2, 0.0, 0.0)))
+    closures = (path.closures[0], replace(path.closures[1], log_odds=10.0))
+    inconsistency = find_inconsistency(replace(path, closures=closures), 81)
+    assert [[c.closure_id[0] for c in e.false_closures] for e in inconsistency.explanations] == [[80]]
 
 
 def test_closures_that_were_accepted_because_of_a_false_one_go_with_it_and_true_ones_stay():
     shifted = (80, 6, 0, FALSE), (81, 6, 1, FALSE), (82, 7, 2, FALSE)
-    account = drive_with((79, 3, 0, TRUE), *shifted, (90, 5, 3, TRUE), (91, 7, 4, TRUE))
-    doubt = doubt_of(account, 91)
-    best = doubt.explanations[0]
+    path = drive_with((79, 3, 0, TRUE), *shifted, (90, 5, 3, TRUE), (91, 7, 4, TRUE))
+    inconsistency = find_inconsistency(path, 91)
+    best = inconsistency.explanations[0]
     assert [c.closure_id[0] for c in best.false_closures] == [80, 81, 82]
     assert best.probability > 0.99
     assert [c.closure_id[0] for c in best.path.closures] == [79, 90, 91]
@@ -137,7 +137,7 @@ def joined():
         PathStep(43, 0, 1, ()),
         PathStep(50, 1, 4, ((1, 4),), frozenset({50})),
     )
-    return account_of(hybrid_map, history, [closure], 4)
+    return path_of(hybrid_map, history, [closure], 4)
 
 
 def in_frame_of(hybrid_map, *areas):
@@ -148,7 +148,7 @@ def in_frame_of(hybrid_map, *areas):
     return pose
 
 
-def test_what_was_stored_in_areas_that_were_entered_falsely_becomes_an_area_of_its_own():
+def test_keyframes_stored_after_a_false_closure_become_a_separate_area():
     before = joined()
     found = withdraw_closure(before, before.closures[0].closure_id, 9)
     hybrid_map = found.hybrid_map
@@ -198,7 +198,7 @@ def test_a_link_that_the_robot_never_crossed_is_only_taken_out():
     assert before.hybrid_map.arc(0, 6) is not None
 
 
-def test_what_a_refinement_moved_goes_back_and_what_was_stored_since_goes_with_it():
+def test_a_rollback_restores_moved_keyframes_and_moves_later_ones_along():
     hybrid_map, history = corridor(4)
     bent = np.array([0.3, 0.2, 0.05])
     closure = closed(hybrid_map, 40, 3, 0)
@@ -212,8 +212,8 @@ def test_what_a_refinement_moved_goes_back_and_what_was_stored_since_goes_with_i
     hybrid_map.set_keyframe(45, 4, np.zeros(3))
     hybrid_map.set_arc(3, 4, PoseGaussian(se2.compose(bent, reached), ODOMETRY), closure=False)
     history += (PathStep(40, 3, 3, ((0, 3),)), PathStep(45, 3, 4, ((3, 4),), frozenset({45})))
-    account = account_of(hybrid_map, history, [replace(closure, snapshot=undo)], 4)
-    found = undo_refinements(account, closure.closure_id)
+    path = path_of(hybrid_map, history, [replace(closure, snapshot=undo)], 4)
+    found = undo_refinements(path, closure.closure_id)
     placed = found.hybrid_map.keyframes(3)
     for k in (30, 31):
         np.testing.assert_array_equal(placed[k], former[k][1])
@@ -221,15 +221,15 @@ def test_what_a_refinement_moved_goes_back_and_what_was_stored_since_goes_with_i
     np.testing.assert_allclose(found.hybrid_map.arc(3, 4).mean, reached, atol=1e-12)
     np.testing.assert_array_equal(found.hybrid_map.arc(2, 3).mean, NEXT)
     assert found.closures[0].snapshot is None
-    at_home = undo_refinements(replace(account, area=3, pose=se2.compose(bent, stored)), closure.closure_id)
+    at_home = undo_refinements(replace(path, area=3, pose=se2.compose(bent, stored)), closure.closure_id)
     np.testing.assert_allclose(at_home.pose, stored, atol=1e-12)
     np.testing.assert_allclose(at_home.frame_change, se2.inverse(bent), atol=1e-12)
 
 
 def test_an_area_that_became_part_of_another_is_that_one_in_the_account():
     """Areas 3 and 6 are one; the false closure of areas 7 and 1 can be withdrawn as before, that of 3 and 6 cannot."""
-    account = drive_with((80, 6, 3, TRUE), (81, 7, 1, FALSE), (82, 6, 0, TRUE))
-    history, closures = apply_area_merge(account, AreaMerge(6, 3, account.hybrid_map.arc(3, 6)))
+    path = drive_with((80, 6, 3, TRUE), (81, 7, 1, FALSE), (82, 6, 0, TRUE))
+    history, closures = apply_area_merge(path, AreaMerge(6, 3, path.hybrid_map.arc(3, 6)))
     assert [(c.closure_id[0], c.near, c.far) for c in closures] == [(81, 7, 1), (82, 3, 0)]
     np.testing.assert_allclose(closures[1].pose.mean, around(3, 0), atol=1e-9)
     steps = [(step.event, step.area_before, step.area_after, step.new_arcs) for step in history]
@@ -241,8 +241,8 @@ def test_an_area_that_became_part_of_another_is_that_one_in_the_account():
         (81, 7, 7, ((1, 7),)),
         (82, 3, 3, ((0, 3),)),
     ]
-    history, closures = apply_area_merge(account, AreaMerge(6, 3, account.hybrid_map.arc(3, 6)))
-    hybrid_map = account.hybrid_map.branch()
+    history, closures = apply_area_merge(path, AreaMerge(6, 3, path.hybrid_map.arc(3, 6)))
+    hybrid_map = path.hybrid_map.branch()
     hybrid_map.merge(6, 3, hybrid_map.arc(3, 6))
     found = withdraw_closure(AcceptedPath(hybrid_map, history, closures, 7, np.zeros(3)), closures[0].closure_id, 100)
     assert found.hybrid_map.arc(1, 7) is None
@@ -252,12 +252,12 @@ def test_an_area_that_became_part_of_another_is_that_one_in_the_account():
 
 def test_a_closure_beside_which_another_observation_of_its_arc_is_fused_is_not_withdrawn():
     """Both 5 and 6 were found beside 0, and are then found to be one."""
-    account = drive_with((80, 6, 0, TRUE), (81, 5, 0, TRUE), (82, 6, 5, TRUE))
-    _, closures = apply_area_merge(account, AreaMerge(6, 5, account.hybrid_map.arc(5, 6)))
+    path = drive_with((80, 6, 0, TRUE), (81, 5, 0, TRUE), (82, 6, 5, TRUE))
+    _, closures = apply_area_merge(path, AreaMerge(6, 5, path.hybrid_map.arc(5, 6)))
     assert closures == ()
 
 
-def test_what_a_refinement_moved_goes_back_after_an_area_became_part_of_another():
+def test_a_rollback_after_a_merge():
     hybrid_map, history = corridor(4)
     bent = np.array([0.3, 0.2, 0.05])
     former = {k: (k // 10, hybrid_map.keyframes(k // 10)[k].copy()) for k in (20, 21, 30, 31)}
@@ -265,8 +265,8 @@ def test_what_a_refinement_moved_goes_back_after_an_area_became_part_of_another(
         hybrid_map.set_keyframe(k, area, se2.compose(bent, pose))
     arcs = {pair: hybrid_map.arc_value(*pair) for pair in ((1, 2), (2, 3))}
     closure = replace(closed(hybrid_map, 40, 2, 0), snapshot=MapSnapshot(former, arcs))
-    account = account_of(hybrid_map, history, [closure], 2)
-    history, closures = apply_area_merge(account, AreaMerge(3, 2, account.hybrid_map.arc(2, 3)))
+    path = path_of(hybrid_map, history, [closure], 2)
+    history, closures = apply_area_merge(path, AreaMerge(3, 2, path.hybrid_map.arc(2, 3)))
     assert set(closures[0].snapshot.keyframes) == {20, 21}
     assert set(closures[0].snapshot.arcs) == {(1, 2)}
     hybrid_map.merge(3, 2, hybrid_map.arc(2, 3))
@@ -302,7 +302,7 @@ def test_tsbi_goes_on_with_the_explanations_as_live_hypotheses():
     assert sorted(r.keyframe for r in one.moved_keyframes) == [5, 6, 7, 8]
     assert sorted(run.replica.maps[one.id].keyframes(0)) == list(range(9))
     assert one.local_areas[0].area == 0
-    assert [leaf.removed_arcs for leaf in run.keyframe(ring_drive(10)[9]).hypotheses] == [(), ()]
+    assert [hypothesis.removed_arcs for hypothesis in run.keyframe(ring_drive(10)[9]).hypotheses] == [(), ()]
 
 
 LOG = "sim:ring,seed=3,size=1.5"
@@ -325,9 +325,9 @@ def test_a_closure_that_was_accepted_falsely_is_withdrawn_when_the_true_one_come
     (without_it, _), (with_it, _) = drives
     accepted = {row.keyframe: row for row in with_it.probabilities if row.accepted}
     assert min(k for k, row in accepted.items() if row.closures) < 80  # definite, long before the true one
-    (told,) = [notice.text for notice in with_it.notices if notice.process == "tlca"]
-    assert "closure between areas 0 and 4 contradicts" in told
-    assert "of all closures 2-0 is taken for false" in told
+    (text,) = [notice.text for notice in with_it.notices if notice.process == "tlca"]
+    assert "closure between areas 0 and 4 contradicts" in text
+    assert "of all closures 2-0 is taken for false" in text
     assert arcs(with_it) == arcs(without_it)
     assert with_it.hybrid_map.arc(0, 2) is None
     assert with_it.replica.probabilities[with_it.replica.best_hypothesis] == 1.0

@@ -16,7 +16,7 @@ def test_the_first_area_lies_at_the_origin_of_the_map_with_hardly_any_uncertaint
     assert 0.0 < np.trace(poses_of(verdict)[0].covariance) < 1e-6
 
 
-def test_nothing_is_said_where_nothing_changed():
+def test_without_changes_no_poses_are_published():
     play = Play()
     play.start()
     verdict = play.step(places=[(0, 0, [0.5, 0.0, 0.0])])
@@ -48,7 +48,7 @@ def test_a_dominant_path_is_accepted_after_enough_keyframes_since_the_paths_part
     assert [play.step(*both()).hypothesis for _ in range(2)] == [None, 1]
 
 
-def test_a_dominant_path_is_accepted_after_enough_metres_since_the_paths_parted():
+def test_a_dominant_path_is_accepted_after_enough_meters_since_the_paths_parted():
     play = Play(accept_keyframes=1, accept_distance=2.0)
     assert parted(play).hypothesis is None  # parted at 0.5 m
     assert [play.step(*both(), travelled=t).hypothesis for t in (1.0, 2.4, 2.5)] == [None, None, 1]
@@ -77,7 +77,7 @@ def test_branching_again_starts_the_count_anew():
         Hypothesis(2, 2, 0.02, 1),
     )
     rest = (Hypothesis(3, 3, 0.92, 2), Hypothesis(4, 4, 0.06, 2), Hypothesis(2, 2, 0.02, 1))
-    assert [play.step(*leaves).hypothesis for leaves in (again, rest, rest)] == [None, None, 3]
+    assert [play.step(*hypotheses).hypothesis for hypotheses in (again, rest, rest)] == [None, None, 3]
 
 
 def test_after_acceptance_only_the_accepted_hypothesis_goes_on():

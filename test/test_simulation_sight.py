@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import yaml
 
-from hmt_slam_ros.area_abstraction.overlap import overlaps, sensed_points
+from hmt_slam_ros.area_abstraction.overlap_graph import overlaps, sensed_points
 from hmt_slam_ros.open_log import open_log
 from hmt_slam_ros.simulation.laser import Laser, wall_index
 from hmt_slam_ros.simulation.settings import Settings

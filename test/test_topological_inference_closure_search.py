@@ -7,7 +7,7 @@ from benchmark.lattice import Lattice, LatticeScans
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map import surroundings
-from hmt_slam_ros.topological_inference.admission import Query
+from hmt_slam_ros.topological_inference.candidate_gating import Query
 from hmt_slam_ros.topological_inference.closure_search import ClosureSearch
 
 HERE = 210  # in the middle of the lattice
@@ -43,18 +43,18 @@ def test_their_maps_are_made_ahead_one_at_a_time(lattice, monkeypatch):
     build = surroundings.build_area_grid
     monkeypatch.setattr(surroundings, "build_area_grid", lambda *args: built.append(len(args[0])) or build(*args))
 
-    def maps_of(looks):
-        """How many maps a comparison needs after some looks ahead from one before it, and what it finds."""
+    def maps_of(count):
+        """Number of grids that a comparison builds after ``count`` calls to look ahead, and its result."""
         search = ClosureSearch(Configuration(), LatticeScans())
         excluded = {HERE}
-        asked = query(lattice)
-        search.compare(lattice, HERE, asked, dict.fromkeys(range(400), asked.poses), excluded, 8)
-        for _ in range(looks):
+        keyframes = query(lattice)
+        search.compare(lattice, HERE, keyframes, dict.fromkeys(range(400), keyframes.poses), excluded, 8)
+        for _ in range(count):
             before = len(built)
             search.look_ahead(lattice)
             assert len(built) - before <= 1
         before = len(built)
-        found = search.compare(lattice, HERE, asked, {}, excluded, 8)
+        found = search.compare(lattice, HERE, keyframes, {}, excluded, 8)
         return len(built) - before, [fit.log_weight for fit in found.fits]
 
     without, plain = maps_of(0)

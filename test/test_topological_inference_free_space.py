@@ -1,4 +1,4 @@
-"""Keyframes of one room beside those of another: walls that either sees through tell whether they are the same."""
+"""Keyframes of one room beside those of another: violations of free space show whether they are the same."""
 
 import numpy as np
 import pytest

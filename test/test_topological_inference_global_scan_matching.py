@@ -1,4 +1,4 @@
-"""Keyframes of which the arcs tell nothing are laid into the whole map, at any pose."""
+"""Keyframes are matched into the whole map, at any pose."""
 
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ def seen(walls, pose, keyframe):
 
 
 @pytest.fixture
-def asked():
+def query():
     """Keyframes 0 to 11 in two rooms, areas 0 and 1, and 12 to 15 in the first of them."""
     hybrid_map, scans = HybridMap(), {}
     for area, walls in enumerate((ROOM, OTHER)):
@@ -35,102 +35,102 @@ def asked():
     return hybrid_map, poses, scans
 
 
-def whole_map(scans):
-    views = GridCache(scans, GridModel(), Neighborhood(0.3, REACH))
-    return GlobalScanMatcher(views, FreeSpaceCheck(scans, Configuration()), MatchSettings(temper=0.3), 2.0, REACH)
+def make_matcher(scans):
+    grid_cache = GridCache(scans, GridModel(), Neighborhood(0.3, REACH))
+    return GlobalScanMatcher(grid_cache, FreeSpaceCheck(scans, Configuration()), MatchSettings(temper=0.3), 2.0, REACH)
 
 
 @pytest.fixture
-def laid(asked):
-    """Lays the keyframes of ``asked`` into areas of the map."""
-    hybrid_map, poses, scans = asked
-    whole = whole_map(scans)
-    return lambda areas: whole.match_regions(hybrid_map, poses, 1000, dict.fromkeys(areas, 1.0 / len(areas)))
+def match(query):
+    """Matches the keyframes of ``query`` into areas of the map."""
+    hybrid_map, poses, scans = query
+    matcher = make_matcher(scans)
+    return lambda areas: matcher.match_regions(hybrid_map, poses, 1000, dict.fromkeys(areas, 1.0 / len(areas)))
 
 
-def off(fit):
-    away = se2.between(se2.between(PATH[0], ASKED[0]), fit.mode.pose.mean)
-    return np.hypot(away[0], away[1])
+def position_error(fit):
+    difference = se2.between(se2.between(PATH[0], ASKED[0]), fit.mode.pose.mean)
+    return np.hypot(difference[0], difference[1])
 
 
-def test_a_room_is_recognised_from_anywhere_in_it(laid):
-    best = max(laid([0, 1]), key=lambda fit: fit.mode.log_mass)
+def test_a_room_is_recognized_from_anywhere_in_it(match):
+    best = max(match([0, 1]), key=lambda fit: fit.mode.log_mass)
     assert best.area == 0
-    assert off(best) < 0.05
+    assert position_error(best) < 0.05
     assert abs(se2.between(se2.between(PATH[0], ASKED[0]), best.mode.pose.mean)[2]) < 0.02
 
 
-def test_what_came_after_is_no_part_of_the_map(asked):
-    hybrid_map, poses, scans = asked
-    whole = whole_map(scans)
-    assert whole.match_regions(hybrid_map, poses, 0, {0: 1.0}) == []
+def test_later_keyframes_are_no_part_of_the_map(query):
+    hybrid_map, poses, scans = query
+    matcher = make_matcher(scans)
+    assert matcher.match_regions(hybrid_map, poses, 0, {0: 1.0}) == []
     for keyframe, pose in poses.items():
         hybrid_map.set_keyframe(keyframe, 2, pose)
-    assert {fit.area for fit in whole.match_regions(hybrid_map, poses, 12, {0: 0.5, 2: 0.5})} == {0}
+    assert {fit.area for fit in matcher.match_regions(hybrid_map, poses, 12, {0: 0.5, 2: 0.5})} == {0}
 
 
-def test_a_room_in_which_the_map_has_traces_of_people_is_recognised(asked, laid):
+def test_a_room_is_recognized_despite_traces_of_people_in_its_map(query, match):
     """They stand where the robot sees free space, which is no sign of another place."""
-    hybrid_map, _, scans = asked
+    hybrid_map, _, scans = query
     crowd = np.concatenate([box(x, y, x + 0.3, y + 0.3) for x in (0.8, 2.2, 4.3) for y in (0.9, 2.0, 3.4)])
     walls = np.concatenate((ROOM, crowd))
     for k, pose in enumerate(PATH):
         scans[20 + k] = seen(walls, pose, 20 + k)
         hybrid_map.set_keyframe(20 + k, 0, se2.between(PATH[0], pose))
-    best = max(laid([0, 1]), key=lambda fit: fit.mode.log_mass)
+    best = max(match([0, 1]), key=lambda fit: fit.mode.log_mass)
     assert best.area == 0
-    assert off(best) < 0.1
+    assert position_error(best) < 0.1
 
 
-def test_who_walks_through_what_the_robot_sees_speaks_against_no_place(asked, laid):
+def test_people_in_the_scans_do_not_count_against_a_place(query, match):
     """Two people stand elsewhere at every keyframe, where the others see through."""
-    _, poses, scans = asked
+    _, poses, scans = query
     for n, keyframe in enumerate(poses):
         people = [box(x, y, x + 0.4, y + 0.4) for x, y in ((0.6 + 1.1 * n, 0.6), (4.6 - 1.0 * n, 1.2))]
         scans[keyframe] = seen(np.concatenate((ROOM, *people)), ASKED[n], keyframe)
-    best = max(laid([0, 1]), key=lambda fit: fit.mode.log_mass)
+    best = max(match([0, 1]), key=lambda fit: fit.mode.log_mass)
     assert best.area == 0
-    assert off(best) < 0.05
+    assert position_error(best) < 0.05
     assert best.agreement.in_free_space <= 1
 
 
-def test_all_areas_are_looked_at_however_many_there_are(asked, laid):
-    hybrid_map, _, scans = asked
+def test_all_of_many_areas_are_searched(query, match):
+    hybrid_map, _, scans = query
     for area in range(2, 24):
         for k, pose in enumerate(PATH):
             keyframe = 100 + 6 * area + k
             scans[keyframe] = seen(OTHER, pose, keyframe)
             hybrid_map.set_keyframe(keyframe, area, se2.between(PATH[0], pose))
-    assert max(laid(range(24)), key=lambda fit: fit.mode.log_mass).area == 0
+    assert max(match(range(24)), key=lambda fit: fit.mode.log_mass).area == 0
 
 
-def test_walls_tell_where_keyframes_lie(asked, laid):
-    """As they were found, no wall is seen through; half a metre aside, the robot would see through some."""
-    hybrid_map, poses, scans = asked
-    best = max(laid([0]), key=lambda fit: fit.mode.log_mass)
-    found = whole_map(scans).check_walls(hybrid_map, best, poses, 1000)
+def test_wrong_poses_violate_walls(query, match):
+    """At the pose found, no beam passes a wall; half a meter aside, some would."""
+    hybrid_map, poses, scans = query
+    best = max(match([0]), key=lambda fit: fit.mode.log_mass)
+    found = make_matcher(scans).check_walls(hybrid_map, best, poses, 1000)
     assert found.on_surface > 100
     assert found.in_free_space == 0
     aside = PoseGaussian(best.mode.pose.mean + np.array([0.5, 0.5, 0.0]), best.mode.pose.covariance)
     moved = best._replace(mode=best.mode._replace(pose=aside))
-    assert whole_map(scans).check_walls(hybrid_map, moved, poses, 1000).in_free_space > 20
-    assert whole_map(scans).check_walls(hybrid_map, best, poses, 0).samples == 0
+    assert make_matcher(scans).check_walls(hybrid_map, moved, poses, 1000).in_free_space > 20
+    assert make_matcher(scans).check_walls(hybrid_map, best, poses, 0).samples == 0
 
 
-def test_none_but_the_areas_asked_for_are_looked_at(laid):
-    assert {fit.area for fit in laid([1])} <= {1}
-    assert {fit.area for fit in laid([0])} == {0}
+def test_only_the_given_areas_are_searched(match):
+    assert {fit.area for fit in match([1])} <= {1}
+    assert {fit.area for fit in match([0])} == {0}
 
 
-def test_a_fit_is_told_in_the_frame_of_its_area_wherever_that_lies_in_its_region(asked, laid):
-    hybrid_map, _, scans = asked
+def test_a_candidate_is_in_the_frame_of_its_area_anywhere_in_its_region(query, match):
+    hybrid_map, _, scans = query
     for k, pose in enumerate(PATH):
         scans[30 + k] = seen(ROOM, pose, 30 + k)
         hybrid_map.set_keyframe(30 + k, 2, se2.between(PATH[0], pose))
     hybrid_map.set_arc(1, 2, PoseGaussian(np.array([1.0, -5.5, 2.0]), 1e-4 * np.eye(3)), closure=False)
-    found = laid([2])
+    found = match([2])
     assert {fit.area for fit in found} == {2}
-    assert off(max(found, key=lambda fit: fit.mode.log_mass)) < 0.05
+    assert position_error(max(found, key=lambda fit: fit.mode.log_mass)) < 0.05
 
 
 @pytest.mark.parametrize(("deviation", "count"), [(0.05, 2), (3.0, 6)])

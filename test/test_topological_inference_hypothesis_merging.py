@@ -1,4 +1,4 @@
-"""Hypotheses that say the same are told from those that do not."""
+"""Equivalent hypotheses are told apart from others."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,7 @@ import pytest
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
-from hmt_slam_ros.topological_inference.hypothesis_merging import LocalizedHypothesis, merge_equivalent
+from hmt_slam_ros.topological_inference.hypothesis_tree import LocalizedHypothesis, merge_equivalent
 
 SHARP, VAGUE = np.diag([0.05, 0.05, 0.01]) ** 2, np.diag([2.0, 2.0, 0.2]) ** 2
 STEP = np.array([10.0, 0.0, 0.0])
@@ -36,9 +36,9 @@ def in_next_area(pose):
     return se2.between(STEP, pose)
 
 
-def with_sharp_arc(claim):
-    claim.hybrid_map.set_arc(0, 1, PoseGaussian(STEP, SHARP), closure=False)
-    return claim
+def with_sharp_arc(hypothesis):
+    hypothesis.hybrid_map.set_arc(0, 1, PoseGaussian(STEP, SHARP), closure=False)
+    return hypothesis
 
 
 def test_the_same_place_entered_by_one_area_or_by_the_next_is_one_claim():
@@ -56,15 +56,15 @@ def test_modes_that_part_by_less_than_is_mended_are_one_claim(offset, same):
 
 def test_known_ground_is_a_claim_of_its_own():
     tracked = LocalizedHypothesis(chain(), 0, POSE, {0})
-    recognised = entered(0, POSE)
-    assert not tracked.is_equivalent(recognised)
-    assert not recognised.is_equivalent(tracked)
+    recognized = entered(0, POSE)
+    assert not tracked.is_equivalent(recognized)
+    assert not recognized.is_equivalent(tracked)
 
 
-def with_another_loop(claim, covariance=SHARP):
-    """The same, and the robot's area is said to lie beside area 2 as well."""
-    claim.hybrid_map.set_arc(claim.area, 2, PoseGaussian(2.0 * STEP, covariance), closure=True)
-    return claim
+def with_another_loop(hypothesis, covariance=SHARP):
+    """The same with an arc from the robot's area to area 2."""
+    hypothesis.hybrid_map.set_arc(hypothesis.area, 2, PoseGaussian(2.0 * STEP, covariance), closure=True)
+    return hypothesis
 
 
 @pytest.mark.parametrize("covariance", [SHARP, 100.0 * SHARP])
@@ -76,20 +76,20 @@ def test_a_further_loop_is_a_claim_of_its_own(covariance):
 
 def test_a_loop_that_one_hypothesis_closes_by_two_arcs_and_one_by_the_second_is_one_claim():
     direct, around = entered(0, POSE), with_another_loop(entered(0, POSE))
-    for claim in (direct, around):
-        claim.hybrid_map.set_arc(0, 1, PoseGaussian(STEP, SHARP), closure=False)
-        claim.hybrid_map.set_arc(1, 2, PoseGaussian(STEP, SHARP), closure=False)
+    for hypothesis in (direct, around):
+        hypothesis.hybrid_map.set_arc(0, 1, PoseGaussian(STEP, SHARP), closure=False)
+        hypothesis.hybrid_map.set_arc(1, 2, PoseGaussian(STEP, SHARP), closure=False)
     assert direct.is_equivalent(around)
     assert around.is_equivalent(direct)
 
 
-def test_what_a_hypothesis_is_uncertain_of_it_does_not_claim():
+def test_uncertain_poses_imply_no_closure():
     assert not entered(0, POSE).is_equivalent(entered(1, in_next_area(POSE)))
 
 
 def test_the_heaviest_stands_for_all_that_say_the_same():
-    claims = [entered(0, POSE), entered(1, POSE), entered(0, POSE + 0.01)]
+    hypotheses = [entered(0, POSE), entered(1, POSE), entered(0, POSE + 0.01)]
     weights = np.log([0.2, 0.3, 0.5])
-    found = merge_equivalent(claims, weights)
+    found = merge_equivalent(hypotheses, weights)
     assert list(found) == [2, 1]
     np.testing.assert_allclose(np.exp(list(found.values())), [0.7, 0.3])

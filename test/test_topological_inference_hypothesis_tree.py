@@ -1,4 +1,4 @@
-"""Weights of the leaves and what is remembered of them."""
+"""Weights and states of hypotheses."""
 
 import math
 from dataclasses import replace
@@ -24,7 +24,7 @@ def settled(weights, skipped=0.0, unexamined=0.0, most=16, least=1e-6):
     return normalize_and_reduce(logs, log_skipped, unexamined, most, least, random_stream(0, Purpose.HYPOTHESES, 0))
 
 
-def test_weights_are_normalised():
+def test_weights_are_normalized():
     assert settled([2.0, 6.0]).probabilities.tolist() == pytest.approx([0.25, 0.75])
 
 
@@ -35,19 +35,19 @@ def test_hopelessly_small_weights_do_not_underflow():
     assert found.probabilities.tolist() == pytest.approx([1.0 / (1.0 + math.exp(-1.0)), 1.0 / (1.0 + math.e)])
 
 
-def test_what_was_skipped_keeps_its_mass():
+def test_skipped_weight_keeps_its_mass():
     found = settled([3.0, 6.0], skipped=1.0)
     assert found.unexamined == pytest.approx(0.1)
     assert found.probabilities.sum() == pytest.approx(0.9)
 
 
-def test_what_was_not_examined_earlier_keeps_its_share():
+def test_unexamined_probability_keeps_its_share():
     found = settled([1.0, 1.0], unexamined=0.2)
     assert found.probabilities.tolist() == pytest.approx([0.4, 0.4])
     assert found.unexamined == pytest.approx(0.2)
 
 
-def test_what_is_dropped_is_counted_as_unexamined():
+def test_dropped_probability_counts_as_unexamined():
     found = settled([1.0, 1e-3], least=0.01)
     assert found.indices.tolist() == [0]
     assert found.unexamined == pytest.approx(1e-3, rel=0.01)
@@ -63,7 +63,7 @@ def test_the_reduction_keeps_the_total():
     assert found.probabilities.sum() == pytest.approx(1.0)
 
 
-def test_the_drift_beyond_the_reference_is_what_the_chain_added():
+def test_the_relative_covariance_is_that_of_the_chain_since_the_reference():
     reference = PoseGaussian(np.array([3.0, 1.0, 0.4]), np.diag([0.04, 0.02, 0.01]))
     step = PoseGaussian(np.array([2.0, -0.5, 0.3]), np.diag([0.003, 0.001, 0.0004]))
     whole = reference.compose(step)
@@ -71,21 +71,21 @@ def test_the_drift_beyond_the_reference_is_what_the_chain_added():
     assert np.allclose(found, step.covariance)
 
 
-def test_a_keyframe_that_is_better_known_than_the_reference_leaves_the_floor():
+def test_a_keyframe_more_certain_than_the_reference_has_the_floor():
     floor = np.diag([1e-4, 1e-4, 1e-5])
     found = relative_covariance(np.eye(3) * 1e-3, np.eye(3) * 1e-2, np.zeros(3), floor)
     assert np.allclose(found, floor)
 
 
 def test_entering_an_area_keeps_the_notes_of_the_keyframes_that_came_along():
-    notes = HypothesisState().after_keyframe(4, np.eye(3)).after_keyframe(5, np.eye(3)).after_matching([9], [4, 5])
-    entered = notes.after_area_change({5: 2.0 * np.eye(3)})
+    state = HypothesisState().after_keyframe(4, np.eye(3)).after_keyframe(5, np.eye(3)).after_matching([9], [4, 5])
+    entered = state.after_area_change({5: 2.0 * np.eye(3)})
     assert entered.matched_keyframes == {9: {5}}
     assert entered.covariances.keys() == {5}
     assert entered.unmatched_keyframes == ()
 
 
-def test_entering_an_area_a_lost_robot_stays_lost_and_a_tracked_one_is_no_more_where_it_was_recognized():
+def test_an_area_change_keeps_a_lost_state_and_ends_a_relocalized_area():
     lost = Lost(7, counted_evidence=2.0)
     assert HypothesisState(localization=lost).after_area_change({}).localization is lost
     entered = HypothesisState(localization=Tracking(3)).after_area_change({})
@@ -94,11 +94,11 @@ def test_entering_an_area_a_lost_robot_stays_lost_and_a_tracked_one_is_no_more_w
 
 
 def test_areas_beside_which_keyframes_fitted_are_remembered_until_the_next_comparison():
-    notes = HypothesisState(unmatched_keyframes=(3, 4, 5, 6, 7)).after_matching([1], [3, 4, 5, 6, 7], (2,))
-    assert (notes.unmatched_keyframes, notes.pending_candidates) == ((), (2,))
-    assert notes.matched_keyframes == {1: {3, 4, 5, 6, 7}}
-    soon = replace(notes, unmatched_keyframes=(8, 9)).after_matching([2], [5, 6, 7, 8, 9], all_areas=False)
-    assert (soon.unmatched_keyframes, soon.pending_candidates) == ((8, 9), ())
+    state = HypothesisState(unmatched_keyframes=(3, 4, 5, 6, 7)).after_matching([1], [3, 4, 5, 6, 7], (2,))
+    assert (state.unmatched_keyframes, state.pending_candidates) == ((), (2,))
+    assert state.matched_keyframes == {1: {3, 4, 5, 6, 7}}
+    later = replace(state, unmatched_keyframes=(8, 9)).after_matching([2], [5, 6, 7, 8, 9], all_areas=False)
+    assert (later.unmatched_keyframes, later.pending_candidates) == ((8, 9), ())
 
 
 def test_notes_are_values():

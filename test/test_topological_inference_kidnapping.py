@@ -1,4 +1,4 @@
-"""A robot that was displaced without notice is lost from then on, as far as its scans contradict that it was not."""
+"""Kidnapping: a hypothesis is spawned, or lost, as far as the scans contradict the tracked pose."""
 
 import math
 from dataclasses import replace
@@ -18,8 +18,11 @@ from hmt_slam_ros.messages.messages import AreaEvents, Keyframe, PrunedKeyframe
 from hmt_slam_ros.topological_inference import relocalization
 from hmt_slam_ros.topological_inference.global_localization import PoseDistribution
 from hmt_slam_ros.topological_inference.hypothesis_tree import FalseAlarm, HypothesisState, Lost, PoseInArea, Tracking
-from hmt_slam_ros.topological_inference.kidnapping import decide_without_mapping, spawn_kidnapped_hypothesis
-from hmt_slam_ros.topological_inference.relocalization import KIDNAPPED_UNMAPPED_PRIOR
+from hmt_slam_ros.topological_inference.relocalization import (
+    KIDNAPPED_UNMAPPED_PRIOR,
+    decide_without_mapping,
+    spawn_kidnapped_hypothesis,
+)
 from hmt_slam_ros.topological_inference.tsbi import Tsbi
 
 FAR, HERE = (30.0, 20.0), (0.0, 0.0)
@@ -33,18 +36,18 @@ NOWHERE = np.concatenate((box(-1.0, 1.0, 4.2, 6.5), box(2.6, 4.0, 3.6, 5.0)))
 HALL = np.concatenate((box(-3.0, 0.5, 9.0, 4.5), box(4.0, 3.0, 5.0, 4.0)))
 
 
-def asked(rooms, doubts, first=FAR, hall=2):
-    """What comes of doubts in the last room, {keyframe of it: nats}; arcs have the others far off but the first.
+def spawned(rooms, evidence, first=FAR, hall=2):
+    """The children after CUSUM increments in the last room, {keyframe of it: nats}; rooms but the first are far.
 
-    The robot was carried there from a hall, in which it stored ``hall`` keyframes.
+    The robot was kidnapped there from a hall, in which it stored ``hall`` keyframes.
     """
     parent, branching, newest = rooms_apart(rooms, [first, *[FAR] * (len(rooms) - 2)], 0.1)
     for k, keyframe in enumerate(newest[:hall]):
         branching._replica.scans[keyframe] = scan_in(
             HALL, PATH[k], noise=0.01, seed=keyframe, field_of_view=2 * np.pi, beams=361
         )
-    notes = replace(parent.state, kidnapping_evidence={newest[n]: nats for n, nats in doubts.items()})
-    return spawn_kidnapped_hypothesis(branching, replace(parent, state=notes))
+    state = replace(parent.state, kidnapping_evidence={newest[n]: nats for n, nats in evidence.items()})
+    return spawn_kidnapped_hypothesis(branching, replace(parent, state=state))
 
 
 def since(child):
@@ -52,8 +55,8 @@ def since(child):
     return child.state.localization.since if child.state.is_lost else None
 
 
-def test_the_keyframes_since_then_begin_an_area_of_which_nothing_tells_where_it_is():
-    stays, lost = asked((ROOM, OTHER, ROOM), {2: 8.0}).children
+def test_the_keyframes_since_then_begin_an_area_with_an_uninformative_arc():
+    stays, lost = spawned((ROOM, OTHER, ROOM), {2: 8.0}).children
     assert (stays.area, stays.log_weight, stays.moved_keyframes) == (2, 0.0, ())
     assert lost.area == 3
     assert lost.state.localization.since == 14
@@ -68,30 +71,30 @@ def test_the_keyframes_since_then_begin_an_area_of_which_nothing_tells_where_it_
     assert not lost.state.kidnapping_evidence
 
 
-def test_that_the_place_is_known_elsewhere_speaks_for_it_and_one_look_has_found_it():
-    _, lost = asked((ROOM, OTHER, ROOM), {2: 8.0}).children
+def test_a_match_elsewhere_is_evidence_for_it_and_the_first_candidate():
+    _, lost = spawned((ROOM, OTHER, ROOM), {2: 8.0}).children
     assert lost.log_weight > PRIOR + 8.0 + 1.0
     assert lost.state.localization.counted_evidence == pytest.approx(lost.log_weight - PRIOR - 8.0)
     assert lost.state.localization.candidate.area == 0
     np.testing.assert_allclose(lost.state.localization.candidate.pose, se2.between(PATH[0], PATH[5]), atol=0.05)
 
 
-def test_it_is_believed_to_be_where_two_looks_find_it():
+def test_two_searches_with_the_same_result_relocalize_it():
     parent, branching, newest = rooms_apart((ROOM, OTHER, ROOM), [FAR, FAR], 0.1)
     lost = Lost(newest[0], tracked_pose=PoseInArea(2, newest[0], np.zeros(3)), counted_evidence=None)
-    notes = replace(parent.state, localization=lost)
-    (still,) = relocalization.update_relocalization(branching, replace(parent, state=notes)).children
+    state = replace(parent.state, localization=lost)
+    (still,) = relocalization.update_relocalization(branching, replace(parent, state=state)).children
     assert still.state.localization.candidate.area == 0
-    looked = relocalization.update_relocalization(branching, replace(parent, state=still.state))
-    _, found = looked.children
-    assert relocalization.accept_relocalization(looked).children == [found]
+    branches = relocalization.update_relocalization(branching, replace(parent, state=still.state))
+    _, found = branches.children
+    assert relocalization.accept_relocalization(branches).children == [found]
     assert isinstance(found.state.localization, Tracking)
     assert found.state.localization.relocalized_area == 0
     assert (found.arcs[0].source, found.arcs[0].target) == (2, 0)
 
 
 @pytest.mark.parametrize(("mapping", "area"), [(True, 1), (False, 0)])
-def test_where_nothing_is_stored_it_goes_over_into_the_area_where_it_was_recognized(mapping, area):
+def test_without_mapping_it_moves_to_the_area_of_its_relocalization(mapping, area):
     """Of what it mapped while it was lost one place alone is joined to the map."""
     run, poses = Run(RING), ring_drive(8)
     for pose in poses[:-1]:
@@ -99,77 +102,79 @@ def test_where_nothing_is_stored_it_goes_over_into_the_area_where_it_was_recogni
     run.keyframe(poses[-1], cut=3)
     found = replace(run.tsbi.state.hypothesis_states[0], localization=Tracking(0))
     run.tsbi._state = replace(run.tsbi._state, hypothesis_states={0: found})
-    (leaf,) = run.keyframe(poses[-1], mapping=mapping).hypotheses
-    assert leaf.area == area
+    (hypothesis,) = run.keyframe(poses[-1], mapping=mapping).hypotheses
+    assert hypothesis.area == area
     assert run.tsbi.state.hypothesis_states[0].localization.relocalized_area is None
 
 
-def test_on_ground_that_nobody_knows_the_doubts_alone_speak_for_it():
-    _, lost = asked((OTHER, OTHER, ROOM), {2: 8.0}).children
+def test_on_unmapped_ground_only_the_cusum_statistic_counts():
+    _, lost = spawned((OTHER, OTHER, ROOM), {2: 8.0}).children
     assert lost.log_weight == pytest.approx(PRIOR + 8.0 + math.log(KIDNAPPED_UNMAPPED_PRIOR), abs=0.5)
     assert lost.state.localization.candidate is None
 
 
-def test_that_the_place_is_known_where_the_robot_would_be_anyway_speaks_against_it():
-    _, lost = asked((ROOM, OTHER, ROOM), {2: 8.0}, HERE, hall=0).children
+def test_a_match_at_the_tracked_pose_is_evidence_against_it():
+    _, lost = spawned((ROOM, OTHER, ROOM), {2: 8.0}, HERE, hall=0).children
     assert lost.log_weight < PRIOR + 8.0 - 2.0
 
 
 @pytest.mark.parametrize(
-    "doubts",
+    "evidence",
     [{}, {2: 1.0}, {4: 12.0}],
     ids=["sure", "hardly doubtful", "just now, and two keyframes are too few"],
 )
-def test_a_robot_that_is_hardly_displaced_is_not_asked_about(doubts):
-    assert asked((ROOM, OTHER, ROOM), doubts) is None
+def test_an_improbable_kidnapping_spawns_no_hypothesis(evidence):
+    assert spawned((ROOM, OTHER, ROOM), evidence) is None
 
 
 def test_an_area_is_not_left_without_keyframes():
-    _, lost = asked((ROOM, OTHER, ROOM), {0: 8.0}).children
+    _, lost = spawned((ROOM, OTHER, ROOM), {0: 8.0}).children
     assert [r.keyframe for r in lost.moved_keyframes] == [13, 14, 15, 16, 17]
 
 
 @pytest.mark.parametrize(("nats", "lost"), [(11.0, None), (12.0, 18)])
-def test_where_nothing_is_stored_it_is_lost_from_the_next_keyframe_on_if_that_is_more_probable(nats, lost):
+def test_without_mapping_it_is_lost_from_the_next_keyframe_on_if_that_is_more_probable(nats, lost):
     parent, branching, _ = rooms_apart((ROOM,), [], 0.1)
-    spot = PoseInArea(0, 17, PATH[3])
-    doubtful = replace(parent, state=replace(parent.state, kidnapping_evidence={17: nats}, unstored_poses={17: spot}))
+    pose_in_area = PoseInArea(0, 17, PATH[3])
+    suspected = replace(
+        parent, state=replace(parent.state, kidnapping_evidence={17: nats}, unstored_poses={17: pose_in_area})
+    )
     branching.keep_scans(17, scan_in(OTHER, PATH[3], field_of_view=2 * np.pi, beams=361), {17})
-    child = decide_without_mapping(branching, doubtful, 17)
+    child = decide_without_mapping(branching, suspected, 17)
     assert since(child) == lost
     assert bool(child.state.kidnapping_evidence) == (lost is None)
     if lost is not None:
-        assert child.state.localization.false_alarm.tracked_pose is spot
+        assert child.state.localization.false_alarm.tracked_pose is pose_in_area
         assert child.state.localization.false_alarm.probability == pytest.approx(1.0 / (1.0 + math.exp(PRIOR + nats)))
 
 
 @pytest.mark.parametrize(
     ("world", "off", "lost"),
     [(MOVED, 0.0, None), (MOVED, 2.0, 16), (OTHER, 0.0, 16), (NOWHERE, 0.0, 16)],
-    ids=["furniture was moved", "farther on in the same room", "in another room", "on ground that nobody knows"],
+    ids=["furniture was moved", "farther on in the same room", "in another room", "on unmapped ground"],
 )
-def test_where_nothing_is_stored_it_is_lost_if_it_is_rather_in_another_place(world, off, lost):
+def test_without_mapping_it_is_lost_if_another_place_is_more_probable(world, off, lost):
     parent, branching, _ = rooms_apart((OTHER, BEFORE), [FAR], 0.1)
-    notes = parent.state
+    state = parent.state
     for event, pose in enumerate(PATH[:4], start=12):
         scan = scan_in(world, pose, noise=0.01, seed=event, field_of_view=2 * np.pi, beams=361)
         claimed = se2.between(PATH[0], pose) + np.array([off, 0.0, 0.0])
-        notes = notes.after_scan(event, 6.0, PoseInArea(1, event, claimed))
-        branching.keep_scans(event, scan, notes.unstored_poses)
-    child = decide_without_mapping(branching, replace(parent, state=notes), 15)
+        state = state.after_scan(event, 6.0, PoseInArea(1, event, claimed))
+        branching.keep_scans(event, scan, state.unstored_poses)
+    child = decide_without_mapping(branching, replace(parent, state=state), 15)
     assert since(child) == lost
     assert not child.state.kidnapping_evidence
     assert not child.state.unstored_poses
 
 
-@pytest.mark.parametrize(("lost", "stays"), [(11, True), (9, False)], ids=["takes itself for lost", "was carried"])
-def test_where_it_would_be_if_it_had_not_been_displaced_is_where_odometry_has_it_when_it_is_lost(lost, stays):
+@pytest.mark.parametrize(("lost", "stays"), [(11, True), (9, False)], ids=["false alarm", "was moved"])
+def test_the_false_alarm_is_at_the_odometry_pose_when_the_robot_is_lost(lost, stays):
     parent, branching, _ = rooms_apart((ROOM, OTHER), [FAR], 0.1)
     alarm = FalseAlarm(PoseInArea(1, 10, PATH[2]), 0.4)
-    notes = replace(parent.state, localization=Lost(lost, alarm))
+    state = replace(parent.state, localization=Lost(lost, alarm))
     scan = scan_in(ROOM, PATH[3], field_of_view=2 * np.pi, beams=361)
     keyframe = Keyframe(11, scan, 1.0, (), motion_unknown=True, mapping=False)
-    (child,) = relocalization.begin_relocalization(branching, replace(parent, state=notes), keyframe, PATH[3]).children
+    (child,) = relocalization.begin_relocalization(branching, replace(parent, state=state), keyframe, PATH[3]).children
     assert since(child) == 11
     if not stays:
         assert child.state.localization.false_alarm is None
@@ -183,37 +188,41 @@ def test_where_it_would_be_if_it_had_not_been_displaced_is_where_odometry_has_it
 
 
 @pytest.mark.parametrize(("at", "found"), [(0.0, True), (3.0, False)], ids=["there", "elsewhere"])
-def test_a_place_is_believed_sooner_where_it_would_be_if_it_had_not_been_displaced_and_later_elsewhere(at, found):
+def test_a_false_alarm_raises_the_probability_of_the_tracked_pose_only(at, found):
     parent, branching, newest = rooms_apart((ROOM, OTHER, ROOM), [FAR, FAR], 0.1)
-    looked = {}
+    branches = {}
     for probability in (0.0, 0.4):
         stay = FalseAlarm(PoseInArea(0, newest[0], np.array([at, 0.0, 0.0])), probability)
-        notes = replace(parent.state, localization=Lost(newest[0], stay))
-        where = relocalization.update_relocalization(branching, replace(parent, state=notes)).pose_distribution
-        looked[probability] = max(
-            p for p, fit in zip(where.probabilities, where.candidates, strict=True) if fit.area == 0
+        state = replace(parent.state, localization=Lost(newest[0], stay))
+        distribution = relocalization.update_relocalization(branching, replace(parent, state=state)).pose_distribution
+        branches[probability] = max(
+            p for p, fit in zip(distribution.probabilities, distribution.candidates, strict=True) if fit.area == 0
         )
-    assert (looked[0.4] > looked[0.0]) == found
+    assert (branches[0.4] > branches[0.0]) == found
 
 
-def test_who_says_where_it_is_knows_better_than_where_it_would_be_if_it_had_not_been_displaced():
+def test_an_initial_pose_replaces_the_false_alarm():
     parent, branching, newest = rooms_apart((ROOM, OTHER, ROOM), [FAR, FAR], 0.1)
     alarm = FalseAlarm(PoseInArea(1, newest[0], np.zeros(3)), 0.4)
-    notes = replace(parent.state, localization=Lost(newest[0], alarm))
-    told = InitialPose(0, PoseGaussian(se2.between(PATH[0], PATH[5]), np.diag([0.3, 0.3, 0.2]) ** 2))
+    state = replace(parent.state, localization=Lost(newest[0], alarm))
+    initial_pose = InitialPose(0, PoseGaussian(se2.between(PATH[0], PATH[5]), np.diag([0.3, 0.3, 0.2]) ** 2))
     pose = parent.hybrid_map.keyframes(2)[newest[-1]]
-    keyframe = Keyframe(newest[-1], branching._replica.scans[newest[-1]], 1.0, (), initial_pose=told, mapping=False)
-    looked = relocalization.begin_relocalization(branching, replace(parent, state=notes), keyframe, pose)
-    lost = [child.state.localization for child in looked.children if child.state.is_lost]
+    keyframe = Keyframe(
+        newest[-1], branching._replica.scans[newest[-1]], 1.0, (), initial_pose=initial_pose, mapping=False
+    )
+    branches = relocalization.begin_relocalization(branching, replace(parent, state=state), keyframe, pose)
+    lost = [child.state.localization for child in branches.children if child.state.is_lost]
     assert [one.false_alarm for one in lost] == [None]
 
 
-def test_a_robot_that_may_have_stayed_where_much_was_moved_is_nowhere_rather_than_in_a_like_place():
-    where = PoseDistribution((None, None), np.array([0.0, 0.9]))
-    stayed = where.with_false_alarm(np.array([True, False]), 0.5, 4)
-    # Of the displaced half, 0.2 on ground that nobody knows weighs 0.1 of it; the other half weighs as new ground.
+def test_a_false_alarm_keeps_a_similar_place_from_being_accepted():
+    distribution = PoseDistribution((None, None), np.array([0.0, 0.9]))
+    stayed = distribution.with_false_alarm(np.array([True, False]), 0.5, 4)
+    # Of the kidnapped half, unmapped ground of 0.2 weighs 0.1; the other half weighs as new ground.
     np.testing.assert_allclose(stayed.probabilities, [0.0, 0.9 / (0.9 + 0.1 + 0.1 / 0.2)], atol=1e-12)
-    assert where.with_false_alarm(np.array([True, False]), 0.0, 4).probabilities == pytest.approx(where.probabilities)
+    assert distribution.with_false_alarm(np.array([True, False]), 0.0, 4).probabilities == pytest.approx(
+        distribution.probabilities
+    )
     known = PoseDistribution((None, None), np.array([0.6, 0.3]))
     assert known.with_false_alarm(np.array([True, False]), 0.5, 4).probabilities[0] > 0.8
 
@@ -236,33 +245,33 @@ def test_scans_that_the_map_does_not_hold_are_remembered_as_long_as_they_are_dou
 
 
 def test_scans_that_contradict_add_up_and_are_remembered_in_the_next_area():
-    notes = HypothesisState().after_scan(5, -0.3).after_scan(6, 8.0).after_scan(7, 5.0).after_scan(8, 1.2)
-    odds, since = notes.kidnapping_test(1e-5)
+    state = HypothesisState().after_scan(5, -0.3).after_scan(6, 8.0).after_scan(7, 5.0).after_scan(8, 1.2)
+    odds, since = state.kidnapping_test(1e-5)
     assert since == 6
     assert odds == pytest.approx(PRIOR + 7.0 + 4.0 + 0.2)
-    assert notes.after_area_change({}).kidnapping_test(1e-5) == (odds, since)
+    assert state.after_area_change({}).kidnapping_test(1e-5) == (odds, since)
 
 
-def test_what_contradicts_at_every_keyframe_is_clutter():
-    notes = HypothesisState()
+def test_small_contradictions_at_every_keyframe_are_clutter():
+    state = HypothesisState()
     for event in range(20):
-        notes = notes.after_scan(event, 0.9)
-    assert not notes.kidnapping_evidence
-    assert notes.kidnapping_test(1e-5) == (-math.inf, 0)
+        state = state.after_scan(event, 0.9)
+    assert not state.kidnapping_evidence
+    assert state.kidnapping_test(1e-5) == (-math.inf, 0)
 
 
 def test_a_doubt_passes_with_scans_that_fit():
-    notes = HypothesisState().after_scan(5, 4.0)
+    state = HypothesisState().after_scan(5, 4.0)
     for event in range(6, 9):
-        notes = notes.after_scan(event, -0.3)
-    assert not notes.kidnapping_evidence
+        state = state.after_scan(event, -0.3)
+    assert not state.kidnapping_evidence
 
 
-def test_what_contradicted_a_little_before_is_another_matter():
+def test_small_contradictions_before_the_onset_do_not_count():
     assert HypothesisState().after_scan(5, 2.0).after_scan(6, 9.0).after_scan(7, 6.0).kidnapping_test(1e-5)[1] == 6
 
 
-def test_what_a_displaced_robot_saw_is_not_forgotten_at_the_same_event():
+def test_keyframes_of_a_kidnapped_robot_are_not_pruned_at_the_same_event():
     run = Run(RING)
     poses = ring_drive(16)
     for pose in poses[:12]:
@@ -272,5 +281,5 @@ def test_what_a_displaced_robot_saw_is_not_forgotten_at_the_same_event():
         assert len(run.keyframe(pose).hypotheses) == 1
     run._answer = lambda sequence, _events: run.tsbi.handle(AreaEvents(sequence, (), (PrunedKeyframe(sequence, 0),)))
     (answer,) = run.keyframe(poses[14])
-    assert [leaf.lost for leaf in answer.hypotheses] == [False, True]
+    assert [hypothesis.lost for hypothesis in answer.hypotheses] == [False, True]
     assert not answer.pruned_keyframes

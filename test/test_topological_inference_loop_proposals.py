@@ -14,13 +14,13 @@ from hmt_slam_ros.places.landmark_evidence import PlaceEvidence
 from hmt_slam_ros.places.loop_proposals import AreaLoop, LoopProposer
 
 SPREAD = np.diag([0.15, 0.15, math.radians(1.5)]) ** 2
-# Areas whose position is less certain than this are not looked at, m: none behind the ring.
+# Largest deviation of an area's position that is searched, m: none behind the ring.
 GATED = with_changes(Configuration(), {"tsbi.prior_limit": 0.5})
 LAP, LAST = 96, 120  # keyframes
 
 
 class Told(LoopProposer):
-    """Proposes what it is told."""
+    """Proposes a given loop."""
 
     def __init__(self, loop, configuration, views):
         super().__init__(configuration, views)
@@ -59,11 +59,11 @@ def twice_into_the_first_corridor(shift, proposing=GATED):
     return run, poses, [(a, b, arc) for a, b, arc in best.all_arcs() if arc.closure]
 
 
-def test_nobody_proposes_where_nobody_asks_for_it():
+def test_without_the_parameter_there_are_no_proposals():
     assert Run(RING).tsbi._branching.landmarks is None
 
 
-def test_what_is_out_of_reach_by_the_arcs_is_closed_where_it_is_proposed():
+def test_a_loop_beyond_the_arcs_is_closed_where_it_is_proposed():
     assert not twice_into_the_first_corridor(None)[2]
     run, poses, ((a, b, arc), *_) = twice_into_the_first_corridor((0.0, 0.0))
     off = se2.log(se2.between(arc.pose.mean, se2.between(frame(run, poses, a), frame(run, poses, b))))
@@ -73,7 +73,7 @@ def test_what_is_out_of_reach_by_the_arcs_is_closed_where_it_is_proposed():
     assert run.tsbi._branching.landmarks.loops.asked == 1
 
 
-def test_nothing_is_proposed_where_the_arcs_tell_where_all_areas_are():
+def test_certain_arcs_need_no_proposals():
     run, _, closures = twice_into_the_first_corridor((0.0, 0.0), Configuration())
     assert run.tsbi._branching.landmarks.loops.asked == 0
     assert not closures

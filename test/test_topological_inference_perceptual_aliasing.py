@@ -1,4 +1,4 @@
-"""How often a building looks like itself: what fits into places where it surely is not."""
+"""Perceptual aliasing: matches in places where the keyframes surely do not lie."""
 
 import math
 
@@ -17,7 +17,7 @@ ROOM = np.concatenate((box(-6.0, -3.0, 6.0, 4.0), box(1.0, 1.0, 2.5, 2.0), box(-
 
 
 def corridor(seed):
-    """A corridor of 40 m with a niche every few metres, each 0.2 m deep and 1 m wide, on both sides."""
+    """A corridor of 40 m with a niche every few meters, each 0.2 m deep and 1 m wide, on both sides."""
     walls = []
     for side in (-1.0, 1.0):
         at, steps = -20.0, np.random.default_rng([seed, int(side) + 1]).uniform(2.0, 5.0, 30)
@@ -55,12 +55,12 @@ def test_both_ways_through_a_corridor_are_tried():
     assert min(forth, turned) > 0.7
 
 
-def test_where_nothing_is_seen_nothing_fits():
+def test_without_surfaces_nothing_matches():
     nothing = build_area_grid([], np.zeros((0, 3)), MODEL)
     assert best_shares(nothing, [elsewhere(corridor(0), 200)], SETTINGS) == [0.0]
 
 
-def test_a_fit_tells_the_more_the_rarer_it_is():
+def test_a_rare_match_is_distinctive():
     likeness = PerceptualAliasing(0.25)
     assert likeness.log_distinctiveness(0.9, already_expected=False) == pytest.approx(math.log(4.0))
     likeness.add_negatives([0.2] * 38)
@@ -77,7 +77,7 @@ def test_a_fit_that_is_hardly_better_is_not_better():
     assert likeness.log_distinctiveness(0.99, already_expected=False) == pytest.approx(math.log(10.0 / 0.5))
 
 
-def test_a_fit_that_was_to_be_expected_tells_little():
+def test_an_expected_match_is_hardly_distinctive():
     likeness = PerceptualAliasing(0.25)
     likeness.add_negatives([0.2] * 38)
     assert likeness.log_distinctiveness(0.9, already_expected=True) == pytest.approx(math.log(2.5))
@@ -86,7 +86,7 @@ def test_a_fit_that_was_to_be_expected_tells_little():
     )
 
 
-def test_that_a_building_looks_alike_everywhere_is_learnt():
+def test_a_building_of_similar_places_is_learned():
     likeness = PerceptualAliasing(0.25)
     likeness.add_negatives([1.0] * 64)
     assert 0.0 < likeness.log_distinctiveness(1.0, already_expected=False) < 0.03

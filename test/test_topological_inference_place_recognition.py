@@ -1,4 +1,4 @@
-"""What places look like, whatever the robot's heading there, and which of a building's areas look most like it."""
+"""The appearance of places at any heading, and the most similar areas of a building."""
 
 import numpy as np
 import pytest
@@ -32,31 +32,31 @@ def test_a_scan_without_a_return_has_a_look():
 
 
 @pytest.fixture
-def looks():
+def descriptors():
     scans = {k: seen(SMALL, 0.1 * k, 0.0, 0.0) for k in range(3)}
     scans |= {k: seen(LARGE, 0.1 * k, 0.0, 0.0) for k in range(3, 9)}
     scans[9] = seen(SMALL, 0.25, 0.05, 2.0)
     return ScanDescriptors(scans)
 
 
-def test_the_place_itself_looks_most_alike(looks):
-    likeness = looks.similarity([9], [(3, 4, 5), (0, 1, 2), (6, 7, 8)])
-    assert likeness.argmax() == 1
-    assert likeness[1] > 1.0
-    assert np.median(likeness) == 0.0
+def test_the_place_itself_is_the_most_similar(descriptors):
+    similarity = descriptors.similarity([9], [(3, 4, 5), (0, 1, 2), (6, 7, 8)])
+    assert similarity.argmax() == 1
+    assert similarity[1] > 1.0
+    assert np.median(similarity) == 0.0
 
 
-def test_no_area_has_no_likeness(looks):
-    assert looks.similarity([9], []).shape == (0,)
-    assert looks.area_probabilities([9], {}) == {}
+def test_without_areas_there_is_no_similarity(descriptors):
+    assert descriptors.similarity([9], []).shape == (0,)
+    assert descriptors.area_probabilities([9], {}) == {}
 
 
-def test_the_looks_share_the_probability_among_areas(looks):
-    shares = looks.area_probabilities([9], {4: (3, 4, 5), 7: (0, 1, 2)})
-    assert sum(shares.values()) == pytest.approx(1.0)
-    assert shares[7] > 0.6
+def test_descriptors_share_the_probability_among_areas(descriptors):
+    probabilities = descriptors.area_probabilities([9], {4: (3, 4, 5), 7: (0, 1, 2)})
+    assert sum(probabilities.values()) == pytest.approx(1.0)
+    assert probabilities[7] > 0.6
 
 
-def test_what_looks_more_alike_than_the_median_speaks_for_the_place():
+def test_more_similarity_than_the_median_is_evidence_for_an_area():
     ratios = descriptor_log_ratio(np.array([-1.0, 0.0, 1.0]))
     assert ratios[0] < ratios[1] == RATIO_AT_MEDIAN < 0.0 < ratios[2]

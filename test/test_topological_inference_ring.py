@@ -12,7 +12,7 @@ DRIFT = np.array([0.002, -0.001, 0.0012])  # m, m, rad per keyframe
 
 
 def around_the_ring():
-    """Once around and a few metres further; the best hypothesis is accepted between cuts until the ring closes."""
+    """Once around and a few meters further; the best hypothesis is accepted between cuts until the ring closes."""
     run = Run(RING, DRIFT, field_of_view=2 * np.pi, beams=241)
     poses = ring_drive(112)
     for k, pose in enumerate(poses):
@@ -74,10 +74,10 @@ def test_a_hypothesis_that_branched_has_children_with_new_ids(ring):
     run, _ = ring
     seen = set()
     for answer in run.answers:
-        parents = [leaf.parent for leaf in answer.hypotheses]
-        for leaf in answer.hypotheses:
-            if leaf.id != leaf.parent:
-                assert leaf.id not in seen
-            elif leaf.id == leaf.parent:
-                assert parents.count(leaf.parent) == 1
-        seen |= {leaf.id for leaf in answer.hypotheses}
+        parents = [hypothesis.parent for hypothesis in answer.hypotheses]
+        for hypothesis in answer.hypotheses:
+            if hypothesis.id != hypothesis.parent:
+                assert hypothesis.id not in seen
+            elif hypothesis.id == hypothesis.parent:
+                assert parents.count(hypothesis.parent) == 1
+        seen |= {hypothesis.id for hypothesis in answer.hypotheses}

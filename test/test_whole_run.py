@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hmt_slam_ros.area_abstraction.overlap import overlaps, sensed_points
+from hmt_slam_ros.area_abstraction.overlap_graph import overlaps, sensed_points
 from hmt_slam_ros.evaluation import read_tum
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.open_log import open_log

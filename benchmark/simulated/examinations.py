@@ -17,14 +17,14 @@ from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.hybrid_map.shortest_path import shortest_path_beliefs
-from hmt_slam_ros.hybrid_map.surroundings import GridCache, entry_prior
+from hmt_slam_ros.hybrid_map.surroundings import GridCache
 from hmt_slam_ros.messages.replica import Replica
 from hmt_slam_ros.registration.likelihood_grid import AreaGrid
 from hmt_slam_ros.registration.match_modes import log_ratio_at
 from hmt_slam_ros.registration.search_bounds import LogRatioGrid
 from hmt_slam_ros.sensors import Scan
-from hmt_slam_ros.topological_inference.admission import Query
 from hmt_slam_ros.topological_inference.branching import Branches, Branching, Parent
+from hmt_slam_ros.topological_inference.candidate_gating import Query, entry_prior
 from hmt_slam_ros.topological_inference.closure_search import AreaComparison, ClosureSearch, Fit
 from hmt_slam_ros.topological_inference.place_recognition import ScanDescriptors, descriptor_log_ratio
 

@@ -1,7 +1,7 @@
-"""Where an area ends: what the AAM remembers of every hypothesis, and its criteria of partition.
+"""Partition of areas: what the AAM remembers of every hypothesis, and the criterion by which an area ends.
 
-Blanco et al. say that their areas are no rooms; for Tomatis, Nourbakhsh and Siegwart (2003), section 2.1, a place ends
-at an opening. By ``both``, overlaps through an opening that the path passed count less in the normalized cut.
+The areas of Blanco et al. need not be rooms. For Tomatis, Nourbakhsh and Siegwart (2003), section 2.1, a place ends at
+an opening. With the policy ``both``, overlaps through a crossed opening count less in the normalized cut.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hmt_slam_ros.area_abstraction.doors import DoorTracker, OpeningDetector, OpeningView
 from hmt_slam_ros.area_abstraction.overlap_graph import OverlapGraph, Separation, find_separation, min_ncut
@@ -24,25 +23,28 @@ from hmt_slam_ros.hybrid_map.shortest_path import connected_neighbors
 from hmt_slam_ros.messages.messages import HypothesisEstimate, Keyframe
 from hmt_slam_ros.messages.replica import FIRST_AREA, FIRST_HYPOTHESIS, Replica, ReplicaState
 
+_NEARBY_KEYFRAMES = 10
+"""Keyframes whose map is searched for openings around the robot."""
+
 
 @dataclass(frozen=True, eq=False)
 class JoinedGraph:
-    """Two areas a and b that a closure joins, as one.
+    """The overlap graph of two areas a and b that a closure joins.
 
-    :ivar arc: ``a_T_b``, shape (3,), by which overlaps between the two were measured, m and rad.
+    :ivar arc: ``a_T_b``, shape (3,), with which overlaps between the two were measured, m and rad.
     :ivar graph: number of the overlap graph of the keyframes of both in ``AamState.graphs``.
     :ivar second_keyframes: keyframes of area b.
-    :ivar min_ncut: least normalized cut of the graph.
+    :ivar min_ncut: smallest normalized cut of the graph.
     """
 
-    arc: NDArray[np.float64]
+    arc: Float64
     graph: int
     second_keyframes: frozenset[int]
     min_ncut: float
 
-    def max_displacement(self, arc: NDArray[np.float64], placed: KeyframePoses) -> float:
-        """How far at most another arc has the keyframes of area b, {keyframe: pose in b}, from where they were, m."""
-        points = np.array([pose[:2] for pose in placed.values()]).reshape(-1, 2)
+    def max_displacement(self, arc: Float64, poses: KeyframePoses) -> float:
+        """Largest distance by which another arc moves the keyframes of area b, {keyframe: pose in b}, m."""
+        points = np.array([pose[:2] for pose in poses.values()]).reshape(-1, 2)
         return float(np.hypot(*(se2.transform(arc, points) - se2.transform(self.arc, points)).T).max(initial=0.0))
 
 
@@ -51,14 +53,13 @@ class Partition:
     """What the AAM remembers of one hypothesis; a value, so that the children of a hypothesis inherit it.
 
     :ivar area: the robot's area.
-    :ivar graphs: {area: number of the overlap graph of its keyframes in ``AamState.graphs``} of the areas that the
-        robot was in.
-    :ivar new_keyframes: keyframes stored since the robot entered ``area``, and those that came over with it.
-    :ivar separation_count: at how many of the latest evaluations in a row the newest keyframes separated.
+    :ivar graphs: {area: number of its overlap graph in ``AamState.graphs``} of the areas that the robot was in.
+    :ivar new_keyframes: keyframes stored since the robot entered ``area``, and those that moved there with it.
+    :ivar separation_count: number of the latest evaluations in a row at which the newest keyframes separated.
     :ivar overlap_candidate: the known area that the robot seems to be in, and for how many keyframes in a row.
-    :ivar joined_graphs: {pair of areas: what was found when it was last asked whether they are one}.
-    :ivar door_tracker: the openings that the robot passes, where the policy asks for them.
-    :ivar pairs_split_by_door: areas, the smaller first, between which the path went through an opening, likewise.
+    :ivar joined_graphs: {pair of areas: their graph when a merge was last evaluated}.
+    :ivar door_tracker: the openings on the path, if the policy uses them.
+    :ivar pairs_split_by_door: areas, the smaller first, between which the path crossed an opening, likewise.
     """
 
     area: int
@@ -77,9 +78,9 @@ class AamState:
 
     :ivar replica: the maps of the live hypotheses.
     :ivar graphs: {number: overlap graph}; hypotheses share them.
-    :ivar partitions: {hypothesis: what is remembered of it}.
-    :ivar merge_queue: areas, the smaller first, of which is still to be asked whether they are one.
-    :ivar prune_queue: areas that the robot left, of which is still to be asked whether they hold too much.
+    :ivar partitions: {hypothesis: its partition}.
+    :ivar merge_queue: pairs of areas, the smaller first, of which a merge is still to be evaluated.
+    :ivar prune_queue: areas that the robot left, which are still to be pruned.
     """
 
     replica: ReplicaState = field(default_factory=ReplicaState)
@@ -89,26 +90,25 @@ class AamState:
     prune_queue: frozenset[int] = frozenset()
 
     def with_partition(self, hypothesis: int, partition: Partition) -> AamState:
-        """The state with something else remembered of a hypothesis."""
+        """The state with another partition of a hypothesis."""
         return replace(self, partitions={**self.partitions, hypothesis: partition})
 
     def graph(self, number: int | None) -> OverlapGraph:
-        """The graph of a number, without keyframes for None."""
+        """The graph with a number; an empty one for None."""
         return OverlapGraph() if number is None else self.graphs[number]
 
     def without_unused_graphs(self) -> AamState:
-        """The state without the graphs of which no hypothesis knows any more."""
-        known = self.partitions.values()
-        used = {number for partition in known for number in partition.graphs.values()}
-        used |= {joined.graph for partition in known for joined in partition.joined_graphs.values()}
+        """The state without the graphs that no hypothesis uses any more."""
+        partitions = self.partitions.values()
+        used = {number for partition in partitions for number in partition.graphs.values()}
+        used |= {joined.graph for partition in partitions for joined in partition.joined_graphs.values()}
         if used == self.graphs.keys():
             return self
         return replace(self, graphs={number: graph for number, graph in self.graphs.items() if number in used})
 
     def without_keyframes(self, keyframes: Collection[int]) -> AamState:
-        """The state without keyframes that the maps do not hold any more; areas as one are left as they are."""
-        known = self.partitions.values()
-        changed = {number for partition in known for number in partition.graphs.values()}
+        """The state without keyframes that were pruned; joined graphs stay as they are."""
+        changed = {number for partition in self.partitions.values() for number in partition.graphs.values()}
         return replace(
             self,
             graphs={
@@ -122,17 +122,13 @@ class AamState:
         )
 
 
-# Keyframes in whose map an opening around the robot is looked for.
-_AROUND = 10
-
-
 class AreaPolicy:
-    """Says what separates from an area, and sees the openings that this takes."""
+    """The criterion by which keyframes separate from an area, with the openings that it needs."""
 
     def __init__(self, configuration: Configuration, detector: OpeningDetector | None = None) -> None:
-        """:param detector: sees openings; by policy ``both`` there has to be one.
+        """:param detector: detects openings; required by the policy ``both``.
 
-        :raises HmtSlamError: where there is none then.
+        :raises HmtSlamError: if there is none then.
         """
         self._options, self._detector = configuration.aam, detector
         if configuration.aam.area_policy == "both" and detector is None:
@@ -142,48 +138,46 @@ class AreaPolicy:
     def track_doors(
         self,
         keyframe: Keyframe,
-        leaves: Sequence[HypothesisEstimate],
+        estimates: Sequence[HypothesisEstimate],
         replica: Replica,
         partitions: Mapping[int, Partition],
     ) -> dict[int, Partition]:
-        """The watches over hypotheses after what a keyframe shows of openings; none by a policy that asks for none.
+        """The partitions after the openings of a keyframe; none for a policy without openings.
 
-        All hypotheses see what the most probable one does: what is around the robot they have in common.
+        All hypotheses take the openings of the most probable one, since they share the robot's surroundings.
         """
-        if self._detector is None or not keyframe.mapping or not leaves:
+        if self._detector is None or not keyframe.mapping or not estimates:
             return {}
-        best = max(leaves, key=lambda leaf: (replica.probabilities[leaf.hypothesis], -leaf.hypothesis))
-        around = self._observe_surroundings(self._detector, keyframe, best, replica)
-        found = {}
-        for leaf in leaves:
-            watch = partitions[leaf.hypothesis]
-            way = watch.door_tracker.break_path() if keyframe.motion_unknown else watch.door_tracker
-            pose = PoseGaussian(leaf.pose.mean, around.pose.covariance)
-            way = way.update(keyframe.sequence, pose, around)
-            found[leaf.hypothesis] = replace(watch, door_tracker=way)
-        return found
+        best = max(estimates, key=lambda e: (replica.probabilities[e.hypothesis], -e.hypothesis))
+        view = self._observe_surroundings(self._detector, keyframe, best, replica)
+        tracked = {}
+        for estimate in estimates:
+            partition = partitions[estimate.hypothesis]
+            tracker = partition.door_tracker.break_path() if keyframe.motion_unknown else partition.door_tracker
+            tracker = tracker.update(keyframe.sequence, PoseGaussian(estimate.pose.mean, view.pose.covariance), view)
+            tracked[estimate.hypothesis] = replace(partition, door_tracker=tracker)
+        return tracked
 
     def _observe_surroundings(
-        self, detector: OpeningDetector, keyframe: Keyframe, leaf: HypothesisEstimate, replica: Replica
+        self, detector: OpeningDetector, keyframe: Keyframe, estimate: HypothesisEstimate, replica: Replica
     ) -> OpeningView:
-        """What is around a keyframe, by the keyframes of its area and those beside it that were taken nearest."""
-        hybrid_map, here = replica.maps[leaf.hypothesis], leaf.area
-        placed: list[tuple[int, Float64]] = []
-        for area in () if detector.sees_around(keyframe.scan) else (here, *connected_neighbors(hybrid_map, here)):
-            arc = hybrid_map.arc(here, area) if area != here else None
+        """The openings around a keyframe, in the map of the nearest keyframes of its area and the neighbors."""
+        hybrid_map, area = replica.maps[estimate.hypothesis], estimate.area
+        poses: list[tuple[int, Float64]] = []
+        for other in () if detector.sees_around(keyframe.scan) else (area, *connected_neighbors(hybrid_map, area)):
+            arc = hybrid_map.arc(area, other) if other != area else None
             frame = np.zeros(3) if arc is None else arc.mean
-            placed += [(k, se2.compose(frame, at)) for k, at in hybrid_map.keyframes(area).items()]
-        placed = [(k, at) for k, at in placed if k != keyframe.sequence]
-        away = [float(np.hypot(*(at[:2] - leaf.pose.mean[:2]))) for _, at in placed]
-        nearest = sorted(np.argsort(away, kind="stable")[:_AROUND].tolist())
-        scans = [replica.scans[placed[i][0]] for i in nearest]
-        poses = np.array([placed[i][1] for i in nearest]).reshape(-1, 3)
-        return detector.view(keyframe.scan, leaf.pose.mean, scans, poses)
+            poses += [(k, se2.compose(frame, pose)) for k, pose in hybrid_map.keyframes(other).items()]
+        poses = [(k, pose) for k, pose in poses if k != keyframe.sequence]
+        distances = [float(np.hypot(*(pose[:2] - estimate.pose.mean[:2]))) for _, pose in poses]
+        nearest = [poses[i] for i in sorted(np.argsort(distances, kind="stable")[:_NEARBY_KEYFRAMES].tolist())]
+        scans = [replica.scans[k] for k, _ in nearest]
+        return detector.view(keyframe.scan, estimate.pose.mean, scans, np.array([p for _, p in nearest]).reshape(-1, 3))
 
     def find_separation(
         self, graph: OverlapGraph, new_keyframes: Collection[int], newest: int, door_tracker: DoorTracker
     ) -> Separation | None:
-        """The part of the robot's own keyframes, the newest among them, that separates from its area.
+        """The part of the new keyframes, the newest among them, that separates from the area.
 
         :param graph: of the area.
         :param new_keyframes: the keyframes stored since the robot entered the area.
@@ -195,7 +189,7 @@ class AreaPolicy:
         return find_separation(graph, new_keyframes, newest, self._options.ncut_threshold, self._options.min_cluster)
 
     def min_ncut(self, graph: OverlapGraph, second_keyframes: Collection[int]) -> float:
-        """The least NCut of two areas as one between which the path went through an opening.
+        """The smallest NCut of two areas between which the path crossed an opening.
 
         :param graph: of the keyframes of both.
         :param second_keyframes: of one of them.

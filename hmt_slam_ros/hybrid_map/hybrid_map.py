@@ -1,6 +1,6 @@
-"""The HMT map of one hypothesis, Eq. (2): areas with keyframes, and arcs; what all hypotheses agree on stands once.
+"""The hybrid map of one hypothesis, Eq. (2): areas with keyframes, and arcs.
 
-What all hypotheses agree on stands once, in a shared common map; a hypothesis holds only what it changed.
+What all hypotheses agree on is stored once, in a shared common map. A hybrid map stores what differs.
 """
 
 from __future__ import annotations
@@ -12,19 +12,24 @@ from dataclasses import dataclass, field
 from typing import NamedTuple, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hmt_slam_ros.arrays import Bool, Float64, Int32, Int64
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian, fuse
 
-KeyframePoses = Mapping[int, NDArray[np.float64]]
+KeyframePoses = Mapping[int, Float64]
 AreaPair = tuple[int, int]
 
 Array = TypeVar("Array", Int32, Float64)
 
 _NONE = -1
-_FIRST_ROOM = 16
+"""Stands for no area or no side in arrays."""
+
+_INITIAL_CAPACITY = 16
+"""Areas and arcs for which memory is allocated at first."""
+
+_DEGREES_OF_FREEDOM = 3
+"""Degrees of freedom of a pose."""
 
 
 def area_pair(a: int, b: int) -> AreaPair:
@@ -34,7 +39,7 @@ def area_pair(a: int, b: int) -> AreaPair:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class ArcValue:
-    """What the map stores of an arc.
+    """An arc of the map.
 
     :ivar pose: belief over ``a_T_b``, a < b.
     :ivar closure: whether the arc closed a loop.
@@ -62,13 +67,13 @@ class ArcTable(NamedTuple):
 
 
 class CommonMap:
-    """Areas and arcs that are definite. They change in place, for all hypotheses that share them.
+    """Definite areas and arcs. They change in place, for all hypotheses that share them.
 
-    What is asked of one area takes the same time however many there are.
+    A query of one area takes constant time, whatever the size of the map.
 
     :ivar areas: {area: {keyframe: ``area_T_base`` (3,)}}.
     :ivar arcs: {(smaller area, larger area): arc}.
-    :ivar max_area_id: the largest area that there ever was, -1 where there was none.
+    :ivar max_area_id: the largest area that there ever was, -1 if there was none.
     """
 
     def __init__(self) -> None:
@@ -77,12 +82,12 @@ class CommonMap:
         self.max_area_id = _NONE
         self._row: dict[AreaPair, int] = {}
         self._rows = 0
-        self._extents = np.zeros(_FIRST_ROOM)
-        self._table = _empty_table(_FIRST_ROOM)
+        self._extents = np.zeros(_INITIAL_CAPACITY)
+        self._table = _empty_table(_INITIAL_CAPACITY)
 
     @property
     def table(self) -> ArcTable:
-        """The arcs; its arrays may be longer than what they hold, and are only good until the next change."""
+        """The arcs, valid until the next change; the arrays may be longer than their content."""
         return self._table
 
     @property
@@ -98,12 +103,12 @@ class CommonMap:
         self._extents[area] = extent(keyframes)
 
     def remove_area(self, area: int) -> None:
-        """Take an area out that no arc joins to another; no other area gets its number."""
+        """Remove an area without arcs; its number is not used again."""
         del self.areas[area]
         self._extents[area] = 0.0
 
     def set_arc(self, pair: AreaPair, arc: ArcValue) -> None:
-        """Set or replace the arc of (smaller area, larger area), which become areas where they are none."""
+        """Set or replace the arc of (smaller area, larger area); areas that do not exist are created."""
         for area in pair:
             if area not in self.areas:
                 self.set_area(area, {})
@@ -114,7 +119,7 @@ class CommonMap:
         self._table.means[row], self._table.covariances[row] = arc.pose.mean, arc.pose.covariance
 
     def _insert_arc(self, pair: AreaPair) -> None:
-        """Give a new arc a row, and its sides a place among those of its areas."""
+        """Give a new arc a row, and link its sides to those of its areas."""
         row = self._row[pair] = self._rows
         self._rows += 1
         table = self._table
@@ -131,7 +136,7 @@ class CommonMap:
             table.first[area] = side
 
     def remove_arc(self, pair: AreaPair) -> None:
-        """Take an arc out, if it is there; its row in the table is not used again."""
+        """Remove an arc, if it exists; its row in the table is not used again."""
         if self.arcs.pop(pair, None) is None:
             return
         row = self._row.pop(pair)
@@ -147,12 +152,12 @@ class CommonMap:
 
     def neighbors(self, area: int) -> list[int]:
         """The areas one arc away, in no order."""
-        found: list[int] = []
+        neighbors: list[int] = []
         side = int(self._table.first[area]) if area in self.areas else _NONE
         while side != _NONE:
-            found.append(int(self._table.opposite_area[side]))
+            neighbors.append(int(self._table.opposite_area[side]))
             side = int(self._table.next_side[side])
-        return found
+        return neighbors
 
     def _ensure_capacity(self, area: int) -> None:
         while area >= len(self._extents):
@@ -165,29 +170,29 @@ def extent(keyframes: KeyframePoses) -> float:
     return max((math.hypot(pose[0], pose[1]) for pose in keyframes.values()), default=0.0)
 
 
-def _empty_table(room: int) -> ArcTable:
-    first, sides = np.full(room, _NONE, dtype=np.int32), np.full(2 * room, _NONE, dtype=np.int32)
-    return ArcTable(first, sides, sides.copy(), np.zeros((room, 3)), np.zeros((room, 3, 3)))
+def _empty_table(capacity: int) -> ArcTable:
+    first, sides = np.full(capacity, _NONE, dtype=np.int32), np.full(2 * capacity, _NONE, dtype=np.int32)
+    return ArcTable(first, sides, sides.copy(), np.zeros((capacity, 3)), np.zeros((capacity, 3, 3)))
 
 
 def _double_capacity(array: Array) -> Array:
-    """The same array with room for as much again; numbers of sides and areas in it are -1."""
+    """The array with twice its capacity, filled up with -1."""
     return np.concatenate((array, np.full_like(array, _NONE)))
 
 
 @dataclass(frozen=True, eq=False)
 class GraphState:
-    """Areas with their keyframes, and arcs, in the order in which they came.
+    """Areas with their keyframes, and arcs, in the order of insertion.
 
     :ivar areas: shape (n,), ids.
-    :ivar keyframe_counts: shape (n,), how many keyframes each has.
+    :ivar keyframe_counts: shape (n,), number of keyframes of each.
     :ivar keyframes: shape (k,), ids, area by area.
     :ivar poses: shape (k, 3), ``area_T_base`` of each keyframe, m and rad.
     :ivar arcs: shape (m, 2), smaller and larger area.
     :ivar means: shape (m, 3), ``smaller_T_larger`` of each arc, m and rad.
     :ivar covariances: shape (m, 3, 3), right tangent frame.
     :ivar closures: shape (m,), whether the arc closed a loop.
-    :ivar removed: shape (m,), whether a hypothesis lacks an arc that all others have; its belief is zeros then.
+    :ivar removed: shape (m,), whether the hypothesis lacks an arc of the common map; its belief is zeros then.
     """
 
     areas: Int64
@@ -209,9 +214,9 @@ class GraphState:
     def from_areas_and_arcs(
         cls, areas: Mapping[int, KeyframePoses], arcs: Mapping[AreaPair, ArcValue | None]
     ) -> GraphState:
-        """The state of areas and arcs, None for one that is withdrawn."""
-        none = ArcValue(PoseGaussian.from_pose(np.zeros(3)), closure=False)
-        values = [none if arc is None else arc for arc in arcs.values()]
+        """The state of areas and arcs, None for one that is removed."""
+        removed = ArcValue(PoseGaussian.from_pose(np.zeros(3)), closure=False)
+        values = [removed if arc is None else arc for arc in arcs.values()]
         return cls(
             np.array(list(areas), dtype=np.int64),
             np.array([len(keyframes) for keyframes in areas.values()], dtype=np.int64),
@@ -226,31 +231,27 @@ class GraphState:
 
     def area_keyframes(self) -> dict[int, dict[int, Float64]]:
         """{area: {keyframe: ``area_T_base``}}."""
-        placed = zip(self.keyframes.tolist(), self.poses, strict=True)
-        sizes = zip(self.areas.tolist(), self.keyframe_counts.tolist(), strict=True)
-        return {area: dict(itertools.islice(placed, size)) for area, size in sizes}
+        poses = zip(self.keyframes.tolist(), self.poses, strict=True)
+        counts = zip(self.areas.tolist(), self.keyframe_counts.tolist(), strict=True)
+        return {area: dict(itertools.islice(poses, count)) for area, count in counts}
 
     def arc_values(self) -> dict[AreaPair, ArcValue | None]:
-        """{(smaller area, larger area): arc}, None for one that is withdrawn."""
+        """{(smaller area, larger area): arc}, None for one that is removed."""
         columns = (self.arcs.tolist(), self.means, self.covariances, self.closures.tolist(), self.removed.tolist())
         return {
-            (a, b): None if withdrawn else ArcValue(PoseGaussian(mean, covariance), closure)
-            for (a, b), mean, covariance, closure, withdrawn in zip(*columns, strict=True)
+            (a, b): None if removed else ArcValue(PoseGaussian(mean, covariance), closure)
+            for (a, b), mean, covariance, closure, removed in zip(*columns, strict=True)
         }
-
-
-_DEGREES_OF_FREEDOM = 3
 
 
 def fuse_traversals(old: PoseGaussian, new: PoseGaussian, shared: float) -> PoseGaussian:
     """The belief over ``a_T_b`` from two traversals of an arc.
 
-    Eq. (10) takes the traversals for independent. Two things speak against it, and both inflate the two covariances:
+    Eq. (10) assumes that the traversals are independent. Two effects violate that, and inflate both covariances:
 
-    * the same scans in both: with all of them shared the factor is 2, and the product of equal beliefs is then no more
-      certain than one of them, as in covariance intersection with equal weights;
-    * a disagreement beyond what the covariances admit: then at least one of them is too small, and both are scaled by
-      their chi-square per degree of freedom (Birge's ratio).
+    * shared scans: the factor is 2 if all are shared, so that equal beliefs gain no certainty, as in covariance
+      intersection with equal weights;
+    * a disagreement beyond the covariances: the factor is the chi-square per degree of freedom (Birge's ratio).
 
     :param shared: share of the new observation's keyframes that the old one had too, in [0, 1].
     """
@@ -259,47 +260,42 @@ def fuse_traversals(old: PoseGaussian, new: PoseGaussian, shared: float) -> Pose
 
 
 def apply_sigma_floor(belief: PoseGaussian, sigma: float, angle: float) -> PoseGaussian:
-    """A belief no more certain than the maps that both traversals were matched against.
+    """The belief with the given smallest deviations, as maps of walls are no more precise.
 
     :param sigma: smallest deviation of the translation along each axis, m.
     :param angle: smallest deviation of the heading, rad.
     """
-    lack = np.array([sigma, sigma, angle]) ** 2 - np.diag(belief.covariance)
-    covariance: NDArray[np.float64] = belief.covariance + np.diag(np.maximum(lack, 0.0))
+    missing = np.array([sigma, sigma, angle]) ** 2 - np.diag(belief.covariance)
+    covariance: Float64 = belief.covariance + np.diag(np.maximum(missing, 0.0))
     return PoseGaussian(belief.mean, covariance)
-
-
-def _arc_key(a: int, b: int) -> tuple[int, int]:
-    return (a, b) if a < b else (b, a)
 
 
 @dataclass
 class HybridMap:
     """Areas, keyframes and arcs under one topological hypothesis.
 
-    :ivar common: what every live hypothesis agrees on.
-    :ivar changed_areas: the areas in which this hypothesis differs from the common map, with all their keyframes.
-    :ivar changed_arcs: likewise the arcs, keyed by (smaller area, larger area); None for one that this hypothesis
-        lacks.
+    :ivar common: what all live hypotheses agree on.
+    :ivar changed_areas: the areas that differ from the common map, with all their keyframes.
+    :ivar changed_arcs: the arcs that differ, {(smaller area, larger area): arc}; None for one that is removed.
     """
 
     common: CommonMap = field(default_factory=CommonMap)
-    changed_areas: dict[int, dict[int, NDArray[np.float64]]] = field(default_factory=dict)
-    changed_arcs: dict[tuple[int, int], ArcValue | None] = field(default_factory=dict)
+    changed_areas: dict[int, dict[int, Float64]] = field(default_factory=dict)
+    changed_arcs: dict[AreaPair, ArcValue | None] = field(default_factory=dict)
 
     def branch(self) -> HybridMap:
-        """A child that may change without its parent noticing."""
+        """A copy that shares the common map."""
         return HybridMap(self.common, {a: dict(k) for a, k in self.changed_areas.items()}, dict(self.changed_arcs))
 
     def subgraph(self, areas: Collection[int]) -> HybridMap:
-        """A map of its own of some areas, and of the arcs between them."""
-        part = HybridMap(changed_areas={area: dict(self.keyframes(area)) for area in areas})
-        part.changed_arcs |= {(a, b): arc for a, b, arc in self.all_arcs() if a in areas and b in areas}
-        part.commit()
-        return part
+        """A separate map of some areas and the arcs between them."""
+        subgraph = HybridMap(changed_areas={area: dict(self.keyframes(area)) for area in areas})
+        subgraph.changed_arcs |= {(a, b): arc for a, b, arc in self.all_arcs() if a in areas and b in areas}
+        subgraph.commit()
+        return subgraph
 
     def commit(self) -> None:
-        """Make this hypothesis's changes common; valid only when it is the one live hypothesis of ``common``."""
+        """Move the changes to the common map; only valid if no other live hypothesis shares it."""
         for area, keyframes in self.changed_areas.items():
             self.common.set_area(area, keyframes)
         for pair, arc in self.changed_arcs.items():
@@ -319,41 +315,41 @@ class HybridMap:
 
     @property
     def max_area_id(self) -> int:
-        """The largest area that there ever was, -1 where there was none."""
+        """The largest area that there ever was, -1 if there was none."""
         return max(self.common.max_area_id, max(self.changed_areas, default=-1))
 
     def keyframes(self, area: int) -> KeyframePoses:
         """{keyframe: ``area_T_base`` (3,)} of an area, in the order of insertion.
 
-        :raises KeyError: where there is no such area.
+        :raises KeyError: if there is no such area.
         """
-        own = self.changed_areas.get(area)
-        return self.common.areas[area] if own is None else own
+        changed = self.changed_areas.get(area)
+        return self.common.areas[area] if changed is None else changed
 
     def extents(self, areas: Int64) -> Float64:
         """Largest distance of each area's keyframes from its origin, m, shape (n,) as ``areas``."""
-        common = areas < len(self.common.extents)
-        found = np.zeros(len(areas))
-        found[common] = self.common.extents[areas[common]]
-        own = np.isin(areas, list(self.changed_areas))
-        found[own] = [extent(self.changed_areas[area]) for area in areas[own].tolist()]
-        return found
+        extents = np.zeros(len(areas))
+        is_common = areas < len(self.common.extents)
+        extents[is_common] = self.common.extents[areas[is_common]]
+        is_changed = np.isin(areas, list(self.changed_areas))
+        extents[is_changed] = [extent(self.changed_areas[area]) for area in areas[is_changed].tolist()]
+        return extents
 
-    def set_keyframe(self, keyframe: int, area: int, pose: NDArray[np.float64]) -> None:
-        """Put a keyframe into an area, made where missing, at ``area_T_base``."""
+    def set_keyframe(self, keyframe: int, area: int, pose: Float64) -> None:
+        """Put a keyframe into an area at ``area_T_base``; an area that does not exist is created."""
         self._writable_area(area)[keyframe] = pose
 
     def remove_keyframe(self, keyframe: int, area: int) -> None:
-        """Take a keyframe out of an area."""
+        """Remove a keyframe from an area."""
         del self._writable_area(area)[keyframe]
 
-    def _writable_area(self, area: int) -> dict[int, NDArray[np.float64]]:
+    def _writable_area(self, area: int) -> dict[int, Float64]:
         if area not in self.changed_areas:
             self.changed_areas[area] = dict(self.common.areas.get(area, {}))
         return self.changed_areas[area]
 
     def arc(self, a: int, b: int) -> PoseGaussian | None:
-        """The belief over ``a_T_b``, or None where no arc joins the two."""
+        """The belief over ``a_T_b``, or None if no arc joins the two."""
         value = self.arc_value(a, b)
         if value is None:
             return None
@@ -361,12 +357,12 @@ class HybridMap:
 
     def arc_value(self, a: int, b: int) -> ArcValue | None:
         """The arc as stored, from the smaller to the larger area, or None."""
-        key = _arc_key(a, b)
-        return self.changed_arcs[key] if key in self.changed_arcs else self.common.arcs.get(key)
+        pair = area_pair(a, b)
+        return self.changed_arcs[pair] if pair in self.changed_arcs else self.common.arcs.get(pair)
 
     @property
-    def pending_closures(self) -> dict[tuple[int, int], ArcValue]:
-        """The arcs by which this hypothesis closed loops that the common map leaves open."""
+    def pending_closures(self) -> dict[AreaPair, ArcValue]:
+        """The arcs by which this hypothesis closed loops, and which are not definite."""
         return {
             pair: arc
             for pair, arc in self.changed_arcs.items()
@@ -375,18 +371,18 @@ class HybridMap:
 
     def set_arc(self, a: int, b: int, pose: PoseGaussian, *, closure: bool) -> None:
         """Set or replace the arc between a and b from the belief over ``a_T_b``."""
-        self.changed_arcs[_arc_key(a, b)] = ArcValue(pose if a < b else pose.inverse(), closure)
+        self.changed_arcs[area_pair(a, b)] = ArcValue(pose if a < b else pose.inverse(), closure)
 
     def remove_arc(self, a: int, b: int) -> None:
-        """Take the arc between a and b out, if there is one."""
-        self.changed_arcs[_arc_key(a, b)] = None
+        """Remove the arc between a and b, if there is one."""
+        self.changed_arcs[area_pair(a, b)] = None
 
     def merge(self, area: int, into: int, into_T_area: PoseGaussian) -> None:
-        """Make an area part of another; valid only when this is the one live hypothesis of ``common``.
+        """Make an area part of another; only valid if no other live hypothesis shares the common map.
 
-        Its keyframes lie there, and its arcs begin there. Where both had an arc to a third area these are fused, Eq.
-        (10), as if the same scans had told both, since refinement lets them agree. Where the arc between the two closed
-        a loop, that by which the area was first entered closes it now.
+        Its keyframes and arcs move to the other area. Where both had an arc to a third area the two are fused, Eq.
+        (10), as if from the same scans, since refinement makes them agree. If the arc between the two closed a loop,
+        the arc by which the area was first entered closes it now.
 
         :param into_T_area: the belief over it.
         """
@@ -395,32 +391,31 @@ class HybridMap:
         for keyframe, pose in self.keyframes(area).items():
             self.set_keyframe(keyframe, into, se2.compose(into_T_area.mean, pose))
         self.remove_arc(area, into)
-        arcs = {other: self.common.arcs[_arc_key(area, other)] for other in self.neighbors(area)}
-        entered = min((other for other, arc in arcs.items() if not arc.closure), default=None)
-        loop = between is None or between.closure
+        arcs = {other: self.common.arcs[area_pair(area, other)] for other in self.neighbors(area)}
+        entered_from = min((other for other, arc in arcs.items() if not arc.closure), default=None)
+        closed_loop = between is None or between.closure
         for other, arc in arcs.items():
-            seen = into_T_area.compose(arc.pose if area < other else arc.pose.inverse())
-            closure = arc.closure or (loop and other == entered)
+            belief = into_T_area.compose(arc.pose if area < other else arc.pose.inverse())
+            closure = arc.closure or (closed_loop and other == entered_from)
             known, value = self.arc(into, other), self.arc_value(into, other)
             if known is not None and value is not None:
-                seen, closure = fuse_traversals(known, seen, shared=1.0), value.closure and closure
+                belief, closure = fuse_traversals(known, belief, shared=1.0), value.closure and closure
             self.remove_arc(area, other)
-            self.set_arc(into, other, seen, closure=closure)
+            self.set_arc(into, other, belief, closure=closure)
         self.commit()
         self.common.remove_area(area)
 
     def neighbors(self, area: int) -> list[int]:
         """The areas one arc away, ascending."""
-        found = set(self.common.neighbors(area))
+        neighbors = set(self.common.neighbors(area))
         for (a, b), arc in self.changed_arcs.items():
             if area in (a, b):
-                (found.discard if arc is None else found.add)(b if a == area else a)
-        return sorted(found)
+                (neighbors.discard if arc is None else neighbors.add)(b if a == area else a)
+        return sorted(neighbors)
 
     def all_arcs(self) -> Iterator[tuple[int, int, ArcValue]]:
         """All arcs as (a, b, value) with a < b, ascending."""
-        keys = self.common.arcs.keys() | self.changed_arcs.keys()
-        for a, b in sorted(keys):
+        for a, b in sorted(self.common.arcs.keys() | self.changed_arcs.keys()):
             value = self.arc_value(a, b)
             if value is not None:
                 yield a, b, value

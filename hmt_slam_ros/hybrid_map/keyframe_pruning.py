@@ -1,7 +1,6 @@
-"""Which keyframes are more than their places need, and to which others the scans are related that were related to them.
+"""Keyframe pruning: which keyframes are redundant, and which others replace them.
 
-A place is what metric SLAM takes for one when it asks whether a keyframe would add anything new: close by, with a like
-heading.
+A viewpoint is a position with a heading, as in metric SLAM's test whether a keyframe would add anything new.
 """
 
 from __future__ import annotations
@@ -11,39 +10,39 @@ from collections.abc import Collection, Mapping
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hmt_slam_ros.arrays import Bool, Float64
 from hmt_slam_ros.configuration.metric_slam import FilterParameters
 from hmt_slam_ros.geometry import se2
 
-Pose = NDArray[np.float64]
+Pose = Float64
 
-# Below 1, since the filter step at a keyframe may move the robot a little back towards the last one.
 _VIEWPOINT_FRACTION = 0.8
+"""Size of a viewpoint relative to the distance of keyframes, below 1 as the filter may move a keyframe a little."""
 
 
 class ReplacementKeyframe(NamedTuple):
-    """The keyframe to which scans are related instead of another, and the other's pose in its frame, shape (3,)."""
+    """A keyframe that replaces another one as a reference of scans, and the other's pose in its frame, shape (3,)."""
 
     keyframe: int
     pose: Pose
 
 
-def is_same_viewpoint(relative: NDArray[np.float64], settings: FilterParameters) -> NDArray[np.bool_]:
-    """Which poses are in one place with the base: near it, and with a like heading.
+def is_same_viewpoint(relative: Float64, settings: FilterParameters) -> Bool:
+    """Which poses are at the base's viewpoint: near it, and with a similar heading.
 
     :param relative: shape (..., 3), ``base_T_other``, m and rad.
     :returns: shape (...).
     """
-    near = np.hypot(relative[..., 0], relative[..., 1]) < _VIEWPOINT_FRACTION * settings.keyframe_distance
-    alike = np.abs(relative[..., 2]) < _VIEWPOINT_FRACTION * math.radians(settings.keyframe_angle)
-    return np.asarray(near & alike, dtype=np.bool_)
+    is_near = np.hypot(relative[..., 0], relative[..., 1]) < _VIEWPOINT_FRACTION * settings.keyframe_distance
+    is_aligned = np.abs(relative[..., 2]) < _VIEWPOINT_FRACTION * math.radians(settings.keyframe_angle)
+    return np.asarray(is_near & is_aligned, dtype=np.bool_)
 
 
 def nearest_replacement(pose: Pose, others: Mapping[int, Pose]) -> ReplacementKeyframe:
     """The nearest of other keyframes; a turn by one radian counts as much as a meter.
 
-    :param pose: shape (3,), ``area_T_base`` of a keyframe that is forgotten.
+    :param pose: shape (3,), ``area_T_base`` of a keyframe that is pruned.
     :param others: {keyframe: ``area_T_base``} of those that stay, at least one.
     """
     keyframes, poses = list(others), np.array(list(others.values()))
@@ -55,32 +54,29 @@ def nearest_replacement(pose: Pose, others: Mapping[int, Pose]) -> ReplacementKe
 def redundant_keyframes(
     keyframe_poses: Mapping[int, Pose], protected: Collection[int], max_per_viewpoint: int, settings: FilterParameters
 ) -> list[int]:
-    """The keyframes to be forgotten so that no place holds too many, where others may be.
+    """The keyframes to prune so that no viewpoint has too many.
 
-    One after the other, of all that are in too full a place: the one that is in one place with the most others, and of
-    equals the oldest, so that a map follows a world that changes.
+    They are pruned one after the other: the one that shares its viewpoint with the most others, of those at crowded
+    viewpoints, and of equals the oldest, so that a map follows a world that changes.
 
     :param keyframe_poses: {keyframe: ``area_T_base``} of one area.
     :param protected: keyframes that stay in any case.
-    :param max_per_viewpoint: this many may be in a place, that of any of them.
+    :param max_per_viewpoint: most keyframes at the viewpoint of any of them.
     :returns: in that order.
     """
     if not keyframe_poses:
         return []
-    keyframes, poses = (
-        np.array(sorted(keyframe_poses)),
-        np.array([keyframe_poses[keyframe] for keyframe in sorted(keyframe_poses)]),
-    )
-    count = len(keyframes)
-    together = is_same_viewpoint(se2.between(np.repeat(poses, count, 0), np.tile(poses, (count, 1))), settings)
-    together = together.reshape(count, count)
-    may_go = ~np.isin(keyframes, list(protected))
-    found: list[int] = []
+    keyframes = np.array(sorted(keyframe_poses))
+    poses, count = np.array([keyframe_poses[keyframe] for keyframe in sorted(keyframe_poses)]), len(keyframes)
+    relative = se2.between(np.repeat(poses, count, 0), np.tile(poses, (count, 1)))
+    is_shared = is_same_viewpoint(relative, settings).reshape(count, count)
+    is_prunable = ~np.isin(keyframes, list(protected))
+    pruned: list[int] = []
     while True:
-        counts = together.sum(axis=1)
-        in_full_place = (together & (counts > max_per_viewpoint)[:, None]).any(axis=0) & may_go
-        if not in_full_place.any():
-            return found
-        gone = int(np.argmax(np.where(in_full_place, counts, 0)))
-        found.append(int(keyframes[gone]))
-        together[gone], together[:, gone] = False, False
+        counts = is_shared.sum(axis=1)
+        is_crowded = (is_shared & (counts > max_per_viewpoint)[:, None]).any(axis=0) & is_prunable
+        if not is_crowded.any():
+            return pruned
+        k = int(np.argmax(np.where(is_crowded, counts, 0)))
+        pruned.append(int(keyframes[k]))
+        is_shared[k], is_shared[:, k] = False, False

@@ -1,22 +1,19 @@
-"""A landmark of an area and the probability that it is there, as values.
+"""Landmarks of an area, and the probability that they exist.
 
-Tomatis, Nourbakhsh and Siegwart (2003), section 3.3: where a landmark is seen again, what the map believes of it is
-averaged with the extraction confidence p_l, Eq. (4); where it should be seen and is not, 1 - p_lmap takes the place of
-p_l, Eq. (5); below a minimum it is deleted. Taken literally that never falls below 1/2, however often a landmark is
-missed, and what was seen often has to be missed about as often before anything shows.
+Tomatis, Nourbakhsh and Siegwart (2003), section 3.3: at a detection, the map's belief p_lmap is averaged with the
+extraction confidence p_l, Eq. (4). At a miss, 1 - p_lmap takes the place of p_l, Eq. (5). Taken literally the belief
+then never falls below 1/2, and a landmark that was seen often has to be missed about as often before that shows.
 
-Two things are in doubt. Whether what was extracted is a landmark at all: scans that show it again say the same again,
-and what is none is seen again as surely (94 % of the time where 98 % of the true ones are, on training seeds). So that
-stays the mean of p_l over the scans that showed it, Eq. (4). And whether it is still there, r, in a world that changes:
-it was still there after one more visit with probability p_S, is seen with p_D if it is, and with p_F if it is not,
+Here p_lmap is the product of two probabilities. That the detections were of a landmark at all is the mean of p_l,
+Eq. (4): false ones are detected again as surely as true ones. That it is still there, r, follows from a world that
+changes, with p_S that it stays until the next visit, and p_D and p_F that it is detected if it is there or is not:
 
     r- = p_S r
-    r  = p_D r- / (p_D r- + p_F (1 - r-))                          where it is seen,
-    r  = (1 - p_D) r- / ((1 - p_D) r- + (1 - p_F) (1 - r-))        where it is missed, instead of Eq. (5).
+    r  = p_D r- / (p_D r- + p_F (1 - r-))                          at a detection,
+    r  = (1 - p_D) r- / ((1 - p_D) r- + (1 - p_F) (1 - r-))        at a miss, instead of Eq. (5).
 
-As r- is p_S at most, a few misses suffice for what was seen a hundred times. Doors are closed and furniture is moved
-while nobody looks rather than between two scans: at the first look after an absence r- is p_A p_S r, so that one look
-may suffice. p_lmap is the product of the two.
+As r- is p_S at most, a few misses suffice for a landmark that was seen a hundred times. Doors close while nobody looks
+rather than between two scans, so that r- is p_A p_S r at the first visit after an absence.
 """
 
 from __future__ import annotations
@@ -32,12 +29,12 @@ from hmt_slam_ros.geometry.gaussian import PoseGaussian
 
 @dataclass(frozen=True)
 class Existence:
-    """What is known of whether something is there.
+    """The existence of a landmark.
 
     :ivar confidence: mean of the extraction confidences, in [0, 1].
     :ivar presence: r, the probability that it is still there, in [0, 1].
-    :ivar detections: at how many visits it was seen, 1 or more.
-    :ivar misses: at how many it should have been and was not.
+    :ivar detections: number of visits at which it was detected, 1 or more.
+    :ivar misses: number of visits at which it should have been and was not.
     :ivar robot_was_away: whether the robot was away since.
     """
 
@@ -53,25 +50,28 @@ class Existence:
         return self.confidence * self.presence
 
     def update_on_detection(self, confidence: float, features: FeatureParameters) -> Existence:
-        """It was seen, with an extraction confidence p_l."""
-        seen = self.detections + 1
-        mean = self.confidence + (confidence - self.confidence) / seen  # Eq. (4)
+        """The existence after a detection, with an extraction confidence p_l."""
+        detections = self.detections + 1
+        mean = self.confidence + (confidence - self.confidence) / detections  # Eq. (4)
         presence = self._update_presence(features.landmark_detected, features.landmark_by_chance, features)
-        return replace(self, confidence=mean, presence=presence, detections=seen, robot_was_away=False)
+        return replace(self, confidence=mean, presence=presence, detections=detections, robot_was_away=False)
 
     def update_on_miss(self, features: FeatureParameters) -> Existence:
-        """It should have been seen and was not."""
+        """The existence after a miss."""
         presence = self._update_presence(1.0 - features.landmark_detected, 1.0 - features.landmark_by_chance, features)
         return replace(self, presence=presence, misses=self.misses + 1, robot_was_away=False)
 
     def mark_absence(self) -> Existence:
-        """Nobody looked for a while."""
+        """The existence after an absence of the robot."""
         return replace(self, robot_was_away=True)
 
     def _update_presence(self, likelihood: float, otherwise: float, features: FeatureParameters) -> float:
-        """Bayes' rule, for something that is there or not."""
-        lasting = features.landmark_lasting * (features.landmark_lasting_away if self.robot_was_away else 1.0)
-        prior = lasting * self.presence
+        """The presence by Bayes' rule.
+
+        :param likelihood: of the observation if the landmark is there; ``otherwise`` if it is not.
+        """
+        survival = features.landmark_lasting * (features.landmark_lasting_away if self.robot_was_away else 1.0)
+        prior = survival * self.presence
         return likelihood * prior / (likelihood * prior + otherwise * (1.0 - prior))
 
 
@@ -81,13 +81,12 @@ class Landmark:
 
     :ivar kind: ``INNER``, ``OUTER`` or ``OPENING`` of `landmarks.landmarks`.
     :ivar pose: the belief over its pose in the area's frame; that of an opening is the middle between its jambs, with
-        the heading through it, away from where it was seen from.
+        the heading through it, away from the robot.
     :ivar width: of an opening, m; 0 of a corner.
     :ivar width_deviation: of this, m.
     :ivar existence: whether it is there.
-    :ivar scatter: shape (3, 3), sum of the squares of its sightings about their mean, each in deviations.
-    :ivar scan_covariance_share: shape (3, 3), what part of their covariances is the scans' own, in deviations, on
-        average.
+    :ivar scatter: shape (3, 3), sum of the squares of its observations about their mean, each in deviations.
+    :ivar scan_covariance_share: shape (3, 3), mean part of their covariances that is the scans' own, in deviations.
     """
 
     kind: int
@@ -99,13 +98,13 @@ class Landmark:
     scan_covariance_share: Float64 = field(default_factory=lambda: np.zeros((3, 3)))
 
     def pose_from_scatter(self, ratio: Float64) -> PoseGaussian:
-        """The belief over its pose by how far its sightings are apart.
+        """The belief over its pose, with the covariance scaled by the scatter of its n observations.
 
-        What is stated of a sighting is scaled by the scatter of all n, one more being as those of its area. Errors of
-        n scans average out; those of the places that they were taken from may be one and the same, and do not.
+        The area's ratio counts as one more observation. Errors of n scans average out; those of the robot's poses may
+        be common to all, and do not.
 
         :param ratio: of its area, see `scatter_ratio`.
         """
         n = self.existence.detections
-        own = np.linalg.cholesky(self.pose.covariance) @ np.linalg.cholesky((ratio + self.scatter) / n)
-        return PoseGaussian(self.pose.mean, own @ (np.eye(3) - (1.0 - 1.0 / n) * self.scan_covariance_share) @ own.T)
+        root = np.linalg.cholesky(self.pose.covariance) @ np.linalg.cholesky((ratio + self.scatter) / n)
+        return PoseGaussian(self.pose.mean, root @ (np.eye(3) - (1.0 - 1.0 / n) * self.scan_covariance_share) @ root.T)

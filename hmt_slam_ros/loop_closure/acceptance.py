@@ -1,17 +1,19 @@
-"""What acceptance makes of a path's pending arcs: definite arcs, and keyframes that lie where their scans fit."""
+"""Acceptance of a path: its pending arcs become definite, and keyframes move to where their scans match."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
 
+from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.geometry.gaussian import PoseGaussian, chi_square_gate, match_moments
+from hmt_slam_ros.grids.patches import GridView
 from hmt_slam_ros.hybrid_map.hybrid_map import (
     ArcValue,
     AreaPair,
@@ -21,12 +23,80 @@ from hmt_slam_ros.hybrid_map.hybrid_map import (
     fuse_traversals,
 )
 from hmt_slam_ros.hybrid_map.shortest_path import is_uninformative
-from hmt_slam_ros.loop_closure.area_alignment import AreaAlignment
 from hmt_slam_ros.loop_closure.closure_history import Closure, MapSnapshot
-from hmt_slam_ros.loop_closure.closure_refinement import ClosureRefinement
+from hmt_slam_ros.loop_closure.joint_refinement import ClosureRefinement
 from hmt_slam_ros.messages.map_changes import Arc, MovedKeyframe
 from hmt_slam_ros.messages.messages import Hypothesis
+from hmt_slam_ros.registration import scan_to_map
+from hmt_slam_ros.registration.area_to_area import MatchSettings, match_areas
+from hmt_slam_ros.registration.likelihood_grid import AreaGrid, GridModel, build_area_grid
 from hmt_slam_ros.sensors import Scan
+from hmt_slam_ros.sensors.scan import transform_surfels
+from hmt_slam_ros.submap.local_mapping import LocalMapping
+
+PlacedScan: TypeAlias = tuple[Scan, Float64]
+KeyframeScans: TypeAlias = Mapping[int, Scan]
+ArcKeyframes: TypeAlias = dict[AreaPair, frozenset[int]]
+
+
+class AreaAlignment:
+    """Aligns several scans as one rigid body with several others.
+
+    First a global search covers all poses that the closure's covariance admits, since a local one would end at the next
+    similar structure. From its best pose, Gauss-Newton steps on the distance field of the map with Cauchy weights go
+    below the width of the search's cells.
+    """
+
+    def __init__(self, configuration: Configuration) -> None:
+        self._model = GridModel.from_configuration(configuration)
+        self._settings = MatchSettings.from_options(configuration.tsbi)
+        self._inflation = configuration.tlca.alignment_inflation
+        self._mapping = LocalMapping(configuration)
+        self._alignment = self._mapping.alignment._replace(inflation=1.0 / configuration.matching.temper)
+        self._gate = chi_square_gate(configuration.tsbi.gate_probability)
+
+    def align(
+        self, known: Sequence[PlacedScan], joined: Sequence[PlacedScan], closure: PoseGaussian
+    ) -> PoseGaussian | None:
+        """The belief over ``known_T_joined`` by the scans alone, as the moments of all modes.
+
+        :param known: (scan, ``known_T_base``) of the keyframes that the area held before.
+        :param joined: (scan, ``joined_T_base``) of those that joined it.
+        :param closure: belief over ``known_T_joined`` by TSBI, which also matched the surroundings.
+        :returns: None if the scans determine the pose no better than the closure did.
+        """
+        modes = match_areas(self._build_grid(joined), self._build_grid(known), closure, self._settings).modes
+        matched = match_moments([(mode.measured, mode.log_mass) for mode in modes]) if modes else closure
+        if np.linalg.det(matched.covariance) >= np.linalg.det(closure.covariance):
+            return None
+        table = self._mapping.pool.empty_table()
+        for scan, pose in known:
+            self._mapping.insert_scan(table[None], pose[None], scan)
+        surfels = [
+            transform_surfels(se2.compose(matched.mean, pose), self._mapping.matching_surfels(scan))
+            for scan, pose in joined
+        ]
+        offset = self._refine_offset(np.concatenate(surfels), closure, matched, self._mapping.pool.view(table))
+        self._mapping.pool.release(table)
+        covariance = min(self._inflation * matched.covariance, closure.covariance, key=np.linalg.det)
+        return PoseGaussian(se2.compose(offset, matched.mean), covariance)
+
+    def _build_grid(self, scans: Sequence[PlacedScan]) -> AreaGrid:
+        poses = np.array([pose for _, pose in scans]).reshape(-1, 3)
+        return build_area_grid([scan for scan, _ in scans], poses, self._model)
+
+    def _refine_offset(self, points: Float64, closure: PoseGaussian, matched: PoseGaussian, view: GridView) -> Float64:
+        """The motion in the area's frame, shape (3,), that improves the match, or none if it leaves its gate.
+
+        The closure holds the directions that walls leave open.
+        """
+        closure_information, matched_information = (
+            np.linalg.inv(belief.inverse().covariance) for belief in (closure, matched)
+        )
+        no_motion = np.zeros(3)
+        prior = scan_to_map.Prior(no_motion, closure_information.astype(np.float64, copy=False))
+        offset, _ = scan_to_map.align(points, no_motion, prior, view, self._alignment)
+        return offset if offset @ matched_information @ offset <= self._gate else no_motion
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,30 +131,24 @@ class PendingArc:
 
     def to_closure(self, log_odds: float, snapshot: MapSnapshot) -> Closure:
         """The closure that it becomes."""
-        far = self.target if self.near == self.source else self.source
-        pose = self.pose if self.near == self.source else self.pose.inverse()
+        is_from_source = self.near == self.source
+        far, pose = (self.target, self.pose) if is_from_source else (self.source, self.pose.inverse())
         return Closure((self.event, self.pair), self.near, far, pose, log_odds, snapshot)
 
 
-def pending_arc(arc: Arc, leaf: Hypothesis, event: int, near: int, hybrid_map: HybridMap) -> PendingArc:
-    """What TLCA keeps of a leaf's arc.
+def pending_arc(arc: Arc, hypothesis: Hypothesis, event: int, near: int, hybrid_map: HybridMap) -> PendingArc:
+    """The pending arc of an arc that a hypothesis set.
 
     :param near: the robot's area before the event.
-    :param hybrid_map: of the leaf's parent.
+    :param hybrid_map: of the hypothesis's parent.
     """
-    inwards = arc.target == leaf.area
-    source, target, pose = (
-        (arc.source, arc.target, arc.pose) if inwards else (arc.target, arc.source, arc.pose.inverse())
-    )
+    source, target, pose = arc.source, arc.target, arc.pose
+    if target != hypothesis.area:
+        source, target, pose = target, source, pose.inverse()
     value, before = hybrid_map.arc_value(source, target), hybrid_map.arc(source, target)
-    old = None if value is None or before is None else Arc(source, target, before, value.closure)
-    joined = tuple(sorted(r.keyframe for r in leaf.moved_keyframes if r.area == target))
-    witnesses = frozenset(joined or [event])
-    return PendingArc(event, near, source, target, pose, arc.closure, old, joined, witnesses)
-
-
-KeyframeScans: TypeAlias = Mapping[int, Scan]
-ArcKeyframes: TypeAlias = dict[AreaPair, frozenset[int]]
+    replaced = None if value is None or before is None else Arc(source, target, before, value.closure)
+    joined = tuple(sorted(moved.keyframe for moved in hypothesis.moved_keyframes if moved.area == target))
+    return PendingArc(event, near, source, target, pose, arc.closure, replaced, joined, frozenset(joined or [event]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +158,7 @@ class AcceptanceResult:
     :ivar arcs: those observed, and those around the areas that closures joined.
     :ivar moved_keyframes: the keyframes that moved.
     :ivar arc_keyframes: {arc: the keyframes by which it was observed}, of all definite arcs.
-    :ivar arcs_before: the arcs around the areas that closures joined as they were before these were refined.
+    :ivar arcs_before: the arcs around the areas that closures joined, before these were refined.
     """
 
     arcs: dict[AreaPair, Arc]
@@ -104,9 +168,7 @@ class AcceptanceResult:
 
 
 class Acceptance:
-    """Closures are finely aligned, arcs that were traveled before are fused with what was known of them, and the
-    areas refined that closures joined.
-    """
+    """Aligns closures, fuses arcs with earlier traversals, and refines the areas that closures joined."""
 
     def __init__(self, configuration: Configuration) -> None:
         self._options = configuration.tlca
@@ -121,104 +183,104 @@ class Acceptance:
         arc_keyframes: Mapping[AreaPair, frozenset[int]],
         closed_areas: Collection[int],
     ) -> AcceptanceResult:
-        """What becomes of a path that is accepted, changing its map.
+        """The result of accepting a path; changes its map.
 
         :param scans: of all keyframes.
-        :param pending_arcs: that wait for it, in order.
-        :param arc_keyframes: {arc: the keyframes by which it was observed}, of the arcs that are definite already.
+        :param pending_arcs: of the path, in order.
+        :param arc_keyframes: {arc: the keyframes by which it was observed}, of the definite arcs.
         :param closed_areas: the areas that closures joined.
         """
         arcs: dict[AreaPair, Arc] = {}
-        relabelled: list[MovedKeyframe] = []
-        before: dict[AreaPair, ArcValue] = {}
-        observed = dict(arc_keyframes)
-        for seen in pending_arcs:
-            aligned, moved = self._align(hybrid_map, scans, seen)
-            relabelled += moved
-            old = arcs.get(seen.pair, seen.replaced_arc)
-            arcs[seen.pair] = self._fuse_arc(aligned, old, observed.get(seen.pair, frozenset()))
-            observed[seen.pair] = observed.get(seen.pair, frozenset()) | seen.observing_keyframes
+        moved: list[MovedKeyframe] = []
+        arcs_before: dict[AreaPair, ArcValue] = {}
+        observers = dict(arc_keyframes)
+        for pending in pending_arcs:
+            aligned, aligned_keyframes = self._align(hybrid_map, scans, pending)
+            moved += aligned_keyframes
+            old, old_observers = arcs.get(pending.pair, pending.replaced_arc), observers.get(pending.pair, frozenset())
+            arcs[pending.pair] = self._fuse_arc(aligned, old, old_observers)
+            observers[pending.pair] = old_observers | pending.observing_keyframes
         if closed_areas:
-            relabelled, before = self._refine_closed_areas(hybrid_map, scans, closed_areas, arcs, relabelled)
-        return AcceptanceResult(arcs, relabelled, observed, before)
+            moved, arcs_before = self._refine_closed_areas(hybrid_map, scans, closed_areas, arcs, moved)
+        return AcceptanceResult(arcs, moved, observers, arcs_before)
 
     def _refine_closed_areas(
         self,
         hybrid_map: HybridMap,
         scans: KeyframeScans,
-        closed: Collection[int],
+        closed_areas: Collection[int],
         arcs: dict[AreaPair, Arc],
-        relabelled: list[MovedKeyframe],
+        moved: list[MovedKeyframe],
     ) -> tuple[list[MovedKeyframe], dict[AreaPair, ArcValue]]:
-        """Refine the areas that closures joined; the arcs around them follow.
-
-        Returns the keyframes that moved, and the arcs as they were before.
-        """
+        """All moved keyframes after the refinement, and the arcs around the areas before it; updates ``arcs``."""
         for arc in arcs.values():
             hybrid_map.set_arc(arc.source, arc.target, arc.pose, closure=arc.closure)
-        found = self._refinement.refine(hybrid_map, scans, closed)
-        before = {(a, b): value for a, b, value in hybrid_map.all_arcs() if (a, b) in found.arcs}
-        for (a, b), value in before.items():
-            arcs[a, b] = Arc(a, b, self._apply_sigma_floor(found.arcs[a, b]), value.closure)
-        moved = {
+        refined = self._refinement.refine(hybrid_map, scans, closed_areas)
+        arcs_before = {(a, b): value for a, b, value in hybrid_map.all_arcs() if (a, b) in refined.arcs}
+        for (a, b), value in arcs_before.items():
+            arcs[a, b] = Arc(a, b, self._apply_sigma_floor(refined.arcs[a, b]), value.closure)
+        moved_by_keyframe = {one.keyframe: one for one in moved} | {
             keyframe: MovedKeyframe(keyframe, area, area, pose)
-            for area, keyframes in found.keyframes.items()
+            for area, keyframes in refined.keyframes.items()
             for keyframe, pose in keyframes.items()
         }
-        return list(({r.keyframe: r for r in relabelled} | moved).values()), before
+        return list(moved_by_keyframe.values()), arcs_before
 
     def _align(
-        self, hybrid_map: HybridMap, scans: KeyframeScans, seen: PendingArc
+        self, hybrid_map: HybridMap, scans: KeyframeScans, pending: PendingArc
     ) -> tuple[PendingArc, list[MovedKeyframe]]:
-        """A closure that was found by matching areas, finely aligned."""
-        if not seen.closure:
-            return seen, []
-        if seen.joined_keyframes:
-            return self._align_joined_keyframes(hybrid_map, scans, seen)
-        return self._align_areas(hybrid_map, scans, seen), []
+        """A closure with its aligned pose, and the keyframes that move with it; other arcs as they are."""
+        if not pending.closure:
+            return pending, []
+        if pending.joined_keyframes:
+            return self._align_joined_keyframes(hybrid_map, scans, pending)
+        return self._align_areas(hybrid_map, scans, pending), []
 
     def _align_joined_keyframes(
-        self, hybrid_map: HybridMap, scans: KeyframeScans, seen: PendingArc
+        self, hybrid_map: HybridMap, scans: KeyframeScans, pending: PendingArc
     ) -> tuple[PendingArc, list[MovedKeyframe]]:
-        """The keyframes that joined a known area, moved to where their scans fit the area's own, and the arc likewise.
+        """The arc and the keyframes that joined a known area, aligned with the area's own keyframes.
 
-        Keyframes that the robot stored in the area since then are on neither side: they were matched against both.
+        Keyframes stored in the area since then are on neither side, as they were matched against both.
         """
-        placed = hybrid_map.keyframes(seen.target)
-        joined = [keyframe for keyframe in seen.joined_keyframes if keyframe in placed]
-        known = [keyframe for keyframe in placed if keyframe < seen.joined_keyframes[0]]
+        poses = hybrid_map.keyframes(pending.target)
+        joined = [keyframe for keyframe in pending.joined_keyframes if keyframe in poses]
+        known = [keyframe for keyframe in poses if keyframe < pending.joined_keyframes[0]]
         motion = self._alignment.align(
-            [(scans[keyframe], placed[keyframe]) for keyframe in known],
-            [(scans[keyframe], placed[keyframe]) for keyframe in joined],
-            PoseGaussian(np.zeros(3), seen.pose.covariance),
+            [(scans[keyframe], poses[keyframe]) for keyframe in known],
+            [(scans[keyframe], poses[keyframe]) for keyframe in joined],
+            PoseGaussian(np.zeros(3), pending.pose.covariance),
         )
         if motion is None:
-            return seen, []
+            return pending, []
         moved = [
-            MovedKeyframe(keyframe, seen.target, seen.target, se2.compose(motion.mean, placed[keyframe]))
+            MovedKeyframe(keyframe, pending.target, pending.target, se2.compose(motion.mean, poses[keyframe]))
             for keyframe in joined
         ]
-        for r in moved:
-            hybrid_map.set_keyframe(r.keyframe, r.area, r.pose)
-        return replace(seen, pose=PoseGaussian.from_pose(seen.pose.mean).compose(motion.inverse())), moved
+        for keyframe in moved:
+            hybrid_map.set_keyframe(keyframe.keyframe, keyframe.area, keyframe.pose)
+        return replace(pending, pose=PoseGaussian.from_pose(pending.pose.mean).compose(motion.inverse())), moved
 
-    def _align_areas(self, hybrid_map: HybridMap, scans: KeyframeScans, seen: PendingArc) -> PendingArc:
+    def _align_areas(self, hybrid_map: HybridMap, scans: KeyframeScans, pending: PendingArc) -> PendingArc:
         """An arc between areas that keep their keyframes, as the scans of both measure it."""
-        known, others = (
+        source_scans, target_scans = (
             [(scans[keyframe], pose) for keyframe, pose in hybrid_map.keyframes(area).items()]
-            for area in (seen.source, seen.target)
+            for area in (pending.source, pending.target)
         )
-        found = self._alignment.align(known, others, seen.pose)
-        return seen if found is None else replace(seen, pose=found)
+        aligned = self._alignment.align(source_scans, target_scans, pending.pose)
+        return pending if aligned is None else replace(pending, pose=aligned)
 
-    def _fuse_arc(self, seen: PendingArc, old: Arc | None, witnesses: frozenset[int]) -> Arc:
-        """The definite arc from an observation and what was known before, which tells whether it closed a loop."""
-        belief, closure = seen.pose, seen.closure
+    def _fuse_arc(self, pending: PendingArc, old: Arc | None, observers: frozenset[int]) -> Arc:
+        """The definite arc from a new observation and the old arc, which decides whether it closed a loop.
+
+        :param observers: the keyframes by which the old arc was observed.
+        """
+        belief, closure = pending.pose, pending.closure
         if old is not None and not is_uninformative(old.pose):
-            shared = len(seen.observing_keyframes & witnesses) / len(seen.observing_keyframes)
-            known = old.pose if old.source == seen.source else old.pose.inverse()
+            shared = len(pending.observing_keyframes & observers) / len(pending.observing_keyframes)
+            known = old.pose if old.source == pending.source else old.pose.inverse()
             belief, closure = fuse_traversals(known, belief, shared), old.closure
-        return Arc(seen.source, seen.target, self._apply_sigma_floor(belief), closure)
+        return Arc(pending.source, pending.target, self._apply_sigma_floor(belief), closure)
 
     def _apply_sigma_floor(self, belief: PoseGaussian) -> PoseGaussian:
         return apply_sigma_floor(belief, self._options.arc_sigma_floor, math.radians(self._options.arc_angle_floor))

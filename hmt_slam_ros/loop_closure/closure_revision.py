@@ -1,13 +1,12 @@
-"""Do accepted closures contradict each other, and what TLCA asks TSBI anew where they do.
+"""Consistency of accepted closures, and their revision by TSBI where they contradict each other.
 
-A closure fits where the chi-square of all arcs does not grow by more than a quantile with its cycle. Where one that is
-new does not fit, either it is false, or one that was accepted before and with it whatever was accepted because of it,
-or chance has been unkind. The most probable explanation is the one of least chi-square, with the odds at which a
-closure was accepted as the price of its being false:
+A new closure is consistent if the chi-square of all arcs grows by no more than a quantile with its cycle. Otherwise it
+is false, or an earlier closure is and with it what was accepted because of it, or it is chance. The most probable
+explanation has the smallest chi-square, and pays for a false closure the odds at which it was accepted:
 
-    -2 log P = chi2 - 3 (closures left) + 2 log odds(first that is false) + const
+    -2 log P = chi2 - 3 (closures left) + 2 log odds(first false closure) + const
 
-What was accepted after a false closure was judged by a false map; of these, all that do not fit are false for nothing.
+Closures accepted after a false one were judged by a false map: of these, the inconsistent ones are false at no price.
 """
 
 from __future__ import annotations
@@ -20,8 +19,8 @@ import numpy as np
 
 from hmt_slam_ros.configuration.topology import LoopClosureParameters
 from hmt_slam_ros.geometry.gaussian import PoseGaussian, chi_square_gate
-from hmt_slam_ros.hybrid_map.global_map import total_arc_chi2
 from hmt_slam_ros.hybrid_map.hybrid_map import AreaPair, HybridMap
+from hmt_slam_ros.hybrid_map.pose_graph import total_arc_chi2
 from hmt_slam_ros.loop_closure.closure_history import (
     AcceptedPath,
     Closure,
@@ -36,14 +35,15 @@ from hmt_slam_ros.messages.messages import Hypothesis, Notice
 from hmt_slam_ros.messages.replica import FIRST_AREA
 
 _DEGREES_OF_FREEDOM = 3
+"""Degrees of freedom of a cycle of arcs."""
 
 
 class Explanation(NamedTuple):
-    """One way in which closures that contradict each other go together.
+    """One set of false closures that explains a contradiction.
 
-    :ivar path: the path without what is false.
-    :ivar false_closures: the closures that are false, in the order of acceptance.
-    :ivar probability: that this is so.
+    :ivar path: the path without them.
+    :ivar false_closures: in the order of acceptance.
+    :ivar probability: of the explanation.
     """
 
     path: AcceptedPath
@@ -52,10 +52,10 @@ class Explanation(NamedTuple):
 
 
 class Inconsistency(NamedTuple):
-    """A closure that does not fit.
+    """A new closure that contradicts others.
 
     :ivar closure: the new closure.
-    :ivar excess_chi2: by how much the chi-square grows with it.
+    :ivar excess_chi2: growth of the chi-square with it.
     :ivar explanations: of that, the most probable first.
     """
 
@@ -65,7 +65,7 @@ class Inconsistency(NamedTuple):
 
 
 class ClosureConsistencyCheck:
-    """Looks for contradictions in one account.
+    """Tests the closures of one path.
 
     :param max_excess: the quantile of chi-square.
     :param new_area: the first number that no area has.
@@ -79,9 +79,9 @@ class ClosureConsistencyCheck:
         self._chi2: dict[frozenset[ClosureId], float] = {}
 
     def find_inconsistency(self, new: Collection[ClosureId], min_probability: float) -> Inconsistency | None:
-        """The contradiction that new closures bring, or None.
+        """The worst contradiction of new closures, or None.
 
-        :param min_probability: explanations less probable are left out.
+        :param min_probability: smallest probability of an explanation.
         """
         excess = {closure: self._excess_chi2(closure, frozenset()) for closure in self._closures_by_id(new)}
         worst = max(excess, key=lambda closure: excess[closure], default=None)
@@ -89,39 +89,39 @@ class ClosureConsistencyCheck:
             return None
         return Inconsistency(worst, excess[worst], tuple(self._explanations(worst, min_probability)))
 
-    def _explanations(self, doubted: Closure, least: float) -> list[Explanation]:
+    def _explanations(self, inconsistent: Closure, min_probability: float) -> list[Explanation]:
         costs = {frozenset[ClosureId](): self._cost(frozenset())}
-        for root in self._path.closures:
-            false = self._false_closures(root, doubted)
+        for first in self._path.closures:
+            false = self._false_closures(first, inconsistent)
             if false is not None:
-                cost = self._cost(false) + 2.0 * root.log_odds
+                cost = self._cost(false) + 2.0 * first.log_odds
                 costs[false] = min(cost, costs.get(false, np.inf))
         weights = np.exp(-0.5 * (np.array(list(costs.values())) - min(costs.values())))
-        found = [
+        explanations = [
             Explanation(self._path_without(false), self._closures_by_id(false), float(probability))
             for false, probability in zip(costs, weights / weights.sum(), strict=True)
-            if probability >= least
+            if probability >= min_probability
         ]
-        return sorted(found, key=lambda explanation: -explanation.probability)
+        return sorted(explanations, key=lambda explanation: -explanation.probability)
 
-    def _false_closures(self, root: Closure, doubted: Closure) -> frozenset[ClosureId] | None:
-        """What is false where ``root`` is the first that is; None where that does not explain the doubt."""
+    def _false_closures(self, first: Closure, inconsistent: Closure) -> frozenset[ClosureId] | None:
+        """The false closures if ``first`` is the first of them; None if that does not explain the contradiction."""
         order = [closure.closure_id for closure in self._path.closures]
-        later = [name for name in order[order.index(root.closure_id) + 1 :] if name != doubted.closure_id]
-        false = frozenset({root.closure_id, *later})
-        if root is not doubted and self._excess_chi2(doubted, false) > self._max_excess:
+        later = [other for other in order[order.index(first.closure_id) + 1 :] if other != inconsistent.closure_id]
+        false = frozenset({first.closure_id, *later})
+        if first is not inconsistent and self._excess_chi2(inconsistent, false) > self._max_excess:
             return None
-        for name in later:
-            closure = self._closures_by_id({name})[0]
-            if self._excess_chi2(closure, false - {name}) <= self._max_excess:
-                false -= {name}
-        return false if self._excess_chi2(root, false - {root.closure_id}) > self._max_excess else None
+        for other in later:
+            closure = self._closures_by_id({other})[0]
+            if self._excess_chi2(closure, false - {other}) <= self._max_excess:
+                false -= {other}
+        return false if self._excess_chi2(first, false - {first.closure_id}) > self._max_excess else None
 
-    def _closures_by_id(self, names: Collection[ClosureId]) -> tuple[Closure, ...]:
-        return tuple(closure for closure in self._path.closures if closure.closure_id in names)
+    def _closures_by_id(self, ids: Collection[ClosureId]) -> tuple[Closure, ...]:
+        return tuple(closure for closure in self._path.closures if closure.closure_id in ids)
 
     def _excess_chi2(self, closure: Closure, false: frozenset[ClosureId]) -> float:
-        """By how much the chi-square grows with a closure, where others are false."""
+        """Growth of the chi-square with a closure, if others are false."""
         return self._total_arc_chi2(false) - self._total_arc_chi2(false | {closure.closure_id})
 
     def _cost(self, false: frozenset[ClosureId]) -> float:
@@ -133,14 +133,14 @@ class ClosureConsistencyCheck:
         return self._chi2[false]
 
     def _path_without(self, false: frozenset[ClosureId]) -> AcceptedPath:
-        """The account without some closures; what hangs on several of them hangs on the last."""
+        """The path without some closures, the last of which is withdrawn first."""
         if false not in self._paths:
-            account, new_area, closures = self._path, self._new_area, self._closures_by_id(false)
-            account = undo_refinements(account, closures[0].closure_id) if closures else account
-            for closure in reversed(closures):
-                account = withdraw_closure(account, closure.closure_id, new_area)
-                new_area += 1
-            self._paths[false] = account
+            path, closures = self._path, self._closures_by_id(false)
+            if closures:
+                path = undo_refinements(path, closures[0].closure_id)
+            for new_area, closure in enumerate(reversed(closures), self._new_area):
+                path = withdraw_closure(path, closure.closure_id, new_area)
+            self._paths[false] = path
         return self._paths[false]
 
 
@@ -148,10 +148,10 @@ ExplanationKey = tuple[tuple[AreaPair, ...], tuple[AreaPair, ...]]
 
 
 class RevisionRequest(NamedTuple):
-    """A question that is open again.
+    """A request to TSBI to decide between explanations.
 
-    :ivar hypotheses: the answers.
-    :ivar notice: what a person should know of it.
+    :ivar hypotheses: the explanations, as children of the hypothesis.
+    :ivar notice: about the contradiction.
     """
 
     hypotheses: tuple[Hypothesis, ...]
@@ -159,7 +159,7 @@ class RevisionRequest(NamedTuple):
 
 
 class PathHistory(NamedTuple):
-    """What a path went through.
+    """The steps and closures of a path.
 
     :ivar steps: the keyframe events at which the robot changed its area or arcs were new, in order.
     :ivar closures: those that were accepted, in order.
@@ -171,11 +171,11 @@ class PathHistory(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class ClosureRevisionState:
-    """What is known of questions that were opened again.
+    """What TLCA remembers of its revision requests.
 
     :ivar max_area_id: the largest area that there ever was.
-    :ivar requested_at: the keyframe event of the last question, -1 before the first.
-    :ivar histories: {(arcs withdrawn, arcs set): the past of a path that goes on with this answer to it}.
+    :ivar requested_at: the keyframe event of the last request, -1 before the first.
+    :ivar histories: {(arcs removed, arcs set): the history of a path that follows this explanation}.
     """
 
     max_area_id: int = FIRST_AREA
@@ -184,100 +184,88 @@ class ClosureRevisionState:
 
 
 class ClosureRevision:
-    """Finds contradictions, and knows the answers again that TSBI goes on with."""
+    """Finds contradictions, and recognizes the explanations with which TSBI continues.
+
+    :ivar state: what is remembered.
+    """
 
     def __init__(self, options: LoopClosureParameters, state: ClosureRevisionState) -> None:
-        """:param state: to go on from."""
+        """:param state: to continue from."""
         self._max_excess = chi_square_gate(options.contradiction_probability)
         self._min_probability = 1.0 - options.accept_probability
-        self._state = state
-
-    @property
-    def state(self) -> ClosureRevisionState:
-        """All that is known."""
-        return self._state
+        self.state = state
 
     def check(
         self, event: int, path: AcceptedPath, new: Collection[ClosureId], hypothesis: int
     ) -> RevisionRequest | None:
-        """The question that closures raise which have just been accepted, if they do not fit.
+        """The request to revise closures that were just accepted, if they are inconsistent.
 
         :param new: these closures.
-        :param hypothesis: the hypothesis of the account.
+        :param hypothesis: the hypothesis of the path.
         """
-        doubt = ClosureConsistencyCheck(path, self._max_excess, self._state.max_area_id + 1).find_inconsistency(
-            new, self._min_probability
-        )
-        if doubt is None:
+        consistency_check = ClosureConsistencyCheck(path, self._max_excess, self.state.max_area_id + 1)
+        found = consistency_check.find_inconsistency(new, self._min_probability)
+        if found is None:
             return None
-        leaves = tuple(_as_hypothesis(explanation, hypothesis, path.hybrid_map) for explanation in doubt.explanations)
+        hypotheses = tuple(_as_hypothesis(one, hypothesis, path.hybrid_map) for one in found.explanations)
         histories = {
-            _explanation_key(leaf): PathHistory(explanation.path.history, explanation.path.closures)
-            for leaf, explanation in zip(leaves, doubt.explanations, strict=True)
+            _explanation_key(child): PathHistory(explanation.path.history, explanation.path.closures)
+            for child, explanation in zip(hypotheses, found.explanations, strict=True)
         }
-        self._state = replace(self._state, requested_at=event, histories=histories)
-        for leaf in leaves:
-            self._note_areas(leaf)
-        return RevisionRequest(leaves, Notice("tlca", _notice_text(doubt, self._max_excess)))
+        self.state = replace(self.state, requested_at=event, histories=histories)
+        for child in hypotheses:
+            self._note_areas(child)
+        return RevisionRequest(hypotheses, Notice("tlca", _notice_text(found, self._max_excess)))
 
-    def resolve(self, leaf: Hypothesis, event: int) -> PathHistory | None:
-        """Learn of a leaf; where it answers the question of the event before, the past of a path with that answer."""
-        self._note_areas(leaf)
-        asked = self._state.histories if event == self._state.requested_at + 1 else {}
-        return asked[_explanation_key(leaf)] if asked else None
+    def resolve(self, hypothesis: Hypothesis, event: int) -> PathHistory | None:
+        """The history of a hypothesis that follows an explanation of the last event's request; None for others."""
+        self._note_areas(hypothesis)
+        histories = self.state.histories if event == self.state.requested_at + 1 else {}
+        return histories[_explanation_key(hypothesis)] if histories else None
 
-    def _note_areas(self, leaf: Hypothesis) -> None:
-        areas = [area for arc in leaf.arcs for area in (arc.source, arc.target)]
-        self._state = replace(self._state, max_area_id=max(self._state.max_area_id, leaf.area, *areas))
+    def _note_areas(self, hypothesis: Hypothesis) -> None:
+        areas = [area for arc in hypothesis.arcs for area in (arc.source, arc.target)]
+        self.state = replace(self.state, max_area_id=max(self.state.max_area_id, hypothesis.area, *areas))
 
 
 def _as_hypothesis(explanation: Explanation, hypothesis: int, hybrid_map: HybridMap) -> Hypothesis:
-    """What an explanation changes, as the child of a hypothesis.
+    """An explanation as a child of a hypothesis.
 
     :param hybrid_map: of the hypothesis.
     """
-    account = explanation.path
-    changed = account.hybrid_map
-    former = {
-        k: area for area in changed.changed_areas if hybrid_map.has_area(area) for k in hybrid_map.keyframes(area)
-    }
-    relabelled = tuple(
-        MovedKeyframe(k, former[k], area, pose)
-        for area, keyframes in sorted(changed.changed_areas.items())
+    path = explanation.path
+    changed_areas, changed_arcs = path.hybrid_map.changed_areas, sorted(path.hybrid_map.changed_arcs.items())
+    former_areas = {k: area for area in changed_areas if hybrid_map.has_area(area) for k in hybrid_map.keyframes(area)}
+    moved = tuple(
+        MovedKeyframe(k, former_areas[k], area, pose)
+        for area, keyframes in sorted(changed_areas.items())
         for k, pose in keyframes.items()
-        if former[k] != area or not np.array_equal(pose, hybrid_map.keyframes(area)[k])
+        if former_areas[k] != area or not np.array_equal(pose, hybrid_map.keyframes(area)[k])
     )
-    rebase = None if account.frame_change is None else PoseGaussian.from_pose(account.frame_change)
     return Hypothesis(
         hypothesis,
         hypothesis,
         explanation.probability,
-        account.area,
-        rebase,
-        relabelled,
-        tuple(
-            Arc(a, b, arc.pose, arc.closure) for (a, b), arc in sorted(changed.changed_arcs.items()) if arc is not None
-        ),
-        removed_arcs=tuple(
-            ArcEnds(a, b)
-            for (a, b), arc in sorted(changed.changed_arcs.items())
-            if arc is None and hybrid_map.arc(a, b)
-        ),
+        path.area,
+        None if path.frame_change is None else PoseGaussian.from_pose(path.frame_change),
+        moved,
+        tuple(Arc(a, b, arc.pose, arc.closure) for (a, b), arc in changed_arcs if arc is not None),
+        removed_arcs=tuple(ArcEnds(a, b) for (a, b), arc in changed_arcs if arc is None and hybrid_map.arc(a, b)),
     )
 
 
-def _explanation_key(leaf: Hypothesis) -> ExplanationKey:
-    withdrawn = tuple((ends.source, ends.target) for ends in leaf.removed_arcs)
-    return withdrawn, tuple((arc.source, arc.target) for arc in leaf.arcs)
+def _explanation_key(hypothesis: Hypothesis) -> ExplanationKey:
+    removed = tuple((ends.source, ends.target) for ends in hypothesis.removed_arcs)
+    return removed, tuple((arc.source, arc.target) for arc in hypothesis.arcs)
 
 
-def _notice_text(doubt: Inconsistency, bound: float) -> str:
+def _notice_text(inconsistency: Inconsistency, bound: float) -> str:
     """One sentence."""
-    a, b = doubt.closure.pair
-    best = doubt.explanations[0]
+    a, b = inconsistency.closure.pair
+    best = inconsistency.explanations[0]
     false = " and ".join(f"{closure.near}-{closure.far}" for closure in best.false_closures) or "none"
     return (
         f"The closure between areas {a} and {b} contradicts those accepted before by a chi-square of "
-        f"{doubt.excess_chi2:.1f}, above {bound:.1f}: of all closures {false} is taken for false with probability "
-        f"{best.probability:.3f}; raise tlca.accept_probability if this happens often."
+        f"{inconsistency.excess_chi2:.1f}, above {bound:.1f}: of all closures {false} is taken for false with "
+        f"probability {best.probability:.3f}; raise tlca.accept_probability if this happens often."
     )

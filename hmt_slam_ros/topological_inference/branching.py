@@ -1,8 +1,8 @@
-"""The children of a hypothesis, where its newest keyframes may lie in known areas: Eq. (6), summed over gamma.
+"""The children of a hypothesis: Eq. (6), summed over the areas gamma that its newest keyframes may lie in.
 
-Every scan is counted once. Metric SLAM's evidence counts it against the local map. Here the surfaces of several
-keyframes are compared with known areas of which the local map did not know: what that map holds is left out of the
-candidates' grids, and no keyframe is compared with an area twice.
+Every scan counts once. Metric SLAM compares it with the submap. Here the surfaces of several keyframes are compared
+with known areas outside the submap: the submap's areas are left out of the candidates' grids, and no keyframe is
+compared with an area twice.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry import se2
@@ -28,11 +28,19 @@ from hmt_slam_ros.messages.messages import Hypothesis
 from hmt_slam_ros.messages.replica import FIRST_AREA, Replica
 from hmt_slam_ros.registration.consistency import NO_CLUTTER, Clutter
 from hmt_slam_ros.sensors import Scan
-from hmt_slam_ros.topological_inference.admission import Query
+from hmt_slam_ros.topological_inference.candidate_gating import Query
 from hmt_slam_ros.topological_inference.closure_search import AreaComparison, ClosureSearch, Fit, SearchState
-from hmt_slam_ros.topological_inference.global_localization import PoseDistribution, PoseHint
+from hmt_slam_ros.topological_inference.global_localization import LandmarkEvidence, PoseDistribution, PoseHint
 from hmt_slam_ros.topological_inference.hypothesis_tree import HypothesisState, Lost, relative_covariance
-from hmt_slam_ros.topological_inference.landmark_evidence import LandmarkEvidence
+
+MIN_PROPOSAL_PROBABILITY = 0.5
+"""Smallest probability of a hypothesis for which landmarks propose loops."""
+
+MIN_EXAMINED_AREAS = 4
+"""Known areas that every hypothesis may examine at a cut, however improbable it is."""
+
+_UNCONFIRMED_INFLATION = 100.0
+"""Factor on the covariance of an arc along other arcs that no match confirms: it adds next to nothing to those."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,8 +48,8 @@ class Parent:
     """A hypothesis before the event.
 
     :ivar log_weight: log of its probability, the newest scan's evidence included.
-    :ivar probability: its probability before, by which hypotheses share the areas that are examined at an event.
-    :ivar clutter: what contradicts its map usually.
+    :ivar probability: its probability before, in proportion to which it may examine areas.
+    :ivar clutter: usual rate of contradictions of its map.
     """
 
     hypothesis: int
@@ -52,13 +60,17 @@ class Parent:
     probability: float = 1.0
     clutter: Clutter = NO_CLUTTER
 
-    def local_area_poses(self) -> dict[int, NDArray[np.float64]]:
-        """{area: ``area_T_other``} of the local map's other areas."""
+    def local_area_poses(self) -> dict[int, Float64]:
+        """{area: ``area_T_other``} of the submap's other areas."""
         return {area: pose for area, pose in self.state.local_area_poses.items() if self.hybrid_map.has_area(area)}
 
-    def covariance(self, keyframe: int) -> NDArray[np.float64]:
-        """Of a keyframe's pose in the robot's area, shape (3, 3)."""
+    def covariance(self, keyframe: int) -> Float64:
+        """The covariance of a keyframe's pose in the robot's area, shape (3, 3)."""
         return self.state.covariances.get(keyframe, np.zeros((3, 3)))
+
+    def unchanged_child(self, state: HypothesisState | None = None) -> Child:
+        """The child with the robot in the same area of the same map, and with this state, if one is given."""
+        return Child(self.hypothesis, self.log_weight, self.area, state or self.state)
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +79,7 @@ class Child:
 
     :ivar parent: id of the hypothesis that it continues.
     :ivar log_weight: log of its weight, unnormalized.
-    :ivar reload_local_map: whether the local map has to be loaded anew.
+    :ivar reload_local_map: whether the submap has to be loaded again.
     """
 
     parent: int
@@ -85,9 +97,9 @@ class Child:
 class Branches(NamedTuple):
     """All continuations of one hypothesis.
 
-    :ivar closures_searched: whether known areas were looked for.
-    :ivar log_skipped_weight: log of the weight of those that were not looked at.
-    :ivar pose_distribution: where in the map a robot may be of which nothing told how it came there, if that was asked.
+    :ivar closures_searched: whether known areas were searched.
+    :ivar log_skipped_weight: log of the weight of those that were not examined.
+    :ivar pose_distribution: of a lost robot in the map, if it was searched.
     """
 
     children: list[Child]
@@ -96,25 +108,13 @@ class Branches(NamedTuple):
     pose_distribution: PoseDistribution | None = None
 
 
-MIN_HYPOTHESIS_PROBABILITY = 0.5
-"""Hypotheses of this probability are asked for loops that landmarks propose."""
-
-MIN_EXAMINED_AREAS = 4
-"""Known areas that every hypothesis may examine at a cut, however improbable it is."""
-
-# Factor on the covariance of an arc along other arcs, where no match confirms it: it adds next to nothing to those.
-_UNCONFIRMED = 100.0
-
-
 @dataclass(frozen=True)
 class BranchingState:
-    """What is known of areas beside the maps of the hypotheses.
-
-    :class:`Branching` does not hold it, as its search reads the scans from a table that changes in place.
+    """What branching remembers beside the maps of the hypotheses.
 
     :ivar largest_area: the largest number that an area was given.
-    :ivar search: what was learnt by comparing areas.
-    :ivar unstored_scans: {keyframe event: scan} of those that no map holds and that may be looked for.
+    :ivar search: what the closure search learned.
+    :ivar unstored_scans: {keyframe event: scan} of scans that no map holds and that may still be matched.
     """
 
     largest_area: int = FIRST_AREA
@@ -123,12 +123,12 @@ class BranchingState:
 
 
 class Branching:
-    """Makes the children of hypotheses; numbers new areas.
+    """Creates the children of hypotheses, and numbers new areas.
 
     :ivar search: finds and compares known areas.
-    :ivar landmarks: what they say of places and loops, where they are asked.
-    :ivar unstored_scans: {keyframe event: scan} of those that no map holds and that may be looked for.
-    :ivar options: the parameters of the inference.
+    :ivar landmarks: their evidence on places and loops, where the configuration asks for it.
+    :ivar unstored_scans: {keyframe event: scan} of scans that no map holds and that may still be matched.
+    :ivar options: parameters of the inference.
     """
 
     def __init__(
@@ -156,69 +156,67 @@ class Branching:
 
     @property
     def state(self) -> BranchingState:
-        """All that is known between two events."""
+        """What is remembered between two events."""
         return BranchingState(self._largest_area, self.search.state, dict(self.unstored_scans))
 
     def restore(self, state: BranchingState) -> None:
-        """Take over what was known before the first event."""
+        """Start from a saved state."""
         self._largest_area = state.largest_area
         self.search.restore(state.search)
         self.unstored_scans.update(state.unstored_scans)
 
     def localize_globally(
-        self, parent: Parent, poses: Mapping[int, NDArray[np.float64]], before: int, pose_hint: PoseHint | None = None
+        self, parent: Parent, poses: Mapping[int, Float64], before: int, pose_hint: PoseHint | None = None
     ) -> PoseDistribution:
-        """Where in the map keyframes lie of which the arcs tell nothing.
+        """The distribution of the keyframes' pose in the whole map.
 
-        Landmarks are asked after a look that found a place: one look alone finds nobody, and by then they are gathered.
+        Landmarks count from the second search with a candidate on, since one search alone localizes nobody.
 
         :param poses: {keyframe: ``reference_T_base``}.
         :param before: the map is that of the keyframes before this one.
-        :param pose_hint: where the reference is, if somebody says so.
+        :param pose_hint: of the reference.
         """
-        where = self.search.localize_globally(parent.hybrid_map, poses, before, parent.clutter, pose_hint)
+        distribution = self.search.localize_globally(parent.hybrid_map, poses, before, parent.clutter, pose_hint)
         lost = parent.state.localization
         if self.landmarks is None or not isinstance(lost, Lost) or lost.candidate is None:
-            return where
-        return self.landmarks.weigh(where, parent.hybrid_map, poses, before)
+            return distribution
+        return self.landmarks.weigh(distribution, parent.hybrid_map, poses, before)
 
     def look_ahead(self, parents: Sequence[Parent]) -> None:
-        """At an event at which nothing was looked for, prepare what the next look will ask for."""
+        """Prepare the next search, at an event without one."""
         self.search.look_ahead(max(parents, key=lambda parent: parent.log_weight).hybrid_map)
-        found = [(one.hybrid_map, one.state.localization) for one in parents]
-        lost = [(hybrid_map, one.since) for hybrid_map, one in found if isinstance(one, Lost)]
-        if lost and self.landmarks is not None:
-            self.landmarks.prepare_places(lost)
+        localizations = [(parent.hybrid_map, parent.state.localization) for parent in parents]
+        lost_maps = [(hybrid_map, lost.since) for hybrid_map, lost in localizations if isinstance(lost, Lost)]
+        if lost_maps and self.landmarks is not None:
+            self.landmarks.prepare_places(lost_maps)
 
     def end_global_localization(self) -> None:
-        """It is known where the robot is."""
+        """Free what served global localization."""
         self.search.end_global_localization()
         if self.landmarks is not None:
             self.landmarks.localized()
 
     def forget_scans(self) -> None:
-        """Work out anew what is made of scans, of which some have changed."""
+        """Drop what was computed from scans, of which some have changed."""
         self.search.forget_scans()
         if self.landmarks is not None:
             self.landmarks.forget_scans()
 
     def keep_scans(self, event: int, scan: Scan, wanted: Collection[int]) -> None:
-        """Keep the scan of a keyframe event, and of those that were kept the ones that are wanted."""
-        for late in self.unstored_scans.keys() - set(wanted):
-            del self.unstored_scans[late]
+        """Keep the scans of the wanted keyframe events, the newest event's among them, and drop others."""
+        for unwanted in self.unstored_scans.keys() - set(wanted):
+            del self.unstored_scans[unwanted]
         if event in wanted:
             self.unstored_scans[event] = scan
 
     def begin_event(self) -> None:
-        """Forget which new areas were named; within one event hypotheses share the ids of the same new area."""
+        """Begin an event, within which hypotheses share the numbers of new areas with the same keyframes."""
         self._new_areas = {}
 
-    def reweight_by_known_ground(
-        self, parent: Parent, pose: NDArray[np.float64], points: NDArray[np.float64], keyframe: int
-    ) -> Parent:
-        """The hypothesis weighed by what the newest scan says for the known ground that it has the robot in.
+    def reweight_by_known_ground(self, parent: Parent, pose: Float64, points: Float64, keyframe: int) -> Parent:
+        """The hypothesis with the evidence of the newest scan for the known ground around it.
 
-        :param points: its surface points, shape (n, 2), m, base frame.
+        :param points: the scan's surface points, shape (n, 2), m, base frame.
         :param pose: ``area_T_base`` of the scan.
         :param keyframe: its number.
         """
@@ -227,57 +225,52 @@ class Branching:
         return replace(parent, log_weight=parent.log_weight + log_ratio)
 
     def cut(self, parent: Parent, keyframes: Sequence[int]) -> Branches:
-        """{new area} and every known area that the arcs admit, with one child a mode.
+        """Branch over a new area and every known area that the arcs admit, with one child per mode.
 
-        Where the keyframes lie in the place of an area of the local map there is nothing to ask: the robot tracks its
-        pose there, and "new" would be the same metric map under another name.
+        Where the keyframes lie in the place of an area of the submap there is one child: the robot is tracked there.
         """
         query = self.query(parent, keyframes)
-        tracked = self.search.tracked_area(
-            parent.hybrid_map, parent.area, parent.local_area_poses(), query.poses_in_area
-        )
+        local_areas = parent.local_area_poses()
+        tracked = self.search.tracked_area(parent.hybrid_map, parent.area, local_areas, query.poses_in_area)
         if tracked is not None:
             return Branches([self._enter_tracked(parent, query, tracked)])
-        excluded = {parent.area, *parent.local_area_poses()}
-        supposed = parent
-        if self.landmarks is not None and parent.probability >= MIN_HYPOTHESIS_PROBABILITY:
-            supposed = replace(parent, hybrid_map=self.landmarks.propose_loop(parent.hybrid_map, parent.area))
-        found = self._compare_areas(supposed, query, excluded)
-        noted = replace(
-            parent, state=parent.state.after_matching(found.examined_areas, keyframes, found.pending_candidates)
-        )
-        children = [self._enter_new(noted, query, math.log(found.transition.new))]
-        children += [self._enter_known(noted, query, fit) for fit in found.fits]
+        proposed = parent
+        if self.landmarks is not None and parent.probability >= MIN_PROPOSAL_PROBABILITY:
+            proposed = replace(parent, hybrid_map=self.landmarks.propose_loop(parent.hybrid_map, parent.area))
+        found = self._compare_areas(proposed, query, {parent.area, *local_areas})
+        state = parent.state.after_matching(found.examined_areas, keyframes, found.pending_candidates)
+        parent = replace(parent, state=state)
+        children = [self._enter_new(parent, query, math.log(found.transition.new))]
+        children += [self._enter_known(parent, query, fit) for fit in found.fits]
         return Branches(children, True, _log(found.skipped_weight) + parent.log_weight)
 
     def recheck(self, parent: Parent, only: Collection[int] = ()) -> Branches:
-        """Stay as it is, or join the robot's area to a known one by a further arc; no keyframe changes its area.
+        """Branch over no change and a further arc from the robot's area to a known one; no keyframe changes its area.
 
-        :param only: known areas beside which keyframes fitted: whether the newest are in one of them now.
+        :param only: the only areas to examine, beside which keyframes fitted; all if empty.
         """
         newest = sorted(parent.state.covariances)[-self.options.recheck_keyframes :]
-        placed = parent.hybrid_map.keyframes(parent.area)
-        keyframes = [k for k in (newest if only else parent.state.unmatched_keyframes) if k in placed]
+        own = parent.hybrid_map.keyframes(parent.area)
+        keyframes = [k for k in (newest if only else parent.state.unmatched_keyframes) if k in own]
         query = self.query(parent, keyframes)
         excluded = {parent.area, *parent.local_area_poses(), *connected_neighbors(parent.hybrid_map, parent.area)}
-        if self.landmarks is not None and parent.probability >= MIN_HYPOTHESIS_PROBABILITY:
+        if self.landmarks is not None and parent.probability >= MIN_PROPOSAL_PROBABILITY:
             self.landmarks.prepare_loops(parent.hybrid_map, parent.area)
         found = self._compare_areas(parent, query, excluded, only)
-        notes = parent.state.after_matching(
+        state = parent.state.after_matching(
             found.examined_areas, keyframes, found.pending_candidates, all_areas=not only
         )
-        noted = replace(parent, state=notes)
-        # That none is in the place was weighed when they fitted beside it.
+        parent = replace(parent, state=state)
+        # The probability that they are in no place counted when they fitted beside it.
         log_new = 0.0 if only and not found.fits else math.log(found.transition.new)
-        stay = parent.log_weight + log_new
-        children = [Child(parent.hypothesis, stay, parent.area, noted.state)]
-        children += [self._join(noted, query, fit) for fit in found.fits]
+        stay = replace(parent.unchanged_child(), log_weight=parent.log_weight + log_new)
+        children = [stay, *(self._join(parent, query, fit) for fit in found.fits)]
         return Branches(children, True, _log(found.skipped_weight) + parent.log_weight)
 
     def _compare_areas(
         self, parent: Parent, query: Query, excluded: Collection[int], only: Collection[int] = ()
     ) -> AreaComparison:
-        """The comparison with known areas, of which a hypothesis may examine the more the more probable it is."""
+        """The comparison with known areas, more of them the more probable the hypothesis is."""
         most = min(
             self.options.max_candidates,
             max(MIN_EXAMINED_AREAS, math.ceil(self.options.max_comparisons * parent.probability)),
@@ -287,36 +280,32 @@ class Branching:
         )
 
     def move(self, parent: Parent, area: int) -> Branches:
-        """The robot went into a known area; the keyframes stay where they are."""
-        belief, notes = self._belief(parent, area), parent.state.after_area_change({})
-        return Branches(
-            [
-                Child(
-                    parent.hypothesis,
-                    parent.log_weight,
-                    area,
-                    notes,
-                    frame_change=belief.inverse(),
-                    reload_local_map=True,
-                )
-            ]
+        """The robot in a known area; the keyframes stay where they are."""
+        child = Child(
+            parent.hypothesis,
+            parent.log_weight,
+            area,
+            parent.state.after_area_change({}),
+            frame_change=self._belief(parent, area).inverse(),
+            reload_local_map=True,
         )
+        return Branches([child])
 
-    def find_unlinked_overlap(self, parent: Parent, pose: NDArray[np.float64]) -> int | None:
-        """The area of the local map in whose place the robot is, where no arc joins that to the robot's own area.
+    def find_unlinked_overlap(self, parent: Parent, pose: Float64) -> int | None:
+        """The area of the submap in whose place the robot is, where no arc joins it to the robot's area.
 
-        Area abstraction looks along the arcs and would not notice.
+        Area abstraction only follows arcs and would not notice.
 
         :param pose: ``area_T_base``.
         """
-        joined = connected_neighbors(parent.hybrid_map, parent.area)
-        around = {area: at for area, at in parent.local_area_poses().items() if area not in joined}
+        linked = connected_neighbors(parent.hybrid_map, parent.area)
+        around = {area: other for area, other in parent.local_area_poses().items() if area not in linked}
         found = self.search.tracked_area(parent.hybrid_map, parent.area, around, pose[None])
         if found is None:
             return None
-        here = keyframe_positions(parent.hybrid_map, parent.area, np.zeros(3))
-        there = keyframe_positions(parent.hybrid_map, found, around[found])
-        return found if min_distance(pose[None, :2], there) < min_distance(pose[None, :2], here) else None
+        own = keyframe_positions(parent.hybrid_map, parent.area, np.zeros(3))
+        other = keyframe_positions(parent.hybrid_map, found, around[found])
+        return found if min_distance(pose[None, :2], other) < min_distance(pose[None, :2], own) else None
 
     def link(self, parent: Parent, area: int, scan: Scan, pose: PoseGaussian) -> Branches:
         """Join the robot's area to one in which it is tracked by the arc that the newest scan measures.
@@ -325,26 +314,26 @@ class Branching:
         """
         belief = self._belief(parent, area)
         prior = belief.inverse().compose(PoseGaussian(pose.mean, pose.covariance + self._covariance_floor))
-        found = self.search.measure_pose(parent.hybrid_map, area, parent.area, scan, prior)
-        notes = parent.state.after_overlap(None)
-        if found is None:
-            return Branches([Child(parent.hypothesis, parent.log_weight, parent.area, notes)])
-        arc = Arc(parent.area, area, pose.compose(found.inverse()), closure=True)
-        return Branches([Child(parent.hypothesis, parent.log_weight, parent.area, notes, arcs=(arc,))])
+        measured = self.search.measure_pose(parent.hybrid_map, area, parent.area, scan, prior)
+        child = parent.unchanged_child(parent.state.after_overlap(None))
+        if measured is not None:
+            arc = Arc(parent.area, area, pose.compose(measured.inverse()), closure=True)
+            child = replace(child, arcs=(arc,))
+        return Branches([child])
 
     def _belief(self, parent: Parent, area: int) -> PoseGaussian:
-        """The belief over ``area_T_other``, its mean as the local map has it, so that the robot does not jump."""
+        """The belief over ``area_T_other``, with the submap's mean, so that the robot does not jump."""
         arc = informative_arc(parent.hybrid_map, parent.area, area)
-        found = arc or shortest_path_beliefs(parent.hybrid_map, parent.area, targets=(area,))[area]
-        return PoseGaussian(parent.state.local_area_poses.get(area, found.mean), found.covariance)
+        belief = arc or shortest_path_beliefs(parent.hybrid_map, parent.area, targets=(area,))[area]
+        return PoseGaussian(parent.state.local_area_poses.get(area, belief.mean), belief.covariance)
 
     def query(self, parent: Parent, keyframes: Sequence[int]) -> Query:
-        """Keyframes of a hypothesis as TSBI asks for them."""
-        placed = parent.hybrid_map.keyframes(parent.area)
-        reference = placed[keyframes[0]]
+        """The query of some keyframes of the robot's area."""
+        poses = parent.hybrid_map.keyframes(parent.area)
+        reference = poses[keyframes[0]]
         covariance = parent.covariance(keyframes[0]) + self._covariance_floor
-        poses = {keyframe: se2.between(reference, placed[keyframe]) for keyframe in keyframes}
-        return Query(PoseGaussian(reference, covariance), poses)
+        relative_poses = {keyframe: se2.between(reference, poses[keyframe]) for keyframe in keyframes}
+        return Query(PoseGaussian(reference, covariance), relative_poses)
 
     def _enter_new(self, parent: Parent, query: Query, log_factor: float) -> Child:
         """New ground: the reference keyframe becomes the frame of a new area."""
@@ -360,24 +349,24 @@ class Branching:
         return self._new_areas[keyframes]
 
     def _enter_tracked(self, parent: Parent, query: Query, area: int) -> Child:
-        """A known area in whose place the robot is known to be.
+        """A known area in whose place the robot is tracked.
 
-        The arc is new only where none joined the two; then the newest of the keyframes measures it.
+        If no arc joins the two areas, the newest of the keyframes measures a new one.
         """
         belief = self._belief(parent, area)
         entry = belief.inverse().compose(query.belief)
-        joined = informative_arc(parent.hybrid_map, parent.area, area) is not None
-        arc = None if joined else self._measure_arc(parent, query, area, belief)
+        is_linked = informative_arc(parent.hybrid_map, parent.area, area) is not None
+        arc = None if is_linked else self._measure_arc(parent, query, area, belief)
         return self.enter_area(parent, query, area, entry, arc, 0.0)
 
     def _measure_arc(self, parent: Parent, query: Query, area: int, belief: PoseGaussian) -> PoseGaussian:
         newest, pose = list(query.poses.items())[-1]
-        here = query.belief.compose(PoseGaussian(pose, np.zeros((3, 3))))
-        scan, prior = self._replica.scans[newest], belief.inverse().compose(here)
-        found = self.search.measure_pose(parent.hybrid_map, area, parent.area, scan, prior)
-        if found is None:
-            return PoseGaussian(belief.mean, _UNCONFIRMED * belief.covariance)
-        return here.compose(found.inverse())
+        area_T_base = query.belief.compose(PoseGaussian(pose, np.zeros((3, 3))))
+        scan, prior = self._replica.scans[newest], belief.inverse().compose(area_T_base)
+        measured = self.search.measure_pose(parent.hybrid_map, area, parent.area, scan, prior)
+        if measured is None:
+            return PoseGaussian(belief.mean, _UNCONFIRMED_INFLATION * belief.covariance)
+        return area_T_base.compose(measured.inverse())
 
     def _enter_known(self, parent: Parent, query: Query, fit: Fit) -> Child:
         """A known area, recognized."""
@@ -387,8 +376,12 @@ class Branching:
     def enter_area(
         self, parent: Parent, query: Query, area: int, entry: PoseGaussian, arc: PoseGaussian | None, log_factor: float
     ) -> Child:
-        """The robot and the query's keyframes are in ``area``, at ``entry`` = ``area_T_reference``."""
-        relabelled = tuple(
+        """The robot and the query's keyframes in ``area``, at ``entry`` = ``area_T_reference``.
+
+        :param arc: belief over the pose of ``area`` in the robot's area, if there is a new one.
+        :param log_factor: log of the factor on the weight.
+        """
+        moved = tuple(
             MovedKeyframe(keyframe, parent.area, area, se2.compose(entry.mean, pose))
             for keyframe, pose in query.poses.items()
         )
@@ -402,8 +395,8 @@ class Branching:
             area,
             parent.state.after_area_change(covariances),
             _frame_change(query, entry, covariances),
-            relabelled,
-            () if arc is None else (self._make_arc(parent, area, arc),),
+            moved,
+            () if arc is None else (_make_arc(parent, area, arc),),
             reload_local_map=True,
         )
 
@@ -413,22 +406,22 @@ class Branching:
         return PoseGaussian(pose, relative_covariance(parent.covariance(keyframe), reference, pose, np.zeros((3, 3))))
 
     @staticmethod
-    def _make_arc(parent: Parent, area: int, belief: PoseGaussian) -> Arc:
-        """The arc from the robot's area; it closes a loop where it joins two known areas that no arc joined."""
-        known = parent.hybrid_map.arc_value(parent.area, area)
-        revisited = parent.hybrid_map.has_area(area)
-        return Arc(parent.area, area, belief, closure=revisited if known is None else known.closure)
-
-    @staticmethod
     def _join(parent: Parent, query: Query, fit: Fit) -> Child:
-        """The robot stays in its area, which an arc now joins to a known one."""
+        """The robot in its area, which an arc now joins to a known one."""
         arc = Arc(parent.area, fit.area, query.belief.compose(fit.mode.measured.inverse()), closure=True)
         log_weight = parent.log_weight + fit.log_weight
-        return Child(parent.hypothesis, log_weight, parent.area, parent.state, arcs=(arc,), reload_local_map=True)
+        return replace(parent.unchanged_child(), log_weight=log_weight, arcs=(arc,), reload_local_map=True)
 
 
-def _frame_change(query: Query, entry: PoseGaussian, covariances: Mapping[int, NDArray[np.float64]]) -> PoseGaussian:
-    """``area_T_previous``, as uncertain as the newest of the keyframes is in the area, so that its drift goes on."""
+def _make_arc(parent: Parent, area: int, belief: PoseGaussian) -> Arc:
+    """The arc from the robot's area; it closes a loop where it joins two known areas that no arc joined."""
+    known = parent.hybrid_map.arc_value(parent.area, area)
+    closure = parent.hybrid_map.has_area(area) if known is None else known.closure
+    return Arc(parent.area, area, belief, closure)
+
+
+def _frame_change(query: Query, entry: PoseGaussian, covariances: Mapping[int, Float64]) -> PoseGaussian:
+    """``area_T_previous`` with the uncertainty of the newest keyframe in the area, so that its drift continues."""
     newest, pose = list(query.poses.items())[-1]
     belief = PoseGaussian(se2.compose(entry.mean, pose), covariances[newest])
     return belief.compose(PoseGaussian.from_pose(se2.inverse(se2.compose(query.belief.mean, pose))))
@@ -439,55 +432,54 @@ def _log(value: float) -> float:
 
 
 def merge_areas(parent: Parent, area: int, into: int, search: ClosureSearch) -> Child:
-    """The child in which ``area`` is part of ``into``, or which stays as it is where their surfaces contradict.
+    """The child in which ``area`` is part of ``into``, or an unchanged one where their surfaces contradict.
 
-    :param search: which compares them.
+    :param search: compares them.
     """
-    child = Child(parent.hypothesis, parent.log_weight, parent.area, parent.state)
+    child = parent.unchanged_child()
     belief = parent.hybrid_map.arc(into, area)
     if belief is None or not search.is_same_place(parent.hybrid_map, into, area, belief.mean):
         return child
     child = replace(child, reload_local_map=True, area_merge=AreaMerge(area, into, belief))
     if parent.area != area:
         return child
-    placed = parent.hybrid_map.keyframes(area)
+    poses = parent.hybrid_map.keyframes(area)
     covariances = {
-        k: belief.compose(PoseGaussian(placed[k], covariance)).covariance
+        k: belief.compose(PoseGaussian(poses[k], covariance)).covariance
         for k, covariance in parent.state.covariances.items()
-        if k in placed
+        if k in poses
     }
     return replace(child, area=into, state=parent.state.after_area_change(covariances), frame_change=belief)
 
 
-def apply_revision(parent: Parent, leaf: Hypothesis, newest: int) -> Child:
-    """The child that believes one of TLCA's explanations; all areas may be compared again.
+def apply_revision(parent: Parent, explanation: Hypothesis, newest: int) -> Child:
+    """The child that follows one of TLCA's explanations; all areas may be compared again.
 
-    :param leaf: the explanation; of the keyframes that came since TLCA spoke it does not know.
-    :param newest: the newest keyframe.
+    :param explanation: it lacks the keyframe that came since.
+    :param newest: that keyframe.
     """
-    relabelled = leaf.moved_keyframes
-    if leaf.frame_change is not None and newest in parent.hybrid_map.keyframes(parent.area):
-        pose = se2.compose(leaf.frame_change.mean, parent.hybrid_map.keyframes(parent.area)[newest])
-        relabelled += (MovedKeyframe(newest, parent.area, leaf.area, pose),)
+    moved = explanation.moved_keyframes
+    if explanation.frame_change is not None and newest in parent.hybrid_map.keyframes(parent.area):
+        pose = se2.compose(explanation.frame_change.mean, parent.hybrid_map.keyframes(parent.area)[newest])
+        moved += (MovedKeyframe(newest, parent.area, explanation.area, pose),)
     return Child(
         parent.hypothesis,
-        parent.log_weight + math.log(leaf.probability),
-        leaf.area,
-        _state_after_revision(parent, leaf, {r.keyframe for r in relabelled if r.area == leaf.area}),
-        leaf.frame_change,
-        relabelled,
-        leaf.arcs,
+        parent.log_weight + math.log(explanation.probability),
+        explanation.area,
+        _state_after_revision(parent, explanation, {m.keyframe for m in moved if m.area == explanation.area}),
+        explanation.frame_change,
+        moved,
+        explanation.arcs,
         reload_local_map=True,
-        removed_arcs=leaf.removed_arcs,
+        removed_arcs=explanation.removed_arcs,
     )
 
 
-def _state_after_revision(parent: Parent, leaf: Hypothesis, moved: set[int]) -> HypothesisState:
-    """Without what was compared; where the robot is in another area now, of the keyframes that it took along."""
-    notes = replace(parent.state, matched_keyframes={}, unlinked_overlap=None)
-    if leaf.area == parent.area:
-        return notes
-    covariances = {keyframe: covariance for keyframe, covariance in notes.covariances.items() if keyframe in moved}
-    return HypothesisState(
-        covariances, unmatched_keyframes=tuple(keyframe for keyframe in notes.unmatched_keyframes if keyframe in moved)
-    )
+def _state_after_revision(parent: Parent, explanation: Hypothesis, moved: set[int]) -> HypothesisState:
+    """The state without comparisons; in another area, only of the keyframes that moved there."""
+    state = replace(parent.state, matched_keyframes={}, unlinked_overlap=None)
+    if explanation.area == parent.area:
+        return state
+    covariances = {keyframe: covariance for keyframe, covariance in state.covariances.items() if keyframe in moved}
+    unmatched = tuple(keyframe for keyframe in state.unmatched_keyframes if keyframe in moved)
+    return HypothesisState(covariances, unmatched_keyframes=unmatched)

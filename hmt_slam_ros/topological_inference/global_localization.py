@@ -1,25 +1,26 @@
-"""Where in the map is a robot that woke up somewhere? Eq. (6) with a prior that is flat over all known areas.
+"""Global localization: Eq. (6) with a prior that is flat over all known areas.
 
-Blanco et al. name it as future work: the robot awakening problem is a topological loop closure whose prior tells
-nothing. What the robot has seen since it woke up, all of it, is laid into every area, at all positions in its place and
-all headings. Every scan counts once, since at every look the probability is worked out anew, from the same prior.
+Blanco et al. name robot awakening as future work: a topological loop closure whose prior is uninformative. All
+keyframes since the robot was lost are matched into every area, at all positions in its place and all headings. Each
+search computes the probabilities again from the same prior, so every scan counts once.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hmt_slam_ros.arrays import Bool, Float64
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.hybrid_map.shortest_path import connected_areas
 from hmt_slam_ros.hybrid_map.surroundings import keyframe_positions
+from hmt_slam_ros.messages.messages import Notice
 from hmt_slam_ros.registration.consistency import (
     MAP_IN_MAP,
     MAPS_OUTLIER_RATE,
@@ -30,25 +31,30 @@ from hmt_slam_ros.registration.consistency import (
 from hmt_slam_ros.topological_inference.global_scan_matching import GlobalScanMatcher, PoseCandidate
 from hmt_slam_ros.topological_inference.place_recognition import PerceptualAliasing
 
+Pose = Float64
+
 UNMAPPED_PRIOR = 0.2
-"""Probability that a robot that woke up somewhere is where the map does not reach."""
+"""Prior probability that a lost robot is on unmapped ground."""
 
-# Weight of what surfaces say for one area rather than another. A place where less of what the robot sees is known may
-# have holes in its map, which come in lumps, and not sample by sample.
 _SURFACE_WEIGHT = 0.5
-# Probability from which on the walls of a place are looked at.
-_PROBABLE = 0.05
-# Walls are passed as often as this in a map of long before, relative to one of just before: people stood elsewhere.
-_LONG_AGO = 2.0
-# Deviations of what somebody says, beyond which no place is looked at.
-_DEVIATIONS = 4.0
+"""Exponent of the surface likelihood between areas: holes in a map come in lumps, not sample by sample."""
 
-Pose = NDArray[np.float64]
+_MIN_WALL_CHECK_PROBABILITY = 0.05
+"""Smallest probability of a candidate whose walls are checked."""
+
+_OLD_MAP_FACTOR = 2.0
+"""Ratio of the outlier rates of walls in an old map and in a recent one: people stood elsewhere."""
+
+_HINT_DEVIATIONS = 4.0
+"""Deviations of a pose hint beyond which no area is searched."""
+
+_MIN_PROBABILITY = 1e-300
+"""Smallest probability that is not 0, for logarithms."""
 
 
 @dataclass(frozen=True, eq=False)
 class PoseHint:
-    """Where a keyframe is, as somebody says.
+    """The pose of a keyframe that a person gave.
 
     :ivar keyframe: its number.
     :ivar area: a known area.
@@ -61,57 +67,57 @@ class PoseHint:
 
 
 class PoseDistribution(NamedTuple):
-    """The probability of every place where the robot may be; the rest is where the map does not reach.
+    """The probability of every pose candidate; the rest is unmapped ground.
 
-    :ivar candidates: ways in which what it saw lies in the map.
-    :ivar probabilities: shape (len(found),).
+    :ivar candidates: ways in which the robot's keyframes lie in the map.
+    :ivar probabilities: shape (len(candidates),).
     """
 
     candidates: tuple[PoseCandidate, ...]
-    probabilities: NDArray[np.float64]
+    probabilities: Float64
 
     @property
     def best(self) -> tuple[PoseCandidate, float] | None:
-        """The most probable place and its probability."""
+        """The most probable candidate and its probability."""
         if not self.candidates:
             return None
         n = int(self.probabilities.argmax())
         return self.candidates[n], float(self.probabilities[n])
 
-    def reweight(self, log_weights: Sequence[float] | NDArray[np.float64]) -> PoseDistribution:
-        """The same after something more was learnt of every place, relative to where the map does not reach, nats."""
-        rest = max(1.0 - float(self.probabilities.sum()), 1e-300)
-        logs = np.log(np.maximum(self.probabilities, 1e-300)) + log_weights
+    def reweight(self, log_weights: Sequence[float] | Float64) -> PoseDistribution:
+        """The distribution after more evidence for every candidate, relative to unmapped ground, nats."""
+        unmapped = max(1.0 - float(self.probabilities.sum()), _MIN_PROBABILITY)
+        logs = np.log(np.maximum(self.probabilities, _MIN_PROBABILITY)) + log_weights
         shift = max(0.0, float(logs.max(initial=0.0)))
         weights = np.exp(logs - shift)
-        return PoseDistribution(self.candidates, weights / (weights.sum() + rest * math.exp(-shift)))
+        return PoseDistribution(self.candidates, weights / (weights.sum() + unmapped * math.exp(-shift)))
 
     def with_unmapped_prior(self, prior: float) -> PoseDistribution:
-        """The same, where the map does not reach where the robot is with another probability than ``UNMAPPED``."""
+        """The distribution for another prior of unmapped ground than ``UNMAPPED_PRIOR``."""
         weights = (1.0 - prior) / prior * UNMAPPED_PRIOR / (1.0 - UNMAPPED_PRIOR) * self.probabilities
-        rest = max(0.0, 1.0 - float(self.probabilities.sum()))
-        return PoseDistribution(self.candidates, weights / max(rest + float(weights.sum()), 1e-300))
+        unmapped = max(0.0, 1.0 - float(self.probabilities.sum()))
+        return PoseDistribution(self.candidates, weights / max(unmapped + float(weights.sum()), _MIN_PROBABILITY))
 
-    def with_false_alarm(self, there: NDArray[np.bool_], probability: float, areas: int) -> PoseDistribution:
-        """The same for a robot that may be where it would be if it had not been displaced.
+    def with_false_alarm(self, at_tracked_pose: Bool, probability: float, areas: int) -> PoseDistribution:
+        """The distribution for a robot that may not have been moved.
 
-        What it sees there is as likely as in new ground at least, since things are moved.
+        At the tracked pose its scans are as likely as on new ground at least, since furniture may have been moved.
 
-        :param there: which places are where it would be, shape (len(found),).
-        :param probability: that it was not displaced.
-        :param areas: known areas, over which the prior of one that was is flat.
+        :param at_tracked_pose: which candidates are the tracked pose, shape (len(candidates),).
+        :param probability: that the robot was not moved.
+        :param areas: number of known areas, over which the prior of a moved robot is flat.
         """
-        rest = max(1.0 - float(self.probabilities.sum()), 1e-300)
-        displaced = UNMAPPED_PRIOR / rest * self.probabilities
-        stayed = np.where(there, areas / (1.0 - UNMAPPED_PRIOR) * displaced, 0.0)
-        weights = (1.0 - probability) * displaced + probability * stayed
-        nowhere = (1.0 - probability) * UNMAPPED_PRIOR + probability * max(0.0, 1.0 - float(stayed.sum()))
-        return PoseDistribution(self.candidates, weights / (nowhere + weights.sum()))
+        unmapped = max(1.0 - float(self.probabilities.sum()), _MIN_PROBABILITY)
+        moved = UNMAPPED_PRIOR / unmapped * self.probabilities
+        stayed = np.where(at_tracked_pose, areas / (1.0 - UNMAPPED_PRIOR) * moved, 0.0)
+        weights = (1.0 - probability) * moved + probability * stayed
+        rest = (1.0 - probability) * UNMAPPED_PRIOR + probability * max(0.0, 1.0 - float(stayed.sum()))
+        return PoseDistribution(self.candidates, weights / (rest + weights.sum()))
 
 
 def localize_globally(
     matcher: GlobalScanMatcher,
-    shares: Mapping[int, float],
+    area_probabilities: Mapping[int, float],
     aliasing_prior: float,
     hybrid_map: HybridMap,
     poses: Mapping[int, Pose],
@@ -120,81 +126,171 @@ def localize_globally(
     pose_hint: PoseHint | None = None,
     radius: float = 0.0,
 ) -> PoseDistribution:
-    """Where some keyframes are.
+    """The distribution of the pose of some keyframes in the whole map.
 
-    How rare a fit is shows in the other areas, in which the same was tried. Whether they are in the map at all is asked
-    of the best fit; between those that remain, the surfaces that are known at one and not at the other count too, and
-    where these make a place probable, the walls that either side sees through. Where somebody says where they are, the
-    prior is not flat, but as wide as that is uncertain, and areas farther off are not looked at.
+    The best matches in the other areas show how distinctive a match is. Whether the keyframes are in the map at all is
+    tested with the best match. Between candidates the surfaces also count that are known at one and not at the other.
+    For probable candidates, walls that beams pass count against them. A pose hint replaces the flat prior by one as
+    wide as its covariance, and excludes areas that are farther away.
 
-    :param shares: {area: probability by its look} of all known areas.
-    :param aliasing_prior: probability that keyframes fit into an area where they do not lie, before any was tried.
+    :param area_probabilities: {area: probability by its appearance} of all known areas.
+    :param aliasing_prior: prior probability that keyframes match an area in which they do not lie.
     :param poses: {keyframe: ``reference_T_base`` (3,)}.
     :param before: the map is that of the keyframes before this one.
-    :param clutter: what contradicts the robot's map usually, where that is more than of maps.
+    :param clutter: usual rate of contradictions of the robot's map, where that is above the rate of maps.
     :param pose_hint: of the reference.
-    :param radius: farthest distance to a keyframe of an area's place, m.
+    :param radius: largest distance to a keyframe of an area's place, m.
     """
     near = None if pose_hint is None else _areas_near_hint(hybrid_map, pose_hint, radius, before)
-    areas = [area for area in shares if near is None or area in near]
-    found = matcher.match_regions(hybrid_map, poses, before, {area: shares[area] for area in areas})
-    whole: dict[int, float] = {}
-    for fit in found:
-        whole[fit.area] = float(np.logaddexp(whole.get(fit.area, -math.inf), fit.mode.log_mass))
-    most = max(whole.values(), default=0.0)
+    areas = [area for area in area_probabilities if near is None or area in near]
+    candidates = matcher.match_regions(hybrid_map, poses, before, {area: area_probabilities[area] for area in areas})
+    log_mass: dict[int, float] = {}
+    for candidate in candidates:
+        log_mass[candidate.area] = float(np.logaddexp(log_mass.get(candidate.area, -math.inf), candidate.mode.log_mass))
+    max_log_mass = max(log_mass.values(), default=0.0)
     log_flat = math.log((1.0 - UNMAPPED_PRIOR) / max(1, len(areas)))
-    best = {
-        area: max((fit.agreement.matched_share for fit in found if fit.area == area), default=0.0) for area in areas
+    best_shares = {
+        area: max((c.agreement.matched_share for c in candidates if c.area == area), default=0.0) for area in areas
     }
-    usual = max(MAPS_OUTLIER_RATE, clutter.beam_outlier_rate)
-    likeness = PerceptualAliasing(aliasing_prior)
-    likeness.add_negatives(sorted(best.values())[:-1])
-    logs = [
-        (log_flat if pose_hint is None or near is None else _log_hint_prior(pose_hint, near[fit.area], fit))
-        + fit.mode.log_mass
-        - whole[fit.area]
-        + _SURFACE_WEIGHT * (whole[fit.area] - most)
-        + MAP_IN_MAP.log_likelihood_ratio(fit.agreement, usual)
-        + likeness.log_distinctiveness(fit.agreement.matched_share, already_expected=False)
-        for fit in found
+    outlier_rate = max(MAPS_OUTLIER_RATE, clutter.beam_outlier_rate)
+    aliasing = PerceptualAliasing(aliasing_prior)
+    aliasing.add_negatives(sorted(best_shares.values())[:-1])
+    log_weights = [
+        (log_flat if pose_hint is None or near is None else _log_hint_prior(pose_hint, near[c.area], c))
+        + c.mode.log_mass
+        - log_mass[c.area]
+        + _SURFACE_WEIGHT * (log_mass[c.area] - max_log_mass)
+        + MAP_IN_MAP.log_likelihood_ratio(c.agreement, outlier_rate)
+        + aliasing.log_distinctiveness(c.agreement.matched_share, already_expected=False)
+        for c in candidates
     ]
-    first = _probabilities(logs)
-    passed = max(WALLS_OUTLIER_RATE, _LONG_AGO * clutter.wall_outlier_rate)
-    for n in np.flatnonzero(first >= _PROBABLE):
-        # That none is passed says no more than the surfaces, which count already.
-        logs[n] += min(
-            0.0, WALLS_OF_MAP.log_likelihood_ratio(matcher.check_walls(hybrid_map, found[n], poses, before), passed)
-        )
-    return PoseDistribution(tuple(found), _probabilities(logs))
+    wall_rate = max(WALLS_OUTLIER_RATE, _OLD_MAP_FACTOR * clutter.wall_outlier_rate)
+    for n in np.flatnonzero(_probabilities(log_weights) >= _MIN_WALL_CHECK_PROBABILITY):
+        walls = matcher.check_walls(hybrid_map, candidates[n], poses, before)
+        # Walls without violations repeat what the surfaces said, so they only count against a candidate.
+        log_weights[n] += min(0.0, WALLS_OF_MAP.log_likelihood_ratio(walls, wall_rate))
+    return PoseDistribution(tuple(candidates), _probabilities(log_weights))
 
 
-def _probabilities(logs: Sequence[float]) -> NDArray[np.float64]:
-    """Of fits with some log-weights, beside that the map does not reach there, shape (len(logs),)."""
-    weights = np.exp(np.array([*logs, math.log(UNMAPPED_PRIOR)]))
+def _probabilities(log_weights: Sequence[float]) -> Float64:
+    """Probabilities of candidates beside unmapped ground, shape (len(log_weights),)."""
+    weights = np.exp(np.array([*log_weights, math.log(UNMAPPED_PRIOR)]))
     return (weights / weights.sum())[:-1]
 
 
 def _areas_near_hint(hybrid_map: HybridMap, pose_hint: PoseHint, radius: float, before: int) -> dict[int, PoseGaussian]:
-    """{area: belief over ``told_area_T_area``} of those in which the reference may be."""
+    """{area: belief over ``hint_area_T_area``} of those in which the reference may be."""
     if not hybrid_map.has_area(pose_hint.area):
         return {}
-    reach = radius + _DEVIATIONS * math.sqrt(float(np.linalg.eigvalsh(pose_hint.pose.covariance[:2, :2])[-1]))
+    reach = radius + _HINT_DEVIATIONS * math.sqrt(float(np.linalg.eigvalsh(pose_hint.pose.covariance[:2, :2])[-1]))
     near = {}
     for area, belief in connected_areas(hybrid_map, pose_hint.area).items():
         if min(hybrid_map.keyframes(area), default=before) >= before:
             continue
-        away = keyframe_positions(hybrid_map, area, belief.mean) - pose_hint.pose.mean[:2]
-        if np.hypot(*away.T).min() <= reach:
+        offsets = keyframe_positions(hybrid_map, area, belief.mean) - pose_hint.pose.mean[:2]
+        if np.hypot(*offsets.T).min() <= reach:
             near[area] = belief
     return near
 
 
-def _log_hint_prior(pose_hint: PoseHint, belief: PoseGaussian, fit: PoseCandidate) -> float:
-    """Of a fit, relative to the best that there could be.
+def _log_hint_prior(pose_hint: PoseHint, belief: PoseGaussian, candidate: PoseCandidate) -> float:
+    """Log-prior of a candidate by a pose hint, relative to the best that there could be.
 
-    :param belief: over ``told_area_T_area`` of the fit's area.
+    :param belief: over ``hint_area_T_area`` of the candidate's area.
     """
-    there = belief.compose(fit.mode.measured)
-    away = se2.log(se2.between(pose_hint.pose.mean, there.mean))
-    distance = float(away @ np.linalg.solve(pose_hint.pose.covariance + there.covariance, away))
+    pose = belief.compose(candidate.mode.measured)
+    difference = se2.log(se2.between(pose_hint.pose.mean, pose.mean))
+    distance = float(difference @ np.linalg.solve(pose_hint.pose.covariance + pose.covariance, difference))
     return math.log(1.0 - UNMAPPED_PRIOR) - 0.5 * distance
+
+
+class LandmarkEvidence(Protocol):
+    """Weighs pose candidates by landmarks, and proposes loops: the protocol behind which the second paper plugs in."""
+
+    def weigh(
+        self, distribution: PoseDistribution, hybrid_map: HybridMap, poses: Mapping[int, Float64], before: int
+    ) -> PoseDistribution:
+        """The distribution with the evidence of landmarks.
+
+        :param poses: {keyframe: ``reference_T_base`` (3,)} of the robot's keyframes, m and rad.
+        :param before: the map is that of the keyframes before this one.
+        """
+        ...
+
+    def prepare_places(self, maps: Iterable[tuple[HybridMap, int]]) -> None:
+        """Compute a part of what :meth:`weigh` needs, between two searches.
+
+        :param maps: each with the keyframe before which it is.
+        """
+        ...
+
+    def propose_loop(self, hybrid_map: HybridMap, area: int) -> HybridMap:
+        """The map with an arc where landmarks propose a loop; the map itself where they do not.
+
+        :param area: the robot's.
+        """
+        ...
+
+    def prepare_loops(self, hybrid_map: HybridMap, area: int) -> None:
+        """Compute a part of what :meth:`propose_loop` needs, between two cuts.
+
+        :param area: the robot's.
+        """
+        ...
+
+    def notices(self) -> list[Notice]:
+        """Notices of the loops proposed since the last call."""
+        ...
+
+    def localized(self) -> None:
+        """Free what served global localization, which has ended."""
+        ...
+
+    def forget_scans(self) -> None:
+        """Drop what was computed from scans, of which some have changed."""
+        ...
+
+
+class LocalizationStatus(NamedTuple):
+    """Whether the robot is localized.
+
+    :ivar localized: whether the lost hypotheses are improbable.
+    :ivar entropy: of the belief over the robot's area, nats; 0 where it is certain.
+    """
+
+    localized: bool
+    entropy: float
+
+
+def summarize_localization(
+    area_probabilities: Mapping[int, float],
+    lost: float,
+    unexamined: float,
+    known: int,
+    distribution: PoseDistribution | None,
+    max_lost_probability: float,
+) -> LocalizationStatus:
+    """The localization status of all hypotheses together.
+
+    :param area_probabilities: {area: probability that a tracked robot is in it}.
+    :param lost: probability of the lost hypotheses.
+    :param unexamined: probability that no hypothesis is right.
+    :param known: number of areas in which a lost robot can be.
+    :param distribution: of the pose of a lost robot; None before the first search.
+    :param max_lost_probability: largest probability of the lost hypotheses of a localized robot.
+    """
+    lost_areas = [lost * probability for probability in _lost_distribution(known, distribution)]
+    probabilities = np.array([*area_probabilities.values(), *lost_areas, unexamined])
+    probabilities = probabilities[probabilities > 0.0]
+    entropy = abs(float(probabilities @ np.log(probabilities)))
+    return LocalizationStatus(lost <= max_lost_probability, entropy)
+
+
+def _lost_distribution(known: int, distribution: PoseDistribution | None) -> list[float]:
+    """The probability of every area and, last, of unmapped ground."""
+    if distribution is None:
+        return [*[(1.0 - UNMAPPED_PRIOR) / max(1, known)] * known, UNMAPPED_PRIOR if known else 1.0]
+    areas: dict[int, float] = {}
+    for candidate, probability in zip(distribution.candidates, distribution.probabilities.tolist(), strict=True):
+        areas[candidate.area] = areas.get(candidate.area, 0.0) + probability
+    return [*areas.values(), max(0.0, 1.0 - sum(areas.values()))]

@@ -1,12 +1,10 @@
-"""How keyframes lie in the whole map, of which the arcs tell nothing: all positions in it and all headings.
+"""Matching keyframes into the whole map: all positions in it and all headings.
 
-Doors are open in one corridor and closed in the next, a wall ends sooner, a shelf stands in front of nothing: surfaces
-that are there are mostly in places that look alike, too, but not each of them, and a beam that passes where one should
-be is seldom an error. The walls are those of either side, and so are the beams, as what one of them did not see of the
-other may be what differs.
+Surfaces are mostly also there in similar places, but not all of them, and a beam that passes a known surface is seldom
+an error. The free-space check therefore tests the beams of both sides on the walls of both sides.
 
-Areas that lie for certain beside each other are one region, and are searched together, so that no spot is searched
-twice, and only where one of the keyframes would be near to one of the map.
+Areas that certainly lie beside each other form one region. A region is searched once, and only where one of the
+keyframes would be near one of the map.
 """
 
 from __future__ import annotations
@@ -17,8 +15,8 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hmt_slam_ros.arrays import Float64, Int64
 from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
@@ -40,16 +38,42 @@ from hmt_slam_ros.registration.likelihood_grid import AreaGrid
 from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.submap.local_mapping import LocalMapping
 
-# Deviation of an answer's position at most, m.
-_MAX_DEVIATION = 0.2
+Pose = Float64
+
+_MAX_SIGMA = 0.2
+"""Largest deviation of the position of a certain candidate, m."""
+
+_WALL_RADIUS = 12.0
+"""Distance of keyframes within which they see each other's walls, m."""
+
+_REGION_SIGMA = 1.0
+"""Largest deviation of an area's position in a region, m: that of an arc traveled once."""
+
+_FLAT = PoseGaussian(np.zeros(3), np.diag([100.0, 100.0, 20.0]) ** 2)
+"""Prior that is flat over a region and all headings, m and rad."""
+
+_SAMPLE_STRIDE = 3
+"""One of so many surface samples is matched."""
+
+_SURFACE_LOG_RATIO = math.log(3.0)
+"""Log-ratio of a sample on a known surface, nats."""
+
+_MIN_LOG_RATIO = 0.5 * _SURFACE_LOG_RATIO
+"""Smallest mean log-ratio of a match, nats. Surface in known free space does not count: furniture moves."""
+
+_SHARE_MARGIN = 0.15
+"""Matches with a matched share so much smaller than the best do not matter."""
+
+_MAX_MATCHES = 40
+"""Most matches per region."""
 
 
 class PoseCandidate(NamedTuple):
-    """Where keyframes are.
+    """A pose of keyframes in the map.
 
-    :ivar area: in whose place.
-    :ivar mode: how they lie there.
-    :ivar agreement: their surfaces in the map of the place.
+    :ivar area: in whose place they lie.
+    :ivar mode: their pose there.
+    :ivar agreement: of their surfaces with the map of the place.
     """
 
     area: int
@@ -58,35 +82,26 @@ class PoseCandidate(NamedTuple):
 
 
 def is_certain(candidate: PoseCandidate) -> bool:
-    """Whether the surfaces alone say where, also along corridors."""
+    """Whether the surfaces alone determine the position in all directions."""
     variance = float(np.linalg.eigvalsh(candidate.mode.measured.covariance[:2, :2])[-1])
-    return variance <= _MAX_DEVIATION**2
+    return variance <= _MAX_SIGMA**2
 
 
-def query_bounds(
-    positions: NDArray[np.float64], query: AreaGrid, poses: Mapping[int, NDArray[np.float64]], radius: float
-) -> NDArray[np.float64]:
-    """The smallest and the largest (x, y) of the middle of the query's points where a keyframe of it is near one of
-    some positions, shape (2, 2).
+def query_bounds(positions: Float64, query: AreaGrid, poses: Mapping[int, Float64], radius: float) -> Float64:
+    """Smallest and largest (x, y) of the query's centroid with a query keyframe near a position, shape (2, 2).
 
     :param positions: shape (n, 2), m.
     :param poses: {keyframe: ``reference_T_base``} of the query.
     :param radius: how near, m.
     """
-    middle = query.points.mean(axis=0) if len(query.points) else np.zeros(2)
-    lever = float(np.hypot(*(stack_poses(poses)[:, :2] - middle).T).max())
+    centroid = query.points.mean(axis=0) if len(query.points) else np.zeros(2)
+    lever = float(np.hypot(*(stack_poses(poses)[:, :2] - centroid).T).max())
     reach = radius + lever
     return np.array([positions.min(axis=0) - reach, positions.max(axis=0) + reach])
 
 
-Pose = NDArray[np.float64]
-
-# Keyframes see each other's walls where they are this near, m.
-_WALL_RADIUS = 12.0
-
-
 class FreeSpaceCheck:
-    """Lays keyframes into each other's maps.
+    """Tests the beams of two sets of keyframes on each other's walls.
 
     :param scans: {keyframe: scan}, which may grow.
     """
@@ -94,63 +109,46 @@ class FreeSpaceCheck:
     def __init__(self, scans: Mapping[int, Scan], configuration: Configuration) -> None:
         self._scans, self._configuration = scans, configuration
 
-    def compare(self, known: Mapping[int, Pose], seen: Mapping[int, Pose]) -> Agreement:
+    def compare(self, known: Mapping[int, Pose], query: Mapping[int, Pose]) -> Agreement:
         """Samples of the walls of either on which beams of the other end (on), and which they pass (free).
 
-        :param known: {keyframe: ``map_T_base`` (3,)}, of which those count that are near to the others.
-        :param seen: the others, likewise.
+        :param known: {keyframe: ``map_T_base`` (3,)}, of which those near the others count.
+        :param query: the others, likewise.
         """
-        if not known or not seen:
+        if not known or not query:
             return Agreement(0, 0, 0)
-        middle = np.append(stack_poses(seen)[:, :2].mean(axis=0), 0.0)
-        here = stack_poses(seen) - middle
-        there = stack_poses(known) - middle
-        apart = np.hypot(*(there[:, None, :2] - here[None, :, :2]).transpose(2, 0, 1)).min(axis=1)
-        near = apart <= _WALL_RADIUS
-        scans = [self._scans[k] for k, is_near in zip(known, near, strict=True) if is_near]
-        own = [self._scans[k] for k in seen]
+        centroid = np.append(stack_poses(query)[:, :2].mean(axis=0), 0.0)
+        query_poses = stack_poses(query) - centroid
+        known_poses = stack_poses(known) - centroid
+        distances = np.hypot(*(known_poses[:, None, :2] - query_poses[None, :, :2]).transpose(2, 0, 1)).min(axis=1)
+        is_near = distances <= _WALL_RADIUS
+        known_scans = [self._scans[k] for k, near in zip(known, is_near, strict=True) if near]
+        known_poses = known_poses[is_near]
+        query_scans = [self._scans[k] for k in query]
         mapping = LocalMapping(self._configuration)
-        there = there[near]
-        found = _count_hits_and_violations(mapping, scans, there, own, here) + _count_hits_and_violations(
-            mapping, own, here, scans, there
-        )
-        met, passed = found.tolist()
-        return Agreement(met + passed, met, passed)
+        counts = _count_in_map(mapping, known_scans, known_poses, query_scans, query_poses)
+        counts = counts + _count_in_map(mapping, query_scans, query_poses, known_scans, known_poses)
+        hits, violations = counts.tolist()
+        return Agreement(hits + violations, hits, violations)
 
 
-def _count_hits_and_violations(
-    mapping: LocalMapping, scans: list[Scan], poses: Pose, seeing: list[Scan], at: Pose
-) -> NDArray[np.int64]:
-    """Samples that beams of some scans end on, and that they pass, in a map of others, shape (2,).
+def _count_in_map(
+    mapping: LocalMapping, map_scans: list[Scan], map_poses: Pose, scans: list[Scan], poses: Pose
+) -> Int64:
+    """Samples on which beams of scans end, and which they pass, in a map of other scans, shape (2,).
 
-    :param poses: shape (len(scans), 3), where the map's were taken; ``at`` is where the others were.
+    :param map_poses: shape (len(map_scans), 3); ``poses`` is that of ``scans``.
     """
     table = mapping.pool.empty_table()
-    for scan, pose in zip(scans, poses, strict=True):
+    for scan, pose in zip(map_scans, map_poses, strict=True):
         mapping.insert_scan(table[None], pose[None], scan)
     view = mapping.pool.view(table)
-    found = [
+    counts = [
         count_hits_and_violations(mapping.matching_surfels(scan), scan.laser_pose[:2], pose, view, mapping.hit_distance)
-        for scan, pose in zip(seeing, at, strict=True)
+        for scan, pose in zip(scans, poses, strict=True)
     ]
     mapping.pool.release(table)
-    return np.array(found, dtype=np.int64).reshape(-1, 2).sum(axis=0)
-
-
-# Deviation of an area's position, m, up to which it is part of a region: keyframes lie across the border of two areas
-# also where their arc was travelled over once.
-_WIDE = 1.0
-# Flat over a region and all headings, m, m, rad.
-_FLAT = PoseGaussian(np.zeros(3), np.diag([100.0, 100.0, 20.0]) ** 2)
-# Of the samples, one of so many is looked for.
-_SAMPLE_STRIDE = 3
-# Of the log-ratio of a sample on a surface, as much on average at least: what the robot sees is in the map, or it is
-# not. That little of the map is where it sees free space is not asked, as what moved left its traces there.
-_SURFACE_LOG_RATIO = math.log(3.0)
-_MIN_LOG_RATIO = 0.5 * _SURFACE_LOG_RATIO
-# Where so much less of the surfaces is known than in the best place, a place does not matter; and the fits of a region
-# that are worked out at most.
-_SHARE_MARGIN, _MAX_FITS = 0.15, 40
+    return np.array(counts, dtype=np.int64).reshape(-1, 2).sum(axis=0)
 
 
 class Region(NamedTuple):
@@ -158,7 +156,7 @@ class Region(NamedTuple):
 
     :ivar reference: one of them.
     :ivar poses: {area: ``reference_T_area``} of all that the region's map holds.
-    :ivar own_areas: the areas that are looked for here; the others are in the map, but belong to other regions.
+    :ivar own_areas: the areas that are searched here; the others belong to other regions.
     """
 
     reference: int
@@ -167,57 +165,59 @@ class Region(NamedTuple):
 
 
 class GlobalScanMatcher:
-    """Looks for keyframes in the whole map.
+    """Matches keyframes into the whole map, one region after the other.
 
-    :param radius: farthest distance to a keyframe of a place, m.
-    :param reach: as far as that from an area's keyframes, m, others are part of what is seen there.
+    :param radius: largest distance to a keyframe of a place, m.
+    :param reach: largest distance between keyframes of two areas of a region, m.
     """
 
     def __init__(
-        self, views: GridCache, walls: FreeSpaceCheck, settings: MatchSettings, radius: float, reach: float
+        self,
+        grid_cache: GridCache,
+        free_space_check: FreeSpaceCheck,
+        settings: MatchSettings,
+        radius: float,
+        reach: float,
     ) -> None:
-        self._grid_cache, self._free_space_check, self._settings, self._radius, self._reach = (
-            views,
-            walls,
-            settings,
-            radius,
-            reach,
-        )
+        self._grid_cache, self._free_space_check = grid_cache, free_space_check
+        self._settings, self._radius, self._reach = settings, radius, reach
 
     def match_regions(
-        self, hybrid_map: HybridMap, poses: Mapping[int, Pose], before: float, shares: Mapping[int, float]
+        self, hybrid_map: HybridMap, poses: Mapping[int, Pose], before: float, area_probabilities: Mapping[int, float]
     ) -> list[PoseCandidate]:
-        """How the keyframes lie in some areas: the ways that matter beside the best.
+        """The best match of the keyframes into some areas, and those that matter beside it.
 
         :param poses: {keyframe: ``reference_T_base``}.
         :param before: the map is that of the keyframes before this one.
-        :param shares: {area: probability by its look} of the areas; where it is most probable is looked first.
+        :param area_probabilities: {area: probability by its appearance} of the areas; the most probable comes first.
         """
-        found: list[PoseCandidate] = []
+        candidates: list[PoseCandidate] = []
         query = replace(self._grid_cache.grid(poses), points=self._grid_cache.static_points(poses))
         known = [area for area in hybrid_map.area_ids() if min(hybrid_map.keyframes(area), default=before) < before]
-        parts = [part for part in regions(hybrid_map, known, self._reach) if part.own_areas & shares.keys()]
-        for part in sorted(parts, key=lambda part: (-sum(shares.get(a, 0.0) for a in part.own_areas), part.reference)):
-            best = max((fit.agreement.matched_share for fit in found), default=0.0)
-            place = self._grid_cache.place_among(hybrid_map, part.reference, part.poses, before)
-            own = part.own_areas & shares.keys()
-            here = self._match_region(
-                place, query, poses, own, max(_MIN_LOG_RATIO, (best - _SHARE_MARGIN) * _SURFACE_LOG_RATIO)
-            )
-            found += [fit._replace(mode=_mode_in_frame(fit.mode, part.poses[fit.area])) for fit in here]
-        return found
+        searched = [r for r in regions(hybrid_map, known, self._reach) if r.own_areas & area_probabilities.keys()]
+        searched.sort(key=lambda r: (-sum(area_probabilities.get(a, 0.0) for a in r.own_areas), r.reference))
+        for region in searched:
+            best_share = max((candidate.agreement.matched_share for candidate in candidates), default=0.0)
+            min_log_ratio = max(_MIN_LOG_RATIO, (best_share - _SHARE_MARGIN) * _SURFACE_LOG_RATIO)
+            place = self._grid_cache.place_among(hybrid_map, region.reference, region.poses, before)
+            areas = region.own_areas & area_probabilities.keys()
+            candidates += [
+                candidate._replace(mode=_mode_in_frame(candidate.mode, region.poses[candidate.area]))
+                for candidate in self._match_region(place, query, poses, areas, min_log_ratio)
+            ]
+        return candidates
 
     def check_walls(
         self, hybrid_map: HybridMap, candidate: PoseCandidate, poses: Mapping[int, Pose], before: float
     ) -> Agreement:
-        """Walls of the map and of the keyframes that beams of the other end on or pass, if these lie there.
+        """Walls on which beams end, and which they pass, between the map and keyframes at a candidate.
 
         :param poses: {keyframe: ``reference_T_base``}.
         :param before: the map is that of the keyframes before this one.
         """
         known = {
             keyframe: se2.compose(belief.mean, pose)
-            for area, belief in areas_around(hybrid_map, candidate.area, Neighborhood(_WIDE, 2.0 * self._reach)).items()
+            for area, belief in areas_around(hybrid_map, candidate.area, _region_neighborhood(self._reach)).items()
             for keyframe, pose in hybrid_map.keyframes(area).items()
             if keyframe < before
         }
@@ -225,58 +225,60 @@ class GlobalScanMatcher:
             known, {k: se2.compose(candidate.mode.pose.mean, pose) for k, pose in poses.items()}
         )
 
-    def forget(self) -> None:
-        """Forget the maps of the regions, which take as much memory as a large building's local maps."""
-        self._grid_cache.forget()
-
     def _match_region(
-        self, place: AreaPlace, query: AreaGrid, poses: Mapping[int, Pose], own: Collection[int], least: float
+        self, place: AreaPlace, query: AreaGrid, poses: Mapping[int, Pose], areas: Collection[int], min_log_ratio: float
     ) -> Iterator[PoseCandidate]:
-        """How the keyframes lie in areas of a region, in the frame of its reference.
+        """Matches of the keyframes into areas of a region, in the frame of its reference.
 
-        :param query: what the keyframes saw.
-        :param own: the areas.
-        :param least: log-ratio of the samples on average, nats.
+        :param query: grid of the keyframes.
+        :param min_log_ratio: smallest mean log-ratio of the samples, nats.
         """
-        some, known = (replace(grid, points=grid.points[::_SAMPLE_STRIDE]) for grid in (query, place.grid))
+        sparse_query, sparse_map = (replace(grid, points=grid.points[::_SAMPLE_STRIDE]) for grid in (query, place.grid))
         temper = _SAMPLE_STRIDE * self._settings.temper
-        margin = max(self._settings.margin, _SHARE_MARGIN * _SURFACE_LOG_RATIO * temper * len(some.points))
         settings = replace(
-            self._settings, temper=temper, margin=margin, min_log_ratio=least, max_modes=_MAX_FITS, check_reverse=False
+            self._settings,
+            temper=temper,
+            margin=max(self._settings.margin, _SHARE_MARGIN * _SURFACE_LOG_RATIO * temper * len(sparse_query.points)),
+            min_log_ratio=min_log_ratio,
+            max_modes=_MAX_MATCHES,
+            check_reverse=False,
         )
-        near = place.positions[np.isin(place.keyframe_areas, list(own))]
-        ground = constrain_around(near, stack_poses(poses)[:, :2], self._radius, place.grid.cell)
-        for mode in match_areas(
-            some, known, _FLAT, settings, query_bounds(near, query, poses, self._radius), ground
-        ).modes:
+        positions = place.positions[np.isin(place.keyframe_areas, list(areas))]
+        constraint = constrain_around(positions, stack_poses(poses)[:, :2], self._radius, place.grid.cell)
+        bounds = query_bounds(positions, query, poses, self._radius)
+        for mode in match_areas(sparse_query, sparse_map, _FLAT, settings, bounds, constraint).modes:
             area = containing_area(place, se2.compose(mode.pose.mean, stack_poses(poses)), self._radius)
-            if area is not None and area in own:
+            if area is not None and area in areas:
                 yield PoseCandidate(area, mode, place.grid.compare(query.points, mode.pose.mean))
 
 
 def regions(hybrid_map: HybridMap, areas: Collection[int], reach: float) -> list[Region]:
-    """The regions of a map; every area is one's own.
+    """The regions of a map; each area is searched in one of them.
 
-    :param reach: between the nearest keyframes of two areas of a region, m; its map reaches as far beyond.
+    :param reach: largest distance between keyframes of two areas of a region, m; its map reaches as far beyond.
     """
-    found, left = [], set(areas)
+    found, remaining = [], set(areas)
     for area in sorted(areas):
-        if area not in left:
+        if area not in remaining:
             continue
-        around = areas_around(hybrid_map, area, Neighborhood(_WIDE, 2.0 * reach))
+        around = areas_around(hybrid_map, area, _region_neighborhood(reach))
         poses = {other: belief.mean for other, belief in around.items() if other in areas}
-        here = keyframe_positions(hybrid_map, area, np.zeros(3))
-        own = {
+        positions = keyframe_positions(hybrid_map, area, np.zeros(3))
+        own_areas = {
             other
-            for other in left & poses.keys()
-            if min_distance(here, keyframe_positions(hybrid_map, other, poses[other])) <= reach
+            for other in remaining & poses.keys()
+            if min_distance(positions, keyframe_positions(hybrid_map, other, poses[other])) <= reach
         }
-        left -= own
-        found.append(Region(area, poses, frozenset(own)))
+        remaining -= own_areas
+        found.append(Region(area, poses, frozenset(own_areas)))
     return found
 
 
+def _region_neighborhood(reach: float) -> Neighborhood:
+    return Neighborhood(_REGION_SIGMA, 2.0 * reach)
+
+
 def _mode_in_frame(mode: MatchMode, pose: Pose) -> MatchMode:
-    """A mode in the frame of an area that stands at ``pose``, shape (3,), of the frame that it is in."""
-    back = PoseGaussian.from_pose(se2.inverse(pose))
-    return MatchMode(back.compose(mode.pose), back.compose(mode.measured), mode.log_mass)
+    """A mode in the frame of an area at ``pose``, shape (3,), in the mode's frame."""
+    area_T_frame = PoseGaussian.from_pose(se2.inverse(pose))
+    return MatchMode(area_T_frame.compose(mode.pose), area_T_frame.compose(mode.measured), mode.log_mass)

@@ -1,18 +1,47 @@
-"""The tree of topological paths: what is remembered of each live one, their PMF, and which of them are kept."""
+"""The tree of topological paths: the state of each live hypothesis, merging of equivalent ones, PMF and reduction."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from hmt_slam_ros.arrays import Float64
+from hmt_slam_ros.arrays import Float64, Int64
 from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.geometry.gaussian import PoseGaussian, chi_square_gate
+from hmt_slam_ros.hybrid_map.hybrid_map import ArcValue, AreaPair, HybridMap
+from hmt_slam_ros.hybrid_map.shortest_path import shortest_path_beliefs
 from hmt_slam_ros.topological_inference.global_localization import PoseHint
+
+Covariance = Float64
+
+_CUSUM_DRIFT = 1.0
+"""Drift of the CUSUM statistic per keyframe, nats: people contradict the map in several keyframes."""
+
+_CUSUM_WINDOW = 30
+"""Keyframe events for which evidence of a kidnapping is kept."""
+
+_ONSET_SHARE = 0.2
+"""Smallest share of the largest evidence with which the kidnapping can begin."""
+
+_SAME_DISTANCE = 0.5
+"""Largest distance between equivalent poses, m; fine alignment closes it."""
+
+_SAME_ANGLE = math.radians(5.0)
+"""Largest difference of their headings, rad."""
+
+_ALIGNMENT_COVARIANCE = np.diag([0.5 * _SAME_DISTANCE, 0.5 * _SAME_DISTANCE, 0.5 * _SAME_ANGLE]) ** 2
+"""How far fine alignment may move an arc, m and rad, squared."""
+
+_MAX_VARIANCE = 1.0
+"""Largest variance of a position on which a hypothesis is certain, m^2."""
+
+_EQUIVALENCE_GATE = chi_square_gate(0.95)
+"""Largest squared Mahalanobis distance of equivalent arcs."""
 
 
 class Reduction(NamedTuple):
@@ -22,20 +51,19 @@ class Reduction(NamedTuple):
     :ivar weights: shape (n,), their new weights, with the sum of all the old ones.
     """
 
-    indices: NDArray[np.int64]
-    weights: NDArray[np.float64]
+    indices: Int64
+    weights: Float64
 
 
-def reduce_hypotheses(weights: NDArray[np.float64], most: int, generator: np.random.Generator) -> Reduction:
-    """Keep at most ``most`` hypotheses.
+def reduce_hypotheses(weights: Float64, most: int, generator: np.random.Generator) -> Reduction:
+    """At most ``most`` hypotheses, by the resampling of Fearnhead and Clifford (2003).
 
     Those heavier than a threshold c keep their weight; of the others a stratified draw keeps some at weight c. No
-    hypothesis appears twice, the expected weight of each is what it was, and no other such scheme has a smaller
-    squared error.
+    hypothesis appears twice, and expected weights stay the same. No such scheme has a smaller squared error.
 
     :param weights: shape (m,), not negative, of distinct hypotheses; those with weight 0 are dropped.
     :param most: N, at least 1.
-    :param generator: gives one number where a draw is needed.
+    :param generator: of the number that a draw needs.
     """
     alive = np.flatnonzero(weights > 0.0)
     if alive.size <= most:
@@ -49,42 +77,32 @@ def reduce_hypotheses(weights: NDArray[np.float64], most: int, generator: np.ran
     return Reduction(kept, np.where(weights[kept] >= c, weights[kept], weights[light].sum() / max(1, draws)))
 
 
-def threshold(weights: NDArray[np.float64], most: int) -> float:
+def threshold(weights: Float64, most: int) -> float:
     """The c with sum of min(w / c, 1) = N, for more than N positive weights, shape (m,)."""
-    falling = np.sort(weights)[::-1]
-    rest = np.cumsum(falling[::-1])[::-1]
+    descending = np.sort(weights)[::-1]
+    rest = np.cumsum(descending[::-1])[::-1]
     # With the k heaviest kept, c = rest / (N - k); k is right where the next weight is below that c.
     for k in range(most):
         c = rest[k] / (most - k)
-        if falling[k] < c:
+        if descending[k] < c:
             return float(c)
-    return float(falling[most - 1])
+    return float(descending[most - 1])
 
 
-def _draw_stratified(weights: NDArray[np.float64], count: int, offset: float) -> NDArray[np.int64]:
+def _draw_stratified(weights: Float64, count: int, offset: float) -> Int64:
     """``count`` different indices, each drawn in proportion to its weight, none of which exceeds the stride."""
     edges = np.cumsum(weights) / weights.sum() * count
     edges[-1] = count
     return np.searchsorted(edges, np.arange(count) + offset, side="right").astype(np.int64)
 
 
-Covariance = NDArray[np.float64]
-
-# Of the nats by which a scan contradicts, so many are no news: who stands there does so at the next keyframe too.
-_CUSUM_DRIFT = 1.0
-# Keyframe events for which a doubt is kept.
-_CUSUM_WINDOW = 30
-# What contradicted less than so much of the most is another matter, of before the robot was displaced.
-_ONSET_SHARE = 0.2
-
-
 @dataclass(frozen=True, eq=False)
 class PoseInArea:
-    """Where in the map a robot that may be anywhere seems to be.
+    """The pose of a keyframe in an area.
 
     :ivar area: a known area.
-    :ivar keyframe: of what it saw.
-    :ivar pose: shape (3,), ``area_T_base`` of that.
+    :ivar keyframe: its number.
+    :ivar pose: shape (3,), ``area_T_base`` of the keyframe.
     """
 
     area: int
@@ -94,10 +112,10 @@ class PoseInArea:
 
 @dataclass(frozen=True, eq=False)
 class FalseAlarm:
-    """That a robot that takes itself for lost was not displaced: furniture that was moved contradicts, too.
+    """The alternative that a lost robot was not kidnapped, but that furniture was moved.
 
-    :ivar tracked_pose: where it is then.
-    :ivar probability: of that, by the scans for which it takes itself for lost.
+    :ivar tracked_pose: the robot's pose then.
+    :ivar probability: of that, by the scans that made it lost.
     """
 
     tracked_pose: PoseInArea
@@ -106,10 +124,10 @@ class FalseAlarm:
 
 @dataclass(frozen=True, eq=False)
 class Tracking:
-    """That the place of the robot in the map is known.
+    """The pose of the robot in the map is known.
 
-    :ivar relocalized_area: the known area in which it was recognized, until it goes over into another one; else None.
-    :ivar kind: tells it from ``Lost`` in a document.
+    :ivar relocalized_area: the known area in which it was relocalized, until it changes its area; else None.
+    :ivar kind: distinguishes it from ``Lost`` in a document.
     """
 
     relocalized_area: int | None = None
@@ -118,17 +136,16 @@ class Tracking:
 
 @dataclass(frozen=True, eq=False)
 class Lost:
-    """That the robot may be anywhere, until it is recognized.
+    """The robot may be anywhere, until it is relocalized.
 
-    :ivar since: the keyframe at which the robot arrived it is not known where.
-    :ivar false_alarm: where it was then if it was not displaced, where nothing is mapped and nobody carried it; else
-        None.
-    :ivar pose_hint: where one of the keyframes since then is, as somebody says; else None.
-    :ivar candidate: where it was recognized at the last look, if it was.
-    :ivar tracked_pose: where it was at ``since`` if it was not displaced, as another hypothesis says; else None.
-    :ivar counted_evidence: nats by which what it saw since then speaks for a place elsewhere, as far as that is in the
-        hypothesis's weight; None where another one has it there since.
-    :ivar kind: tells it from ``Tracking`` in a document.
+    :ivar since: the first keyframe after the robot was lost.
+    :ivar false_alarm: the alternative to a kidnapping, in localization; else None.
+    :ivar pose_hint: for one of the keyframes since then; else None.
+    :ivar candidate: the pose that the last search found, if it did.
+    :ivar tracked_pose: the pose at ``since`` without a kidnapping, in mapping; else None.
+    :ivar counted_evidence: log Bayes factor for a pose elsewhere that is in the hypothesis's weight, nats; None after
+        a relocalized hypothesis was split off.
+    :ivar kind: distinguishes it from ``Tracking`` in a document.
     """
 
     since: int
@@ -142,26 +159,26 @@ class Lost:
 
 @dataclass(frozen=True, eq=False)
 class HypothesisState:
-    """What TSBI remembers of a leaf beside its map; children inherit it.
+    """What TSBI remembers of a hypothesis beside its map; children inherit it.
 
-    :ivar covariances: {keyframe: covariance (3, 3) of ``area_T_base``, right tangent} of the unsettled keyframes: those
-        stored in the robot's area since it was entered, and those that came over with it.
-    :ivar matched_keyframes: {known area: unsettled keyframes that were compared with it}. A keyframe speaks for or
-        against a known area once.
-    :ivar local_area_poses: {area: ``current_T_area``} of the areas in the local map besides the robot's own.
-    :ivar unmatched_keyframes: the unsettled keyframes that no re-check has looked at.
-    :ivar pending_candidates: known areas that the newest of them fitted beside, and in which the robot may be soon.
-    :ivar unlinked_overlap: the area of the local map, joined to the robot's own by no arc, in whose place the robot
-        seems to be, and for how many keyframe events in a row; or None.
-    :ivar kidnapping_evidence: {keyframe event: nats by which its scan contradicted what the robot should have seen}, of
-        the latest events since the robot may have been displaced.
-    :ivar unstored_poses: {event of these: where the robot was}, where the map stays as it is and does not hold them.
-    :ivar localization: whether the place of the robot in the map is known.
+    :ivar covariances: {keyframe: covariance (3, 3) of ``area_T_base``, right tangent} of the keyframes stored in the
+        robot's area since it was entered, and those that moved there with it.
+    :ivar matched_keyframes: {known area: those of them that were compared with it}. A keyframe counts for or against a
+        known area once.
+    :ivar local_area_poses: {area: ``current_T_area``} of the areas in the submap besides the robot's own.
+    :ivar unmatched_keyframes: those of them that no re-check has compared.
+    :ivar pending_candidates: known areas beside which the newest of them fitted, and which the robot may enter soon.
+    :ivar unlinked_overlap: the area of the submap in whose place the robot is, if no arc joins it to the robot's own,
+        and for how many keyframe events in a row; or None.
+    :ivar kidnapping_evidence: {keyframe event: CUSUM increment, nats} of the latest events since the robot may have
+        been kidnapped.
+    :ivar unstored_poses: {event of these: the robot's pose} of scans that the map does not hold.
+    :ivar localization: tracking, or lost.
     """
 
     covariances: Mapping[int, Covariance] = field(default_factory=dict)
     matched_keyframes: Mapping[int, frozenset[int]] = field(default_factory=dict)
-    local_area_poses: Mapping[int, NDArray[np.float64]] = field(default_factory=dict)
+    local_area_poses: Mapping[int, Float64] = field(default_factory=dict)
     unmatched_keyframes: tuple[int, ...] = ()
     pending_candidates: tuple[int, ...] = ()
     unlinked_overlap: tuple[int, int] | None = None
@@ -171,46 +188,43 @@ class HypothesisState:
 
     @property
     def is_lost(self) -> bool:
-        """Whether the robot may be anywhere."""
+        """Whether the hypothesis is lost."""
         return isinstance(self.localization, Lost)
 
     def after_scan(
         self, event: int, log_kidnapping_ratio: float, unstored_pose: PoseInArea | None = None
     ) -> HypothesisState:
-        """After the scan of a keyframe event.
+        """The state after the scan of a keyframe event.
 
-        :param unstored_pose: where the robot was, if the map does not hold that.
-        :param log_kidnapping_ratio: log p(scan | the robot was displaced before it) / p(scan | the robot is there),
-            nats, by the map of what is around.
+        :param log_kidnapping_ratio: log p(scan | kidnapped before it) / p(scan | not kidnapped), by the submap, nats.
+        :param unstored_pose: the robot's pose, if the map does not hold the scan.
         """
-        told = log_kidnapping_ratio - _CUSUM_DRIFT
-        doubts = {k: nats for k, nats in self.kidnapping_evidence.items() if k > event - _CUSUM_WINDOW}
-        if doubts or told > 0.0:
-            doubts[event] = told
-        if sum(doubts.values()) <= 0.0:
-            doubts = {}
-        if not doubts and not self.kidnapping_evidence:
+        increment = log_kidnapping_ratio - _CUSUM_DRIFT
+        evidence = {k: nats for k, nats in self.kidnapping_evidence.items() if k > event - _CUSUM_WINDOW}
+        if evidence or increment > 0.0:
+            evidence[event] = increment
+        if sum(evidence.values()) <= 0.0:
+            evidence = {}
+        if not evidence and not self.kidnapping_evidence:
             return self
-        spots = self.unstored_poses if unstored_pose is None else {**self.unstored_poses, event: unstored_pose}
-        return replace(
-            self, kidnapping_evidence=doubts, unstored_poses={k: at for k, at in spots.items() if k in doubts}
-        )
+        poses = self.unstored_poses if unstored_pose is None else {**self.unstored_poses, event: unstored_pose}
+        unstored_poses = {k: pose for k, pose in poses.items() if k in evidence}
+        return replace(self, kidnapping_evidence=evidence, unstored_poses=unstored_poses)
 
     def kidnapping_test(self, prior: float) -> tuple[float, int]:
-        """Log-odds that the robot was displaced of late, and the first keyframe event after that.
+        """Log-odds of a recent kidnapping, and the first keyframe event after it (CUSUM test, Page 1954).
 
-        The events since then speak for that together (the test of Page 1954).
-
-        :param prior: probability of a displacement per keyframe event.
+        :param prior: probability of a kidnapping per keyframe event.
         """
         if not self.kidnapping_evidence:
             return -math.inf, 0
-        most = max(self.kidnapping_evidence.values())
-        first = min(event for event, nats in self.kidnapping_evidence.items() if nats >= _ONSET_SHARE * most)
-        return math.log(prior) + sum(nats for event, nats in self.kidnapping_evidence.items() if event >= first), first
+        onset = _ONSET_SHARE * max(self.kidnapping_evidence.values())
+        first = min(event for event, nats in self.kidnapping_evidence.items() if nats >= onset)
+        statistic = sum(nats for event, nats in self.kidnapping_evidence.items() if event >= first)
+        return math.log(prior) + statistic, first
 
     def after_keyframe(self, keyframe: int, covariance: Covariance) -> HypothesisState:
-        """After a keyframe entered the robot's area."""
+        """The state after a keyframe was stored in the robot's area."""
         return replace(
             self,
             covariances={**self.covariances, keyframe: covariance},
@@ -220,34 +234,30 @@ class HypothesisState:
     def after_matching(
         self, areas: Sequence[int], keyframes: Sequence[int], pending: tuple[int, ...] = (), *, all_areas: bool = True
     ) -> HypothesisState:
-        """After keyframes were compared with known areas.
+        """The state after keyframes were compared with known areas.
 
-        :param pending: others, beside which they fitted.
-        :param all_areas: whether they were compared with all that come into question.
+        :param pending: other areas, beside which they fitted.
+        :param all_areas: whether they were compared with all candidates.
         """
         added = {area: self.matched_keyframes.get(area, frozenset()) | set(keyframes) for area in areas}
-        unchecked = () if all_areas else self.unmatched_keyframes
         return replace(
             self,
             matched_keyframes={**self.matched_keyframes, **added},
-            unmatched_keyframes=unchecked,
+            unmatched_keyframes=() if all_areas else self.unmatched_keyframes,
             pending_candidates=pending,
         )
 
     def after_overlap(self, area: int | None) -> HypothesisState:
-        """After a keyframe event at which the robot seemed to be in ``area`` of the local map, or in none such."""
-        times = (
-            self.unlinked_overlap[1] if self.unlinked_overlap is not None and self.unlinked_overlap[0] == area else 0
-        )
-        return replace(self, unlinked_overlap=None if area is None else (area, times + 1))
+        """The state after an event with the robot in the place of ``area`` without an arc to it, or of none such."""
+        before, count = self.unlinked_overlap or (None, 0)
+        return replace(self, unlinked_overlap=None if area is None else (area, count + 1 if area == before else 1))
 
     def after_area_change(self, covariances: Mapping[int, Covariance]) -> HypothesisState:
-        """After the robot entered another area together with the keyframes of ``covariances``."""
-        kept = {area: keyframes & covariances.keys() for area, keyframes in self.matched_keyframes.items()}
-        compared = {area: keyframes for area, keyframes in kept.items() if keyframes}
+        """The state after the robot entered another area together with the keyframes of ``covariances``."""
+        matched = {area: keyframes & covariances.keys() for area, keyframes in self.matched_keyframes.items()}
         return HypothesisState(
             covariances,
-            compared,
+            {area: keyframes for area, keyframes in matched.items() if keyframes},
             kidnapping_evidence=self.kidnapping_evidence,
             unstored_poses=self.unstored_poses,
             localization=self.localization if isinstance(self.localization, Lost) else Tracking(),
@@ -255,13 +265,13 @@ class HypothesisState:
 
 
 def relative_covariance(
-    whole: Covariance, reference: Covariance, reference_T_base: NDArray[np.float64], floor: Covariance
+    whole: Covariance, reference: Covariance, reference_T_base: Float64, floor: Covariance
 ) -> Covariance:
-    """Covariance of ``reference_T_base`` where the drift up to the reference is part of that of ``area_T_base``.
+    """Covariance of ``reference_T_base``, shape (3, 3), if that of ``area_T_base`` includes that of the reference.
 
     :param whole: of ``area_T_base``, shape (3, 3), right tangent.
     :param reference: of ``area_T_reference``.
-    :param floor: the least that is returned.
+    :param floor: is added.
     """
     ad = se2.adjoint(se2.inverse(reference_T_base))
     values, vectors = np.linalg.eigh(whole - ad @ reference @ ad.T)
@@ -273,28 +283,22 @@ class ReducedDistribution(NamedTuple):
 
     :ivar indices: shape (n,), int64, ascending: the hypotheses that stay.
     :ivar probabilities: shape (n,); they sum to 1 less ``unexamined``.
-    :ivar unexamined: probability of what was not looked at or was dropped for its smallness.
+    :ivar unexamined: probability of what was not examined, or dropped as too improbable.
     """
 
-    indices: NDArray[np.int64]
-    probabilities: NDArray[np.float64]
+    indices: Int64
+    probabilities: Float64
     unexamined: float
 
 
 def normalize_and_reduce(
-    log_weights: NDArray[np.float64],
-    log_skipped: float,
-    unexamined: float,
-    most: int,
-    least: float,
-    generator: np.random.Generator,
+    log_weights: Float64, log_skipped: float, unexamined: float, most: int, least: float, generator: np.random.Generator
 ) -> ReducedDistribution:
-    """Normalize, drop what is tiny, reduce to N.
+    """The distribution of hypotheses, without the improbable ones, reduced to N.
 
     :param log_weights: shape (m,), nats, of all hypotheses.
-    :param log_skipped: log of the weight, on the same scale, of what was not looked at now.
-    :param unexamined: probability of what was not looked at earlier; it keeps its share, as no evidence is computed
-        for it.
+    :param log_skipped: log of the weight, on the same scale, of what was not examined now.
+    :param unexamined: probability of what was not examined earlier; it keeps its share, as it has no evidence.
     :param most: N.
     :param least: probability below which a hypothesis is dropped.
     """
@@ -302,6 +306,95 @@ def normalize_and_reduce(
     probabilities = (1.0 - unexamined) * np.exp(log_weights - scale)
     probabilities[(probabilities < least) & (probabilities < probabilities.max())] = 0.0
     reduction = reduce_hypotheses(probabilities, most, generator)
-    # What the sum lacks is the skipped, the dropped and what was unexamined before.
-    total = float(reduction.weights.sum())
-    return ReducedDistribution(reduction.indices, reduction.weights, max(0.0, 1.0 - total))
+    rest = max(0.0, 1.0 - float(reduction.weights.sum()))
+    return ReducedDistribution(reduction.indices, reduction.weights, rest)
+
+
+@dataclass(frozen=True, eq=False)
+class LocalizedHypothesis:
+    """The map of a hypothesis, and the robot's pose in it, to be compared with another hypothesis.
+
+    Over known ground, hypotheses differ in the area by which they enter it, or in the mode of one match. They claim the
+    same topology if their maps would agree after fine alignment.
+
+    :ivar area: the robot's area.
+    :ivar pose: ``area_T_base``, shape (3,).
+    :ivar nearby_areas: the areas that the robot is in or beside.
+    """
+
+    hybrid_map: HybridMap
+    area: int
+    pose: Float64
+    nearby_areas: Collection[int]
+
+    @cached_property
+    def poses_in_areas(self) -> Mapping[int, Float64]:
+        """{area: ``area_T_base``} of the areas relative to which the robot's pose is certain."""
+        beliefs = shortest_path_beliefs(self.hybrid_map, self.area, cost_limit=_MAX_VARIANCE)
+        return {area: se2.between(belief.mean, self.pose) for area, belief in beliefs.items()}
+
+    @cached_property
+    def closures(self) -> Mapping[AreaPair, ArcValue]:
+        """The arcs that closed loops and are not definite."""
+        return self.hybrid_map.pending_closures
+
+    @cached_property
+    def removed_arcs(self) -> frozenset[AreaPair]:
+        """The definite arcs that the hypothesis lacks."""
+        return frozenset(pair for pair, arc in self.hybrid_map.changed_arcs.items() if arc is None)
+
+    def is_equivalent(self, other: LocalizedHypothesis) -> bool:
+        """Whether both have the same robot pose in all common areas around it, and close the same loops.
+
+        A closure is a claim of its own, even where the arcs alone imply it.
+        """
+        if bool(self.closures) != bool(other.closures) or self.removed_arcs != other.removed_arcs:
+            return False
+        nearby = {*self.nearby_areas, *other.nearby_areas}
+        common = {area for area in nearby if self._has_areas(area) and other._has_areas(area)}
+        return (
+            bool(common)
+            and all(self._agrees_on_pose(other, area) for area in common)
+            and all(other._implies_closure(pair, arc) for pair, arc in self.closures.items())
+            and all(self._implies_closure(pair, arc) for pair, arc in other.closures.items())
+        )
+
+    def _has_areas(self, *areas: int) -> bool:
+        return all(map(self.hybrid_map.has_area, areas))
+
+    def _implies_closure(self, pair: AreaPair, arc: ArcValue) -> bool:
+        """Whether this hypothesis has two areas as an arc of another one has them, by its own closure or for certain.
+
+        It need not have areas that only the other has.
+        """
+        if not self._has_areas(*pair):
+            return True
+        own = self.closures.get(pair)
+        belief = self._certain_belief(pair, arc) if own is None else own.pose
+        # Fine alignment may move the arc.
+        return (
+            belief is not None
+            and arc.pose.mahalanobis2(PoseGaussian(belief.mean, _ALIGNMENT_COVARIANCE)) <= _EQUIVALENCE_GATE
+        )
+
+    def _certain_belief(self, pair: AreaPair, arc: ArcValue) -> PoseGaussian | None:
+        """The belief over the second of two areas in the first, if it is not much less certain than an arc."""
+        limit = max(_MAX_VARIANCE, 4.0 * float(np.trace(arc.pose.covariance[:2, :2])))
+        return shortest_path_beliefs(self.hybrid_map, pair[0], limit, targets=pair[1:]).get(pair[1])
+
+    def _agrees_on_pose(self, other: LocalizedHypothesis, area: int) -> bool:
+        own_pose, other_pose = self.poses_in_areas.get(area), other.poses_in_areas.get(area)
+        if own_pose is None or other_pose is None:
+            return False
+        difference = se2.between(own_pose, other_pose)
+        is_near = math.hypot(difference[0], difference[1]) <= _SAME_DISTANCE
+        return is_near and abs(float(difference[2])) <= _SAME_ANGLE
+
+
+def merge_equivalent(hypotheses: Sequence[LocalizedHypothesis], log_weights: Sequence[float]) -> dict[int, float]:
+    """{number of a hypothesis: log of the weight of all equivalent ones}, the heaviest of each first."""
+    merged: dict[int, float] = {}
+    for number in sorted(range(len(hypotheses)), key=lambda n: (-log_weights[n], n)):
+        same = next((kept for kept in merged if hypotheses[kept].is_equivalent(hypotheses[number])), number)
+        merged[same] = float(np.logaddexp(merged.get(same, -math.inf), log_weights[number]))
+    return merged

@@ -1,20 +1,23 @@
-"""A robot that woke up somewhere: it maps around itself, and is joined to the map where it is recognized.
+"""Lost hypotheses: how the robot becomes lost, and how it is relocalized.
 
-It is not known how it came there, so that it begins a new area, to which an arc leads that tells nothing. From then on
-all that it saw is looked for in the whole map, again and again, until one place has nearly all of the probability at
-two looks in a row, or at one where somebody says that it is there; then a further continuation of the path closes the
-loop between the two maps, and TLCA decides as it does about any other.
+A lost robot maps around itself. It begins a new area, to which an uninformative arc leads. All keyframes since then
+are searched in the whole map, again and again. A pose is accepted with enough probability in two searches in a row, or
+in one that agrees with a pose hint. Then a child closes the loop between the two maps, and TLCA decides on it.
+
+Kidnapping: odometry can fail (slip, lost readings, a carried robot). The scans then contradict the submap, from which
+a CUSUM test gives the log-odds (``HypothesisState.kidnapping_test``). If they suffice, a kidnapped child is spawned,
+whose keyframes since the kidnapping begin a new area.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hmt_slam_ros.arrays import Bool, Float64
 from hmt_slam_ros.configuration.topology import InferenceParameters
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
@@ -25,222 +28,242 @@ from hmt_slam_ros.messages.messages import Keyframe
 from hmt_slam_ros.topological_inference.branching import Branches, Branching, Child, Parent
 from hmt_slam_ros.topological_inference.global_localization import PoseDistribution, PoseHint
 from hmt_slam_ros.topological_inference.global_scan_matching import PoseCandidate, is_certain
-from hmt_slam_ros.topological_inference.hypothesis_tree import Lost, PoseInArea, Tracking
+from hmt_slam_ros.topological_inference.hypothesis_tree import FalseAlarm, Lost, PoseInArea, Tracking
 
-Pose = NDArray[np.float64]
+Pose = Float64
 
 KIDNAPPED_UNMAPPED_PRIOR = 0.5
-"""Probability that a robot that was carried while it maps is where the map does not reach."""
+"""Prior probability that a robot kidnapped during mapping is on unmapped ground."""
 
-# Two looks found the same place where they have a keyframe within so much of each other, m and rad.
-_SAME_DISTANCE, _SAME_ANGLE = 1.0, math.radians(15.0)
-# So many keyframes that fit nowhere near where somebody says, in this probability, refute it.
-_REFUTING_KEYFRAMES, _REFUTING_PROBABILITY = 5, 0.9
-# Probability that is taken for none.
+_SAME_DISTANCE = 1.0
+"""Largest distance between two poses of a keyframe that count as the same, m."""
+
+_SAME_ANGLE = math.radians(15.0)
+"""Largest difference of their headings, rad."""
+
+_REFUTING_KEYFRAMES = 5
+"""Keyframes after which a pose hint can be refuted."""
+
+_REFUTING_PROBABILITY = 0.9
+"""Probability that no candidate is right, above which the pose hint is refuted."""
+
 _PROBABILITY_FLOOR = 1e-12
-# Keyframes that are laid into the map at most, the newest.
+"""Smallest probability of unmapped ground in a Bayes factor."""
+
 _MAX_KEYFRAMES = 40
+"""Most keyframes that are searched in the map, the newest."""
+
+_MIN_KIDNAPPED_PROBABILITY = 0.05
+"""Smallest probability of a hypothesis that spawns a kidnapped child."""
+
+_MIN_KIDNAPPED_KEYFRAMES = 3
+"""Fewest keyframes since the kidnapping of a kidnapped child."""
 
 
 def begin_relocalization(branching: Branching, parent: Parent, keyframe: Keyframe, pose: Pose) -> Branches:
-    """The continuations of a hypothesis at a keyframe of which nothing or somebody tells where it is.
+    """The children of a hypothesis at a keyframe with unknown motion or with an initial pose.
 
     :param pose: ``area_T_base`` of its scan.
     """
     if keyframe.motion_unknown:
-        return _enter_unknown_area(
-            branching, _update_false_alarm(parent, keyframe, pose), keyframe.sequence, keyframe.initial_pose
-        )
+        parent = _update_false_alarm(parent, keyframe, pose)
+        return _enter_unknown_area(branching, parent, keyframe.sequence, keyframe.initial_pose)
     lost = parent.state.localization
     if keyframe.initial_pose is not None and isinstance(lost, Lost):
         return _relocalize_at_hint(branching, parent, lost, keyframe.initial_pose, pose)
-    return Branches([Child(parent.hypothesis, parent.log_weight, parent.area, parent.state)])
+    return Branches([parent.unchanged_child()])
 
 
 def _update_false_alarm(parent: Parent, keyframe: Keyframe, pose: Pose) -> Parent:
-    """The hypothesis, which knows where a robot is that takes itself for lost and is not; of one carried, nobody does.
+    """The parent with its false alarm at the odometry pose, or without one if the robot was really moved.
 
-    :param pose: ``area_T_base`` of the scan, as its odometry has it.
+    :param pose: ``area_T_base`` of the scan by the odometry.
     """
     lost = parent.state.localization
     if not isinstance(lost, Lost):
         return parent
-    stay = lost.false_alarm
-    if stay is not None and lost.since == keyframe.sequence and keyframe.initial_pose is None:
-        stay = replace(stay, tracked_pose=PoseInArea(parent.area, keyframe.sequence, pose))
+    false_alarm = lost.false_alarm
+    if false_alarm is not None and lost.since == keyframe.sequence and keyframe.initial_pose is None:
+        false_alarm = replace(false_alarm, tracked_pose=PoseInArea(parent.area, keyframe.sequence, pose))
     else:
-        stay = None
-    return _with_localization(parent, replace(lost, false_alarm=stay))
+        false_alarm = None
+    return _with_localization(parent, replace(lost, false_alarm=false_alarm))
 
 
 def _with_localization(parent: Parent, localization: Tracking | Lost) -> Parent:
     return replace(parent, state=replace(parent.state, localization=localization))
 
 
-def _enter_unknown_area(branching: Branching, parent: Parent, keyframe: int, place: InitialPose | None) -> Branches:
-    """The one continuation of a hypothesis where the robot may be anywhere: in a new area.
-
-    :param place: where it is as somebody says: there the area is drawn, and there it is looked for first.
-    """
+def _enter_unknown_area(
+    branching: Branching, parent: Parent, keyframe: int, initial_pose: InitialPose | None
+) -> Branches:
+    """The only child, in which the robot may be anywhere: in a new area, drawn at the initial pose if there is one."""
     query = branching.query(parent, [keyframe])
-    told = None
-    if place is not None and parent.hybrid_map.has_area(place.area):
-        told = PoseHint(keyframe, place.area, place.pose)
-    arc = uninformative_belief(query.belief.mean if told is None else _hinted_pose(parent, parent.area, told))
+    hint = None
+    if initial_pose is not None and parent.hybrid_map.has_area(initial_pose.area):
+        hint = PoseHint(keyframe, initial_pose.area, initial_pose.pose)
+    arc = uninformative_belief(query.belief.mean if hint is None else _hinted_pose(parent, parent.area, hint))
     origin = PoseGaussian.from_pose(np.zeros(3))
     child = branching.enter_area(parent, query, branching.new_area(parent, query), origin, arc, 0.0)
     before = child.state.localization
-    lost = replace(before if isinstance(before, Lost) else Lost(keyframe), since=keyframe, pose_hint=told)
+    lost = replace(before if isinstance(before, Lost) else Lost(keyframe), since=keyframe, pose_hint=hint)
     return Branches([replace(child, state=replace(child.state, localization=lost))])
 
 
-def _relocalize_at_hint(branching: Branching, parent: Parent, lost: Lost, place: InitialPose, pose: Pose) -> Branches:
-    """A robot that may be anywhere, of which somebody says where it is: it is drawn there, and looked for at once.
+def _relocalize_at_hint(
+    branching: Branching, parent: Parent, lost: Lost, initial_pose: InitialPose, pose: Pose
+) -> Branches:
+    """The children of a lost hypothesis with an initial pose: drawn there, and searched at once.
 
     :param pose: ``area_T_base`` of the newest scan.
     """
-    seen = _poses_since(parent, lost.since)
-    if not parent.hybrid_map.has_area(place.area) or not seen:
-        return Branches([Child(parent.hypothesis, parent.log_weight, parent.area, parent.state)])
-    newest = max(seen)
-    told = PoseHint(newest, place.area, place.pose.compose(PoseGaussian.from_pose(se2.between(pose, seen[newest]))))
-    hinted = _with_localization(parent, replace(lost, pose_hint=told, false_alarm=None))
-    looked = update_relocalization(branching, hinted)
-    arcs = _hinted_arcs(parent, lost.since, told, seen[newest])
-    return looked._replace(children=[replace(child, arcs=child.arcs or arcs) for child in looked.children])
+    keyframes = _poses_since(parent, lost.since)
+    if not parent.hybrid_map.has_area(initial_pose.area) or not keyframes:
+        return Branches([parent.unchanged_child()])
+    newest = max(keyframes)
+    scan_T_newest = PoseGaussian.from_pose(se2.between(pose, keyframes[newest]))
+    hint = PoseHint(newest, initial_pose.area, initial_pose.pose.compose(scan_T_newest))
+    hinted = _with_localization(parent, replace(lost, pose_hint=hint, false_alarm=None))
+    branches = update_relocalization(branching, hinted)
+    arcs = _hinted_arcs(parent, lost.since, hint, keyframes[newest])
+    return branches._replace(children=[replace(child, arcs=child.arcs or arcs) for child in branches.children])
 
 
 def _hinted_pose(parent: Parent, area: int, pose_hint: PoseHint) -> Pose:
-    """``area_T_base`` of what somebody said, shape (3,), in the frame of another area."""
+    """The mean of a pose hint in the frame of another area, ``area_T_base``, shape (3,)."""
     between = shortest_path_beliefs(parent.hybrid_map, area, targets=(pose_hint.area,)).get(pose_hint.area)
     return pose_hint.pose.mean if between is None else se2.compose(between.mean, pose_hint.pose.mean)
 
 
-def _hinted_arcs(parent: Parent, lost: int, pose_hint: PoseHint, pose: Pose) -> tuple[Arc, ...]:
-    """The arc that tells nothing, such that all since the robot arrived is drawn where somebody says.
+def _hinted_arcs(parent: Parent, since: int, pose_hint: PoseHint, pose: Pose) -> tuple[Arc, ...]:
+    """The uninformative arc with the mean at which the areas since then agree with a pose hint.
 
-    :param pose: ``area_T_base`` of the keyframe of which it is said, in the robot's area.
+    :param pose: ``area_T_base`` of the hint's keyframe, in the robot's area.
     """
     for known, new, arc in parent.hybrid_map.all_arcs():
-        if is_uninformative(arc.pose) and min(parent.hybrid_map.keyframes(new), default=-1) >= lost:
-            own = shortest_path_beliefs(parent.hybrid_map, parent.area, targets=(new,))[new].mean
-            mean = se2.compose(_hinted_pose(parent, known, pose_hint), se2.between(pose, own))
+        if is_uninformative(arc.pose) and min(parent.hybrid_map.keyframes(new), default=-1) >= since:
+            area_T_new = shortest_path_beliefs(parent.hybrid_map, parent.area, targets=(new,))[new].mean
+            mean = se2.compose(_hinted_pose(parent, known, pose_hint), se2.between(pose, area_T_new))
             return (Arc(known, new, uninformative_belief(mean)),)
     return ()
 
 
 def update_relocalization(branching: Branching, parent: Parent) -> Branches:
-    """To be lost still, or where the robot was recognized.
+    """The children of a lost hypothesis after a search: still lost, or relocalized.
 
-    :param parent: a hypothesis in which the robot is lost.
+    :param parent: a lost hypothesis.
     """
     lost = parent.state.localization
     assert isinstance(lost, Lost)
     keyframes = _poses_since(parent, lost.since)
     reference = next(iter(keyframes.values()))
     poses = {k: se2.between(reference, pose) for k, pose in keyframes.items()}
-    told = _hint_of_first(lost, keyframes)
-    where = branching.localize_globally(parent, poses, lost.since, told)
-    if lost.tracked_pose is not None:
-        where = where.with_unmapped_prior(KIDNAPPED_UNMAPPED_PRIOR)
-    where = _with_false_alarm(parent.hybrid_map, lost, where, poses)
-    matched = replace(parent, state=parent.state.after_matching((), tuple(poses)))
-    noted, lost = _reweight_by_evidence(matched, lost, where, poses)
-    if len(keyframes) >= _REFUTING_KEYFRAMES and float(where.probabilities.sum()) < 1.0 - _REFUTING_PROBABILITY:
+    hint = _hint_of_first(lost, keyframes)
+    is_kidnapped = lost.tracked_pose is not None
+    distribution = branching.localize_globally(parent, poses, lost.since, hint)
+    if is_kidnapped:
+        distribution = distribution.with_unmapped_prior(KIDNAPPED_UNMAPPED_PRIOR)
+    distribution = _with_false_alarm(parent.hybrid_map, lost, distribution, poses)
+    parent = replace(parent, state=parent.state.after_matching((), tuple(poses)))
+    parent, lost = _reweight_by_evidence(parent, lost, distribution, poses)
+    unmapped = 1.0 - _REFUTING_PROBABILITY
+    if len(keyframes) >= _REFUTING_KEYFRAMES and float(distribution.probabilities.sum()) < unmapped:
         lost = replace(lost, pose_hint=None)
-    best = where.best
-    if best is None or not _is_decisive(*best, branching.options, mapping=lost.tracked_pose is not None):
-        return Branches([_unmoved_child(noted, replace(lost, candidate=None))], True, pose_distribution=where)
-    located, probability = best
-    sighted = replace(lost, candidate=_pose_in_area(located, poses, max(poses)))
-    by_hint = told is not None and probability >= branching.options.hint_probability
-    if not by_hint and not _confirms_candidate(parent.hybrid_map, lost, located, poses):
-        return Branches([_unmoved_child(noted, sighted)], True, pose_distribution=where)
-    return Branches(_split_at_candidate(noted, sighted, reference, *best), True, pose_distribution=where)
+    best = distribution.best
+    if best is None or not _is_decisive(*best, branching.options, is_kidnapped=is_kidnapped):
+        children = [_child_with_localization(parent, replace(lost, candidate=None))]
+        return Branches(children, True, pose_distribution=distribution)
+    candidate, probability = best
+    with_candidate = replace(lost, candidate=_pose_in_area(candidate, poses, max(poses)))
+    if (hint is not None and probability >= branching.options.hint_probability) or _confirms_candidate(
+        parent.hybrid_map, lost, candidate, poses
+    ):
+        children = _split_at_candidate(parent, with_candidate, reference, candidate, probability)
+    else:
+        children = [_child_with_localization(parent, with_candidate)]
+    return Branches(children, True, pose_distribution=distribution)
 
 
 def _split_at_candidate(
     parent: Parent, lost: Lost, reference: Pose, candidate: PoseCandidate, probability: float
 ) -> list[Child]:
-    """The two continuations of a hypothesis where a place was found: lost still, and recognized there.
+    """The two children where a pose is accepted: still lost, and relocalized there.
 
-    :param lost: what is remembered while the robot is lost.
-    :param reference: ``area_T_reference`` of the keyframes that were located, shape (3,).
-    :param probability: of the place.
+    :param lost: the state of the lost one.
+    :param reference: ``area_T_reference`` of the keyframes that were searched, shape (3,).
+    :param probability: of the candidate.
     """
-    # What speaks for the place from here on is the other's.
-    still = _unmoved_child(parent, replace(lost, counted_evidence=None))
-    left = parent.log_weight + math.log(max(1.0 - probability, 1e-300))
+    # From here on, evidence for the candidate counts for the relocalized child.
+    still_lost = _child_with_localization(parent, replace(lost, counted_evidence=None))
     belief = PoseGaussian.from_pose(reference).compose(candidate.mode.measured.inverse())
-    found = replace(
-        _unmoved_child(parent, Tracking(candidate.area)),
+    relocalized = replace(
+        _child_with_localization(parent, Tracking(candidate.area)),
         log_weight=parent.log_weight + math.log(probability),
         arcs=(Arc(parent.area, candidate.area, belief, True),),
         reload_local_map=True,
     )
-    return [replace(still, log_weight=left), found]
+    log_weight = parent.log_weight + math.log(max(1.0 - probability, 1e-300))
+    return [replace(still_lost, log_weight=log_weight), relocalized]
 
 
-def _unmoved_child(parent: Parent, localization: Tracking | Lost) -> Child:
-    """The hypothesis with the robot in its area, of whose place this is known now."""
-    state = replace(parent.state, localization=localization)
-    return Child(parent.hypothesis, parent.log_weight, parent.area, state)
+def _child_with_localization(parent: Parent, localization: Tracking | Lost) -> Child:
+    return _with_localization(parent, localization).unchanged_child()
 
 
 def _with_false_alarm(
     hybrid_map: HybridMap, lost: Lost, distribution: PoseDistribution, poses: Mapping[int, Pose]
 ) -> PoseDistribution:
-    """Where a robot is that may have been right about its place before it took itself for lost.
+    """The distribution that includes a false alarm, if the hypothesis has one.
 
-    :param poses: {keyframe: ``reference_T_base``} of those that were located.
+    :param poses: {keyframe: ``reference_T_base``} of those that were searched.
     """
-    stay = lost.false_alarm
-    if stay is None or stay.tracked_pose.keyframe not in poses:
+    alarm = lost.false_alarm
+    if alarm is None or alarm.tracked_pose.keyframe not in poses:
         return distribution
-    there = _candidates_at(hybrid_map, distribution, stay.tracked_pose, poses)
-    return distribution.with_false_alarm(there, stay.probability, len(hybrid_map.area_ids()))
+    at_tracked_pose = _candidates_at(hybrid_map, distribution, alarm.tracked_pose, poses)
+    return distribution.with_false_alarm(at_tracked_pose, alarm.probability, len(hybrid_map.area_ids()))
 
 
 def accept_relocalization(branches: Branches) -> Branches:
-    """A look after which a robot that was recognized is lost no more.
+    """The relocalized children only, if there are any.
 
-    Where nothing is mapped, what the robot saw since would go on to explain itself better than a map of before that the
-    world does not keep to; if it was taken for another place, the map contradicts it soon.
+    Without mapping, a lost child would keep explaining its own scans better than a map that the world has changed from.
+    If the relocalization was wrong, the map contradicts it soon.
     """
-    found = [child for child in branches.children if not child.state.is_lost]
-    return branches._replace(children=found or branches.children)
+    relocalized = [child for child in branches.children if not child.state.is_lost]
+    return branches._replace(children=relocalized or branches.children)
 
 
 def _reweight_by_evidence(
     parent: Parent, lost: Lost, distribution: PoseDistribution, poses: Mapping[int, Pose]
 ) -> tuple[Parent, Lost]:
-    """A hypothesis of a displaced robot, weighed by what it saw since, as far as that is not in its weight yet.
+    """A kidnapped hypothesis with the evidence since the kidnapping that its weight lacks.
 
-    :param poses: {keyframe: ``reference_T_base``} of those that were located.
+    :param poses: {keyframe: ``reference_T_base``} of those that were searched.
     """
-    claim = lost.tracked_pose
-    if claim is None or lost.counted_evidence is None or claim.keyframe not in poses:
+    tracked_pose = lost.tracked_pose
+    if tracked_pose is None or lost.counted_evidence is None or tracked_pose.keyframe not in poses:
         return parent, lost
-    credit = log_bayes_factor(parent.hybrid_map, distribution, claim, poses)
-    weighed = replace(parent, log_weight=parent.log_weight + credit - lost.counted_evidence)
-    return weighed, replace(lost, counted_evidence=credit)
+    evidence = log_bayes_factor(parent.hybrid_map, distribution, tracked_pose, poses)
+    reweighted = replace(parent, log_weight=parent.log_weight + evidence - lost.counted_evidence)
+    return reweighted, replace(lost, counted_evidence=evidence)
 
 
 def log_bayes_factor(
     hybrid_map: HybridMap, distribution: PoseDistribution, tracked_pose: PoseInArea, poses: Mapping[int, Pose]
 ) -> float:
-    """log p(what a robot saw | it was displaced) / p(that | it was not), by where that lies in the map before, nats.
+    """log p(scans | kidnapped) / p(scans | not kidnapped), nats, both relative to new ground.
 
-    New ground is the measure of both.
-
-    :param tracked_pose: where it is if it was not displaced: there it is not, if it was.
-    :param poses: {keyframe: ``reference_T_base``} of those that were located.
+    :param tracked_pose: the pose without a kidnapping; a kidnapped robot is elsewhere.
+    :param poses: {keyframe: ``reference_T_base``} of those that were searched.
     """
-    there, shares = _candidates_at(hybrid_map, distribution, tracked_pose, poses), distribution.probabilities
-    unmapped = max(1.0 - float(shares.sum()), _PROBABILITY_FLOOR)
-    elsewhere = unmapped + float(shares[~there].sum())
+    probabilities = distribution.probabilities
+    at_tracked_pose = _candidates_at(hybrid_map, distribution, tracked_pose, poses)
+    unmapped = max(1.0 - float(probabilities.sum()), _PROBABILITY_FLOOR)
+    elsewhere = unmapped + float(probabilities[~at_tracked_pose].sum())
     areas = len(hybrid_map.area_ids())
-    stayed = float(shares[there].sum()) / unmapped * KIDNAPPED_UNMAPPED_PRIOR / (1.0 - KIDNAPPED_UNMAPPED_PRIOR) * areas
+    prior_odds = KIDNAPPED_UNMAPPED_PRIOR / (1.0 - KIDNAPPED_UNMAPPED_PRIOR)
+    stayed = float(probabilities[at_tracked_pose].sum()) / unmapped * prior_odds * areas
     return math.log(elsewhere / unmapped * KIDNAPPED_UNMAPPED_PRIOR) - math.log(max(1.0, stayed))
 
 
@@ -251,27 +274,29 @@ def prefers_tracked_pose(
     poses: Mapping[int, Pose],
     options: InferenceParameters,
 ) -> bool:
-    """Whether a robot is rather where a claim has it than in any other place of the map, and most of it is known there.
+    """Whether the tracked pose is more probable than all other candidates, and most surfaces are known there.
 
-    What contradicts there speaks for ground that the map does not hold, too; it is not asked again whether that is so.
+    Unmapped ground is no alternative here, since any contradiction speaks for it.
 
-    :param poses: {keyframe: ``reference_T_base``} of those that were located.
+    :param poses: {keyframe: ``reference_T_base``} of those that were searched.
     """
-    there, shares = _candidates_at(hybrid_map, distribution, tracked_pose, poses), distribution.probabilities
-    known = max(
-        (located.agreement.matched_share for located, one in zip(distribution.candidates, there, strict=True) if one),
+    probabilities = distribution.probabilities
+    at_tracked_pose = _candidates_at(hybrid_map, distribution, tracked_pose, poses)
+    known_share = max(
+        (c.agreement.matched_share for c, there in zip(distribution.candidates, at_tracked_pose, strict=True) if there),
         default=0.0,
     )
-    return known >= options.relocalization_share and bool(shares[there].sum() > shares[~there].sum())
+    is_preferred = probabilities[at_tracked_pose].sum() > probabilities[~at_tracked_pose].sum()
+    return known_share >= options.relocalization_share and bool(is_preferred)
 
 
 def _candidates_at(
     hybrid_map: HybridMap, distribution: PoseDistribution, pose: PoseInArea, poses: Mapping[int, Pose]
-) -> NDArray[np.bool_]:
-    """Which of the places where a robot may be are that of a claim, shape (len(where.found),)."""
+) -> Bool:
+    """Which candidates are at a pose, shape (len(distribution.candidates),)."""
     found = [
-        _is_same_place(hybrid_map, _pose_in_area(located, poses, pose.keyframe), pose)
-        for located in distribution.candidates
+        _is_same_place(hybrid_map, _pose_in_area(candidate, poses, pose.keyframe), pose)
+        for candidate in distribution.candidates
     ]
     return np.array(found, dtype=np.bool_)
 
@@ -279,24 +304,26 @@ def _candidates_at(
 def decisive_candidate(
     distribution: PoseDistribution, poses: Mapping[int, Pose], options: InferenceParameters
 ) -> PoseInArea | None:
-    """Where a look found a robot that was carried while it maps, if it did.
+    """The pose that a search found for a robot kidnapped during mapping, or None.
 
-    :param poses: {keyframe: ``reference_T_base``} of those that were located.
+    :param poses: {keyframe: ``reference_T_base``} of those that were searched.
     """
     best = distribution.best
-    if best is None or not _is_decisive(*best, options, mapping=True):
+    if best is None or not _is_decisive(*best, options, is_kidnapped=True):
         return None
     return _pose_in_area(best[0], poses, max(poses))
 
 
-def _is_decisive(candidate: PoseCandidate, probability: float, options: InferenceParameters, *, mapping: bool) -> bool:
-    """Whether a look tells where the robot is.
+def _is_decisive(
+    candidate: PoseCandidate, probability: float, options: InferenceParameters, *, is_kidnapped: bool
+) -> bool:
+    """Whether a search determines the pose.
 
-    :param mapping: whether it was carried while it maps.
+    :param is_kidnapped: whether the robot was kidnapped during mapping.
     """
-    known = options.relocalization_share if mapping else 0.0
-    found = probability >= options.relocalization_probability
-    return found and candidate.agreement.matched_share >= known and is_certain(candidate)
+    min_share = options.relocalization_share if is_kidnapped else 0.0
+    is_probable = probability >= options.relocalization_probability
+    return is_probable and candidate.agreement.matched_share >= min_share and is_certain(candidate)
 
 
 def _pose_in_area(candidate: PoseCandidate, poses: Mapping[int, Pose], keyframe: int) -> PoseInArea:
@@ -304,11 +331,11 @@ def _pose_in_area(candidate: PoseCandidate, poses: Mapping[int, Pose], keyframe:
 
 
 def _confirms_candidate(hybrid_map: HybridMap, lost: Lost, candidate: PoseCandidate, poses: Mapping[int, Pose]) -> bool:
-    """Whether the last look found the robot where this one has it.
+    """Whether the last search found the same pose.
 
-    A place that looks alike is seldom taken for the right one twice, as other things are seen next.
+    A similar place is seldom mistaken twice, as the robot sees other things by then.
 
-    :param poses: {keyframe: ``reference_T_base``} of those that were located.
+    :param poses: {keyframe: ``reference_T_base``} of those that were searched.
     """
     before = lost.candidate
     if before is None or before.keyframe not in poses:
@@ -317,27 +344,95 @@ def _confirms_candidate(hybrid_map: HybridMap, lost: Lost, candidate: PoseCandid
 
 
 def _is_same_place(hybrid_map: HybridMap, one: PoseInArea, other: PoseInArea) -> bool:
-    """Whether two sightings of a keyframe are of the same place."""
+    """Whether two poses of a keyframe are about the same."""
     frames = shortest_path_beliefs(hybrid_map, one.area, targets=(other.area,))
     if other.area not in frames:
         return False
-    away = se2.between(one.pose, se2.compose(frames[other.area].mean, other.pose))
-    return bool(math.hypot(away[0], away[1]) <= _SAME_DISTANCE and abs(away[2]) <= _SAME_ANGLE)
+    difference = se2.between(one.pose, se2.compose(frames[other.area].mean, other.pose))
+    is_near = math.hypot(difference[0], difference[1]) <= _SAME_DISTANCE
+    return bool(is_near and abs(difference[2]) <= _SAME_ANGLE)
 
 
 def _hint_of_first(lost: Lost, keyframes: dict[int, Pose]) -> PoseHint | None:
-    """Where the first of keyframes, {keyframe: ``area_T_base``}, is, as somebody said of one of them."""
-    told = lost.pose_hint
-    if told is None or told.keyframe not in keyframes:
+    """The pose hint for the first of keyframes, {keyframe: ``area_T_base``}, from that for one of them."""
+    hint = lost.pose_hint
+    if hint is None or hint.keyframe not in keyframes:
         return None
     first = next(iter(keyframes))
-    moved = PoseGaussian.from_pose(se2.between(keyframes[told.keyframe], keyframes[first]))
-    return PoseHint(first, told.area, told.pose.compose(moved))
+    hinted_T_first = PoseGaussian.from_pose(se2.between(keyframes[hint.keyframe], keyframes[first]))
+    return PoseHint(first, hint.area, hint.pose.compose(hinted_T_first))
 
 
 def _poses_since(parent: Parent, keyframe: int) -> dict[int, Pose]:
-    """The newest keyframes of the local map since one of them, {keyframe: ``area_T_base``}, ascending."""
-    seen = dict(parent.hybrid_map.keyframes(parent.area))
+    """The newest keyframes of the submap since one of them, {keyframe: ``area_T_base``}, ascending."""
+    poses = dict(parent.hybrid_map.keyframes(parent.area))
     for area, pose in parent.local_area_poses().items():
-        seen |= {k: se2.compose(pose, at) for k, at in parent.hybrid_map.keyframes(area).items()}
-    return {k: seen[k] for k in sorted(seen)[-_MAX_KEYFRAMES:] if k >= keyframe}
+        poses |= {k: se2.compose(pose, in_area) for k, in_area in parent.hybrid_map.keyframes(area).items()}
+    return {k: poses[k] for k in sorted(poses)[-_MAX_KEYFRAMES:] if k >= keyframe}
+
+
+def spawn_kidnapped_hypothesis(branching: Branching, parent: Parent) -> Branches | None:
+    """The children "not kidnapped" and "kidnapped", or None where a kidnapping is too improbable."""
+    log_odds, since = parent.state.kidnapping_test(branching.options.kidnapping_prior)
+    keyframes = _keyframes_since(parent, since)
+    if (
+        log_odds < math.log(branching.options.kidnapping_odds)
+        or parent.probability < _MIN_KIDNAPPED_PROBABILITY
+        or len(keyframes) < _MIN_KIDNAPPED_KEYFRAMES
+    ):
+        return None
+    kidnapped = _kidnapped_child(branching, parent, keyframes, log_odds)
+    return Branches([parent.unchanged_child(replace(parent.state, kidnapping_evidence={})), kidnapped], True)
+
+
+def decide_without_mapping(branching: Branching, parent: Parent, event: int) -> Child:
+    """The only child without mapping: lost if a kidnapping is more probable than not, else unchanged.
+
+    No keyframe is stored that could tell which later. Moved furniture contradicts the map as a wrong pose does. But
+    then the other surfaces match at the tracked pose, and in no other place of the map.
+
+    :param event: the newest; metric SLAM resets its filters at the next one.
+    """
+    log_odds, since = parent.state.kidnapping_test(branching.options.kidnapping_prior)
+    state = parent.state
+    if log_odds > 0.0:
+        if not _confirms_tracked_pose(branching, parent, since):
+            alarm = FalseAlarm(state.unstored_poses[event], 1.0 / (1.0 + math.exp(log_odds)))
+            state = replace(state, localization=Lost(event + 1, false_alarm=alarm))
+        state = replace(state, kidnapping_evidence={}, unstored_poses={})
+    return parent.unchanged_child(state)
+
+
+def _confirms_tracked_pose(branching: Branching, parent: Parent, since: int) -> bool:
+    """Whether the scans since an event, which the map does not hold, match it at the tracked pose."""
+    unstored = [pose for event, pose in sorted(parent.state.unstored_poses.items()) if event >= since]
+    frames = shortest_path_beliefs(parent.hybrid_map, parent.area, targets={pose.area for pose in unstored})
+    tracked = {p.keyframe: se2.compose(frames[p.area].mean, p.pose) for p in unstored if p.area in frames}
+    if not tracked:
+        return False
+    first = min(tracked)
+    poses = {keyframe: se2.between(tracked[first], pose) for keyframe, pose in tracked.items()}
+    distribution = branching.localize_globally(parent, poses, first)
+    tracked_pose = PoseInArea(parent.area, first, tracked[first])
+    return prefers_tracked_pose(parent.hybrid_map, distribution, tracked_pose, poses, branching.options)
+
+
+def _keyframes_since(parent: Parent, event: int) -> list[int]:
+    """The keyframes of the robot's area since an event, without the first if the area would be left empty."""
+    keyframes = sorted(parent.hybrid_map.keyframes(parent.area))
+    newer = [k for k in keyframes if k >= event]
+    return newer if min(keyframes, default=0) < event else newer[1:]
+
+
+def _kidnapped_child(branching: Branching, parent: Parent, keyframes: Sequence[int], log_odds: float) -> Child:
+    """The child that was kidnapped before the first of some keyframes of its area, which begin a new area."""
+    query = branching.query(parent, keyframes)
+    distribution = branching.localize_globally(parent, query.poses, keyframes[0])
+    distribution = distribution.with_unmapped_prior(KIDNAPPED_UNMAPPED_PRIOR)
+    tracked_pose = PoseInArea(parent.area, keyframes[0], query.belief.mean)
+    evidence = log_bayes_factor(parent.hybrid_map, distribution, tracked_pose, query.poses)
+    origin, arc = PoseGaussian.from_pose(np.zeros(3)), uninformative_belief(query.belief.mean)
+    child = branching.enter_area(parent, query, branching.new_area(parent, query), origin, arc, log_odds + evidence)
+    candidate = decisive_candidate(distribution, query.poses, branching.options)
+    lost = Lost(keyframes[0], candidate=candidate, tracked_pose=tracked_pose, counted_evidence=evidence)
+    return replace(child, state=replace(child.state, kidnapping_evidence={}, localization=lost))

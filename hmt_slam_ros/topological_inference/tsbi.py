@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.hybrid_map.surroundings import areas_around, consistent_pose
@@ -36,32 +36,40 @@ from hmt_slam_ros.topological_inference.branching import (
     apply_revision,
     merge_areas,
 )
-from hmt_slam_ros.topological_inference.global_localization import PoseDistribution
-from hmt_slam_ros.topological_inference.hypothesis_merging import LocalizedHypothesis, merge_equivalent
+from hmt_slam_ros.topological_inference.global_localization import (
+    LocalizationStatus,
+    PoseDistribution,
+    summarize_localization,
+)
 from hmt_slam_ros.topological_inference.hypothesis_tree import (
     HypothesisState,
+    LocalizedHypothesis,
     Lost,
     PoseInArea,
     ReducedDistribution,
     Tracking,
+    merge_equivalent,
     normalize_and_reduce,
-)
-from hmt_slam_ros.topological_inference.kidnapping import decide_without_mapping, spawn_kidnapped_hypothesis
-from hmt_slam_ros.topological_inference.localization_status import (
-    HypothesisSummary,
-    LocalizationStatus,
-    summarize_localization,
 )
 from hmt_slam_ros.topological_inference.relocalization import (
     accept_relocalization,
     begin_relocalization,
+    decide_without_mapping,
+    spawn_kidnapped_hypothesis,
     update_relocalization,
 )
 
-# Keyframe events in a row that the robot has to spend in an area of the local map before an arc joins it.
 _OVERLAP_PERSISTENCE = 3
-# Keyframes after which it is looked whether the robot is in known ground that it saw before it.
+"""Keyframe events in a row that the robot has to be in an area of the submap before an arc joins it."""
+
 _RETRY_KEYFRAMES = 3
+"""Keyframes after which pending candidates are compared again."""
+
+_UNEXAMINED_DECAY = 0.5
+"""Factor on the unexamined probability at a search: unexamined ground would match again by now."""
+
+_MIN_PROBABILITY = 1e-300
+"""Smallest probability of a hypothesis, for logarithms."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,12 +77,12 @@ class TsbiState:
     """TSBI between two keyframe events, at first before the first one.
 
     :ivar replica: the maps of the live hypotheses.
-    :ivar branching: what is known of areas beside these.
-    :ivar hypothesis_states: {hypothesis: what is remembered of it}.
+    :ivar branching: what branching remembers beside these.
+    :ivar hypothesis_states: {hypothesis: its state}.
     :ivar next_hypothesis: the first number that no hypothesis had.
-    :ivar unexamined: probability of the topologies that were not looked at.
-    :ivar global_poses: ``map_T_area`` as TLCA told it last, ordered by area.
-    :ivar revised_hypotheses: the explanations of a contradiction that TLCA has asked about, else empty.
+    :ivar unexamined: probability of the topologies that were not examined.
+    :ivar global_poses: ``map_T_area`` of TLCA's last decision, ordered by area.
+    :ivar revised_hypotheses: the explanations of TLCA's revision request, until they are applied; else empty.
     """
 
     replica: ReplicaState = field(default_factory=ReplicaState)
@@ -91,8 +99,7 @@ class TsbiState:
 class Tsbi:
     """Answers the area events of every keyframe with the live hypotheses.
 
-    Consumes TrackingReset, Keyframe, AreaEvents, ClosureDecision; produces Hypotheses, and Notices of loops that are
-    looked for.
+    Consumes TrackingReset, Keyframe, AreaEvents, ClosureDecision; produces Hypotheses, and Notices of proposed loops.
     """
 
     def __init__(
@@ -101,9 +108,9 @@ class Tsbi:
         branching: Callable[[Configuration, Replica], Branching] = Branching,
         state: TsbiState | None = None,
     ) -> None:
-        """:param branching: what makes the children of hypotheses, such as one that is watched.
+        """:param branching: makes the children of hypotheses.
 
-        :param state: to go on from.
+        :param state: to continue from.
         """
         state = state or TsbiState()
         self._options = configuration.tsbi
@@ -111,49 +118,46 @@ class Tsbi:
         self._replica = Replica.from_state(state.replica)
         self._branching = branching(configuration, self._replica)
         self._branching.restore(state.branching)
-        # All but the two parts above, which change in place.
+        # Without the two parts above, which change in place.
         self._state = replace(state, replica=ReplicaState(), branching=BranchingState())
         self._keyframe: Keyframe | None = None
         self._estimates: dict[int, HypothesisEstimate] = {}
-        # What the next look finds out anew: the keyframe event before which the robot arrived, and where it may be.
+        # Not part of the state, since the next search computes them again.
         self._reset_event = -1
         self._pose_distribution: PoseDistribution | None = None
 
     @property
     def state(self) -> TsbiState:
-        """All that TSBI knows between two keyframe events, as a value."""
+        """The state between two keyframe events."""
         return replace(self._state, replica=self._replica.state, branching=self._branching.state)
 
     @property
     def localization(self) -> LocalizationStatus:
-        """What is known of the robot's place."""
-        arriving = (-1 if self._keyframe is None else self._keyframe.sequence) < self._reset_event
-        standings = [
-            HypothesisSummary(
-                probability,
-                self._replica.robot_areas[hypothesis],
-                arriving or self._state.hypothesis_states[hypothesis].is_lost,
-            )
-            for hypothesis, probability in self._replica.probabilities.items()
-        ]
+        """Whether the robot is localized, and the entropy of the belief over its area."""
+        is_reset = (-1 if self._keyframe is None else self._keyframe.sequence) < self._reset_event
+        states = self._state.hypothesis_states
+        areas, lost = defaultdict[int, float](float), 0.0
+        for hypothesis, probability in self._replica.probabilities.items():
+            if is_reset or states[hypothesis].is_lost:
+                lost += probability
+            else:
+                areas[self._replica.robot_areas[hypothesis]] += probability
         best = self._replica.best_hypothesis
-        leading = self._state.hypothesis_states[best].localization
-        since = self._reset_event if arriving else leading.since if isinstance(leading, Lost) else None
-        hybrid_map = self._replica.maps[best]
+        localization, hybrid_map = states[best].localization, self._replica.maps[best]
+        since = self._reset_event if is_reset else localization.since if isinstance(localization, Lost) else None
         known = sum(
             since is None or any(k < since for k in hybrid_map.keyframes(area)) for area in hybrid_map.area_ids()
         )
-        distribution = None if arriving else self._pose_distribution
+        distribution = None if is_reset else self._pose_distribution
         allowed = self._options.lost_probability
-        return summarize_localization(standings, self._state.unexamined, known, distribution, allowed)
+        return summarize_localization(areas, lost, self._state.unexamined, known, distribution, allowed)
 
     def handle(self, message: Message) -> list[Message]:
         """Learn from ``Keyframe`` and ``ClosureDecision``; answer ``AreaEvents`` with ``Hypotheses``."""
         if isinstance(message, Keyframe):
             self._add_keyframe(message)
         elif isinstance(message, AreaEvents):
-            answer = self._infer(message)
-            landmarks = self._branching.landmarks
+            answer, landmarks = self._infer(message), self._branching.landmarks
             return [*(landmarks.notices() if landmarks else ()), answer]
         elif isinstance(message, ClosureDecision):
             self._accept(message)
@@ -162,24 +166,28 @@ class Tsbi:
         return []
 
     def _add_keyframe(self, keyframe: Keyframe) -> None:
-        """Store the keyframe and what its scan says of every hypothesis."""
+        """Store the keyframe, and update the state of every hypothesis by its scan."""
         self._replica.add_keyframe(keyframe)
         self._keyframe = keyframe
-        self._estimates = {leaf.hypothesis: leaf for leaf in keyframe.estimates}
+        self._estimates = {estimate.hypothesis: estimate for estimate in keyframe.estimates}
         states = dict(self._state.hypothesis_states)
-        for leaf in keyframe.estimates:
-            if leaf.hypothesis in states:
-                held = keyframe.mapping or leaf.stored
-                spot = None if held else PoseInArea(leaf.area, keyframe.sequence, leaf.pose.mean)
-                notes = states[leaf.hypothesis].after_scan(keyframe.sequence, leaf.log_kidnapping_ratio, spot)
-                stored = notes.after_keyframe(keyframe.sequence, leaf.pose.covariance) if leaf.stored else notes
-                states[leaf.hypothesis] = stored
+        for estimate in keyframe.estimates:
+            if estimate.hypothesis not in states:
+                continue
+            unstored_pose = None
+            if not keyframe.mapping and not estimate.stored:
+                unstored_pose = PoseInArea(estimate.area, keyframe.sequence, estimate.pose.mean)
+            state = states[estimate.hypothesis]
+            state = state.after_scan(keyframe.sequence, estimate.log_kidnapping_ratio, unstored_pose)
+            if estimate.stored:
+                state = state.after_keyframe(keyframe.sequence, estimate.pose.covariance)
+            states[estimate.hypothesis] = state
         self._state = replace(self._state, hypothesis_states=states)
-        wanted = {event for notes in states.values() for event in notes.unstored_poses}
+        wanted = {event for state in states.values() for event in state.unstored_poses}
         self._branching.keep_scans(keyframe.sequence, keyframe.scan, wanted)
 
     def _infer(self, events: AreaEvents) -> Hypotheses:
-        """Weight, branch, normalise, reduce."""
+        """Weigh, branch, normalize, reduce."""
         if self._keyframe is None or self._keyframe.sequence != events.sequence:
             last = "none" if self._keyframe is None else self._keyframe.sequence
             raise HmtSlamError(
@@ -191,35 +199,30 @@ class Tsbi:
         parents = self._parents(keyframe)
         branches = [self._branch(parent, by_hypothesis.get(parent.hypothesis), keyframe) for parent in parents]
         children = [child for branch in branches for child in branch.children]
-        self._pose_distribution = next(
-            (branch.pose_distribution for branch in branches if branch.pose_distribution is not None),
-            self._pose_distribution,
-        )
+        distributions = (branch.pose_distribution for branch in branches)
+        self._pose_distribution = next((d for d in distributions if d is not None), self._pose_distribution)
         if not any(branch.closures_searched for branch in branches):
             self._branching.look_ahead(parents)
-        settled = self._reduce(events.sequence, children, branches)
-        chosen = [children[k] for k in settled.indices]
-        changed = self._surviving_hypotheses(children, chosen, settled.probabilities)
-        # What a question that is open again moves has to be there.
-        arrived_now = keyframe.motion_unknown or keyframe.initial_pose is not None
-        # Area abstraction, which does not know that the robot was displaced, forgets where it moves nothing itself.
-        displaced = any(leaf.moved_keyframes for leaf in changed)
+        reduced = self._reduce(events.sequence, children, branches)
+        survivors = [children[k] for k in reduced.indices]
+        hypotheses = self._surviving_hypotheses(children, survivors, reduced.probabilities)
+        # Keyframes and beams that a revision, a reset or a kidnapping moves must still be there.
         revised = self._state.revised_hypotheses
-        forgotten = () if revised or arrived_now or displaced else events.redundant_keyframes
-        outdated = () if revised or arrived_now else keyframe.stale_beams
-        self._replica.apply_hypotheses(
-            Hypotheses(events.sequence, tuple(changed), settled.unexamined, forgotten, outdated)
-        )
-        if outdated:
+        is_reset = keyframe.motion_unknown or keyframe.initial_pose is not None
+        is_moved = any(hypothesis.moved_keyframes for hypothesis in hypotheses)
+        pruned = () if revised or is_reset or is_moved else events.redundant_keyframes
+        stale_beams = () if revised or is_reset else keyframe.stale_beams
+        answer = Hypotheses(events.sequence, tuple(hypotheses), reduced.unexamined, pruned, stale_beams)
+        self._replica.apply_hypotheses(answer)
+        if stale_beams:
             self._branching.forget_scans()
-        loaded = [self._with_local_map(changed[n], child) for n, child in enumerate(chosen)]
+        loaded = [self._with_local_map(h, child) for h, child in zip(hypotheses, survivors, strict=True)]
         still_revised = revised if keyframe.motion_unknown else ()
-        self._state = replace(self._state, unexamined=settled.unexamined, revised_hypotheses=still_revised)
-        leaves = tuple(sorted(loaded, key=lambda leaf: leaf.id))
-        return Hypotheses(events.sequence, leaves, settled.unexamined, forgotten, outdated)
+        self._state = replace(self._state, unexamined=reduced.unexamined, revised_hypotheses=still_revised)
+        return replace(answer, hypotheses=tuple(sorted(loaded, key=lambda hypothesis: hypothesis.id)))
 
     def _parents(self, keyframe: Keyframe) -> list[Parent]:
-        """The live hypotheses with their weights; of those that say the same, the heaviest, with the weight of all."""
+        """The live hypotheses with their weights; of equivalent ones the heaviest, with the weight of all."""
         parents = [self._parent(hypothesis) for hypothesis in sorted(self._state.hypothesis_states)]
         if len(parents) == 1:
             return parents
@@ -229,52 +232,50 @@ class Tsbi:
             self._branching.reweight_by_known_ground(parent, pose, points, keyframe.sequence)
             for parent, pose in zip(parents, poses, strict=True)
         ]
-        claims = [
+        localized = [
             LocalizedHypothesis(p.hybrid_map, p.area, pose, {p.area, *p.local_area_poses()})
             for p, pose in zip(parents, poses, strict=True)
         ]
-        weights = merge_equivalent(claims, [parent.log_weight for parent in parents])
-        return [replace(parents[n], log_weight=weight) for n, weight in sorted(weights.items())]
+        log_weights = merge_equivalent(localized, [parent.log_weight for parent in parents])
+        return [replace(parents[n], log_weight=log_weight) for n, log_weight in sorted(log_weights.items())]
 
     def _parent(self, hypothesis: int) -> Parent:
         estimate = self._estimates[hypothesis]
         probability = self._replica.probabilities[hypothesis]
-        # Where it is asked whether the robot was displaced, the walls that its beams pass tell.
+        # A kidnapping is tested by the walls that beams pass as well.
         log_evidence = -estimate.log_kidnapping_ratio if self._is_kidnapped else estimate.log_evidence
-        log_weight = math.log(max(probability, 1e-300)) + log_evidence
-        area, hybrid_map = self._replica.robot_areas[hypothesis], self._replica.maps[hypothesis]
         return Parent(
             hypothesis,
-            area,
-            hybrid_map,
+            self._replica.robot_areas[hypothesis],
+            self._replica.maps[hypothesis],
             self._state.hypothesis_states[hypothesis],
-            log_weight,
+            math.log(max(probability, _MIN_PROBABILITY)) + log_evidence,
             probability,
             estimate.clutter,
         )
 
     @property
     def _is_kidnapped(self) -> bool:
-        """Whether the robot was displaced under one of the hypotheses, and is not found yet."""
-        found = [state.localization for state in self._state.hypothesis_states.values()]
-        return any(isinstance(one, Lost) and one.tracked_pose is not None for one in found)
+        """Whether the robot is kidnapped under one of the hypotheses."""
+        localizations = (state.localization for state in self._state.hypothesis_states.values())
+        return any(isinstance(lost, Lost) and lost.tracked_pose is not None for lost in localizations)
 
     def _branch(self, parent: Parent, event: AreaEvent | None, keyframe: Keyframe) -> Branches:
-        """The continuations of one hypothesis, each with its weight."""
+        """The children of one hypothesis, each with its weight."""
         if keyframe.motion_unknown or keyframe.initial_pose is not None:
-            come = begin_relocalization(self._branching, parent, keyframe, self._estimates[parent.hypothesis].pose.mean)
-            return come if keyframe.mapping else accept_relocalization(come)
+            pose = self._estimates[parent.hypothesis].pose.mean
+            branches = begin_relocalization(self._branching, parent, keyframe, pose)
+            return branches if keyframe.mapping else accept_relocalization(branches)
         if self._state.revised_hypotheses:
-            return Branches(
-                [apply_revision(parent, leaf, keyframe.sequence) for leaf in self._state.revised_hypotheses]
-            )
+            revised = self._state.revised_hypotheses
+            return Branches([apply_revision(parent, explanation, keyframe.sequence) for explanation in revised])
         if not keyframe.mapping and isinstance(parent.state.localization, Tracking):
-            found = parent.state.localization.relocalized_area
-            return self._branch_without_mapping(parent, event, keyframe.sequence, found)
-        if not any(notes.is_lost for notes in self._state.hypothesis_states.values()):
-            displaced = spawn_kidnapped_hypothesis(self._branching, parent)
-            if displaced is not None:
-                return displaced
+            relocalized_area = parent.state.localization.relocalized_area
+            return self._branch_without_mapping(parent, event, keyframe.sequence, relocalized_area)
+        if not any(state.is_lost for state in self._state.hypothesis_states.values()):
+            kidnapped = spawn_kidnapped_hypothesis(self._branching, parent)
+            if kidnapped is not None:
+                return kidnapped
         if event is not None:
             return self._branch_on_area_event(parent, event)
         return self._branch_without_area_event(parent, self._estimates[parent.hypothesis], keyframe)
@@ -282,25 +283,28 @@ class Tsbi:
     def _branch_without_mapping(
         self, parent: Parent, event: AreaEvent | None, sequence: int, relocalized_area: int | None
     ) -> Branches:
-        """The map stays as it is; the robot may go into another area of it, or be lost.
+        """The children without mapping: the robot in the same area, in another known one, or lost.
 
-        What it mapped while it was lost is joined to the map in one place alone and leads nowhere, so that it goes over
-        into the area where it was recognized as soon as that is sure.
+        What it mapped while it was lost leads nowhere, so it moves to the area of its relocalization as soon as that
+        is certain.
 
         :param relocalized_area: that area, if there is one.
         """
         child = decide_without_mapping(self._branching, parent, sequence)
         if child.state.is_lost:
             return Branches([child])
-        found = relocalized_area
-        if found is not None and len(self._state.hypothesis_states) == 1 and parent.hybrid_map.has_area(found):
-            return self._branching.move(parent, found)
+        if (
+            relocalized_area is not None
+            and len(self._state.hypothesis_states) == 1
+            and parent.hybrid_map.has_area(relocalized_area)
+        ):
+            return self._branching.move(parent, relocalized_area)
         if event is not None and event.kind == "moved":
             return self._branching.move(parent, event.area)
         return Branches([child])
 
     def _branch_on_area_event(self, parent: Parent, event: AreaEvent) -> Branches:
-        """Areas changed, or the robot its own."""
+        """The children after an area was cut, two were merged, or the robot changed its area."""
         if event.kind == "cut":
             return self._branching.cut(parent, event.keyframes)
         if event.into is not None:
@@ -308,57 +312,57 @@ class Tsbi:
         return self._branching.move(parent, event.area)
 
     def _branch_without_area_event(self, parent: Parent, estimate: HypothesisEstimate, keyframe: Keyframe) -> Branches:
-        """No area was left; but the robot may be in known ground that area abstraction does not know to be near."""
+        """The children in the same area; the robot may be on known ground that no arc leads to."""
         overlap = self._branching.find_unlinked_overlap(parent, estimate.pose.mean)
         lost = parent.state.localization if isinstance(parent.state.localization, Lost) else None
-        notes = replace(parent.state.after_overlap(overlap), localization=lost or Tracking())
-        parent = replace(parent, state=notes)
-        if notes.unlinked_overlap is not None and notes.unlinked_overlap[1] >= _OVERLAP_PERSISTENCE:
-            return self._branching.link(parent, notes.unlinked_overlap[0], keyframe.scan, estimate.pose)
-        enough = self._options.recheck_keyframes
-        if lost is not None and len(notes.unmatched_keyframes) >= (enough if lost.pose_hint is None else 1):
-            looked = update_relocalization(self._branching, parent)
-            return looked if keyframe.mapping else accept_relocalization(looked)
-        if len(notes.unmatched_keyframes) >= enough:
+        state = replace(parent.state.after_overlap(overlap), localization=lost or Tracking())
+        parent = replace(parent, state=state)
+        if state.unlinked_overlap is not None and state.unlinked_overlap[1] >= _OVERLAP_PERSISTENCE:
+            return self._branching.link(parent, state.unlinked_overlap[0], keyframe.scan, estimate.pose)
+        unmatched = len(state.unmatched_keyframes)
+        if lost is not None and unmatched >= (self._options.recheck_keyframes if lost.pose_hint is None else 1):
+            branches = update_relocalization(self._branching, parent)
+            return branches if keyframe.mapping else accept_relocalization(branches)
+        if unmatched >= self._options.recheck_keyframes:
             return self._branching.recheck(parent)
-        if notes.pending_candidates and len(notes.unmatched_keyframes) == _RETRY_KEYFRAMES:
-            return self._branching.recheck(parent, notes.pending_candidates)
-        return Branches([Child(parent.hypothesis, parent.log_weight, parent.area, notes)])
+        if state.pending_candidates and unmatched == _RETRY_KEYFRAMES:
+            return self._branching.recheck(parent, state.pending_candidates)
+        return Branches([parent.unchanged_child()])
 
     def _reduce(self, sequence: int, children: Sequence[Child], branches: Sequence[Branches]) -> ReducedDistribution:
         generator = random_stream(self._seed, Purpose.HYPOTHESES, sequence)
-        # Ground that was not looked at would show again by now, in the keyframes that are looked at.
         searched = any(branch.closures_searched for branch in branches)
         return normalize_and_reduce(
             np.array([child.log_weight for child in children]),
             float(np.logaddexp.reduce([branch.log_skipped_weight for branch in branches])),
-            self._state.unexamined * (0.5 if searched else 1.0),
+            self._state.unexamined * (_UNEXAMINED_DECAY if searched else 1.0),
             self._options.max_hypotheses,
             self._options.drop_probability,
             generator,
         )
 
     def _surviving_hypotheses(
-        self, children: Sequence[Child], chosen: Sequence[Child], probabilities: NDArray[np.float64]
+        self, children: Sequence[Child], survivors: Sequence[Child], probabilities: Float64
     ) -> list[Hypothesis]:
-        """The survivors; a hypothesis that did not branch keeps its id, children of one that did get new ones."""
+        """The surviving hypotheses; an only child keeps the id of its parent, others get new ones."""
         siblings = Counter(child.parent for child in children)
-        leaves = [
+        hypotheses = [
             self._hypothesis(child, siblings[child.parent] > 1, float(probability))
-            for child, probability in zip(chosen, probabilities, strict=True)
+            for child, probability in zip(survivors, probabilities, strict=True)
         ]
-        states = {leaf.id: child.state for leaf, child in zip(leaves, chosen, strict=True)}
+        states = {hypothesis.id: child.state for hypothesis, child in zip(hypotheses, survivors, strict=True)}
         self._state = replace(self._state, hypothesis_states=states)
-        if not any(notes.is_lost for notes in states.values()):
+        if not any(state.is_lost for state in states.values()):
             self._branching.end_global_localization()
-        return leaves
+        return hypotheses
 
     def _hypothesis(self, child: Child, branched: bool, probability: float) -> Hypothesis:
         hypothesis = child.parent
         if branched:
             hypothesis = self._state.next_hypothesis
             self._state = replace(self._state, next_hypothesis=hypothesis + 1)
-        found, newest = child.state.localization, -1 if self._keyframe is None else self._keyframe.sequence
+        localization = child.state.localization
+        newest = -1 if self._keyframe is None else self._keyframe.sequence
         return Hypothesis(
             hypothesis,
             child.parent,
@@ -369,37 +373,38 @@ class Tsbi:
             child.arcs,
             removed_arcs=child.removed_arcs,
             area_merge=child.area_merge,
-            lost=isinstance(found, Lost),
-            tracking_reset=isinstance(found, Lost) and found.since > newest,
+            lost=isinstance(localization, Lost),
+            tracking_reset=isinstance(localization, Lost) and localization.since > newest,
         )
 
-    def _with_local_map(self, leaf: Hypothesis, child: Child) -> Hypothesis:
-        """The leaf with the areas that its local map must hold, where that is to be loaded anew."""
+    def _with_local_map(self, hypothesis: Hypothesis, child: Child) -> Hypothesis:
+        """The hypothesis with the areas of its submap, if that is to be loaded again."""
         if not child.reload_local_map:
-            return leaf
-        around = areas_around(self._replica.maps[leaf.id], leaf.area, self._branching.search.submap_radius)
+            return hypothesis
+        search, area = self._branching.search, hypothesis.area
+        around = areas_around(self._replica.maps[hypothesis.id], area, search.submap_radius)
         global_poses = GlobalPoses(self._state.global_poses)
         poses = {
-            area: consistent_pose(belief, leaf.area, area, global_poses, self._branching.search.gating.gate)
-            for area, belief in around.items()
-            if area != leaf.area
+            other: consistent_pose(belief, area, other, global_poses, search.gating.gate)
+            for other, belief in around.items()
+            if other != area
         }
         states = self._state.hypothesis_states
-        located = replace(states[leaf.id], local_area_poses=poses)
-        self._state = replace(self._state, hypothesis_states={**states, leaf.id: located})
-        loaded = [LocalArea(area, pose) for area, pose in poses.items()]
-        return replace(leaf, local_areas=(LocalArea(leaf.area, np.zeros(3)), *loaded))
+        state = replace(states[hypothesis.id], local_area_poses=poses)
+        self._state = replace(self._state, hypothesis_states={**states, hypothesis.id: state})
+        others = [LocalArea(other, pose) for other, pose in poses.items()]
+        return replace(hypothesis, local_areas=(LocalArea(area, np.zeros(3)), *others))
 
-    def _accept(self, accepted: ClosureDecision) -> None:
-        """One hypothesis is definite: the others, and what was not examined, are gone."""
-        if accepted.global_poses:
-            self._state = replace(self._state, global_poses=accepted.global_poses)
-        if accepted.hypothesis is None:
+    def _accept(self, decision: ClosureDecision) -> None:
+        """Drop the other hypotheses and what was not examined, where one is definite."""
+        if decision.global_poses:
+            self._state = replace(self._state, global_poses=decision.global_poses)
+        if decision.hypothesis is None:
             return
-        self._replica.apply_decision(accepted)
+        self._replica.apply_decision(decision)
         self._state = replace(
             self._state,
-            revised_hypotheses=accepted.revised_hypotheses,
-            hypothesis_states={accepted.hypothesis: self._state.hypothesis_states[accepted.hypothesis]},
+            revised_hypotheses=decision.revised_hypotheses,
+            hypothesis_states={decision.hypothesis: self._state.hypothesis_states[decision.hypothesis]},
             unexamined=0.0,
         )

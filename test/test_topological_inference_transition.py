@@ -1,4 +1,4 @@
-"""The transition model: where the arcs alone say that the robot is."""
+"""The transition model: the probability of areas by the arcs alone."""
 
 import math
 
@@ -6,15 +6,17 @@ import numpy as np
 import pytest
 from worlds import box, scan_in
 
+from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.hybrid_map.surroundings import (
-    AreaPlace,
-    containing_area,
+from hmt_slam_ros.hybrid_map.shortest_path import ShortestPaths
+from hmt_slam_ros.hybrid_map.surroundings import AreaPlace, containing_area
+from hmt_slam_ros.registration.likelihood_grid import GridModel, build_area_grid
+from hmt_slam_ros.topological_inference.candidate_gating import (
     entry_prior,
+    quick_entry_bounds,
     sampled_entry_bound,
     transition_model,
 )
-from hmt_slam_ros.registration.likelihood_grid import GridModel, build_area_grid
 
 RADIUS = 2.0
 # Two corridors side by side, a wall between them.
@@ -22,7 +24,7 @@ CORRIDORS = np.concatenate((box(-1.0, -1.0, 21.0, 1.0), box(-1.0, 1.0, 21.0, 3.0
 
 
 def place(first=0.0, last=8.0, border=5.0):
-    """Keyframes every metre along the lower corridor; those beyond ``border`` belong to area 7, the others to 3."""
+    """Keyframes every meter along the lower corridor; those beyond ``border`` belong to area 7, the others to 3."""
     x = np.arange(first, last + 0.1)
     poses = np.stack((x, np.zeros_like(x), np.zeros_like(x)), axis=1)
     scans = [scan_in(CORRIDORS, pose, field_of_view=2 * np.pi, beams=361) for pose in poses]
@@ -30,7 +32,7 @@ def place(first=0.0, last=8.0, border=5.0):
 
 
 def keyframes(x, y=0.0, count=4):
-    """Keyframes half a metre apart that begin at (x, y)."""
+    """Keyframes half a meter apart that begin at (x, y)."""
     return np.array([[x + 0.5 * k, y, 0.0] for k in range(count)])
 
 
@@ -59,7 +61,7 @@ def test_a_parallel_corridor_behind_a_wall_is_another_place(corridor):
     assert containing_area(corridor, keyframes(1.0, 1.6), RADIUS) is None
 
 
-def test_where_most_keyframes_lie_decides(corridor):
+def test_most_keyframes_decide(corridor):
     assert containing_area(corridor, keyframes(9.0, count=5), RADIUS) == 7  # up to 11 m, place up to 10 m
     assert containing_area(corridor, keyframes(9.6, count=5), RADIUS) is None
 
@@ -93,7 +95,7 @@ def test_the_probability_is_that_of_the_gaussian():
     assert share == pytest.approx(0.5 * (1.0 + math.erf((10.0 - 9.0) / 0.8 / math.sqrt(2.0))), abs=0.02)
 
 
-def test_neighbouring_areas_share_the_probability(corridor):
+def test_neighboring_areas_share_the_probability(corridor):
     other = AreaPlace(7, corridor.keyframe_areas, corridor.positions, corridor.grid)
     prior = PoseGaussian(np.array([4.0, 0.0, 0.0]), np.diag([0.5, 0.1, 0.003]) ** 2)
     shares = [entry_prior(p, prior, keyframes(0.5), RADIUS).probability for p in (corridor, other)]
@@ -108,7 +110,7 @@ def test_known_and_new_sum_to_one():
         assert sum(model.known.values()) + model.new == pytest.approx(1.0)
 
 
-def test_new_ground_has_what_the_known_places_leave():
+def test_new_ground_has_the_remaining_probability():
     model = transition_model({1: 0.2, 4: 0.3}, 0.05)
     assert model.new == pytest.approx(0.5)
     assert model.known == pytest.approx({1: 0.2, 4: 0.3})
@@ -133,3 +135,35 @@ def test_a_place_at_the_edge_of_the_belief_is_made_of_poses_that_are_far_off(cor
     near, far = (entry_prior(corridor, belief(1.0), keyframes(x), RADIUS) for x in (1.0, -3.5))
     assert near.probability > 5.0 * far.probability > 0.0
     assert far.median_mahalanobis2 > near.median_mahalanobis2 + 1.0
+
+
+@pytest.mark.parametrize(("query_position", "keyframe"), [((0.0, 0.0), (0.0, 0.0)), ((2.0, 0.5), (1.5, 0.0))])
+def test_the_quick_bound_lets_all_pass_that_are_near_and_few_others(query_position, keyframe):
+    rng = np.random.default_rng(2)
+    square = rng.normal(size=(200, 3, 3)) * np.array([0.3, 0.3, 0.05])[:, None]
+    found = ShortestPaths(np.arange(200), rng.uniform(-9.0, 9.0, size=(200, 3)), square @ square.transpose(0, 2, 1))
+    query = PoseGaussian(np.array([1.0, 2.0, 0.3]), np.diag([0.1, 0.2, 0.05]) ** 2)
+    lever, extent = np.hypot(*query_position), np.hypot(*keyframe)
+    bounds = quick_entry_bounds(found, query, lever, np.full(200, extent + lever + 2.0), 2.0, 2.0)
+    passed = bounds > 0.0
+    near = []
+    for mean, covariance in zip(found.means, found.covariances, strict=True):
+        prior = PoseGaussian(mean, covariance).inverse().compose(query)
+        spread = np.sqrt(np.linalg.eigvalsh(prior.covariance[:2, :2])[-1]) + lever * np.sqrt(prior.covariance[2, 2])
+        near.append(np.hypot(*(se2.transform(prior.mean, np.array(query_position)) - keyframe)) <= 2.0 + 4.0 * spread)
+    assert passed[near].all()
+    assert 20 < sum(near) < 180
+    # Where the query and the area are points, the bound is the distance itself.
+    assert passed.sum() == sum(near) if lever == 0.0 else sum(near) < passed.sum() < 200
+
+
+@pytest.mark.parametrize("away", [0.0, 6.0, 15.0, 30.0])
+def test_the_quick_bound_is_one_on_the_probability_of_an_area_far_from_certain(away):
+    spread = np.diag([6.0, 4.0, 0.1]) ** 2
+    found = ShortestPaths(np.array([3]), np.array([[away, 1.0, 0.5]]), spread[None])
+    query = PoseGaussian(np.array([0.0, 0.0, 1.0]), 0.01 * np.eye(3))
+    (bound,) = quick_entry_bounds(found, query, 1.0, np.array([3.0]), 1.5, 4.0)
+    prior = PoseGaussian(found.means[0], spread).inverse().compose(query)
+    poses = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
+    exact = sampled_entry_bound(np.zeros((1, 2)), PoseGaussian(prior.mean, 1.5**2 * prior.covariance), poses, 2.0)
+    assert exact <= bound <= max(10.0 * exact, 0.01)
