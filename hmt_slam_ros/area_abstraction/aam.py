@@ -47,7 +47,7 @@ _BEST_KEYFRAMES = 3
 """Those of them, with the largest overlaps, whose mean is the area's overlap."""
 
 _MAX_PER_VIEWPOINT = 2
-"""Most keyframes at one viewpoint of an area."""
+"""Most keyframes at one viewpoint of an area (docs/decisions/0012-keyframe-pruning.md)."""
 
 _RECENT_EVENTS = 30
 """Keyframe events for which new keyframes are not pruned."""

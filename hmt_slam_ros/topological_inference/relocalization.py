@@ -32,16 +32,25 @@ from hmt_slam_ros.topological_inference.hypothesis_tree import FalseAlarm, Lost,
 Pose = Float64
 
 KIDNAPPED_UNMAPPED_PRIOR = 0.5
-"""Prior probability that a robot kidnapped during mapping is on unmapped ground."""
+"""Prior probability that a robot kidnapped during mapping is on unmapped ground.
+
+From docs/decisions/0026-kidnapping-detection.md.
+"""
 
 _ACCEPTANCE = 0.8
-"""Smallest probability of an accepted pose, in each of two searches."""
+"""Smallest probability of an accepted pose, in each of two searches (docs/decisions/0025-global-localization.md)."""
 
 _ACCEPTANCE_WITH_HINT = 0.9
-"""Smallest probability of a pose that one search with a pose hint accepts."""
+"""Smallest probability of a pose that one search with a pose hint accepts.
+
+From docs/decisions/0025-global-localization.md.
+"""
 
 _MIN_KNOWN_SHARE = 0.7
-"""Smallest matched share of surfaces for a robot kidnapped during mapping: unmapped ground may look the same."""
+"""Smallest matched share of surfaces for a robot kidnapped during mapping: unmapped ground may look the same.
+
+From docs/decisions/0027-lost-or-changed-world.md.
+"""
 
 _SAME_DISTANCE = 1.0
 """Largest distance between two poses of a keyframe that count as the same, m."""
@@ -62,13 +71,16 @@ _MAX_KEYFRAMES = 40
 """Most keyframes that are searched in the map, the newest."""
 
 _MIN_KIDNAPPING_LOG_ODDS = math.log(3e-5)
-"""Smallest log-odds of a kidnapping for which a kidnapped child is spawned."""
+"""Smallest log-odds of a kidnapping for which a kidnapped child is spawned.
+
+From docs/decisions/0026-kidnapping-detection.md.
+"""
 
 _MIN_KIDNAPPED_PROBABILITY = 0.05
 """Smallest probability of a hypothesis that spawns a kidnapped child."""
 
 _MIN_KIDNAPPED_KEYFRAMES = 3
-"""Fewest keyframes since the kidnapping of a kidnapped child."""
+"""Fewest keyframes since the kidnapping of a kidnapped child (docs/decisions/0026-kidnapping-detection.md)."""
 
 
 def begin_relocalization(branching: Branching, parent: Parent, keyframe: Keyframe, pose: Pose) -> Branches:
