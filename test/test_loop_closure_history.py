@@ -7,6 +7,7 @@ import worlds
 from play_for_tlca import SPREAD, Play, belief, new_area, poses_of
 
 from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.hybrid_map.pose_graph import shortest_path_map
 from hmt_slam_ros.messages.map_changes import Arc, MovedKeyframe
 from hmt_slam_ros.messages.messages import Hypothesis
 
@@ -110,7 +111,8 @@ def test_a_loop_error_is_distributed_or_left_open_as_configured():
 
     play, turns = around()
     np.testing.assert_allclose(turns, 90.0, atol=1e-6)
-    tree = np.array([play.process.shortest_path_poses()[area].mean for area in (0, 1, 2, 3, 0)])
+    shortest_paths = shortest_path_map(play.process._replica.maps[0]).poses
+    tree = np.array([shortest_paths[area].mean for area in (0, 1, 2, 3, 0)])
     _, turns = around(global_map="shortest_path")
     np.testing.assert_allclose(turns, np.degrees(se2.between(tree[:-1], tree[1:])[:, 2]), atol=1e-9)
     assert np.ptp(turns) > 5.0

@@ -24,7 +24,7 @@ from hmt_slam_ros.messages.messages import HypothesisEstimate, Keyframe
 from hmt_slam_ros.messages.replica import FIRST_AREA, FIRST_HYPOTHESIS, Replica, ReplicaState
 
 _NEARBY_KEYFRAMES = 10
-"""Keyframes whose map is searched for openings around the robot."""
+"""Keyframes whose map is searched for openings around the robot (docs/decisions/0010-area-policy.md)."""
 
 
 @dataclass(frozen=True, eq=False)

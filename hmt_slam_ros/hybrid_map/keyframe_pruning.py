@@ -18,7 +18,10 @@ from hmt_slam_ros.geometry import se2
 Pose = Float64
 
 _VIEWPOINT_FRACTION = 0.8
-"""Size of a viewpoint relative to the distance of keyframes, below 1 as the filter may move a keyframe a little."""
+"""Size of a viewpoint relative to the distance of keyframes, below 1 as the filter may move a keyframe a little.
+
+From docs/decisions/0012-keyframe-pruning.md.
+"""
 
 
 class ReplacementKeyframe(NamedTuple):

@@ -3,7 +3,8 @@
 A surface point is *static* if one of the recent scans, a second or more apart, saw a surface there and none saw through
 it. People who walk by are not static. A beam of a keyframe is *stale* if the scan and the recent scans together
 contradict it. It is *removed* if they see through its end point. It is *occluded* if it passes a surface that stands
-there now; only its part before that surface is stale, since the room behind a closed door is still there.
+there now; only its part before that surface is stale, since the room behind a closed door is still there. The
+thresholds are those of docs/decisions/0029-change-detection.md.
 """
 
 from __future__ import annotations

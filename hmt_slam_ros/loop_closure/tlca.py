@@ -11,7 +11,7 @@ import numpy as np
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.geometry.gaussian import PoseGaussian, chi_square_gate
+from hmt_slam_ros.geometry.gaussian import chi_square_gate
 from hmt_slam_ros.hybrid_map.hybrid_map import AreaPair, HybridMap
 from hmt_slam_ros.hybrid_map.pose_graph import consistent_map, shortest_path_map
 from hmt_slam_ros.hybrid_map.shortest_path import shortest_path_beliefs
@@ -183,10 +183,6 @@ class Tlca:
         elif isinstance(message, Hypotheses):
             return self._decide(message)
         return []
-
-    def shortest_path_poses(self) -> dict[int, PoseGaussian]:
-        """``map_T_area`` of the most probable hypothesis along the least uncertain paths only, Eq. (15)."""
-        return shortest_path_map(self._replica.maps[self._replica.best_hypothesis]).poses
 
     def _decide(self, hypotheses: Hypotheses) -> list[Message]:
         paths = {h.id: self._updated_path(h, hypotheses.sequence) for h in hypotheses.hypotheses}

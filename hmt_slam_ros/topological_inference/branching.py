@@ -37,7 +37,10 @@ MIN_PROPOSAL_PROBABILITY = 0.5
 """Smallest probability of a hypothesis for which landmarks propose loops."""
 
 MIN_EXAMINED_AREAS = 4
-"""Known areas that every hypothesis may examine at a cut, however improbable it is."""
+"""Known areas that every hypothesis may examine at a cut, however improbable it is.
+
+From docs/decisions/0021-bounded-cost-of-a-cut.md.
+"""
 
 _UNCONFIRMED_INFLATION = 100.0
 """Factor on the covariance of an arc along other arcs that no match confirms: it adds next to nothing to those."""

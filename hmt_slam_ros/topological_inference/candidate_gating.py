@@ -35,7 +35,7 @@ from hmt_slam_ros.hybrid_map.surroundings import (
 Pose = Float64
 
 _MAX_EXAMINED = 64
-"""Most areas whose keyframes are examined, where the arcs admit many."""
+"""Most areas whose keyframes are examined, where the arcs admit many (docs/decisions/0021-bounded-cost-of-a-cut.md)."""
 
 _MAX_NEGATIVES = 6
 """Most areas in which the keyframes surely do not lie that they are compared with."""

@@ -50,7 +50,7 @@ from hmt_slam_ros.topological_inference.place_recognition import (
 Pose = Float64
 
 _OLD_EVENTS = 30
-"""Keyframe events after which a keyframe counts as known ground."""
+"""Keyframe events after which a keyframe counts as known ground (docs/decisions/0018-scans-count-once.md)."""
 
 _OLD_STEP = 20
 """Keyframe events between two changes of that known ground, so that its grid stays cached."""

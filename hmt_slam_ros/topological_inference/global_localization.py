@@ -34,13 +34,13 @@ from hmt_slam_ros.topological_inference.place_recognition import PerceptualAlias
 Pose = Float64
 
 UNMAPPED_PRIOR = 0.2
-"""Prior probability that a lost robot is on unmapped ground."""
+"""Prior probability that a lost robot is on unmapped ground (docs/decisions/0025-global-localization.md)."""
 
 _SURFACE_WEIGHT = 0.5
 """Exponent of the surface likelihood between areas: holes in a map come in lumps, not sample by sample."""
 
 _MIN_WALL_CHECK_PROBABILITY = 0.05
-"""Smallest probability of a candidate whose walls are checked."""
+"""Smallest probability of a candidate whose walls are checked (docs/decisions/0025-global-localization.md)."""
 
 _OLD_MAP_FACTOR = 2.0
 """Ratio of the outlier rates of walls in an old map and in a recent one: people stood elsewhere."""

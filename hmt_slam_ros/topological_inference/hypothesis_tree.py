@@ -20,7 +20,10 @@ from hmt_slam_ros.topological_inference.global_localization import PoseHint
 Covariance = Float64
 
 _CUSUM_DRIFT = 1.0
-"""Drift of the CUSUM statistic per keyframe, nats: people contradict the map in several keyframes."""
+"""Drift of the CUSUM statistic per keyframe, nats: people contradict the map in several keyframes.
+
+From docs/decisions/0026-kidnapping-detection.md.
+"""
 
 _CUSUM_WINDOW = 30
 """Keyframe events for which evidence of a kidnapping is kept."""
@@ -29,10 +32,13 @@ _ONSET_SHARE = 0.2
 """Smallest share of the largest evidence with which the kidnapping can begin."""
 
 _SAME_DISTANCE = 0.5
-"""Largest distance between equivalent poses, m; fine alignment closes it."""
+"""Largest distance between equivalent poses, m; fine alignment closes it.
+
+From docs/decisions/0015-merging-equivalent-hypotheses.md.
+"""
 
 _SAME_ANGLE = math.radians(5.0)
-"""Largest difference of their headings, rad."""
+"""Largest difference of their headings, rad (docs/decisions/0015-merging-equivalent-hypotheses.md)."""
 
 _ALIGNMENT_COVARIANCE = np.diag([0.5 * _SAME_DISTANCE, 0.5 * _SAME_DISTANCE, 0.5 * _SAME_ANGLE]) ** 2
 """How far fine alignment may move an arc, m and rad, squared."""

@@ -41,7 +41,10 @@ _MIN_DISTANCE = 1e-3
 """Smallest distance between descriptors that differs from 0."""
 
 RATIO_AT_MEDIAN = -0.3
-"""log p(similarity | same place) / p(similarity | another) at the median, from `python -m benchmark appearance`."""
+"""log p(similarity | same place) / p(similarity | another) at the median, from `python -m benchmark appearance`.
+
+From docs/reports/2026-11-22-appearance.md.
+"""
 
 RATIO_SLOPE = 1.44
 """Its slope over the similarity, from the same fit."""
@@ -65,10 +68,13 @@ _PRIOR_COUNT = 2.0
 """Negative samples that the prior counts for."""
 
 _MAX_NEGATIVES = 64
-"""Negative samples that are kept."""
+"""Negative samples that are kept (docs/decisions/0017-perceptual-aliasing.md)."""
 
 _ALIASING_PERSISTENCE = 0.4
-"""Largest probability that a similar place is still similar at the next keyframes."""
+"""Largest probability that a similar place is still similar at the next keyframes.
+
+From docs/decisions/0017-perceptual-aliasing.md.
+"""
 
 _SHARE_TOLERANCE = 0.02
 """Variation of the matched share at one place."""

@@ -33,7 +33,10 @@ from hmt_slam_ros.topological_inference.hypothesis_tree import FalseAlarm, Lost,
 Pose = Float64
 
 KIDNAPPED_UNMAPPED_PRIOR = 0.5
-"""Prior probability that a robot kidnapped during mapping is on unmapped ground."""
+"""Prior probability that a robot kidnapped during mapping is on unmapped ground.
+
+From docs/decisions/0026-kidnapping-detection.md.
+"""
 
 _SAME_DISTANCE = 1.0
 """Largest distance between two poses of a keyframe that count as the same, m."""
@@ -57,7 +60,7 @@ _MIN_KIDNAPPED_PROBABILITY = 0.05
 """Smallest probability of a hypothesis that spawns a kidnapped child."""
 
 _MIN_KIDNAPPED_KEYFRAMES = 3
-"""Fewest keyframes since the kidnapping of a kidnapped child."""
+"""Fewest keyframes since the kidnapping of a kidnapped child (docs/decisions/0026-kidnapping-detection.md)."""
 
 
 def begin_relocalization(branching: Branching, parent: Parent, keyframe: Keyframe, pose: Pose) -> Branches:

@@ -63,7 +63,7 @@ _OVERLAP_PERSISTENCE = 3
 """Keyframe events in a row that the robot has to be in an area of the submap before an arc joins it."""
 
 _RETRY_KEYFRAMES = 3
-"""Keyframes after which pending candidates are compared again."""
+"""Keyframes after which pending candidates are compared again (docs/decisions/0020-retry-beside-known-areas.md)."""
 
 _UNEXAMINED_DECAY = 0.5
 """Factor on the unexamined probability at a search: unexamined ground would match again by now."""
