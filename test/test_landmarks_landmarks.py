@@ -7,10 +7,10 @@ from worlds import box, scan_at, scan_in
 from benchmark.landmark_truth import World
 from hmt_slam_ros.configuration.landmarks import FeatureParameters
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.landmarks.beam_labels import rays_from_scan
-from hmt_slam_ros.landmarks.corners import extract_corners
+from hmt_slam_ros.landmarks.landmarks import extract_corners
 from hmt_slam_ros.landmarks.line_extraction import Lines, extract_lines
 from hmt_slam_ros.landmarks.openings import extract_openings
+from hmt_slam_ros.landmarks.rays import rays_from_scan
 from hmt_slam_ros.simulation import open_simulated
 
 NOISE = 0.01

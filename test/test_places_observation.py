@@ -10,10 +10,10 @@ from worlds import scan_at
 
 from benchmark.belief_world import drawn_anywhere, drawn_observation
 from hmt_slam_ros.configuration.landmarks import FeatureParameters, PlaceParameters
-from hmt_slam_ros.landmarks.beam_labels import rays_from_scan
-from hmt_slam_ros.landmarks.corners import Corners, extract_corners
+from hmt_slam_ros.landmarks.landmarks import Corners, extract_corners
 from hmt_slam_ros.landmarks.line_extraction import extract_lines
 from hmt_slam_ros.landmarks.openings import Openings, extract_openings
+from hmt_slam_ros.landmarks.rays import rays_from_scan
 from hmt_slam_ros.places.observation import (
     ExpectedLandmarks,
     estimate_distance_past_node,

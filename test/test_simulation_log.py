@@ -20,7 +20,7 @@ from hmt_slam_ros.open_log import open_log
 from hmt_slam_ros.sensors import Odometry, Scan
 from hmt_slam_ros.simulation import FAMILIES, SimulatedLog
 from hmt_slam_ros.simulation.building import outline_of_cells
-from hmt_slam_ros.simulation.world_file import read_world
+from hmt_slam_ros.simulation.worlds import read_world
 
 MALAGA = Path(__file__).parents[1] / "data" / "malaga_one_loop"
 

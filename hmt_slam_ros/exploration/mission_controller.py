@@ -19,8 +19,8 @@ from hmt_slam_ros.exploration.local_motion import MotionCommand, MotionLimits, c
 from hmt_slam_ros.exploration.path_follower import PathFollower
 from hmt_slam_ros.exploration.rooms import Destination, KnownBuilding, RoomFilter
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.landmarks.heading import QUARTER_TURN
 from hmt_slam_ros.logs.stamps import NANOSECONDS
+from hmt_slam_ros.places.corridor_frame import QUARTER_TURN
 from hmt_slam_ros.places.edge_existence import EdgeMonitor
 from hmt_slam_ros.places.estimator import PlaceEstimator
 from hmt_slam_ros.places.observation import observation_model

@@ -23,12 +23,12 @@ from hmt_slam_ros.exploration.rooms import KnownBuilding, named_destinations
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian, chi_square_gate
 from hmt_slam_ros.hybrid_map.shortest_path import connected_areas
-from hmt_slam_ros.landmarks.heading import QUARTER_TURN
 from hmt_slam_ros.logs.stamps import NANOSECONDS
 from hmt_slam_ros.messages.map_changes import InitialPose
 from hmt_slam_ros.messages.messages import ClosureDecision, Hypotheses, Keyframe, Message, PoseReset, RealTimePose
 from hmt_slam_ros.messages.replica import Replica, ReplicaState
 from hmt_slam_ros.messages.tasks import GoalPose, PlaceEstimate, Task, TaskResult, VelocityCommand
+from hmt_slam_ros.places.corridor_frame import QUARTER_TURN
 from hmt_slam_ros.places.edge_existence import EdgeMonitor
 from hmt_slam_ros.places.observation_graph import QUARTERS
 from hmt_slam_ros.places.place_graph import DIRECTION_NAMES, state_of

@@ -24,9 +24,9 @@ from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.hybrid_map.surroundings import Neighborhood, areas_around
 from hmt_slam_ros.landmarks.area_classes import hallway_log_odds, measure_free_space
-from hmt_slam_ros.landmarks.beam_labels import rays_from_scan
 from hmt_slam_ros.landmarks.line_extraction import extract_lines
 from hmt_slam_ros.landmarks.openings import distance_to_doors, extract_openings, jamb_positions
+from hmt_slam_ros.landmarks.rays import rays_from_scan
 from hmt_slam_ros.sensors import Scan
 
 

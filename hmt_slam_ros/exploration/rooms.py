@@ -19,7 +19,7 @@ from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.hybrid_map.surroundings import Neighborhood, areas_around, stack_poses
-from hmt_slam_ros.landmarks.filter_selection import FilterSelector
+from hmt_slam_ros.landmarks.line_filter import FilterSelector
 from hmt_slam_ros.places.area_views import AreaViewCache
 from hmt_slam_ros.places.chart import DOOR, Chart, build_chart
 from hmt_slam_ros.places.floor import SideOpening

@@ -18,8 +18,7 @@ import numpy as np
 from hmt_slam_ros.arrays import Float64, Int64
 from hmt_slam_ros.configuration.landmarks import FeatureParameters
 from hmt_slam_ros.grids.virtual_scan import cast_virtual_scan
-from hmt_slam_ros.landmarks.beam_labels import Rays
-from hmt_slam_ros.landmarks.virtual_lines import rays_from_virtual_scan
+from hmt_slam_ros.landmarks.rays import Rays, rays_from_virtual_scan
 from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.submap.local_mapping import LocalMapping
 

@@ -19,8 +19,8 @@ from hmt_slam_ros.configuration.landmarks import FeatureParameters
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian, chi_square_gate, fuse
 from hmt_slam_ros.hybrid_map.landmark import Existence, Landmark
-from hmt_slam_ros.landmarks.beam_labels import Rays
 from hmt_slam_ros.landmarks.landmarks import OPENING, ScanLandmarks, should_be_visible
+from hmt_slam_ros.landmarks.rays import Rays
 
 # Beyond this distance, m, nothing is compared.
 _MAX_PAIR_DISTANCE = 2.0

@@ -18,7 +18,9 @@ from numba import njit
 from hmt_slam_ros.arrays import Bool, Float64, Int32, Int64
 from hmt_slam_ros.configuration.landmarks import FeatureParameters
 from hmt_slam_ros.geometry.gaussian import chi_square_gate
+from hmt_slam_ros.grids.virtual_scan import VirtualScan
 from hmt_slam_ros.landmarks.line_fit import Beams, MergeGate, fit_line, merge_lines, relabel
+from hmt_slam_ros.landmarks.rays import range_deviations_of_map
 from hmt_slam_ros.sensors import Scan
 
 _NO_LINE = -1
@@ -304,3 +306,24 @@ def _visible_segments(
             pieces[count - 1, 1] = max(pieces[count - 1, 1], along)
             before, last = k, along
     return pieces[:count], owners[:count]
+
+
+# Beams that err alike; what one more line explains has to be so many times as much.
+_CORRELATED_BEAMS = 2.0
+
+
+def extract_map_lines(virtual: VirtualScan, features: FeatureParameters) -> Lines:
+    """The lines of a virtual scan."""
+    costs = replace(
+        features,
+        line_penalty=_CORRELATED_BEAMS * features.line_penalty,
+        stray_penalty=_CORRELATED_BEAMS * features.stray_penalty,
+    )
+    lines = extract_lines(virtual.scan, costs, range_deviations_of_map(virtual, features)[virtual.scan.valid])
+    begins, ends = np.full(len(lines), np.inf), np.full(len(lines), -np.inf)
+    np.minimum.at(begins, lines.owners, lines.segments[:, 0])
+    np.maximum.at(ends, lines.owners, lines.segments[:, 1])
+    of_ends = features.map_deviation**2
+    middles, turn, off = 0.5 * (begins + ends), 2.0 * of_ends / (ends - begins) ** 2, 0.5 * of_ends
+    own = np.stack((turn, middles * turn, middles * turn, middles * middles * turn + off), axis=1).reshape(-1, 2, 2)
+    return replace(lines, covariances=lines.covariances + own)

@@ -25,15 +25,19 @@ from hmt_slam_ros.configuration.landmarks import FeatureParameters
 from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.landmark import Landmark
-from hmt_slam_ros.landmarks.beam_labels import Rays, rays_from_scan
-from hmt_slam_ros.landmarks.corners import NO_CORNERS, extract_corners
-from hmt_slam_ros.landmarks.heading import QUARTER_TURN
 from hmt_slam_ros.landmarks.landmark_map import LandmarkMap
-from hmt_slam_ros.landmarks.landmarks import OPENING, concatenate_landmarks
+from hmt_slam_ros.landmarks.landmarks import NO_CORNERS, OPENING, concatenate_landmarks, extract_corners
 from hmt_slam_ros.landmarks.line_extraction import Lines, extract_lines
 from hmt_slam_ros.landmarks.openings import NO_OPENINGS, Openings, extract_openings
+from hmt_slam_ros.landmarks.rays import Rays, rays_from_scan
 from hmt_slam_ros.places.chart import END_NODE_TO_WALL
-from hmt_slam_ros.places.corridor_frame import ALIGNMENT_TOLERANCE, CorridorFrame, DetectedNode, distance_to_wall_ahead
+from hmt_slam_ros.places.corridor_frame import (
+    ALIGNMENT_TOLERANCE,
+    QUARTER_TURN,
+    CorridorFrame,
+    DetectedNode,
+    distance_to_wall_ahead,
+)
 from hmt_slam_ros.places.observation import estimate_distance_past_node, observation_model
 from hmt_slam_ros.places.observation_graph import QUARTERS, LandmarkSequence, observation_graph, select_wall_landmarks
 from hmt_slam_ros.places.place_graph import PlaceGraph, heading_of, node_of

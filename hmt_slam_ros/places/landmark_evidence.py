@@ -7,13 +7,79 @@ from collections.abc import Iterable, Mapping
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
+from hmt_slam_ros.hybrid_map.shortest_path import informative_arc, shortest_paths
 from hmt_slam_ros.messages.messages import Notice
 from hmt_slam_ros.places.area_views import AreaViewCache
-from hmt_slam_ros.places.loop_proposals import LoopProposer
+from hmt_slam_ros.places.loop_detector import (
+    AreaLoop,
+    AreaLoopDetector,
+)
 from hmt_slam_ros.places.relocalization_prior import RelocalizationPrior
 from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.submap.local_mapping import LocalMapping
 from hmt_slam_ros.topological_inference.global_localization import PoseDistribution
+
+# Keyframes that are looked at ahead, at a time.
+_AHEAD = 32
+
+_TEXT = (
+    "landmarks on the way from area {} to area {} are those up to area {}: a loop is looked for there, and nothing is "
+    "to do"
+)
+
+
+class LoopProposer:
+    """Supposes arcs."""
+
+    def __init__(self, configuration: Configuration, views: AreaViewCache) -> None:
+        """:param views: what areas show."""
+        self._loops, self._views = AreaLoopDetector(configuration, views), views
+        # Areas whose position is known this well, m, are told from others by the arcs, or looked for all the same.
+        self._max_arc_deviation = min(configuration.places.spacing, configuration.tsbi.prior_limit)
+        self._unreported: list[AreaLoop] = []
+        self._reported: set[tuple[int, int]] = set()
+
+    def propose(self, hybrid_map: HybridMap) -> AreaLoop | None:
+        """The newest loop that landmarks propose and no arc closes; None for none."""
+        loop = self._loops.newest_loop(hybrid_map)
+        return None if loop is None or informative_arc(hybrid_map, loop.area, loop.other_area) is not None else loop
+
+    def with_proposed_arc(self, hybrid_map: HybridMap, area: int) -> HybridMap:
+        """The map with an arc where one is proposed; the map itself where none is, and where the arcs know all.
+
+        :param area: the robot's.
+        """
+        loop = self.propose(hybrid_map) if self._is_needed(hybrid_map, area) else None
+        if loop is None:
+            return hybrid_map
+        self._unreported.append(loop)
+        supposed = hybrid_map.branch()
+        supposed.set_arc(loop.area, loop.other_area, loop.pose, closure=False)
+        return supposed
+
+    def prefetch(self, hybrid_map: HybridMap, area: int) -> None:
+        """Between cuts, look up a part of what areas show, which the next cut would ask for.
+
+        :param area: the robot's.
+        """
+        if self._is_needed(hybrid_map, area):
+            areas = ((known, hybrid_map.keyframes(known)) for known in hybrid_map.area_ids())
+            self._views.prefetch(areas, _AHEAD)
+
+    def _is_needed(self, hybrid_map: HybridMap, area: int) -> bool:
+        """Whether the arcs leave open where an area is, seen from that of the robot."""
+        return len(shortest_paths(hybrid_map, area, self._max_arc_deviation**2).areas) < len(hybrid_map.area_ids())
+
+    def notices(self) -> list[Notice]:
+        """What was proposed since this was asked last, each pair of areas once."""
+        new = {
+            (loop.area, loop.other_area): loop
+            for loop in self._unreported
+            if (loop.area, loop.other_area) not in self._reported
+        }
+        self._unreported.clear()
+        self._reported.update(new)
+        return [Notice("tsbi", _TEXT.format(loop.first_area, loop.area, loop.other_area)) for loop in new.values()]
 
 
 class PlaceEvidence:

@@ -18,19 +18,23 @@ the way lies in the map, and a second one where the map holds the same places an
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
 from hmt_slam_ros.arrays import Float64
+from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.configuration.landmarks import PlaceParameters
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.hybrid_map.shortest_path import shortest_path_beliefs
 from hmt_slam_ros.hybrid_map.surroundings import keyframe_positions
-from hmt_slam_ros.places.chart import Chart, ChartNode
-from hmt_slam_ros.places.observation import ObservationModel, visible_interval
+from hmt_slam_ros.places.area_views import AreaView, AreaViewCache
+from hmt_slam_ros.places.chart import Chart, ChartNode, build_chart
+from hmt_slam_ros.places.observation import ObservationModel, observation_model, visible_interval
 from hmt_slam_ros.places.observation_graph import QUARTERS, LandmarkSequence, select_landmarks
 from hmt_slam_ros.places.place_graph import Edge, PlaceGraph, heading_of, node_of, state_of
 from hmt_slam_ros.places.position_belief import PositionBelief, Travel, uniform_belief
@@ -198,3 +202,124 @@ def _visible_landmarks(landmarks: LandmarkSequence, model: ObservationModel) -> 
     pairs = zip(landmarks.tracks.tolist(), landmarks.forms.tolist(), strict=True)
     low, high = np.array([visible_interval(track, form, model.reach) for track, form in pairs]).reshape(-1, 2).T
     return select_landmarks(landmarks, (low <= landmarks.positions) & (landmarks.positions <= high))
+
+
+# Of the robot's way so many transitions are enough.
+_MAX_TRANSITIONS = 3 * TRANSITIONS
+# Deviations of a node's place against its twin's, m, and of its axes, rad. Of 12 twins in institutes of training seeds
+# the largest errors are 0.13 m and 0.2 degrees, the mean ones 0.03 m and 0.1 degrees.
+_TWIN_DEVIATION, _HEADING_DEVIATION = 0.1, math.radians(0.5)
+
+
+class AreaLoop(NamedTuple):
+    """Two areas that a loop joins.
+
+    :ivar area: one that the robot went through last.
+    :ivar other_area: one of before.
+    :ivar pose: the belief over ``area_T_other``.
+    :ivar first_area: the area, of those that the robot went through last, in which the loop begins.
+    """
+
+    area: int
+    other_area: int
+    pose: PoseGaussian
+    first_area: int
+
+
+class _CachedChart(NamedTuple):
+    """A chart, and what it was made of."""
+
+    views: tuple[AreaView, ...]
+    arcs: tuple[tuple[int, int, bytes, bytes], ...]
+    chart: Chart
+
+    def is_current(self, views: Iterable[AreaView], arcs: tuple[tuple[int, int, bytes, bytes], ...]) -> bool:
+        """Whether it is made of these."""
+        return arcs == self.arcs and all(own is other for own, other in zip(self.views, views, strict=True))
+
+
+class AreaLoopDetector:
+    """Looks for loops in maps; keeps the charts that were asked for last."""
+
+    def __init__(self, configuration: Configuration, views: AreaViewCache) -> None:
+        """:param views: what areas show."""
+        self._features, self._places, self._views = configuration.features, configuration.places, views
+        self._model = observation_model(configuration.places, configuration.features)
+        self._charts: dict[tuple[int, ...], _CachedChart] = {}
+
+    def newest_loop(self, hybrid_map: HybridMap) -> AreaLoop | None:
+        """The newest place of the robot's way that the map holds another time, as the belief says; None for none."""
+        kept, self._charts = self._charts, {}
+        for last, before in _temporal_splits(hybrid_map):
+            own = self._chart(last, kept)
+            found = traversed_paths(last, own)
+            if max(map(len, found), default=0) >= TRANSITIONS:
+                both = _disjoint_union(own, self._chart(before, kept))
+                graph = both.graph(self._places)
+                loops = [
+                    pair for way in found if (pair := self._confirm_in_reverse(way, graph, len(own.nodes))) is not None
+                ]
+                if loops:
+                    return _area_loop(both, *loops[-1], len(own.nodes))
+            if sum(map(len, found)) >= _MAX_TRANSITIONS:
+                break
+        return None
+
+    def _confirm_in_reverse(
+        self, way: Sequence[Edge], graph: PlaceGraph, own: int
+    ) -> tuple[LoopCandidate, LoopCandidate] | None:
+        """The newest loop on a way between one of the first nodes and one of the others, and where that begins."""
+        there = list(self._loops_between(way, graph, own))
+        if not there:
+            return None
+        steps, newest = there[-1]
+        back = list(self._loops_between([edge.reverse for edge in reversed(way[:steps])], graph, own))
+        return (newest, back[-1][1]) if back else None
+
+    def _loops_between(self, way: Sequence[Edge], graph: PlaceGraph, own: int) -> Iterator[tuple[int, LoopCandidate]]:
+        """Loops between one of the first nodes and one of the others, each with the steps of the way up to there."""
+        for steps, loop in enumerate(detect_loops(way, graph, self._model, self._places), 1):
+            if loop is not None and (loop.node < own) != (loop.other_node < own):
+                yield steps, loop
+
+    def _chart(self, hybrid_map: HybridMap, kept: Mapping[tuple[int, ...], _CachedChart]) -> Chart:
+        """The chart of a map, which may be one of those that were kept."""
+        views = self._views.views_of_map(hybrid_map)
+        every = ((a, b, arc.pose) for a, b, arc in hybrid_map.all_arcs())
+        arcs = tuple((a, b, pose.mean.tobytes(), pose.covariance.tobytes()) for a, b, pose in every)
+        found = kept.get(tuple(views))
+        if found is None or not found.is_current(views.values(), arcs):
+            found = _CachedChart(tuple(views.values()), arcs, build_chart(hybrid_map, views, self._features))
+        self._charts[tuple(views)] = found
+        return found.chart
+
+
+def _temporal_splits(hybrid_map: HybridMap) -> Iterator[tuple[HybridMap, HybridMap]]:
+    """The map of the areas in which the robot was last, from the fewest on, and that of all in which it was before."""
+    keyframes = {area: hybrid_map.keyframes(area) for area in hybrid_map.area_ids()}
+    areas = sorted((area for area, own in keyframes.items() if own), key=lambda area: max(keyframes[area]))
+    for k in range(len(areas) - 1, 0, -1):
+        if max(keyframes[areas[k - 1]]) < min(min(keyframes[area]) for area in areas[k:]):
+            yield hybrid_map.subgraph(areas[k:]), hybrid_map.subgraph(areas[:k])
+
+
+def _disjoint_union(one: Chart, other: Chart) -> Chart:
+    """Two charts as one, in which no edge leads from the one to the other."""
+    count = len(one.nodes)
+    edges = (edge._replace(start=edge.start + count, end=edge.end + count) for edge in other.edges)
+    return Chart(one.nodes + other.nodes, one.graph_nodes + other.graph_nodes, (*one.edges, *edges))
+
+
+def _area_loop(chart: Chart, loop: LoopCandidate, begin: LoopCandidate, own: int) -> AreaLoop:
+    """A loop between a node of the first ones and another one, as it joins their areas.
+
+    :param begin: the same loop where it begins.
+    """
+    quarters = loop.quarters if loop.node < own else -loop.quarters
+    node, other = (chart.nodes[k] for k in sorted((loop.node, loop.other_node)))
+    turned = PoseGaussian(
+        np.array((0.0, 0.0, 0.5 * math.pi * quarters)), np.diag([_TWIN_DEVIATION, _TWIN_DEVIATION, _HEADING_DEVIATION]) ** 2
+    )
+    back = PoseGaussian.from_pose(other.pose).inverse()
+    pose = PoseGaussian.from_pose(node.pose).compose(turned).compose(back)
+    return AreaLoop(node.area, other.area, pose, chart.nodes[min(begin.node, begin.other_node)].area)

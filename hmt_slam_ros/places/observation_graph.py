@@ -17,7 +17,7 @@ import numpy as np
 from hmt_slam_ros.arrays import Bool, Float64, Int64
 from hmt_slam_ros.configuration.landmarks import PlaceParameters
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.landmarks.corners import Corners
+from hmt_slam_ros.landmarks.landmarks import Corners
 from hmt_slam_ros.landmarks.openings import Openings
 
 TRACKS = 8

@@ -18,8 +18,7 @@ from hmt_slam_ros.configuration.landmarks import PlaceParameters
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.landmark import Landmark
-from hmt_slam_ros.landmarks.corners import Corners
-from hmt_slam_ros.landmarks.landmarks import CONVEX_CORNER, OPENING
+from hmt_slam_ros.landmarks.landmarks import CONVEX_CORNER, OPENING, Corners
 from hmt_slam_ros.landmarks.openings import Openings
 from hmt_slam_ros.places.floor import DIRECTIONS, AlignedNeighborhood
 from hmt_slam_ros.places.observation_graph import (

@@ -15,11 +15,10 @@ from hmt_slam_ros.logs.records import LogRecord
 from hmt_slam_ros.logs.stamps import NANOSECONDS
 from hmt_slam_ros.random_streams import Purpose, random_stream
 from hmt_slam_ros.sensors import Odometry, Scan
-from hmt_slam_ros.simulation.drive import ACCELERATION, TURN_ACCELERATION
+from hmt_slam_ros.simulation.drive import ACCELERATION, TURN_ACCELERATION, add_odometry_noise
 from hmt_slam_ros.simulation.laser import clearance
 from hmt_slam_ros.simulation.people import ReactivePeople
 from hmt_slam_ros.simulation.scenario import START, Scenario
-from hmt_slam_ros.simulation.wheels import add_odometry_noise
 
 COMMAND_TIMEOUT = 0.5
 """So long a command holds, s; after that the robot stops."""

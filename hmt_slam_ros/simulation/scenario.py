@@ -13,12 +13,18 @@ from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.random_streams import Purpose, random_stream
 from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.simulation.building import Building, furniture_walls
-from hmt_slam_ros.simulation.drive import Drive, drive_along, path_through
+from hmt_slam_ros.simulation.drive import (
+    Drive,
+    draw_slips,
+    drive_along,
+    noisy_increments,
+    odometry_readings,
+    path_through,
+)
 from hmt_slam_ros.simulation.furniture import change_since_first_visit, schedule_furniture
 from hmt_slam_ros.simulation.laser import Laser, WallIndex, clearance, wall_index
 from hmt_slam_ros.simulation.people import draw_people
 from hmt_slam_ros.simulation.settings import Settings
-from hmt_slam_ros.simulation.wheels import draw_slips, noisy_increments, odometry_readings
 
 
 @dataclass(frozen=True)
