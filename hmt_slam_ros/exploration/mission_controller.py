@@ -20,11 +20,10 @@ from hmt_slam_ros.exploration.path_follower import PathFollower
 from hmt_slam_ros.exploration.rooms import Destination, KnownBuilding, RoomFilter
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.logs.stamps import NANOSECONDS
-from hmt_slam_ros.places.corridor_frame import QUARTER_TURN
 from hmt_slam_ros.places.edge_existence import EdgeMonitor
 from hmt_slam_ros.places.estimator import PlaceEstimator
 from hmt_slam_ros.places.observation import observation_model
-from hmt_slam_ros.places.observation_graph import QUARTERS
+from hmt_slam_ros.places.observation_graph import QUARTER_TURN, QUARTERS
 from hmt_slam_ros.places.place_graph import state_of
 from hmt_slam_ros.places.policy import MetricInitialPose, metric_initial_pose, next_turn, turn_towards
 from hmt_slam_ros.places.position_belief import PositionBelief, certain_belief

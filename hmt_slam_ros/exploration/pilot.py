@@ -28,9 +28,8 @@ from hmt_slam_ros.messages.map_changes import InitialPose
 from hmt_slam_ros.messages.messages import ClosureDecision, Hypotheses, Keyframe, Message, PoseReset, RealTimePose
 from hmt_slam_ros.messages.replica import Replica, ReplicaState
 from hmt_slam_ros.messages.tasks import GoalPose, PlaceEstimate, Task, TaskResult, VelocityCommand
-from hmt_slam_ros.places.corridor_frame import QUARTER_TURN
 from hmt_slam_ros.places.edge_existence import EdgeMonitor
-from hmt_slam_ros.places.observation_graph import QUARTERS
+from hmt_slam_ros.places.observation_graph import QUARTER_TURN, QUARTERS
 from hmt_slam_ros.places.place_graph import DIRECTION_NAMES, state_of
 from hmt_slam_ros.places.policy import MetricInitialPose, metric_initial_pose
 from hmt_slam_ros.places.position_belief import PositionBelief, certain_belief, uniform_belief

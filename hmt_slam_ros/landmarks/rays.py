@@ -1,4 +1,4 @@
-"""Beams as free space around the robot, of a scan or of a virtual one."""
+"""Beams as free space around the robot, of real and virtual scans."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from hmt_slam_ros.sensors import Scan
 
 
 class Rays(NamedTuple):
-    """How far beams go through free space, in the order of their bearing.
+    """Beams with their free ranges, in the order of bearing.
 
-    :ivar origins: shape (n, 2), where they begin, m.
+    :ivar origins: shape (n, 2), m.
     :ivar directions: shape (n, 2), unit vectors.
     :ivar free_range: shape (n,), m.
     :ivar deviations: shape (n,), of these, m.
-    :ivar hit: shape (n,), whether there is a surface; else it is not known how the beam goes on.
+    :ivar hit: shape (n,), whether a surface is at the end; else what follows is unknown.
     """
 
     origins: Float64
@@ -39,7 +39,7 @@ def rays_from_scan(scan: Scan, features: FeatureParameters) -> Rays:
 
 
 def rays_from_virtual_scan(virtual: VirtualScan, features: FeatureParameters) -> Rays:
-    """The beams of a virtual scan, also those that come into unknown ground."""
+    """The beams of a virtual scan, with those that end in unknown ground."""
     scan = virtual.scan
     angles = scan.angle_min + scan.angle_increment * np.arange(scan.ranges.size)
     directions = np.stack((np.cos(angles), np.sin(angles)), axis=1)
@@ -48,5 +48,5 @@ def rays_from_virtual_scan(virtual: VirtualScan, features: FeatureParameters) ->
 
 
 def range_deviations_of_map(virtual: VirtualScan, features: FeatureParameters) -> Float64:
-    """Of the ranges, shape (n,), m."""
+    """Deviations of the ranges of a virtual scan, which grow with the angle of incidence, shape (n,), m."""
     return features.map_deviation / virtual.incidence_cosine
