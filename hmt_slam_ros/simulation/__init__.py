@@ -1,4 +1,4 @@
-"""A simulated world with ground truth: buildings, a robot that drives through them, and what it measures."""
+"""Simulation with ground truth: buildings, a robot that drives through them, and its measurements."""
 
 from hmt_slam_ros.simulation.simulated_log import SimulatedLog, open_simulated
 from hmt_slam_ros.simulation.worlds import FAMILIES

@@ -1,4 +1,4 @@
-"""What can be chosen of a simulated world, and how it is written: ``sim:office,seed=3,people=4``."""
+"""Settings of a simulated drive, written as in ``sim:office,seed=3,people=4``."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from hmt_slam_ros.logs.records import SIMULATION_PREFIX
 
 @dataclass(frozen=True)
 class Settings:
-    """Building, robot, laser and company of a simulated drive."""
+    """Settings of building, robot, laser and people of a simulated drive."""
 
     seed: int = parameter(0, "Seed of building, noise, people and furniture.", low=0, high=2**31 - 1)
     visit: int = parameter(
@@ -68,12 +68,12 @@ class Settings:
 
     @property
     def run_seed(self) -> int:
-        """Seed of what is another at every visit: noise, people, what is moved."""
+        """Seed of everything that differs between visits: noise, people, moved furniture."""
         return self.seed + (self.visit << 32)
 
 
 def parse_name(log: str | Path) -> tuple[str, dict[str, Value]]:
-    """The world, and the settings given, of ``sim:WORLD,name=value,...``.
+    """The world and the given settings of ``sim:WORLD,name=value,...``.
 
     :raises HmtSlamError: for a setting without ``=``; names and values are checked by `chosen_settings`.
     """
@@ -82,7 +82,7 @@ def parse_name(log: str | Path) -> tuple[str, dict[str, Value]]:
 
 
 def chosen_settings(own: Mapping[str, Value], given: Mapping[str, Value]) -> Settings:
-    """Defaults, then those of a world's own, then those given.
+    """The defaults, changed by those of a world, changed by the given settings.
 
     :raises HmtSlamError: for an unknown name, a value of the wrong type or out of range.
     """

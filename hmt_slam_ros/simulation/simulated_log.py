@@ -1,9 +1,7 @@
-"""Which places are the same, and what the robot sees of them: the truth about loop closures.
+"""Simulated logs, made while they are read, and the truth about their loop closures.
 
-Walls decide; furniture and people do not.
-
-
-A log that is made while it is read."""
+The truth is by walls alone: which poses are in one place, and how much of the walls they see in common.
+"""
 
 from __future__ import annotations
 
@@ -24,8 +22,11 @@ from hmt_slam_ros.simulation.scenario import Scenario
 from hmt_slam_ros.simulation.settings import chosen_settings, parse_name
 from hmt_slam_ros.simulation.worlds import FAMILIES, read_world
 
-_SHORT_OF_WALL = 0.01  # m, where the view of a point on a wall ends
-_SLACK = 1e-9  # rad, that the outermost beam is counted in
+_SHORT_OF_WALL = 0.01
+"""Distance before a point on a wall at which its line of sight ends, m."""
+
+_SLACK = 1e-9
+"""Tolerance of the field of view, which includes the outermost beams, rad."""
 
 
 def same_place(
@@ -48,10 +49,10 @@ def same_place(
 def shared_view(
     walls: WallIndex, laser: Laser, poses: NDArray[np.float64], others: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """How much of what a laser sees of the walls from one pose it sees from another too.
+    """Share of the visible walls that two poses of a laser have in common.
 
-    The mean of two shares: of the points seen from the one that are in the other's field of view, within its reach and
-    not hidden, and the other way round; 0 where one of them sees nothing.
+    It is the mean of two shares: of the points visible from the one that are visible from the other, and vice versa; 0
+    if one of them sees no wall.
 
     :param poses: shape (n, 3), ``world_T_base``, m and rad.
     :param others: shape (m, 3).
@@ -70,7 +71,7 @@ def shared_view(
 
 
 def _visible_wall_points(walls: WallIndex, laser: Laser, poses: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-    """Where the beams of each pose end on walls, (k, 2) each, m, in the world."""
+    """End points on walls of the beams of each pose, (k, 2) each, m, in the world."""
     ends = []
     for pose in poses:
         distances = laser.distances(pose[None], walls, np.empty((0, 3)))
@@ -84,53 +85,38 @@ def _visible_wall_points(walls: WallIndex, laser: Laser, poses: NDArray[np.float
 def _is_visible(
     walls: WallIndex, laser: Laser, eye: NDArray[np.float64], points: NDArray[np.float64]
 ) -> NDArray[np.bool_]:
-    """Which points on walls (k, 2) a laser at ``world_T_laser`` (3,) sees, shape (k,)."""
+    """Whether points on walls (k, 2) are visible to a laser at ``world_T_laser`` (3,), shape (k,)."""
     local = se2.transform(se2.inverse(eye), points)
-    away = np.hypot(local[:, 0], local[:, 1])
-    ahead = np.abs(np.arctan2(local[:, 1], local[:, 0])) <= laser.half_field + _SLACK
-    short = points + (eye[:2] - points) * np.minimum(1.0, _SHORT_OF_WALL / np.maximum(away, 1e-9))[:, None]
-    return ahead & (away < laser.reach) & has_line_of_sight(walls, np.tile(eye[:2], (len(points), 1)), short)
+    distances = np.hypot(local[:, 0], local[:, 1])
+    in_field = np.abs(np.arctan2(local[:, 1], local[:, 0])) <= laser.half_field + _SLACK
+    ends = points + (eye[:2] - points) * np.minimum(1.0, _SHORT_OF_WALL / np.maximum(distances, 1e-9))[:, None]
+    starts = np.tile(eye[:2], (len(points), 1))
+    return in_field & (distances < laser.reach) & has_line_of_sight(walls, starts, ends)
 
 
 class SimulatedLog:
-    """A simulated drive as a log; every record tells the truth.
+    """A simulated drive as a log; every record has the true pose.
 
-    :ivar scenario: the world behind it.
+    :ivar name: world and settings.
+    :ivar scenario: the simulated world.
+    :ivar scan_count: number of scans.
+    :ivar duration: from the first to the last record, s.
     """
 
     def __init__(self, name: str, scenario: Scenario, window: TimeWindow) -> None:
-        self.scenario = scenario
-        self._name = name
-        stamps, readings = scenario.stamps, scenario.settings.readings
-        self._part = window.select(stamps)
-        in_part = np.arange(stamps.size)[self._part] % readings == 0
-        self._scan_count = int(in_part.sum())
-        require_scans(name, self._scan_count, stamps.size)
-
-    @property
-    def name(self) -> str:
-        """World and settings."""
-        return self._name
-
-    @property
-    def scan_count(self) -> int:
-        """Number of scans."""
-        return self._scan_count
-
-    @property
-    def duration(self) -> float:
-        """Seconds from the first to the last record."""
-        part = self.scenario.stamps[self._part]
-        return float(part[-1] - part[0]) / NANOSECONDS
+        self.name, self.scenario = name, scenario
+        self._part = window.select(scenario.stamps)
+        rows = np.arange(scenario.stamps.size)[self._part]
+        self.scan_count = int((rows % scenario.settings.readings == 0).sum())
+        require_scans(name, self.scan_count, scenario.stamps.size)
+        self.duration = float(scenario.stamps[rows[-1]] - scenario.stamps[rows[0]]) / NANOSECONDS
 
     def true_poses(self, stamps: NDArray[np.int64]) -> NDArray[np.float64]:
         """``world_T_base`` (n, 3), m and rad, at any stamps (n,), ns."""
         return self.scenario.true_poses(stamps)
 
     def same_place(self, stamps: NDArray[np.int64], others: NDArray[np.int64], radius: float) -> NDArray[np.bool_]:
-        """Whether the robot was in the same place at two times: within a radius, and in sight of where it was.
-
-        Walls hide; furniture and people do not.
+        """Whether the robot was in the same place at two times: within a radius, with no wall between.
 
         :param stamps: shape (n,), ns.
         :param others: shape (m,), ns.
@@ -140,12 +126,12 @@ class SimulatedLog:
         return same_place(self.scenario.walls, self.true_poses(stamps), self.true_poses(others), radius)
 
     def shared_view(self, stamps: NDArray[np.int64], others: NDArray[np.int64]) -> NDArray[np.float64]:
-        """How much of the walls that the laser saw at one time it saw at another, from 0 to 1; as `same_place`."""
+        """Share of visible walls that two times have in common, from 0 to 1; shapes as of `same_place`."""
         scenario = self.scenario
         return shared_view(scenario.walls, scenario.laser, self.true_poses(stamps), self.true_poses(others))
 
     def records(self) -> Iterator[LogRecord]:
-        """All measurements in the order of time, each scan behind the odometry of the same stamp."""
+        """All measurements in the order of time, each scan after the odometry of the same stamp."""
         scenario = self.scenario
         for k in range(self._part.start, self._part.stop):
             stamp, truth = int(scenario.stamps[k]), scenario.poses[k]
@@ -160,7 +146,7 @@ def open_simulated(log: str | Path, window: TimeWindow | None = None) -> Simulat
 
     :param log: WORLD is the name of a family or the path of a world file (.yaml).
     :param window: the part wanted, None for all.
-    :raises HmtSlamError: for a world or a setting that there is not, or a route too close to a wall.
+    :raises HmtSlamError: for an unknown world or setting, or a route too close to a wall.
     """
     world, given = parse_name(log)
     if world in FAMILIES:
@@ -168,7 +154,7 @@ def open_simulated(log: str | Path, window: TimeWindow | None = None) -> Simulat
         settings = chosen_settings(family.default_settings, given)
         draw = random_stream(settings.seed, Purpose.BUILDING, 0)
         building = family.build(draw, settings)
-        # So that neither the world's axes nor its origin are the map's.
+        # The axes and origin of the world differ from those of the map.
         building = building.transform(np.array([*draw.uniform(-50.0, 50.0, 2), draw.uniform(-np.pi, np.pi)]))
     elif Path(world).suffix in {".yaml", ".yml"}:
         building, own = read_world(Path(world))

@@ -24,9 +24,9 @@ from hmt_slam_ros.simulation.settings import Settings
 class Family:
     """A kind of building.
 
-    :ivar build: draws one.
+    :ivar build: draws a building of the kind.
     :ivar description: one sentence.
-    :ivar default_settings: settings that differ from the defaults where nobody sets them.
+    :ivar default_settings: settings of the family that differ from the common defaults.
     """
 
     build: Callable[[np.random.Generator, Settings], Building]
@@ -66,18 +66,18 @@ FAMILIES: dict[str, Family] = {
 }
 
 _KEYS = ("walls", "furniture", "route", "settings", "image", "resolution", "origin", "negate", "occupied_thresh")
-# map_server's, that this needs not.
 _IGNORED = ("free_thresh", "mode")
+"""Keys of map_server that have no effect here."""
 
 
 def read_world(path: Path) -> tuple[Building, dict[str, Any]]:
-    """The building of a world file, and its settings.
+    """The building and the settings of a world file.
 
-    ``walls`` are lists of x0, y0, x1, y1 (m), ``route`` of x, y (m), ``furniture`` of x, y, heading (degrees), length,
-    width (m). ``image`` (relative to the file), ``resolution``, ``origin``, ``negate`` and ``occupied_thresh`` are
-    those of map_server's map.yaml: the edges of occupied pixels are walls.
+    It has ``walls`` as lists of x0, y0, x1, y1 (m), ``route`` of x, y (m), and ``furniture`` of x, y, heading
+    (degrees), length, width (m). ``image`` (relative to the file), ``resolution``, ``origin``, ``negate`` and
+    ``occupied_thresh`` are those of map_server's map.yaml: the edges of occupied pixels are walls.
 
-    :raises HmtSlamError: where file or image cannot be read, a key is unknown, or a table is none.
+    :raises HmtSlamError: if file or image cannot be read, a key is unknown, or a table is malformed.
     """
     content = _content(path)
     unknown = sorted(set(content) - {*_KEYS, *_IGNORED})
@@ -97,9 +97,9 @@ def read_world(path: Path) -> tuple[Building, dict[str, Any]]:
 
 
 def walls_of_image(occupied: NDArray[np.bool_], resolution: float, origin: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The edges of the occupied pixels as walls (n, 4), m.
+    """Walls (n, 4) at the edges of occupied pixels, m.
 
-    :param occupied: shape (height, width); row 0 is the top, largest y.
+    :param occupied: shape (height, width); row 0 has the largest y.
     :param resolution: side of a pixel, m.
     :param origin: shape (3,), pose of the lower left corner of the image, m and rad.
     """
@@ -120,7 +120,7 @@ def _content(path: Path) -> Mapping[str, Any]:
 
 
 def _table(path: Path, content: Mapping[str, Any], key: str, columns: int) -> NDArray[np.float64]:
-    """Rows of numbers, shape (n, columns); none where there is no such key."""
+    """The rows of a key, shape (n, columns); none without the key."""
     try:
         rows = np.array(content.get(key) or [], dtype=np.float64).reshape(-1, columns)
         lengths = {len(row) for row in content.get(key) or []}
@@ -145,6 +145,6 @@ def _walls_of_image(path: Path, content: Mapping[str, Any]) -> NDArray[np.float6
     except (OSError, ValueError, SyntaxError) as fault:
         raise HmtSlamError(f"the image {file} cannot be read ({fault}): give a PGM or PNG file.") from fault
     brightness = pixels / 255.0 if pixels.dtype == np.uint8 else pixels.astype(np.float64)
-    grey = brightness if brightness.ndim == 2 else brightness[..., : min(3, brightness.shape[2])].mean(axis=2)
-    occupancy = grey if content.get("negate") else 1.0 - grey
+    gray = brightness if brightness.ndim == 2 else brightness[..., : min(3, brightness.shape[2])].mean(axis=2)
+    occupancy = gray if content.get("negate") else 1.0 - gray
     return walls_of_image(occupancy > threshold, resolution, origin)
