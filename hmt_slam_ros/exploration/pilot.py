@@ -2,7 +2,7 @@
 
 Tomatis, Nourbakhsh and Siegwart (2003), sections 3.3 and 3.4.
 
-1. The belief over places is updated at every scan, whoever drives.
+1. The belief over places is updated at every scan, also where others drive.
 2. At an opening a confident belief gives metric SLAM an initial pose, if that is lost.
 3. Behind the door of a task the metric filter of the room steers the robot (rooms.py).
 4. There the pose of RTL is compared with that by the door, which shows whether either is wrong.

@@ -125,7 +125,7 @@ def classify_area(spaces: Iterable[FreeSpace], features: FeatureParameters) -> A
         probability = 1.0 / (1.0 + math.exp(-max(-50.0, min(50.0, total / count))))
         is_hallway = decide_hallway(is_hallway, probability, features)
     if is_hallway is None:
-        raise ValueError("an area has no keyframe around which enough is known to tell a hallway from a room")
+        raise ValueError("an area has no keyframe with enough known free space around it to classify it")
     return AreaClass(probability, is_hallway)
 
 

@@ -150,8 +150,8 @@ def _update_landmark(
     )
 
 
-def _distance(one: PoseGaussian, other: PoseGaussian) -> float:
-    return float(np.hypot(*(one.mean[:2] - other.mean[:2])))
+def _distance(first: PoseGaussian, second: PoseGaussian) -> float:
+    return float(np.hypot(*(first.mean[:2] - second.mean[:2])))
 
 
 def _intersect_covariances(known: PoseGaussian, seen: PoseGaussian, weight: float) -> PoseGaussian:

@@ -6,8 +6,7 @@ from its size. Corners of rooms are concave, those of pillars convex.
 
 A known landmark should be visible where beams reach all parts of it: both walls of a corner, or the gap and both jambs
 of an opening. Of a closed opening, whose gap no beam passes, one jamb is enough. A beam that ends before it, such as at
-a person, tells nothing. One that goes on behind the wall of a corner tells that the corner is gone, without the other
-wall.
+a person, counts for nothing. Beams that pass one wall of a corner show that it is gone, without its other wall.
 """
 
 from __future__ import annotations
@@ -163,7 +162,7 @@ _MIN_CLOSED_SHARE = 0.5
 """Smallest share of the gap of a closed opening that is visible."""
 
 _MAX_BEAM_ANGLE = math.radians(1.5)
-"""Largest angle between a point and the beam that tells of it, rad."""
+"""Largest angle between a point and the beam that decides on it, rad."""
 
 
 class ScanLandmarks(NamedTuple):

@@ -71,36 +71,15 @@ def lines_of_scan(scan: Scan, configuration: Configuration) -> Lines:
     return extract_for_map(scan, configuration.features)
 
 
-class BeamWallCounts(NamedTuple):
-    """Beams of a scan that agree with walls or contradict them.
-
-    :ivar beams_ending: beams that end on a wall.
-    :ivar beams_passing: beams that pass a wall.
-    :ivar samples_hit: samples of walls on which beams end.
-    :ivar samples_passed: samples of walls that beams pass.
-    """
-
-    beams_ending: int
-    beams_passing: int
-    samples_hit: int
-    samples_passed: int
-
-
-def count_beams_at_walls(ends: Float64, laser: Float64, line_map: LineMap, near: float) -> BeamWallCounts:
-    """Compare beams with the walls of a map.
-
-    :param ends: of the beams, in their order, shape (n, 2), m, frame of the map.
-    :param laser: position of the laser, shape (2,), m, frame of the map.
-    :param near: distance from a wall below which a beam ends on it, m.
-    """
-    rows = [(*line_map.lines[line], *segment) for line, wall in enumerate(line_map.walls) for segment in wall.segments]
-    segments = np.array(rows, dtype=np.float64).reshape(-1, 4)
-    return BeamWallCounts(*_count_beams(ends, laser, segments, near))
-
-
 @njit(cache=True)
 def _count_beams(ends: Float64, laser: Float64, segments: Float64, near: float) -> tuple[int, int, int, int]:
-    """Fields of `BeamWallCounts`; ``segments`` are alpha, r, begin and end of each, (m, 4)."""
+    """Numbers of beams that end on a wall and that pass one, and of samples of walls that are hit and passed.
+
+    :param ends: of the beams, in their order, shape (n, 2), m, frame of the map.
+    :param laser: its position, shape (2,), m, frame of the map.
+    :param segments: alpha, r, begin and end of each, shape (m, 4).
+    :param near: distance from a wall below which a beam ends on it, m.
+    """
     ending = passing = 0
     met, passed = NO_SAMPLES, NO_SAMPLES
     at = np.empty(2)
@@ -286,9 +265,11 @@ class LineFilter:
         near = self.mapping.configuration.matching.matched_distance
         ends = se2.transform(self.pose, prepared.surfels[:, :2])
         laser = se2.transform(self.pose, prepared.laser_position[None])[0]
-        counts = count_beams_at_walls(ends, laser, self.line_map, near)
-        walls = Agreement(counts.samples_hit + counts.samples_passed, counts.samples_hit, counts.samples_passed)
-        return MapAgreement(Agreement(len(ends), counts.beams_ending, counts.beams_passing), walls)
+        lines = zip(self.line_map.lines, self.line_map.walls, strict=True)
+        rows = [(*line, *segment) for line, wall in lines for segment in wall.segments]
+        segments = np.array(rows, dtype=np.float64).reshape(-1, 4)
+        ending, passing, hit, passed = _count_beams(ends, laser, segments, near)
+        return MapAgreement(Agreement(len(ends), ending, passing), Agreement(hit + passed, hit, passed))
 
     def add_keyframe(self, keyframe: int, scan: Scan) -> None:
         """Add a keyframe at the robot's pose; the first one begins the map."""

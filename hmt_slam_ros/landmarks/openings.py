@@ -143,7 +143,7 @@ def write_wall_end_jamb(
 
     The first of them may end on the side of the jamb, in the thickness of the wall.
 
-    :param told: labels of the informative beams.
+    :param labels: of the informative beams.
     """
     end = len(labels.kinds)
     while (

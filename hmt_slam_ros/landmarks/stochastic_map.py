@@ -256,8 +256,8 @@ class LineMap:
 
     def _pairings(self, lines: Lines, k: int) -> list[Pairing]:
         """The pairings of an observed line within the gate, Eq. (13)."""
-        every = (self._pair_lines(lines, k, line) for line in self._parallel_lines(lines, k))
-        return [each for each in every if each and each.distance2(self.covariance) <= self._gate]
+        pairings = (self._pair_lines(lines, k, line) for line in self._parallel_lines(lines, k))
+        return [each for each in pairings if each and each.distance2(self.covariance) <= self._gate]
 
     def _update_with_pairings(self, chosen: Sequence[Pairing]) -> None:
         """Eqs. (14) to (17) for all pairings at once, the covariance in Joseph's form."""

@@ -208,7 +208,7 @@ class _ChartBuilder:
         return np.array([point for point in points if point is not None])
 
     def _transform_point(self, area: int, point: Float64, target: int) -> Float64 | None:
-        """A point (2,) of the neighborhood of one area in that of another; None where the arcs do not tell."""
+        """A point (2,) of the neighborhood of one area in that of another; None if its pose is unknown."""
         pose = self._neighborhoods[target].areas.get(area)
         if pose is None:
             return None

@@ -277,7 +277,7 @@ class CorridorFrame:
         return float(self.position @ _unit_vector(axis))
 
     def free_distance(self, quarters: int) -> float:
-        """Free distance some quarters to the right of the direction of travel, m; nan where no beam tells."""
+        """Free distance some quarters to the right of the direction of travel, m; nan without a beam there."""
         bearing = np.array(QUARTER_TURN * (self.travel_axis - quarters) - self.pose[2])
         return float(self._sector_distances[sector_indices(bearing)])
 

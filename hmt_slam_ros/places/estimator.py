@@ -92,7 +92,7 @@ _INITIAL_DEVIATION = 0.1
 
 _UNINFORMATIVE_TURN_VARIANCE = 2.0 * math.pi
 """Variance of the turn between two nodes, rad^2: a robot that follows one axis measures none. With this variance the
-density of no turn is that of any turn where the map does not tell it, 1 / (2 pi)."""
+density of no turn is that of any turn on unmapped edges, 1 / (2 pi)."""
 
 
 class OpeningTracker:

@@ -102,7 +102,7 @@ class AlignedNeighborhood(NamedTuple):
 
 
 def aligned_neighborhoods(hybrid_map: HybridMap, views: Mapping[int, AreaView]) -> dict[int, AlignedNeighborhood]:
-    """{area: its neighborhood} of all areas around which landmarks tell the building's axes."""
+    """{area: its neighborhood} of all areas with landmarks around them, which give the building's axes."""
     around = {area: areas_around(hybrid_map, area, _NEIGHBORHOOD) for area in hybrid_map.area_ids()}
     norths = _north_headings(around, views)
     return {area: _aligned_neighborhood(area, north, around[area], views) for area, north in norths.items()}
@@ -147,7 +147,7 @@ def _wall_axis_around(areas: Mapping[int, PoseGaussian], views: Mapping[int, Are
 
 
 def wall_axis(landmarks: Iterable[tuple[Landmark, float]]) -> float | None:
-    """Direction of walls up to quarters of a turn, rad; None where no landmark tells.
+    """Direction of walls up to quarters of a turn, rad; None without landmarks.
 
     :param landmarks: of the walls, each with the heading of its frame, rad.
     """

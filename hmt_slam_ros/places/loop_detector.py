@@ -15,7 +15,7 @@ Here the belief follows the robot's path over the stored map:
 3. Where the two peaks propose a loop, an area of the one chart is joined to an area of the other.
 4. The loop has to show along the reversed path, too. The paper's robot turns back for that.
 
-A proposal is no evidence. It tells where keyframes are matched in known areas, and the matches decide
+A proposal is no evidence. Keyframes are then matched in the known areas, and the matches decide
 (topological_inference/closure_search.py).
 """
 

@@ -138,9 +138,9 @@ def cut_room(plan: FloorPlan, side: Side, plot: Plot, width: float, *, is_open: 
         plan.cut_rectangle(*floor)
     plan.cut_rectangle(*side.rectangle((left, right), (-_OVERLAP, WALL + _OVERLAP if is_open else 0.4 * WALL)))
     middle = left + 0.5 * plot.door
-    leaf = (*side.point(left, 0.5 * WALL), *side.point(right, 0.5 * WALL))
+    door = (*side.point(left, 0.5 * WALL), *side.point(right, 0.5 * WALL))
     inside = side.point(middle, WALL + 0.5 * plot.depth)
-    return Room(floor, middle, side.point(middle, -0.5 * width), inside, is_open, leaf)
+    return Room(floor, middle, side.point(middle, -0.5 * width), inside, is_open, door)
 
 
 def cut_niches(draw: np.random.Generator, plan: FloorPlan, side: Side, length: float) -> None:
